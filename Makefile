@@ -1,0 +1,38 @@
+# `make help` lists the targets. Without an active environment, one is made in .venv and used.
+PHASE ?= 1
+SCALE ?=
+ARGS ?=
+ACTIVE := $(or $(VIRTUAL_ENV),$(CONDA_PREFIX))
+PYTHON := $(if $(ACTIVE),python,.venv/bin/python)
+# The stamp remembers an install: it is redone when pyproject.toml changes. It lives inside the environment it describes.
+STAMP := $(if $(ACTIVE),$(ACTIVE),.venv)/.horizon3d-installed
+SCALE_ARG := $(if $(SCALE),scale=$(SCALE))
+
+.PHONY: help install world train benchmark test check
+.DEFAULT_GOAL := help
+
+help: ## show this list
+	@awk -F':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+$(STAMP): pyproject.toml
+	$(if $(ACTIVE),,test -x .venv/bin/python || python3 -m venv .venv)
+	$(PYTHON) -m pip install --quiet --editable ".[test,oracle]"
+	@touch $@
+
+install: $(STAMP) ## create .venv (unless an environment is active) and install the project
+
+world: $(STAMP) ## write the synthetic highway (preview: ARGS="preview=true")
+	$(PYTHON) -m src.world $(SCALE_ARG) $(ARGS)
+
+train: $(STAMP) ## train PHASE=1 [SCALE=debug|mini|paper] [ARGS="optim.lr=2e-4 ..."]
+	$(PYTHON) -m src.train phase=phase$(PHASE) $(SCALE_ARG) $(ARGS)
+
+benchmark: $(STAMP) ## time and memory of every part [ARGS="suite=metric"]
+	$(PYTHON) -m src.benchmark $(SCALE_ARG) $(ARGS)
+
+test: $(STAMP) ## run every test
+	$(PYTHON) -m pytest $(ARGS)
+
+check: $(STAMP) ## lint and the fast tests, under a minute
+	$(PYTHON) -m ruff check .
+	$(PYTHON) -m pytest -q -m "not slow and not gpu" $(ARGS)

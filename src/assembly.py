@@ -1,0 +1,65 @@
+"""From a configuration to its pieces: data, model, module. Shared by the entry points."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from src.config import Config
+from src.data.datamodule import DetectionDataModule
+from src.data.world.write import WORLD_FILE, ensure_world, world_digest
+from src.errors import ConfigError
+from src.models import build_model as build_model_of
+from src.models.detector import Detector
+from src.training.detection import DetectionModule
+
+logger = logging.getLogger(__name__)
+
+
+def data_root(config: Config, write: bool = True) -> Path:
+    """Folder to read, written first when it is a synthetic world that does not exist yet.
+
+    With `write` false an existing folder is read as it is, whatever made it (evaluation on other data).
+    Raises ConfigError when there is neither a root nor a world to write; DataError when the folder holds another world.
+    """
+    data = config.data
+    if data.root is not None and Path(data.root).exists() and (not write or data.world is None):
+        return Path(data.root)
+    if data.world is None:
+        if data.root is None:
+            raise ConfigError("data.root is null and there is no data.world to write; give data.root=FOLDER")
+        return Path(data.root)  # the reader says what is missing
+    root = Path(data.root) if data.root else Path(config.paths.outputs) / "worlds" / world_digest(data.world)
+    return ensure_world(data.world, root)
+
+
+def build_datamodule(config: Config, root: Path) -> DetectionDataModule:
+    """The data of a run; images are left out for a model that uses none."""
+    return DetectionDataModule(
+        config.data,
+        root=root,
+        grid=config.grid.build(),
+        image_size_px=tuple(config.backbone.image_size_px) if config.model.uses_images else None,
+        seed=config.seed,
+        cache=Path(config.paths.outputs) / "cache",
+    )
+
+
+def build_model(config: Config) -> Detector:
+    """The configured detector with fresh weights (and pretrained backbone weights where given)."""
+    return build_model_of(
+        config.model, config.grid.build(), config.backbone, velocity_code_weight=config.phase.velocity_code_weight
+    )
+
+
+def build_module(config: Config, tree: dict[str, Any], datamodule: DetectionDataModule) -> DetectionModule:
+    """The LightningModule of a run; `tree` is the configuration as plain values."""
+    return DetectionModule(
+        build_model(config),
+        optim=config.optim,
+        backbone_lr_multiplier=config.backbone.lr_multiplier,
+        evaluation_set=datamodule.evaluation_set(),
+        seed=config.seed,
+        config=tree,
+    )

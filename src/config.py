@@ -1,0 +1,317 @@
+"""The root of a run's configuration, and what every entry point does before it starts.
+
+Values live in conf/; this file names them, gives types, and turns the composed tree into dataclasses. Only entry points
+import it: everything below receives plain values or its own small dataclass.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import hashlib
+import json
+import logging
+import math
+import sys
+import traceback
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from src.data.datamodule import DataConfig
+from src.data.world.config import WorldConfig
+from src.errors import CheckpointError, ConfigError, HorizonError, InterruptedRunError
+from src.geometry.bev_grid import BEVGrid
+from src.models import MODEL_CONFIGS
+from src.models.backbones.image import ImageEncoderConfig
+from src.training.optim import OptimConfig
+from src.training.run_folder import Resume
+
+CONF = Path(__file__).resolve().parent.parent / "conf"
+
+# What cannot change the result of a run is left out of its identity.
+OUTSIDE_IDENTITY = (
+    "paths",
+    "logger",
+    "trainer",
+    "resume",
+    "checkpoint",
+    "predictions",
+    "out",
+    "preview",
+    "suite",
+    "data.num_workers",
+    "data.world.num_workers",
+)
+
+
+@dataclass(kw_only=True)
+class GridConfig:
+    """The BEV grid; see `BEVGrid`."""
+
+    cells: list[int]  # [rows, columns]
+    cell_m: float
+    centre_m: list[float]  # [x, y]
+    z_range_m: list[float]  # [low, high]
+
+    def build(self) -> BEVGrid:
+        """The checked grid."""
+        return BEVGrid(tuple(self.cells), self.cell_m, tuple(self.centre_m), tuple(self.z_range_m))
+
+
+@dataclass(kw_only=True)
+class PhaseConfig:
+    """One training phase."""
+
+    name: str
+    epochs: int
+    validate_every: int  # epochs
+    velocity_code_weight: float  # weight of velocity in the box loss
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "validate_every"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"phase.{name} must be at least 1, but got {getattr(self, name)}")
+
+
+@dataclass(kw_only=True)
+class TrainerConfig:
+    """Where a run computes and how often it reports."""
+
+    accelerator: str  # auto, cpu, gpu
+    devices: int
+    log_every_steps: int
+    num_pictures: int  # validation frames drawn at the end
+
+    def __post_init__(self) -> None:
+        if self.devices < 1:
+            raise ConfigError(f"trainer.devices must be at least 1, but got {self.devices}")
+        if self.log_every_steps < 1:
+            raise ConfigError(f"trainer.log_every_steps must be at least 1, but got {self.log_every_steps}")
+
+
+@dataclass(kw_only=True)
+class WandbConfig:
+    """Weights & Biases."""
+
+    project: str
+    offline: bool
+
+
+@dataclass(kw_only=True)
+class LoggerConfig:
+    """Loggers beside metrics.csv."""
+
+    wandb: WandbConfig | None
+
+
+@dataclass(kw_only=True)
+class PathsConfig:
+    """Folders, relative to where the command is run."""
+
+    outputs: str  # runs, worlds, caches
+    reports: str
+
+
+class Precision(Enum):
+    """Lightning's precision names, as the command line writes them."""
+
+    full = "32-true"
+    bf16 = "bf16-mixed"
+
+
+class BenchmarkSuite(Enum):
+    """What `python -m src.benchmark` measures."""
+
+    model = "model"
+    metric = "metric"
+    reader = "reader"
+
+
+@dataclass(kw_only=True)
+class Config:
+    """Everything a run is made of."""
+
+    grid: GridConfig
+    model: Any  # the chosen model's own dataclass, see MODEL_CONFIGS
+    backbone: ImageEncoderConfig
+    data: DataConfig
+    phase: PhaseConfig
+    trainer: TrainerConfig
+    logger: LoggerConfig
+    optim: OptimConfig
+    paths: PathsConfig
+    scale: str
+    precision: str
+    seed: int
+    resume: Resume
+    checkpoint: str | None
+    predictions: str | None
+    out: str | None
+    preview: bool
+    suite: BenchmarkSuite
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.precision, str) or self.precision not in [p.value for p in Precision]:
+            raise ConfigError(f"precision must be one of {[p.value for p in Precision]}, but got {self.precision!r}")
+        if self.seed < 0:
+            raise ConfigError(f"seed must be at least 0, but got {self.seed}")
+        if self.data.batch_size % self.trainer.devices:
+            raise ConfigError(
+                f"data.batch_size={self.data.batch_size} is the total over all devices and must be divisible by "
+                f"trainer.devices={self.trainer.devices}"
+            )
+
+
+def _register() -> None:
+    """Tell Hydra the types: the root as `run`, each model's as `model/schema_<name>`."""
+    store = ConfigStore.instance()
+    store.store(name="run", node=Config)
+    for name, schema in MODEL_CONFIGS.items():
+        store.store(group="model", name=f"schema_{name}", node=schema)
+
+
+def compose_config(overrides: list[str]) -> tuple[Config, dict[str, Any]]:
+    """Compose conf/ with command-line overrides into checked dataclasses.
+
+    Returns the configuration and the same as a plain tree (what a checkpoint and `config.yaml` keep).
+    Raises ConfigError naming the key for anything unknown, mistyped, missing or impossible.
+    """
+    _register()
+    for override in overrides:
+        if override.startswith("-"):
+            raise ConfigError(f"{override}: options are written key=value, without dashes")
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            tree = compose("config", overrides=overrides)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(_hydra_message(error)) from error
+    return build_config(tree), OmegaConf.to_container(tree, resolve=True, enum_to_str=True)
+
+
+def build_config(tree: DictConfig) -> Config:
+    """Turn a composed tree into dataclasses; see `compose_config`."""
+    missing = OmegaConf.missing_keys(tree)
+    if missing:
+        raise ConfigError(f"{min(missing)} has no value; give {min(missing)}=... on the command line")
+    try:
+        config = OmegaConf.to_object(tree)
+    except OmegaConfBaseException as error:
+        raise ConfigError(_hydra_message(error)) from error
+    _check_tree(config, tree, "")
+    return config
+
+
+def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
+    """A configuration as a checkpoint stores it, with the keys named in `overrides` replaced.
+
+    A group choice (`data=truckscenes`) replaces that whole group.
+    Raises CheckpointError when the stored tree does not fit this version of the code.
+    """
+    _, fresh = compose_config(overrides)
+    tree = OmegaConf.create(stored)
+    for override in OverridesParser.create().parse_overrides(overrides):
+        key = override.key_or_group.lstrip("+~")
+        OmegaConf.update(tree, key, OmegaConf.select(OmegaConf.create(fresh), key), merge=False)
+    schema = OmegaConf.structured(Config)
+    model = stored.get("model", {}).get("name")
+    if model not in MODEL_CONFIGS:
+        raise CheckpointError(f"the checkpoint is of model {model!r}; this version knows {sorted(MODEL_CONFIGS)}")
+    try:
+        schema.model = OmegaConf.structured(MODEL_CONFIGS[model])
+        return build_config(OmegaConf.merge(schema, tree))
+    except (OmegaConfBaseException, ConfigError) as error:
+        raise CheckpointError(f"the checkpoint's configuration does not fit this version of the code: {error}") from error
+
+
+def _hydra_message(error: Exception) -> str:
+    """Hydra's message in one paragraph, with the nearest key there is."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    cause = error.__cause__
+    if cause is not None:
+        lines += [line.strip() for line in str(cause).splitlines() if line.strip() and line.strip() not in lines]
+    text = " | ".join(lines)
+    unknown = getattr(cause or error, "full_key", None)
+    if unknown:
+        near = difflib.get_close_matches(str(unknown), _known_keys(), n=1, cutoff=0.6)
+        if near and near[0] != unknown:
+            text += f" | did you mean {near[0]}?"
+    return text
+
+
+def _known_keys() -> list[str]:
+    """Every key of the default tree, dotted."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        tree = compose("config")
+
+    def walk(node: Any, prefix: str) -> list[str]:
+        if not isinstance(node, dict):
+            return [prefix]
+        inner = [key for name, value in node.items() for key in walk(value, f"{prefix}.{name}" if prefix else name)]
+        return ([prefix] if prefix else []) + inner
+
+    return walk(OmegaConf.to_container(tree, resolve=False), "")
+
+
+def _check_tree(value: Any, node: Any, path: str) -> None:
+    """Refuse what OmegaConf lets pass: keys added with `+` and numbers that are not finite."""
+    if dataclasses.is_dataclass(value):
+        known = [f.name for f in dataclasses.fields(value)]
+        for key in node:
+            name = f"{path}.{key}" if path else str(key)
+            if key not in known:
+                near = difflib.get_close_matches(str(key), known, n=1)
+                hint = f"; did you mean {near[0]}?" if near else f"; known here: {', '.join(known)}"
+                raise ConfigError(f"{name} is not a configuration key{hint}")
+            _check_tree(getattr(value, key), node[key], name)
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            _check_tree(item, node[index], f"{path}[{index}]")
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{path} must be a finite number, but got {value}")
+
+
+def run_identity(tree: dict[str, Any]) -> str:
+    """`<model>-<phase>-<scale>-<8 hex>`: the hex is a digest of all that can change the result of a run."""
+    tree = json.loads(json.dumps(tree))
+    for key in OUTSIDE_IDENTITY:
+        *parents, leaf = key.split(".")
+        node = tree
+        for parent in parents:
+            node = (node or {}).get(parent)
+        if node is not None:
+            node.pop(leaf, None)
+    digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:8]
+    return f"{tree['model']['name']}-{tree['phase']['name']}-{tree['scale']}-{digest}"
+
+
+def run_command(main: Callable[[list[str]], None]) -> None:
+    """Run an entry point on the command line's `key=value`s; known errors end with one message and their exit code.
+
+    Exit codes: 0 finished, 3 configuration or checkpoint, 4 data, 5 diverged, 6 interrupted and resumable, 1 a defect.
+    """
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname).1s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    for noisy in ("matplotlib", "PIL", "lightning.pytorch.utilities.rank_zero"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+    try:
+        main(sys.argv[1:])
+    except HorizonError as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        print("Interrupted; the same command goes on from the last checkpoint.", file=sys.stderr)
+        sys.exit(InterruptedRunError.exit_code)
+    except Exception:
+        traceback.print_exc()
+        print("This is a defect of the program; please report it with the lines above.", file=sys.stderr)
+        sys.exit(1)

@@ -1,0 +1,166 @@
+"""One TruckScenes JSON table as checked columns; every complaint names table, record, value and remedy."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from src.errors import DataError
+
+Array = np.ndarray
+
+_REMEDY = "restore the file from the data set's archive, or write the synthetic world again"
+
+
+class Table:
+    """The records of one table, addressed by column.
+
+    Raises DataError when the file is missing, is not JSON (with line and column), is not a list of records, or when a
+    token is missing, empty or used twice.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.name = path.stem
+        self.records: list[dict[str, Any]] = _read_list(path)
+        self.tokens: list[str] = self.values("token")
+        self.rows = {token: row for row, token in enumerate(self.tokens)}
+        if len(self.rows) != len(self.tokens):
+            row = next(row for row, token in enumerate(self.tokens) if self.rows[token] != row)
+            self.fail(row, "token", self.tokens[row], f"a token of its own (record {self.rows[self.tokens[row]]} has it too)")
+        if "" in self.rows:
+            self.fail(self.rows[""], "token", "", "a token that is not empty")
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    def fail(self, row: int, field: str, value: object, expected: str) -> None:
+        """Raise a DataError about one value of one record."""
+        token = self.records[row].get("token", "")
+        text = repr(value)
+        text = text if len(text) <= 120 else text[:117] + "..."
+        raise DataError(f"{self.path}: {self.name} {token!r} (record {row}): {field}={text}, expected {expected}; {_REMEDY}")
+
+    def check(self, good: Array, field: str, values: Sequence[object] | Array, expected: str) -> None:
+        """Raise about the first record for which `good` [n] is False."""
+        if not np.all(good):
+            row = int(np.argmin(good))
+            value = values[row]
+            self.fail(row, field, value.tolist() if isinstance(value, np.ndarray | np.generic) else value, expected)
+
+    def values(self, field: str, kind: type = str) -> list[Any]:
+        """One field of every record, all of type `kind`."""
+        try:
+            column = [record[field] for record in self.records]
+        except KeyError:
+            row = next(row for row, record in enumerate(self.records) if field not in record)
+            token = self.records[row].get("token", "")
+            raise DataError(
+                f"{self.path}: {self.name} {token!r} (record {row}) has no field '{field}', "
+                f"but only {sorted(self.records[row])}; {_REMEDY}"
+            ) from None
+        if any(type(value) is not kind for value in column):
+            row = next(row for row, value in enumerate(column) if type(value) is not kind)
+            self.fail(row, field, column[row], f"a value of type {kind.__name__}")
+        return column
+
+    def integers(self, field: str) -> Array:  # [n] int64
+        """An integer field."""
+        column = self.values(field, int)
+        try:
+            return np.array(column, np.int64)
+        except OverflowError:
+            row = next(row for row, value in enumerate(column) if not -(2**63) <= value < 2**63)
+            self.fail(row, field, column[row], "an integer of at most 64 bits")
+            raise
+
+    def times(self) -> Array:  # [n] int64, microseconds
+        """The time stamps."""
+        stamps = self.integers("timestamp")
+        self.check(stamps > 0, "timestamp", stamps, "microseconds since 1970, above 0")
+        return stamps
+
+    def vectors(self, field: str, width: int) -> Array:  # [n, width] float64
+        """A list of `width` finite numbers per record."""
+        return self._numbers(self.values(field, list), field, (width,))
+
+    def quaternions(self, field: str) -> Array:  # [n, 4] float64 (w, x, y, z), unit length
+        """Rotations; a length more than 1e-3 away from 1 is refused, smaller rounding is taken out."""
+        raw = self.vectors(field, 4)
+        length = np.linalg.norm(raw, axis=1, keepdims=True)
+        self.check(np.abs(length[:, 0] - 1) < 1e-3, field, raw, "a quaternion (w, x, y, z) of length 1")
+        return raw
+
+    def intrinsics(self, field: str, needed: Array) -> Array:  # [n, 3, 3] float64, NaN where not needed
+        """Camera matrices of the records marked in `needed` [n]."""
+        column = self.values(field, list)
+        result = np.full((len(column), 3, 3), np.nan)
+        for row in np.flatnonzero(needed):
+            matrix = self._numbers([column[row]], field, (3, 3), int(row))[0]
+            if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.array_equal(matrix[2], [0, 0, 1])):
+                self.fail(int(row), field, column[row], "an invertible 3x3 with positive focal lengths and last row 0, 0, 1")
+            result[row] = matrix
+        return result
+
+    def links(self, field: str, other: Table, optional: bool = False) -> Array:  # [n] int64, -1 where ""
+        """Rows in `other` that a token field points to."""
+        return self.lookup(self.values(field), field, other, optional)
+
+    def lookup(self, tokens: list[str], field: str, other: Table, optional: bool = False) -> Array:  # [n] int64
+        """Rows in `other` of one token per record."""
+        rows = np.array([other.rows.get(token, -2 if token else -1) for token in tokens], np.int64)
+        self.check(rows >= (-1 if optional else 0), field, tokens, f"a token of the table {other.name}")
+        return rows
+
+    def _numbers(self, column: list[Any], field: str, shape: tuple[int, ...], first_row: int = 0) -> Array:
+        """Finite numbers of one shape per record, float64."""
+        try:
+            raw = np.array(column) if column else np.zeros((0, *shape))
+        except ValueError:  # ragged
+            raw = np.zeros(0, object)
+        if raw.shape != (len(column), *shape) or raw.dtype.kind not in "if":
+            row = _first(column, lambda value: not _is_numeric(value, shape))
+            self.fail(first_row + row, field, column[row], f"{'x'.join(map(str, shape))} numbers")
+        result = raw.astype(np.float64)
+        finite = np.isfinite(result).reshape(len(column), -1).all(axis=1)
+        if not finite.all():
+            row = int(np.argmin(finite))
+            self.fail(first_row + row, field, column[row], "finite numbers")
+        return result
+
+
+def _first(column: list[Any], bad: Callable[[Any], bool]) -> int:
+    return next((row for row, value in enumerate(column) if bad(value)), 0)
+
+
+def _is_numeric(value: object, shape: tuple[int, ...]) -> bool:
+    try:
+        array = np.array(value)
+    except ValueError:
+        return False
+    return array.shape == shape and array.dtype.kind in "if"
+
+
+def _read_list(path: Path) -> list[dict[str, Any]]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise DataError(f"{path}: this table is missing; {_REMEDY}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: cannot be read as UTF-8 text ({error}); {_REMEDY}") from None
+    try:
+        records = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise DataError(f"{path}: line {error.lineno}, column {error.colno}: {error.msg}; {_REMEDY}") from None
+    except (RecursionError, ValueError) as error:
+        raise DataError(f"{path}: not a table ({error}); {_REMEDY}") from None
+    if not isinstance(records, list):
+        raise DataError(f"{path}: expected a list of records, but got {type(records).__name__}; {_REMEDY}")
+    for row, record in enumerate(records):
+        if not isinstance(record, dict):
+            raise DataError(f"{path}: record {row} must be an object, but got {type(record).__name__}; {_REMEDY}")
+    return records

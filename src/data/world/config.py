@@ -1,0 +1,95 @@
+"""What a synthetic world is made of; the values live in `conf/data/synthetic.yaml`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from dataclasses import asdict, dataclass
+
+from src.errors import ConfigError
+
+GENERATOR = "highway-1"
+"""Changes whenever the same config would give other bytes, so that old worlds are not mistaken for new ones."""
+
+RADAR_RATE_HZ = 20
+CAMERA_RATE_HZ = 10
+KEY_FRAME_RATE_HZ = 2
+
+
+@dataclass(kw_only=True)
+class WorldConfig:
+    """Size, sensors and difficulty of a world. Raises ConfigError for values that cannot be simulated."""
+
+    num_train_scenes: int  # scenes of the split "train"
+    num_val_scenes: int  # scenes of the split "val", on roads of their own
+    key_frames_per_scene: int  # labelled frames, 2 Hz
+    seed: int  # of everything random
+    num_workers: int  # processes that write scenes side by side; changes no byte
+
+    image_width_px: int  # the real cameras have 1980 x 943
+    image_height_px: int
+    camera_fov_deg: float  # horizontal field of view of all four cameras
+    jpeg_quality: int  # 1..95
+    camera_sweeps: bool  # also write the 10 Hz images between key frames
+
+    radar_sweeps_per_key_frame: int  # sweeps written up to and including a key frame, 10 = all of the 20 Hz
+    returns_density: float  # scales the returns of every object and of clutter; about 6 for the real sensor's density
+    clutter_density: float  # scales static clutter and look-alikes alone
+    ghost_fraction: float  # multipath copies per real return
+    false_alarms_per_sweep: float  # mean number of returns from nowhere
+    range_noise_m: float
+    azimuth_noise_deg: float
+    elevation_noise_deg: float  # real radars know height poorly
+    doppler_noise_mps: float
+
+    vehicles_per_lane_km: float  # traffic density
+    rare_objects: float  # scales how many of the rare classes a scene gets
+    annotation_range_m: float  # objects farther away are not labelled
+    lidar: bool  # ray-cast six lidars; otherwise only the empty LIDAR_LEFT key frames
+    lidar_step_deg: float  # azimuth step of the ray-cast lidars
+    ego_rate_hz: int  # ego_pose and ego_motion rows per second besides those of the sensors
+
+    def __post_init__(self) -> None:
+        at_least = {
+            "num_train_scenes": 0, "num_val_scenes": 0, "key_frames_per_scene": 1, "seed": 0, "num_workers": 0,
+            "image_width_px": 32, "image_height_px": 32, "jpeg_quality": 1, "radar_sweeps_per_key_frame": 1,
+            "returns_density": 0.0, "clutter_density": 0.0, "ghost_fraction": 0.0, "false_alarms_per_sweep": 0.0,
+            "range_noise_m": 0.0, "azimuth_noise_deg": 0.0, "elevation_noise_deg": 0.0, "doppler_noise_mps": 0.0,
+            "vehicles_per_lane_km": 0.0, "rare_objects": 0.0, "annotation_range_m": 1.0, "camera_fov_deg": 10.0,
+            "lidar_step_deg": 0.05, "ego_rate_hz": 1,
+        }  # fmt: skip
+        at_most = {
+            "jpeg_quality": 95, "radar_sweeps_per_key_frame": RADAR_RATE_HZ // KEY_FRAME_RATE_HZ,
+            "camera_fov_deg": 150.0, "annotation_range_m": 250.0, "vehicles_per_lane_km": 40.0, "ego_rate_hz": 1000,
+            "key_frames_per_scene": 60, "ghost_fraction": 1.0, "lidar_step_deg": 10.0,
+        }  # fmt: skip
+        for name, low in at_least.items():
+            value, high = getattr(self, name), at_most.get(name, math.inf)
+            if not (math.isfinite(value) and low <= value <= high):
+                raise ConfigError(f"data.world.{name} must be a number from {low} to {high}, but got {value}")
+        if self.num_train_scenes + self.num_val_scenes == 0:
+            raise ConfigError("data.world: num_train_scenes and num_val_scenes are both 0; a world needs a scene")
+
+    @property
+    def num_scenes(self) -> int:
+        """Scenes of both splits, train first."""
+        return self.num_train_scenes + self.num_val_scenes
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last key frame."""
+        return (self.key_frames_per_scene - 1) / KEY_FRAME_RATE_HZ
+
+
+def stored_config(config: WorldConfig) -> dict[str, object]:
+    """What decides the bytes of a world: the config without `num_workers`, with the generator's name."""
+    values = asdict(config)
+    del values["num_workers"]
+    return {"generator": GENERATOR, **values}
+
+
+def world_digest(config: WorldConfig) -> str:
+    """16 hex digits that name a world: equal exactly when the bytes of the world are."""
+    text = json.dumps(stored_config(config), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

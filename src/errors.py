@@ -1,0 +1,37 @@
+"""Errors that a user can act on; each knows the exit code of the command that ends with it."""
+
+
+class HorizonError(Exception):
+    """Base of the errors whose message alone tells what to do; entry points print it without a traceback."""
+
+    exit_code = 1
+
+
+class ConfigError(HorizonError):
+    """A setting, or a combination of settings, that cannot work."""
+
+    exit_code = 3
+
+
+class CheckpointError(HorizonError):
+    """A weights or checkpoint file that is missing, broken or of another model."""
+
+    exit_code = 3
+
+
+class DataError(HorizonError):
+    """A data file, table or calibration that is missing, broken or contradicts another."""
+
+    exit_code = 4
+
+
+class DivergedError(HorizonError):
+    """Training produced a loss that is not a finite number."""
+
+    exit_code = 5
+
+
+class InterruptedRunError(HorizonError):
+    """The run was stopped from outside after a checkpoint; the same command goes on."""
+
+    exit_code = 6

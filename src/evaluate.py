@@ -1,0 +1,60 @@
+"""`python -m src.evaluate checkpoint=PATH | predictions=FILE.json [data.root=DIR data.version=V data.split=S] [out=DIR]`."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+
+from src.assembly import build_datamodule, build_module, data_root
+from src.config import Config, compose_config, restore_config, run_command
+from src.errors import ConfigError
+from src.metrics.detection import DetectionScores, score_detections
+from src.metrics.report import format_scores
+from src.metrics.submission import load_submission
+from src.ops.allocator import tune_cpu_allocator
+from src.training.checkpoints import load_model_weights, read_checkpoint
+from src.training.fit import build_evaluation_trainer
+from src.training.run_folder import write_json
+
+logger = logging.getLogger(__name__)
+
+
+def main(overrides: list[str]) -> None:
+    """Score a checkpoint, or a submission file, and write metrics.json (and submission.json) into `out`."""
+    config, _ = compose_config(overrides)
+    if (config.checkpoint is None) == (config.predictions is None):
+        raise ConfigError("give either checkpoint=PATH or predictions=FILE.json")
+    source = Path(config.checkpoint or config.predictions)
+    out = Path(config.out) if config.out else Path(config.paths.outputs) / "evaluations" / source.stem
+    out.mkdir(parents=True, exist_ok=True)
+    scores = score_checkpoint(source, overrides, out) if config.checkpoint else score_file(source, config)
+    write_json(out / "metrics.json", scores.as_dict())
+    print(format_scores(scores.as_dict()))
+    print(f"\nwritten: {out / 'metrics.json'}" + (f", {out / 'submission.json'}" if config.checkpoint else ""))
+
+
+def score_file(path: Path, config: Config) -> DetectionScores:
+    """Score an existing submission against the data folder's annotations."""
+    evaluation_set = build_datamodule(config, data_root(config, write=False)).evaluation_set()
+    return score_detections(evaluation_set, load_submission(path, evaluation_set.tokens))
+
+
+def score_checkpoint(path: Path, overrides: list[str], out: Path) -> DetectionScores:
+    """Rebuild the checkpoint's own model, run it over the split and score it; the command line may change its data."""
+    tune_cpu_allocator()
+    checkpoint = read_checkpoint(path)
+    tree = checkpoint["horizon3d"]["config"]
+    config = restore_config(tree, overrides)
+    datamodule = build_datamodule(config, data_root(config, write=False))
+    module = build_module(config, tree, datamodule)
+    load_model_weights(module.model, checkpoint, path)
+    build_evaluation_trainer(config.precision, config.trainer.accelerator).validate(
+        module, datamodule=datamodule, verbose=False
+    )
+    datamodule.write_submission(out / "submission.json", module.detections)
+    return module.scores
+
+
+if __name__ == "__main__":
+    run_command(main)

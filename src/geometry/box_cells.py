@@ -1,0 +1,72 @@
+"""Cells under rotated boxes, and the ragged windows of cells that rasters and splats are made from."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from src.geometry.bev_grid import BEVGrid
+
+# Closed rectangles: a cell centre on the edge counts, whatever the rounding of its coordinates says.
+EDGE_TOLERANCE_M = 1e-6
+
+
+def window_cells(
+    centres: Tensor,  # [n, 2] (x, y) in cells; cell (row, col) has its centre at (col, row)
+    half_extents: Tensor,  # [n, 2] (x, y) in cells, not negative
+    grid: BEVGrid,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Every cell of the grid whose centre lies in an axis-aligned window, for all windows at once.
+
+    Returns (window, row, col) [pairs] int64, ordered by window and row-major within, and the number of cells of each
+    window [n] int64. Windows outside the grid and NaN windows have no cells that any sensible test would keep.
+    """
+    limit = torch.tensor([grid.cols, grid.rows], device=centres.device)
+    low = torch.maximum((centres - half_extents).ceil(), torch.zeros_like(centres)).minimum(limit).long()  # [n, 2]
+    high = torch.maximum((centres + half_extents).floor(), -torch.ones_like(centres)).minimum(limit - 1).long()
+    widths, heights = (high - low + 1).clamp(min=0).unbind(1)
+    counts = widths * heights
+    window = torch.repeat_interleave(counts)  # [pairs]
+    place = torch.arange(len(window), device=centres.device) - (counts.cumsum(0) - counts).index_select(0, window)
+    width = widths.index_select(0, window)
+    down = torch.div(place, width, rounding_mode="floor")
+    corner = low.index_select(0, window)
+    return window, corner[:, 1] + down, corner[:, 0] + place - down * width, counts
+
+
+def cells_in_boxes(
+    boxes: Tensor,  # [n, 5] (x, y, length, width, yaw): metres, radians, frame of the grid
+    grid: BEVGrid,
+    margin_m: float = 0.0,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Cells whose centres the boxes cover, with length and width enlarged by `margin_m` in total (specification 8.2).
+
+    The rectangle is closed and each of its dimensions at least one cell. A box that covers no centre gets the one cell
+    that contains its own centre, if the grid has it. Returns (box, cell) [pairs] int64 sorted by box and cell, with
+    cell = row * cols + col, and `fallback` [n] bool: the boxes of the last rule. Computed in float64.
+    """
+    if boxes.dim() != 2 or boxes.shape[1] != 5:
+        raise ValueError(f"boxes: expected [n, 5] (x, y, length, width, yaw), got {list(boxes.shape)}")
+    boxes = boxes.detach().double()
+    cosine, sine = boxes[:, 4].cos(), boxes[:, 4].sin()
+    half = 0.5 * (boxes[:, 2:4] + margin_m).clamp(min=grid.cell_m) + EDGE_TOLERANCE_M  # [n, 2] m
+    reach = torch.stack(
+        [half[:, 0] * cosine.abs() + half[:, 1] * sine.abs(), half[:, 0] * sine.abs() + half[:, 1] * cosine.abs()], 1
+    )
+    centres = grid.to_cells(boxes[:, :2]) - 0.5
+    box, row, col, _ = window_cells(centres, reach / grid.cell_m, grid)
+    offset = (torch.stack([col, row], 1) - centres.index_select(0, box)) * grid.cell_m  # [pairs, 2] m
+    cosine, sine, half = cosine.index_select(0, box), sine.index_select(0, box), half.index_select(0, box)
+    inside = ((cosine * offset[:, 0] + sine * offset[:, 1]).abs() <= half[:, 0]) & (
+        (cosine * offset[:, 1] - sine * offset[:, 0]).abs() <= half[:, 1]
+    )
+    box, cell = box[inside], (row * grid.cols + col)[inside]
+
+    bare = torch.bincount(box, minlength=len(boxes)) == 0
+    fallback = bare & grid.contains(boxes[:, :2])
+    if bool(fallback.any()):
+        extra = fallback.nonzero().squeeze(1)
+        home = grid.cell_of(boxes[extra, :2])
+        box, order = torch.sort(torch.cat([box, extra]), stable=True)
+        cell = torch.cat([cell, home[:, 0] * grid.cols + home[:, 1]])[order]
+    return box, cell, fallback

@@ -1,0 +1,168 @@
+"""Detection scores of MAN TruckScenes: AP, true positive errors and NDS (devkit 1.2, `detection_cvpr_2024`).
+
+The definition, in short. Boxes beyond their class's range, without points, or cycles in a bicycle rack do not count.
+Per class and distance threshold, predictions by descending score (the later in the file first among equal ones) each
+take the nearest free ground truth of their sample. AP is the area under precision over recall above 0.1 and 0.1,
+averaged over four thresholds; errors are running means over the matches at 2 m. NDS joins both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from src.errors import DataError
+from src.metrics.checks import check_predictions
+from src.metrics.curves import (
+    RECALLS,
+    RankedMatches,
+    average_precision,
+    error_curve,
+    mean_error,
+    precision_and_confidence,
+)
+from src.metrics.filtering import RANGE_BINS_M, ego_distances, ego_offsets, official_filter
+from src.metrics.matching import Pairs, find_pairs, match_greedily
+from src.metrics.scores import (
+    CLASS_WITHOUT_ERRORS,
+    DISTANCE_THRESHOLDS_M,
+    ERROR_THRESHOLD_M,
+    ERRORS,
+    DetectionScores,
+    SubsetScores,
+)
+from src.structures.detections import DetectionTable, EvaluationSet
+from src.structures.taxonomy import CLASSES
+
+Array = np.ndarray
+
+SCENE_TAGS = tuple(
+    f"{group}.{name}"
+    for group, names in {
+        "weather": ("clear", "rain", "snow", "fog", "hail", "overcast", "other_weather"),
+        "area": ("highway", "rural", "terminal", "parking", "city", "residential", "other_area"),
+        "daytime": ("morning", "noon", "evening", "night"),
+        "season": ("spring", "summer", "autumn", "winter"),
+        "lighting": ("illuminated", "glare", "dark", "twilight", "other_lighting"),
+        "structure": ("tunnel", "bridge", "underpass", "overpass", "regular"),
+        "construction": ("roadworks", "unchanged"),
+    }.items()
+    for name in names
+)
+
+TAGS_WITHOUT_SCORE = (
+    "weather.other_weather",
+    "weather.snow",
+    "weather.hail",
+    "area.parking",
+    "area.other_area",
+    "season.spring",
+    "lighting.other_lighting",
+)
+"""The official evaluation reports NaN for these, whatever the boxes are."""
+
+_UNDEFINED = np.array([[error in CLASS_WITHOUT_ERRORS.get(name, ()) for error in ERRORS] for name in CLASSES])
+
+
+def score_detections(
+    evaluation_set: EvaluationSet,
+    predictions: DetectionTable,
+    samples: Array | None = None,  # [S] bool, the samples to score; all without it
+    by_range: bool = True,
+    by_tag: bool = True,
+) -> DetectionScores:
+    """Score predictions as the official evaluator does, and by distance bin and scene tag.
+
+    A sample of the set without predictions is scored as empty. `samples` restricts ground truth and predictions to
+    some samples (the part of a split that was seen so far). Tags follow the official rule: samples whose scene carries
+    the tag, NaN for the tags in TAGS_WITHOUT_SCORE. Distance bins are our own: see RANGE_BINS_M.
+
+    Raises DataError for predictions that cannot be scored (see `check_predictions`) and for matched ground truth
+    whose size is not positive, as the official evaluator does.
+    """
+    check_predictions(predictions, evaluation_set.tokens)
+    truth = evaluation_set.ground_truth
+    distances = ego_distances(evaluation_set, predictions)
+    truth_distances = ego_distances(evaluation_set, truth)
+    kept = official_filter(evaluation_set, predictions, distances)
+    truth_kept = official_filter(evaluation_set, truth, truth_distances)
+    if samples is not None:
+        kept &= samples[predictions.samples]
+        truth_kept &= samples[truth.samples]
+
+    ranking = rank_predictions(evaluation_set, predictions, kept, truth_kept)
+    pairs = find_candidates(ranking)
+    matching = match_predictions(ranking, pairs)
+    everyone, every_truth = np.ones(len(ranking.rows), bool), np.ones(len(ranking.truth_rows), bool)
+    scores = DetectionScores(
+        overall=_score_subset(ranking, matching, everyone, every_truth),
+        ranges={},
+        tags={},
+        truth_kept=truth_kept,
+        predictions_kept=kept,
+    )
+    if by_range:
+        edges = [low for low, _ in RANGE_BINS_M[1:]]
+        bins = np.digitize(distances[ranking.rows], edges)
+        truth_bins = np.digitize(truth_distances[ranking.truth_rows], edges)
+        # Boxes of different bins never meet, so the four bins are matched at once.
+        matching_in_bins = match_predictions(ranking, pairs[bins[pairs.predictions] == truth_bins[pairs.ground_truth]])
+        scores.ranges = {
+            f"{low:.0f}-{high:.0f}": _score_subset(ranking, matching_in_bins, bins == i, truth_bins == i)
+            for i, (low, high) in enumerate(RANGE_BINS_M)
+        }
+    if by_tag:
+        scores.tags = {tag: _score_tag(ranking, matching, tag) for tag in SCENE_TAGS}
+    return scores
+
+
+def _score_subset(
+    ranking: Ranking,
+    matching: Matching,
+    members: Array,  # [n] bool over the ranked predictions
+    truth_members: Array,  # [k] bool over the ground truth that counts
+) -> SubsetScores:
+    """Curves and scores of some predictions and ground truth that were matched only with one another."""
+    num_classes, num_points = len(CLASSES), len(RECALLS)
+    num_gt = np.bincount(ranking.truth_labels[truth_members], minlength=num_classes)
+    places = np.flatnonzero(members)
+    scores = ranking.scores[places]
+    class_starts = np.searchsorted(places, ranking.class_starts)
+    precision = np.zeros((num_classes, len(DISTANCE_THRESHOLDS_M), num_points))
+    confidence = np.zeros_like(precision)
+    error_curves = np.ones((num_classes, len(ERRORS), num_points))
+    errors = np.ones((num_classes, len(ERRORS)))
+    for t, threshold in enumerate(DISTANCE_THRESHOLDS_M):
+        chosen = members[matching.places[t]]
+        matched = np.searchsorted(places, matching.places[t][chosen])  # place within the subset
+        match_starts = np.searchsorted(matched, class_starts)
+        match_errors = matching.errors[chosen] if threshold == ERROR_THRESHOLD_M else None
+        for c in np.flatnonzero(np.diff(match_starts)):
+            begin, end = class_starts[c], class_starts[c + 1]
+            of_class = slice(match_starts[c], match_starts[c + 1])
+            ranked = RankedMatches(matched[of_class] - begin, scores[begin:end], int(num_gt[c]))
+            precision[c, t], confidence[c, t] = precision_and_confidence(ranked)
+            if match_errors is None:
+                continue
+            match_scores = ranked.scores[ranked.ranks]
+            for e, values in enumerate(match_errors[of_class].T):
+                error_curves[c, e] = error_curve(values, match_scores, confidence[c, t])
+                errors[c, e] = mean_error(error_curves[c, e], confidence[c, t])
+    return SubsetScores(
+        num_gt=num_gt,
+        ap=average_precision(precision),
+        errors=np.where(_UNDEFINED, np.nan, errors),
+        precision=precision,
+        confidence=confidence,
+        error_curves=error_curves,
+    )
+
+
+def _score_tag(ranking: Ranking, matching: Matching, tag: str) -> SubsetScores:
+    """Scores over the samples whose scene carries `tag`; samples do not meet, so the matches stay what they are."""
+    tagged = np.array([tag in tags for tags in ranking.evaluation_set.scene_tags], dtype=bool)
+    scores = _score_subset(ranking, matching, tagged[ranking.samples], tagged[ranking.truth_samples])
+    if tag in TAGS_WITHOUT_SCORE:
+        scores.ap, scores.errors = np.full_like(scores.ap, np.nan), np.full_like(scores.errors, np.nan)
+    return scores

@@ -1,0 +1,213 @@
+"""Radar encoder: points to voxels to a sparse BEV map (VoxelNeXt, spec section 2)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import torch
+from torch import Tensor, nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.sparse_layers import ConvNormReLU, ResidualBlock, SparseConv, SubmanifoldConv
+from src.ops.bags import bag_sum, bags
+from src.ops.sites import Sites
+from src.ops.voxelize import voxelize
+from src.structures.sparse_bev import SparseBEV, SparseMap
+
+# x, y, z (m), rcs (dB), vx, vy (m/s), dt (s) divided by these (spec section 1.3)
+POINT_SCALES = (150.0, 150.0, 5.0, 20.0, 20.0, 20.0, 0.5)
+BACKBONE_NORM = {"eps": 1e-3, "momentum": 0.01}
+SHARED_NORM = {"eps": 1e-5, "momentum": 0.1}  # the public code leaves torch's defaults here
+
+
+class ConvOut(Enum):
+    """Sites of the last convolution; members are spelled as in the configuration."""
+
+    sparse = "sparse"  # dilates by one cell
+    subm = "subm"  # keeps the sites
+
+
+@dataclass(kw_only=True)
+class RadarEncoderConfig:
+    """Settings of the radar encoder (`model.radar_encoder` in the configuration).
+
+    Raises ConfigError for values that cannot work on any grid; what depends on the grid is checked by the encoder.
+    """
+
+    voxel_size_m: list[float]  # [x, y, z]; x = y = cell_m / a power of two; z as high as the grid gives pillars
+    stage_channels: list[int]  # width of the stage at stride 1, 2, 4 ... voxels
+    blocks_per_stage: int  # residual blocks
+    max_voxels: int  # guard, per sample
+    conv_out: ConvOut
+    point_count_channel: bool  # log of the number of points as one more input channel
+
+    def __post_init__(self) -> None:
+        size = self.voxel_size_m
+        if len(size) != 3 or min(size) <= 0 or size[0] != size[1]:
+            raise ConfigError(
+                f"model.radar_encoder.voxel_size_m={size}: must be three positive numbers [x, y, z] with x equal to y"
+            )
+        if not self.stage_channels or min(self.stage_channels) < 1:
+            raise ConfigError(
+                f"model.radar_encoder.stage_channels={self.stage_channels}: must list at least one positive width"
+            )
+        for key, value, least in (("blocks_per_stage", self.blocks_per_stage, 0), ("max_voxels", self.max_voxels, 1)):
+            if value < least:
+                raise ConfigError(f"model.radar_encoder.{key}={value}: must be at least {least}")
+
+
+class RadarEncoder(nn.Module):
+    """Radar points to F_R, a sparse map of `channels` on the BEV grid (spec section 2).
+
+    Stages of submanifold residual blocks run at strides 1, 2, 4 ... voxels; those from the BEV cell on are summed over
+    height and stride into one map. A single layer of voxels (pillars) runs the same network in two dimensions.
+
+    Raises ConfigError when voxels, stages and grid do not fit together.
+    """
+
+    def __init__(self, config: RadarEncoderConfig, grid: BEVGrid, channels: int) -> None:
+        super().__init__()
+        self.voxel_size_m = tuple(config.voxel_size_m)
+        self.lower_m = (grid.x_min_m, grid.y_min_m, grid.z_range_m[0])
+        self.max_voxels = config.max_voxels
+        self.point_count_channel = config.point_count_channel
+        widths = list(config.stage_channels)
+        self.bev_stage = _bev_stage(config, grid)
+        layers = _height_layers(config, grid)
+        self.ndim = 2 if layers == 1 else 3
+        plane = (grid.rows * 2**self.bev_stage, grid.cols * 2**self.bev_stage)
+        self.voxel_shape = (layers, *plane)  # z, y, x of the height band
+        # One layer more than the band holds, so that 41 halve to 21, 11, 6, 3 and 2 as in the public code.
+        self.input_shape = plane if self.ndim == 2 else (layers + 1, *plane)
+        self.register_buffer("point_scales", torch.tensor(POINT_SCALES), persistent=False)
+
+        inputs = len(POINT_SCALES) + config.point_count_channel
+        self.conv_input = ConvNormReLU(
+            SubmanifoldConv(inputs, widths[0], 3, self.ndim, bias=False), **BACKBONE_NORM
+        )
+        self.stages = nn.ModuleList(
+            _stage(widths[index - 1] if index else None, width, config.blocks_per_stage, self.ndim)
+            for index, width in enumerate(widths)
+        )
+        if config.conv_out is ConvOut.sparse:
+            conv_out = SparseConv(widths[-1], channels, 3, 2, bias=False, stride=1, padding=1)
+        else:
+            conv_out = SubmanifoldConv(widths[-1], channels, 3, 2, bias=False)
+        self.conv_out = ConvNormReLU(conv_out, **BACKBONE_NORM)
+        self.shared_conv = ConvNormReLU(SubmanifoldConv(channels, channels, 3, 2, bias=True), **SHARED_NORM)
+
+    def forward(
+        self,
+        radar_points: Tensor,  # [P, 7] x, y, z (m, aug frame), rcs (dB), vx, vy (m/s), dt (s)
+        radar_batch: Tensor,  # [P] int64 sample of each point
+        batch_size: int,
+    ) -> SparseBEV:
+        """F_R; points outside the grid are left out, and no point at all gives a map without sites."""
+        return self.encode(self.voxelise(radar_points, radar_batch, batch_size))
+
+    def voxelise(
+        self,
+        radar_points: Tensor,  # [P, 7]
+        radar_batch: Tensor,  # [P] int64
+        batch_size: int,
+    ) -> SparseMap:
+        """Means of the normalised points of every voxel, on (B, z, y, x), or (B, y, x) for pillars; float32 throughout."""
+        points = radar_points.float()
+        sites, features, counts = voxelize(
+            points / self.point_scales,
+            points[:, :3],
+            radar_batch,
+            self.lower_m,
+            self.voxel_size_m,
+            self.voxel_shape,
+            batch_size,
+            self.max_voxels,
+        )
+        if self.point_count_channel:
+            features = torch.cat([features, counts.to(features.dtype).log()[:, None]], dim=1)
+        cells = sites.indices() if self.ndim == 3 else sites.indices()[:, [0, 2, 3]]
+        sites, _ = Sites.from_indices(cells, (batch_size, *self.input_shape))  # sorted already: the order is kept
+        return SparseMap(sites, features)
+
+    def encode(self, voxels: SparseMap) -> SparseBEV:
+        """Voxel features to F_R."""
+        stages = self.run_stages(voxels)
+        return self.shared_conv(self.conv_out(self.compress(stages[self.bev_stage :])))
+
+    def run_stages(self, voxels: SparseMap) -> list[SparseMap]:
+        """The output of every stage at its own resolution."""
+        x = self.conv_input(voxels)
+        outputs = []
+        for stage in self.stages:
+            x = stage(x)
+            outputs.append(x)
+        return outputs
+
+    def compress(
+        self,
+        stages: list[SparseMap],  # at the BEV resolution and every coarser one
+    ) -> SparseBEV:
+        """Sum over height and over strides: a coarse site lands on the first cell, the lowest row and column, of its block."""
+        shape = (stages[0].batch_size, *stages[0].sites.shape[-2:])
+        columns = [
+            torch.cat([stage.indices[:, :1], stage.indices[:, -2:] * 2**depth], dim=1) for depth, stage in enumerate(stages)
+        ]
+        features = torch.cat([stage.features for stage in stages])
+        features = features.to(torch.promote_types(features.dtype, torch.float32))  # many terms: not in half precision
+        sites, rows = Sites.unique(torch.cat(columns), shape)
+        if len(sites) > 0:  # without sites the (empty) features stay as they are, in the graph of their parameters
+            features = bag_sum(features, *bags(rows, len(sites)))
+        return SparseBEV(sites, features)
+
+
+def _stage(in_channels: int | None, channels: int, blocks: int, ndim: int) -> nn.Sequential:
+    """Residual blocks, behind a convolution of stride 2 unless the stage is the first (`in_channels` None)."""
+    layers: list[nn.Module] = []
+    if in_channels is not None:
+        conv = SparseConv(in_channels, channels, 3, ndim, bias=False, stride=2, padding=1)
+        layers.append(ConvNormReLU(conv, **BACKBONE_NORM))
+    layers += [ResidualBlock(channels, ndim, **BACKBONE_NORM) for _ in range(blocks)]
+    return nn.Sequential(*layers)
+
+
+def _bev_stage(config: RadarEncoderConfig, grid: BEVGrid) -> int:
+    """Index of the stage whose sites are BEV cells; checks the relations between voxels, stages and grid."""
+    ratio = grid.cell_m / config.voxel_size_m[0]
+    stage = round(math.log2(ratio))
+    if stage < 0 or not math.isclose(ratio, 2**stage, rel_tol=1e-6):
+        raise ConfigError(
+            f"model.radar_encoder.voxel_size_m={config.voxel_size_m}: x and y must be grid.cell_m={grid.cell_m} divided by "
+            f"a power of two, but the quotient is {ratio:g}"
+        )
+    widths = config.stage_channels
+    if len(widths) <= stage:
+        raise ConfigError(
+            f"model.radar_encoder.stage_channels={widths}: must list at least {stage + 1} stages, since a cell of "
+            f"{grid.cell_m} m is 2^{stage} voxels of {config.voxel_size_m[0]} m"
+        )
+    if len(set(widths[stage:])) > 1:
+        raise ConfigError(
+            f"model.radar_encoder.stage_channels={widths}: must be equal from stage {stage + 1} on, where stages are summed, "
+            f"but got {widths[stage:]}"
+        )
+    coarsest = 2 ** (len(widths) - 1 - stage)
+    if any(cells % coarsest for cells in grid.cells):
+        raise ConfigError(
+            f"grid.cells={list(grid.cells)}: each must be a multiple of {coarsest}, the radar encoder's coarsest stride in cells"
+        )
+    return stage
+
+
+def _height_layers(config: RadarEncoderConfig, grid: BEVGrid) -> int:
+    """Number of voxel layers in the grid's height band; 1 means pillars."""
+    height = grid.z_range_m[1] - grid.z_range_m[0]
+    layers = round(height / config.voxel_size_m[2])
+    if layers < 1 or not math.isclose(layers * config.voxel_size_m[2], height, rel_tol=1e-6):
+        raise ConfigError(
+            f"model.radar_encoder.voxel_size_m={config.voxel_size_m}: z must divide the height {height:g} m of "
+            f"grid.z_range_m={list(grid.z_range_m)} into whole layers"
+        )
+    return layers

@@ -1,0 +1,368 @@
+"""The encoder that moves Gaussians to the objects (Eq. 2-3): cross-attention, self-encoding, refinement."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from src.geometry.bev_grid import BEVGrid
+from src.models.horizon3d.views import CameraViews
+from src.models.sparse_layers import SubmanifoldConv
+from src.ops import Sites, deform_attend_bev, deform_attend_images
+from src.structures.gaussians import GaussianSet
+from src.structures.sparse_bev import SparseBEV
+
+NUM_HEADS = 4
+FFN_RATIO = 4
+DROPOUT = 0.1
+SELF_ENCODING_KERNEL = 5
+FIXED_POINTS = ((0.0, 0.0), (0.45, 0.0), (-0.45, 0.0), (0.0, 0.45), (0.0, -0.45))
+LEARNABLE_REACH = 6.0
+"""Learnable points lie within half of this many standard deviations (specification 5.2)."""
+INITIAL_HEIGHT_M = 1.0
+INITIAL_OPACITY = 0.25
+RAW_ATTRIBUTES = (0.0, 0.0, 1.0, 0.0, math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY)), 0.0, 0.0)
+"""Raw scale 2, rotation 2, opacity 1, velocity 2 of an untrained Gaussian (specification 4.4)."""
+REFINEMENT_STD = 0.01
+
+
+@dataclass(frozen=True)
+class GaussianBounds:
+    """Ranges of the attributes; the activations keep to them (specification 5.4)."""
+
+    scale_range_m: tuple[float, float]
+    max_mean_shift_m: float
+    max_speed_mps: float
+
+    def activate(
+        self,
+        raw: Tensor,  # [..., 7] scale 2, rotation 2, opacity 1, velocity 2
+    ) -> dict[str, Tensor]:
+        """Physical attributes by their GaussianSet name, float32; opacity stays a logit."""
+        scale, rotation, opacity, velocity = raw.float().split([2, 2, 1, 2], dim=-1)
+        low, high = self.scale_range_m
+        return {
+            "scales": low + (high - low) * scale.sigmoid(),
+            "directions": F.normalize(rotation, dim=-1, eps=1e-6),
+            "opacity_logits": opacity.squeeze(-1),
+            "velocities": self.max_speed_mps * torch.tanh(velocity / self.max_speed_mps),
+        }
+
+
+def linear_relu_norm(in_channels: int, channels: int) -> nn.Sequential:
+    """Linear, ReLU, LayerNorm, twice."""
+    layers: list[nn.Module] = []
+    for width in (in_channels, channels):
+        layers += [nn.Linear(width, channels), nn.ReLU(), nn.LayerNorm(channels)]
+    return nn.Sequential(*layers)
+
+
+def attention_linear(in_channels: int, out_channels: int, zero: bool = False) -> nn.Linear:
+    """Linear layer with zero bias and Xavier (or zero) weights."""
+    layer = nn.Linear(in_channels, out_channels)
+    nn.init.zeros_(layer.bias)
+    if zero:
+        nn.init.zeros_(layer.weight)
+    else:
+        nn.init.xavier_uniform_(layer.weight)
+    return layer
+
+
+class AnchorEncoder(nn.Module):
+    """Embed the attributes of each Gaussian: a sum of small MLPs, one per attribute, and one more on top.
+
+    Runs in float32: a position of 150 m has steps of half a metre in bfloat16.
+    """
+
+    def __init__(self, channels: int, grid: BEVGrid, bounds: GaussianBounds) -> None:
+        super().__init__()
+        self.bounds = bounds
+        widths = {"mean": 2, "scale": 2, "direction": 2, "opacity": 1, "velocity": 2}
+        self.embed = nn.ModuleDict({name: linear_relu_norm(width, channels) for name, width in widths.items()})
+        self.output = linear_relu_norm(channels, channels)
+        self.register_buffer("centre_m", torch.tensor(grid.centre_m), persistent=False)
+        self.register_buffer("half_extent_m", torch.tensor(grid.half_extent_m), persistent=False)
+
+    def forward(
+        self,
+        gaussians: GaussianSet,
+    ) -> Tensor:  # [B, G, C]
+        """e of the layer's equations."""
+        with torch.autocast(gaussians.means.device.type, enabled=False):
+            inputs = {
+                "mean": (gaussians.means - self.centre_m) / self.half_extent_m,
+                "scale": gaussians.scales / self.bounds.scale_range_m[1],
+                "direction": gaussians.directions,
+                "opacity": gaussians.opacity_logits.sigmoid()[..., None],
+                "velocity": gaussians.velocities / self.bounds.max_speed_mps,
+            }
+            return self.output(sum(self.embed[name](value) for name, value in inputs.items()))
+
+
+class RadarCrossAttention(nn.Module):
+    """Deformable attention from Gaussians to the sparse radar map (DCA_R of Eq. 2)."""
+
+    def __init__(self, channels: int, num_points: int, grid: BEVGrid) -> None:
+        super().__init__()
+        self.grid = grid
+        self.num_points = num_points
+        self.value = attention_linear(channels, channels)
+        self.logits = attention_linear(channels, NUM_HEADS * num_points, zero=True)
+        self.output = attention_linear(channels, channels)
+
+    def forward(
+        self,
+        query: Tensor,  # [B, G, C]
+        points: Tensor,  # [B, G, P, 2] aug metres
+        radar_bev: SparseBEV,
+    ) -> Tensor:  # [B, G, C]
+        """Weighted bilinear samples; cells without a site and points beyond the grid count as zero."""
+        b, g = query.shape[:2]
+        values = self.value(radar_bev.features).unflatten(-1, (NUM_HEADS, -1))  # [M, heads, C / heads]
+        weights = self.logits(query).float().unflatten(-1, (NUM_HEADS, self.num_points)).softmax(-1)
+        sample = torch.arange(b, device=query.device).repeat_interleave(g)
+        gathered = deform_attend_bev(
+            values, radar_bev.sites, points.flatten(0, 1), sample, weights.flatten(0, 1), self.grid
+        )
+        return self.output(gathered.to(values.dtype)).unflatten(0, (b, g))
+
+
+class ImageCrossAttention(nn.Module):
+    """Deformable attention from Gaussians to the image pyramids of all views (DCA_I of Eq. 2).
+
+    The softmax runs jointly over the visible (view, level, point) triples of a Gaussian; without any, the result
+    before the output layer is exactly zero.
+    """
+
+    def __init__(self, channels: int, num_points: int, num_views: int, num_levels: int, grid: BEVGrid) -> None:
+        super().__init__()
+        self.z_range_m = grid.z_range_m
+        self.per_view = (NUM_HEADS, num_levels, num_points)
+        self.num_views = num_views
+        self.height = attention_linear(channels, num_points)
+        low, high = self.z_range_m
+        share = min(max((INITIAL_HEIGHT_M - low) / (high - low), 0.01), 0.99)
+        nn.init.constant_(self.height.bias, math.log(share / (1.0 - share)))
+        self.camera = linear_relu_norm(12, channels)
+        self.logits = attention_linear(channels, num_views * math.prod(self.per_view), zero=True)
+        self.output = attention_linear(channels, channels)
+
+    def forward(
+        self,
+        features: Tensor,  # [B, G, C]
+        query: Tensor,  # [B, G, C] features + anchor embedding
+        points: Tensor,  # [B, G, P, 2] aug metres
+        views: CameraViews,
+        values: list[Tensor],  # L x [B, N, C, h, w]
+    ) -> Tensor:  # [B, G, C]
+        """Samples of every visible point on every level."""
+        low, high = self.z_range_m
+        z = low + (high - low) * self.height(features).float().sigmoid()  # [B, G, P]
+        pixels, visible = views.project(torch.cat([points, z[..., None]], dim=-1))
+        weights = self._weights(query, views.pix_from_aug, visible)
+        gathered = deform_attend_images(values, pixels, views.image_size_px, weights)
+        return self.output(gathered.to(values[0].dtype))
+
+    def _weights(
+        self,
+        query: Tensor,  # [B, G, C]
+        pix_from_aug: Tensor,  # [B, N, 4, 4]
+        visible: Tensor,  # [B, G, N, P] bool
+    ) -> Tensor:  # [B, G, heads, N, L, P], zero where invisible
+        rows = F.normalize(pix_from_aug[:, :, :3].float(), dim=-1)  # pixel-scaled rows would drown the metric one
+        camera = self.camera(rows.flatten(2))  # [B, N, C]
+        # Every view has its own rows of one linear layer on (f + e + cam_n); the camera's share is added separately.
+        weight = self.logits.weight.unflatten(0, (self.num_views, -1))  # [N, heads*L*P, C]
+        logits = self.logits(query).unflatten(-1, (self.num_views, -1))  # [B, G, N, heads*L*P]
+        logits = logits + torch.einsum("bnc,nkc->bnk", camera.to(weight.dtype), weight)[:, None]
+        logits = logits.float().unflatten(-1, self.per_view).transpose(2, 3)  # [B, G, heads, N, L, P]
+        seen = visible[:, :, None, :, None].expand_as(logits)
+        logits = logits.masked_fill(~seen, torch.finfo(logits.dtype).min)
+        return logits.flatten(3).softmax(-1).view_as(logits) * seen
+
+
+class SelfEncoding(nn.Module):
+    """Let neighbouring Gaussians talk: mean per occupied cell, two sparse 5x5 convolutions, back to the Gaussians."""
+
+    def __init__(self, channels: int, grid: BEVGrid) -> None:
+        super().__init__()
+        self.grid = grid
+        self.convs = nn.ModuleList(
+            SubmanifoldConv(channels, channels, SELF_ENCODING_KERNEL, 2, bias=False) for _ in range(2)
+        )
+        self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(2))
+        self.output = attention_linear(channels, channels)
+
+    def forward(
+        self,
+        features: Tensor,  # [B, G, C]
+        gaussians: GaussianSet,
+    ) -> Tensor:  # [B, G, C]; zero for padding
+        """No gradient reaches the means, which only choose cells."""
+        b, g, c = features.shape
+        picks = gaussians.valid.flatten().nonzero().squeeze(1)  # [V]
+        cells = self.grid.cell_of(gaussians.means.detach().flatten(0, 1).index_select(0, picks))
+        sample = torch.div(picks, g, rounding_mode="floor")
+        sites, rows = Sites.unique(torch.cat([sample[:, None], cells], dim=1), (b, *self.grid.cells))
+        flat = features.flatten(0, 1).index_select(0, picks)  # [V, C]
+        count = torch.bincount(rows, minlength=len(sites)).to(flat.dtype)
+        x = SparseBEV(sites, flat.new_zeros(len(sites), c).index_add(0, rows, flat) / count[:, None])
+        for conv, norm in zip(self.convs, self.norms, strict=True):
+            x = conv(x)
+            x = x.with_features(norm(x.features).relu())
+        x = self.output(x.features).index_select(0, rows)  # [V, C]
+        return x.new_zeros(b * g, c).index_copy(0, picks, x).unflatten(0, (b, g))
+
+
+class Refinement(nn.Module):
+    """New attributes from features (Eq. 3): the mean moves by a bounded step, everything else is regressed anew."""
+
+    def __init__(self, channels: int, grid: BEVGrid, bounds: GaussianBounds) -> None:
+        super().__init__()
+        self.bounds = bounds
+        self.trunk = linear_relu_norm(channels, channels)
+        self.output = nn.Linear(channels, 2 + len(RAW_ATTRIBUTES))
+        self.output_scale = nn.Parameter(torch.ones(2 + len(RAW_ATTRIBUTES)))
+        # Untrained, a Gaussian keeps the place and the attributes that KGGI gives it.
+        nn.init.normal_(self.output.weight, std=REFINEMENT_STD)
+        with torch.no_grad():
+            self.output.bias.copy_(torch.tensor((0.0, 0.0, *RAW_ATTRIBUTES)))
+        half = torch.tensor(grid.half_extent_m) - 1e-3 * grid.cell_m  # strictly inside, so that every mean has a cell
+        centre = torch.tensor(grid.centre_m)
+        self.register_buffer("lower_m", centre - half, persistent=False)
+        self.register_buffer("upper_m", centre + half, persistent=False)
+
+    def forward(
+        self,
+        x: Tensor,  # [B, G, C] features + anchor embedding
+        gaussians: GaussianSet,
+    ) -> GaussianSet:
+        """Attributes are float32 also under autocast."""
+        trunk = self.trunk(x)
+        with torch.autocast(x.device.type, enabled=False):
+            raw = self.output(trunk.float()) * self.output_scale  # [B, G, 9]
+            shift = self.bounds.max_mean_shift_m * (2.0 * raw[..., :2].sigmoid() - 1.0)
+            means = torch.minimum(torch.maximum(gaussians.means + shift, self.lower_m), self.upper_m)
+            return replace(gaussians, means=means, **self.bounds.activate(raw[..., 2:]))
+
+
+class EncoderLayer(nn.Module):
+    """One round of attention, self-encoding and refinement (specification 5.1, Eq. 2-3)."""
+
+    def __init__(
+        self,
+        channels: int,
+        num_learnable_points: int,
+        num_views: int,
+        num_levels: int,
+        grid: BEVGrid,
+        bounds: GaussianBounds,
+        chained_attention: bool,
+        refine_before_self_encoding: bool,
+    ) -> None:
+        super().__init__()
+        num_points = len(FIXED_POINTS) + num_learnable_points
+        self.chained_attention = chained_attention
+        self.refine_before_self_encoding = refine_before_self_encoding
+        self.register_buffer("fixed_points", torch.tensor(FIXED_POINTS), persistent=False)
+        self.offsets = attention_linear(channels, 2 * num_learnable_points) if num_learnable_points else None
+        self.radar_attention = RadarCrossAttention(channels, num_points, grid)
+        self.image_attention = ImageCrossAttention(channels, num_points, num_views, num_levels, grid)
+        self.self_encoding = SelfEncoding(channels, grid)
+        self.feed_forward = nn.ModuleList(_feed_forward(channels) for _ in range(2))
+        self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(4))
+        self.refinement = Refinement(channels, grid, bounds)
+
+    def sampling_points(
+        self,
+        query: Tensor,  # [B, G, C]
+        gaussians: GaussianSet,
+    ) -> Tensor:  # [B, G, P, 2] aug metres
+        """q_k = m + R(theta) (s * phi_k): fixed and learnable points that follow the Gaussian's shape."""
+        phi = self.fixed_points.expand(*query.shape[:2], -1, -1)
+        if self.offsets is not None:
+            learnt = LEARNABLE_REACH * (self.offsets(query).float().sigmoid() - 0.5)
+            phi = torch.cat([phi, learnt.unflatten(-1, (-1, 2))], dim=2)
+        local = gaussians.scales[:, :, None] * phi  # [B, G, P, 2] along and across the direction
+        cos, sin = gaussians.directions[:, :, None].unbind(-1)  # [B, G, 1]
+        along, across = local.unbind(-1)
+        rotated = torch.stack([cos * along - sin * across, sin * along + cos * across], dim=-1)
+        return gaussians.means[:, :, None] + rotated
+
+    def forward(
+        self,
+        gaussians: GaussianSet,
+        embedding: Tensor,  # [B, G, C] from the anchor encoder
+        radar_bev: SparseBEV,
+        views: CameraViews,
+        values: list[Tensor],  # L x [B, N, C, h, w]
+    ) -> GaussianSet:
+        """Features and attributes after this layer."""
+        f = gaussians.features
+        query = f + embedding
+        points = self.sampling_points(query, gaussians)
+        x = f + self.radar_attention(query, points, radar_bev)
+        if self.chained_attention:
+            x = x + self.image_attention(x, x + embedding, points, views, values)
+        else:
+            x = x + self.image_attention(f, query, points, views, values)
+        x = self.norms[0](x)
+        x = attended = self.norms[1](x + self.feed_forward[0](x))
+        x = self.norms[2](x + self.self_encoding(x, gaussians))
+        x = self.norms[3](x + self.feed_forward[1](x))
+        refined = self.refinement((attended if self.refine_before_self_encoding else x) + embedding, gaussians)
+        return replace(refined, features=x)
+
+
+class GaussianEncoder(nn.Module):
+    """L encoder layers with their own weights; anchor encoder and image values are shared."""
+
+    def __init__(
+        self,
+        channels: int,
+        image_channels: int,
+        num_layers: int,
+        num_learnable_points: int,
+        num_views: int,
+        num_levels: int,
+        grid: BEVGrid,
+        bounds: GaussianBounds,
+        chained_attention: bool,
+        refine_before_self_encoding: bool,
+    ) -> None:
+        super().__init__()
+        self.anchor = AnchorEncoder(channels, grid, bounds)
+        self.image_value = nn.Conv2d(image_channels, channels, 1)
+        self.layers = nn.ModuleList(
+            EncoderLayer(
+                channels,
+                num_learnable_points,
+                num_views,
+                num_levels,
+                grid,
+                bounds,
+                chained_attention,
+                refine_before_self_encoding,
+            )
+            for _ in range(num_layers)
+        )
+
+    def forward(self, gaussians: GaussianSet, radar_bev: SparseBEV, views: CameraViews) -> GaussianSet:
+        """G_0 -> G_L."""
+        values = [
+            self.image_value(level.flatten(0, 1)).unflatten(0, level.shape[:2]) for level in views.levels
+        ]  # L x [B, N, C, h, w]
+        for layer in self.layers:
+            gaussians = layer(gaussians, self.anchor(gaussians), radar_bev, views, values)
+        return gaussians
+
+
+def _feed_forward(channels: int) -> nn.Sequential:
+    hidden = FFN_RATIO * channels
+    return nn.Sequential(
+        nn.Linear(channels, hidden), nn.ReLU(), nn.Dropout(DROPOUT), nn.Linear(hidden, channels), nn.Dropout(DROPOUT)
+    )

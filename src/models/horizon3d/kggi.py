@@ -1,0 +1,240 @@
+"""KGGI, keypoint-guided Gaussian initialisation: where the Gaussians start (Sec. 3.1 of the paper)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.heads.keypoint_head import KEYPOINT_BIAS, CameraKeypointHead, CameraMaps, keypoint_scores
+from src.models.horizon3d.gaussian_encoder import RAW_ATTRIBUTES, GaussianBounds
+from src.models.horizon3d.views import CameraViews
+from src.structures.gaussians import GaussianSet, Source
+from src.structures.sparse_bev import SparseBEV
+from src.targets.depth import DepthTarget, check_depth_target, lid_centres
+
+INSIDE = 1.0 - 1e-5
+"""Random means stay strictly inside the grid, in units of its half extent."""
+
+
+class Initialization(Enum):
+    """Where Gaussians come from (Table 3)."""
+
+    both = "both"
+    keypoint = "keypoint"
+    random = "random"
+
+
+@dataclass(kw_only=True)
+class KGGIConfig:
+    """Settings of KGGI (`model.kggi`). Raises ConfigError for values that cannot work on any grid."""
+
+    initialization: Initialization  # Table 3
+    num_radar_keypoints: int  # K_r
+    num_camera_keypoints: int  # K_c
+    num_random_keypoints: int  # K_rand; with initialization=random all three counts are random Gaussians
+    num_depth_bins: int  # D, linearly increasing widths
+    depth_range_m: list[float]  # [nearest, farthest] along the optical axis
+    depth_target: DepthTarget  # what supervises the depth head
+    keypoint_nms_cells: int | None  # odd window of local maxima in the keypoint map; null = every pixel competes
+    property_head: bool  # local features correct the learnable attributes
+
+    def __post_init__(self) -> None:
+        for name in ("num_radar_keypoints", "num_camera_keypoints"):
+            least = 0 if self.initialization is Initialization.random else 1
+            if getattr(self, name) < least:
+                raise ConfigError(f"model.kggi.{name}={getattr(self, name)}: must be at least {least}")
+        if self.num_random_keypoints < 0 or sum(self.counts.values()) < 1:
+            raise ConfigError(
+                f"model.kggi.num_random_keypoints={self.num_random_keypoints}: must not be negative, and "
+                "the three sources together must give at least one Gaussian"
+            )
+        low_high = self.depth_range_m
+        if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
+            raise ConfigError(f"model.kggi.depth_range_m={low_high}: must be [near, far] in metres with 0 < near < far")
+        if self.num_depth_bins < 1:
+            raise ConfigError(f"model.kggi.num_depth_bins={self.num_depth_bins}: must be at least 1")
+        window = self.keypoint_nms_cells
+        if window is not None and (window < 3 or window % 2 == 0):
+            raise ConfigError(f"model.kggi.keypoint_nms_cells={window}: must be null or an odd number from 3 on")
+        check_depth_target(self.depth_target)
+
+    @property
+    def depth_range(self) -> tuple[float, float]:
+        """(nearest, farthest) in metres."""
+        return self.depth_range_m[0], self.depth_range_m[1]
+
+    @property
+    def uses_keypoints(self) -> bool:
+        """Whether keypoint heads exist; without them there is no KGGI loss."""
+        return self.initialization is not Initialization.random
+
+    @property
+    def counts(self) -> dict[Source, int]:
+        """Gaussians per source, sources without any left out."""
+        radar, camera, random = self.num_radar_keypoints, self.num_camera_keypoints, self.num_random_keypoints
+        if self.initialization is Initialization.random:
+            radar, camera, random = 0, 0, radar + camera + random
+        elif self.initialization is Initialization.keypoint:
+            random = 0
+        counts = {Source.RADAR: radar, Source.CAMERA: camera, Source.RANDOM: random}
+        return {source: count for source, count in counts.items() if count}
+
+
+@dataclass
+class KGGIOutput:
+    """G_0 and what the KGGI losses need."""
+
+    gaussians: GaussianSet
+    objectness_logits: Tensor | None  # [M] per cell of the radar map, None without keypoint heads
+    camera: CameraMaps | None
+
+
+class GaussianSlots(nn.Module):
+    """Learnable attributes and features of the K Gaussians of one source, by their rank."""
+
+    def __init__(self, count: int, channels: int) -> None:
+        super().__init__()
+        self.attributes = nn.Parameter(torch.tensor(RAW_ATTRIBUTES).repeat(count, 1))  # [K, 7]
+        self.features = nn.Parameter(torch.empty(count, channels))
+        nn.init.xavier_uniform_(self.features)
+
+
+class KGGI(nn.Module):
+    """Gaussians at radar keypoints, at lifted camera keypoints and at learnable places (specification section 4)."""
+
+    def __init__(
+        self, config: KGGIConfig, channels: int, image_channels: int, grid: BEVGrid, bounds: GaussianBounds
+    ) -> None:
+        super().__init__()
+        if config.num_radar_keypoints > grid.rows * grid.cols and config.uses_keypoints:
+            raise ConfigError(
+                f"model.kggi.num_radar_keypoints={config.num_radar_keypoints}: must not exceed the "
+                f"{grid.rows * grid.cols} cells of grid.cells={list(grid.cells)}"
+            )
+        self.config, self.grid, self.bounds = config, grid, bounds
+        counts = config.counts
+        self.slots = nn.ModuleDict({source.name.lower(): GaussianSlots(n, channels) for source, n in counts.items()})
+        self.source_embedding = nn.Embedding(len(Source), channels)
+        if Source.RANDOM in counts:
+            # In units of the half extent, so that one step of Adam is of the order of a metre.
+            self.random_means = nn.Parameter(torch.empty(counts[Source.RANDOM], 2).uniform_(-1.0, 1.0))
+        if config.uses_keypoints:
+            self.objectness = nn.Sequential(nn.Linear(channels, channels // 2), nn.ReLU(), nn.Linear(channels // 2, 1))
+            nn.init.constant_(self.objectness[-1].bias, KEYPOINT_BIAS)
+            self.camera_head = CameraKeypointHead(image_channels, channels, config.num_depth_bins)
+            centres = lid_centres(config.depth_range, config.num_depth_bins)
+            self.register_buffer("depth_centres_m", centres, persistent=False)
+        if config.uses_keypoints and config.property_head:
+            self.property_heads = nn.ModuleDict(
+                {name: nn.Linear(channels, channels + len(RAW_ATTRIBUTES)) for name in ("radar", "camera")}
+            )
+            for head in self.property_heads.values():
+                nn.init.zeros_(head.weight)
+                nn.init.zeros_(head.bias)
+        self.register_buffer("centre_m", torch.tensor(grid.centre_m), persistent=False)
+        self.register_buffer("half_extent_m", torch.tensor(grid.half_extent_m), persistent=False)
+
+    def forward(self, radar_bev: SparseBEV, views: CameraViews) -> KGGIOutput:
+        """G_0: radar, camera, then random Gaussians."""
+        parts: list[GaussianSet] = []
+        logits = camera = None
+        if self.config.uses_keypoints:
+            logits = self.objectness(radar_bev.features).squeeze(-1).float()  # [M]
+            camera = self.camera_head(views.levels[0])
+            parts += [self._radar_gaussians(logits.detach(), radar_bev), self._camera_gaussians(camera, views)]
+        if Source.RANDOM in self.config.counts:
+            means = self.centre_m + self.half_extent_m * self.random_means.clamp(-INSIDE, INSIDE)
+            means = means.expand(radar_bev.batch_size, -1, -1)
+            valid = torch.ones(means.shape[:2], dtype=torch.bool, device=means.device)
+            parts.append(self._gaussians(Source.RANDOM, means, valid, None))
+        return KGGIOutput(GaussianSet.concatenate(parts), logits, camera)
+
+    def _radar_gaussians(
+        self,
+        scores: Tensor,  # [M]
+        radar_bev: SparseBEV,
+    ) -> GaussianSet:
+        rows = best_rows(scores, radar_bev.indices[:, 0], radar_bev.batch_size, self.config.num_radar_keypoints)
+        valid = rows >= 0
+        cells = F.pad(radar_bev.indices, (0, 0, 0, 1))  # one more row for padding to point at
+        features = F.pad(radar_bev.features, (0, 0, 0, 1))
+        picks = torch.where(valid, rows, len(radar_bev))  # [B, K]
+        means = self.grid.centre_of(cells[picks][..., 1:])  # [B, K, 2]
+        return self._gaussians(Source.RADAR, means, valid, F.embedding(picks, features))
+
+    def _camera_gaussians(self, camera: CameraMaps, views: CameraViews) -> GaussianSet:
+        with torch.no_grad():
+            depth, confidence = most_likely_depth(camera.depth_logits, self.depth_centres_m)  # [B, N, h, w] each
+            xy = views.lift(depth)[..., :2]
+            scores = keypoint_scores(camera, self.config.keypoint_nms_cells) * confidence
+            scores = scores * (self.grid.contains(xy) & views.valid[:, :, None, None])
+            # One ranking over the pixels of all views of a sample.
+            wanted = self.config.num_camera_keypoints
+            best, picks = scores.flatten(1).topk(min(wanted, scores[0].numel()), dim=1)
+            missing = wanted - picks.shape[1]
+            best, picks = F.pad(best, (0, missing)), F.pad(picks, (0, missing))  # [B, K]
+            means = xy.flatten(1, 3).gather(1, picks[..., None].expand(-1, -1, 2))
+        local = camera.features.movedim(2, -1).flatten(1, 3)  # [B, N*h*w, C]
+        local = local.gather(1, picks[..., None].expand(-1, -1, local.shape[-1]))
+        return self._gaussians(Source.CAMERA, means, best > 0, local)
+
+    def _gaussians(
+        self,
+        source: Source,
+        means: Tensor,  # [B, K, 2] m
+        valid: Tensor,  # [B, K] bool
+        local: Tensor | None,  # [B, K, C] features at the keypoints
+    ) -> GaussianSet:
+        """Slot attributes, corrected by the property head where there is one."""
+        name = source.name.lower()
+        features = self.slots[name].features + self.source_embedding.weight[source]  # [K, C]
+        features, raw = features.expand(*valid.shape, -1), self.slots[name].attributes.expand(*valid.shape, -1)
+        if local is not None and self.config.property_head:
+            change = self.property_heads[name](local).float()
+            features, raw = features + change[..., : features.shape[-1]], raw + change[..., features.shape[-1] :]
+        return GaussianSet(
+            means=torch.where(valid[..., None], means.float(), self.centre_m),
+            features=features,
+            sources=torch.full_like(valid, int(source), dtype=torch.int64),
+            elapsed_s=torch.zeros_like(valid, dtype=torch.float32),
+            valid=valid,
+            **self.bounds.activate(raw),
+        )
+
+
+def best_rows(
+    scores: Tensor,  # [M]
+    sample: Tensor,  # [M] int64
+    batch_size: int,
+    count: int,
+) -> Tensor:  # [B, count] int64
+    """Rows of the highest scores of each sample, best first, ties by row; -1 where a sample has fewer."""
+    order = scores.argsort(descending=True, stable=True)
+    order = order[sample[order].argsort(stable=True)]
+    owner = sample[order]
+    sizes = torch.bincount(owner, minlength=batch_size)
+    rank = torch.arange(len(order), device=order.device) - (sizes.cumsum(0) - sizes)[owner]
+    rows = order.new_full((batch_size, count + 1), -1)
+    rows[owner, rank.clamp(max=count)] = order  # everything behind the last place meets in one column that is dropped
+    return rows[:, :count]
+
+
+def most_likely_depth(
+    logits: Tensor,  # [B, N, D, h, w]
+    centres_m: Tensor,  # [D]
+) -> tuple[Tensor, Tensor]:  # [B, N, h, w] m, [B, N, h, w] in 0..1
+    """Mean depth over the most likely bin and its two neighbours, and the probability of the three (4.2)."""
+    probabilities = logits.float().softmax(2)
+    last = len(centres_m) - 1
+    window = probabilities.argmax(2, keepdim=True) + torch.arange(-1, 2, device=logits.device).view(3, 1, 1)
+    inside = (window >= 0) & (window <= last)  # [B, N, 3, h, w]
+    window = window.clamp(0, last)
+    chosen = probabilities.gather(2, window) * inside
+    confidence = chosen.sum(2)
+    return (chosen * centres_m[window]).sum(2) / confidence, confidence

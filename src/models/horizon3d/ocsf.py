@@ -1,0 +1,116 @@
+"""OCSF, object-centric sparse fusion: encode Gaussians, splat them, fuse with the radar map (Sec. 3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from torch import nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.horizon3d.gaussian_encoder import FIXED_POINTS, GaussianBounds, GaussianEncoder
+from src.models.horizon3d.sparse_fusion import SparseFusion
+from src.models.horizon3d.splatting import GaussianSplat, splat_set
+from src.models.horizon3d.views import CameraViews
+from src.structures.gaussians import GaussianSet
+from src.structures.sparse_bev import SparseBEV
+
+
+class CrossAttention(Enum):
+    """Order of radar and image attention: Eq. 2 adds both, Fig. 2 lets images follow radar."""
+
+    parallel = "parallel"
+    chained = "chained"
+
+
+class RefineFrom(Enum):
+    """Which features the refinement reads: Fig. 2 those behind the self-encoding, Eq. 3 those before it."""
+
+    self_encoding = "self_encoding"
+    cross_attention = "cross_attention"
+
+
+@dataclass(kw_only=True)
+class OCSFConfig:
+    """Settings of OCSF (`model.ocsf`). Raises ConfigError for values that cannot work."""
+
+    num_layers: int  # L
+    num_learnable_points: int  # sampling points beside the fixed ones
+    margin_m: float  # epsilon, added to length and to width of the boxes that supervise occupancy
+    occupancy_threshold: float  # tau
+    max_occupied_cells: int  # guard, per sample
+    scale_range_m: list[float]  # [smallest, largest] standard deviation
+    max_mean_shift_m: float  # bound of one refinement step per axis
+    max_speed_mps: float  # bound of a Gaussian's velocity per axis
+    support_sigmas: float  # a Gaussian ends at this many standard deviations
+    cross_attention: CrossAttention
+    refine_from: RefineFrom
+    gate_kernel_size: int  # of psi: 1 or 3
+
+    def __post_init__(self) -> None:
+        for name, least in (("num_layers", 1), ("num_learnable_points", 0), ("max_occupied_cells", 1), ("margin_m", 0)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"model.ocsf.{name}={getattr(self, name)}: must be at least {least}")
+        for name in ("max_mean_shift_m", "max_speed_mps", "support_sigmas"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"model.ocsf.{name}={getattr(self, name)}: must be positive")
+        if not 0 < self.occupancy_threshold < 1:
+            raise ConfigError(f"model.ocsf.occupancy_threshold={self.occupancy_threshold}: must lie between 0 and 1")
+        if len(self.scale_range_m) != 2 or not 0 < self.scale_range_m[0] < self.scale_range_m[1]:
+            raise ConfigError(
+                f"model.ocsf.scale_range_m={self.scale_range_m}: must be [low, high] in metres with 0 < low < high"
+            )
+        if self.gate_kernel_size not in (1, 3):
+            raise ConfigError(f"model.ocsf.gate_kernel_size={self.gate_kernel_size}: must be 1 or 3")
+
+    @property
+    def num_points(self) -> int:
+        """K, sampling points of each Gaussian."""
+        return len(FIXED_POINTS) + self.num_learnable_points
+
+    @property
+    def bounds(self) -> GaussianBounds:
+        """Ranges of the attributes."""
+        return GaussianBounds(tuple(self.scale_range_m), self.max_mean_shift_m, self.max_speed_mps)
+
+
+@dataclass
+class OCSFOutput:
+    """What the occupancy loss, the head and later frames read."""
+
+    gaussians: GaussianSet  # G_L
+    splat: GaussianSplat
+    fused_bev: SparseBEV  # F_fuse
+
+
+class OCSF(nn.Module):
+    """Gaussian encoder, splatting and sparse fusion (specification section 5)."""
+
+    def __init__(
+        self, config: OCSFConfig, channels: int, image_channels: int, num_views: int, num_levels: int, grid: BEVGrid
+    ) -> None:
+        super().__init__()
+        self.config, self.grid = config, grid
+        self.encoder = GaussianEncoder(
+            channels,
+            image_channels,
+            config.num_layers,
+            config.num_learnable_points,
+            num_views,
+            num_levels,
+            grid,
+            config.bounds,
+            chained_attention=config.cross_attention is CrossAttention.chained,
+            refine_before_self_encoding=config.refine_from is RefineFrom.cross_attention,
+        )
+        self.fusion = SparseFusion(channels, config.gate_kernel_size)
+
+    def forward(self, gaussians: GaussianSet, radar_bev: SparseBEV, views: CameraViews) -> OCSFOutput:
+        """G_0 to F_fuse."""
+        config = self.config
+        gaussians = self.encoder(gaussians, radar_bev, views)
+        splat = splat_set(
+            gaussians, self.grid, config.occupancy_threshold, config.max_occupied_cells, config.support_sigmas
+        )
+        return OCSFOutput(gaussians, splat, self.fusion(splat.bev, radar_bev))

@@ -1,0 +1,58 @@
+"""Image features with their cameras: projecting the plane into the views and lifting pixels out of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+MIN_DEPTH_M = 0.5
+"""Points nearer to the image plane count as invisible (specification 5.3)."""
+
+
+@dataclass
+class CameraViews:
+    """Pyramid of N views for each of B samples, with calibration; geometry is float32 even under autocast.
+
+    Pixels are those of the augmented network input, pixel centres at +0.5.
+    """
+
+    levels: list[Tensor]  # L x [B, N, C_I, h, w], finest first
+    pix_from_aug: Tensor  # [B, N, 4, 4]: (x, y, z, 1) in aug metres -> (u*d, v*d, d, 1)
+    valid: Tensor  # [B, N] bool, False where the camera is missing
+    image_size_px: tuple[int, int]  # (H, W)
+
+    def project(
+        self,
+        points: Tensor,  # [B, Q, P, 3] aug metres
+    ) -> tuple[Tensor, Tensor]:  # [B, Q, N, P, 2] pixels (u, v), [B, Q, N, P] bool
+        """Pixels of the points in every view and whether they are visible there; invisible ones get pixel (0, 0)."""
+        with torch.autocast(points.device.type, enabled=False):
+            matrix = self.pix_from_aug.float()[:, :, :3]  # [B, N, 3, 4]
+            homogeneous = torch.einsum("bnij,bqpj->bqnpi", matrix[..., :3], points.float())
+            homogeneous = homogeneous + matrix[:, None, :, None, :, 3]  # [B, Q, N, P, 3]
+            depth = homogeneous[..., 2]
+            pixels = homogeneous[..., :2] / depth.clamp(min=MIN_DEPTH_M)[..., None]
+            height, width = self.image_size_px
+            inside = (pixels >= 0).all(-1) & (pixels[..., 0] < width) & (pixels[..., 1] < height)
+            visible = inside & (depth > MIN_DEPTH_M) & self.valid[:, None, :, None]
+            return torch.where(visible[..., None], pixels, 0.0), visible
+
+    def lift(
+        self,
+        depth: Tensor,  # [B, N, h, w] m along the optical axis, one per pixel of the finest level
+    ) -> Tensor:  # [B, N, h, w, 3] aug metres
+        """3D points at the pixel centres of the finest level, without gradient."""
+        with torch.no_grad(), torch.autocast(depth.device.type, enabled=False):
+            height, width = depth.shape[-2:]
+            v = (torch.arange(height, device=depth.device) + 0.5) * (self.image_size_px[0] / height)
+            u = (torch.arange(width, device=depth.device) + 0.5) * (self.image_size_px[1] / width)
+            v, u = torch.meshgrid(v, u, indexing="ij")
+            rays = torch.stack([u, v, torch.ones_like(u)], -1)  # [h, w, 3]
+            # A missing view may carry any matrix; its points are never used, but must not stop the inversion.
+            matrix = torch.where(self.valid[..., None, None], self.pix_from_aug, torch.eye(4, device=depth.device))
+            aug_from_pix = torch.linalg.inv_ex(matrix.double())[0].float()[:, :, :3]  # [B, N, 3, 4]
+            points = rays * depth.float()[..., None]  # [B, N, h, w, 3] (u*d, v*d, d)
+            lifted = torch.einsum("bnij,bnhwj->bnhwi", aug_from_pix[..., :3], points)
+            return lifted + aug_from_pix[:, :, None, None, :, 3]

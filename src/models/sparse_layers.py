@@ -1,0 +1,106 @@
+"""Layers on sparse maps of two or three dimensions: convolutions, batch norm over the active cells, residual blocks."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from src.ops.sparse_conv import sparse_conv, strided_map, submanifold_map
+from src.structures.sparse_bev import SparseMap
+
+
+class SparseKernel(nn.Module):
+    """Weight and bias of a sparse convolution, drawn like those of torch's dense one.
+
+    `weight` is [K, in, out], its K = kernel_size ** ndim offsets in C order over the kernel axes.
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, kernel_size: int, ndim: int, bias: bool) -> None:
+        super().__init__()
+        self.in_channels, self.out_channels = in_channels, out_channels
+        self.kernel_size, self.ndim = kernel_size, ndim
+        self.weight = nn.Parameter(torch.empty(kernel_size**ndim, in_channels, out_channels))
+        self.bias = nn.Parameter(torch.empty(out_channels)) if bias else None
+        bound = 1 / math.sqrt(kernel_size**ndim * in_channels)
+        nn.init.uniform_(self.weight, -bound, bound)
+        if self.bias is not None:
+            nn.init.uniform_(self.bias, -bound, bound)
+
+    def extra_repr(self) -> str:
+        """Sizes for the printed module."""
+        return f"{self.in_channels}, {self.out_channels}, kernel_size={self.kernel_size}, ndim={self.ndim}"
+
+
+class SubmanifoldConv(SparseKernel):
+    """Convolution whose output sites are its input sites."""
+
+    def forward(self, x: SparseMap) -> SparseMap:
+        kernel_map = submanifold_map(x.sites, self.kernel_size)
+        return x.with_features(sparse_conv(x.features, self.weight, kernel_map, self.bias))
+
+
+class SparseConv(SparseKernel):
+    """Convolution with an output at every cell that some input site reaches; at stride 1 it dilates the map."""
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        kernel_size: int,
+        ndim: int,
+        bias: bool,
+        stride: int,
+        padding: int,
+    ) -> None:
+        super().__init__(in_channels, out_channels, kernel_size, ndim, bias)
+        self.stride, self.padding = stride, padding
+
+    def forward(self, x: SparseMap) -> SparseMap:
+        kernel_map, sites = strided_map(x.sites, self.kernel_size, self.stride, self.padding)
+        return type(x)(sites, sparse_conv(x.features, self.weight, kernel_map, self.bias))
+
+
+class RowNorm(nn.BatchNorm1d):
+    """Batch norm over the rows of all samples; fewer than two rows carry no statistics, so running ones serve them."""
+
+    def forward(
+        self,
+        x: Tensor,  # [M, C]
+    ) -> Tensor:  # [M, C]
+        if len(x) == 0:
+            return x * self.weight + self.bias  # keeps the parameters in the graph, which DDP expects on every rank
+        if self.training and len(x) < 2:
+            return F.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, False, 0.0, self.eps)
+        return super().forward(x)
+
+
+class ConvNormReLU(nn.Module):
+    """A sparse convolution, batch norm and ReLU."""
+
+    def __init__(self, conv: SubmanifoldConv | SparseConv, eps: float, momentum: float) -> None:
+        super().__init__()
+        self.conv = conv
+        self.norm = RowNorm(conv.out_channels, eps=eps, momentum=momentum)
+
+    def forward(self, x: SparseMap) -> SparseMap:
+        y = self.conv(x)
+        return y.with_features(F.relu(self.norm(y.features)))
+
+
+class ResidualBlock(nn.Module):
+    """Two submanifold convolutions with bias and norm around an identity (spec section 2)."""
+
+    def __init__(self, channels: int, ndim: int, eps: float, momentum: float) -> None:
+        super().__init__()
+        self.conv1 = SubmanifoldConv(channels, channels, 3, ndim, bias=True)
+        self.bn1 = RowNorm(channels, eps=eps, momentum=momentum)
+        self.conv2 = SubmanifoldConv(channels, channels, 3, ndim, bias=True)
+        self.bn2 = RowNorm(channels, eps=eps, momentum=momentum)
+
+    def forward(self, x: SparseMap) -> SparseMap:
+        y = self.conv1(x)
+        y = self.conv2(y.with_features(F.relu(self.bn1(y.features))))
+        return x.with_features(F.relu(self.bn2(y.features) + x.features))

@@ -1,0 +1,218 @@
+"""Kernel maps: which input site meets which output site under which kernel offset."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from src.ops.bags import bags
+from src.ops.sites import HALO, Sites
+
+Size = int | tuple[int, ...]
+
+
+@dataclass(eq=False)
+class KernelMap:
+    """Pairs (input row, output row) of a sparse convolution, grouped by kernel offset.
+
+    Offsets run in C order over the kernel axes, as in a torch weight [Cout, Cin, k...]. `mirrored` marks a map whose
+    transpose is itself with the offsets reversed (submanifold); `identity` one in which output i sees input i only.
+    """
+
+    inputs: Tensor  # [pairs] int32, input row
+    outputs: Tensor  # [pairs] int32, output row
+    counts: tuple[int, ...]  # pairs of each kernel offset; they lie one block after the other
+    num_inputs: int
+    num_outputs: int
+    mirrored: bool = False
+    identity: bool = False
+    _lazy: dict[str, tuple[Tensor, ...]] = field(default_factory=dict, repr=False)
+
+    @property
+    def num_offsets(self) -> int:
+        """Number of kernel offsets K."""
+        return len(self.counts)
+
+    def ends(self) -> Tensor:  # [K] int32
+        """End of each offset's block of pairs."""
+        if "ends" not in self._lazy:
+            ends = list(itertools.accumulate(self.counts))
+            self._lazy["ends"] = (torch.tensor(ends, dtype=torch.int32, device=self.inputs.device),)
+        return self._lazy["ends"][0]
+
+    def bags_by_output(self) -> tuple[Tensor, Tensor]:
+        """Pairs ordered by output row [pairs] int32 and the first pair of each row [num_outputs + 1] int32."""
+        if "by_output" not in self._lazy:
+            self._lazy["by_output"] = bags(self.outputs, self.num_outputs)
+        return self._lazy["by_output"]
+
+    def bags_by_input(self) -> tuple[Tensor, Tensor]:
+        """Pairs ordered by input row [pairs] int32 and the first pair of each row [num_inputs + 1] int32."""
+        if "by_input" not in self._lazy:
+            self._lazy["by_input"] = bags(self.inputs, self.num_inputs)
+        return self._lazy["by_input"]
+
+
+def submanifold_map(sites: Sites, kernel_size: Size) -> KernelMap:
+    """Map whose outputs are the inputs: sites never dilate. Kernel sizes are odd, at most 5; cached on the sites.
+
+    Raises ValueError for an even or too large kernel.
+    """
+    kernel = _per_axis(kernel_size, sites.ndim, "kernel_size")
+    if any(size % 2 == 0 or size > 2 * HALO + 1 for size in kernel):
+        raise ValueError(f"kernel_size={kernel}: a submanifold kernel must be odd and at most {2 * HALO + 1} per axis")
+    key = ("submanifold", kernel)
+    if key not in sites.cache:
+        sites.cache[key] = _build_submanifold(sites, kernel)
+    return sites.cache[key]
+
+
+def strided_map(sites: Sites, kernel_size: Size, stride: Size, padding: Size) -> tuple[KernelMap, Sites]:
+    """Map to every output cell whose window holds at least one site (stride 1 dilates the set); cached on the sites.
+
+    Output cell p sees input cell p * stride - padding + k, as in a dense torch convolution, and the output grid has its
+    size. Raises ValueError when the kernel does not fit the padded grid.
+    """
+    kernel = _per_axis(kernel_size, sites.ndim, "kernel_size")
+    strides, pads = _per_axis(stride, sites.ndim, "stride"), _per_axis(padding, sites.ndim, "padding")
+    key = ("strided", kernel, strides, pads)
+    if key not in sites.cache:
+        sites.cache[key] = _build_strided(sites, kernel, strides, pads)
+    return sites.cache[key]
+
+
+def temporal_map(sites: Sites, kernel_size: Size, stride: Size, padding: Size) -> tuple[KernelMap, Sites]:
+    """Map over (t, y, x) that shortens time but never spreads over the plane (specification 6.1); cached on the sites.
+
+    Output (t', y, x) exists exactly if an input slot in its temporal window has a site at the same (y, x); the weights
+    still reach the spatial neighbours. `stride` is (s, 1, 1), the spatial padding half the spatial kernel.
+    Raises ValueError for another stride or padding.
+    """
+    kernel = _per_axis(kernel_size, sites.ndim, "kernel_size")
+    strides, pads = _per_axis(stride, sites.ndim, "stride"), _per_axis(padding, sites.ndim, "padding")
+    if any(s != 1 for s in strides[1:]) or any(2 * p + 1 != k for p, k in zip(pads[1:], kernel[1:], strict=True)):
+        raise ValueError(
+            f"stride={strides}, padding={pads}, kernel_size={kernel}: behind the time axis the stride must be 1 "
+            "and the padding half of an odd kernel, otherwise the plane would change"
+        )
+    if max(pads) > HALO or kernel[0] - 1 - pads[0] > HALO:
+        raise ValueError(f"kernel_size={kernel}, padding={pads}: a tap may reach at most {HALO} cells beyond the grid")
+    key = ("temporal", kernel, strides, pads)
+    if key not in sites.cache:
+        sites.cache[key] = _build_temporal(sites, kernel, strides, pads)
+    return sites.cache[key]
+
+
+def _build_submanifold(sites: Sites, kernel: tuple[int, ...]) -> KernelMap:
+    """Search the offsets before the centre only; the ones behind it are their mirror images."""
+    num, device = len(sites), sites.device
+    rows = torch.arange(num, dtype=torch.int32, device=device)
+    half = torch.Size(kernel).numel() // 2
+    if half == 0:
+        return KernelMap(rows, rows, (num,), num, num, mirrored=True, identity=True)
+    starts = sites.keys - sum(size // 2 * step for size, step in zip(kernel, sites.strides[1:], strict=True))
+    found, where = _search(sites.keys, starts, sites.strides[1:], kernel, half)
+    inputs, outputs, counts = _pairs(found, where)
+    blocks_in, blocks_out = inputs.split(counts), outputs.split(counts)
+    return KernelMap(
+        torch.cat([inputs, rows, *blocks_out[::-1]]),
+        torch.cat([outputs, rows, *blocks_in[::-1]]),
+        (*counts, num, *counts[::-1]),
+        num,
+        num,
+        mirrored=True,
+    )
+
+
+def _build_strided(
+    sites: Sites, kernel: tuple[int, ...], stride: tuple[int, ...], padding: tuple[int, ...]
+) -> tuple[KernelMap, Sites]:
+    shape = _output_shape(sites.shape, kernel, stride, padding)
+    out = Sites(shape, sites.keys)
+    cells = sites.indices()
+    targets, valid = cells[:, 0] * out.strides[0], torch.ones_like(cells[:, 0], dtype=torch.bool)
+    for axis in range(sites.ndim):
+        # One more leading axis per kernel axis: [k0, ..., n] output keys and whether the tap meets the output lattice.
+        taps = torch.arange(kernel[axis], device=sites.device)[:, None]
+        moved = cells[:, axis + 1] + padding[axis] - taps  # [k, n]
+        coarse = torch.div(moved, stride[axis], rounding_mode="floor")
+        fits = (coarse * stride[axis] == moved) & (coarse >= 0) & (coarse < shape[axis + 1])
+        targets = targets.unsqueeze(-2) + coarse * out.strides[axis + 1]
+        valid = valid.unsqueeze(-2) & fits
+    num = len(sites)
+    hits = valid.reshape(-1).nonzero().squeeze(1)
+    counts = valid.reshape(-1, num).sum(1).tolist()
+    out.keys, outputs = torch.unique(targets.reshape(-1).index_select(0, hits), return_inverse=True)
+    inputs = torch.remainder(hits, max(num, 1)).to(torch.int32)
+    return KernelMap(inputs, outputs.to(torch.int32), tuple(counts), num, len(out)), out
+
+
+def _build_temporal(
+    sites: Sites, kernel: tuple[int, ...], stride: tuple[int, ...], padding: tuple[int, ...]
+) -> tuple[KernelMap, Sites]:
+    shape = _output_shape(sites.shape, kernel, stride, padding)
+    # The temporal taps alone decide which outputs exist.
+    ones = (1,) * (sites.ndim - 1)
+    zeros = (0,) * (sites.ndim - 1)
+    _, reached = _build_strided(sites, (kernel[0], *ones), (stride[0], *ones), (padding[0], *zeros))
+    out = Sites(shape, reached.keys)
+    cells = out.indices()
+    corner = cells[:, 0] * sites.strides[0]
+    for axis in range(sites.ndim):
+        corner = corner + (cells[:, axis + 1] * stride[axis] - padding[axis]) * sites.strides[axis + 1]
+    found, where = _search(sites.keys, corner, sites.strides[1:], kernel, torch.Size(kernel).numel())
+    inputs, outputs, counts = _pairs(found, where)
+    return KernelMap(inputs, outputs, tuple(counts), len(sites), len(out)), out
+
+
+def _search(
+    keys: Tensor,  # [n] int64, sorted
+    corners: Tensor,  # [m] int64, key of the first kernel tap of every output
+    strides: tuple[int, ...],
+    kernel: tuple[int, ...],
+    num_taps: int,
+) -> tuple[Tensor, Tensor]:  # [num_taps, m] bool, [num_taps, m] int64
+    """Whether each of the first `num_taps` taps meets a site, and its row (of no meaning where it does not).
+
+    The taps of one kernel row are neighbours among the sorted keys, so one binary search serves the whole row.
+    """
+    padded = torch.cat([keys, keys.new_full((1,), torch.iinfo(torch.int64).max)])
+    found, where = [], []
+    for lead in itertools.product(*(range(size) for size in kernel[:-1])):
+        if len(found) >= num_taps:
+            break
+        first = corners + sum(offset * step for offset, step in zip(lead, strides[:-1], strict=True))
+        position = torch.searchsorted(keys, first)
+        for tap in range(min(kernel[-1], num_taps - len(found))):
+            hit = padded.index_select(0, position) == first + tap
+            found.append(hit)
+            where.append(position)
+            position = position + hit
+    return torch.stack(found), torch.stack(where)
+
+
+def _pairs(found: Tensor, where: Tensor) -> tuple[Tensor, Tensor, list[int]]:
+    """(input rows, output rows, counts) of the taps that met a site, block by block."""
+    hits = found.reshape(-1).nonzero().squeeze(1)
+    outputs = torch.remainder(hits, max(found.shape[1], 1))
+    inputs = where.reshape(-1).index_select(0, hits)
+    return inputs.to(torch.int32), outputs.to(torch.int32), found.sum(1).tolist()
+
+
+def _output_shape(
+    shape: tuple[int, ...], kernel: tuple[int, ...], stride: tuple[int, ...], padding: tuple[int, ...]
+) -> tuple[int, ...]:
+    sizes = [(n + 2 * p - k) // s + 1 for n, k, s, p in zip(shape[1:], kernel, stride, padding, strict=True)]
+    if min(sizes) < 1:
+        raise ValueError(f"kernel_size={kernel} does not fit spatial shape {shape[1:]} with padding {padding}")
+    return (shape[0], *sizes)
+
+
+def _per_axis(value: Size, ndim: int, name: str) -> tuple[int, ...]:
+    sizes = (value,) * ndim if isinstance(value, int) else tuple(value)
+    if len(sizes) != ndim or min(sizes) < (0 if name == "padding" else 1):
+        raise ValueError(f"{name}={value}: expected one number or {ndim}, one per spatial axis, none too small")
+    return sizes

@@ -1,0 +1,169 @@
+"""Sets of active cells: sorted integer keys that support shifts, look-ups and unions without a dense grid."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+# Empty cells kept behind the last cell of every spatial axis. A key moved by up to HALO cells along any axis, in either
+# direction, lands in such a gap and never on a cell of the next row, so look-ups need no bounds test.
+HALO = 2
+
+
+@dataclass(eq=False)
+class Sites:
+    """Active cells of a batch of grids, unique and in lexicographic order.
+
+    `shape` is (batch, *spatial), for example (B, rows, cols) or (B, z, y, x); `keys` [n] int64 are sorted and unique.
+    `cache` holds what was derived from this set (kernel maps), so every layer that works on the same `Sites` object
+    shares them. Build with `from_indices`, `unique` or `from_linear`; the constructor trusts its arguments.
+    """
+
+    shape: tuple[int, ...]
+    keys: Tensor  # [n] int64, sorted, unique
+    cache: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def from_indices(
+        cls,
+        indices: Tensor,  # [n, 1 + d] int64 (batch, *cell), any order, unique
+        shape: tuple[int, ...],
+    ) -> tuple[Sites, Tensor]:
+        """Sites of the given cells, and `order` [n] int64 such that `indices[order]` are in the order of the sites.
+
+        Raises ValueError for a cell outside `shape` or listed twice.
+        """
+        empty = _checked_empty(indices, shape)
+        keys, order = torch.sort(empty._keys_of(indices))
+        sites = cls(empty.shape, keys)
+        if len(keys) > 1 and bool((keys[1:] == keys[:-1]).any()):
+            raise ValueError(
+                f"indices: {len(keys) - len(torch.unique(keys))} cells are listed more than once, expected unique "
+                "cells; merge them first (Sites.unique gives the rows to merge into)"
+            )
+        return sites, order
+
+    @classmethod
+    def unique(
+        cls,
+        indices: Tensor,  # [n, 1 + d] int64 (batch, *cell), any order, repeats allowed
+        shape: tuple[int, ...],
+    ) -> tuple[Sites, Tensor]:
+        """Sites of the distinct cells, and the row [n] int64 of every given cell in them.
+
+        Raises ValueError for a cell outside `shape`.
+        """
+        empty = _checked_empty(indices, shape)
+        keys, rows = torch.unique(empty._keys_of(indices), return_inverse=True)
+        return cls(empty.shape, keys), rows
+
+    @classmethod
+    def from_linear(
+        cls,
+        linear: Tensor,  # [n] int64, sorted, unique: (batch * rows + row) * cols + col and alike for any d
+        shape: tuple[int, ...],
+    ) -> Sites:
+        """Sites from plain row-major positions, which have the same order as the keys. Trusts its arguments."""
+        empty = cls(tuple(shape), linear)
+        keys = torch.zeros_like(linear)
+        rest = linear
+        for axis in reversed(range(1, len(shape))):
+            keys += torch.remainder(rest, shape[axis]) * empty.strides[axis]
+            rest = torch.div(rest, shape[axis], rounding_mode="floor")
+        return cls(tuple(shape), keys + rest * empty.strides[0])
+
+    @property
+    def strides(self) -> tuple[int, ...]:
+        """Step of the key per axis of `shape`."""
+        strides = [1]
+        for size in reversed(self.shape[1:]):
+            strides.append(strides[-1] * (size + HALO))
+        return tuple(reversed(strides))
+
+    @property
+    def ndim(self) -> int:
+        """Number of spatial axes."""
+        return len(self.shape) - 1
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the keys."""
+        return self.keys.device
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def indices(self) -> Tensor:  # [n, 1 + d] int64
+        """(batch, *cell) of every site, in order."""
+        if "indices" not in self.cache:
+            rest, columns = self.keys, []
+            for stride in self.strides:
+                columns.append(torch.div(rest, stride, rounding_mode="floor"))
+                rest = rest - columns[-1] * stride
+            self.cache["indices"] = torch.stack(columns, 1)
+        return self.cache["indices"]
+
+    def linear(self) -> Tensor:  # [n] int64
+        """Row-major position of every site, (batch * rows + row) * cols + col in 2D; sorted."""
+        position = torch.zeros_like(self.keys)
+        for size, column in zip(self.shape, self.indices().unbind(1), strict=True):
+            position = position * size + column
+        return position
+
+    def batch_counts(self) -> Tensor:  # [B] int64
+        """Number of sites of every sample."""
+        starts = torch.arange(self.shape[0] + 1, device=self.device) * self.strides[0]
+        return torch.searchsorted(self.keys, starts).diff()
+
+    def rows_of(
+        self,
+        indices: Tensor,  # [q, 1 + d] int64, may lie outside the grid
+    ) -> Tensor:  # [q] int64
+        """Row of each cell among the sites, -1 where it is absent or outside the grid."""
+        upper = torch.tensor(self.shape, device=indices.device)
+        inside = ((indices >= 0) & (indices < upper)).all(1)
+        if len(self) == 0:
+            return torch.full_like(inside, -1, dtype=torch.int64)
+        wanted = self._keys_of(indices)
+        rows = torch.searchsorted(self.keys, wanted).clamp_(max=len(self) - 1)
+        return torch.where(inside & (self.keys[rows] == wanted), rows, -1)
+
+    def _keys_of(self, indices: Tensor) -> Tensor:
+        return (indices.long() * torch.tensor(self.strides, device=indices.device)).sum(1)
+
+
+def union(a: Sites, b: Sites) -> tuple[Sites, Tensor, Tensor]:
+    """Sites of either set, and the rows of a [len a] and of b [len b] in it, both int64.
+
+    Raises ValueError when the two sets live on different grids.
+    """
+    if a.shape != b.shape:
+        raise ValueError(f"union of sites on different grids: shapes {a.shape} and {b.shape} must be equal")
+    if a is b:
+        rows = torch.arange(len(a), device=a.device)
+        return a, rows, rows
+    keys = torch.unique(torch.cat([a.keys, b.keys]))
+    return Sites(a.shape, keys), torch.searchsorted(keys, a.keys), torch.searchsorted(keys, b.keys)
+
+
+def _checked_empty(indices: Tensor, shape: tuple[int, ...]) -> Sites:
+    """A set without sites on the grid, after checking that the indices fit it."""
+    if indices.dim() != 2 or indices.shape[1] != len(shape) or indices.is_floating_point():
+        raise ValueError(
+            f"indices: expected integers [n, {len(shape)}] for shape {tuple(shape)}, "
+            f"got {indices.dtype} {list(indices.shape)}"
+        )
+    if any(size < 1 for size in shape[1:]) or shape[0] < 0:
+        raise ValueError(f"shape={tuple(shape)}: every spatial size must be at least 1")
+    sites = Sites(tuple(int(size) for size in shape), indices.new_empty(0, dtype=torch.int64))
+    if math.prod(size + HALO for size in sites.shape) >= 2**63:
+        raise ValueError(f"shape={sites.shape}: too many cells for 64-bit keys")
+    outside = (indices < 0) | (indices >= torch.tensor(sites.shape, device=indices.device))
+    if bool(outside.any()):
+        first = indices[outside.any(1)][0].tolist()
+        raise ValueError(f"indices: cell {first} lies outside shape {sites.shape}; drop such cells first")
+    return sites

@@ -1,0 +1,361 @@
+"""Gaussians to bird's-eye-view cells: occupancy, occupied cells and their features (Eq. 4-6)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from src.geometry.bev_grid import BEVGrid
+from src.geometry.box_cells import window_cells
+from src.ops.backend import implementation, register
+from src.ops.bags import bag_sum, row_products
+from src.ops.sites import Sites
+
+# A contribution is at most 1 - CAP, so that the logarithm of the free probability stays finite.
+CAP = 1e-4
+# Windows are widened by this before the exact test, so that rounding cannot lose a cell.
+WINDOW_SLACK_CELLS = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Splat:
+    """What a set of Gaussians does to the cells of a batch of grids.
+
+    The support are the cells that at least one Gaussian reaches; everywhere else alpha = 0 and S = 0. Linear keys are (batch * rows + row) * cols + col.
+    """
+
+    support: Tensor  # [n] int64 linear keys, sorted
+    log_free: Tensor  # [n] S = log(1 - alpha) <= 0
+    occupied: Sites  # Omega, the cells with alpha above the threshold, shape (B, rows, cols)
+    features: Tensor  # [w, C] F_G at the occupied cells
+    occupied_rows: Tensor  # [w] int64, row of each occupied cell in the support
+    active: Tensor  # [G] bool, the Gaussian reaches an occupied cell
+    peak_cell: Tensor  # [G] int64, linear key of the occupied cell where it contributes most, -1 if not active
+    num_cut: int  # occupied cells dropped by the max_cells guard
+
+    @property
+    def occupancy(self) -> Tensor:  # [n]
+        """alpha = 1 - exp(S) on the support."""
+        return -torch.expm1(self.log_free)
+
+    @property
+    def log_occupancy(self) -> Tensor:  # [n]
+        """log(alpha) on the support, exact for small alpha as well."""
+        return log1mexp(-self.log_free)
+
+
+def log1mexp(
+    u: Tensor,  # [...] > 0
+) -> Tensor:  # [...]
+    """log(1 - exp(-u)) without cancellation on either side."""
+    small = u < math.log(2.0)
+    # Each branch sees harmless arguments where the other is taken, or its gradient would be NaN.
+    near = torch.log(-torch.expm1(-torch.where(small, u, 1.0)))
+    far = torch.log1p(-torch.exp(-torch.where(small, 1.0, u)))
+    return torch.where(small, near, far)
+
+
+def splat_gaussians(
+    means: Tensor,  # [G, 2] (x, y) metres
+    scales: Tensor,  # [G, 2] standard deviations along and across, metres
+    directions: Tensor,  # [G, 2] (cos, sin), unit
+    opacity_logits: Tensor,  # [G]
+    features: Tensor,  # [G, C]
+    batch: Tensor,  # [G] int64, sample of each Gaussian, any order
+    grid: BEVGrid,
+    batch_size: int,
+    threshold: float = 0.1,
+    max_cells: int = 32768,
+    support_sigmas: float = 3.0,
+    smooth_cap: bool = False,
+) -> Splat:
+    """Splat Gaussians onto BEV cells (Eq. 4-6, specification 5.6).
+
+    k_i(p) = exp(-q/2) within `support_sigmas`, else 0; a_i = sigmoid(o_i) k_i, at most 1 - 1e-4; S = sum log(1 - a_i);
+    alpha = 1 - exp(S); Omega = {alpha > threshold}; F_G(p) = sum k_i(p) f_i on Omega. At most `max_cells` cells a
+    sample stay in Omega, the most occupied ones. The hard cap stops the gradient of a contribution it binds for; `smooth_cap`
+    adds 1e-4 to -log a instead, which moves alpha by up to 1e-4 and keeps every gradient alive.
+
+    Gradients of `log_free` and `features` reach all five float inputs; Omega is a constant set. Computed in float32
+    (float64 for float64 inputs) whatever autocast says, the same on every run. Gaussians of different samples never
+    meet. Raises ValueError for shapes that do not fit together.
+    """
+    num = len(means)
+    expected = {"means": (num, 2), "scales": (num, 2), "directions": (num, 2), "opacity_logits": (num,)}
+    found = {"means": means, "scales": scales, "directions": directions, "opacity_logits": opacity_logits}
+    for name, tensor in found.items():
+        if tensor.shape != expected[name]:
+            raise ValueError(f"{name}: expected {list(expected[name])}, got {list(tensor.shape)}")
+    if features.dim() != 2 or len(features) != num or batch.shape != (num,):
+        raise ValueError(
+            f"expected features [{num}, C] and batch [{num}], got {list(features.shape)} and {list(batch.shape)}"
+        )
+    dtype = torch.float64 if means.dtype == torch.float64 else torch.float32
+    with torch.autocast(means.device.type, enabled=False):
+        return implementation("splat")(
+            *(x.to(dtype) for x in (means, scales, directions, opacity_logits, features)),
+            batch,
+            grid,
+            batch_size,
+            threshold,
+            max_cells,
+            support_sigmas,
+            smooth_cap,
+        )
+
+
+@dataclass(eq=False)
+class _Pairs:
+    """(Gaussian, cell) pairs in the order of the cells, and the way back to the order of the Gaussians."""
+
+    gaussian: Tensor  # [pairs] int64
+    cell: Tensor  # [pairs] int64, row in the support, ascending
+    delta: Tensor  # [pairs, 2] cell centre - mean, metres
+    q: Tensor  # [pairs] squared Mahalanobis distance
+    cell_starts: Tensor  # [n + 1] int64, first pair of each support cell
+    by_gaussian: Tensor  # [pairs] int64, pairs in the order of the Gaussians
+    gaussian_starts: Tensor  # [G + 1] int64, first place of each Gaussian in by_gaussian
+
+
+@torch.no_grad()
+def _gaussian_cells(
+    means: Tensor, scales: Tensor, directions: Tensor, batch: Tensor, grid: BEVGrid, support_sigmas: float
+) -> tuple[_Pairs, Tensor]:
+    """All pairs with q <= support_sigmas^2, and the linear keys [n] of the cells they reach."""
+    squares, turned = scales.square(), directions.square()
+    variances = torch.stack([(turned * squares).sum(1), (turned.flip(1) * squares).sum(1)], 1)  # Sigma_xx, Sigma_yy
+    centres = grid.to_cells(means) - 0.5
+    reach = support_sigmas * variances.sqrt() / grid.cell_m + WINDOW_SLACK_CELLS
+    gaussian, row, col, _ = window_cells(centres, reach, grid)
+    # Offsets are taken from the nearest cell centre: float32 would lose five digits on coordinates of 150 m.
+    nearest = centres.round()
+    rest = (means.double() - grid.centre_of(nearest.flip(1), torch.float64)).to(means.dtype)  # [G, 2] m
+    table = torch.cat([nearest, rest, directions, scales], 1).index_select(0, gaussian)
+    base_x, base_y, rest_x, rest_y, cosine, sine, size_x, size_y = table.unbind(1)  # [candidates] each
+    delta_x, delta_y = (col - base_x) * grid.cell_m - rest_x, (row - base_y) * grid.cell_m - rest_y
+    along = (cosine * delta_x + sine * delta_y) / size_x
+    across = (cosine * delta_y - sine * delta_x) / size_y
+    q = along.square() + across.square()
+    near = (q <= support_sigmas**2).nonzero().squeeze(1)
+
+    gaussian = gaussian.index_select(0, near)
+    linear = (batch.index_select(0, gaussian) * grid.rows + row.index_select(0, near)) * grid.cols
+    linear, order = torch.sort(linear + col.index_select(0, near), stable=True)
+    support, cell, sizes = torch.unique_consecutive(linear, return_inverse=True, return_counts=True)
+    by_gaussian = torch.empty_like(order)
+    by_gaussian[order] = torch.arange(len(order), device=order.device)
+    counts = torch.bincount(gaussian, minlength=len(means))
+    near = near.index_select(0, order)
+    pairs = _Pairs(
+        gaussian=gaussian.index_select(0, order),
+        cell=cell,
+        delta=torch.stack([delta_x.index_select(0, near), delta_y.index_select(0, near)], 1),
+        q=q.index_select(0, near),
+        cell_starts=F.pad(sizes.cumsum(0), (1, 0)),
+        by_gaussian=by_gaussian,
+        gaussian_starts=F.pad(counts.cumsum(0), (1, 0)),
+    )
+    return pairs, support
+
+
+class _LogFree(torch.autograd.Function):
+    """S per support cell (Eq. 5), with the closed-form gradients of specification 5.6."""
+
+    @staticmethod
+    def forward(
+        ctx: torch.autograd.function.FunctionCtx,
+        q: Tensor,
+        opacity_logits: Tensor,
+        pairs: _Pairs,
+        smooth_cap: bool,
+    ) -> Tensor:
+        surprise = F.softplus(-opacity_logits).index_select(0, pairs.gaussian) + 0.5 * q  # -log a
+        if smooth_cap:
+            surprise = surprise + CAP
+        else:
+            surprise = surprise.clamp(min=-math.log1p(-CAP))
+        ctx.save_for_backward(surprise, opacity_logits)
+        ctx.pairs, ctx.smooth_cap = pairs, smooth_cap
+        return _segment_sum(log1mexp(surprise), pairs.cell_starts)
+
+    @staticmethod
+    def backward(ctx: torch.autograd.function.FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        surprise, opacity_logits = ctx.saved_tensors
+        pairs: _Pairs = ctx.pairs
+        slope = grad.index_select(0, pairs.cell) / torch.expm1(surprise)  # d log(1 - a) / d(-log a) = a / (1 - a)
+        if not ctx.smooth_cap:
+            slope = torch.where(surprise > -math.log1p(-CAP), slope, 0.0)
+        grad_logits = _gaussian_sum(slope[:, None], pairs).squeeze(1) * -torch.sigmoid(-opacity_logits)
+        return 0.5 * slope, grad_logits, None, None
+
+
+class _Distance(torch.autograd.Function):
+    """The squared distances q of all pairs as a function of the Gaussians that made them."""
+
+    @staticmethod
+    def forward(
+        ctx: torch.autograd.function.FunctionCtx,
+        means: Tensor,
+        scales: Tensor,
+        directions: Tensor,
+        pairs: _Pairs,
+    ) -> Tensor:
+        ctx.save_for_backward(scales, directions)
+        ctx.pairs = pairs
+        return pairs.q.clone()
+
+    @staticmethod
+    def backward(ctx: torch.autograd.function.FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
+        scales, directions = ctx.saved_tensors
+        pairs: _Pairs = ctx.pairs
+        cosine, sine, size_x, size_y = torch.cat([directions, scales], 1).index_select(0, pairs.gaussian).unbind(1)
+        delta_x, delta_y = pairs.delta.unbind(1)
+        along, across = cosine * delta_x + sine * delta_y, cosine * delta_y - sine * delta_x
+        push_x, push_y = 2 * grad * along / size_x.square(), 2 * grad * across / size_y.square()  # dL/du, u = R^T d
+        sums = _gaussian_sum(
+            torch.stack(
+                [
+                    push_x,
+                    push_y,
+                    push_x * along,
+                    push_y * across,
+                    push_x * delta_x + push_y * delta_y,
+                    push_x * delta_y - push_y * delta_x,
+                ],
+                1,
+            ),
+            pairs,
+        )  # [G, 6]
+        turn = torch.stack([directions[:, 0], -directions[:, 1], directions[:, 1], directions[:, 0]], 1)
+        grad_means = -(turn.view(-1, 2, 2) @ sums[:, :2, None]).squeeze(2)  # -R dL/du
+        return grad_means, -sums[:, 2:4] / scales, sums[:, 4:6], None
+
+
+class _WeightedBag(torch.autograd.Function):
+    """F_G (Eq. 6): the kernel-weighted sum of features per cell; no pairs x C tensor is ever stored."""
+
+    @staticmethod
+    def forward(
+        ctx: torch.autograd.function.FunctionCtx,
+        features: Tensor,  # [G, C]
+        kernel: Tensor,  # [kept pairs]
+        gaussian: Tensor,  # [kept pairs], in the order of the cells
+        cell: Tensor,  # [kept pairs], occupied row, ascending
+        starts: Tensor,  # [w + 1]
+        by_gaussian: Tensor,  # [kept pairs]
+        gaussian_starts: Tensor,  # [G + 1]
+    ) -> Tensor:
+        ctx.save_for_backward(features, kernel, gaussian, cell, by_gaussian, gaussian_starts)
+        return bag_sum(features, gaussian, starts, kernel)
+
+    @staticmethod
+    def backward(
+        ctx: torch.autograd.function.FunctionCtx, grad: Tensor
+    ) -> tuple[Tensor | None, Tensor | None, None, None, None, None, None]:
+        features, kernel, gaussian, cell, by_gaussian, gaussian_starts = ctx.saved_tensors
+        grad = grad.contiguous()
+        grad_features = grad_kernel = None
+        if ctx.needs_input_grad[0]:
+            cells, weights = cell.index_select(0, by_gaussian), kernel.index_select(0, by_gaussian)
+            grad_features = bag_sum(grad, cells, gaussian_starts, weights)
+        if ctx.needs_input_grad[1]:
+            grad_kernel = row_products(grad, cell, features, gaussian)
+        return grad_features, grad_kernel, None, None, None, None, None
+
+
+@register("splat", "reference")
+def splat_reference(
+    means: Tensor,
+    scales: Tensor,
+    directions: Tensor,
+    opacity_logits: Tensor,
+    features: Tensor,
+    batch: Tensor,
+    grid: BEVGrid,
+    batch_size: int,
+    threshold: float,
+    max_cells: int,
+    support_sigmas: float,
+    smooth_cap: bool,
+) -> Splat:
+    """Plain torch form over ragged (Gaussian, cell) pairs; arguments as `splat_gaussians`."""
+    pairs, support = _gaussian_cells(means, scales, directions, batch, grid, support_sigmas)
+    q = _Distance.apply(means, scales, directions, pairs)
+    log_free = _LogFree.apply(q, opacity_logits, pairs, smooth_cap)
+    occupied_rows, num_cut = _occupied(log_free.detach(), support, threshold, max_cells, grid.rows * grid.cols)
+
+    # Pairs of the occupied cells, in both orders.
+    place = torch.full_like(support, -1)
+    place[occupied_rows] = torch.arange(len(occupied_rows), device=place.device)
+    cell = place.index_select(0, pairs.cell)
+    kept = cell >= 0
+    chosen = kept.nonzero().squeeze(1)
+    gaussian, cell = pairs.gaussian.index_select(0, chosen), cell.index_select(0, chosen)
+    kept_in_turn = kept.index_select(0, pairs.by_gaussian)
+    rank = kept.cumsum(0) - 1
+    by_gaussian = rank.index_select(0, pairs.by_gaussian[kept_in_turn])
+    counts = torch.bincount(gaussian, minlength=len(means))
+    gaussian_starts = F.pad(counts.cumsum(0), (1, 0))
+    starts = F.pad(torch.bincount(cell, minlength=len(occupied_rows)).cumsum(0), (1, 0))
+    distance = q.index_select(0, chosen)
+    out = _WeightedBag.apply(features, torch.exp(-0.5 * distance), gaussian, cell, starts, by_gaussian, gaussian_starts)
+    keys = support.index_select(0, occupied_rows)
+    return Splat(
+        support=support,
+        log_free=log_free,
+        occupied=Sites.from_linear(keys, (batch_size, grid.rows, grid.cols)),
+        features=out,
+        occupied_rows=occupied_rows,
+        active=counts > 0,
+        peak_cell=_nearest_cell(distance.detach(), gaussian, keys.index_select(0, cell), len(means)),
+        num_cut=num_cut,
+    )
+
+
+def _occupied(
+    log_free: Tensor,  # [n]
+    support: Tensor,  # [n]
+    threshold: float,
+    max_cells: int,
+    cells_per_sample: int,
+) -> tuple[Tensor, int]:
+    """Rows of the support above the threshold, at most `max_cells` a sample, and how many were dropped for that."""
+    rows = (-torch.expm1(log_free) > threshold).nonzero().squeeze(1)
+    if len(rows) <= max_cells:
+        return rows, 0
+    sample = torch.div(support.index_select(0, rows), cells_per_sample, rounding_mode="floor")
+    by_occupancy = torch.argsort(log_free.index_select(0, rows), stable=True)
+    by_sample = by_occupancy[torch.argsort(sample[by_occupancy], stable=True)]  # best first within each sample
+    counts = torch.bincount(sample)
+    first = (counts.cumsum(0) - counts).index_select(0, sample[by_sample])
+    best = torch.arange(len(rows), device=rows.device) - first < max_cells
+    kept = rows[by_sample[best]].sort().values
+    return kept, len(rows) - len(kept)
+
+
+def _nearest_cell(
+    q: Tensor,  # [pairs]
+    gaussian: Tensor,  # [pairs]
+    key: Tensor,  # [pairs]
+    num: int,
+) -> Tensor:  # [num] int64
+    """Key of the cell with the smallest q per Gaussian (the largest contribution), lowest key on ties, -1 if none."""
+    least = q.new_full((num,), math.inf).scatter_reduce_(0, gaussian, q, "amin")
+    none = torch.iinfo(torch.int64).max
+    candidates = torch.where(q == least.index_select(0, gaussian), key, none)
+    peak = key.new_full((num,), none).scatter_reduce_(0, gaussian, candidates, "amin")
+    return torch.where(peak == none, -1, peak)
+
+
+def _segment_sum(values: Tensor, starts: Tensor) -> Tensor:
+    """Sums of consecutive stretches of values [pairs] that begin at starts [n + 1]."""
+    return torch.segment_reduce(values, "sum", offsets=starts, unsafe=True)
+
+
+def _gaussian_sum(values: Tensor, pairs: _Pairs) -> Tensor:
+    """Sums of pair values [pairs, C] per Gaussian [G, C]."""
+    return bag_sum(values, pairs.by_gaussian, pairs.gaussian_starts)

@@ -1,0 +1,65 @@
+"""A sheet of picture pixels: where things go, how legends are set, how the PNG is written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from src.pictures.contents import INK
+
+DPI = 100
+SHEET_PX = 1600
+"""Width of every picture."""
+
+
+class Canvas:
+    """A white sheet measured in pixels from the top left corner.
+
+    Uses matplotlib's Agg canvas directly: no window system, no global figure list, nothing to close.
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        self.width, self.height = width, height
+        self.figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
+        FigureCanvasAgg(self.figure)
+
+    def axes(self, left: float, top: float, width: float, height: float) -> Axes:
+        """An empty plot over the given pixels."""
+        box = (left / self.width, 1 - (top + height) / self.height, width / self.width, height / self.height)
+        return self.figure.add_axes(box)
+
+    def text(
+        self,
+        left: float,
+        top: float,
+        text: str,
+        size_px: float,
+        bold: bool = False,
+        colour: str = INK,
+        align: str = "left",
+    ) -> None:
+        """One line of plain text (never read as formulas), its upper corner at the given pixels."""
+        self.figure.text(
+            left / self.width, 1 - top / self.height, text.replace("\n", " "), fontsize=size_px * 72 / DPI,
+            fontweight="bold" if bold else "normal", color=colour, ha=align, va="top", parse_math=False,
+        )  # fmt: skip
+
+    def legend(self, left: float, top: float, handles: Sequence[Artist], size_px: float = 13, columns: int = 20) -> None:
+        """A row of keys, its upper left corner at the given pixels."""
+        if handles:
+            self.figure.legend(
+                handles=handles, loc="upper left", bbox_to_anchor=(left / self.width, 1 - top / self.height),
+                ncols=min(columns, len(handles)), fontsize=size_px * 72 / DPI, frameon=False, borderpad=0,
+                borderaxespad=0, handlelength=1.9, handletextpad=0.5, columnspacing=1.5, labelcolor=INK,
+            )  # fmt: skip
+
+    def save(self, path: Path | str) -> None:
+        """Write the PNG, making the folder where needed."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})

@@ -1,0 +1,191 @@
+"""What a picture shows: boxes, Gaussians and a grid as plain numpy arrays, and the colours they are drawn in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from src.structures.taxonomy import CLASSES
+
+Array = np.ndarray
+Colour = str
+
+# Hues are spread over lightness as well, after Okabe & Ito (2008) and P. Tol, so that they stay apart for colour-blind
+# readers; the seven small classes also differ by marker.
+CLASS_COLOURS: dict[str, Colour] = {
+    "car": "#0072B2",
+    "truck": "#D55E00",
+    "bus": "#E6A000",
+    "trailer": "#8C2D7E",
+    "other_vehicle": "#7A7A00",
+    "pedestrian": "#E7298A",
+    "motorcycle": "#00846B",
+    "bicycle": "#3DA5D9",
+    "traffic_cone": "#FF7F50",
+    "barrier": "#6B6B6B",
+    "animal": "#6B3E1E",
+    "traffic_sign": "#4B3BB5",
+}
+CLASS_MARKERS: dict[str, str] = {
+    "pedestrian": "o",
+    "motorcycle": "s",
+    "bicycle": "D",
+    "traffic_cone": "^",
+    "barrier": "X",
+    "animal": "P",
+    "traffic_sign": "v",
+}
+"""Classes whose footprint is too small to be seen from above at 150 m; the others show as rectangles."""
+
+SOURCES = ("radar", "camera", "random", "history")
+SOURCE_COLOURS: dict[str, Colour] = {
+    "radar": "#D55E00",
+    "camera": "#0072B2",
+    "random": "#7F7F7F",
+    "history": "#007D5B",
+}
+INK = "#1B1F24"
+MUTED = "#8A929B"
+OCCUPANCY_COLOUR = (0.93, 0.67, 0.10)
+BOX_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
+FRONT_FACE = (0, 1, 5, 4)
+MATCH_DISTANCE_M = 2.0
+
+
+def check_shapes(name: str, arrays: dict[str, Array], expected: dict[str, tuple[int, ...]]) -> None:
+    """Raise ValueError, naming the array, where a shape differs from the expected one."""
+    for field, shape in expected.items():
+        if arrays[field].shape != shape:
+            raise ValueError(f"{name}.{field} must be {list(shape)}, but got {list(arrays[field].shape)}")
+
+
+@dataclass
+class PictureBoxes:
+    """K boxes in ego metres (x forward, y left, z up). Raises ValueError when shapes disagree."""
+
+    centers: Array  # [K, 3] m, box centre
+    sizes: Array  # [K, 3] m (length, width, height)
+    yaws: Array  # [K] rad, counter-clockwise from +x
+    velocities: Array  # [K, 2] m/s over ground, NaN where unknown
+    labels: Array  # [K] integer, index into taxonomy.CLASSES
+    scores: Array | None = None  # [K] in 0..1, for predictions
+
+    def __post_init__(self) -> None:
+        for name in ("centers", "sizes", "yaws", "velocities"):
+            setattr(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+        self.labels = np.asarray(self.labels, dtype=np.int64)
+        k = len(self.labels)
+        expected = {"centers": (k, 3), "sizes": (k, 3), "yaws": (k,), "velocities": (k, 2), "labels": (k,)}
+        if self.scores is not None:
+            self.scores = np.asarray(self.scores, dtype=np.float64)
+            expected["scores"] = (k,)
+        check_shapes("PictureBoxes", vars(self), expected)
+        if k and not (0 <= self.labels.min() and self.labels.max() < len(CLASSES)):
+            raise ValueError(f"PictureBoxes.labels must lie in 0..{len(CLASSES) - 1}, but got {np.unique(self.labels)}")
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @classmethod
+    def empty(cls) -> PictureBoxes:
+        """No box at all."""
+        return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+
+    def __getitem__(self, rows: Array) -> PictureBoxes:
+        """The boxes at `rows` (a boolean mask or indices)."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: None if value is None else value[rows] for name, value in values.items()})
+
+    def drawable(self, score_threshold: float = 0.0) -> PictureBoxes:
+        """The finite boxes, of those with scores the ones at or above the threshold, weakest first."""
+        keep = np.isfinite(np.concatenate([self.centers, self.sizes, self.yaws[:, None]], axis=1)).all(axis=1)
+        if self.scores is None:
+            return self[keep]
+        kept = self[keep & (self.scores >= score_threshold)]
+        return kept[np.argsort(kept.scores, kind="stable")]
+
+    def corners(self) -> Array:
+        """Corners [K, 8, 3] m: bottom front-left, front-right, back-right, back-left, then the same on top."""
+        along = np.array([1, 1, -1, -1, 1, 1, -1, -1]) / 2
+        across = np.array([1, -1, -1, 1, 1, -1, -1, 1]) / 2
+        upward = np.array([-1, -1, -1, -1, 1, 1, 1, 1]) / 2
+        x, y, z = (self.sizes[:, i, None] * part for i, part in enumerate((along, across, upward)))
+        cos, sin = np.cos(self.yaws)[:, None], np.sin(self.yaws)[:, None]
+        return self.centers[:, None] + np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
+
+    def colours(self) -> list[Colour]:
+        """The class colour of each box."""
+        return [CLASS_COLOURS[CLASSES[label]] for label in self.labels]
+
+
+@dataclass
+class PictureGaussians:
+    """G Gaussians on the ground plane, ego metres (Eq. 1). Raises ValueError when shapes disagree."""
+
+    means: Array  # [G, 2] m
+    scales: Array  # [G, 2] m, standard deviation along and across `directions`
+    directions: Array  # [G, 2] (cos, sin)
+    opacities: Array  # [G] in 0..1
+    sources: Array  # [G] integer, index into SOURCES
+
+    def __post_init__(self) -> None:
+        for name in ("means", "scales", "directions", "opacities"):
+            setattr(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+        self.sources = np.asarray(self.sources, dtype=np.int64)
+        g = len(self.sources)
+        pairs = {name: (g, 2) for name in ("means", "scales", "directions")}
+        check_shapes("PictureGaussians", vars(self), pairs | {"opacities": (g,), "sources": (g,)})
+        if g and not (0 <= self.sources.min() and self.sources.max() < len(SOURCES)):
+            raise ValueError(f"PictureGaussians.sources must lie in 0..{len(SOURCES) - 1}, but got {self.sources}")
+
+    def __len__(self) -> int:
+        return len(self.sources)
+
+    def outlines(self, corners: int = 24) -> Array:
+        """The one-sigma ellipses as polygons [G, corners, 2] m."""
+        turn = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+        along, across = self.scales[:, :1] * np.cos(turn), self.scales[:, 1:] * np.sin(turn)  # [G, corners]
+        length = np.linalg.norm(self.directions, axis=1, keepdims=True)
+        cos, sin = (self.directions / np.where(length > 0, length, 1)).T[..., None]
+        return self.means[:, None] + np.stack([cos * along - sin * across, sin * along + cos * across], axis=-1)
+
+
+@dataclass(frozen=True)
+class PictureGrid:
+    """Extent of the BEV: rows run along y, columns along x."""
+
+    x_min_m: float
+    y_min_m: float
+    cell_m: float
+    rows: int
+    cols: int
+
+    @property
+    def x_max_m(self) -> float:
+        """Upper edge of the last column."""
+        return self.x_min_m + self.cols * self.cell_m
+
+    @property
+    def y_max_m(self) -> float:
+        """Upper edge of the last row."""
+        return self.y_min_m + self.rows * self.cell_m
+
+
+def match_boxes(
+    predictions: PictureBoxes,
+    ground_truth: PictureBoxes,
+) -> tuple[Array, Array]:
+    """Which predictions [P] and which true boxes [K] found a partner (bool): the evaluation's greedy rule at 2 m.
+
+    By falling score, each prediction takes the nearest free true box of its class closer than 2 m on the ground.
+    """
+    found = np.zeros(len(predictions), dtype=bool)
+    taken = np.zeros(len(ground_truth), dtype=bool)
+    scores = np.zeros(len(predictions)) if predictions.scores is None else predictions.scores
+    for row in np.argsort(-scores, kind="stable"):
+        distance = np.linalg.norm(ground_truth.centers[:, :2] - predictions.centers[row, :2], axis=1)
+        distance[taken | (ground_truth.labels != predictions.labels[row])] = np.inf
+        if len(distance) and distance.min() < MATCH_DISTANCE_M:
+            found[row] = taken[distance.argmin()] = True
+    return found, taken

@@ -1,0 +1,96 @@
+"""3D boxes of one sample, in one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+
+@dataclass
+class Boxes3D:
+    """K boxes in the ego or augmented ego frame of one sample.
+
+    Ground truth carries `num_points` (lidar + radar returns), predictions carry `scores`.
+    Raises ValueError when shapes disagree.
+    """
+
+    centers: Tensor  # [K, 3] m, box centre
+    sizes: Tensor  # [K, 3] m (length, width, height)
+    yaws: Tensor  # [K] rad, counter-clockwise from +x
+    velocities: Tensor  # [K, 2] m/s over ground, NaN where unknown
+    labels: Tensor  # [K] int64, index into taxonomy.CLASSES
+    attributes: Tensor  # [K] int64, index into taxonomy.ATTRIBUTES, -1 for none
+    scores: Tensor | None = None  # [K] in 0..1
+    num_points: Tensor | None = None  # [K] int64
+
+    def __post_init__(self) -> None:
+        k = self.centers.shape[0]
+        expected = {
+            "centers": (k, 3),
+            "sizes": (k, 3),
+            "yaws": (k,),
+            "velocities": (k, 2),
+            "labels": (k,),
+            "attributes": (k,),
+            "scores": (k,),
+            "num_points": (k,),
+        }
+        for name, shape in expected.items():
+            value = getattr(self, name)
+            if value is not None and tuple(value.shape) != shape:
+                raise ValueError(f"Boxes3D.{name} must be {list(shape)}, but got {list(value.shape)}")
+
+    def __len__(self) -> int:
+        return self.centers.shape[0]
+
+    @classmethod
+    def empty(cls, device: torch.device | str = "cpu") -> Boxes3D:
+        """No box at all; scores and num_points are present and empty."""
+        floats = {"centers": (0, 3), "sizes": (0, 3), "yaws": (0,), "velocities": (0, 2), "scores": (0,)}
+        integers = ("labels", "attributes", "num_points")
+        return cls(
+            **{name: torch.zeros(shape, device=device) for name, shape in floats.items()},
+            **{name: torch.zeros(0, dtype=torch.int64, device=device) for name in integers},
+        )
+
+    def _map(self, function: object) -> Boxes3D:
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Boxes3D(**{name: None if value is None else function(value) for name, value in values.items()})
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> Boxes3D:
+        """The same boxes on another device."""
+        return self._map(lambda value: value.to(device, non_blocking=non_blocking))
+
+    def pin_memory(self) -> Boxes3D:
+        """The same boxes in page-locked memory."""
+        return self._map(lambda value: value.pin_memory())
+
+    def __getitem__(self, rows: Tensor) -> Boxes3D:
+        """The boxes at `rows` (a boolean mask or indices)."""
+        return self._map(lambda value: value[rows])
+
+    def bev(self) -> Tensor:
+        """Footprints [K, 5]: x, y, length, width, yaw."""
+        return torch.cat([self.centers[:, :2], self.sizes[:, :2], self.yaws[:, None]], dim=1)
+
+    def transform(
+        self,
+        dst_from_src: Tensor,  # [4, 4] rotation, reflection and uniform scale, with translation
+    ) -> Boxes3D:
+        """The boxes seen in another frame whose z axis stays vertical; velocities and sizes take the linear part.
+
+        Spec section 9: sizes are scaled, a heading becomes the direction of its transformed unit vector.
+        """
+        matrix = dst_from_src.to(self.centers.dtype)
+        linear, planar = matrix[:3, :3], matrix[:2, :2]
+        scale = torch.linalg.det(linear).abs() ** (1 / 3)
+        heading = torch.stack([self.yaws.cos(), self.yaws.sin()], dim=1) @ planar.T
+        return replace(
+            self,
+            centers=self.centers @ linear.T + matrix[:3, 3],
+            sizes=self.sizes * scale,
+            yaws=torch.atan2(heading[:, 1], heading[:, 0]),
+            velocities=self.velocities @ planar.T,
+        )

@@ -1,0 +1,64 @@
+"""The set of 2D Gaussians on the BEV plane that the model refines and splats (Eq. 1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+
+class Source(IntEnum):
+    """Where a Gaussian came from."""
+
+    RADAR = 0
+    CAMERA = 1
+    RANDOM = 2
+    HISTORY = 3
+
+
+@dataclass
+class GaussianSet:
+    """G Gaussians for each of B samples (Eq. 1); attributes hold physical values, opacity its logit.
+
+    Rows with `valid` False are padding and never take part in attention, splatting or losses.
+    Raises ValueError when shapes disagree.
+    """
+
+    means: Tensor  # [B, G, 2] m, augmented ego frame
+    scales: Tensor  # [B, G, 2] m, standard deviation along and across `directions`
+    directions: Tensor  # [B, G, 2] (cos, sin) of the rotation, unit length
+    opacity_logits: Tensor  # [B, G]
+    velocities: Tensor  # [B, G, 2] m/s over ground, augmented ego axes
+    features: Tensor  # [B, G, C]
+    sources: Tensor  # [B, G] int64, see Source
+    elapsed_s: Tensor  # [B, G] age of the observation, 0 for the current frame
+    valid: Tensor  # [B, G] bool
+
+    def __post_init__(self) -> None:
+        b, g = self.valid.shape
+        pairs = ("means", "scales", "directions", "velocities")
+        expected = {name: (b, g, 2) for name in pairs}
+        expected |= {name: (b, g) for name in ("opacity_logits", "sources", "elapsed_s")}
+        expected["features"] = (b, g, self.features.shape[-1])
+        for name, shape in expected.items():
+            value = getattr(self, name)
+            if tuple(value.shape) != shape:
+                raise ValueError(f"GaussianSet.{name} must be {list(shape)}, but got {list(value.shape)}")
+        if self.valid.dtype != torch.bool:
+            raise ValueError(f"GaussianSet.valid must be bool, but got {self.valid.dtype}")
+
+    @property
+    def batch_size(self) -> int:
+        """B."""
+        return self.valid.shape[0]
+
+    def __len__(self) -> int:
+        return self.valid.shape[1]
+
+    @staticmethod
+    def concatenate(parts: list[GaussianSet]) -> GaussianSet:
+        """Join sets of the same samples along G."""
+        names = GaussianSet.__dataclass_fields__
+        return GaussianSet(**{name: torch.cat([getattr(part, name) for part in parts], dim=1) for name in names})

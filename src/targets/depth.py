@@ -1,0 +1,88 @@
+"""Linear-increasing depth bins and the painted depth target of the camera branch (spec sections 4.2 and 4.3)."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import torch
+from torch import Tensor
+
+from src.errors import ConfigError
+from src.targets.pairs import enumerate_pairs
+from src.targets.projection import BoxViews
+
+
+class DepthTarget(Enum):
+    """What supervises depth: the centre depth of annotated boxes, or projected lidar points."""
+
+    box = "box"
+    lidar = "lidar"
+
+
+def check_depth_target(depth_target: DepthTarget) -> None:
+    """Raise ConfigError for a target that the batches cannot supply."""
+    if depth_target is not DepthTarget.box:
+        raise ConfigError(
+            f"model.kggi.depth_target={depth_target.value}: frames carry no lidar points in this version, so there is "
+            "nothing to project; use model.kggi.depth_target=box"
+        )
+
+
+def lid_edges(
+    depth_range_m: tuple[float, float],
+    num_bins: int,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> Tensor:  # [num_bins + 1] m
+    """Bin edges e_i = low + delta i (i + 1) / 2 with delta = 2 (high - low) / (n (n + 1)) (section 4.2)."""
+    low, high = depth_range_m
+    number = torch.arange(num_bins + 1, dtype=torch.float64)
+    edges = low + (high - low) * number * (number + 1) / (num_bins * (num_bins + 1))
+    return edges.to(device=device, dtype=dtype)
+
+
+def lid_centres(
+    depth_range_m: tuple[float, float],
+    num_bins: int,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> Tensor:  # [num_bins] m
+    """Mean of the two edges of each bin: the depth a bin stands for."""
+    edges = lid_edges(depth_range_m, num_bins, torch.float64)
+    return (0.5 * (edges[:-1] + edges[1:])).to(device=device, dtype=dtype)
+
+
+def lid_index(
+    depths_m: Tensor,  # [...]
+    depth_range_m: tuple[float, float],
+    num_bins: int,
+) -> Tensor:  # [...] int64
+    """Bin of each depth, lower edge included; -1 outside [low, high), for NaN and for infinity."""
+    edges = lid_edges(depth_range_m, num_bins, depths_m.dtype, depths_m.device)
+    bins = torch.searchsorted(edges, depths_m.contiguous(), right=True) - 1
+    return bins.where((depths_m >= edges[0]) & (depths_m < edges[-1]), -1)
+
+
+def paint_depth(
+    seen: BoxViews,
+    num_views: int,  # B * N
+    image_size_px: tuple[int, int],  # (H, W)
+    depth_range_m: tuple[float, float],
+    num_bins: int,
+    stride_px: int,
+) -> Tensor:  # [B * N, H / stride, W / stride] int64
+    """Depth bin of the nearest box whose clipped 2D hull covers each cell, -1 for background (section 4.3).
+
+    Boxes out of the depth range are painted, too, and leave background: what stands before an object hides it.
+    """
+    rows, cols = image_size_px[0] // stride_px, image_size_px[1] // stride_px
+    limit = seen.hulls_px.new_tensor([cols, rows])
+    low = (seen.hulls_px[:, :2] / stride_px).floor().long()
+    high = torch.minimum((seen.hulls_px[:, 2:] / stride_px).ceil(), limit).long()
+    width, height = (high - low).clamp(min=0).unbind(1)
+    owners, offsets = enumerate_pairs(width * height)
+    row = low[owners, 1] + torch.div(offsets, width[owners], rounding_mode="floor")
+    col = low[owners, 0] + offsets % width[owners]
+    depths = seen.depths_m.new_full((num_views * rows * cols,), torch.inf)
+    depths.scatter_reduce_(0, (seen.views[owners] * rows + row) * cols + col, seen.depths_m[owners], "amin")
+    return lid_index(depths, depth_range_m, num_bins).view(num_views, rows, cols)

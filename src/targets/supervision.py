@@ -1,0 +1,34 @@
+"""Which annotations supervise the model (spec sections 4.3, 7 and 8.2)."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import torch
+from torch import Tensor
+
+from src.geometry.bev_grid import BEVGrid
+from src.structures.boxes import Boxes3D
+
+
+def supervised_boxes(
+    boxes: list[Boxes3D],  # B, augmented ego frame
+    grid: BEVGrid,
+) -> tuple[Boxes3D, Tensor]:  # K boxes of all samples, [K] int64 sample of each, ascending
+    """Join the boxes of a batch that lie in the grid, were seen and have an extent.
+
+    A box without any lidar or radar point (`num_points` 0), with its centre outside the grid, with a value that is
+    not finite (velocities excepted) or with a size of zero supervises nothing. `num_points` None counts as seen.
+    """
+    kept = []
+    for sample in boxes:
+        usable = grid.contains(sample.centers[:, :2]) & (sample.sizes > 0).all(1)
+        values = torch.cat([sample.centers, sample.sizes, sample.yaws[:, None]], dim=1)
+        usable &= values.isfinite().all(1)
+        if sample.num_points is not None:
+            usable &= sample.num_points > 0
+        kept.append(sample[usable])
+    counts = torch.tensor([len(sample) for sample in kept], device=kept[0].centers.device)
+    columns = [field.name for field in fields(Boxes3D) if field.name not in ("scores", "num_points")]
+    joined = Boxes3D(**{name: torch.cat([getattr(sample, name) for sample in kept]) for name in columns})
+    return joined, torch.repeat_interleave(counts)

@@ -1,0 +1,125 @@
+"""One training: Lightning's Trainer with our checkpoints, log and progress bar."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.loggers.logger import Logger
+
+from src.data.datamodule import DetectionDataModule
+from src.errors import InterruptedRunError
+from src.training.checkpoints import AtomicCheckpointIO, read_checkpoint
+from src.training.detection import DetectionModule
+from src.training.metrics_csv import MetricsCSV
+from src.training.run_folder import RunFolder
+
+logger = logging.getLogger(__name__)
+
+
+class LossProgressBar(TQDMProgressBar):
+    """Lightning's bar with the loss terms by their bare names."""
+
+    def get_metrics(self, trainer: L.Trainer, module: L.LightningModule) -> dict[str, int | str | float]:
+        """Terms of the last step, three digits each."""
+        items = super().get_metrics(trainer, module)
+        items.pop("v_num", None)
+        return {
+            name.removeprefix("step/").removeprefix("val/"): f"{value:.3g}" if isinstance(value, float) else value
+            for name, value in items.items()
+        }
+
+
+def build_trainer(
+    folder: RunFolder,
+    *,
+    epochs: int,
+    validate_every: int,
+    precision: str,
+    accelerator: str,
+    devices: int,
+    log_every_steps: int,
+    ema_decay: float | None,
+    loggers: list[Logger],
+) -> L.Trainer:
+    """A Trainer that keeps `last.ckpt` of every epoch and `best.ckpt` by validation mAP in the run's folder."""
+    # Checkpoint names carry no metric: an unquoted `=` in a path cannot be typed after checkpoint=.
+    fixed_name = {"dirpath": folder.checkpoints, "auto_insert_metric_name": False, "enable_version_counter": False}
+    callbacks: list[L.Callback] = [
+        ModelCheckpoint(filename="best", monitor="val/mAP", mode="max", save_top_k=1, **fixed_name),
+        ModelCheckpoint(filename="last", save_top_k=1, save_on_train_epoch_end=True, **fixed_name),
+        LossProgressBar(refresh_rate=10),
+    ]
+    if ema_decay is not None:
+        callbacks.append(EMAWeightAveraging(decay=ema_decay))
+    return L.Trainer(
+        max_epochs=epochs,
+        check_val_every_n_epoch=validate_every,
+        precision=precision,
+        accelerator=accelerator,
+        devices=devices,
+        logger=loggers,
+        callbacks=callbacks,
+        plugins=[AtomicCheckpointIO()],
+        log_every_n_steps=log_every_steps,
+        num_sanity_val_steps=0,
+        use_distributed_sampler=False,  # Lightning's pads validation, so samples would count twice
+        default_root_dir=folder.path,
+        enable_model_summary=False,
+    )
+
+
+def build_loggers(folder: RunFolder, resume_from: Path | None, wandb: dict[str, Any] | None) -> list[Logger]:
+    """metrics.csv always; Weights & Biases where asked for, and a warning instead of a stop when it cannot start."""
+    step = -1 if resume_from is None else int(read_checkpoint(resume_from)["global_step"])
+    loggers: list[Logger] = [MetricsCSV(folder.metrics_csv, resume_step=step)]
+    if wandb is not None:
+        try:
+            from lightning.pytorch.loggers import WandbLogger
+
+            run = WandbLogger(
+                project=wandb["project"],
+                name=folder.run_id,
+                id=folder.run_id,
+                offline=wandb["offline"],
+                save_dir=folder.path,
+                log_model=False,
+            )
+            run.log_hyperparams(wandb["config"])
+            loggers.append(run)
+            if wandb["offline"]:
+                logger.info("W&B is offline; send the run later with: wandb sync %s/wandb/offline-run-*", folder.path)
+        except Exception as error:  # wandb raises its own, varying types; the run must not depend on a web service
+            logger.warning("W&B could not start (%s); the run goes on with %s", error, folder.metrics_csv)
+    return loggers
+
+
+def fit(
+    trainer: L.Trainer, module: DetectionModule, datamodule: DetectionDataModule, resume_from: Path | None
+) -> None:
+    """Train to the last epoch, from `resume_from` where given, then validate the final weights into `module.scores`.
+
+    Raises InterruptedRunError when stopped from outside; the same command then goes on.
+    """
+    try:
+        trainer.fit(module, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
+        trainer.validate(module, datamodule=datamodule, verbose=False)
+    except SystemExit as error:  # Lightning's way to end on Ctrl-C and SIGTERM
+        raise InterruptedRunError("training was stopped; the same command goes on from the last checkpoint") from error
+
+
+def build_evaluation_trainer(precision: str, accelerator: str) -> L.Trainer:
+    """A Trainer that only validates: one device, nothing written."""
+    return L.Trainer(
+        accelerator=accelerator,
+        devices=1,
+        precision=precision,
+        logger=False,
+        enable_checkpointing=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        callbacks=[LossProgressBar(refresh_rate=10)],
+    )

@@ -1,0 +1,80 @@
+"""metrics.csv: one row per logged step or epoch, continued rather than replaced when a run goes on."""
+
+from __future__ import annotations
+
+import csv
+import os
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch.loggers.logger import Logger, rank_zero_experiment
+from lightning.pytorch.utilities import rank_zero_only
+
+
+class MetricsCSV(Logger):
+    """A Lightning logger over one CSV file.
+
+    Lightning's own deletes the file of an earlier start; this one keeps its rows up to the step that the checkpoint
+    resumes from, so the file of an interrupted run equals that of an uninterrupted one.
+    """
+
+    def __init__(self, path: Path, resume_step: int) -> None:
+        super().__init__()
+        self._path = path
+        self._rows: list[dict[str, str]] = []
+        self._columns: list[str] = ["step", "epoch"]
+        self._rewrite = True
+        if path.is_file():
+            with path.open(newline="") as file:
+                for row in csv.DictReader(file):
+                    if row.get("step", "").isdigit() and int(row["step"]) <= resume_step:
+                        self._add({key: value for key, value in row.items() if key and value})
+
+    def _add(self, row: dict[str, str]) -> None:
+        new = [key for key in row if key not in self._columns]
+        self._columns += sorted(new)
+        self._rewrite = self._rewrite or bool(new)
+        self._rows.append(row)
+
+    @property
+    def name(self) -> str:
+        """Name in Lightning's bookkeeping."""
+        return "metrics_csv"
+
+    @property
+    def version(self) -> str:
+        """There is one version per run folder."""
+        return ""
+
+    @property
+    @rank_zero_experiment
+    def experiment(self) -> MetricsCSV:
+        """The logger itself."""
+        return self
+
+    def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
+        """Nothing: config.yaml has them."""
+
+    @rank_zero_only
+    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
+        """Append one row."""
+        row = {key: f"{float(value):.8g}" for key, value in metrics.items() if key != "epoch"}
+        row["step"] = str(step if step is not None else len(self._rows))
+        if "epoch" in metrics:
+            row["epoch"] = str(int(metrics["epoch"]))
+        self._add(row)
+        self._write()
+
+    def _write(self) -> None:
+        """Append the newest row; write the whole file anew when a column was added."""
+        if not self._rewrite:
+            with self._path.open("a", newline="") as file:
+                csv.DictWriter(file, self._columns).writerow(self._rows[-1])
+            return
+        temporary = self._path.with_name(self._path.name + ".tmp")
+        with temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, self._columns)
+            writer.writeheader()
+            writer.writerows(self._rows)
+        os.replace(temporary, self._path)
+        self._rewrite = False

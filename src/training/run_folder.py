@@ -1,0 +1,112 @@
+"""The folder of one run: what it holds, when it counts as finished, and what the same command does again."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+import subprocess
+import time
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from src.errors import CheckpointError, ConfigError
+
+logger = logging.getLogger(__name__)
+
+
+class Resume(Enum):
+    """What happens when the folder of the run exists (the values of `resume`)."""
+
+    auto = "auto"  # go on with an unfinished run, show a finished one
+    never = "never"  # refuse
+    restart = "restart"  # move the old folder aside
+
+
+class RunFolder:
+    """`outputs/<run_id>/`: config.yaml, checkpoints/, metrics.csv, metrics.json, run.json, log.txt, pictures/."""
+
+    def __init__(self, outputs: Path, run_id: str) -> None:
+        self.run_id = run_id
+        self.path = outputs / run_id
+        self.checkpoints = self.path / "checkpoints"
+        self.pictures = self.path / "pictures"
+        self.config = self.path / "config.yaml"
+        self.metrics_csv = self.path / "metrics.csv"
+        self.metrics_json = self.path / "metrics.json"
+        self.record = self.path / "run.json"
+        self.log = self.path / "log.txt"
+        self._lock: Any = None
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has ended and its numbers are written; both files are renamed into place when whole."""
+        return self.record.is_file() and self.metrics_json.is_file()
+
+    def open(self, resume: Resume) -> None:
+        """Make the folder ready to train in, or leave a finished one as it is; see `finished`.
+
+        Raises ConfigError when the run exists and `resume` is `never`, when another process trains it at this
+        moment, or when the folder cannot be written.
+        """
+        if self.path.exists() and resume is Resume.never:
+            raise ConfigError(f"{self.path} exists and resume=never; use resume=auto to go on or resume=restart")
+        if self.path.exists() and resume is Resume.restart:
+            self._acquire()
+            aside = self.path.with_name(f"{self.run_id}.before-{time.strftime('%Y%m%d-%H%M%S')}")
+            self.path.rename(aside)
+            self._release()
+            logger.info("moved the old run to %s", aside)
+        try:
+            self.checkpoints.mkdir(parents=True, exist_ok=True)
+            probe = self.path / ".probe"
+            probe.write_text("")
+            probe.unlink()
+        except OSError as error:
+            raise ConfigError(f"{self.path} cannot be written ({error}); choose another paths.outputs") from error
+        self._acquire()
+
+    def _acquire(self) -> None:
+        self._lock = open(self.path / ".lock", "w")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise ConfigError(f"{self.path} is being trained by another process; wait for it or end it") from error
+
+    def _release(self) -> None:
+        self._lock.close()
+        self._lock = None
+
+    def newest_checkpoint(self) -> Path | None:
+        """The checkpoint an unfinished run goes on from."""
+        last = self.checkpoints / "last.ckpt"
+        return last if last.is_file() else None
+
+    def read_record(self) -> dict[str, Any]:
+        """run.json of a finished run."""
+        try:
+            return json.loads(self.record.read_text())
+        except (OSError, ValueError) as error:
+            raise CheckpointError(f"{self.record} is not readable ({error}); retrain with resume=restart") from error
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a JSON file that is never seen half-written."""
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    os.replace(temporary, path)
+
+
+def current_commit() -> str:
+    """Commit of the code that runs, `+` appended when files differ from it; `unknown` outside a git checkout."""
+    root = Path(__file__).resolve().parents[2]
+    try:
+        commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=True)
+        dirty = subprocess.run(
+            ["git", "status", "--porcelain", "--untracked-files=no"], cwd=root, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return commit.stdout.strip() + ("+" if dirty.stdout.strip() else "")

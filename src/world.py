@@ -1,0 +1,30 @@
+"""`python -m src.world [preview=true] [data.world.*=...]`: write the synthetic highway, or pictures of it."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from src.assembly import data_root
+from src.config import compose_config, run_command
+from src.errors import ConfigError
+from src.pictures.world import draw_world_preview
+
+logger = logging.getLogger(__name__)
+
+
+def main(overrides: list[str]) -> None:
+    """Write the configured world unless it is there; with preview=true draw one picture per scene into out=DIR."""
+    config, _ = compose_config(overrides)
+    if config.data.world is None:
+        raise ConfigError("data.world is null: this configuration reads recorded data, there is no world to write")
+    root = data_root(config)
+    print(f"world: {root}")
+    if config.preview:
+        folder = Path(config.out) if config.out else Path(config.paths.outputs) / "previews" / root.name
+        for path in draw_world_preview(root, folder):
+            print(f"picture: {path}")
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,133 @@
+"""The commands as people type them, at debug scale."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+pytestmark = pytest.mark.slow
+
+
+def command(module, *overrides, expect=0, timeout=240):
+    result = subprocess.run(
+        [sys.executable, "-m", f"src.{module}", *overrides],
+        cwd=ROOT, capture_output=True, text=True, timeout=timeout,
+    )  # fmt: skip
+    assert result.returncode == expect, result.stdout[-3000:] + result.stderr[-3000:]
+    return result
+
+
+@pytest.fixture(scope="module")
+def outputs(tmp_path_factory):
+    return tmp_path_factory.mktemp("outputs")
+
+
+@pytest.fixture(scope="module")
+def trained(outputs):
+    """One debug run, made by the command: (run folder, its output)."""
+    result = command("train", "phase=phase1", "scale=debug", f"paths.outputs={outputs}")
+    (folder,) = outputs.glob("horizon3d-phase1-debug-*")
+    return folder, result
+
+
+def test_train_leaves_everything_that_is_promised(trained):
+    folder, result = trained
+    for name in ("config.yaml", "metrics.json", "metrics.csv", "log.txt", "run.json", "submission.json"):
+        assert (folder / name).is_file(), name
+    assert {p.name for p in (folder / "checkpoints").iterdir()} == {"best.ckpt", "last.ckpt"}
+    assert list((folder / "pictures").glob("frame_*.png"))
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert set(metrics) >= {"mAP", "NDS", "mATE", "mASE", "mAOE", "mAVE", "mAAE", "classes", "ranges", "tags"}
+    assert set(metrics["ranges"]) == {"0-25", "25-50", "50-100", "100-150"} and len(metrics["classes"]) == 12
+    for word in ("mAP", "NDS", "car", "100-150", str(folder)):
+        assert word in result.stdout
+    with (folder / "metrics.csv").open() as file:
+        columns = next(csv.reader(file))
+    for term in ("heatmap", "box", "keypoint", "depth", "radar_objectness", "occupancy_focal", "occupancy_dice", "total"):
+        assert f"loss/{term}" in columns, term
+
+
+def test_the_same_command_shows_the_finished_run(trained, outputs):
+    folder, first = trained
+    before = {p: p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file() and p.name != ".lock"}
+    again = command("train", "phase=phase1", "scale=debug", f"paths.outputs={outputs}")
+    assert "mAP" in again.stdout
+    assert before == {p: p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file() and p.name != ".lock"}
+    command("train", "phase=phase1", "scale=debug", f"paths.outputs={outputs}", "resume=never", expect=3)
+
+
+def test_evaluate_agrees_with_training_from_checkpoint_and_from_file(trained, outputs, tmp_path):
+    folder, _ = trained
+    expected = json.loads((folder / "metrics.json").read_text())
+    checkpoint = folder / "checkpoints" / "last.ckpt"
+    command("evaluate", f"checkpoint={checkpoint}", f"out={tmp_path / 'a'}", f"paths.outputs={outputs}")
+    assert json.loads((tmp_path / "a" / "metrics.json").read_text()) == expected
+    (world,) = (outputs / "worlds").iterdir()
+    command(
+        "evaluate", f"predictions={tmp_path / 'a' / 'submission.json'}", f"data.root={world}",
+        f"out={tmp_path / 'b'}", f"paths.outputs={outputs}",
+    )  # fmt: skip
+    assert json.loads((tmp_path / "b" / "metrics.json").read_text()) == expected
+
+
+def test_evaluate_refuses_what_it_cannot_score(trained, outputs, tmp_path):
+    folder, _ = trained
+    (world,) = (outputs / "worlds").iterdir()
+    base = (f"data.root={world}", f"paths.outputs={outputs}", f"out={tmp_path}")
+    assert "either checkpoint" in command("evaluate", *base, expect=3).stderr
+    assert "does not exist" in command("evaluate", "checkpoint=nothing.ckpt", *base, expect=3).stderr
+    half = tmp_path / "half.ckpt"
+    half.write_bytes((folder / "checkpoints" / "last.ckpt").read_bytes()[:5000])
+    assert "half.ckpt" in command("evaluate", f"checkpoint={half}", *base, expect=3).stderr
+    wrong = tmp_path / "wrong.json"
+    wrong.write_text('{"meta": {}, "results": {}}')
+    assert "wrong.json" in command("evaluate", f"predictions={wrong}", *base, expect=4).stderr
+    other = ("data=truckscenes", f"data.root={tmp_path / 'nowhere'}")
+    assert "nowhere" in command("evaluate", f"predictions={wrong}", *other, f"out={tmp_path}", expect=4).stderr
+
+
+def test_a_killed_run_goes_on_and_ends_with_the_same_weights(outputs, tmp_path):
+    import torch
+
+    changes = ("scale=debug", "phase.epochs=3", "trainer.num_pictures=0", "model.kggi=null", "model.ocsf=null")
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    (world,) = (outputs / "worlds").iterdir()
+    arguments = (*changes, f"data.root={world}")
+    command("train", *arguments, f"paths.outputs={whole}")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "src.train", *arguments, f"paths.outputs={killed}"],
+        cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+    deadline = time.monotonic() + 200
+    while not list(killed.glob("*/checkpoints/last.ckpt")):
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not list(killed.glob("*/metrics.json"))
+    command("train", *arguments, f"paths.outputs={killed}")
+    (a,) = whole.glob("horizon3d-*/checkpoints/last.ckpt")
+    (b,) = killed.glob("horizon3d-*/checkpoints/last.ckpt")
+    first, second = (torch.load(p, weights_only=True)["state_dict"] for p in (a, b))
+    assert first.keys() == second.keys() and all(torch.equal(first[k], second[k]) for k in first)
+    assert (a.parent.parent / "metrics.json").read_text() == (b.parent.parent / "metrics.json").read_text()
+    lines = [(p.parent.parent / "metrics.csv").read_text().splitlines()[0] for p in (a, b)]
+    assert lines[0] == lines[1]
+
+
+def test_world_preview(outputs, tmp_path):
+    result = command("world", "scale=debug", "preview=true", f"paths.outputs={outputs}", f"out={tmp_path}")
+    assert list(tmp_path.glob("*.png")) and "picture:" in result.stdout
+
+
+def test_make_names_its_targets_and_a_wrong_phase():
+    helped = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for target in ("install", "world", "train", "benchmark", "test", "check"):
+        assert f"make {target}" in helped

@@ -1,0 +1,126 @@
+"""Every shipped configuration composes; every mistake is named."""
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from src.config import CONF, compose_config, restore_config, run_identity
+from src.errors import CheckpointError, ConfigError
+
+SCALES = sorted(p.stem for p in (CONF / "scale").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("radar_only", [False, True])
+def test_every_scale_composes(scale, radar_only):
+    overrides = [f"scale={scale}", "data.root=x"] + (["model.kggi=null", "model.ocsf=null"] if radar_only else [])
+    config, tree = compose_config(overrides)
+    assert config.scale == tree["scale"] == scale
+    assert config.model.uses_images is not radar_only
+    # The range and the cell are those of the paper at every scale.
+    assert config.grid.cells == [384, 384] and config.grid.cell_m == 0.8
+
+
+@pytest.mark.parametrize("group", ["backbone", "data", "trainer", "logger"])
+def test_every_choice_composes(group):
+    for path in (CONF / group).glob("*.yaml"):
+        compose_config([f"{group}={path.stem}", "data.root=x"])
+
+
+def test_paper_values():
+    """The bold values of the specification, section 16."""
+    config, _ = compose_config(["scale=paper", "data.root=x"])
+    model = config.model
+    assert config.backbone.name.value == "resnet50" and config.backbone.image_size_px == [256, 864]
+    assert (config.data.batch_size, config.data.num_sweeps, config.phase.epochs) == (8, 10, 24)
+    assert (config.optim.lr, config.optim.weight_decay, config.optim.clip_norm) == (1e-4, 1e-2, 35.0)
+    kggi, ocsf = model.kggi, model.ocsf
+    assert (kggi.num_radar_keypoints, kggi.num_camera_keypoints, kggi.num_random_keypoints) == (1024, 256, 256)
+    assert (ocsf.num_layers, ocsf.num_learnable_points, ocsf.margin_m, ocsf.occupancy_threshold) == (2, 6, 4.8, 0.1)
+    assert (model.loss.kggi_weight, model.loss.ocsf_weight) == (1.0, 5.0)
+    assert config.data.augmentation.image.resize == [-0.06, 0.11]
+    assert config.data.augmentation.bev.rotation_rad == 0.3925
+    vovnet, _ = compose_config(["scale=paper", "data.root=x", "backbone=vovnet99"])
+    assert vovnet.backbone.image_size_px == [640, 960] and vovnet.backbone.lr_multiplier == 0.1
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["phase=phase3"], "phase3.*phase1"),
+        (["scale=huge"], "huge.*mini"),
+        (["model.ocsf.margn_m=4.8"], "margn_m.*did you mean model.ocsf.margin_m"),
+        (["+model.typo=1"], "model.typo is not a configuration key"),
+        (["+model.ocsf.margn_m=1"], "did you mean margin_m"),
+        (["model.ocsf.margin_m=nan"], "model.ocsf.margin_m must be a finite number"),
+        (["model.ocsf.margin_m=-1"], "margin_m"),
+        (["model.ocsf.margin_m=wide"], "margin_m"),
+        (["optim.lr=-1"], "optim.lr must be above 0"),
+        (["optim.betas=[]"], "optim.betas"),
+        (["trainer.devices=0"], "trainer.devices"),
+        (["trainer.devices=3"], "data.batch_size=2.*trainer.devices=3"),
+        (["precision=16"], "precision"),
+        (["resume=maybe"], "resume"),
+        (["--help"], "key=value"),
+        (["model.kggi=null"], "model.kggi.*model.ocsf|model.ocsf.*model.kggi"),
+        (["data.on_bad_file=ignore"], "on_bad_file"),
+        (["data.world.num_train_scenes=-1"], "num_train_scenes"),
+        (["scale=paper"], "data.root has no value"),
+        (["phase.epochs=0"], "phase.epochs"),
+    ],
+)
+def test_mistakes_are_named(overrides, message):
+    with pytest.raises(ConfigError, match=f"(?s){message}"):
+        compose_config(overrides)
+
+
+def test_relations_with_the_grid_are_named():
+    from src.assembly import build_model
+
+    config, _ = compose_config(["scale=debug", "grid.cells=[382,384]"])
+    with pytest.raises(ConfigError, match=r"grid.cells=.*382.*multiple of"):
+        build_model(config)
+    config, _ = compose_config(["scale=debug", "grid.cells=[8,8]", "model.kggi.num_radar_keypoints=100"])
+    with pytest.raises(ConfigError, match="num_radar_keypoints"):
+        build_model(config)
+
+
+def test_run_identity_ignores_what_cannot_change_the_result():
+    def identity(*overrides):
+        return run_identity(compose_config(["scale=debug", *overrides])[1])
+
+    base = identity()
+    assert base.startswith("horizon3d-phase1-debug-") and len(base.rsplit("-", 1)[1]) == 8
+    same = ["paths.outputs=elsewhere", "logger=wandb", "data.num_workers=7", "resume=never", "trainer=cpu", "suite=metric"]
+    for override in same:
+        assert identity(override) == base, override
+    for override in ["seed=1", "optim.lr=1e-3", "model.ocsf.margin_m=0.8", "model.kggi.initialization=random"]:
+        assert identity(override) != base, override
+
+
+def test_a_stored_configuration_comes_back_with_the_command_lines_changes():
+    _, tree = compose_config(["scale=debug", "model.ocsf.margin_m=1.6", "seed=4"])
+    config = restore_config(tree, ["data.split=train", "data.root=/elsewhere"])
+    assert config.model.ocsf.margin_m == 1.6 and config.seed == 4 and config.scale == "debug"
+    assert config.data.split == "train" and config.data.root == "/elsewhere"
+    whole = restore_config(tree, ["data=truckscenes", "data.root=/real"])
+    assert whole.data.world is None and whole.data.version == "v1.2-trainval"
+
+
+@pytest.mark.parametrize("change", [{"model": {"name": "other"}}, {"unknown": 1}, {"seed": math.nan}])
+def test_a_stored_configuration_of_other_code_is_refused(change):
+    _, tree = compose_config(["scale=debug"])
+    with pytest.raises(CheckpointError):
+        restore_config(tree | change, [])
+
+
+def test_exit_code_of_a_configuration_error():
+    root = Path(__file__).resolve().parent.parent
+    result = subprocess.run(
+        [sys.executable, "-m", "src.train", "phase=phase3"], cwd=root, capture_output=True, text=True
+    )
+    assert result.returncode == 3
+    assert "phase3" in result.stderr and "Traceback" not in result.stderr

@@ -1,0 +1,63 @@
+import json
+
+import pytest
+
+from src.errors import CheckpointError, ConfigError
+from src.training.run_folder import Resume, RunFolder, write_json
+
+
+def finish(folder):
+    write_json(folder.metrics_json, {"mAP": 0.5})
+    write_json(folder.record, {"commit": "abc"})
+
+
+def test_a_new_run_is_unfinished_and_a_finished_one_is_kept(tmp_path):
+    folder = RunFolder(tmp_path, "run")
+    folder.open(Resume.auto)
+    assert not folder.finished and folder.newest_checkpoint() is None
+    finish(folder)
+    folder._release()
+    again = RunFolder(tmp_path, "run")
+    again.open(Resume.auto)
+    assert again.finished and again.read_record() == {"commit": "abc"}
+
+
+def test_never_refuses_and_restart_moves_the_old_folder_aside(tmp_path):
+    folder = RunFolder(tmp_path, "run")
+    folder.open(Resume.auto)
+    finish(folder)
+    folder._release()
+    with pytest.raises(ConfigError, match="resume=never"):
+        RunFolder(tmp_path, "run").open(Resume.never)
+    fresh = RunFolder(tmp_path, "run")
+    fresh.open(Resume.restart)
+    assert not fresh.finished
+    (old,) = tmp_path.glob("run.before-*")
+    assert json.loads((old / "metrics.json").read_text()) == {"mAP": 0.5}
+
+
+def test_two_trainings_of_one_run_do_not_mix(tmp_path):
+    folder = RunFolder(tmp_path, "run")
+    folder.open(Resume.auto)
+    with pytest.raises(ConfigError, match="another process"):
+        RunFolder(tmp_path, "run").open(Resume.auto)
+
+
+def test_a_folder_that_cannot_be_written_is_named_before_training(tmp_path):
+    (tmp_path / "outputs").write_text("a file where a folder should be")
+    with pytest.raises(ConfigError, match="paths.outputs"):
+        RunFolder(tmp_path / "outputs", "run").open(Resume.auto)
+
+
+def test_a_broken_record_is_named(tmp_path):
+    folder = RunFolder(tmp_path, "run")
+    folder.open(Resume.auto)
+    folder.record.write_text("{")
+    with pytest.raises(CheckpointError, match=r"run\.json.*resume=restart"):
+        folder.read_record()
+
+
+def test_json_with_nan_is_refused_rather_than_written(tmp_path):
+    with pytest.raises(ValueError):
+        write_json(tmp_path / "x.json", {"mAP": float("nan")})
+    assert not (tmp_path / "x.json").exists()
