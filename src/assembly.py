@@ -8,7 +8,7 @@ from typing import Any
 
 from src.config import Config
 from src.data.datamodule import DetectionDataModule
-from src.data.world.write import WORLD_FILE, ensure_world, world_digest
+from src.data.world.write import ensure_world, world_digest
 from src.errors import ConfigError
 from src.models import build_model as build_model_of
 from src.models.detector import Detector

@@ -14,7 +14,6 @@ import logging
 import math
 import sys
 import traceback
-import typing
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -25,11 +24,10 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from src.data.datamodule import DataConfig
-from src.data.world.config import WorldConfig
 from src.errors import CheckpointError, ConfigError, HorizonError, InterruptedRunError
 from src.geometry.bev_grid import BEVGrid
 from src.models import MODEL_CONFIGS

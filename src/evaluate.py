@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-
 from src.assembly import build_datamodule, build_module, data_root
 from src.config import Config, compose_config, restore_config, run_command
 from src.errors import ConfigError

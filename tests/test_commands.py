@@ -50,7 +50,8 @@ def test_train_leaves_everything_that_is_promised(trained):
         assert word in result.stdout
     with (folder / "metrics.csv").open() as file:
         columns = next(csv.reader(file))
-    for term in ("heatmap", "box", "keypoint", "depth", "radar_objectness", "occupancy_focal", "occupancy_dice", "total"):
+    kggi, ocsf = ("keypoint", "depth", "radar_objectness"), ("occupancy_focal", "occupancy_dice")
+    for term in ("heatmap", "box", *kggi, *ocsf, "total"):
         assert f"loss/{term}" in columns, term
 
 

@@ -94,7 +94,7 @@ def test_run_identity_ignores_what_cannot_change_the_result():
 
     base = identity()
     assert base.startswith("horizon3d-phase1-debug-") and len(base.rsplit("-", 1)[1]) == 8
-    same = ["paths.outputs=elsewhere", "logger=wandb", "data.num_workers=7", "resume=never", "trainer=cpu", "suite=metric"]
+    same = ["paths.outputs=elsewhere", "logger=wandb", "data.num_workers=7", "resume=never", "trainer=cpu"]
     for override in same:
         assert identity(override) == base, override
     for override in ["seed=1", "optim.lr=1e-3", "model.ocsf.margin_m=0.8", "model.kggi.initialization=random"]:

@@ -10,7 +10,6 @@ from torch import Tensor
 from src.losses.classification import FOCAL_ALPHA
 from src.losses.normalizers import full_precision
 from src.ops.splat import log1mexp
-from src.targets.occupancy import cells_are_occupied
 
 MIN_OCCUPANCY = 1e-4
 
@@ -28,7 +27,7 @@ def occupancy_losses(
     focal form is alpha 0.25, gamma 2. A positive cell costs no more than at alpha = 1e-4, without gradient there.
     """
     log_free = full_precision(log_free)
-    target = cells_are_occupied(support, occupied)
+    target = torch.isin(support, occupied, assume_unique=True)
     occupancy = -torch.expm1(log_free)
     reached = log_free.clamp(max=math.log1p(-MIN_OCCUPANCY))
     positive = -FOCAL_ALPHA * torch.exp(2 * reached) * log1mexp(-reached)

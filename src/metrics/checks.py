@@ -21,28 +21,24 @@ def check_predictions(table: DetectionTable, tokens: Sequence[str]) -> None:
 
     Raises DataError naming the sample, the box (counted within the table) and the value.
     """
-    faults = {
-        "sample index": (table.samples, (table.samples < 0) | (table.samples >= len(tokens)), f"0..{len(tokens) - 1}"),
-        "label": (table.labels, (table.labels < 0) | (table.labels >= len(CLASSES)), f"0..{len(CLASSES) - 1}"),
-        "attribute": (
-            table.attributes,
-            (table.attributes < -1) | (table.attributes >= len(ATTRIBUTES)),
-            f"-1..{len(ATTRIBUTES) - 1}",
-        ),
-        "center": (table.centers, ~np.isfinite(table.centers).all(axis=1), "finite"),
-        "size": (table.sizes, ~_all_positive(table.sizes), "finite and positive"),
-        "rotation": (table.rotations, ~_is_direction(table.rotations), "finite and not all zero"),
-        "velocity": (table.velocities, np.isinf(table.velocities).any(axis=1), "finite or NaN"),
-        "score": (table.scores, ~(np.isfinite(table.scores) & (table.scores >= 0)), "finite and at least 0"),
+    valid = {
+        "samples": (_within(table.samples, 0, len(tokens)), f"0..{len(tokens) - 1}"),
+        "labels": (_within(table.labels, 0, len(CLASSES)), f"0..{len(CLASSES) - 1}"),
+        "attributes": (_within(table.attributes, -1, len(ATTRIBUTES)), f"-1..{len(ATTRIBUTES) - 1}"),
+        "centers": (np.isfinite(table.centers), "finite"),
+        "sizes": (np.isfinite(table.sizes) & (table.sizes > 0), "finite and positive"),
+        "rotations": (np.isfinite(np.where(_all_zero(table.rotations), np.nan, table.rotations)), "finite, not all 0"),
+        "velocities": (~np.isinf(table.velocities), "finite or NaN"),
+        "scores": (np.isfinite(table.scores) & (table.scores >= 0), "finite and at least 0"),
     }
-    for name, (values, wrong, expected) in faults.items():
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            sample = int(table.samples[row])
-            token = tokens[sample] if 0 <= sample < len(tokens) else "(none)"
-            raise DataError(
-                f"prediction {row} (sample {token}): {name} must be {expected}, but got {values[row].tolist()}"
-            )
+    for name, (right, expected) in valid.items():
+        if right.all():
+            continue
+        row = int(np.argmin(right.reshape(len(table), -1).all(axis=1)))
+        sample = int(table.samples[row])
+        token = tokens[sample] if 0 <= sample < len(tokens) else "(none)"
+        value = getattr(table, name)[row].tolist()
+        raise DataError(f"prediction {row} (sample {token}): {name} must be {expected}, but got {value}")
     counts = np.bincount(table.samples, minlength=len(tokens))
     if len(table) and counts.max() > MAX_BOXES_PER_SAMPLE:
         worst = int(np.argmax(counts))
@@ -51,13 +47,16 @@ def check_predictions(table: DetectionTable, tokens: Sequence[str]) -> None:
         )
 
 
-def _all_positive(
-    sizes: Array,  # [n, 3]
+def _within(
+    values: Array,  # [n] int
+    low: int,
+    high: int,
 ) -> Array:
-    return (np.isfinite(sizes) & (sizes > 0)).all(axis=1)
+    return (values >= low) & (values < high)
 
 
-def _is_direction(
+def _all_zero(
     rotations: Array,  # [n, 4]
-) -> Array:
-    return np.isfinite(rotations).all(axis=1) & (rotations != 0).any(axis=1)
+) -> Array:  # [n, 1] bool
+    w, x, y, z = rotations.T
+    return ((w == 0) & (x == 0) & (y == 0) & (z == 0))[:, None]

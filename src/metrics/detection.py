@@ -8,11 +8,14 @@ averaged over four thresholds; errors are running means over the matches at 2 m.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
 
-from src.errors import DataError
 from src.metrics.checks import check_predictions
 from src.metrics.curves import (
     RECALLS,
@@ -22,8 +25,8 @@ from src.metrics.curves import (
     mean_error,
     precision_and_confidence,
 )
-from src.metrics.filtering import RANGE_BINS_M, ego_distances, ego_offsets, official_filter
-from src.metrics.matching import Pairs, find_pairs, match_greedily
+from src.metrics.filtering import RANGE_BINS_M, ego_distances, expand_ranges, official_filter
+from src.metrics.ranking import Matching, Ranking, find_candidates, match_predictions, rank_predictions
 from src.metrics.scores import (
     CLASS_WITHOUT_ERRORS,
     DISTANCE_THRESHOLDS_M,
@@ -166,3 +169,114 @@ def _score_tag(ranking: Ranking, matching: Matching, tag: str) -> SubsetScores:
     if tag in TAGS_WITHOUT_SCORE:
         scores.ap, scores.errors = np.full_like(scores.ap, np.nan), np.full_like(scores.errors, np.nan)
     return scores
+
+
+class DetectionMetric(Metric):
+    """Collects the boxes of a validation pass on any number of processes, then scores them.
+
+    A sample that several processes (or a padded batch) saw counts once. Samples that nobody saw are scored as empty,
+    which is the official rule; with `seen_only` they are left out instead, for a pass over part of the split. The
+    result does not depend on who saw what, nor on the order: boxes are scored in the order of the evaluation set.
+    """
+
+    full_state_update = False
+    higher_is_better = True
+    is_differentiable = False
+
+    boxes: list[Tensor]  # each [n, 17] float64, the columns of DetectionTable
+    blocks: list[Tensor]  # each [t, 2] int64: sample, number of its boxes in `boxes`
+
+    def __init__(self, evaluation_set: EvaluationSet, seen_only: bool = False) -> None:
+        super().__init__()
+        self.evaluation_set = evaluation_set
+        self.seen_only = seen_only
+        self.add_state("boxes", default=[], dist_reduce_fx="cat")
+        self.add_state("blocks", default=[], dist_reduce_fx="cat")
+
+    def update(self, tokens: Sequence[str], boxes: DetectionTable | Sequence[DetectionTable]) -> None:
+        """Add the boxes of the samples `tokens`; a sample without boxes is named all the same.
+
+        `boxes` is either one table, whose `samples` say which box is whose, or one table per token.
+        Raises ValueError for a token that is not in the evaluation set, a table per token too many or too few, or
+        boxes of a sample that is not named.
+        """
+        index_of = self.evaluation_set.index_of
+        unknown = [token for token in tokens if token not in index_of]
+        if unknown:
+            raise ValueError(f"sample {unknown[0]!r} is not one of the {len(index_of)} of the evaluation set")
+        samples = [index_of[token] for token in tokens]
+        if isinstance(boxes, DetectionTable):
+            stray = set(boxes.samples.tolist()) - set(samples)
+            if stray:
+                raise ValueError(f"boxes of sample {min(stray)}, but this update names only the samples {samples}")
+            boxes = [boxes[boxes.samples == sample] for sample in samples]
+        rows = [_as_rows(sample, table) for sample, table in zip(samples, boxes, strict=True)]
+        counts = [[sample, len(of_sample)] for sample, of_sample in zip(samples, rows, strict=True)]
+        if counts:
+            self.boxes.append(torch.from_numpy(np.concatenate(rows)).to(self.device))
+            self.blocks.append(torch.tensor(counts, dtype=torch.int64, device=self.device))
+
+    def sync(self, *args: object, **kwargs: object) -> None:
+        """Gather from all processes; one that saw nothing still states the shape and type of what it has not."""
+        self.boxes.append(torch.zeros(0, _NUM_COLUMNS, dtype=torch.float64, device=self.device))
+        self.blocks.append(torch.zeros(0, 2, dtype=torch.int64, device=self.device))
+        super().sync(*args, **kwargs)
+
+    def compute(self) -> DetectionScores:
+        """Scores of everything collected so far.
+
+        Raises DataError for boxes that cannot be scored, with the sample's token.
+        """
+        predictions, seen = self.collected()
+        return score_detections(self.evaluation_set, predictions, seen if self.seen_only else None)
+
+    def collected(self) -> tuple[DetectionTable, Array]:
+        """The boxes so far, each sample once and in the order of the evaluation set, and which samples those are.
+
+        Within `compute` and a `sync_context` these are the boxes of all processes, otherwise of this one.
+        """
+        seen = np.zeros(len(self.evaluation_set.tokens), dtype=bool)
+        if not len(self.blocks):
+            return DetectionTable.empty(), seen
+        blocks = dim_zero_cat(self.blocks).cpu().numpy()
+        ends = np.cumsum(blocks[:, 1])
+        samples, first = np.unique(blocks[:, 0], return_index=True)
+        _, rows = expand_ranges((ends - blocks[:, 1])[first], ends[first])
+        seen[samples] = True
+        return _from_rows(dim_zero_cat(self.boxes).cpu().numpy()[rows]), seen
+
+
+_COLUMNS = {
+    "samples": 1,
+    "labels": 1,
+    "centers": 3,
+    "sizes": 3,
+    "rotations": 4,
+    "velocities": 2,
+    "attributes": 1,
+    "scores": 1,
+    "num_points": 1,
+}
+_NUM_COLUMNS = sum(_COLUMNS.values())
+
+
+def _as_rows(sample: int, table: DetectionTable) -> Array:
+    """The table as [n, 17] float64, which holds every index exactly, with `sample` as the sample of each box."""
+    columns = [
+        getattr(table, name).reshape(len(table), width).astype(np.float64) for name, width in _COLUMNS.items()
+    ]
+    columns[0] = np.full((len(table), 1), float(sample))
+    return np.concatenate(columns, axis=1)
+
+
+def _from_rows(
+    rows: Array,  # [n, 17] float64
+) -> DetectionTable:
+    columns, start = {}, 0
+    for name, width in _COLUMNS.items():
+        part = rows[:, start : start + width]
+        columns[name] = part if width > 1 else part[:, 0]
+        if name in ("samples", "labels", "attributes", "num_points"):
+            columns[name] = columns[name].astype(np.int64)
+        start += width
+    return DetectionTable(**columns)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from src.geometry.transforms import quaternion_to_matrix
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import CLASS_RANGE_M, CLASSES
 
@@ -17,12 +18,10 @@ _CYCLES = (CLASSES.index("bicycle"), CLASSES.index("motorcycle"))
 
 def ego_distances(evaluation_set: EvaluationSet, table: DetectionTable) -> Array:
     """Distance in the ground plane from each box to the ego of its sample: [n] metres."""
-    return np.sqrt(np.square(ego_offsets(evaluation_set, table)).sum(axis=1))
-
-
-def ego_offsets(evaluation_set: EvaluationSet, table: DetectionTable) -> Array:
-    """Box centre minus ego position of its sample, global axes: [n, 2] metres."""
-    return table.centers[:, :2] - evaluation_set.ego_centers[table.samples, :2]
+    ego = evaluation_set.ego_centers
+    x = table.centers[:, 0] - ego[table.samples, 0]
+    y = table.centers[:, 1] - ego[table.samples, 1]
+    return np.sqrt(x * x + y * y)
 
 
 def official_filter(
@@ -52,7 +51,7 @@ def _inside_rack(boxes: DetectionTable, racks: DetectionTable) -> Array:
     pairs_box, pairs_rack = join_sorted(boxes.samples, racks.samples[order])
     rack = racks[order[pairs_rack]]
     width, length, height = rack.sizes.T
-    axes = rotation_matrices(rack.rotations)  # [p, 3, 3]
+    axes = quaternion_to_matrix(rack.rotations)  # [p, 3, 3]
     half = np.stack([length, width, height], axis=1) / 2
     signs = {"corner": (1, 1, 1), "x": (-1, 1, 1), "y": (1, -1, 1), "z": (1, 1, -1)}
     corners = {name: np.einsum("pij,pj->pi", axes, half * sign) + rack.centers for name, sign in signs.items()}
@@ -84,17 +83,3 @@ def expand_ranges(
     rows = np.repeat(np.arange(len(counts)), counts)
     before = np.cumsum(counts) - counts
     return rows, np.arange(len(rows)) + (starts - before)[rows]
-
-
-def rotation_matrices(
-    quaternions: Array,  # [n, 4] (w, x, y, z), any non-zero length
-) -> Array:
-    """Rotation matrices [n, 3, 3] of quaternions, which are normalised first; all zeros where the quaternion is."""
-    norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    w, x, y, z = (quaternions / np.where(norms > 0, norms, 1.0)).T
-    rows = [
-        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
-    ]
-    return np.array(rows).reshape(3, 3, -1).transpose(2, 0, 1)

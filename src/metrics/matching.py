@@ -51,7 +51,8 @@ def find_pairs(
         return Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
     stripe_m = radius_m * 1.0025  # wider than the radius by more than any rounding of x
     low = min(prediction_offsets.min(), truth_offsets.min())
-    num_stripes = int((max(prediction_offsets.max(), truth_offsets.max()) - low) / stripe_m) + 3  # one spare at each end
+    high = max(prediction_offsets.max(), truth_offsets.max())
+    num_stripes = int((high - low) / stripe_m) + 3  # one spare at each end
 
     def keys(groups: Array, offsets: Array) -> Array:
         return groups * num_stripes + ((offsets - low) / stripe_m).astype(np.int64) + 1

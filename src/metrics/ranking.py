@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from src.errors import DataError
-from src.metrics.filtering import ego_offsets
 from src.metrics.matching import Pairs, find_pairs, match_greedily
 from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERROR_THRESHOLD_M, ERRORS
 from src.structures.detections import DetectionTable, EvaluationSet
@@ -43,7 +42,13 @@ class Matching:
     errors: Array  # [m at 2 m, 5]
 
 
-def rank_predictions(evaluation_set: EvaluationSet, predictions: DetectionTable, kept: Array, truth_kept: Array) -> Ranking:
+def rank_predictions(
+    evaluation_set: EvaluationSet,
+    predictions: DetectionTable,
+    kept: Array,  # [n] bool, predictions that count
+    truth_kept: Array,  # [k] bool, ground truth that counts
+) -> Ranking:
+    """Put the predictions that count into the order in which they are matched."""
     rows = np.flatnonzero(kept)
     # Reversed ascending stable order: descending scores, and the later in the file first among equal ones.
     rows = rows[np.argsort(predictions.scores[rows], kind="stable")[::-1]]
@@ -68,23 +73,29 @@ def rank_predictions(evaluation_set: EvaluationSet, predictions: DetectionTable,
 
 def find_candidates(ranking: Ranking) -> Pairs:
     """Pairs of one sample and class nearer than the largest threshold; rows count within `ranking`."""
-    predictions, truth = ranking.predictions, ranking.evaluation_set.ground_truth
+    truth, ego_x = ranking.evaluation_set.ground_truth, ranking.evaluation_set.ego_centers[:, 0]
     in_file_order = np.argsort(ranking.rows)  # neighbours in the file share a sample, hence memory
-    rows = ranking.rows[in_file_order]
+    xy = ranking.predictions.centers[ranking.rows[in_file_order], :2]
+    samples = ranking.samples[in_file_order]
+    truth_xy = truth.centers[ranking.truth_rows, :2]
     return find_pairs(
-        prediction_groups=ranking.samples[in_file_order] * len(CLASSES) + ranking.labels[in_file_order],
-        prediction_xy=predictions.centers[rows, :2],
-        prediction_offsets=ego_offsets(ranking.evaluation_set, predictions)[rows, 0],
+        prediction_groups=samples * len(CLASSES) + ranking.labels[in_file_order],
+        prediction_xy=xy,
+        prediction_offsets=xy[:, 0] - ego_x[samples],
         prediction_places=in_file_order,
         truth_groups=ranking.truth_samples * len(CLASSES) + ranking.truth_labels,
-        truth_xy=truth.centers[ranking.truth_rows, :2],
-        truth_offsets=ego_offsets(ranking.evaluation_set, truth)[ranking.truth_rows, 0],
+        truth_xy=truth_xy,
+        truth_offsets=truth_xy[:, 0] - ego_x[ranking.truth_samples],
         num_groups=len(ranking.evaluation_set.tokens) * len(CLASSES),
         radius_m=max(DISTANCE_THRESHOLDS_M),
     )
 
 
 def match_predictions(ranking: Ranking, pairs: Pairs) -> Matching:
+    """Match at each threshold among `pairs`, and measure the matches at 2 m.
+
+    Raises DataError when matched ground truth has a size that is not positive, as the official evaluator does.
+    """
     places, errors = [], np.zeros((0, len(ERRORS)))
     for threshold in DISTANCE_THRESHOLDS_M:
         near = pairs[pairs.distances < threshold]

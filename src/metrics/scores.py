@@ -91,6 +91,11 @@ class DetectionScores:
     truth_kept: Array  # [k] bool, ground truth that survives the official filters
     predictions_kept: Array  # [n] bool
 
+    def headline(self) -> dict[str, float]:
+        """mAP, NDS and the five mean errors over everything."""
+        errors = zip(ERRORS, self.overall.mean_errors.tolist(), strict=True)
+        return {"mAP": self.overall.mean_ap, "NDS": self.overall.nds} | {f"m{name}": value for name, value in errors}
+
     def as_dict(self) -> dict[str, object]:
         """The content of metrics.json: fractions of 1, None where a number is undefined."""
         return self.overall.as_dict() | {

@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from src.errors import DataError
+from src.geometry.transforms import matrix_to_quaternion
 from src.metrics.checks import check_predictions
+from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
 from src.structures.taxonomy import ATTRIBUTES, CLASSES, MAX_BOXES_PER_SAMPLE
 
@@ -25,6 +27,8 @@ _LABELS = {name: row for row, name in enumerate(CLASSES)}
 _ATTRIBUTES = {name: row for row, name in enumerate(ATTRIBUTES)} | {"": -1}
 _WIDTHS = {"translation": 3, "size": 3, "rotation": 4, "velocity": 2}
 _NUMBERS = {int, float}
+
+Array = np.ndarray
 
 
 def load_submission(path: Path | str, tokens: Sequence[str]) -> DetectionTable:
@@ -256,3 +260,37 @@ def _complete_meta(meta: Mapping[str, bool | str]) -> dict[str, bool | str]:
         if type(value) is not type(complete[name]):
             raise DataError(f"meta.{name} must be {type(complete[name]).__name__}, but got {_short(value)}")
     return complete | dict(meta)
+
+
+def to_global(
+    boxes: Boxes3D,
+    global_from_ego: Array,  # [4, 4] float64 rotation and translation
+    sample: int,
+) -> DetectionTable:
+    """Boxes of one sample, given in its ego frame, as rows of a table in the global frame.
+
+    All arithmetic is float64; a box keeps its heading within the ego's ground plane, tilted with the ego. Boxes
+    without scores get 0, without point counts -1.
+    """
+    values = {name: getattr(boxes, name) for name in ("centers", "sizes", "yaws", "velocities", "scores", "num_points")}
+    columns = {name: None if v is None else v.detach().cpu().double().numpy() for name, v in values.items()}
+    rotation, position = global_from_ego[:3, :3].astype(np.float64), global_from_ego[:3, 3].astype(np.float64)
+    n = len(boxes)
+    cosine, sine = np.cos(columns["yaws"]), np.sin(columns["yaws"])
+    turns = np.zeros((n, 3, 3))
+    turns[:, 0, 0] = turns[:, 1, 1] = cosine
+    turns[:, 0, 1], turns[:, 1, 0] = -sine, sine
+    turns[:, 2, 2] = 1.0
+    return DetectionTable(
+        samples=np.full(n, sample, dtype=np.int64),
+        labels=boxes.labels.cpu().numpy().astype(np.int64),
+        centers=columns["centers"] @ rotation.T + position,
+        sizes=columns["sizes"][:, [1, 0, 2]],
+        rotations=matrix_to_quaternion(rotation @ turns),
+        velocities=columns["velocities"] @ rotation[:2, :2].T,
+        attributes=boxes.attributes.cpu().numpy().astype(np.int64),
+        scores=np.zeros(n) if columns["scores"] is None else columns["scores"],
+        num_points=np.full(n, -1, dtype=np.int64)
+        if columns["num_points"] is None
+        else columns["num_points"].astype(np.int64),
+    )

@@ -1,0 +1,23 @@
+"""Detectors. The one table: a model's name in the configuration, its settings, its class."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.image import ImageEncoderConfig
+from src.models.detector import Detector
+from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
+
+MODEL_CONFIGS: dict[str, type[Any]] = {"horizon3d": Horizon3DConfig}
+MODELS: dict[type[Any], type[Detector]] = {Horizon3DConfig: Horizon3D}
+
+
+def build_model(
+    config: Any,  # noqa: ANN401 (an instance of one of MODEL_CONFIGS)
+    grid: BEVGrid,
+    backbone: ImageEncoderConfig | None,
+    velocity_code_weight: float,
+) -> Detector:
+    """The detector that a configuration asks for, with fresh weights. Raises ConfigError when its parts do not fit."""
+    return MODELS[type(config)](config, grid, backbone, velocity_code_weight)

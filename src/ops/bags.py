@@ -1,13 +1,15 @@
-"""Segment sums over rows of a table: deterministic, and without a tensor of one row per pair."""
+"""Segment sums over the rows of a table: deterministic, and without a tensor that holds one row per pair."""
 
 from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd.function import FunctionCtx
 
-# Pairs multiplied at a time in `row_products`; bounds its memory.
-CHUNK = 16384
+# Pairs multiplied at a time in `row_products`: cache-sized on a CPU, few launches on a GPU.
+CPU_CHUNK = 1024
+GPU_CHUNK = 65536
 
 
 def bags(
@@ -26,10 +28,82 @@ def bag_sum(
     starts: Tensor,  # [bags + 1], same type: first pair of each bag
     weights: Tensor | None = None,  # [pairs]
 ) -> Tensor:  # [bags, C]
-    """(Weighted) sum of the picked rows of every bag; 0 for an empty bag."""
+    """(Weighted) sum of the picked rows of every bag, 0 for an empty bag. Without gradient."""
     if len(picks) == 0:
         return values.new_zeros(len(starts) - 1, values.shape[1])
     return F.embedding_bag(picks, values, starts, mode="sum", include_last_offset=True, per_sample_weights=weights)
+
+
+def segment_sum(
+    values: Tensor,  # [n, C]
+    rows: Tensor,  # [n] int64
+    num_rows: int,
+) -> Tensor:  # [num_rows, C]
+    """Sum of the values that share a row, in their order of appearance; rows nobody names are 0. Differentiable."""
+    return _SegmentSum.apply(values, rows, num_rows)
+
+
+def segment_mean(
+    values: Tensor,  # [n, C]
+    rows: Tensor,  # [n] int64
+    num_rows: int,
+) -> Tensor:  # [num_rows, C]
+    """Mean of the values that share a row; rows nobody names are 0. Differentiable."""
+    counts = torch.bincount(rows, minlength=num_rows).clamp(min=1)
+    return segment_sum(values, rows, num_rows) / counts[:, None].to(values.dtype)
+
+
+class _SegmentSum(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: FunctionCtx, values: Tensor, rows: Tensor, num_rows: int) -> Tensor:
+        ctx.save_for_backward(rows)
+        return bag_sum(values, *bags(rows, num_rows))
+
+    @staticmethod
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None, None]:
+        (rows,) = ctx.saved_tensors
+        return F.embedding(rows, grad.contiguous()), None, None
+
+
+def weighted_bag(
+    values: Tensor,  # [n, C]
+    weights: Tensor,  # [pairs]
+    picks: Tensor,  # [pairs] int64, row of `values`
+    bag: Tensor,  # [pairs] int64, ascending
+    num_bags: int,
+    by_pick: Tensor | None = None,  # [pairs] int64, the pairs ordered by `picks`, where the caller knows it
+) -> Tensor:  # [num_bags, C]
+    """Weighted sum of the picked rows of every bag, differentiable in the values and in the weights."""
+    return _WeightedBag.apply(values, weights, picks, bag, num_bags, by_pick)
+
+
+class _WeightedBag(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: FunctionCtx,
+        values: Tensor,
+        weights: Tensor,
+        picks: Tensor,
+        bag: Tensor,
+        num_bags: int,
+        by_pick: Tensor | None,
+    ) -> Tensor:
+        ctx.save_for_backward(values, weights, picks, bag)
+        ctx.by_pick = by_pick
+        return bag_sum(values, picks, _starts(bag, num_bags), weights)
+
+    @staticmethod
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None, None]:
+        values, weights, picks, bag = ctx.saved_tensors
+        grad = grad.contiguous()
+        grad_values = grad_weights = None
+        if ctx.needs_input_grad[0]:
+            order = torch.argsort(picks, stable=True) if ctx.by_pick is None else ctx.by_pick
+            back, turned = bag.index_select(0, order), weights.index_select(0, order)
+            grad_values = bag_sum(grad, back, _starts(picks, len(values)), turned)
+        if ctx.needs_input_grad[1]:
+            grad_weights = row_products(grad, bag, values, picks)
+        return grad_values, grad_weights, None, None, None, None
 
 
 def row_products(
@@ -40,7 +114,16 @@ def row_products(
 ) -> Tensor:  # [pairs]
     """Scalar products of paired rows, a chunk of pairs at a time."""
     out = a.new_empty(len(rows_a))
-    for start in range(0, len(rows_a), CHUNK):
-        span = slice(start, start + CHUNK)
+    chunk = CPU_CHUNK if a.device.type == "cpu" else GPU_CHUNK
+    for start in range(0, len(rows_a), chunk):
+        span = slice(start, start + chunk)
         out[span] = (F.embedding(rows_a[span], a) * F.embedding(rows_b[span], b)).sum(1)
     return out
+
+
+def _starts(
+    rows: Tensor,  # [pairs] int64, any order
+    num_rows: int,
+) -> Tensor:  # [num_rows + 1] int64
+    """Where each row's pairs begin once the pairs are ordered by row."""
+    return F.pad(torch.bincount(rows, minlength=num_rows).cumsum(0), (1, 0))

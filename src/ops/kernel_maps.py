@@ -144,7 +144,7 @@ def _build_strided(
         valid = valid.unsqueeze(-2) & fits
     num = len(sites)
     hits = valid.reshape(-1).nonzero().squeeze(1)
-    counts = valid.reshape(-1, num).sum(1).tolist()
+    counts = valid.flatten(0, -2).sum(1).tolist()
     out.keys, outputs = torch.unique(targets.reshape(-1).index_select(0, hits), return_inverse=True)
     inputs = torch.remainder(hits, max(num, 1)).to(torch.int32)
     return KernelMap(inputs, outputs.to(torch.int32), tuple(counts), num, len(out)), out

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd.function import FunctionCtx
 
 from src.ops.backend import implementation, register
 from src.ops.bags import bag_sum
@@ -13,7 +14,8 @@ from src.ops.sites import Sites, union
 
 __all__ = ["KernelMap", "Sites", "sparse_conv", "strided_map", "submanifold_map", "temporal_map", "union"]
 
-GROUPED_DTYPES = (torch.float32, torch.bfloat16, torch.float16)
+# Types of the grouped product, one kernel launch for all offsets; others, and torch without it, go offset by offset.
+GROUPED_DTYPES = (torch.float32, torch.bfloat16, torch.float16) if hasattr(F, "grouped_mm") else ()
 
 
 def sparse_conv(
@@ -54,7 +56,7 @@ class _SparseConv(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: torch.autograd.function.FunctionCtx,
+        ctx: FunctionCtx,
         features: Tensor,
         weight: Tensor,
         bias: Tensor | None,
@@ -67,9 +69,7 @@ class _SparseConv(torch.autograd.Function):
         return out if bias is None else out.add_(bias)
 
     @staticmethod
-    def backward(
-        ctx: torch.autograd.function.FunctionCtx, grad: Tensor
-    ) -> tuple[Tensor | None, Tensor | None, Tensor | None, None]:
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, Tensor | None, None]:
         features, weight = ctx.saved_tensors
         maps: KernelMap = ctx.kernel_map
         grad = grad.contiguous()

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd.function import FunctionCtx
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import window_cells
 from src.ops.backend import implementation, register
-from src.ops.bags import bag_sum, row_products
+from src.ops.bags import bag_sum, weighted_bag
 from src.ops.sites import Sites
 
 # A contribution is at most 1 - CAP, so that the logarithm of the free probability stays finite.
@@ -25,7 +26,8 @@ WINDOW_SLACK_CELLS = 1e-3
 class Splat:
     """What a set of Gaussians does to the cells of a batch of grids.
 
-    The support are the cells that at least one Gaussian reaches; everywhere else alpha = 0 and S = 0. Linear keys are (batch * rows + row) * cols + col.
+    The support are the cells that at least one Gaussian reaches; everywhere else alpha = 0 and S = 0.
+    Linear keys are (batch * rows + row) * cols + col.
     """
 
     support: Tensor  # [n] int64 linear keys, sorted
@@ -77,8 +79,8 @@ def splat_gaussians(
 
     k_i(p) = exp(-q/2) within `support_sigmas`, else 0; a_i = sigmoid(o_i) k_i, at most 1 - 1e-4; S = sum log(1 - a_i);
     alpha = 1 - exp(S); Omega = {alpha > threshold}; F_G(p) = sum k_i(p) f_i on Omega. At most `max_cells` cells a
-    sample stay in Omega, the most occupied ones. The hard cap stops the gradient of a contribution it binds for; `smooth_cap`
-    adds 1e-4 to -log a instead, which moves alpha by up to 1e-4 and keeps every gradient alive.
+    sample stay in Omega, the most occupied ones. The hard cap stops the gradient of a contribution it binds for;
+    `smooth_cap` adds 1e-4 to -log a instead, which moves alpha by up to 1e-4 and keeps every gradient alive.
 
     Gradients of `log_free` and `features` reach all five float inputs; Omega is a constant set. Computed in float32
     (float64 for float64 inputs) whatever autocast says, the same on every run. Gaussians of different samples never
@@ -116,6 +118,7 @@ class _Pairs:
     cell: Tensor  # [pairs] int64, row in the support, ascending
     delta: Tensor  # [pairs, 2] cell centre - mean, metres
     q: Tensor  # [pairs] squared Mahalanobis distance
+    in_turn: Tensor  # [pairs] int64, 0, 1, 2, ...
     cell_starts: Tensor  # [n + 1] int64, first pair of each support cell
     by_gaussian: Tensor  # [pairs] int64, pairs in the order of the Gaussians
     gaussian_starts: Tensor  # [G + 1] int64, first place of each Gaussian in by_gaussian
@@ -123,7 +126,13 @@ class _Pairs:
 
 @torch.no_grad()
 def _gaussian_cells(
-    means: Tensor, scales: Tensor, directions: Tensor, batch: Tensor, grid: BEVGrid, support_sigmas: float
+    means: Tensor,
+    scales: Tensor,
+    directions: Tensor,
+    batch: Tensor,
+    grid: BEVGrid,
+    batch_size: int,
+    support_sigmas: float,
 ) -> tuple[_Pairs, Tensor]:
     """All pairs with q <= support_sigmas^2, and the linear keys [n] of the cells they reach."""
     squares, turned = scales.square(), directions.square()
@@ -144,10 +153,13 @@ def _gaussian_cells(
 
     gaussian = gaussian.index_select(0, near)
     linear = (batch.index_select(0, gaussian) * grid.rows + row.index_select(0, near)) * grid.cols
-    linear, order = torch.sort(linear + col.index_select(0, near), stable=True)
+    linear = linear + col.index_select(0, near)
+    num_cells = batch_size * grid.rows * grid.cols
+    linear, order = torch.sort(linear.to(torch.int32 if num_cells < 2**31 else torch.int64), stable=True)
     support, cell, sizes = torch.unique_consecutive(linear, return_inverse=True, return_counts=True)
     by_gaussian = torch.empty_like(order)
-    by_gaussian[order] = torch.arange(len(order), device=order.device)
+    in_turn = torch.arange(len(order), device=order.device)
+    by_gaussian[order] = in_turn
     counts = torch.bincount(gaussian, minlength=len(means))
     near = near.index_select(0, order)
     pairs = _Pairs(
@@ -155,11 +167,12 @@ def _gaussian_cells(
         cell=cell,
         delta=torch.stack([delta_x.index_select(0, near), delta_y.index_select(0, near)], 1),
         q=q.index_select(0, near),
+        in_turn=in_turn,
         cell_starts=F.pad(sizes.cumsum(0), (1, 0)),
         by_gaussian=by_gaussian,
         gaussian_starts=F.pad(counts.cumsum(0), (1, 0)),
     )
-    return pairs, support
+    return pairs, support.long()
 
 
 class _LogFree(torch.autograd.Function):
@@ -167,7 +180,7 @@ class _LogFree(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: torch.autograd.function.FunctionCtx,
+        ctx: FunctionCtx,
         q: Tensor,
         opacity_logits: Tensor,
         pairs: _Pairs,
@@ -180,10 +193,10 @@ class _LogFree(torch.autograd.Function):
             surprise = surprise.clamp(min=-math.log1p(-CAP))
         ctx.save_for_backward(surprise, opacity_logits)
         ctx.pairs, ctx.smooth_cap = pairs, smooth_cap
-        return _segment_sum(log1mexp(surprise), pairs.cell_starts)
+        return bag_sum(log1mexp(surprise)[:, None], pairs.in_turn, pairs.cell_starts).squeeze(1)
 
     @staticmethod
-    def backward(ctx: torch.autograd.function.FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
         surprise, opacity_logits = ctx.saved_tensors
         pairs: _Pairs = ctx.pairs
         slope = grad.index_select(0, pairs.cell) / torch.expm1(surprise)  # d log(1 - a) / d(-log a) = a / (1 - a)
@@ -198,7 +211,7 @@ class _Distance(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: torch.autograd.function.FunctionCtx,
+        ctx: FunctionCtx,
         means: Tensor,
         scales: Tensor,
         directions: Tensor,
@@ -209,7 +222,7 @@ class _Distance(torch.autograd.Function):
         return pairs.q.clone()
 
     @staticmethod
-    def backward(ctx: torch.autograd.function.FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
         scales, directions = ctx.saved_tensors
         pairs: _Pairs = ctx.pairs
         cosine, sine, size_x, size_y = torch.cat([directions, scales], 1).index_select(0, pairs.gaussian).unbind(1)
@@ -235,38 +248,6 @@ class _Distance(torch.autograd.Function):
         return grad_means, -sums[:, 2:4] / scales, sums[:, 4:6], None
 
 
-class _WeightedBag(torch.autograd.Function):
-    """F_G (Eq. 6): the kernel-weighted sum of features per cell; no pairs x C tensor is ever stored."""
-
-    @staticmethod
-    def forward(
-        ctx: torch.autograd.function.FunctionCtx,
-        features: Tensor,  # [G, C]
-        kernel: Tensor,  # [kept pairs]
-        gaussian: Tensor,  # [kept pairs], in the order of the cells
-        cell: Tensor,  # [kept pairs], occupied row, ascending
-        starts: Tensor,  # [w + 1]
-        by_gaussian: Tensor,  # [kept pairs]
-        gaussian_starts: Tensor,  # [G + 1]
-    ) -> Tensor:
-        ctx.save_for_backward(features, kernel, gaussian, cell, by_gaussian, gaussian_starts)
-        return bag_sum(features, gaussian, starts, kernel)
-
-    @staticmethod
-    def backward(
-        ctx: torch.autograd.function.FunctionCtx, grad: Tensor
-    ) -> tuple[Tensor | None, Tensor | None, None, None, None, None, None]:
-        features, kernel, gaussian, cell, by_gaussian, gaussian_starts = ctx.saved_tensors
-        grad = grad.contiguous()
-        grad_features = grad_kernel = None
-        if ctx.needs_input_grad[0]:
-            cells, weights = cell.index_select(0, by_gaussian), kernel.index_select(0, by_gaussian)
-            grad_features = bag_sum(grad, cells, gaussian_starts, weights)
-        if ctx.needs_input_grad[1]:
-            grad_kernel = row_products(grad, cell, features, gaussian)
-        return grad_features, grad_kernel, None, None, None, None, None
-
-
 @register("splat", "reference")
 def splat_reference(
     means: Tensor,
@@ -283,35 +264,32 @@ def splat_reference(
     smooth_cap: bool,
 ) -> Splat:
     """Plain torch form over ragged (Gaussian, cell) pairs; arguments as `splat_gaussians`."""
-    pairs, support = _gaussian_cells(means, scales, directions, batch, grid, support_sigmas)
+    pairs, support = _gaussian_cells(means, scales, directions, batch, grid, batch_size, support_sigmas)
     q = _Distance.apply(means, scales, directions, pairs)
     log_free = _LogFree.apply(q, opacity_logits, pairs, smooth_cap)
     occupied_rows, num_cut = _occupied(log_free.detach(), support, threshold, max_cells, grid.rows * grid.cols)
 
-    # Pairs of the occupied cells, in both orders.
+    # Pairs of the occupied cells, and their order by Gaussian.
     place = torch.full_like(support, -1)
     place[occupied_rows] = torch.arange(len(occupied_rows), device=place.device)
     cell = place.index_select(0, pairs.cell)
     kept = cell >= 0
     chosen = kept.nonzero().squeeze(1)
     gaussian, cell = pairs.gaussian.index_select(0, chosen), cell.index_select(0, chosen)
-    kept_in_turn = kept.index_select(0, pairs.by_gaussian)
-    rank = kept.cumsum(0) - 1
-    by_gaussian = rank.index_select(0, pairs.by_gaussian[kept_in_turn])
-    counts = torch.bincount(gaussian, minlength=len(means))
-    gaussian_starts = F.pad(counts.cumsum(0), (1, 0))
-    starts = F.pad(torch.bincount(cell, minlength=len(occupied_rows)).cumsum(0), (1, 0))
+    rank = (kept.cumsum(0) - 1).index_select(0, pairs.by_gaussian)
+    by_gaussian = rank[kept.index_select(0, pairs.by_gaussian)]
     distance = q.index_select(0, chosen)
-    out = _WeightedBag.apply(features, torch.exp(-0.5 * distance), gaussian, cell, starts, by_gaussian, gaussian_starts)
+    out = weighted_bag(features, torch.exp(-0.5 * distance), gaussian, cell, len(occupied_rows), by_gaussian)
     keys = support.index_select(0, occupied_rows)
+    peak_cell = _nearest_cell(distance.detach(), gaussian, keys.index_select(0, cell), len(means))
     return Splat(
         support=support,
         log_free=log_free,
         occupied=Sites.from_linear(keys, (batch_size, grid.rows, grid.cols)),
         features=out,
         occupied_rows=occupied_rows,
-        active=counts > 0,
-        peak_cell=_nearest_cell(distance.detach(), gaussian, keys.index_select(0, cell), len(means)),
+        active=peak_cell >= 0,
+        peak_cell=peak_cell,
         num_cut=num_cut,
     )
 
@@ -349,11 +327,6 @@ def _nearest_cell(
     candidates = torch.where(q == least.index_select(0, gaussian), key, none)
     peak = key.new_full((num,), none).scatter_reduce_(0, gaussian, candidates, "amin")
     return torch.where(peak == none, -1, peak)
-
-
-def _segment_sum(values: Tensor, starts: Tensor) -> Tensor:
-    """Sums of consecutive stretches of values [pairs] that begin at starts [n + 1]."""
-    return torch.segment_reduce(values, "sum", offsets=starts, unsafe=True)
 
 
 def _gaussian_sum(values: Tensor, pairs: _Pairs) -> Tensor:

@@ -14,7 +14,6 @@ from src.pictures.contents import (
     CLASS_COLOURS,
     CLASS_MARKERS,
     INK,
-    MUTED,
     OCCUPANCY_COLOUR,
     SOURCE_COLOURS,
     SOURCES,
@@ -28,7 +27,7 @@ from src.structures.taxonomy import CLASSES
 Array = np.ndarray
 
 ARROW_S = 0.5
-"""An arrow shows the way of this time: the interval of two key frames, so its tip is the next position."""
+"""An arrow shows the travel in this time: the interval of two key frames, so its tip is the next position."""
 
 MOVING_MPS = 1.0
 """Radar points and boxes slower than this count as standing."""
@@ -205,14 +204,15 @@ def paint_markers(axes: Axes, boxes: PictureBoxes, predicted: bool, order: float
 
 
 def paint_arrows(axes: Axes, boxes: PictureBoxes, colours: Array, predicted: bool, order: float) -> None:
-    """Arrows from the centres along the way of ARROW_S seconds; none for standing boxes or unknown velocities."""
+    """Arrows from the centres over the travel of ARROW_S seconds; none for standing boxes or unknown velocities."""
     speeds = np.linalg.norm(boxes.velocities, axis=1)
     moving = np.isfinite(speeds) & (speeds >= MOVING_MPS)
     if moving.any():
         axes.quiver(
             *upright(boxes.centers[moving, :2]).T, *(ARROW_S * upright(boxes.velocities[moving])).T,
-            color=colours[moving], angles="xy", scale_units="xy", scale=1, units="dots", width=2.8 if predicted else 1.1,
-            headwidth=3.6 if predicted else 6, headlength=4 if predicted else 7, headaxislength=3.6, zorder=order,
+            color=colours[moving], angles="xy", scale_units="xy", scale=1, units="dots", zorder=order,
+            width=2.8 if predicted else 1.1, headwidth=3.6 if predicted else 6, headlength=4 if predicted else 7,
+            headaxislength=3.6,
         )  # fmt: skip
 
 

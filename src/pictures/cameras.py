@@ -214,7 +214,8 @@ def paint_camera(
     paint_boxes(axes, ground_truth, pix_from_ego, (width, height), predicted=False)
     axes.text(
         0.008, 0.975, caption, transform=axes.transAxes, ha="left", va="top", color="white", fontsize=9.5,
-        fontweight="bold", parse_math=False, bbox={"boxstyle": "square,pad=0.3", "fc": INK, "ec": "none", "alpha": 0.75},
+        fontweight="bold", parse_math=False,
+        bbox={"boxstyle": "square,pad=0.3", "fc": INK, "ec": "none", "alpha": 0.75},
     )  # fmt: skip
 
 

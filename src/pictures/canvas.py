@@ -49,12 +49,12 @@ class Canvas:
             fontweight="bold" if bold else "normal", color=colour, ha=align, va="top", parse_math=False,
         )  # fmt: skip
 
-    def legend(self, left: float, top: float, handles: Sequence[Artist], size_px: float = 13, columns: int = 20) -> None:
-        """A row of keys, its upper left corner at the given pixels."""
+    def legend(self, left: float, top: float, handles: Sequence[Artist], size_px: float = 13) -> None:
+        """One row of keys, its upper left corner at the given pixels."""
         if handles:
             self.figure.legend(
                 handles=handles, loc="upper left", bbox_to_anchor=(left / self.width, 1 - top / self.height),
-                ncols=min(columns, len(handles)), fontsize=size_px * 72 / DPI, frameon=False, borderpad=0,
+                ncols=len(handles), fontsize=size_px * 72 / DPI, frameon=False, borderpad=0,
                 borderaxespad=0, handlelength=1.9, handletextpad=0.5, columnspacing=1.5, labelcolor=INK,
             )  # fmt: skip
 

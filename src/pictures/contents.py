@@ -18,12 +18,12 @@ CLASS_COLOURS: dict[str, Colour] = {
     "truck": "#D55E00",
     "bus": "#E6A000",
     "trailer": "#8C2D7E",
-    "other_vehicle": "#7A7A00",
-    "pedestrian": "#E7298A",
-    "motorcycle": "#00846B",
+    "other_vehicle": "#3E4A00",
+    "pedestrian": "#D81B7A",
+    "motorcycle": "#2BC4A2",
     "bicycle": "#3DA5D9",
-    "traffic_cone": "#FF7F50",
-    "barrier": "#6B6B6B",
+    "traffic_cone": "#FF8F6B",
+    "barrier": "#5C5C5C",
     "animal": "#6B3E1E",
     "traffic_sign": "#4B3BB5",
 }
@@ -42,8 +42,8 @@ SOURCES = ("radar", "camera", "random", "history")
 SOURCE_COLOURS: dict[str, Colour] = {
     "radar": "#D55E00",
     "camera": "#0072B2",
-    "random": "#7F7F7F",
-    "history": "#007D5B",
+    "random": "#A3A3A3",
+    "history": "#00674C",
 }
 INK = "#1B1F24"
 MUTED = "#8A929B"

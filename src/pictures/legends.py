@@ -20,7 +20,8 @@ def class_keys(present: set[int]) -> list[Artist]:
         name, colour = CLASSES[label], CLASS_COLOURS[CLASSES[label]]
         text = name.replace("_", " ")
         if name in CLASS_MARKERS:
-            keys.append(Line2D([], [], linestyle="none", marker=CLASS_MARKERS[name], markersize=8, color=colour, label=text))
+            marker = CLASS_MARKERS[name]
+            keys.append(Line2D([], [], linestyle="none", marker=marker, markersize=8, color=colour, label=text))
         else:
             keys.append(Patch(facecolor=to_rgba(colour, 0.35), edgecolor=colour, linewidth=1.8, label=text))
     return keys
@@ -33,7 +34,9 @@ def reading_keys(missed: bool) -> list[Artist]:
         Line2D([], [], color=INK, linewidth=1.4, linestyle=(0, (2.6, 1.6)), label="ground truth"),
     ]
     if missed:
-        keys.append(Line2D([], [], linestyle="none", marker="o", markersize=11, mfc="none", mec=MISSED_COLOUR, label="missed"))
+        ring = Line2D([], [], linestyle="none", marker="o", markersize=11, mfc="none", mec=MISSED_COLOUR)
+        ring.set_label("missed")
+        keys.append(ring)
     arrow = Line2D([], [], linestyle="none", marker=r"$\longrightarrow$", markersize=20, color=INK)
     arrow.set_label(f"travel in {ARROW_S:g} s")
     return [*keys, arrow]

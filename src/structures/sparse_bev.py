@@ -16,7 +16,8 @@ from src.ops.sites import Sites, union
 class SparseMap:
     """One feature vector per site of a batch of grids; rows follow the sites' lexicographic order.
 
-    Maps that share the same `Sites` object also share its kernel maps. Raises ValueError when the rows do not match the sites.
+    Maps that share the same `Sites` object also share its kernel maps.
+    Raises ValueError when the rows do not match the sites.
     """
 
     sites: Sites  # M cells of a grid (batch, *spatial)
@@ -92,4 +93,4 @@ class SparseBEV(SparseMap):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.sites.ndim != 2:
-            raise ValueError(f"SparseBEV.sites must lie on a grid (batch, rows, cols), but got shape {self.sites.shape}")
+            raise ValueError(f"SparseBEV.sites must lie on (batch, rows, cols), but got shape {self.sites.shape}")

@@ -29,6 +29,13 @@ def supervised_boxes(
             usable &= sample.num_points > 0
         kept.append(sample[usable])
     counts = torch.tensor([len(sample) for sample in kept], device=kept[0].centers.device)
-    columns = [field.name for field in fields(Boxes3D) if field.name not in ("scores", "num_points")]
-    joined = Boxes3D(**{name: torch.cat([getattr(sample, name) for sample in kept]) for name in columns})
-    return joined, torch.repeat_interleave(counts)
+    return join_boxes(kept), torch.repeat_interleave(counts)
+
+
+def join_boxes(
+    parts: list[Boxes3D],  # at least one
+) -> Boxes3D:
+    """One table of the boxes of all parts, in order; an optional column that a part lacks is dropped."""
+    columns = {field.name: [getattr(part, field.name) for part in parts] for field in fields(Boxes3D)}
+    complete = {name: all(value is not None for value in values) for name, values in columns.items()}
+    return Boxes3D(**{name: torch.cat(values) if complete[name] else None for name, values in columns.items()})

@@ -11,12 +11,13 @@ from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from src.errors import DivergedError
-from src.metrics.detection import DetectionMetric, DetectionScores
+from src.metrics.detection import DetectionMetric
+from src.metrics.scores import DetectionScores
 from src.metrics.submission import to_global
 from src.models.detector import Detector
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
-from src.structures.detections import DetectionTable, EvaluationSet
+from src.structures.detections import EvaluationSet
 from src.training.optim import OptimConfig, build_optimizer
 
 
@@ -45,7 +46,6 @@ class DetectionModule(L.LightningModule):
         self.metric = DetectionMetric(evaluation_set)
         self.loss_means = nn.ModuleDict()
         self.scores: DetectionScores | None = None
-        self.detections: list[DetectionTable] = []
         self.skipped: dict[str, int] = {}
 
     # ---------------------------------------------------------------- training
@@ -119,7 +119,6 @@ class DetectionModule(L.LightningModule):
     def on_validation_epoch_start(self) -> None:
         """Forget what an earlier pass collected."""
         self.metric.reset()
-        self.detections = []
 
     def validation_step(self, batch: FrameBatch, batch_idx: int) -> None:
         """Detect, bring the boxes to the global frame, hand them to the metric."""
@@ -129,7 +128,6 @@ class DetectionModule(L.LightningModule):
         ):
             table = to_global(boxes.to("cpu"), global_from_ego, self.metric.evaluation_set.index_of[token])
             self.metric.update([token], table)
-            self.detections.append(table)
 
     def detect(self, batch: FrameBatch) -> list[Boxes3D]:
         """Boxes of each sample in its ego frame."""
@@ -137,8 +135,6 @@ class DetectionModule(L.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Score, and log the headline numbers; the full table stays in `scores`."""
-        if self.trainer.sanity_checking:
-            return
         self.scores = self.metric.compute()
         for name, value in self.scores.headline().items():
             self.log(f"val/{name}", value)

@@ -66,7 +66,7 @@ class ImageEncoderConfig:
         if self.lr_multiplier < 0:
             raise ConfigError(f"backbone.lr_multiplier={self.lr_multiplier}: must not be negative")
         if self.name is BackboneName.small and self.weights is not None:
-            raise ConfigError(f"backbone.weights={self.weights}: must be null, no weights exist for backbone.name=small")
+            raise ConfigError(f"backbone.weights={self.weights}: must be null, there are none for backbone.name=small")
 
 
 class FPN(nn.Module):
@@ -122,9 +122,9 @@ class SecondFPN16(nn.Module):
 class ImageEncoder(nn.Module):
     """Backbone and neck over all cameras of all samples (spec section 3).
 
-    Feature row r of a level with stride s covers pixel rows r * s to (r + 1) * s of the input image, whether or not padding
-    is trimmed. `strides` and `channels` describe the output; `lr_multiplier` is meant for the parameters of `backbone`.
-    Loads `config.weights` when given: raises CheckpointError for a file that does not fit.
+    Feature row r of a level with stride s covers pixel rows r * s to (r + 1) * s of the input image, whether or not
+    padding is trimmed. `strides` and `channels` describe the output; `lr_multiplier` is meant for the parameters of
+    `backbone`. Loads `config.weights` when given: raises CheckpointError for a file that does not fit.
     """
 
     def __init__(self, config: ImageEncoderConfig) -> None:
@@ -158,10 +158,9 @@ class ImageEncoder(nn.Module):
         skipped = count_black_rows(views) if self.trim_padding else 0
         maps = self.neck(self.backbone(self.normalise(views[:, :, skipped:])))
         # Zero features stand for the skipped rows, so that pixel coordinates keep their meaning.
-        padded = [
-            F.pad(x, (0, 0, skipped // stride, 0)) if skipped else x for x, stride in zip(maps, self.strides, strict=True)
-        ]
-        return [x.unflatten(0, images.shape[:2]) for x in padded]
+        if skipped:
+            maps = [F.pad(x, (0, 0, skipped // stride, 0)) for x, stride in zip(maps, self.strides, strict=True)]
+        return [x.unflatten(0, images.shape[:2]) for x in maps]
 
     def normalise(
         self,
@@ -186,8 +185,8 @@ def count_black_rows(
 ) -> int:
     """Rows on top that are black in every view, as a whole number of stride-32 rows; at least one of those is kept.
 
-    640 x 960 holds 183 padded rows at the test-time resize of a 1980 x 943 camera: 160 are skipped, 480 x 960 remain. Training
-    resizes move that edge, hence the look at the images themselves; a batch keeps what its fullest view needs.
+    640 x 960 holds 183 padded rows at the test-time resize of a 1980 x 943 camera: 160 are skipped, 480 x 960 remain.
+    Training resizes move that edge, hence the look at the images themselves; a batch keeps what its fullest view needs.
     """
     height = views.shape[2]
     lit = views.amax(dim=(0, 1, 3)).nonzero()[:, 0]  # rows with any light

@@ -85,9 +85,7 @@ class RadarEncoder(nn.Module):
         self.register_buffer("point_scales", torch.tensor(POINT_SCALES), persistent=False)
 
         inputs = len(POINT_SCALES) + config.point_count_channel
-        self.conv_input = ConvNormReLU(
-            SubmanifoldConv(inputs, widths[0], 3, self.ndim, bias=False), **BACKBONE_NORM
-        )
+        self.conv_input = ConvNormReLU(SubmanifoldConv(inputs, widths[0], 3, self.ndim, bias=False), **BACKBONE_NORM)
         self.stages = nn.ModuleList(
             _stage(widths[index - 1] if index else None, width, config.blocks_per_stage, self.ndim)
             for index, width in enumerate(widths)
@@ -114,7 +112,7 @@ class RadarEncoder(nn.Module):
         radar_batch: Tensor,  # [P] int64
         batch_size: int,
     ) -> SparseMap:
-        """Means of the normalised points of every voxel, on (B, z, y, x), or (B, y, x) for pillars; float32 throughout."""
+        """Means of the normalised points of every voxel, on (B, z, y, x), or (B, y, x) for pillars; in float32."""
         points = radar_points.float()
         sites, features, counts = voxelize(
             points / self.point_scales,
@@ -150,14 +148,17 @@ class RadarEncoder(nn.Module):
         self,
         stages: list[SparseMap],  # at the BEV resolution and every coarser one
     ) -> SparseBEV:
-        """Sum over height and over strides: a coarse site lands on the first cell, the lowest row and column, of its block."""
+        """Sum over height and over strides: a coarse site lands on the lowest row and column of its block."""
         shape = (stages[0].batch_size, *stages[0].sites.shape[-2:])
-        columns = [
-            torch.cat([stage.indices[:, :1], stage.indices[:, -2:] * 2**depth], dim=1) for depth, stage in enumerate(stages)
-        ]
+        cells = torch.cat(
+            [
+                torch.cat([stage.indices[:, :1], stage.indices[:, -2:] * 2**depth], dim=1)  # (b, row, col)
+                for depth, stage in enumerate(stages)
+            ]
+        )
         features = torch.cat([stage.features for stage in stages])
         features = features.to(torch.promote_types(features.dtype, torch.float32))  # many terms: not in half precision
-        sites, rows = Sites.unique(torch.cat(columns), shape)
+        sites, rows = Sites.unique(cells, shape)
         if len(sites) > 0:  # without sites the (empty) features stay as they are, in the graph of their parameters
             features = bag_sum(features, *bags(rows, len(sites)))
         return SparseBEV(sites, features)
@@ -179,8 +180,8 @@ def _bev_stage(config: RadarEncoderConfig, grid: BEVGrid) -> int:
     stage = round(math.log2(ratio))
     if stage < 0 or not math.isclose(ratio, 2**stage, rel_tol=1e-6):
         raise ConfigError(
-            f"model.radar_encoder.voxel_size_m={config.voxel_size_m}: x and y must be grid.cell_m={grid.cell_m} divided by "
-            f"a power of two, but the quotient is {ratio:g}"
+            f"model.radar_encoder.voxel_size_m={config.voxel_size_m}: x and y must be grid.cell_m={grid.cell_m} "
+            f"divided by a power of two, but the quotient is {ratio:g}"
         )
     widths = config.stage_channels
     if len(widths) <= stage:
@@ -190,13 +191,14 @@ def _bev_stage(config: RadarEncoderConfig, grid: BEVGrid) -> int:
         )
     if len(set(widths[stage:])) > 1:
         raise ConfigError(
-            f"model.radar_encoder.stage_channels={widths}: must be equal from stage {stage + 1} on, where stages are summed, "
-            f"but got {widths[stage:]}"
+            f"model.radar_encoder.stage_channels={widths}: must be equal from stage {stage + 1} on, where stages are "
+            f"summed, but got {widths[stage:]}"
         )
     coarsest = 2 ** (len(widths) - 1 - stage)
     if any(cells % coarsest for cells in grid.cells):
         raise ConfigError(
-            f"grid.cells={list(grid.cells)}: each must be a multiple of {coarsest}, the radar encoder's coarsest stride in cells"
+            f"grid.cells={list(grid.cells)}: each must be a multiple of {coarsest}, "
+            "the radar encoder's coarsest stride in cells"
         )
     return stage
 

@@ -28,11 +28,12 @@ class BackboneName(Enum):
 def load_backbone_weights(module: nn.Module, path: str | Path, name: BackboneName) -> None:
     """Fill an image backbone from a published checkpoint file; nothing is ever downloaded.
 
-    Takes torchvision and timm files for `resnet50`, FCOS3D and DD3D files for `vovnet99`. Every tensor of the module must be
-    in the file with the same shape, and nothing else may be left over; only the classifier of a ResNet and the batch
-    counters, which frozen and old batch norms lack, are exempt.
+    Takes torchvision and timm files for `resnet50`, FCOS3D and DD3D files for `vovnet99`. Every tensor of the module
+    must be in the file with the same shape, and nothing else may be left over; only the classifier of a ResNet and the
+    batch counters, which frozen and old batch norms lack, are exempt.
 
-    Raises CheckpointError for a missing or unreadable file and for tensors that do not match, leaving the module as it was.
+    Raises CheckpointError for a missing or unreadable file and for tensors that do not match; the module then stays as
+    it was.
     """
     found = {_rename(key, name): value for key, value in _read_tensors(Path(path)).items()}
     if name is BackboneName.resnet50:
@@ -45,8 +46,8 @@ def load_backbone_weights(module: nn.Module, path: str | Path, name: BackboneNam
     unexpected = [key for key in found if key not in expected]
     if missing or unexpected:
         raise CheckpointError(
-            f"backbone.weights={path}: must hold exactly the tensors of {name.value}, but {_listed(missing)} are missing and "
-            f"{_listed(unexpected)} are unknown; use a file made for this backbone or set backbone.weights=null"
+            f"backbone.weights={path}: must hold exactly the tensors of {name.value}, but {_listed(missing)} are "
+            f"missing and {_listed(unexpected)} are unknown; use a file made for this backbone, or null"
         )
     wrong = [
         f"{key} {list(found[key].shape)} instead of {list(value.shape)}"
@@ -55,7 +56,8 @@ def load_backbone_weights(module: nn.Module, path: str | Path, name: BackboneNam
     ]
     if wrong:
         raise CheckpointError(
-            f"backbone.weights={path}: {_listed(wrong)} differ in shape from {name.value}; use a file made for this backbone"
+            f"backbone.weights={path}: {_listed(wrong)} differ in shape from {name.value}; "
+            "use a file made for this backbone"
         )
     module.load_state_dict(found)
 

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.views import CameraViews
 from src.models.sparse_layers import SubmanifoldConv
-from src.ops import Sites, deform_attend_bev, deform_attend_images
+from src.ops.deform_sample import deform_attend_bev, deform_attend_images
+from src.ops.sites import Sites
 from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV
 
@@ -164,7 +165,7 @@ class ImageCrossAttention(nn.Module):
         z = low + (high - low) * self.height(features).float().sigmoid()  # [B, G, P]
         pixels, visible = views.project(torch.cat([points, z[..., None]], dim=-1))
         weights = self._weights(query, views.pix_from_aug, visible)
-        gathered = deform_attend_images(values, pixels, views.image_size_px, weights)
+        gathered = deform_attend_images(values, pixels, views.image_size_px, weights, visible)
         return self.output(gathered.to(values[0].dtype))
 
     def _weights(

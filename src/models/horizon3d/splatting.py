@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.ops import Splat, splat_gaussians
+from src.ops.splat import Splat, splat_gaussians
 from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV
 

@@ -23,6 +23,11 @@ class CameraViews:
     valid: Tensor  # [B, N] bool, False where the camera is missing
     image_size_px: tuple[int, int]  # (H, W)
 
+    @property
+    def finest_stride_px(self) -> int:
+        """Pixels of the input per cell of the finest level."""
+        return self.image_size_px[0] // self.levels[0].shape[-2]
+
     def project(
         self,
         points: Tensor,  # [B, Q, P, 3] aug metres

@@ -101,7 +101,8 @@ def test_normalisation_follows_the_backbone() -> None:
     torch.testing.assert_close(rgb, expected, atol=1e-5, rtol=1e-4)
     bgr = ImageEncoder(published(BackboneName.vovnet99))
     found = bgr.normalise(pixel)[0, :, 0, 0]
-    torch.testing.assert_close(found, torch.tensor([0.47 / 57.375, -0.28 / 57.12, 0.325 / 58.395]), atol=1e-6, rtol=1e-3)
+    expected = torch.tensor([0.47 / 57.375, -0.28 / 57.12, 0.325 / 58.395])
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-3)
 
 
 def test_trimmed_rows_come_back_as_zeros_and_the_rest_keeps_its_place() -> None:
@@ -145,7 +146,7 @@ def test_images_of_another_size_or_type_are_refused() -> None:
         ({"blocks": [1, 1]}, r"blocks=\[1, 1\]"),
         ({"name": BackboneName.resnet50}, "must be null, only"),
         ({"neck": NeckName.secondfpn16, "neck_channels": 30}, "neck_channels=30"),
-        ({"weights": "x.pth"}, "no weights exist"),
+        ({"weights": "x.pth"}, "weights=x.pth: must be null, there are none"),
         ({"lr_multiplier": -1.0}, "lr_multiplier=-1.0"),
     ],
 )

@@ -64,8 +64,6 @@ def test_every_parameter_gets_a_gradient() -> None:
     assert [name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()] == []
 
 
-
-
 def test_attention_gates_by_the_mean() -> None:
     gate = ChannelAttention(2)
     nn.init.zeros_(gate.fc.weight)

@@ -1,0 +1,175 @@
+"""`python -m src.benchmark [suite=model|metric|reader] [scale=...] [out=DIR]`: time and memory of the parts.
+
+suite=model   one training step of the configured model, part by part, forward and forward + backward
+suite=metric  our metric against the official evaluator on one val-sized problem
+suite=reader  frames per second of the reader on one core
+"""
+
+from __future__ import annotations
+
+import platform
+import resource
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from src.assembly import build_datamodule, build_model, data_root
+from src.config import BenchmarkSuite, Config, compose_config, run_command
+from src.metrics.benchmark import compare_with_devkit
+from src.models.detector import Detector
+from src.ops.allocator import tune_cpu_allocator
+from src.structures.batch import FrameBatch
+from src.training.run_folder import write_json
+
+REPEATS = 3
+READER_FRAMES = 40
+VAL_SIZED = {"num_samples": 3000, "gts": 25, "preds": 300}
+"""About the size of the official val split with a full submission."""
+
+
+def main(overrides: list[str]) -> None:
+    """Measure one suite, print its table, and keep it as JSON and Markdown in `out` when given."""
+    config, _ = compose_config(overrides)
+    tune_cpu_allocator()
+    suites = {
+        BenchmarkSuite.model: benchmark_model,
+        BenchmarkSuite.metric: lambda config: compare_with_devkit(**VAL_SIZED, seed=config.seed),
+        BenchmarkSuite.reader: benchmark_reader,
+    }
+    result = {"suite": config.suite.value, "overrides": overrides, "machine": machine()}
+    result |= {"result": suites[config.suite](config)}
+    text = markdown(result)
+    print(text)
+    if config.out:
+        folder = Path(config.out)
+        folder.mkdir(parents=True, exist_ok=True)
+        name = f"{config.suite.value}_{config.scale}" if config.suite is not BenchmarkSuite.metric else "metric"
+        write_json(folder / f"{name}.json", result)
+        (folder / f"{name}.md").write_text(text + "\n")
+        print(f"written: {folder / name}.md and .json")
+
+
+def benchmark_model(config: Config) -> dict[str, Any]:
+    """Medians over REPEATS steps of one frame batch, seconds per part; peak memory of the process."""
+    torch.manual_seed(config.seed)
+    config.data.batch_size, config.data.num_workers = 1, 0
+    datamodule = build_datamodule(config, data_root(config))
+    datamodule.setup("fit")
+    batch: FrameBatch = next(iter(datamodule.train_dataloader()))
+    device = torch.device("cuda" if torch.cuda.is_available() and config.trainer.accelerator != "cpu" else "cpu")
+    model, batch = build_model(config).to(device).train(), batch.to(device)
+    timings: dict[str, list[float]] = {}
+    for _ in range(REPEATS):
+        terms = timed_step(model, batch, timings, device, config.precision == "bf16-mixed")
+    peak = torch.cuda.max_memory_allocated() if device.type == "cuda" else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return {
+        "device": str(device),
+        "seconds": {name: statistics.median(values) for name, values in timings.items()},
+        "spread": {name: max(values) - min(values) for name, values in timings.items()},
+        "losses": {name: float(value) for name, value in terms.items()},
+        "peak_memory_mib": int(peak / 2**20),
+        "parameters": {name: sum(p.numel() for p in part.parameters()) for name, part in model.named_children()},
+        "radar_points": len(batch.radar_points),
+        "state": {name: float(value) for name, value in model.diagnostics(model(batch)).items()},
+    }
+
+
+def timed_step(
+    model: Detector, batch: FrameBatch, timings: dict[str, list[float]], device: torch.device, autocast: bool
+) -> dict[str, Tensor]:
+    """One training step; the seconds of every part are appended to `timings`."""
+
+    def now() -> float:
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+    started: dict[str, float] = {}
+    hooks = []
+    for name, part in model.named_children():
+        hooks.append(part.register_forward_pre_hook(lambda *_, name=name: started.update({name: now()})))
+        hooks.append(
+            part.register_forward_hook(
+                lambda *_, name=name: timings.setdefault(f"{name} forward", []).append(now() - started[name])
+            )
+        )
+    begin = now()
+    with torch.autocast(device.type, dtype=torch.bfloat16, enabled=autocast):
+        output = model(batch)
+        forward = now()
+        terms = model.loss(output, batch)
+    loss = now()
+    terms["total"].backward()
+    backward = now()
+    for hook in hooks:
+        hook.remove()
+    model.zero_grad(set_to_none=True)
+    for name, seconds in {
+        "all parts forward": forward - begin,
+        "losses and targets": loss - forward,
+        "backward": backward - loss,
+        "whole step": backward - begin,
+    }.items():
+        timings.setdefault(name, []).append(seconds)
+    return {name: value.detach() for name, value in terms.items()}
+
+
+def benchmark_reader(config: Config) -> dict[str, Any]:
+    """Frames per second of reading, augmenting and batching in this process, on one thread."""
+    torch.set_num_threads(1)
+    config.data.batch_size, config.data.num_workers = 1, 0
+    datamodule = build_datamodule(config, data_root(config))
+    datamodule.setup("fit")
+    batches = iter(datamodule.train_dataloader())
+    next(batches)  # tables and first-use caches
+    count, begin = 0, time.process_time()
+    for _ in range(READER_FRAMES):
+        if next(batches, None) is None:
+            break
+        count += 1
+    seconds = time.process_time() - begin
+    return {"frames": count, "cpu_seconds": seconds, "frames_per_second": count / seconds}
+
+
+def machine() -> dict[str, Any]:
+    """What the numbers were measured on."""
+    return {
+        "processor": processor(),
+        "threads": torch.get_num_threads(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+
+
+def processor() -> str:
+    """Name of the CPU where the system tells it."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """The result as Markdown: a table of seconds where there are some, every other number in a list."""
+    lines = [f"# Benchmark: {result['suite']}", "", f"`python -m src.benchmark {' '.join(result['overrides'])}`", ""]
+    lines += [f"- {name}: {value}" for name, value in result["machine"].items() if value is not None]
+    content = dict(result["result"])
+    seconds, spread = content.pop("seconds", {}), content.pop("spread", {})
+    if seconds:
+        lines += ["", "| part | ms (median) | spread ms |", "|---|---|---|"]
+        lines += [f"| {name} | {1e3 * value:.1f} | {1e3 * spread[name]:.1f} |" for name, value in seconds.items()]
+    lines.append("")
+    for name, value in content.items():
+        shown = value if isinstance(value, dict) else {name: value}
+        prefix = f"{name}: " if isinstance(value, dict) else ""
+        cells = [f"{key} {item:.4g}" if isinstance(item, float) else f"{key} {item:,}" if isinstance(item, int) else f"{key} {item}" for key, item in shown.items()]
+        lines.append(f"- {prefix}{', '.join(cells)}")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    run_command(main)

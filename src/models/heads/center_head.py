@@ -1,0 +1,222 @@
+"""The sparse CenterPoint head: heat maps and box codes on active cells, its loss and its decoding (spec section 7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.losses.classification import penalty_reduced_focal
+from src.losses.normalizers import full_precision, mean_over_ranks
+from src.losses.regression import masked_l1
+from src.models.heads.decode import (
+    AttributeSource,
+    Suppression,
+    allowed_attributes,
+    boxes_from_codes,
+    learned_attributes,
+    rule_attributes,
+    suppress,
+    top_candidates,
+    within_limits,
+)
+from src.models.sparse_layers import ConvNormReLU, RowNorm, SubmanifoldConv
+from src.ops.nms import maxpool_peaks
+from src.structures.boxes import Boxes3D
+from src.structures.sparse_bev import SparseBEV
+from src.structures.taxonomy import ATTRIBUTES, CLASSES, MAX_BOXES_PER_SAMPLE
+from src.targets.heatmap import CODE_SIZE, GROUP_OF_CLASS, HEAD_GROUPS, HeadTargets, head_targets
+from src.targets.supervision import join_boxes
+
+# Probability 0.1 for every cell at the start, so that the focal loss is not drowned by background.
+HEATMAP_BIAS = -2.19
+CODE_WIDTHS = (2, 1, 3, 2, 2)
+"""Branches of the box code: centre, height, log sizes, (cos, sin), velocity."""
+ATTRIBUTE_WEIGHT = 0.2
+SAMPLED_CELLS = 1024
+
+
+class TrainRegression(Enum):
+    """Where the regression branches are evaluated in training.
+
+    `all`: every cell, as specified. `sampled`: the objects' cells and about 1024 cells spread evenly over the batch,
+    which keep the batch statistics those of the map; objects alone would leave rare groups with two or three rows.
+    """
+
+    all = "all"
+    sampled = "sampled"
+
+
+@dataclass(kw_only=True)
+class HeadConfig:
+    """Settings of the head (`model.head`). Raises ConfigError for impossible values."""
+
+    nms: Suppression  # per_group: the table of section 7
+    score_threshold: float  # boxes at or below are dropped
+    max_boxes: int  # per sample, best scores
+    attributes: AttributeSource
+    train_regression: TrainRegression
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.score_threshold < 1:
+            raise ConfigError(f"model.head.score_threshold={self.score_threshold}: must be in 0..1, 1 excluded")
+        if not 1 <= self.max_boxes <= MAX_BOXES_PER_SAMPLE:
+            raise ConfigError(
+                f"model.head.max_boxes={self.max_boxes}: must be in 1..{MAX_BOXES_PER_SAMPLE}; evaluators refuse more"
+            )
+
+
+@dataclass
+class HeadOutput:
+    """Predictions on the M active cells of B samples."""
+
+    bev: SparseBEV  # cells with the shared features that the regression branches read
+    logits: Tensor  # [M, 12] float32, columns as taxonomy.CLASSES
+    codes: Tensor | None  # [M, 7, CODE_SIZE (+ 11 attributes)] in training with `all`, else evaluated where needed
+
+
+class Branches(nn.Module):
+    """Branches of two kernel-1 layers with the same input, their hidden layers evaluated as one."""
+
+    def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
+        super().__init__()
+        self.channels = channels
+        self.hidden = nn.Linear(channels, len(widths) * channels, bias=False)
+        self.norm = RowNorm(len(widths) * channels)
+        self.outputs = nn.ModuleList(nn.Linear(channels, width) for width in widths)
+
+    def forward(
+        self,
+        x: Tensor,  # [n, C]
+    ) -> Tensor:  # [n, sum of widths] float32
+        """Outputs of all branches side by side."""
+        hidden = F.relu(self.norm(self.hidden(x))).split(self.channels, dim=1)
+        return full_precision(torch.cat([out(part) for out, part in zip(self.outputs, hidden, strict=True)], dim=1))
+
+
+class CenterHead(nn.Module):
+    """CenterPoint head on sparse cells (VoxelNeXt's nuScenes head, seven groups); 0.86 M parameters at C = 128."""
+
+    def __init__(self, config: HeadConfig, channels: int, grid: BEVGrid, velocity_code_weight: float) -> None:
+        super().__init__()
+        self.config, self.grid = config, grid
+        self.learned = config.attributes is AttributeSource.learned
+        self.code_weights = (1.0,) * (CODE_SIZE - 2) + (velocity_code_weight,) * 2
+        self.shared = ConvNormReLU(SubmanifoldConv(channels, channels, 3, 2, bias=True), eps=1e-5, momentum=0.1)
+        self.heatmaps = nn.ModuleList(Branches(channels, (len(group),)) for group in HEAD_GROUPS)
+        for branches in self.heatmaps:
+            nn.init.constant_(branches.outputs[0].bias, HEATMAP_BIAS)
+        widths = (*CODE_WIDTHS, len(ATTRIBUTES)) if self.learned else CODE_WIDTHS
+        self.regressions = nn.ModuleList(Branches(channels, widths) for _ in HEAD_GROUPS)
+        in_group_order = [CLASSES.index(name) for group in HEAD_GROUPS for name in group]
+        self.class_columns = [in_group_order.index(label) for label in range(len(CLASSES))]
+
+    def forward(self, bev: SparseBEV) -> HeadOutput:
+        """Heat maps of all cells; box codes only where training needs them everywhere."""
+        bev = self.shared(bev)
+        logits = torch.cat([branches(bev.features) for branches in self.heatmaps], dim=1)[:, self.class_columns]
+        codes = None
+        if self.training and self.config.train_regression is TrainRegression.all:
+            codes = torch.stack([branches(bev.features) for branches in self.regressions], dim=1)
+        return HeadOutput(bev, logits, codes)
+
+    def regress(
+        self,
+        output: HeadOutput,
+        rows: Tensor,  # [n] int64, cells
+        groups: Tensor,  # [n] int64, index into HEAD_GROUPS
+    ) -> Tensor:  # [n, CODE_SIZE (+ 11)]
+        """Box codes, and attribute logits if learned, of chosen cells by the branches of the given groups.
+
+        With running statistics this equals evaluating every cell and picking; in training with `sampled` the batch
+        statistics come from the chosen cells and an even sample of the others.
+        """
+        if output.codes is not None:
+            return output.codes[rows, groups]
+        features = output.bev.features
+        step = max(1, len(features) // SAMPLED_CELLS)
+        spread = features[::step] if self.training else features[:0]
+        order, codes = [], []
+        for number, branches in enumerate(self.regressions):
+            mine = (groups == number).nonzero().squeeze(1)
+            chosen = torch.cat([features[rows[mine]], spread])
+            if not torch.is_autocast_enabled(chosen.device.type):
+                chosen = chosen.to(branches.hidden.weight.dtype)
+            codes.append(branches(chosen)[: len(mine)])
+            order.append(mine)
+        return torch.cat(codes)[torch.cat(order).argsort()]
+
+    def targets(self, output: HeadOutput, boxes: list[Boxes3D]) -> HeadTargets:
+        """What the head should predict on its cells, with the counts of objects that cannot be met."""
+        return head_targets(boxes, output.bev.sites, self.grid)
+
+    def loss(
+        self,
+        output: HeadOutput,
+        boxes: list[Boxes3D],  # B, augmented ego frame
+        heatmap_weight: float | None,
+        box_weight: float | None,
+    ) -> dict[str, Tensor]:
+        """Weighted terms `heatmap`, `box` and, if learned, `attribute`; a weight of None leaves its term out.
+
+        Focal loss per group over its positive cells, L1 per group over its objects (section 8.1). Without objects the
+        box term is 0 with zero gradients.
+        """
+        targets = self.targets(output, boxes)
+        group_of_class = targets.labels.new_tensor(GROUP_OF_CLASS)
+        none = output.logits.new_zeros(len(HEAD_GROUPS))
+        terms: dict[str, Tensor] = {}
+        if heatmap_weight is not None:
+            focal = penalty_reduced_focal(output.logits, targets.heatmap).sum(0)  # [12]
+            positives = (targets.heatmap == 1).sum(0).to(none.dtype)
+            normalizer = mean_over_ranks(none.index_add(0, group_of_class, positives))
+            terms["heatmap"] = heatmap_weight * (none.index_add(0, group_of_class, focal) / normalizer).sum()
+        if box_weight is None and not self.learned:
+            return terms
+        predicted = self.regress(output, targets.rows, targets.groups)
+        if box_weight is not None:
+            errors = masked_l1(predicted[:, :CODE_SIZE], targets.codes) * none.new_tensor(self.code_weights)
+            objects = torch.bincount(targets.groups, minlength=len(HEAD_GROUPS))
+            sums = none.index_add(0, targets.groups, errors.sum(1))
+            terms["box"] = box_weight * (sums / mean_over_ranks(objects)).sum()
+        if self.learned:
+            terms["attribute"] = ATTRIBUTE_WEIGHT * _attribute_loss(predicted[:, CODE_SIZE:], targets)
+        return terms
+
+    @torch.no_grad()
+    def decode(self, output: HeadOutput) -> list[Boxes3D]:
+        """Boxes of each sample, best first, at most `max_boxes`; attributes set, frame as the input's."""
+        scores = output.logits.sigmoid()
+        if self.config.nms is Suppression.maxpool:
+            scores = scores * maxpool_peaks(scores, output.bev.sites)
+        cell_counts = output.bev.sites.batch_counts().tolist()
+        found: list[list[Boxes3D]] = [[] for _ in cell_counts]
+        for number, group in enumerate(HEAD_GROUPS):
+            labels = torch.tensor([CLASSES.index(name) for name in group], device=scores.device)
+            best = top_candidates(scores[:, labels], labels, cell_counts, self.config.score_threshold)
+            codes = self.regress(output, best.rows, torch.full_like(best.rows, number))
+            cells = output.bev.indices[best.rows, 1:]
+            boxes = boxes_from_codes(cells, codes[:, :CODE_SIZE], best.labels, best.scores, self.grid)
+            if self.learned:
+                boxes.attributes = learned_attributes(codes[:, CODE_SIZE:], best.labels)
+            else:
+                boxes.attributes = rule_attributes(boxes)
+            places = torch.arange(len(boxes), device=scores.device).split(best.counts)
+            for sample, rows in enumerate(places):
+                found[sample].append(suppress(boxes[rows], number, self.config.nms))
+        return [within_limits(join_boxes(parts), self.config.max_boxes) for parts in found]
+
+
+def _attribute_loss(logits: Tensor, targets: HeadTargets) -> Tensor:
+    """Cross-entropy over the attributes of each object's class, averaged over objects that carry one."""
+    allowed = allowed_attributes(logits.device)[targets.labels]
+    chosen = targets.attributes.clamp(min=0)[:, None]
+    known = (targets.attributes >= 0) & allowed.gather(1, chosen).squeeze(1)
+    logits = full_precision(logits)[known].masked_fill(~allowed[known], -torch.inf)
+    total = F.cross_entropy(logits, targets.attributes[known], reduction="sum")
+    return total / mean_over_ranks(known.sum())

@@ -1,0 +1,120 @@
+"""The training objective L = L_det + lambda_kggi L_kggi + lambda_ocsf L_ocsf (Eq. 10, supplement A) by named terms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from torch import Tensor
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.losses.classification import depth_cross_entropy, penalty_reduced_focal, sigmoid_focal
+from src.losses.normalizers import mean_over_ranks
+from src.losses.regression import masked_smooth_l1
+from src.losses.segmentation import occupancy_losses
+from src.models.horizon3d.kggi import KGGIConfig, KGGIOutput
+from src.models.horizon3d.ocsf import OCSFOutput
+from src.models.horizon3d.views import CameraViews
+from src.structures.boxes import Boxes3D
+from src.structures.sparse_bev import SparseBEV
+from src.targets.depth import paint_depth
+from src.targets.keypoints import keypoint_heatmap
+from src.targets.occupancy import cells_are_occupied, occupied_cells
+from src.targets.projection import BoxViews, view_boxes
+from src.targets.supervision import supervised_boxes
+from src.targets.velocity import velocity_raster
+
+
+@dataclass(kw_only=True)
+class LossConfig:
+    """Weights of the terms (`model.loss`); an inner weight of null switches its term off, uncomputed."""
+
+    kggi_weight: float  # lambda_kggi, on keypoint, depth and radar objectness
+    ocsf_weight: float  # lambda_ocsf, on the two occupancy terms
+    heatmap_weight: float | None
+    box_weight: float | None
+    keypoint_weight: float | None
+    depth_weight: float | None
+    radar_objectness_weight: float | None
+    occupancy_focal_weight: float | None
+    occupancy_dice_weight: float | None
+    gaussian_velocity_weight: float | None
+    gaussian_velocity_in_phase1: bool  # supervise Gaussian velocities (Eq. 9) already without memory
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name.endswith("_weight") and value is not None and value < 0:
+                raise ConfigError(f"model.loss.{field.name}={value}: must not be negative; null switches a term off")
+
+
+def kggi_losses(
+    kggi: KGGIOutput,
+    radar_bev: SparseBEV,
+    views: CameraViews,
+    boxes: list[Boxes3D],  # B, aug frame
+    grid: BEVGrid,
+    settings: KGGIConfig,
+    config: LossConfig,
+) -> dict[str, Tensor]:
+    """2D keypoints, depth and radar objectness (specification 4.1, 4.3), weighted; {} without keypoint heads."""
+    terms: dict[str, Tensor] = {}
+    if kggi.camera is None or kggi.objectness_logits is None:
+        return terms
+    if config.radar_objectness_weight is not None:
+        target = cells_are_occupied(radar_bev.sites.linear(), occupied_cells(boxes, grid, 0.0))  # [M]
+        total = sigmoid_focal(kggi.objectness_logits, target).sum()
+        terms["radar_objectness"] = config.radar_objectness_weight * total / mean_over_ranks(target.sum())
+    if config.keypoint_weight is None and config.depth_weight is None:
+        return _times(terms, config.kggi_weight)
+
+    joined, sample = supervised_boxes(boxes, grid)
+    seen = view_boxes(joined, sample, views.pix_from_aug, views.valid, views.image_size_px)
+    if config.keypoint_weight is not None:
+        terms["keypoint"] = config.keypoint_weight * _keypoint_loss(kggi, views, seen, settings)
+    if config.depth_weight is not None:
+        logits = kggi.camera.depth_logits.flatten(0, 1)  # [B*N, D, h, w]
+        target = paint_depth(
+            seen, len(logits), views.image_size_px, settings.depth_range, settings.num_depth_bins, views.finest_stride_px
+        )
+        total = depth_cross_entropy(logits, target)
+        terms["depth"] = config.depth_weight * total / mean_over_ranks((target >= 0).sum())
+    return _times(terms, config.kggi_weight)
+
+
+def ocsf_losses(
+    ocsf: OCSFOutput,
+    boxes: list[Boxes3D],  # B, aug frame
+    grid: BEVGrid,
+    margin_m: float,
+    config: LossConfig,
+) -> dict[str, Tensor]:
+    """Occupancy of the splat against enlarged boxes, and velocities where asked for (5.6, Eq. 9), weighted."""
+    terms: dict[str, Tensor] = {}
+    if config.occupancy_focal_weight is not None or config.occupancy_dice_weight is not None:
+        cells = ocsf.splat.cells
+        occupied = occupied_cells(boxes, grid, margin_m)
+        focal, dice = occupancy_losses(cells.log_free, cells.support, occupied, len(boxes), grid.rows * grid.cols)
+        if config.occupancy_focal_weight is not None:
+            normalizer = mean_over_ranks(occupied.new_tensor(len(occupied)))
+            terms["occupancy_focal"] = config.occupancy_focal_weight * focal / normalizer
+        if config.occupancy_dice_weight is not None:
+            terms["occupancy_dice"] = config.occupancy_dice_weight * dice
+    terms = _times(terms, config.ocsf_weight)
+    if config.gaussian_velocity_in_phase1 and config.gaussian_velocity_weight is not None:
+        target = velocity_raster(boxes, grid, margin_m).at(ocsf.splat.peak_cells.flatten())  # [B*G, 2]
+        errors = masked_smooth_l1(ocsf.gaussians.velocities.flatten(0, 1), target)
+        normalizer = mean_over_ranks((~target.isnan()).sum())
+        terms["gaussian_velocity"] = config.gaussian_velocity_weight * errors.sum() / normalizer
+    return terms
+
+
+def _keypoint_loss(kggi: KGGIOutput, views: CameraViews, seen: BoxViews, settings: KGGIConfig) -> Tensor:
+    logits = kggi.camera.keypoint_logits.flatten(0, 1)  # [B*N, h, w]
+    target = keypoint_heatmap(seen, len(logits), views.image_size_px, settings.depth_range, views.finest_stride_px)
+    present = views.valid.flatten()[:, None, None]  # a missing camera says nothing about what is absent
+    return (penalty_reduced_focal(logits, target) * present).sum() / mean_over_ranks((target == 1).sum())
+
+
+def _times(terms: dict[str, Tensor], weight: float) -> dict[str, Tensor]:
+    return {name: weight * value for name, value in terms.items()}

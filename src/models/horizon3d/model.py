@@ -1,0 +1,167 @@
+"""Horizon3D on single frames: encode, initialise Gaussians, fuse through them, detect (Fig. 2 without memory)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
+from src.models.backbones.sparse_voxel import RadarEncoder, RadarEncoderConfig
+from src.models.detector import Detector
+from src.models.heads.center_head import CenterHead, HeadConfig, HeadOutput
+from src.models.horizon3d.gaussian_encoder import NUM_HEADS
+from src.models.horizon3d.kggi import KGGI, KGGIConfig, KGGIOutput
+from src.models.horizon3d.loss import LossConfig, kggi_losses, ocsf_losses
+from src.models.horizon3d.ocsf import OCSF, OCSFConfig, OCSFOutput
+from src.models.horizon3d.views import CameraViews
+from src.structures.batch import FrameBatch
+from src.structures.boxes import Boxes3D
+from src.structures.gaussians import Source
+from src.structures.sparse_bev import SparseBEV
+from src.structures.taxonomy import CAMERAS
+
+CHANNEL_MULTIPLE = 4 * NUM_HEADS
+"""C splits into attention heads of at least 4 channels and into groups of 4 for the camera head's norm."""
+
+
+@dataclass(kw_only=True)
+class Horizon3DConfig:
+    """Settings of the model (`model`). Raises ConfigError for parts that do not go together."""
+
+    name: str
+    channels: int  # C, width of BEV cells and Gaussians
+    radar_encoder: RadarEncoderConfig
+    kggi: KGGIConfig | None  # null together with ocsf: radar only
+    ocsf: OCSFConfig | None
+    head: HeadConfig
+    loss: LossConfig
+
+    def __post_init__(self) -> None:
+        if (self.kggi is None) != (self.ocsf is None):
+            off, on = ("kggi", "ocsf") if self.kggi is None else ("ocsf", "kggi")
+            raise ConfigError(
+                f"model.{off}=null while model.{on} is set: both make and use the Gaussians; set both to null for radar "
+                "only, or model.kggi.initialization=random for OCSF without keypoints"
+            )
+        if self.channels < 1 or self.channels % CHANNEL_MULTIPLE:
+            raise ConfigError(
+                f"model.channels={self.channels}: must be a positive multiple of {CHANNEL_MULTIPLE}, {NUM_HEADS} attention "
+                "heads of at least 4 channels"
+            )
+
+    @property
+    def uses_images(self) -> bool:
+        """Whether images are read and encoded."""
+        return self.ocsf is not None
+
+
+@dataclass
+class Horizon3DOutput:
+    """One frame through the model; the Gaussian parts are None for radar only."""
+
+    radar_bev: SparseBEV  # F_R
+    views: CameraViews | None
+    kggi: KGGIOutput | None  # G_0 and the keypoint maps
+    ocsf: OCSFOutput | None  # G_L, its splat and F_fuse
+    head: HeadOutput
+
+    @property
+    def fused_bev(self) -> SparseBEV:
+        """F_fuse, or F_R where there is nothing to fuse."""
+        return self.radar_bev if self.ocsf is None else self.ocsf.fused_bev
+
+
+class Horizon3D(Detector):
+    """Sparse radar-camera detector whose views meet in a set of 2D Gaussians on the BEV plane.
+
+    `backbone` is only read when the model uses images. Raises ConfigError when parts, grid and backbone do not fit.
+    """
+
+    def __init__(
+        self,
+        config: Horizon3DConfig,
+        grid: BEVGrid,
+        backbone: ImageEncoderConfig | None,
+        velocity_code_weight: float,
+    ) -> None:
+        super().__init__()
+        self.config, self.grid = config, grid
+        channels = config.channels
+        self.radar_encoder = RadarEncoder(config.radar_encoder, grid, channels)
+        self.image_encoder: ImageEncoder | None = None
+        if config.kggi is not None and config.ocsf is not None:
+            if backbone is None:
+                raise ConfigError("backbone=null: KGGI and OCSF need images; choose a backbone or set both to null")
+            self.image_encoder = ImageEncoder(backbone)
+            width, levels = self.image_encoder.channels, len(self.image_encoder.strides)
+            self.kggi = KGGI(config.kggi, channels, width, grid, config.ocsf.bounds)
+            self.ocsf = OCSF(config.ocsf, channels, width, len(CAMERAS), levels, grid)
+        self.head = CenterHead(config.head, channels, grid, velocity_code_weight)
+
+    @property
+    def image_backbone(self) -> nn.Module | None:
+        """Backbone without its neck."""
+        return None if self.image_encoder is None else self.image_encoder.backbone
+
+    def forward(self, batch: FrameBatch) -> Horizon3DOutput:
+        """Detect in B independent frames. Raises ValueError when images are needed and absent."""
+        radar_bev = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
+        if self.image_encoder is None:
+            return Horizon3DOutput(radar_bev, None, None, None, self.head(radar_bev))
+        views = self._encode_views(batch)
+        kggi = self.kggi(radar_bev, views)
+        ocsf = self.ocsf(kggi.gaussians, radar_bev, views)
+        return Horizon3DOutput(radar_bev, views, kggi, ocsf, self.head(ocsf.fused_bev))
+
+    def _encode_views(self, batch: FrameBatch) -> CameraViews:
+        if batch.images is None or batch.image_valid is None or batch.pix_from_aug is None:
+            raise ValueError("FrameBatch.images is None, but this model uses images; read them with the frames")
+        if batch.images.shape[1] != len(CAMERAS):
+            raise ValueError(f"FrameBatch.images must hold {len(CAMERAS)} views, but got {batch.images.shape[1]}")
+        height, width = batch.images.shape[-2:]
+        return CameraViews(
+            self.image_encoder(batch.images), batch.pix_from_aug, batch.image_valid, (int(height), int(width))
+        )
+
+    def loss(self, output: Horizon3DOutput, batch: FrameBatch) -> dict[str, Tensor]:
+        """Terms of Eq. 10 as weighted, and their sum `total`. Raises ValueError for a batch without annotations."""
+        if batch.boxes is None:
+            raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
+        config = self.config
+        with torch.autocast(batch.device.type, enabled=False):
+            terms = self.head.loss(output.head, batch.boxes, config.loss.heatmap_weight, config.loss.box_weight)
+            if output.kggi is not None and output.ocsf is not None:
+                terms |= kggi_losses(
+                    output.kggi, output.radar_bev, output.views, batch.boxes, self.grid, config.kggi, config.loss
+                )
+                terms |= ocsf_losses(output.ocsf, batch.boxes, self.grid, config.ocsf.margin_m, config.loss)
+        zero = torch.zeros((), device=batch.device)
+        return terms | {"total": sum(terms.values(), zero)}
+
+    def decode(self, output: Horizon3DOutput) -> list[Boxes3D]:
+        """Boxes of each frame, best first."""
+        return self.head.decode(output.head)
+
+    @torch.no_grad()
+    def diagnostics(self, output: Horizon3DOutput) -> dict[str, Tensor]:
+        """How full the maps are and what the Gaussians do."""
+        batch_size = output.radar_bev.batch_size
+        cells = batch_size * self.grid.rows * self.grid.cols
+        counts = {"radar_cells": len(output.radar_bev) / batch_size, "fused_cells": len(output.fused_bev) / batch_size}
+        if output.ocsf is not None:
+            splat, gaussians = output.ocsf.splat, output.ocsf.gaussians
+            counts["occupied_share"] = len(splat.bev) / cells
+            counts["cut_cells"] = splat.cells.num_cut / batch_size
+        values = {name: torch.tensor(float(value), device=output.radar_bev.features.device) for name, value in counts.items()}
+        if output.ocsf is not None:
+            valid = gaussians.valid
+            for source in self.config.kggi.counts:
+                number = (valid & (gaussians.sources == source)).sum() / batch_size
+                values[f"gaussians_{source.name.lower()}"] = number
+            opacity = (gaussians.opacity_logits.sigmoid() * valid).sum() / valid.sum().clamp(min=1)
+            values["opacity"] = opacity
+        return values

@@ -1,0 +1,194 @@
+"""Bilinear sampling of sparse BEV maps and image pyramids, and the weighted sums of deformable attention."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from src.geometry.bev_grid import BEVGrid
+from src.ops.backend import implementation, register
+from src.ops.bags import weighted_bag
+from src.ops.sites import Sites
+
+
+def sample_sparse_bev(
+    values: Tensor,  # [M, C]
+    sites: Sites,  # M sites, shape (B, rows, cols)
+    points: Tensor,  # [..., 2] (x, y) metres
+    batch: Tensor,  # [...] int64, sample of each point
+    grid: BEVGrid,
+) -> Tensor:  # [..., C]
+    """Bilinear values at points of a sparse map; absent cells and the outside count as zero (specification 5.2).
+
+    Equals `grid_sample(align_corners=False, padding_mode="zeros")` on the dense map, without making one. Gradients
+    reach the values and the points. Computed in float32 at least, returned in the type of the values.
+    """
+    _check_bev(values, sites, points, batch, grid)
+    rows, weights = _corners(sites, points.reshape(-1, 2), batch.reshape(-1), grid)
+    present = (rows.reshape(-1) >= 0).nonzero().squeeze(1)
+    sampled = weighted_bag(
+        values.to(weights.dtype),
+        weights.reshape(-1).index_select(0, present),
+        rows.reshape(-1).index_select(0, present),
+        torch.div(present, 4, rounding_mode="floor"),
+        len(rows),
+    )
+    return sampled.to(values.dtype).view(*points.shape[:-1], values.shape[1])
+
+
+def deform_attend_bev(
+    values: Tensor,  # [M, heads, C / heads]
+    sites: Sites,  # M sites, shape (B, rows, cols)
+    points: Tensor,  # [Q, P, 2] (x, y) metres
+    batch: Tensor,  # [Q] int64, sample of each query
+    weights: Tensor,  # [Q, heads, P]
+    grid: BEVGrid,
+) -> Tensor:  # [Q, C]
+    """Weighted sum over the points of every query and head of a sparse map (specification 5.2).
+
+    Gradients reach the values, the points and the weights. Raises ValueError for shapes that do not fit together.
+    """
+    if values.dim() != 3 or points.dim() != 3 or weights.shape != (len(points), values.shape[1], points.shape[1]):
+        raise ValueError(
+            "expected values [M, heads, c], points [Q, P, 2] and weights [Q, heads, P], got "
+            f"{list(values.shape)}, {list(points.shape)} and {list(weights.shape)}"
+        )
+    return implementation("deform_attend_bev")(values, sites, points, batch, weights, grid)
+
+
+@register("deform_attend_bev", "reference")
+def deform_attend_bev_reference(
+    values: Tensor, sites: Sites, points: Tensor, batch: Tensor, weights: Tensor, grid: BEVGrid
+) -> Tensor:
+    """Sample whole rows once, then weigh the heads: wide rows suit bags, one bag per head would not."""
+    queries, num_points, _ = points.shape
+    sampled = sample_sparse_bev(
+        values.flatten(1), sites, points, batch[:, None].expand(queries, num_points), grid
+    )  # [Q, P, C]
+    by_head = sampled.view(queries, num_points, *values.shape[1:])
+    return (by_head * weights.transpose(1, 2).unsqueeze(3)).sum(1).flatten(1)
+
+
+def deform_attend_images(
+    values: list[Tensor],  # per level [B, N, heads * c, H_l, W_l]
+    pixels: Tensor,  # [B, Q, N, P, 2] (u, v) pixels of the input image
+    image_size_px: tuple[int, int],  # (H, W) of the input image
+    weights: Tensor,  # [B, Q, heads, N, L, P]
+    visible: Tensor | None = None,  # [B, Q, N, P] bool
+) -> Tensor:  # [B, Q, heads * c]
+    """Weighted sum over views, levels and points of an image pyramid (specification 5.3).
+
+    Pixel (i, j) of the input covers [j, j + 1) x [i, i + 1), cell (i, j) of a level the block of `stride` pixels from
+    (stride * j, stride * i); values are bilinear between cell centres and zero outside. Points that are not `visible`
+    contribute nothing; a query without a point in a view costs nothing there. Gradients reach the values, the pixels
+    and the weights. Raises ValueError for shapes that do not fit or a level that does not divide the image.
+    """
+    _check_images(values, pixels, image_size_px, weights)
+    with torch.autocast(pixels.device.type, enabled=False):
+        return implementation("deform_attend_images")(values, pixels, image_size_px, weights, visible)
+
+
+@register("deform_attend_images", "reference")
+def deform_attend_images_reference(
+    values: list[Tensor],
+    pixels: Tensor,
+    image_size_px: tuple[int, int],
+    weights: Tensor,
+    visible: Tensor | None,
+) -> Tensor:
+    """`grid_sample` per image and level, for the queries that have a point in that image."""
+    batch_size, queries, views, _, _ = pixels.shape
+    heads = weights.shape[2]
+    dtype = torch.promote_types(pixels.dtype, torch.float32)
+    size = pixels.new_tensor(image_size_px[::-1], dtype=dtype)
+    unit = pixels.to(dtype) / size  # [B, Q, N, P, 2], the image is [0, 1) x [0, 1)
+    weights = weights.to(dtype)
+    # Half a cell beyond the edge still mixes with the border cells.
+    reach = max(0.5 / level.shape[axis] for level in values for axis in (3, 4))
+    seen = ((unit > -reach) & (unit < 1 + reach)).all(4)  # [B, Q, N, P]
+    if visible is not None:
+        seen = seen & visible
+        weights = torch.where(visible[:, :, None, :, None, :], weights, 0.0)
+    used = seen.any(3).permute(0, 2, 1)  # [B, N, Q]
+    counts = used.sum(2).flatten().tolist()
+    chosen = (used.flatten().nonzero().squeeze(1) % queries).split(counts)
+
+    out = weights.new_zeros(batch_size * queries, values[0].shape[2])
+    for image, rows in enumerate(chosen):
+        if len(rows) == 0:
+            continue
+        sample, view = divmod(image, views)
+        places = (2 * unit[sample, :, view].index_select(0, rows) - 1).unsqueeze(0)  # [1, q, P, 2]
+        shares = weights[sample, :, :, view].index_select(0, rows)  # [q, heads, L, P]
+        total = 0
+        for level, maps in enumerate(values):
+            sampled = F.grid_sample(maps[sample, view].to(dtype).unsqueeze(0), places, align_corners=False)
+            share = shares[:, :, level].transpose(0, 1).unsqueeze(1)  # [heads, 1, q, P]
+            total = total + (sampled.view(heads, -1, *places.shape[1:3]) * share).sum(3)  # [heads, c, q]
+        # The queries of one image are distinct, so the sum does not depend on the order of the additions.
+        out.index_add_(0, rows + sample * queries, total.permute(2, 0, 1).flatten(1))
+    return out.view(batch_size, queries, -1).to(values[0].dtype)
+
+
+def _corners(
+    sites: Sites,
+    points: Tensor,  # [n, 2]
+    batch: Tensor,  # [n]
+    grid: BEVGrid,
+) -> tuple[Tensor, Tensor]:  # [n, 4] int64, [n, 4]
+    """Rows of the four cells around each point, -1 where absent, and their bilinear weights."""
+    dtype = torch.promote_types(points.dtype, torch.float32)
+    place = grid.to_cells(points.to(dtype)) - 0.5
+    low = place.detach().floor()
+    part = place - low  # [n, 2]
+    across = torch.stack([1 - part[:, 0], part[:, 0]], 1)  # [n, 2] over columns
+    down = torch.stack([1 - part[:, 1], part[:, 1]], 1)  # [n, 2] over rows
+    weights = (down.unsqueeze(2) * across.unsqueeze(1)).flatten(1)
+
+    step = torch.arange(2, device=points.device)
+    # Clamping before the conversion to integers keeps NaN and far points out.
+    low = low.nan_to_num(-2).clamp(-2, max(grid.cells)).long()
+    col, row = low[:, :1] + step, low[:, 1:] + step
+    inside = ((row >= 0) & (row < grid.rows)).unsqueeze(2) & ((col >= 0) & (col < grid.cols)).unsqueeze(1)
+    linear = (batch[:, None] * grid.rows + row).unsqueeze(2) * grid.cols + col.unsqueeze(1)
+    inside, linear = inside.flatten(1), linear.flatten(1)
+    rows = _row_table(sites).take(torch.where(inside, linear, 0))
+    return torch.where(inside, rows, -1), weights
+
+
+def _row_table(sites: Sites) -> Tensor:  # [B * rows * cols] int64
+    """Row of every cell of the grid, -1 where absent; made once per set of sites."""
+    if "row_table" not in sites.cache:
+        table = sites.keys.new_full((max(torch.Size(sites.shape).numel(), 1),), -1)
+        table[sites.linear()] = torch.arange(len(sites), device=sites.device)
+        sites.cache["row_table"] = table
+    return sites.cache["row_table"]
+
+
+def _check_bev(values: Tensor, sites: Sites, points: Tensor, batch: Tensor, grid: BEVGrid) -> None:
+    if sites.shape[1:] != (grid.rows, grid.cols) or len(values) != len(sites):
+        raise ValueError(
+            f"{len(values)} rows of values on sites of shape {sites.shape} with {len(sites)} rows: expected as many "
+            f"rows and a map of {(grid.rows, grid.cols)} cells"
+        )
+    if points.shape[-1] != 2 or batch.shape != points.shape[:-1]:
+        raise ValueError(f"expected points [..., 2] and batch [...], got {list(points.shape)} and {list(batch.shape)}")
+
+
+def _check_images(values: list[Tensor], pixels: Tensor, image_size_px: tuple[int, int], weights: Tensor) -> None:
+    batch_size, queries, views, points = pixels.shape[:4]
+    expected = (batch_size, queries, weights.shape[2], views, len(values), points)
+    if weights.shape != expected:
+        raise ValueError(f"weights: expected [B, Q, heads, N, L, P] = {list(expected)}, got {list(weights.shape)}")
+    for level, maps in enumerate(values):
+        if maps.shape[:2] != (batch_size, views) or maps.shape[2] % weights.shape[2]:
+            raise ValueError(
+                f"values[{level}]: expected [{batch_size}, {views}, a multiple of {weights.shape[2]} channels, H, W], "
+                f"got {list(maps.shape)}"
+            )
+        if image_size_px[0] * maps.shape[4] != image_size_px[1] * maps.shape[3] or image_size_px[0] % maps.shape[3]:
+            raise ValueError(
+                f"values[{level}]: a map of {tuple(maps.shape[3:])} cells does not divide an image of {image_size_px} "
+                "pixels into square cells; choose an image size that the strides divide"
+            )

@@ -1,0 +1,161 @@
+"""Overlap of rotated boxes and the ways to keep one detection per object (specification 7)."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from src.ops.kernel_maps import submanifold_map
+from src.ops.sites import Sites
+
+# Pairs of boxes intersected at a time: bounds the memory where many boxes pile up, and stays in the cache.
+PAIR_CHUNK = 8192
+
+
+def rotated_iou(
+    boxes_a: Tensor,  # [n, 5] (x, y, length, width, yaw): metres, radians
+    boxes_b: Tensor,  # [m, 5]
+) -> Tensor:  # [n, m]
+    """Intersection over union of rotated rectangles. No gradient; computed in float64 relative to each pair.
+
+    Only pairs whose circumscribed circles overlap are looked at. Raises ValueError for tensors that are not [n, 5].
+    """
+    for name, boxes in (("boxes_a", boxes_a), ("boxes_b", boxes_b)):
+        if boxes.dim() != 2 or boxes.shape[1] != 5:
+            raise ValueError(f"{name}: expected [n, 5] (x, y, length, width, yaw), got {list(boxes.shape)}")
+    a, b = boxes_a.detach().double(), boxes_b.detach().double()
+    i, j = _touching(a, b).nonzero(as_tuple=True)
+    iou = boxes_a.new_zeros(len(boxes_a), len(boxes_b))
+    iou[i, j] = _pair_iou(a, b, i, j).to(iou.dtype)
+    return iou
+
+
+def nms_rotated(
+    boxes: Tensor,  # [n, 5] (x, y, length, width, yaw)
+    scores: Tensor,  # [n]
+    iou_threshold: float,
+) -> Tensor:  # [kept] int64, by descending score
+    """Greedy suppression: a box goes if its IoU with a better kept one exceeds the threshold; ties keep their order."""
+    order = torch.argsort(scores, descending=True, stable=True)
+    ranked = boxes.detach().index_select(0, order).double()
+    better, worse = _touching(ranked, ranked).triu(1).nonzero(as_tuple=True)
+    conflict = _pair_iou(ranked, ranked, better, worse) > iou_threshold
+    return order[_greedy(better[conflict], worse[conflict], len(order))]
+
+
+def nms_circle(
+    centers: Tensor,  # [n, 2] (x, y) metres
+    scores: Tensor,  # [n]
+    radius_m: float,
+) -> Tensor:  # [kept] int64, by descending score
+    """Greedy suppression: a detection goes if a better kept one lies within `radius_m` metres (not squared)."""
+    order = torch.argsort(scores, descending=True, stable=True)
+    ranked = centers.detach().index_select(0, order).double()
+    better, worse = (_squared_distance(ranked, ranked) <= radius_m**2).triu(1).nonzero(as_tuple=True)
+    return order[_greedy(better, worse, len(order))]
+
+
+def maxpool_peaks(
+    scores: Tensor,  # [M, c]
+    sites: Sites,  # M sites in 2D
+) -> Tensor:  # [M, c] bool
+    """Where a score equals the maximum of its own 3x3 neighbourhood among the sites, channel by channel."""
+    if len(scores) != len(sites):
+        raise ValueError(f"{len(scores)} rows of scores on {len(sites)} sites: expected one row a site")
+    if len(sites) == 0:
+        return torch.zeros_like(scores, dtype=torch.bool)
+    maps = submanifold_map(sites, 3)
+    order, starts = maps.bags_by_output()
+    picks = maps.inputs.index_select(0, order)
+    scores = scores.detach()
+    return scores == F.embedding_bag(picks, scores, starts[:-1], mode="max")
+
+
+def _greedy(
+    better: Tensor,  # [pairs] int64, ascending
+    worse: Tensor,  # [pairs] int64, each above its partner
+    num: int,
+) -> Tensor:  # [kept] int64
+    """Rows that survive when every kept row removes the later ones it is in conflict with."""
+    dropped = [False] * num
+    # In the order of `better`, so that a row's own fate is settled before it removes others.
+    for first, second in zip(better.tolist(), worse.tolist(), strict=True):
+        if not dropped[first]:
+            dropped[second] = True
+    kept = [row for row, gone in enumerate(dropped) if not gone]
+    return torch.tensor(kept, dtype=torch.int64, device=better.device)
+
+
+def _squared_distance(a: Tensor, b: Tensor) -> Tensor:  # [n, m]
+    return (a[:, None, 0] - b[:, 0]).square() + (a[:, None, 1] - b[:, 1]).square()
+
+
+def _touching(
+    a: Tensor,  # [n, 5]
+    b: Tensor,  # [m, 5]
+) -> Tensor:  # [n, m] bool
+    """Whether the circumscribed circles meet."""
+    radius_a, radius_b = 0.5 * a[:, 2:4].norm(dim=1), 0.5 * b[:, 2:4].norm(dim=1)
+    return _squared_distance(a, b) <= (radius_a[:, None] + radius_b).square()
+
+
+def _pair_iou(
+    a: Tensor,  # [n, 5] float64
+    b: Tensor,  # [m, 5] float64
+    i: Tensor,  # [pairs] int64, row of a
+    j: Tensor,  # [pairs] int64, row of b
+) -> Tensor:  # [pairs]
+    iou = a.new_zeros(len(i))
+    for start in range(0, len(i), PAIR_CHUNK):
+        span = slice(start, start + PAIR_CHUNK)
+        first, second = a.index_select(0, i[span]), b.index_select(0, j[span])
+        shared = _intersection(first, second)
+        whole = first[:, 2] * first[:, 3] + second[:, 2] * second[:, 3] - shared
+        iou[span] = torch.where(whole > 0, shared / torch.where(whole > 0, whole, 1.0), 0.0)
+    return iou
+
+
+def _intersection(
+    a: Tensor,  # [pairs, 5] float64
+    b: Tensor,  # [pairs, 5] float64
+) -> Tensor:  # [pairs]
+    """Area of the intersection of each pair of rectangles.
+
+    In the frame of b the area is the integral over |x| <= l_b / 2 of the part of a between y = -w_b / 2 and w_b / 2.
+    Along the boundary of a this is minus the sum over its edges of the integral of y clamped to that band, a continuous
+    formula: shared edges, equal boxes and nearly parallel sides need no special case.
+    """
+    cosine, sine = b[:, 4].cos(), b[:, 4].sin()
+    shift = a[:, :2] - b[:, :2]
+    centre = torch.stack([cosine * shift[:, 0] + sine * shift[:, 1], cosine * shift[:, 1] - sine * shift[:, 0]], 1)
+    turn = a[:, 4] - b[:, 4]
+    along = torch.stack([turn.cos(), turn.sin()], 1) * 0.5 * a[:, 2:3]
+    across = torch.stack([-turn.sin(), turn.cos()], 1) * 0.5 * a[:, 3:4]
+    corners = centre[:, None] + torch.stack([along + across, across - along, -along - across, along - across], 1)
+    half_x, half_y = 0.5 * b[:, 2:3], 0.5 * b[:, 3:4]  # [pairs, 1]
+    start, end = corners, corners.roll(-1, 1)  # [pairs, 4, 2], counter-clockwise
+    x0, x1 = start[..., 0], end[..., 0]
+    y0, rise = start[..., 1], end[..., 1] - start[..., 1]
+    left, right = x0.clamp(-half_x, half_x), x1.clamp(-half_x, half_x)
+    # The stretch of the edge above |x| <= half_x, as fractions of the edge, and its heights.
+    run = torch.where(x1 == x0, 1.0, x1 - x0)
+    low, high = y0 + rise * ((left - x0) / run).clamp(0, 1), y0 + rise * ((right - x0) / run).clamp(0, 1)
+    return -((right - left) * _mean_clamped(low, high, half_y)).sum(1).clamp(max=0)
+
+
+def _mean_clamped(
+    first: Tensor,  # [pairs, 4]
+    last: Tensor,  # [pairs, 4]
+    bound: Tensor,  # [pairs, 1]
+) -> Tensor:  # [pairs, 4]
+    """Mean of clamp(y, -bound, bound) for y running linearly from first to last."""
+    rise = last - first
+    safe = torch.where(rise == 0, 1.0, rise)
+    cuts = torch.stack([(-bound - first) / safe, (bound - first) / safe]).clamp(0, 1)
+    enter, leave = cuts.amin(0), cuts.amax(0)
+    flat = rise == 0
+    enter, leave = torch.where(flat, 0.0, enter), torch.where(flat, 1.0, leave)
+    at_first, at_last = first.clamp(-bound, bound), last.clamp(-bound, bound)
+    at_enter, at_leave = (first + rise * enter).clamp(-bound, bound), (first + rise * leave).clamp(-bound, bound)
+    return enter * at_first + (leave - enter) * 0.5 * (at_enter + at_leave) + (1 - leave) * at_last

@@ -1,0 +1,63 @@
+"""Points to voxels: the sites they occupy and the mean of their features (specification 1.3)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from src.ops.bags import segment_mean
+from src.ops.sites import Sites
+
+
+def voxelize(
+    points: Tensor,  # [P, F] features
+    coordinates: Tensor,  # [P, d] metres in the order (x, y) or (x, y, z)
+    batch: Tensor,  # [P] int64, sample of each point
+    lower_m: tuple[float, ...],  # (x, y[, z]) lower corner of the grid
+    voxel_size_m: tuple[float, ...],  # (x, y[, z])
+    shape: tuple[int, ...],  # (y, x) or (z, y, x) voxels: reversed, as cells are (row, col)
+    batch_size: int,
+    max_voxels: int | None = None,
+) -> tuple[Sites, Tensor, Tensor]:
+    """Sites [V], mean features [V, F] and number of points [V] int64 of the voxels that hold points.
+
+    Voxel i of an axis covers [lower + i * size, lower + (i + 1) * size). Points outside the grid or with a coordinate
+    that is not finite are left out. Where a sample has more than `max_voxels` voxels, those with the most points stay,
+    on ties those with the lowest index. Means are float32 at least, whatever autocast says, and the same for any order
+    of the points up to rounding. Raises ValueError for shapes that do not fit together.
+    """
+    ndim = len(shape)
+    if coordinates.shape != (len(points), ndim) or batch.shape != (len(points),):
+        raise ValueError(
+            f"expected coordinates [{len(points)}, {ndim}] and batch [{len(points)}] for shape {tuple(shape)}, got "
+            f"{list(coordinates.shape)} and {list(batch.shape)}"
+        )
+    if len(lower_m) != ndim or len(voxel_size_m) != ndim:
+        raise ValueError(f"lower_m={lower_m}, voxel_size_m={voxel_size_m}: expected {ndim} values each, as in {shape}")
+    place = coordinates.double() - coordinates.new_tensor(lower_m, dtype=torch.float64)
+    cells = (place / coordinates.new_tensor(voxel_size_m, dtype=torch.float64)).floor().flip(1)  # [P, d] (z, y, x)
+    limit = torch.tensor(shape, device=cells.device)
+    inside = ((cells >= 0) & (cells < limit)).all(1).nonzero().squeeze(1)
+    indices = torch.cat([batch[:, None].index_select(0, inside), cells.index_select(0, inside).long()], 1)
+    sites, rows = Sites.unique(indices, (batch_size, *shape))
+    values = points.index_select(0, inside)
+    if max_voxels is not None and len(sites) > max_voxels:
+        kept = _densest(sites, torch.bincount(rows, minlength=len(sites)), max_voxels)
+        place_of = torch.full_like(sites.keys, -1)
+        place_of[kept] = torch.arange(len(kept), device=kept.device)
+        rows = place_of.index_select(0, rows)
+        values, rows = values[rows >= 0], rows[rows >= 0]
+        sites = Sites(sites.shape, sites.keys.index_select(0, kept))
+    values = values.to(torch.promote_types(values.dtype, torch.float32))
+    return sites, segment_mean(values, rows, len(sites)), torch.bincount(rows, minlength=len(sites))
+
+
+def _densest(sites: Sites, counts: Tensor, limit: int) -> Tensor:
+    """Ascending rows of the `limit` voxels with the most points of every sample."""
+    sample = sites.indices()[:, 0]
+    by_count = torch.argsort(counts, descending=True, stable=True)
+    best_first = by_count[torch.argsort(sample[by_count], stable=True)]  # sample by sample
+    sizes = sites.batch_counts()
+    first = (sizes.cumsum(0) - sizes).index_select(0, sample[best_first])
+    rank = torch.arange(len(sites), device=sites.device) - first
+    return best_first[rank < limit].sort().values

@@ -1,0 +1,144 @@
+"""Decoding against OpenPCDet's own, suppression, limits and attributes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from src.geometry.bev_grid import BEVGrid
+from src.models.heads.decode import (
+    CIRCLE_GROUPS,
+    Suppression,
+    boxes_from_codes,
+    learned_attributes,
+    rule_attributes,
+    suppress,
+    top_candidates,
+    within_limits,
+)
+from src.ops.nms import nms_circle
+from src.structures.boxes import Boxes3D
+from src.structures.taxonomy import ATTRIBUTES, CLASSES
+from src.targets.heatmap import HEAD_GROUPS
+
+GRID = BEVGrid(cells=(384, 384), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
+CASE = np.load(Path(__file__).parents[2] / "golden" / "voxelnext_head_targets" / "case.npz")
+META = json.loads(str(CASE["meta_json"]))
+
+
+def make_boxes(*rows: tuple[str, float, float, float, float, float]) -> Boxes3D:
+    """Boxes of 4 x 2 x 2 m from rows name, x, y, z, speed, score."""
+    values = torch.tensor([row[1:] for row in rows], dtype=torch.float32).reshape(-1, 5)
+    labels = torch.tensor([CLASSES.index(row[0]) for row in rows])
+    sizes = torch.tensor([[4.0, 2.0, 2.0]]).repeat(len(rows), 1)
+    velocities = torch.stack([values[:, 3], torch.zeros(len(rows))], 1)
+    return Boxes3D(values[:, :3], sizes, values[:, 3] * 0, velocities, labels, labels * 0 - 1, values[:, 4])
+
+
+@pytest.mark.parametrize("group", range(7))
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 1e-4)])
+def test_golden_decoding(group: int, dtype: torch.dtype, tolerance: float) -> None:
+    names = list(HEAD_GROUPS[group])
+    assert META["groups"][group] == names
+    columns = [META["names"].index(name) for name in names]
+    scores = torch.from_numpy(CASE["decode/logits"]).to(dtype).sigmoid()[:, columns]
+    codes = torch.from_numpy(CASE["decode/reg"]).to(dtype)[:, group]
+    counts = np.bincount(CASE["cells"][:, 0]).tolist()
+    labels = torch.tensor([CLASSES.index(name) for name in names])
+    best = top_candidates(scores, labels, counts, META["score_thresh"], META["K"])
+    cells = torch.from_numpy(CASE["cells"].astype(np.int64))[best.rows, 1:]
+    boxes = boxes_from_codes(cells, codes[best.rows], best.labels, best.scores, GRID)
+    for sample, rows in enumerate(torch.arange(len(boxes)).split(best.counts)):
+        key = f"decode/g{group}/b{sample}"
+        mine = boxes[rows]
+        found = torch.cat([mine.centers, mine.sizes, mine.yaws[:, None], mine.velocities], dim=1)
+        np.testing.assert_allclose(found, CASE[f"{key}/boxes"], rtol=0, atol=tolerance)
+        np.testing.assert_allclose(mine.scores, CASE[f"{key}/scores"], rtol=0, atol=tolerance)
+        assert [names.index(CLASSES[label]) for label in mine.labels] == CASE[f"{key}/labels"].tolist()
+
+
+@pytest.mark.parametrize("radius", [0.4, 1.0, 2.5])
+def test_golden_circle_suppression(radius: float) -> None:
+    table = torch.from_numpy(CASE["circle/xy_score"])
+    assert nms_circle(table[:, :2], table[:, 2], radius).tolist() == CASE[f"circle/keep_{radius}"].tolist()
+
+
+def test_log_sizes_are_clamped() -> None:
+    codes = torch.zeros(1, 10)
+    codes[0, 3:6] = torch.tensor([9.0, -9.0, 1.0])
+    sizes = boxes_from_codes(torch.zeros(1, 2).long(), codes, torch.zeros(1).long(), torch.ones(1), GRID).sizes
+    torch.testing.assert_close(sizes[0].log(), torch.tensor([5.0, -5.0, 1.0]))
+
+
+@pytest.mark.parametrize(
+    ("method", "group", "kept"),
+    [
+        # 1.2 m apart along a length of 4 m: IoU 0.54.
+        (Suppression.rotated, 3, 2),
+        (Suppression.circle, 3, 3),
+        (Suppression.per_group, 3, 3),
+        (Suppression.per_group, 0, 2),
+        (Suppression.circle, 0, 2),
+        (Suppression.maxpool, 0, 3),
+    ],
+)
+def test_suppression_of_each_group(method: Suppression, group: int, kept: int) -> None:
+    name = HEAD_GROUPS[group][0]
+    boxes = make_boxes((name, 0, 0, 0, 0, 0.9), (name, 1.2, 0, 0, 0, 0.8), (name, 30, 0, 0, 0, 0.7))
+    assert len(suppress(boxes, group, method)) == kept
+
+
+def test_groups_of_the_table() -> None:
+    assert [HEAD_GROUPS[number][0] for number in CIRCLE_GROUPS] == ["barrier", "pedestrian", "traffic_sign"]
+
+
+def test_at_most_83_boxes_of_a_group_and_the_best() -> None:
+    boxes = make_boxes(*[("car", 10.0 * (k % 10), 10.0 * (k // 10), 0, 0, 1 - k / 200) for k in range(100)])
+    kept = suppress(boxes, 0, Suppression.rotated)
+    assert len(kept) == 83 and torch.equal(kept.scores, boxes.scores[:83])
+
+
+def test_ranges_by_class_and_the_best_of_all_groups() -> None:
+    boxes = make_boxes(
+        ("car", 149, 0, 0, 0, 0.3),
+        ("car", 120, 120, 0, 0, 0.9),
+        ("pedestrian", 60, -50, 0, 0, 0.9),
+        ("pedestrian", 50, -50, 0, 0, 0.5),
+        ("truck", 0, 0, 0, 0, 0.4),
+    )
+    kept = within_limits(boxes, 2)
+    assert kept.scores.tolist() == pytest.approx([0.5, 0.4])
+    assert len(within_limits(boxes, 500)) == 3
+
+
+def test_attribute_rule() -> None:
+    expected = {
+        ("car", 0.0, 3.0): "vehicle.moving",
+        ("car", 0.0, 0.1): "vehicle.parked",
+        ("trailer", 0.0, 0.0): "vehicle.parked",
+        ("bus", 0.0, 0.0): "vehicle.stopped",
+        ("bus", 0.0, 0.3): "vehicle.moving",
+        ("pedestrian", 0.0, 1.0): "pedestrian.moving",
+        ("pedestrian", 0.0, 0.0): "pedestrian.standing",
+        ("bicycle", 0.0, 1.0): "cycle.with_rider",
+        ("motorcycle", 0.0, 0.0): "cycle.without_rider",
+        ("traffic_sign", 4.6, 0.0): "traffic_sign.overhanging",
+        ("traffic_sign", 4.4, 5.0): "traffic_sign.pole_mounted",
+        ("barrier", 9.0, 0.0): None,
+        ("traffic_cone", 0.0, 5.0): None,
+        ("animal", 0.0, 5.0): None,
+    }
+    found = rule_attributes(make_boxes(*[(name, 0, 0, z, speed, 0.5) for name, z, speed in expected]))
+    names = [None if index < 0 else ATTRIBUTES[index] for index in found.tolist()]
+    assert names == list(expected.values())
+
+
+def test_learned_attributes_stay_within_the_class() -> None:
+    logits = torch.zeros(3, 11)
+    logits[:, ATTRIBUTES.index("vehicle.moving")] = 9
+    logits[:, ATTRIBUTES.index("cycle.without_rider")] = 5
+    labels = torch.tensor([CLASSES.index(name) for name in ("car", "bicycle", "barrier")])
+    found = learned_attributes(logits, labels).tolist()
+    assert found == [ATTRIBUTES.index("vehicle.moving"), ATTRIBUTES.index("cycle.without_rider"), -1]

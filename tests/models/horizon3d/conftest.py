@@ -1,0 +1,201 @@
+"""A model of a few thousand parameters and random frames to feed it."""
+
+import math
+
+import pytest
+import torch
+
+from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.image import ImageEncoderConfig, NeckName
+from src.models.backbones.sparse_voxel import ConvOut, RadarEncoderConfig
+from src.models.backbones.weights import BackboneName
+from src.models.heads.center_head import HeadConfig, TrainRegression
+from src.models.heads.decode import AttributeSource, Suppression
+from src.models.horizon3d.kggi import Initialization, KGGIConfig
+from src.models.horizon3d.loss import LossConfig
+from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
+from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom
+from src.models.horizon3d.views import CameraViews
+from src.structures.batch import FrameBatch
+from src.structures.boxes import Boxes3D
+from src.targets.depth import DepthTarget
+
+SIZE = (64, 96)  # image height, width
+
+
+@pytest.fixture
+def grid():
+    return BEVGrid(cells=(48, 64), cell_m=0.8, centre_m=(2.0, -1.0), z_range_m=(-3.0, 5.0))
+
+
+def camera_matrices(size=SIZE):
+    """Four cameras 2 m up, looking along the diagonals, 90 degrees wide: [4, 4, 4] pixels from the aug frame."""
+    height, width = size
+    matrices = []
+    for degrees in (45.0, -45.0, -135.0, 135.0):
+        yaw = math.radians(degrees)
+        forward, right = (math.cos(yaw), math.sin(yaw), 0.0), (math.sin(yaw), -math.cos(yaw), 0.0)
+        rotation = torch.tensor([right, (0.0, 0.0, -1.0), forward])
+        focal = width / 2
+        intrinsics = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+        matrix = torch.eye(4)
+        matrix[:3, :3] = intrinsics @ rotation
+        matrix[:3, 3] = intrinsics @ (rotation @ torch.tensor([0.0, 0.0, -2.0]))
+        matrices.append(matrix)
+    return torch.stack(matrices)
+
+
+def random_boxes(count, generator):
+    centers = torch.rand(count, 3, generator=generator) * torch.tensor([40.0, 30.0, 1.0]) - torch.tensor([18.0, 16.0, 0.0])
+    return Boxes3D(
+        centers=centers,
+        sizes=torch.tensor([4.5, 1.9, 1.6]).expand(count, 3) * (0.5 + torch.rand(count, 1, generator=generator)),
+        yaws=torch.rand(count, generator=generator) * 6.0,
+        velocities=torch.randn(count, 2, generator=generator) * 5.0,
+        labels=torch.arange(count) % 12,
+        attributes=torch.full((count,), -1),
+        num_points=torch.full((count,), 5),
+    )
+
+
+@pytest.fixture
+def make_batch():
+    """Random frames: (points per sample, boxes per sample) -> FrameBatch."""
+
+    def build(points=(150, 120), boxes=(6, 4), seed=0, images=True):
+        generator = torch.Generator().manual_seed(seed)
+        b = len(points)
+        clouds, owners = [], []
+        for sample, count in enumerate(points):
+            xyz = torch.rand(count, 3, generator=generator) * torch.tensor([48.0, 36.0, 4.0])
+            xyz = xyz + torch.tensor([-22.0, -19.0, -1.0])
+            rest = torch.randn(count, 4, generator=generator) * torch.tensor([8.0, 5.0, 5.0, 0.1])
+            clouds.append(torch.cat([xyz, rest], dim=1))
+            owners.append(torch.full((count,), sample))
+        return FrameBatch(
+            tokens=[f"sample{i}" for i in range(b)],
+            timestamps_s=torch.zeros(b, dtype=torch.float64),
+            global_from_ego=torch.eye(4, dtype=torch.float64).repeat(b, 1, 1),
+            aug_from_ego=torch.eye(4).repeat(b, 1, 1),
+            radar_points=torch.cat(clouds),
+            radar_batch=torch.cat(owners),
+            images=torch.randint(0, 256, (b, 4, 3, *SIZE), generator=generator, dtype=torch.uint8) if images else None,
+            image_valid=torch.ones(b, 4, dtype=torch.bool) if images else None,
+            pix_from_aug=camera_matrices().repeat(b, 1, 1, 1) if images else None,
+            boxes=[random_boxes(count, generator) for count in boxes],
+        )
+
+    return build
+
+
+@pytest.fixture
+def make_views():
+    """Random image features of the four cameras for b samples."""
+
+    def build(b=1, strides=(8, 16, 32), channels=16):
+        levels = [torch.randn(b, 4, channels, SIZE[0] // stride, SIZE[1] // stride) for stride in strides]
+        return CameraViews(levels, camera_matrices().repeat(b, 1, 1, 1), torch.ones(b, 4, dtype=torch.bool), SIZE)
+
+    return build
+
+
+@pytest.fixture
+def backbone():
+    return ImageEncoderConfig(
+        name=BackboneName.small,
+        image_size_px=list(SIZE),
+        weights=None,
+        lr_multiplier=1.0,
+        neck=NeckName.fpn,
+        neck_channels=16,
+        trim_padding=False,
+        widths=[8, 8, 16, 16],
+        blocks=[1, 1, 1, 1],
+    )
+
+
+@pytest.fixture
+def make_config():
+    """Smallest configuration with every part on; keyword arguments replace values of kggi, ocsf and loss by name."""
+
+    def build(radar_only=False, **changes):
+        kggi = {
+            "initialization": Initialization.both,
+            "num_radar_keypoints": 24,
+            "num_camera_keypoints": 12,
+            "num_random_keypoints": 8,
+            "num_depth_bins": 16,
+            "depth_range_m": [1.0, 40.0],
+            "depth_target": DepthTarget.box,
+            "keypoint_nms_cells": None,
+            "property_head": True,
+        }
+        ocsf = {
+            "num_layers": 2,
+            "num_learnable_points": 3,
+            "margin_m": 4.8,
+            "occupancy_threshold": 0.1,
+            "max_occupied_cells": 2000,
+            "scale_range_m": [0.2, 3.2],
+            "max_mean_shift_m": 4.0,
+            "max_speed_mps": 60.0,
+            "support_sigmas": 3.0,
+            "cross_attention": CrossAttention.parallel,
+            "refine_from": RefineFrom.self_encoding,
+            "gate_kernel_size": 1,
+        }
+        loss = {
+            "kggi_weight": 1.0,
+            "ocsf_weight": 5.0,
+            "heatmap_weight": 1.0,
+            "box_weight": 0.25,
+            "keypoint_weight": 1.0,
+            "depth_weight": 1.0,
+            "radar_objectness_weight": 1.0,
+            "occupancy_focal_weight": 1.0,
+            "occupancy_dice_weight": 1.0,
+            "gaussian_velocity_weight": 0.25,
+            "gaussian_velocity_in_phase1": False,
+        }
+        for part in (kggi, ocsf, loss):
+            part.update({name: changes.pop(name) for name in list(changes) if name in part})
+        assert not changes
+        return Horizon3DConfig(
+            name="horizon3d",
+            channels=16,
+            radar_encoder=RadarEncoderConfig(
+                voxel_size_m=[0.8, 0.8, 8.0],
+                stage_channels=[16, 16],
+                blocks_per_stage=1,
+                max_voxels=10000,
+                conv_out=ConvOut.subm,
+                point_count_channel=True,
+            ),
+            kggi=None if radar_only else KGGIConfig(**kggi),
+            ocsf=None if radar_only else OCSFConfig(**ocsf),
+            head=head_config(),
+            loss=LossConfig(**loss),
+        )
+
+    return build
+
+
+def head_config():
+    return HeadConfig(
+        nms=Suppression.per_group,
+        score_threshold=0.1,
+        max_boxes=500,
+        attributes=AttributeSource.rule,
+        train_regression=TrainRegression.all,
+    )
+
+
+@pytest.fixture
+def make_model(make_config, grid, backbone):
+    """A fresh model with the random state fixed."""
+
+    def build(seed=0, **changes):
+        torch.manual_seed(seed)
+        return Horizon3D(make_config(**changes), grid, backbone, velocity_code_weight=0.2)
+
+    return build

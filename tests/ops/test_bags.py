@@ -1,0 +1,45 @@
+import torch
+
+from src.ops import segment_mean, segment_sum
+from src.ops.bags import bag_sum, bags, row_products, weighted_bag
+
+
+def test_bags_keep_the_order_of_their_pairs():
+    order, starts = bags(torch.tensor([2, 0, 2, 0]), 4)
+    assert order.tolist() == [1, 3, 0, 2]
+    assert starts.tolist() == [0, 2, 2, 4, 4]
+
+
+def test_bag_sum_by_hand():
+    values = torch.tensor([[1.0], [10.0], [100.0]])
+    picks, starts = torch.tensor([0, 2, 1]), torch.tensor([0, 2, 2, 3])
+    assert bag_sum(values, picks, starts).tolist() == [[101.0], [0.0], [10.0]]
+    assert bag_sum(values, picks, starts, torch.tensor([2.0, 1.0, 3.0])).tolist() == [[102.0], [0.0], [30.0]]
+    assert bag_sum(values, picks[:0], torch.zeros(3, dtype=torch.int64)).tolist() == [[0.0], [0.0]]
+
+
+def test_segment_sum_and_mean():
+    values = torch.tensor([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    rows = torch.tensor([2, 0, 2])
+    assert segment_sum(values, rows, 3).tolist() == [[3.0, 4.0], [0.0, 0.0], [6.0, 8.0]]
+    assert segment_mean(values, rows, 3).tolist() == [[3.0, 4.0], [0.0, 0.0], [3.0, 4.0]]
+    assert segment_mean(values[:0], rows[:0], 2).tolist() == [[0.0, 0.0]] * 2
+    double = values.double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: segment_mean(x, rows, 3), double)
+
+
+def test_weighted_bag_gradients():
+    torch.manual_seed(0)
+    picks, bag = torch.tensor([0, 2, 0, 1, 2]), torch.tensor([0, 0, 2, 2, 2])
+    values, weights = torch.randn(3, 2).double().requires_grad_(), torch.randn(5).double().requires_grad_()
+    for by_pick in (None, torch.argsort(picks, stable=True)):
+        assert torch.autograd.gradcheck(lambda v, w, by=by_pick: weighted_bag(v, w, picks, bag, 4, by), (values, weights))
+    dense = torch.zeros(4, 2).double().index_add(0, bag, weights[:, None] * values[picks])
+    torch.testing.assert_close(weighted_bag(values, weights, picks, bag, 4), dense)
+
+
+def test_row_products_in_chunks(monkeypatch):
+    monkeypatch.setattr("src.ops.bags.CPU_CHUNK", 3)
+    a, b = torch.randn(4, 5), torch.randn(6, 5)
+    rows_a, rows_b = torch.randint(0, 4, (10,)), torch.randint(0, 6, (10,))
+    torch.testing.assert_close(row_products(a, rows_a, b, rows_b), (a[rows_a] * b[rows_b]).sum(1))
