@@ -65,13 +65,15 @@ def benchmark_model(config: Config) -> dict[str, Any]:
     timings: dict[str, list[float]] = {}
     for _ in range(REPEATS):
         terms = timed_step(model, batch, timings, device, config.precision == "bf16-mixed")
-    peak = torch.cuda.max_memory_allocated() if device.type == "cuda" else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    if device.type == "cuda":
+        peak_bytes = torch.cuda.max_memory_allocated()
     return {
         "device": str(device),
         "seconds": {name: statistics.median(values) for name, values in timings.items()},
         "spread": {name: max(values) - min(values) for name, values in timings.items()},
         "losses": {name: float(value) for name, value in terms.items()},
-        "peak_memory_mib": int(peak / 2**20),
+        "peak_memory_mib": int(peak_bytes / 2**20),
         "parameters": {name: sum(p.numel() for p in part.parameters()) for name, part in model.named_children()},
         "radar_points": len(batch.radar_points),
         "state": {name: float(value) for name, value in model.diagnostics(model(batch)).items()},
@@ -153,6 +155,13 @@ def processor() -> str:
     return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
+def number(value: Any) -> str:
+    """Four digits for a float, thousands apart for an integer."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
+
+
 def markdown(result: dict[str, Any]) -> str:
     """The result as Markdown: a table of seconds where there are some, every other number in a list."""
     lines = [f"# Benchmark: {result['suite']}", "", f"`python -m src.benchmark {' '.join(result['overrides'])}`", ""]
@@ -166,7 +175,7 @@ def markdown(result: dict[str, Any]) -> str:
     for name, value in content.items():
         shown = value if isinstance(value, dict) else {name: value}
         prefix = f"{name}: " if isinstance(value, dict) else ""
-        cells = [f"{key} {item:.4g}" if isinstance(item, float) else f"{key} {item:,}" if isinstance(item, int) else f"{key} {item}" for key, item in shown.items()]
+        cells = [f"{key} {number(item)}" for key, item in shown.items()]
         lines.append(f"- {prefix}{', '.join(cells)}")
     return "\n".join(lines)
 

@@ -229,7 +229,7 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
         schema.model = OmegaConf.structured(MODEL_CONFIGS[model])
         return build_config(OmegaConf.merge(schema, tree))
     except (OmegaConfBaseException, ConfigError) as error:
-        raise CheckpointError(f"the checkpoint's configuration does not fit this version of the code: {error}") from error
+        raise CheckpointError(f"the checkpoint's configuration does not fit this code: {error}") from None
 
 
 def _hydra_message(error: Exception) -> str:
@@ -298,7 +298,8 @@ def run_command(main: Callable[[list[str]], None]) -> None:
 
     Exit codes: 0 finished, 3 configuration or checkpoint, 4 data, 5 diverged, 6 interrupted and resumable, 1 a defect.
     """
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname).1s %(name)s: %(message)s", datefmt="%H:%M:%S")
+    line = "%(asctime)s %(levelname).1s %(name)s: %(message)s"
+    logging.basicConfig(level=logging.INFO, format=line, datefmt="%H:%M:%S")
     for noisy in ("matplotlib", "PIL", "lightning.pytorch.utilities.rank_zero"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
     try:

@@ -1,4 +1,4 @@
-"""`python -m src.evaluate checkpoint=PATH | predictions=FILE.json [data.root=DIR data.version=V data.split=S] [out=DIR]`."""
+"""`python -m src.evaluate checkpoint=PATH | predictions=FILE [data.root=DIR data.version=V data.split=S] [out=DIR]`."""
 
 from __future__ import annotations
 

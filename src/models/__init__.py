@@ -14,7 +14,7 @@ MODELS: dict[type[Any], type[Detector]] = {Horizon3DConfig: Horizon3D}
 
 
 def build_model(
-    config: Any,  # noqa: ANN401 (an instance of one of MODEL_CONFIGS)
+    config: Any,  # an instance of one of MODEL_CONFIGS
     grid: BEVGrid,
     backbone: ImageEncoderConfig | None,
     velocity_code_weight: float,

@@ -20,17 +20,17 @@ class Detector(nn.Module, ABC):
         return None
 
     @abstractmethod
-    def forward(self, batch: FrameBatch) -> Any:  # noqa: ANN401 (each model returns its own dataclass)
+    def forward(self, batch: FrameBatch) -> Any:  # each model returns its own dataclass
         """Everything that `loss` and `decode` need for the B frames of a batch."""
 
     @abstractmethod
-    def loss(self, output: Any, batch: FrameBatch) -> dict[str, Tensor]:  # noqa: ANN401
+    def loss(self, output: Any, batch: FrameBatch) -> dict[str, Tensor]:
         """Weighted loss terms by name, each a scalar, and their sum as `total`; needs `batch.boxes`."""
 
     @abstractmethod
-    def decode(self, output: Any) -> list[Boxes3D]:  # noqa: ANN401
+    def decode(self, output: Any) -> list[Boxes3D]:
         """Predicted boxes with scores, one entry per sample, in the (augmented) ego frame."""
 
-    def diagnostics(self, output: Any) -> dict[str, Tensor]:  # noqa: ANN401
+    def diagnostics(self, output: Any) -> dict[str, Tensor]:
         """Scalars worth a curve that are no losses."""
         return {}

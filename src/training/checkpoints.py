@@ -47,14 +47,14 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     Raises CheckpointError when the file is missing, broken, or not written by this project.
     """
     if not path.is_file():
-        raise CheckpointError(f"checkpoint {path} does not exist; give the path of a .ckpt file under outputs/<run_id>/checkpoints")
+        raise CheckpointError(f"checkpoint {path} does not exist; runs keep theirs in outputs/<run_id>/checkpoints")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except _BROKEN as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CheckpointError(f"checkpoint {path} is truncated, damaged or not a plain checkpoint ({reason})") from error
+        raise CheckpointError(f"checkpoint {path} is truncated, damaged or no plain checkpoint ({reason})") from error
     if not isinstance(content, dict) or "horizon3d" not in content or "state_dict" not in content:
-        raise CheckpointError(f"checkpoint {path} was not written by this project: it has no 'horizon3d' and 'state_dict'")
+        raise CheckpointError(f"checkpoint {path} is not of this project: it lacks 'horizon3d' or 'state_dict'")
     return content
 
 

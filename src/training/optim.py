@@ -81,7 +81,7 @@ def cycle_value(step: int, total_steps: int, rise_fraction: float, start: float,
 
 
 class CyclicSchedule(LRScheduler):
-    """Learning rate up by `peak_lr_ratio` and down to `final_lr_ratio`, beta1 the other way round, once per training."""
+    """Learning rate up by `peak_lr_ratio`, then down to `final_lr_ratio`; beta1 the other way round."""
 
     def __init__(self, optimizer: torch.optim.Optimizer, config: OptimConfig, total_steps: int) -> None:
         self.config = config

@@ -49,7 +49,7 @@ def draw_frames(model: Detector, frames: list[FrameBatch], grid: BEVGrid, folder
 def scene_of(
     batch: FrameBatch,  # of one frame
     predictions: Boxes3D,
-    output: Any,  # noqa: ANN401 (the model's own output; Gaussians are drawn where it has some)
+    output: Any,  # the model's own output; Gaussians are drawn where it has some
     grid: BEVGrid,
 ) -> BevScene:
     """What the BEV panels show. Ground truth is what the evaluation counts: with points, within the class range."""
