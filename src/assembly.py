@@ -10,6 +10,7 @@ from src.config import Config
 from src.data.datamodule import DetectionDataModule
 from src.data.world.write import ensure_world, world_digest
 from src.errors import ConfigError
+from src.metrics.submission import write_submission
 from src.models import build_model as build_model_of
 from src.models.detector import Detector
 from src.training.detection import DetectionModule
@@ -51,6 +52,23 @@ def build_model(config: Config) -> Detector:
     return build_model_of(
         config.model, config.grid.build(), config.backbone, velocity_code_weight=config.phase.velocity_code_weight
     )
+
+
+def save_submission(module: DetectionModule, path: Path) -> bool:
+    """Write the boxes of the module's last validation as a submission; False, with a warning, when there is none."""
+    with module.metric.sync_context():
+        table, _ = module.metric.collected()
+    if not len(table):
+        logger.warning("no box reached the score threshold, so there is no valid submission to write")
+        return False
+    meta = {
+        "use_camera": module.model.uses_images,
+        "use_radar": True,
+        "method_name": module.config["model"]["name"],
+        "description": ", ".join(f"{key} {module.config[key]}" for key in ("scale", "seed")),
+    }
+    write_submission(path, module.metric.evaluation_set.tokens, table, meta)
+    return True
 
 
 def build_module(config: Config, tree: dict[str, Any], datamodule: DetectionDataModule) -> DetectionModule:

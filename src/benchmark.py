@@ -19,6 +19,7 @@ from torch import Tensor
 
 from src.assembly import build_datamodule, build_model, data_root
 from src.config import BenchmarkSuite, Config, compose_config, run_command
+from src.errors import DataError
 from src.metrics.benchmark import compare_with_devkit
 from src.models.detector import Detector
 from src.ops.allocator import tune_cpu_allocator
@@ -51,6 +52,8 @@ def main(overrides: list[str]) -> None:
         write_json(folder / f"{name}.json", result)
         (folder / f"{name}.md").write_text(text + "\n")
         print(f"written: {folder / name}.md and .json")
+    if result["result"].get("agrees") is False:
+        raise DataError("our metric and the official evaluator disagree on this problem; see the numbers above")
 
 
 def benchmark_model(config: Config) -> dict[str, Any]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from src.assembly import build_datamodule, build_module, data_root
+from src.assembly import build_datamodule, build_module, data_root, save_submission
 from src.config import Config, compose_config, restore_config, run_command
 from src.errors import ConfigError
-from src.metrics.detection import DetectionScores, score_detections
+from src.metrics.detection import score_detections
 from src.metrics.report import format_scores
+from src.metrics.scores import DetectionScores
 from src.metrics.submission import load_submission
 from src.ops.allocator import tune_cpu_allocator
 from src.training.checkpoints import load_model_weights, read_checkpoint
@@ -30,7 +31,7 @@ def main(overrides: list[str]) -> None:
     scores = score_checkpoint(source, overrides, out) if config.checkpoint else score_file(source, config)
     write_json(out / "metrics.json", scores.as_dict())
     print(format_scores(scores.as_dict()))
-    print(f"\nwritten: {out / 'metrics.json'}" + (f", {out / 'submission.json'}" if config.checkpoint else ""))
+    print(f"\nwritten into {out}: {', '.join(sorted(path.name for path in out.glob('*.json')))}")
 
 
 def score_file(path: Path, config: Config) -> DetectionScores:
@@ -51,7 +52,7 @@ def score_checkpoint(path: Path, overrides: list[str], out: Path) -> DetectionSc
     build_evaluation_trainer(config.precision, config.trainer.accelerator).validate(
         module, datamodule=datamodule, verbose=False
     )
-    datamodule.write_submission(out / "submission.json", module.detections)
+    save_submission(module, out / "submission.json")
     return module.scores
 
 

@@ -16,13 +16,16 @@ import numpy as np
 import torch
 import yaml
 
-from src.assembly import build_datamodule, build_module, data_root
+from src.assembly import build_datamodule, build_module, data_root, save_submission
 from src.config import Config, compose_config, run_command, run_identity
+from src.data.datamodule import DetectionDataModule
 from src.metrics.report import format_scores
 from src.ops.allocator import tune_cpu_allocator
+from src.pictures.curves import draw_curves, draw_scores
+from src.training.detection import DetectionModule
 from src.training.fit import build_loggers, build_trainer, fit
 from src.training.run_folder import RunFolder, current_commit, write_json
-from src.training.snapshots import draw_curves_of, draw_validation_frames
+from src.training.snapshots import draw_frames
 
 logger = logging.getLogger(__name__)
 
@@ -55,9 +58,9 @@ def main(overrides: list[str]) -> None:
     fit(trainer, module, datamodule, resume_from)
     seconds = time.monotonic() - training_started
 
-    draw_curves_of(folder.metrics_csv, folder.pictures)
-    draw_validation_frames(module, datamodule, folder.pictures, config.trainer.num_pictures)
-    datamodule.write_submission(folder.path / "submission.json", module.detections)
+    scores = module.scores.as_dict()
+    draw_pictures(config, module, datamodule, folder, scores)
+    save_submission(module, folder.path / "submission.json")
     record = {
         "run_id": folder.run_id,
         "overrides": overrides,
@@ -81,10 +84,30 @@ def main(overrides: list[str]) -> None:
             "numpy": np.__version__,
         },
     }
-    write_json(folder.metrics_json, module.scores.as_dict())
+    write_json(folder.metrics_json, scores)
     write_json(folder.record, record)
     logger.info("finished in %.0f s", record["seconds"]["all"])
     print_result(folder, record)
+
+
+def draw_pictures(
+    config: Config,
+    module: DetectionModule,
+    datamodule: DetectionDataModule,
+    folder: RunFolder,
+    scores: dict[str, Any],
+) -> None:
+    """Learning curves, bars by class and distance, and some validation frames spread over the split."""
+    folder.pictures.mkdir(exist_ok=True)
+    draw_curves(folder.pictures / "curves.png", folder.metrics_csv, folder.run_id)
+    draw_scores(
+        folder.pictures / "scores.png",
+        {name: values["AP"] for name, values in scores["classes"].items()},
+        {name: values["mAP"] for name, values in scores["ranges"].items()},
+        folder.run_id,
+    )
+    frames = datamodule.validation_frames(config.trainer.num_pictures)
+    draw_frames(module.model, [frame.to(module.device) for frame in frames], config.grid.build(), folder.pictures)
 
 
 def make_trainer(config: Config, tree: dict[str, Any], folder: RunFolder, resume_from: Path | None) -> L.Trainer:

@@ -65,7 +65,7 @@ class BEVGrid:
         self,
         xy: Tensor,  # [..., 2] metres
     ) -> Tensor:  # [..., 2] (x, y) in cells, continuous, measured from the grid's lower corner
-        """Continuous grid coordinates g = (xy - lower corner) / cell; cell (row, col) spans [col, col+1) x [row, row+1)."""
+        """Grid coordinates g = (xy - lower corner) / cell; cell (row, col) spans [col, col+1) x [row, row+1)."""
         return (xy - xy.new_tensor([self.x_min_m, self.y_min_m])) / self.cell_m
 
     def cell_of(

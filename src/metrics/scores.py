@@ -104,42 +104,5 @@ class DetectionScores:
         }
 
 
-def format_scores(scores: DetectionScores) -> str:
-    """Tables for the terminal: the summary by distance bin, then every class with its AP by distance bin.
-
-    mAP, NDS and AP in percent, errors in their own units; "-" where a number is undefined.
-    """
-    parts = {"all": scores.overall} | scores.ranges
-    summary = [["range (m)", "mAP", "NDS", *(f"m{name}" for name in ERRORS), "boxes"]]
-    for name, part in parts.items():
-        numbers = [_percent(part.mean_ap), _percent(part.nds), *map(_plain, part.mean_errors)]
-        summary.append([name, *numbers, str(int(part.num_gt.sum()))])
-    classes = [["class", "AP", *(f"AP {name}" for name in scores.ranges), *ERRORS, "boxes"]]
-    for row, name in enumerate(CLASSES):
-        aps = [_percent(part.class_ap[row]) for part in parts.values()]
-        errors = map(_plain, scores.overall.errors[row])
-        classes.append([name, *aps, *errors, str(int(scores.overall.num_gt[row]))])
-    return _align(summary) + "\n\n" + _align(classes)
-
-
 def _number(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
-
-
-def _percent(value: float) -> str:
-    return "-" if np.isnan(value) else f"{100 * value:.1f}"
-
-
-def _plain(value: float) -> str:
-    return "-" if np.isnan(value) else f"{value:.3f}"
-
-
-def _align(rows: list[list[str]]) -> str:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for row in rows:
-        cells = [row[0].ljust(widths[0])]
-        cells += [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
-        lines.append("  ".join(cells))
-    lines.insert(1, "-" * len(lines[0]))
-    return "\n".join(lines)

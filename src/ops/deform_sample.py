@@ -109,25 +109,28 @@ def deform_attend_images_reference(
     seen = ((unit > -reach) & (unit < 1 + reach)).all(4)  # [B, Q, N, P]
     if visible is not None:
         seen = seen & visible
-        weights = torch.where(visible[:, :, None, :, None, :], weights, 0.0)
+    # Elsewhere samples are zero already, except that a point behind a camera may lie anywhere, NaN included.
+    unit = torch.where(seen.unsqueeze(4), unit, -1.0)
     used = seen.any(3).permute(0, 2, 1)  # [B, N, Q]
     counts = used.sum(2).flatten().tolist()
     chosen = (used.flatten().nonzero().squeeze(1) % queries).split(counts)
 
+    # One image at a time; unbind, because the gradient of an index would fill the whole tensor for every image.
+    images = zip(*(level.to(dtype).flatten(0, 1).unbind(0) for level in values), strict=True)
+    places = (2 * unit - 1).transpose(1, 2).flatten(0, 1).unbind(0)  # B * N of [Q, P, 2]
+    shares = weights.permute(0, 3, 4, 2, 1, 5).flatten(0, 1).unbind(0)  # B * N of [L, heads, Q, P]
     out = weights.new_zeros(batch_size * queries, values[0].shape[2])
-    for image, rows in enumerate(chosen):
+    for image, (maps, place, share, rows) in enumerate(zip(images, places, shares, chosen, strict=True)):
         if len(rows) == 0:
             continue
-        sample, view = divmod(image, views)
-        places = (2 * unit[sample, :, view].index_select(0, rows) - 1).unsqueeze(0)  # [1, q, P, 2]
-        shares = weights[sample, :, :, view].index_select(0, rows)  # [q, heads, L, P]
+        place = place.index_select(0, rows).unsqueeze(0)  # [1, q, P, 2]
+        share = share.index_select(2, rows).unsqueeze(2)  # [L, heads, 1, q, P]
         total = 0
-        for level, maps in enumerate(values):
-            sampled = F.grid_sample(maps[sample, view].to(dtype).unsqueeze(0), places, align_corners=False)
-            share = shares[:, :, level].transpose(0, 1).unsqueeze(1)  # [heads, 1, q, P]
-            total = total + (sampled.view(heads, -1, *places.shape[1:3]) * share).sum(3)  # [heads, c, q]
+        for level, level_share in zip(maps, share, strict=True):
+            sampled = F.grid_sample(level.unsqueeze(0), place, align_corners=False)  # [1, C, q, P]
+            total = total + (sampled.view(heads, -1, *sampled.shape[2:]) * level_share).sum(3)  # [heads, c, q]
         # The queries of one image are distinct, so the sum does not depend on the order of the additions.
-        out.index_add_(0, rows + sample * queries, total.permute(2, 0, 1).flatten(1))
+        out.index_add_(0, rows + image // views * queries, total.flatten(0, 1).t())
     return out.view(batch_size, queries, -1).to(values[0].dtype)
 
 
@@ -153,7 +156,7 @@ def _corners(
     inside = ((row >= 0) & (row < grid.rows)).unsqueeze(2) & ((col >= 0) & (col < grid.cols)).unsqueeze(1)
     linear = (batch[:, None] * grid.rows + row).unsqueeze(2) * grid.cols + col.unsqueeze(1)
     inside, linear = inside.flatten(1), linear.flatten(1)
-    rows = _row_table(sites).take(torch.where(inside, linear, 0))
+    rows = _row_table(sites).index_select(0, torch.where(inside, linear, 0).flatten()).view_as(linear)
     return torch.where(inside, rows, -1), weights
 
 

@@ -105,6 +105,7 @@ def fit(
     Raises InterruptedRunError when stopped from outside; the same command then goes on.
     """
     try:
+        module.skipped.clear()
         trainer.fit(module, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
         trainer.validate(module, datamodule=datamodule, verbose=False)
     except SystemExit as error:  # Lightning's way to end on Ctrl-C and SIGTERM

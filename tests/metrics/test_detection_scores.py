@@ -8,7 +8,8 @@ import pytest
 
 from src.errors import DataError
 from src.metrics.detection import SCENE_TAGS, TAGS_WITHOUT_SCORE, score_detections
-from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERRORS, format_scores
+from src.metrics.report import format_scores
+from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERRORS
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import ATTRIBUTES, CLASSES
 
@@ -89,7 +90,7 @@ def test_as_dict_is_plain_json(scores):
 
 
 def test_table_for_the_terminal(scores):
-    lines = format_scores(scores).splitlines()
+    lines = format_scores(scores.as_dict()).splitlines()
     assert lines[2].split()[:3] == ["all", "21.6", "25.6"]  # 0.21646, 0.25596
     cone = next(line for line in lines if line.startswith("traffic_cone")).split()
     assert cone[1] == "34.2" and cone.count("-") == 3

@@ -33,7 +33,9 @@ def test_weighted_bag_gradients():
     picks, bag = torch.tensor([0, 2, 0, 1, 2]), torch.tensor([0, 0, 2, 2, 2])
     values, weights = torch.randn(3, 2).double().requires_grad_(), torch.randn(5).double().requires_grad_()
     for by_pick in (None, torch.argsort(picks, stable=True)):
-        assert torch.autograd.gradcheck(lambda v, w, by=by_pick: weighted_bag(v, w, picks, bag, 4, by), (values, weights))
+        assert torch.autograd.gradcheck(
+            lambda v, w, by=by_pick: weighted_bag(v, w, picks, bag, 4, by), (values, weights)
+        )
     dense = torch.zeros(4, 2).double().index_add(0, bag, weights[:, None] * values[picks])
     torch.testing.assert_close(weighted_bag(values, weights, picks, bag, 4), dense)
 

@@ -74,21 +74,32 @@ class EgoMotion:
         frequency = np.array([0.8, 2.0, 7.0, 4.5]) * rng.uniform(0.8, 1.2, 4)
         return cls(tracks=tracks, sway=np.stack([amplitude, frequency, rng.uniform(0, 6.28, 4)], 1))
 
+    def poses(self, times_s: Array) -> tuple[Array, Array]:
+        """Rotations [T, 3, 3] and translations [T, 3] from ego to local coordinates; the origin is on the ground."""
+        tracks, road = self.tracks, self.tracks.road
+        place = np.clip((times_s + LEAD_IN_S) / STEP_S, 0, tracks.s.shape[1] - 1.001)
+        low = place.astype(np.int64)
+        part = place - low
+        after, bend = part * STEP_S, 0.5 * part * part * STEP_S
+        s_rate, d_rate = tracks.s_rate[0], tracks.d_rate[0]
+        s = tracks.s[0, low] + after * s_rate[low] + bend * (s_rate[low + 1] - s_rate[low])
+        d = tracks.d[0, low] + after * d_rate[low] + bend * (d_rate[low + 1] - d_rate[low])
+        forward = s_rate[low] + part * (s_rate[low + 1] - s_rate[low])
+        sideways = d_rate[low] + part * (d_rate[low + 1] - d_rate[low])
+        angle = self.sway[:, 1:2] * times_s + self.sway[:, 2:]
+        offset, yaw, pitch, roll = self.sway[:, :1] * np.sin(angle)
+        sideways = sideways + self.sway[0, 0] * self.sway[0, 1] * np.cos(angle[0])
+        course = road.heading_at(s) + np.arctan2(sideways, np.maximum(forward, 1.0)) + yaw
+        return rotation_zyx(course, pitch - np.arctan(road.slope_at(s)), roll), road.place(s, d + offset)
+
     def pose(self, time_s: float) -> tuple[Array, Array]:
-        """Rotation [3, 3] and translation [3] from ego to local coordinates; the origin is on the ground."""
-        s, s_rate, d, d_rate, _ = (float(value[0]) for value in self.tracks.road_state(time_s))
-        offset, yaw, pitch, roll = self.sway[:, 0] * np.sin(self.sway[:, 1] * time_s + self.sway[:, 2])
-        offset_rate = self.sway[0, 0] * self.sway[0, 1] * np.cos(self.sway[0, 1] * time_s + self.sway[0, 2])
-        road = self.tracks.road
-        course = float(road.heading_at(s)) + np.arctan2(d_rate + offset_rate, max(s_rate, 1.0)) + yaw
-        rotation = rotation_zyx(course, -np.arctan(float(road.slope_at(s))) + pitch, roll)
-        return rotation, road.place(np.array(s), np.array(d + offset))
+        """Rotation [3, 3] and translation [3] at one moment."""
+        rotation, translation = self.poses(np.array([time_s]))
+        return rotation[0], translation[0]
 
     def rates(self, time_s: float, half_step_s: float = 0.002) -> tuple[Array, Array]:
         """Velocity [3] and angular rate [3] in the ego frame, m/s and rad/s, by central differences of the pose."""
-        before, t_before = self.pose(time_s - half_step_s)
-        after, t_after = self.pose(time_s + half_step_s)
-        now, _ = self.pose(time_s)
+        (before, now, after), (t_before, _, t_after) = self.poses(time_s + half_step_s * np.array([-1.0, 0.0, 1.0]))
         velocity = now.T @ (t_after - t_before) / (2 * half_step_s)
         skew = now.T @ (after - before) / (2 * half_step_s)
         return velocity, np.array([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]]) / 2

@@ -165,7 +165,7 @@ def _clutter_returns(
     distance = np.linalg.norm(ray, axis=-1)
     azimuth = _wrap(np.arctan2(ray[..., 1], ray[..., 0]) - boresight[:, None])
     signal = _strength(rcs, distance, azimuth)
-    chance = 0.26 * config.returns_density * signal / (1 + signal)
+    chance = 0.4 * config.returns_density * signal / (1 + signal)
     in_view = (np.abs(azimuth) < RADAR_AZIMUTH_RAD) & (distance < REACH_M) & (distance > 3.0)
     radar, index = np.nonzero(rng.random(chance.shape) < np.where(in_view, chance, 0.0))
     states = scene.tracks.state(time_s)
@@ -177,7 +177,7 @@ def _clutter_returns(
     kept = ~hidden | (rng.random(len(hidden)) < THROUGH_OCCLUDER)
     radar, index = radar[kept], index[kept]
     fading = 10 * np.log10(rng.exponential(1.0, len(radar)) + 0.05)
-    tarmac = rng.poisson(6.0 * config.returns_density * config.clutter_density, len(mounts))
+    tarmac = rng.poisson(7.0 * config.returns_density * config.clutter_density, len(mounts))
     which = np.repeat(np.arange(len(mounts)), tarmac)
     angle = boresight[which] + np.clip(rng.normal(0, 0.5, len(which)), -1.0, 1.0)
     span = 9.0 + rng.gamma(1.6, 9.0, len(which))

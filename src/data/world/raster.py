@@ -104,7 +104,11 @@ def _expand(first: Array, count: Array) -> tuple[Array, Array]:
 def _count(group: Array, pixel: Array, shown: Array, num_groups: int, num_pixels: int) -> tuple[Array, Array]:
     """Distinct pixels per group, and those that show it."""
     labelled = np.flatnonzero(group >= 0)
-    touched = np.zeros(num_groups * num_pixels, dtype=bool)
-    touched[group[labelled] * num_pixels + pixel[labelled]] = True
-    own = np.count_nonzero(touched.reshape(num_groups, num_pixels), axis=1)
+    present = np.flatnonzero(np.bincount(group[labelled], minlength=num_groups))
+    place = np.zeros(num_groups, dtype=np.int64)
+    place[present] = np.arange(len(present))
+    touched = np.zeros(len(present) * num_pixels, dtype=bool)
+    touched[place[group[labelled]] * num_pixels + pixel[labelled]] = True
+    own = np.zeros(num_groups, dtype=np.int64)
+    own[present] = [np.count_nonzero(row) for row in touched.reshape(len(present), num_pixels)]
     return own, np.bincount(shown[shown >= 0], minlength=num_groups)

@@ -109,7 +109,8 @@ class Studio:
         # Upward component of each pixel's ray over its length on the ground: the tangent of its elevation.
         across = local_from_cam[:2, 0:1] * x + local_from_cam[:2, 2:3]
         rise = (local_from_cam[2, 0] * x + local_from_cam[2, 2] + local_from_cam[2, 1] * y[:, None]) / np.linalg.norm(across, axis=0)
-        height = np.clip(rise / 0.55, 0.0, 1.0).astype(np.float32)[..., None]
+        rise = rise.astype(np.float32)
+        height = np.clip(rise / np.float32(0.55), 0.0, 1.0)[..., None]
         low, high = (np.array(colour, dtype=np.float32) for colour in (conditions.sky_low, conditions.sky_high))
         sky = low + height * (high - low)
         bearing = np.arctan2(across[1], across[0])

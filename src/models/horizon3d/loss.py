@@ -74,9 +74,8 @@ def kggi_losses(
         terms["keypoint"] = config.keypoint_weight * _keypoint_loss(kggi, views, seen, settings)
     if config.depth_weight is not None:
         logits = kggi.camera.depth_logits.flatten(0, 1)  # [B*N, D, h, w]
-        target = paint_depth(
-            seen, len(logits), views.image_size_px, settings.depth_range, settings.num_depth_bins, views.finest_stride_px
-        )
+        bins = (settings.depth_range, settings.num_depth_bins)
+        target = paint_depth(seen, len(logits), views.image_size_px, *bins, views.finest_stride_px)
         total = depth_cross_entropy(logits, target)
         terms["depth"] = config.depth_weight * total / mean_over_ranks((target >= 0).sum())
     return _times(terms, config.kggi_weight)

@@ -13,14 +13,13 @@ from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.backbones.sparse_voxel import RadarEncoder, RadarEncoderConfig
 from src.models.detector import Detector
 from src.models.heads.center_head import CenterHead, HeadConfig, HeadOutput
-from src.models.horizon3d.gaussian_encoder import NUM_HEADS
+from src.models.horizon3d.cross_attention import NUM_HEADS
 from src.models.horizon3d.kggi import KGGI, KGGIConfig, KGGIOutput
 from src.models.horizon3d.loss import LossConfig, kggi_losses, ocsf_losses
 from src.models.horizon3d.ocsf import OCSF, OCSFConfig, OCSFOutput
 from src.models.horizon3d.views import CameraViews
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
-from src.structures.gaussians import Source
 from src.structures.sparse_bev import SparseBEV
 from src.structures.taxonomy import CAMERAS
 
@@ -44,13 +43,13 @@ class Horizon3DConfig:
         if (self.kggi is None) != (self.ocsf is None):
             off, on = ("kggi", "ocsf") if self.kggi is None else ("ocsf", "kggi")
             raise ConfigError(
-                f"model.{off}=null while model.{on} is set: both make and use the Gaussians; set both to null for radar "
-                "only, or model.kggi.initialization=random for OCSF without keypoints"
+                f"model.{off}=null while model.{on} is set: one makes the Gaussians, the other uses them; set both to "
+                "null for radar only, or model.kggi.initialization=random for OCSF without keypoints"
             )
         if self.channels < 1 or self.channels % CHANNEL_MULTIPLE:
             raise ConfigError(
-                f"model.channels={self.channels}: must be a positive multiple of {CHANNEL_MULTIPLE}, {NUM_HEADS} attention "
-                "heads of at least 4 channels"
+                f"model.channels={self.channels}: must be a positive multiple of {CHANNEL_MULTIPLE}, whole norm groups "
+                f"of 4 channels in each of {NUM_HEADS} attention heads"
             )
 
     @property
@@ -148,20 +147,20 @@ class Horizon3D(Detector):
 
     @torch.no_grad()
     def diagnostics(self, output: Horizon3DOutput) -> dict[str, Tensor]:
-        """How full the maps are and what the Gaussians do."""
-        batch_size = output.radar_bev.batch_size
-        cells = batch_size * self.grid.rows * self.grid.cols
-        counts = {"radar_cells": len(output.radar_bev) / batch_size, "fused_cells": len(output.fused_bev) / batch_size}
+        """Cells per frame, share of the grid that Gaussians open, cells cut by the guard, Gaussians by source."""
+        frames = output.radar_bev.batch_size
+        values: dict[str, Tensor | float] = {
+            "radar_cells": len(output.radar_bev) / frames,
+            "fused_cells": len(output.fused_bev) / frames,
+        }
         if output.ocsf is not None:
             splat, gaussians = output.ocsf.splat, output.ocsf.gaussians
-            counts["occupied_share"] = len(splat.bev) / cells
-            counts["cut_cells"] = splat.cells.num_cut / batch_size
-        values = {name: torch.tensor(float(value), device=output.radar_bev.features.device) for name, value in counts.items()}
-        if output.ocsf is not None:
-            valid = gaussians.valid
+            values["occupied_share"] = len(splat.bev) / (frames * self.grid.rows * self.grid.cols)
+            values["cut_cells"] = splat.cells.num_cut / frames
             for source in self.config.kggi.counts:
-                number = (valid & (gaussians.sources == source)).sum() / batch_size
-                values[f"gaussians_{source.name.lower()}"] = number
-            opacity = (gaussians.opacity_logits.sigmoid() * valid).sum() / valid.sum().clamp(min=1)
-            values["opacity"] = opacity
-        return values
+                number = (gaussians.valid & (gaussians.sources == source)).sum()
+                values[f"gaussians_{source.name.lower()}"] = number / frames
+            opacity = gaussians.opacity_logits.sigmoid() * gaussians.valid
+            values["opacity"] = opacity.sum() / gaussians.valid.sum().clamp(min=1)
+        device = output.radar_bev.features.device
+        return {name: torch.as_tensor(value, dtype=torch.float32, device=device) for name, value in values.items()}

@@ -46,7 +46,8 @@ def camera_matrices(size=SIZE):
 
 
 def random_boxes(count, generator):
-    centers = torch.rand(count, 3, generator=generator) * torch.tensor([40.0, 30.0, 1.0]) - torch.tensor([18.0, 16.0, 0.0])
+    spread, corner = torch.tensor([40.0, 30.0, 1.0]), torch.tensor([-18.0, -16.0, 0.0])
+    centers = torch.rand(count, 3, generator=generator) * spread + corner
     return Boxes3D(
         centers=centers,
         sizes=torch.tensor([4.5, 1.9, 1.6]).expand(count, 3) * (0.5 + torch.rand(count, 1, generator=generator)),

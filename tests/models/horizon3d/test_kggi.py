@@ -29,7 +29,9 @@ class FixedHead(torch.nn.Module):
 def flat_maps(b=1, n=4, bins=16, channels=16):
     """No keypoint anywhere, every depth alike."""
     return CameraMaps(
-        torch.full((b, n, ROWS, COLS), -12.0), torch.zeros(b, n, bins, ROWS, COLS), torch.randn(b, n, channels, ROWS, COLS)
+        keypoint_logits=torch.full((b, n, ROWS, COLS), -12.0),
+        depth_logits=torch.zeros(b, n, bins, ROWS, COLS),
+        features=torch.randn(b, n, channels, ROWS, COLS),
     )
 
 
@@ -195,9 +197,8 @@ def test_selection_passes_no_gradient_but_local_features_do(make_config, grid, m
     kggi, radar, views = make_kggi(make_config, grid), make_radar(grid), make_views()
     radar.features.requires_grad_()
     out = kggi(radar, views).gaussians
-    assert not out.means[0, :24].requires_grad or not torch.autograd.grad(
-        out.means[0, :24].sum(), kggi.objectness[0].weight, allow_unused=True
-    )[0]
+    chosen = [kggi.objectness[0].weight, kggi.camera_head.depth[0].weight, radar.features]
+    assert torch.autograd.grad(out.means.sum(), chosen, allow_unused=True, retain_graph=True) == (None, None, None)
     torch.nn.init.ones_(kggi.property_heads["radar"].weight)
     kggi(radar, views).gaussians.features.sum().backward()
     assert radar.features.grad.abs().sum() > 0

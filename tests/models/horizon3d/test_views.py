@@ -14,7 +14,7 @@ def make_views(pix_from_aug, size=(64, 96), valid=None):
 
 
 def augmented_camera():
-    """A camera at (1, 2, 3) looking along +x, its image scaled, flipped and rotated, behind a rotated, scaled, mirrored BEV."""
+    """A camera at (1, 2, 3) looking along +x, image scaled, flipped and rotated, BEV rotated, scaled and mirrored."""
     intrinsics = torch.tensor([[60.0, 0.0, 50.0], [0.0, 60.0, 30.0], [0.0, 0.0, 1.0]])
     c, s = math.cos(0.08), math.sin(0.08)
     image = torch.tensor([[c, -s, 3.0], [s, c, -2.0], [0.0, 0.0, 1.0]]) @ torch.diag(torch.tensor([-0.9, 0.9, 1.0]))
@@ -44,18 +44,22 @@ def test_lifting_undoes_projection_under_every_augmentation():
     torch.testing.assert_close(ego[0, 0, ..., 0, 0] - 1.0, depth[0, 0], atol=1e-3, rtol=1e-4)
 
 
+def forward_camera():
+    """Focal length 10, principal point (48, 32), at the origin, looking along +x."""
+    rows = [[48.0, -10.0, 0.0, 0.0], [32.0, 0.0, -10.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    return torch.tensor(rows)[None, None]
+
+
 def test_known_point_by_hand():
-    # Focal length 10, centre (48, 32), looking along +x: a point 20 m ahead, 8 m left, 4 m up.
-    matrix = torch.tensor([[48.0, -10.0, 0.0, 0.0], [32.0, 0.0, -10.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-    pixels, visible = make_views(matrix[None, None]).project(torch.tensor([[[[20.0, 8.0, 4.0]]]]))
+    # 20 m ahead, 8 m left, 4 m up.
+    pixels, visible = make_views(forward_camera()).project(torch.tensor([[[[20.0, 8.0, 4.0]]]]))
     assert pixels.flatten().tolist() == [44.0, 30.0]
     assert visible.all()
 
 
 def test_visibility_ends_at_half_a_metre_the_image_edge_and_missing_cameras():
-    matrix = torch.tensor([[48.0, -10.0, 0.0, 0.0], [32.0, 0.0, -10.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     points = torch.tensor([[0.4, 0.0, 0.0], [-5.0, 0.0, 0.0], [10.0, 50.0, 0.0], [10.0, 47.0, 0.0], [10.0, 0.0, 40.0]])
-    two = matrix.repeat(1, 2, 1, 1)
+    two = forward_camera().repeat(1, 2, 1, 1)
     _, visible = make_views(two, valid=torch.tensor([[True, False]])).project(points[None, :, None])
     assert visible[0, :, 0, 0].tolist() == [False, False, False, True, False]
     assert not visible[0, :, 1].any()

@@ -1,0 +1,51 @@
+"""Gated fusion on the union of two sets of cells."""
+
+import pytest
+import torch
+
+from src.models.horizon3d.sparse_fusion import SparseFusion
+from src.ops.sites import Sites
+from src.structures.sparse_bev import SparseBEV
+
+SHAPE = (2, 20, 20)
+
+
+def make_map(cells, channels=8):
+    indices = torch.tensor(cells, dtype=torch.int64).reshape(-1, 3)
+    sites, _ = Sites.from_indices(indices, SHAPE)
+    return SparseBEV(sites, torch.randn(len(sites), channels))
+
+
+def test_equations_11_and_12_on_one_cell_by_hand():
+    torch.manual_seed(0)
+    fusion = SparseFusion(8, 1).eval()
+    gaussian, radar = make_map([[0, 3, 3]]), make_map([[0, 3, 3]])
+    f_g = gaussian.features[0] / (1 + 1e-5) ** 0.5  # batch norm with its initial running statistics
+    f_r = radar.features[0] / (1 + 1e-5) ** 0.5
+    both = torch.cat([f_g, f_r])
+    w_g = torch.sigmoid(both @ fusion.gate_gaussian.weight[0] + fusion.gate_gaussian.bias)
+    w_r = torch.sigmoid(both @ fusion.gate_radar.weight[0] + fusion.gate_radar.bias)
+    h = torch.cat([w_g * f_g, w_r * f_r])
+    # A lone cell meets only the centre of each 3x3 kernel; batch norms divide by the same constant.
+    inner = torch.relu(h @ fusion.conv1.weight[4] / (1 + 1e-5) ** 0.5)
+    expected = torch.relu(inner @ fusion.conv2.weight[4] / (1 + 1e-5) ** 0.5 + h @ fusion.shortcut.weight[0])
+    torch.testing.assert_close(fusion(gaussian, radar).features[0], expected)
+
+
+@pytest.mark.parametrize("kernel", [1, 3])
+def test_union_of_cells_and_samples_apart(kernel):
+    torch.manual_seed(0)
+    fusion = SparseFusion(8, kernel).eval()
+    gaussian, radar = make_map([[0, 3, 3], [1, 5, 5]]), make_map([[0, 3, 4], [1, 5, 5], [1, 9, 9]])
+    out = fusion(gaussian, radar)
+    assert out.indices.tolist() == [[0, 3, 3], [0, 3, 4], [1, 5, 5], [1, 9, 9]]
+    radar.features[1:] += 1.0  # sample 1 only
+    assert torch.equal(fusion(gaussian, radar).features[:2], out.features[:2])
+
+
+@pytest.mark.parametrize("cells", [([], [[0, 1, 1]]), ([[0, 1, 1]], []), ([], [])])
+def test_empty_branches(cells):
+    fusion = SparseFusion(8, 1).train()
+    out = fusion(make_map(cells[0]), make_map(cells[1]))
+    out.features.sum().backward()
+    assert out.features.isfinite().all() and len(out) == len(cells[0]) + len(cells[1])
