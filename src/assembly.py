@@ -40,7 +40,6 @@ def build_datamodule(config: Config, root: Path) -> DetectionDataModule:
     return DetectionDataModule(
         config.data,
         root=root,
-        grid=config.grid.build(),
         image_size_px=tuple(config.backbone.image_size_px) if config.model.uses_images else None,
         seed=config.seed,
         cache=Path(config.paths.outputs) / "cache",
@@ -62,7 +61,7 @@ def save_submission(module: DetectionModule, path: Path) -> bool:
         logger.warning("no box reached the score threshold, so there is no valid submission to write")
         return False
     meta = {
-        "use_camera": module.model.uses_images,
+        "use_camera": module.model.image_backbone is not None,
         "use_radar": True,
         "method_name": module.config["model"]["name"],
         "description": ", ".join(f"{key} {module.config[key]}" for key in ("scale", "seed")),

@@ -117,7 +117,7 @@ def build_index(root: Path, version: str) -> DatasetIndex:
     optional = OPTIONAL_TABLES + (("sample_annotation", "instance") if without_boxes else ())
     missing = [name for name in TABLES if name not in optional and not (folder / f"{name}.json").is_file()]
     if missing:
-        raise DataError(f"{folder}: missing tables {missing}; unpack the release again (all of {list(TABLES)} belong to it)")
+        raise DataError(f"{folder}: missing tables {missing}; unpack the release again (its tables are {list(TABLES)})")
     for name in ("ego_motion_cabin", "ego_motion_chassis", "visibility"):
         Table(folder / f"{name}.json")  # not used, but a broken release should not look whole
 
@@ -139,7 +139,7 @@ def build_index(root: Path, version: str) -> DatasetIndex:
 def version_folder(root: Path, version: str) -> Path:
     """The folder of a release's tables; raises DataError naming the releases there are."""
     if not root.is_dir():
-        raise DataError(f"data.root={root}: no such folder; set data.root to the folder that holds samples/ and the tables")
+        raise DataError(f"data.root={root}: no such folder; set it to the folder that holds samples/ and the tables")
     folder = root / version
     if not version or not folder.is_dir() or folder.parent != root:
         found = sorted(path.parent.name for path in root.glob("*/scene.json"))
@@ -169,7 +169,7 @@ def _scene_columns(scenes: Table, samples: Table) -> dict[str, Array]:
     if twins.any():
         at = int(np.argmax(twins))
         other = samples.tokens[order[at]]
-        samples.fail(int(order[at + 1]), "timestamp", int(times[order[at]]), f"a time other than that of sample {other!r}")
+        samples.fail(int(order[at + 1]), "timestamp", int(times[order[at]]), f"another time than sample {other!r}")
     return {
         "scene_names": np.array(names),
         "scene_descriptions": np.array(scenes.values("description")),
@@ -319,7 +319,8 @@ def _box_attributes(table: Table, attributes: Table, evaluated: Array) -> Array:
     counts = np.array([len(tokens) for tokens in lists], np.int64)
     table.check((counts <= 1) | ~evaluated, "attribute_tokens", lists, "at most one attribute")
     names = attributes.values("name")
-    attributes.check(np.array([name in ATTRIBUTES for name in names], bool), "name", names, f"one of {list(ATTRIBUTES)}")
+    known = np.array([name in ATTRIBUTES for name in names], bool)
+    attributes.check(known, "name", names, f"one of {list(ATTRIBUTES)}")
     ids = np.array([*(ATTRIBUTES.index(name) for name in names), -1], np.int8)
     first = [tokens[0] if tokens else "" for tokens in lists]
     table.check(np.array([type(token) is str for token in first], bool), "attribute_tokens", lists, "a list of tokens")

@@ -31,7 +31,8 @@ class Table:
         self.rows = {token: row for row, token in enumerate(self.tokens)}
         if len(self.rows) != len(self.tokens):
             row = next(row for row, token in enumerate(self.tokens) if self.rows[token] != row)
-            self.fail(row, "token", self.tokens[row], f"a token of its own (record {self.rows[self.tokens[row]]} has it too)")
+            twin = self.rows[self.tokens[row]]
+            self.fail(row, "token", self.tokens[row], f"a token of its own (record {twin} has it too)")
         if "" in self.rows:
             self.fail(self.rows[""], "token", "", "a token that is not empty")
 
@@ -43,7 +44,8 @@ class Table:
         token = self.records[row].get("token", "")
         text = repr(value)
         text = text if len(text) <= 120 else text[:117] + "..."
-        raise DataError(f"{self.path}: {self.name} {token!r} (record {row}): {field}={text}, expected {expected}; {_REMEDY}")
+        where = f"{self.path}: {self.name} {token!r} (record {row})"
+        raise DataError(f"{where}: {field}={text}, expected {expected}; {_REMEDY}")
 
     def check(self, good: Array, field: str, values: Sequence[object] | Array, expected: str) -> None:
         """Raise about the first record for which `good` [n] is False."""
@@ -102,7 +104,8 @@ class Table:
         for row in np.flatnonzero(needed):
             matrix = self._numbers([column[row]], field, (3, 3), int(row))[0]
             if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and np.array_equal(matrix[2], [0, 0, 1])):
-                self.fail(int(row), field, column[row], "an invertible 3x3 with positive focal lengths and last row 0, 0, 1")
+                expected = "an invertible 3x3 with positive focal lengths and last row 0, 0, 1"
+                self.fail(int(row), field, column[row], expected)
             result[row] = matrix
         return result
 

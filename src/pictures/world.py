@@ -54,7 +54,9 @@ def draw_scene_preview(
         canvas.legend(MARGIN_PX + 170, high + 11, radar_keys(), size_px=12)
         paint_radar(axes, radar_points)
         paint_boxes(axes, shown, predicted=False, arrows=False)
-        axes = _panel(canvas, MARGIN_PX + half + GAP_PX, high, half, reach, f"Ground truth, {size}, arrows: travel in 0.5 s")
+        axes = _panel(
+            canvas, MARGIN_PX + half + GAP_PX, high, half, reach, f"Ground truth, {size}, arrows: travel in 0.5 s"
+        )
         paint_boxes(axes, shown, predicted=True)
     canvas.save(path)
 
@@ -74,15 +76,22 @@ def draw_radar_comparison(
     simulated: Sequence[Array],  # sweeps [m, 7] of the same mount
     simulated_speed_mps: Sequence[Array],  # [m] each
 ) -> None:
-    """Write one PNG: a real and a simulated sweep from above, and their distributions of range, RCS, angles and speed."""
+    """Write one PNG: a real and a simulated sweep from above, and how range, RCS, angles and speed spread."""
     canvas = Canvas(SHEET_PX, 1180)
-    canvas.text(MARGIN_PX, 8, f"One real sweep ({len(real)} points) beside {len(simulated)} simulated ones", 20, bold=True)
+    canvas.text(
+        MARGIN_PX, 8, f"One real sweep ({len(real)} points) beside {len(simulated)} simulated ones", 20, bold=True
+    )
     half = (SHEET_PX - 3 * MARGIN_PX) / 2
     first = int(np.argmax([len(sweep) for sweep in simulated]))
-    pairs = ((real, real_speed_mps, "real", REAL_COLOUR), (simulated[first], simulated_speed_mps[first], "simulated", SIMULATED_COLOUR))
+    pairs = (
+        (real, real_speed_mps, "real", REAL_COLOUR),
+        (simulated[first], simulated_speed_mps[first], "simulated", SIMULATED_COLOUR),
+    )
     for column, (points, speeds, name, colour) in enumerate(pairs):
         left = MARGIN_PX + column * (half + MARGIN_PX)
-        canvas.text(left, 44, f"{name}, sensor frame (x up), {len(points)} points; dark: moving", 14, bold=True, colour=colour)
+        canvas.text(
+            left, 44, f"{name}, sensor frame (x up), {len(points)} points; dark: moving", 14, bold=True, colour=colour
+        )
         axes = canvas.axes(left, 72, half, 560)
         moving = np.abs(speeds) > 1.0
         axes.scatter(-points[~moving, 1], points[~moving, 0], s=6, color=MUTED, linewidths=0)
@@ -91,6 +100,7 @@ def draw_radar_comparison(
         axes.set_ylim(0, 195)
         axes.set_aspect("equal", adjustable="box")
         axes.set_xticks([])
+        axes.set_yticks([])
     everything = np.concatenate(list(simulated))
     speeds = np.concatenate(list(simulated_speed_mps))
     rows = [
@@ -106,7 +116,15 @@ def draw_radar_comparison(
         canvas.text(left, 660, name, 14, bold=True)
         axes = canvas.axes(left + 34, 690, wide - 34, 430)
         for values, colour, label in ((truth, REAL_COLOUR, "real"), (model, SIMULATED_COLOUR, "simulated")):
-            axes.hist(np.clip(values, edges[0], edges[-1]), edges, density=True, histtype="step", color=colour, linewidth=1.8, label=label)
+            axes.hist(
+                np.clip(values, edges[0], edges[-1]),
+                edges,
+                density=True,
+                histtype="step",
+                color=colour,
+                linewidth=1.8,
+                label=label,
+            )
         if "speed" in name:
             axes.set_yscale("log")
         axes.tick_params(colors=INK, labelsize=7)

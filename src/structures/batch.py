@@ -16,7 +16,7 @@ RADAR_POINT_FIELDS = ("x", "y", "z", "rcs", "vx", "vy", "dt")
 class FrameBatch:
     """B key frames with their sensors, calibration and, where known, annotations.
 
-    Frames: `ego` is the vehicle at the LIDAR_LEFT key frame, `aug` the same after BEV augmentation A_t (spec section 9).
+    Frames: `ego` is the vehicle at the LIDAR_LEFT key frame, `aug` the same after BEV augmentation A_t (spec 9).
     Global coordinates are float64; only ego-relative ones are float32. Images are raw RGB bytes: each model
     normalises as its backbone was trained.
 
@@ -42,9 +42,8 @@ class FrameBatch:
         self._expect("aug_from_ego", (b, 4, 4), torch.float32)
         self._expect("radar_points", (self.radar_points.shape[0], len(RADAR_POINT_FIELDS)), torch.float32)
         self._expect("radar_batch", (self.radar_points.shape[0],), torch.int64)
-        if len(self.radar_batch) and not (
-            0 <= int(self.radar_batch[0]) and int(self.radar_batch[-1]) < b and bool((self.radar_batch.diff() >= 0).all())
-        ):
+        owners = self.radar_batch
+        if len(owners) and not (owners[0] >= 0 and owners[-1] < b and bool((owners.diff() >= 0).all())):
             raise ValueError(f"FrameBatch.radar_batch must ascend within 0..{b - 1}")
         if self.images is not None:
             n, _, h, w = self.images.shape[1:]

@@ -63,7 +63,7 @@ class DetectionModule(L.LightningModule):
         self._count_skipped(batch)
         for name, value in terms.items():
             self._mean(f"loss/{name}").update(value.detach(), len(batch))
-            self.log(f"step/{name}", value.detach(), batch_size=len(batch), prog_bar=name == "total")
+            self.log(f"step/{name}", value.detach(), batch_size=len(batch), prog_bar=True)
         for name, value in self.model.diagnostics(output).items():
             self._mean(f"state/{name}").update(value)
         return terms["total"]

@@ -10,7 +10,7 @@ from torch import nn
 from torch.optim.lr_scheduler import LRScheduler
 
 from src.errors import ConfigError
-from src.models.sparse_layers import SPARSE_CONVOLUTIONS
+from src.models.sparse_layers import SparseKernel
 
 
 @dataclass(kw_only=True)
@@ -53,7 +53,7 @@ def parameter_groups(
     decayed = {
         id(module.weight)
         for module in model.modules()
-        if isinstance(module, (nn.Linear, nn.Conv2d, *SPARSE_CONVOLUTIONS))
+        if isinstance(module, (nn.Linear, nn.Conv2d, SparseKernel))
     }
     in_backbone = {id(parameter) for parameter in backbone.parameters()} if backbone is not None else set()
     groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}
@@ -115,5 +115,5 @@ def build_optimizer(
 ) -> tuple[torch.optim.AdamW, CyclicSchedule]:
     """AdamW and its schedule over `total_steps` optimiser steps."""
     groups = parameter_groups(model, config, backbone, backbone_lr_multiplier)
-    optimizer = torch.optim.AdamW(groups, lr=config.lr, betas=tuple(config.betas))
+    optimizer = torch.optim.AdamW(groups, lr=config.lr, betas=tuple(config.betas), fused=True)
     return optimizer, CyclicSchedule(optimizer, config, total_steps)

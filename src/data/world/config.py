@@ -34,8 +34,8 @@ class WorldConfig:
     camera_sweeps: bool  # also write the 10 Hz images between key frames
 
     radar_sweeps_per_key_frame: int  # sweeps written up to and including a key frame, 10 = all of the 20 Hz
-    returns_density: float  # scales the returns of every object and of clutter; about 6 for the real sensor's density
-    clutter_density: float  # scales static clutter and look-alikes alone
+    returns_density: float  # scales the returns of objects and of clutter alike; about 6 for the density of the real sensor
+    clutter_density: float  # scales the number of clutter points and of look-alikes
     ghost_fraction: float  # multipath copies per real return
     false_alarms_per_sweep: float  # mean number of returns from nowhere
     range_noise_m: float
@@ -52,18 +52,41 @@ class WorldConfig:
 
     def __post_init__(self) -> None:
         at_least = {
-            "num_train_scenes": 0, "num_val_scenes": 0, "key_frames_per_scene": 1, "seed": 0, "num_workers": 0,
-            "image_width_px": 32, "image_height_px": 32, "jpeg_quality": 1, "radar_sweeps_per_key_frame": 1,
-            "returns_density": 0.0, "clutter_density": 0.0, "ghost_fraction": 0.0, "false_alarms_per_sweep": 0.0,
-            "range_noise_m": 0.0, "azimuth_noise_deg": 0.0, "elevation_noise_deg": 0.0, "doppler_noise_mps": 0.0,
-            "vehicles_per_lane_km": 0.0, "rare_objects": 0.0, "annotation_range_m": 1.0, "camera_fov_deg": 10.0,
-            "lidar_step_deg": 0.05, "ego_rate_hz": 1,
-        }  # fmt: skip
+            "num_train_scenes": 0,
+            "num_val_scenes": 0,
+            "key_frames_per_scene": 1,
+            "seed": 0,
+            "num_workers": 0,
+            "image_width_px": 32,
+            "image_height_px": 32,
+            "jpeg_quality": 1,
+            "radar_sweeps_per_key_frame": 1,
+            "returns_density": 0.0,
+            "clutter_density": 0.0,
+            "ghost_fraction": 0.0,
+            "false_alarms_per_sweep": 0.0,
+            "range_noise_m": 0.0,
+            "azimuth_noise_deg": 0.0,
+            "elevation_noise_deg": 0.0,
+            "doppler_noise_mps": 0.0,
+            "vehicles_per_lane_km": 0.0,
+            "rare_objects": 0.0,
+            "annotation_range_m": 1.0,
+            "camera_fov_deg": 10.0,
+            "lidar_step_deg": 0.05,
+            "ego_rate_hz": 1,
+        }
         at_most = {
-            "jpeg_quality": 95, "radar_sweeps_per_key_frame": RADAR_RATE_HZ // KEY_FRAME_RATE_HZ,
-            "camera_fov_deg": 150.0, "annotation_range_m": 250.0, "vehicles_per_lane_km": 40.0, "ego_rate_hz": 1000,
-            "key_frames_per_scene": 60, "ghost_fraction": 1.0, "lidar_step_deg": 10.0,
-        }  # fmt: skip
+            "jpeg_quality": 95,
+            "radar_sweeps_per_key_frame": RADAR_RATE_HZ // KEY_FRAME_RATE_HZ,
+            "camera_fov_deg": 150.0,
+            "annotation_range_m": 250.0,
+            "vehicles_per_lane_km": 40.0,
+            "ego_rate_hz": 1000,
+            "key_frames_per_scene": 60,
+            "ghost_fraction": 1.0,
+            "lidar_step_deg": 10.0,
+        }
         for name, low in at_least.items():
             value, high = getattr(self, name), at_most.get(name, math.inf)
             if not (math.isfinite(value) and low <= value <= high):

@@ -12,10 +12,10 @@ from src.structures.taxonomy import CLASS_RANGE_M
 
 Array = np.ndarray
 
-SMALL_RANGE_M = 130.0
+SMALL_RANGE_M = 110.0
 """People label small things only as far as they can tell what they are."""
 LIDAR_PATCH_RAD2 = np.radians(0.2) * np.radians(0.4)
-LIDAR_REACH_M = 130.0
+LIDAR_REACH_M = 170.0
 
 
 @dataclass(kw_only=True)
@@ -40,9 +40,17 @@ def frame_truth(scene: Scene, time_s: float, own_pixels: Array, seen_pixels: Arr
     floors = np.array([actor.kind.floor_m for actor in scene.actors])
     centres = ground + np.stack([np.zeros_like(floors), np.zeros_like(floors), floors + 0.5 * scene.sizes[:, 2]], 1)
     nothing = np.zeros(len(centres), dtype=np.int64)
-    return FrameTruth(time_s=time_s, centres=centres, yaws=yaw, speeds=np.linalg.norm(velocity, axis=1),
-                      distance_m=np.hypot(*(ground - ego)[:, :2].T), own_pixels=own_pixels, seen_pixels=seen_pixels,
-                      radar_points=nothing, lidar_points=nothing.copy())  # fmt: skip
+    return FrameTruth(
+        time_s=time_s,
+        centres=centres,
+        yaws=yaw,
+        speeds=np.linalg.norm(velocity, axis=1),
+        distance_m=np.hypot(*(ground - ego)[:, :2].T),
+        own_pixels=own_pixels,
+        seen_pixels=seen_pixels,
+        radar_points=nothing,
+        lidar_points=nothing.copy(),
+    )
 
 
 def count_inside(truth: FrameTruth, sizes: Array, points: Array) -> Array:
@@ -62,7 +70,7 @@ def count_inside(truth: FrameTruth, sizes: Array, points: Array) -> Array:
 
 
 def estimate_lidar_points(truth: FrameTruth, sizes: Array, ego_xyz: Array, rng: np.random.Generator) -> Array:
-    """What a lidar would return from each actor: its solid angle over that of a beam, fading with range, less occlusion."""
+    """What a lidar would return from each actor: solid angle over that of a beam, fading with range and occlusion."""
     bearing = np.arctan2(*(truth.centres - ego_xyz)[:, 1::-1].T)
     aspect = bearing - truth.yaws
     width = np.abs(np.sin(aspect)) * sizes[:, 0] + np.abs(np.cos(aspect)) * sizes[:, 1]
@@ -73,7 +81,7 @@ def estimate_lidar_points(truth: FrameTruth, sizes: Array, ego_xyz: Array, rng: 
 
 
 def labelled(config: WorldConfig, scene: Scene, frames: list[FrameTruth]) -> Array:
-    """Which actors are labelled when, [F, N] bool: in range, from the first to the last frame in which a sensor saw them."""
+    """Which actors are labelled when, [F, N] bool: in range, between the first and last frame with a sensor on them."""
     limit = np.array([_label_range(config, actor.kind.klass) for actor in scene.actors])
     reach = np.stack([f.distance_m for f in frames]) < limit
     seen = np.stack([(f.seen_pixels + f.radar_points + f.lidar_points) > 0 for f in frames]) & reach

@@ -14,13 +14,21 @@ Array = np.ndarray
 
 SCAN_S = 0.1
 HALF_WIDTH_RAD = np.radians(60.0)
-ELEVATIONS_RAD = np.radians(np.concatenate([np.linspace(-22, -4, 16), np.linspace(-3.5, 3.5, 22), np.linspace(4.5, 10, 6)]))
+ELEVATIONS_RAD = np.radians(
+    np.concatenate([np.linspace(-22, -4, 16), np.linspace(-3.5, 3.5, 22), np.linspace(4.5, 10, 6)])
+)
 REACH_M = 180.0
 RANGE_NOISE_M = 0.02
 
 
 def scan_lidars(
-    config: WorldConfig, scene: Scene, studio: Studio, mounts: list[Mount], time_s: float, stamp_us: int, rng: np.random.Generator
+    config: WorldConfig,
+    scene: Scene,
+    studio: Studio,
+    mounts: list[Mount],
+    time_s: float,
+    stamp_us: int,
+    rng: np.random.Generator,
 ) -> dict[str, Array]:
     """One cloud of LIDAR_TYPE per lidar in its sensor frame, not motion compensated beyond the scan's middle.
 
@@ -30,7 +38,9 @@ def scan_lidars(
     ground, _, yaw = scene.tracks.state(time_s)
     near = np.flatnonzero(np.hypot(*(ground - translation)[:, :2].T) < REACH_M + 10)
     sizes = scene.sizes[near]
-    middle = ground[near] + np.stack([np.zeros(len(near)), np.zeros(len(near)), studio.floors[near] + 0.5 * sizes[:, 2]], 1)
+    middle = ground[near] + np.stack(
+        [np.zeros(len(near)), np.zeros(len(near)), studio.floors[near] + 0.5 * sizes[:, 2]], 1
+    )
     azimuths = np.arange(-HALF_WIDTH_RAD, HALF_WIDTH_RAD, np.radians(config.lidar_step_deg))
     a, e = (grid.ravel() for grid in np.meshgrid(azimuths, ELEVATIONS_RAD, indexing="ij"))
     rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], 1)
@@ -52,7 +62,9 @@ def scan_lidars(
     return clouds
 
 
-def _nearest_hit(origin: Array, rays: Array, centres: Array, sizes: Array, yaws: Array, ground_z: float) -> tuple[Array, Array]:
+def _nearest_hit(
+    origin: Array, rays: Array, centres: Array, sizes: Array, yaws: Array, ground_z: float
+) -> tuple[Array, Array]:
     """Distance to the nearest box or to the ground along each ray (inf if none) and its brightness."""
     down = np.minimum(rays[:, 2], -1e-9)
     best = np.where(rays[:, 2] < -1e-3, (ground_z - origin[2]) / down, np.inf)

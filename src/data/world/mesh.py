@@ -10,6 +10,11 @@ Array = np.ndarray
 Colour = tuple[int, int, int]
 
 
+def shade(colour: Colour, factor: float) -> Colour:
+    """The colour, lighter or darker."""
+    return tuple(int(min(255, c * factor)) for c in colour)  # type: ignore[return-value]
+
+
 @dataclass(kw_only=True)
 class Mesh:
     """Q quads. Corners run counter-clockwise seen from outside; a triangle repeats its last corner."""
@@ -27,7 +32,12 @@ class Mesh:
         """All quads in one mesh; the list may be empty."""
         if not meshes:
             return MeshMaker().mesh()
-        return cls(**{name: np.concatenate([getattr(m, name) for m in meshes]) for name in ("corners", "colours", "glows", "open")})
+        return cls(
+            **{
+                name: np.concatenate([getattr(m, name) for m in meshes])
+                for name in ("corners", "colours", "glows", "open")
+            }
+        )
 
     def moved(self, offset: Array, yaw: float) -> Mesh:
         """Turned about z, then shifted."""
@@ -53,29 +63,64 @@ class MeshMaker:
         self.open.append(two_sided)
 
     def frustum(
-        self, low: tuple[float, float, float, float], high: tuple[float, float, float, float], z0: float, z1: float,
-        colour: Colour, *, top: Colour | None = None, front: Colour | None = None, back: Colour | None = None, glow: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        low: tuple[float, float, float, float],
+        high: tuple[float, float, float, float],
+        z0: float,
+        z1: float,
+        colour: Colour,
+        *,
+        top: Colour | None = None,
+        front: Colour | None = None,
+        back: Colour | None = None,
+        glow: bool = False,
+    ) -> None:
         """A box with slanted sides; `low` and `high` are (x0, x1, y0, y1) at the heights z0 and z1. No underside."""
         a0, a1, b0, b1 = low
         c0, c1, e0, e1 = high
-        p = [(a0, b0, z0), (a1, b0, z0), (a1, b1, z0), (a0, b1, z0), (c0, e0, z1), (c1, e0, z1), (c1, e1, z1), (c0, e1, z1)]
-        faces = [((0, 1, 5, 4), colour), ((1, 2, 6, 5), front or colour), ((2, 3, 7, 6), colour), ((3, 0, 4, 7), back or colour),
-                 ((4, 5, 6, 7), top or colour)]  # fmt: skip
+        p = [
+            (a0, b0, z0),
+            (a1, b0, z0),
+            (a1, b1, z0),
+            (a0, b1, z0),
+            (c0, e0, z1),
+            (c1, e0, z1),
+            (c1, e1, z1),
+            (c0, e1, z1),
+        ]
+        faces = [
+            ((0, 1, 5, 4), colour),
+            ((1, 2, 6, 5), front or colour),
+            ((2, 3, 7, 6), colour),
+            ((3, 0, 4, 7), back or colour),
+            ((4, 5, 6, 7), top or colour),
+        ]
         for indices, paint in faces:
             self.quad([p[i] for i in indices], paint, glow=glow)
 
-    def box(self, x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, colour: Colour, **faces: object) -> None:
+    def box(
+        self, x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, colour: Colour, **faces: object
+    ) -> None:
         """An upright box without underside."""
         self.frustum((x0, x1, y0, y1), (x0, x1, y0, y1), z0, z1, colour, **faces)  # type: ignore[arg-type]
 
-    def wheel(self, x: float, y: float, radius: float, side: int, colour: Colour = (24, 24, 26), hub: Colour | None = (120, 120, 124)) -> None:
+    def wheel(
+        self,
+        x: float,
+        y: float,
+        radius: float,
+        side: int,
+        colour: Colour = (24, 24, 26),
+        hub: Colour | None = (120, 120, 124),
+    ) -> None:
         """A six-sided disc that faces `side` (+1 left, -1 right)."""
         for size, paint, lift in ((1.0, colour, 0.0), (0.5, hub, 0.012)):
             if paint is None:
                 continue
             angles = side * -np.arange(6) * np.pi / 3
-            ring = [(x + size * radius * np.cos(a), y + side * lift, radius + size * radius * np.sin(a)) for a in angles]
+            ring = [
+                (x + size * radius * np.cos(a), y + side * lift, radius + size * radius * np.sin(a)) for a in angles
+            ]
             self.quad(ring[0:4], paint, two_sided=True)
             self.quad([ring[0], ring[3], ring[4], ring[5]], paint, two_sided=True)
 
@@ -85,7 +130,9 @@ class MeshMaker:
             for side in (1, -1):
                 self.wheel(x, side * (half_width + 0.012), radius, side)
 
-    def panel(self, x: float, y0: float, y1: float, z0: float, z1: float, facing: int, colour: Colour, *, glow: bool = False) -> None:
+    def panel(
+        self, x: float, y0: float, y1: float, z0: float, z1: float, facing: int, colour: Colour, *, glow: bool = False
+    ) -> None:
         """A flat upright rectangle across the object that faces forwards (+1) or backwards (-1)."""
         left, right = (y1, y0) if facing < 0 else (y0, y1)
         self.quad([(x, left, z0), (x, right, z0), (x, right, z1), (x, left, z1)], colour, glow=glow)
@@ -104,5 +151,9 @@ class MeshMaker:
 
     def mesh(self) -> Mesh:
         """What was collected."""
-        return Mesh(corners=np.array(self.corners).reshape(-1, 4, 3), colours=np.array(self.colours, dtype=np.float32).reshape(-1, 3),
-                    glows=np.array(self.glows, dtype=bool), open=np.array(self.open, dtype=bool))  # fmt: skip
+        return Mesh(
+            corners=np.array(self.corners).reshape(-1, 4, 3),
+            colours=np.array(self.colours, dtype=np.float32).reshape(-1, 3),
+            glows=np.array(self.glows, dtype=bool),
+            open=np.array(self.open, dtype=bool),
+        )

@@ -27,7 +27,7 @@ class Tracks:
     turn: Array  # [N, T] rad, heading relative to the road's
 
     def road_state(self, time_s: float) -> tuple[Array, Array, Array, Array, Array]:
-        """s, ds/dt, d, dd/dt and turn at a time, each [N]; rates change linearly within a step, as they were integrated."""
+        """s, ds/dt, d, dd/dt and turn at a time, each [N]; rates change linearly within a step."""
         place = np.clip((time_s + LEAD_IN_S) / STEP_S, 0, self.s.shape[1] - 1.001)
         low = int(place)
         part = place - low
@@ -45,7 +45,9 @@ class Tracks:
         heading = self.road.heading_at(s)
         forward = s_rate * (1.0 - self.road.curvature_at(s) * d)
         cos, sin = np.cos(heading), np.sin(heading)
-        velocity = np.stack([forward * cos - d_rate * sin, forward * sin + d_rate * cos, s_rate * self.road.slope_at(s)], 1)
+        velocity = np.stack(
+            [forward * cos - d_rate * sin, forward * sin + d_rate * cos, s_rate * self.road.slope_at(s)], 1
+        )
         return self.road.place(s, d), velocity, heading + turn
 
 

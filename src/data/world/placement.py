@@ -46,8 +46,15 @@ class _Maker:
 
     def actor(self, name: str, *, has_rider: bool = True, parked: bool = False) -> Actor:
         kind, rng = KINDS[name], self.rng
-        return Actor(kind=kind, name=name, size=kind.draw_size(rng), colour=kind.colours[int(rng.integers(len(kind.colours)))],
-                     has_rider=has_rider, parked=parked, variant=int(rng.integers(1 << 16)))  # fmt: skip
+        return Actor(
+            kind=kind,
+            name=name,
+            size=kind.draw_size(rng),
+            colour=kind.colours[int(rng.integers(len(kind.colours)))],
+            has_rider=has_rider,
+            parked=parked,
+            variant=int(rng.integers(1 << 16)),
+        )
 
     def count(self, mean: float) -> int:
         return int(np.floor(mean * self.config.rare_objects + self.rng.random()))
@@ -55,7 +62,7 @@ class _Maker:
 
 def bystanders(
     config: WorldConfig, road: Road, reach_m: float, rng: np.random.Generator
-) -> Iterator[tuple[Actor, Start]]:  # fmt: skip
+) -> Iterator[tuple[Actor, Start]]:
     """Actors beside the road with their starts; `reach_m` is how far the ego truck will drive."""
     make = _Maker(config, rng)
     yield from _roadworks(make, road, reach_m)
@@ -71,21 +78,42 @@ def _roadworks(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor
     rng = make.rng
     side = -1 if rng.random() < 0.65 else 1
     start = rng.uniform(15, max(20.0, reach_m - 60))
-    for i in range(make.count(4)):
-        yield make.actor("cone"), Start(start + 9.0 * i + rng.normal(0, 0.6), side * (road.edge_m + 0.35 + 0.12 * i), turn=rng.uniform(0, 3))
-    begin = start + 50
     for i in range(make.count(3)):
+        yield (
+            make.actor("cone"),
+            Start(start + 9.0 * i + rng.normal(0, 0.6), side * (road.edge_m + 0.35 + 0.12 * i), turn=rng.uniform(0, 3)),
+        )
+    begin = start + 40
+    for i in range(make.count(2.3)):
         across = rng.random() < 0.5
-        yield make.actor("barrier"), Start(begin + 3.5 * i + rng.normal(0, 0.3), side * (road.edge_m + rng.uniform(0.8, 2.2)),
-                                           turn=rng.normal(0, 0.12) + (0.0 if across else np.pi / 2))  # fmt: skip
+        yield (
+            make.actor("barrier"),
+            Start(
+                begin + 3.5 * i + rng.normal(0, 0.3),
+                side * (road.edge_m + rng.uniform(0.8, 2.2)),
+                turn=rng.normal(0, 0.12) + (0.0 if across else np.pi / 2),
+            ),
+        )
     if make.count(0.8):
-        yield make.actor("excavator", parked=True), Start(begin + 30, side * (road.edge_m + 5.5), turn=rng.normal(0, 0.3))
+        yield (
+            make.actor("excavator", parked=True),
+            Start(begin + 30, side * (road.edge_m + 5.5), turn=rng.normal(0, 0.3)),
+        )
     for _ in range(make.count(1.1)):
-        yield (make.actor("police_officer" if rng.random() < 0.15 else "worker"),
-               Start(begin + rng.uniform(-30, 40), side * (road.edge_m + rng.uniform(1.2, 5.0)), s_rate=rng.choice([0.0, 0.8, -0.8]),
-                     turn=rng.uniform(-3.1, 3.1)))  # fmt: skip
+        yield (
+            make.actor("police_officer" if rng.random() < 0.15 else "worker"),
+            Start(
+                begin + rng.uniform(-30, 40),
+                side * (road.edge_m + rng.uniform(1.2, 5.0)),
+                s_rate=rng.choice([0.0, 0.8, -0.8]),
+                turn=rng.uniform(-3.1, 3.1),
+            ),
+        )
     for i in range(make.count(1)):
-        yield make.actor("temporary_sign"), Start(start - 35 * (i + 1), side * (road.edge_m + 1.9), turn=np.pi if side < 0 else 0.0)
+        yield (
+            make.actor("temporary_sign"),
+            Start(start - 35 * (i + 1), side * (road.edge_m + 1.9), turn=np.pi if side < 0 else 0.0),
+        )
 
 
 def _side_road(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
@@ -95,16 +123,33 @@ def _side_road(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor
     for _ in range(make.count(1.5)):
         way = int(rng.choice([-1, 1]))
         speed = rng.uniform(3.5, 7.5)
-        yield (make.actor("bicycle"), Start(rng.uniform(25, reach_m - 5), centre - way * rng.uniform(2.0, 2.8), s_rate=way * speed,
-                                            turn=0.0 if way > 0 else np.pi))  # fmt: skip
+        yield (
+            make.actor("bicycle"),
+            Start(
+                rng.uniform(25, reach_m - 5),
+                centre - way * rng.uniform(2.0, 2.8),
+                s_rate=way * speed,
+                turn=0.0 if way > 0 else np.pi,
+            ),
+        )
     for _ in range(make.count(1.0)):
         way = int(rng.choice([-1, 1]))
         standing = rng.random() < 0.3
-        yield (make.actor("child" if rng.random() < 0.25 else "adult"),
-               Start(rng.uniform(15, reach_m), centre - rng.choice([-1, 1]) * rng.uniform(3.4, 4.4),
-                     s_rate=0.0 if standing else way * rng.uniform(0.9, 1.8), turn=0.0 if way > 0 else np.pi))  # fmt: skip
+        yield (
+            make.actor("child" if rng.random() < 0.25 else "adult"),
+            Start(
+                rng.uniform(15, reach_m),
+                centre - rng.choice([-1, 1]) * rng.uniform(3.4, 4.4),
+                s_rate=0.0 if standing else way * rng.uniform(0.9, 1.8),
+                turn=0.0 if way > 0 else np.pi,
+            ),
+        )
     if road.side_road:
-        for name, speed in (("motorcycle", rng.uniform(17, 24)), ("farm_tractor", rng.uniform(6, 11)), ("car", rng.uniform(18, 25))):
+        for name, speed in (
+            ("motorcycle", rng.uniform(17, 24)),
+            ("farm_tractor", rng.uniform(6, 11)),
+            ("car", rng.uniform(18, 25)),
+        ):
             if make.count(0.35):
                 way = int(rng.choice([-1, 1]))
                 s = rng.uniform(-30, 60) if way > 0 else rng.uniform(reach_m - 60, reach_m + 120)
@@ -130,21 +175,36 @@ def _apron(make: _Maker, road: Road) -> Iterator[tuple[Actor, Start]]:
             walks = name in ("adult", "child") and rng.random() < 0.6
             turn = rng.uniform(-3.1, 3.1)
             speed = rng.uniform(0.7, 1.5) if walks else 0.0
-            yield (make.actor(name, has_rider=False, parked=name in ("motorcycle", "bicycle")),
-                   Start(rng.uniform(first, last), rng.uniform(near - 13, near - 1.5), s_rate=speed * np.cos(turn),
-                         d_rate=speed * np.sin(turn), turn=turn))  # fmt: skip
+            yield (
+                make.actor(name, has_rider=False, parked=name in ("motorcycle", "bicycle")),
+                Start(
+                    rng.uniform(first, last),
+                    rng.uniform(near - 13, near - 1.5),
+                    s_rate=speed * np.cos(turn),
+                    d_rate=speed * np.sin(turn),
+                    turn=turn,
+                ),
+            )
 
 
 def _fields(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
     """Deer and cattle beyond the rails."""
     rng = make.rng
-    for name, mean in (("deer", 1.2), ("cow", 1.2)):
+    for name, mean in (("deer", 1.0), ("cow", 0.8)):
         for _ in range(make.count(mean)):
             side = int(rng.choice([-1, 1]))
             turn = rng.uniform(-3.1, 3.1)
             speed = float(rng.choice([0.0, 0.5, 1.1]))
-            yield make.actor(name), Start(rng.uniform(15, reach_m + 10), side * (road.rail_m + rng.uniform(3, 8)),
-                                          s_rate=speed * np.cos(turn), d_rate=0.3 * speed * np.sin(turn), turn=turn)  # fmt: skip
+            yield (
+                make.actor(name),
+                Start(
+                    rng.uniform(15, reach_m + 10),
+                    side * (road.rail_m + rng.uniform(3, 8)),
+                    s_rate=speed * np.cos(turn),
+                    d_rate=0.3 * speed * np.sin(turn),
+                    turn=turn,
+                ),
+            )
 
 
 def _signs(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
@@ -155,8 +215,11 @@ def _signs(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, St
         s = rng.uniform(-180, -100)
         while s < reach_m + 230:
             name = "guide_sign" if rng.random() < 0.3 else "sign"
-            yield make.actor(name), Start(s, -direction * (road.rail_m + rng.uniform(1.0, 2.5)), turn=turn + rng.normal(0, 0.05))
-            s += rng.uniform(110, 300)
+            yield (
+                make.actor(name),
+                Start(s, -direction * (road.rail_m + rng.uniform(1.0, 2.5)), turn=turn + rng.normal(0, 0.05)),
+            )
+            s += rng.uniform(150, 380)
     gantry = rng.uniform(40, reach_m + 60)
     for lane in range(road.lanes):
         if lane == 0 or rng.random() < 0.4:
@@ -166,10 +229,22 @@ def _signs(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, St
 def _lookalikes(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
     """Things that reflect like cones, barriers, signs, animals, people or parked vehicles and are not labelled."""
     rng, clutter = make.rng, make.config.clutter_density
-    for name, mean, low, high in (("bollard", 9, -1.0, 4.0), ("cabinet", 5, 0.8, 7.0), ("concrete_block", 5, -1.2, 6.0),
-                                  ("hay_bale", 5, 5.0, 20.0), ("bush", 16, 1.5, 25.0), ("lamp_post", 5, 0.8, 2.0),
-                                  ("container", 1, 14.0, 25.0)):  # fmt: skip
+    for name, mean, low, high in (
+        ("bollard", 9, -1.0, 4.0),
+        ("cabinet", 5, 0.8, 7.0),
+        ("concrete_block", 5, -1.2, 6.0),
+        ("hay_bale", 5, 5.0, 20.0),
+        ("bush", 16, 1.5, 25.0),
+        ("lamp_post", 5, 0.8, 2.0),
+        ("container", 1, 14.0, 25.0),
+    ):
         for _ in range(int(mean * clutter + rng.random())):
             side = int(rng.choice([-1, 1]))
-            yield make.actor(name, parked=True), Start(rng.uniform(-160, reach_m + 180), side * (road.rail_m + rng.uniform(low, high)),
-                                                       turn=rng.normal(0, 0.25) + float(rng.choice([0.0, 0.0, 1.57])))  # fmt: skip
+            yield (
+                make.actor(name, parked=True),
+                Start(
+                    rng.uniform(-160, reach_m + 180),
+                    side * (road.rail_m + rng.uniform(low, high)),
+                    turn=rng.normal(0, 0.25) + float(rng.choice([0.0, 0.0, 1.57])),
+                ),
+            )

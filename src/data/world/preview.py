@@ -39,11 +39,13 @@ class PreviewFrame:
 def rotation_of(quaternion: list[float]) -> Array:
     """[3, 3] matrix of a unit quaternion (w, x, y, z)."""
     w, x, y, z = quaternion
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def _matrix(row: Row) -> Array:
@@ -57,9 +59,21 @@ class WorldPreview:
 
     def __init__(self, root: Path) -> None:
         self.root = Path(root)
-        names = ("scene", "sample", "sample_data", "ego_pose", "calibrated_sensor", "sensor", "sample_annotation", "instance", "category")
+        names = (
+            "scene",
+            "sample",
+            "sample_data",
+            "ego_pose",
+            "calibrated_sensor",
+            "sensor",
+            "sample_annotation",
+            "instance",
+            "category",
+        )
         try:
-            tables = {name: json.loads((self.root / VERSION / f"{name}.json").read_text(encoding="utf-8")) for name in names}
+            tables = {
+                name: json.loads((self.root / VERSION / f"{name}.json").read_text(encoding="utf-8")) for name in names
+            }
         except (OSError, ValueError) as error:
             raise DataError(f"{self.root}: no world to draw: {error}") from error
         self.rows = {name: {row["token"]: row for row in table} for name, table in tables.items()}
@@ -90,11 +104,14 @@ class WorldPreview:
         centres = np.array([row["translation"] for row in boxes]).reshape(-1, 3)
         velocities = np.array([self._velocity(row) for row in boxes]).reshape(-1, 3)
         width, length, height = np.array([row["size"] for row in boxes]).reshape(-1, 3).T
-        sweeps = [self._radar_points(row, reference["timestamp"], ego_from_global)
-                  for row in self.data[sample["token"]] if self._channel(row) in RADARS
-                  and reference["timestamp"] - row["timestamp"] < SWEEPS * 50_000]  # fmt: skip
+        sweeps = [
+            self._radar_points(row, reference["timestamp"], ego_from_global)
+            for row in self.data[sample["token"]]
+            if self._channel(row) in RADARS and reference["timestamp"] - row["timestamp"] < SWEEPS * 50_000
+        ]
         return PreviewFrame(
-            title=f"{scene['name'][:14]}…  {scene['description'].replace(';', '  ')}",
+            title=f"{scene['name'][:14]}…  "
+            + "  ".join(tag.split(".")[1] for tag in str(scene["description"]).split(";")),
             images=[np.asarray(Image.open(self.root / files[name]["filename"]).convert("RGB")) for name in CAMERAS],
             pix_from_ego=np.stack(projections),
             centers=centres @ ego_from_global[:3, :3].T + ego_from_global[:3, 3],
@@ -144,7 +161,9 @@ class WorldPreview:
         elapsed = max((neighbours[1]["timestamp"] - neighbours[0]["timestamp"]) * 1e-6, 1e-3)
         sight = points[:, :3] @ global_from_sensor[:3, :3].T
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-        range_rate = (points[:, 3:6] @ global_from_sensor[:3, :3].T * sight).sum(1) + sight @ ((ends[1] - ends[0]) / elapsed)
+        range_rate = (points[:, 3:6] @ global_from_sensor[:3, :3].T * sight).sum(1) + sight @ (
+            (ends[1] - ends[0]) / elapsed
+        )
         dst = ego_from_global @ global_from_sensor
         moved = points[:, :3] @ dst[:3, :3].T + dst[:3, 3]
         velocity = (range_rate[:, None] * sight) @ ego_from_global[:3, :3].T
@@ -156,4 +175,6 @@ def radar_in_sensor_frame(root: Path, channel: str, limit: int) -> list[Array]:
     """The first `limit` key sweeps [n, 7] of a channel as stored, for comparison with a real file."""
     files = sorted((Path(root) / "samples" / channel).glob("*.pcd"))[:limit]
     blobs = (path.read_bytes() for path in files)
-    return [np.frombuffer(raw[raw.index(b"DATA binary\n") + 12 :], "<f4").reshape(-1, 7).astype(np.float64) for raw in blobs]
+    return [
+        np.frombuffer(raw[raw.index(b"DATA binary\n") + 12 :], "<f4").reshape(-1, 7).astype(np.float64) for raw in blobs
+    ]

@@ -51,7 +51,14 @@ class Studio:
         ego_s = float(self.scene.ego.tracks.road_state(time_s)[0][0])
         kept = np.flatnonzero(np.abs(self.scenery.s - ego_s) < VIEW_M + 20)
         ground = self.scenery.mesh
-        parts = [Mesh(corners=ground.corners[kept], colours=ground.colours[kept], glows=ground.glows[kept], open=ground.open[kept])]
+        parts = [
+            Mesh(
+                corners=ground.corners[kept],
+                colours=ground.colours[kept],
+                glows=ground.glows[kept],
+                open=ground.open[kept],
+            )
+        ]
         layers, groups = [self.scenery.layer[kept]], [np.full(len(kept), -1)]
         for n in near:
             placed = self.meshes[n].moved(positions[n] + [0.0, 0.0, self.floors[n]], float(headings[n]))
@@ -65,8 +72,13 @@ class Studio:
         return Mesh.join(parts), np.concatenate(layers), np.concatenate(groups)
 
     def photograph(
-        self, mount: Mount, rotation: Array, translation: Array, stage: tuple[Mesh, Array, Array], rng: np.random.Generator
-    ) -> Photo:  # fmt: skip
+        self,
+        mount: Mount,
+        rotation: Array,
+        translation: Array,
+        stage: tuple[Mesh, Array, Array],
+        rng: np.random.Generator,
+    ) -> Photo:
         """The image of one camera of an ego truck at this pose (local from ego)."""
         mesh, layer, group = stage
         local_from_cam = rotation @ mount.rotation
@@ -108,7 +120,9 @@ class Studio:
         y = (np.arange(self.height) + 0.5 - intrinsic[1, 2]) / intrinsic[1, 1]
         # Upward component of each pixel's ray over its length on the ground: the tangent of its elevation.
         across = local_from_cam[:2, 0:1] * x + local_from_cam[:2, 2:3]
-        rise = (local_from_cam[2, 0] * x + local_from_cam[2, 2] + local_from_cam[2, 1] * y[:, None]) / np.linalg.norm(across, axis=0)
+        rise = (local_from_cam[2, 0] * x + local_from_cam[2, 2] + local_from_cam[2, 1] * y[:, None]) / np.linalg.norm(
+            across, axis=0
+        )
         rise = rise.astype(np.float32)
         height = np.clip(rise / np.float32(0.55), 0.0, 1.0)[..., None]
         low, high = (np.array(colour, dtype=np.float32) for colour in (conditions.sky_low, conditions.sky_high))
@@ -132,5 +146,12 @@ class Studio:
 
 def _shadow(size: Array) -> Mesh:
     half_l, half_w = 0.52 * size[0], 0.56 * size[1]
-    corners = np.array([[[-half_l, -half_w, 0.03], [half_l, -half_w, 0.03], [half_l, half_w, 0.03], [-half_l, half_w, 0.03]]])
-    return Mesh(corners=corners, colours=np.array([[34, 35, 38]], dtype=np.float32), glows=np.zeros(1, dtype=bool), open=np.zeros(1, dtype=bool))
+    corners = np.array(
+        [[[-half_l, -half_w, 0.03], [half_l, -half_w, 0.03], [half_l, half_w, 0.03], [-half_l, half_w, 0.03]]]
+    )
+    return Mesh(
+        corners=corners,
+        colours=np.array([[34, 35, 38]], dtype=np.float32),
+        glows=np.zeros(1, dtype=bool),
+        open=np.zeros(1, dtype=bool),
+    )

@@ -63,7 +63,9 @@ _LIDARS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]
 def camera_intrinsic(config: WorldConfig) -> Array:
     """[3, 3] pinhole matrix; the optical axis meets the middle of the image, pixel centres lie at halves."""
     focal = 0.5 * config.image_width_px / np.tan(0.5 * np.radians(config.camera_fov_deg))
-    return np.array([[focal, 0.0, 0.5 * config.image_width_px], [0.0, focal, 0.5 * config.image_height_px], [0.0, 0.0, 1.0]])
+    return np.array(
+        [[focal, 0.0, 0.5 * config.image_width_px], [0.0, focal, 0.5 * config.image_height_px], [0.0, 0.0, 1.0]]
+    )
 
 
 def sensor_rig(config: WorldConfig) -> dict[str, Mount]:
@@ -71,16 +73,49 @@ def sensor_rig(config: WorldConfig) -> dict[str, Mount]:
     mounts = []
     for name in CAMERAS:
         place, yaw, delay = _CAMERAS[name]
-        mounts.append(Mount(channel=name, modality="camera", rotation=_degrees(yaw, 1.5) @ _EGO_FROM_OPTICAL, translation=np.array(place),
-                            intrinsic=camera_intrinsic(config), delay_s=delay))  # fmt: skip
+        mounts.append(
+            Mount(
+                channel=name,
+                modality="camera",
+                rotation=_degrees(yaw, 1.5) @ _EGO_FROM_OPTICAL,
+                translation=np.array(place),
+                intrinsic=camera_intrinsic(config),
+                delay_s=delay,
+            )
+        )
     for name in RADARS:
         place, angles, delay = _RADARS[name]
-        mounts.append(Mount(channel=name, modality="radar", rotation=_degrees(*angles), translation=np.array(place), intrinsic=None,
-                            delay_s=delay))  # fmt: skip
+        mounts.append(
+            Mount(
+                channel=name,
+                modality="radar",
+                rotation=_degrees(*angles),
+                translation=np.array(place),
+                intrinsic=None,
+                delay_s=delay,
+            )
+        )
     for name in LIDARS:
         place, angles = _LIDARS[name]
-        mounts.append(Mount(channel=name, modality="lidar", rotation=_degrees(*angles), translation=np.array(place), intrinsic=None,
-                            delay_s=0.001))  # fmt: skip
+        mounts.append(
+            Mount(
+                channel=name,
+                modality="lidar",
+                rotation=_degrees(*angles),
+                translation=np.array(place),
+                intrinsic=None,
+                delay_s=0.001,
+            )
+        )
     for name, place in (("XSENSE_CABIN", (4.4, 0.0, 1.9)), ("XSENSE_CHASSIS", (0.2, 0.0, 0.9))):
-        mounts.append(Mount(channel=name, modality="imu", rotation=np.eye(3), translation=np.array(place), intrinsic=None, delay_s=0.0))
+        mounts.append(
+            Mount(
+                channel=name,
+                modality="imu",
+                rotation=np.eye(3),
+                translation=np.array(place),
+                intrinsic=None,
+                delay_s=0.0,
+            )
+        )
     return {mount.channel: mount for mount in mounts}

@@ -23,8 +23,8 @@ APRON_DEPTH_M = 34.0
 class Road:
     """Centre line sampled every metre; positions along it are (s, d), d to the left, both in metres.
 
-    Traffic with d < 0 drives towards larger s, traffic with d > 0 comes back. `side_road` is the sign of d of a parallel
-    minor road (0 for none); `apron` the s interval of a parking and loading area on the right (None for none).
+    Traffic with d < 0 drives towards larger s, traffic with d > 0 comes back. `side_road` is the sign of d of a
+    parallel minor road (0 for none); `apron` the s interval of a parking area on the right (None for none).
     """
 
     xy: Array  # [S, 2] m, local coordinates

@@ -11,7 +11,14 @@ from PIL import Image
 
 from src.data.world.catalogue import attribute_of
 from src.data.world.config import CAMERA_RATE_HZ, KEY_FRAME_RATE_HZ, RADAR_RATE_HZ, WorldConfig
-from src.data.world.labels import FrameTruth, count_inside, estimate_lidar_points, frame_truth, labelled, visibility_level
+from src.data.world.labels import (
+    FrameTruth,
+    count_inside,
+    estimate_lidar_points,
+    frame_truth,
+    labelled,
+    visibility_level,
+)
 from src.data.world.lidar import scan_lidars
 from src.data.world.motion import LEAD_IN_S
 from src.data.world.pcd import LIDAR_TYPE, lidar_pcd, radar_pcd
@@ -52,10 +59,14 @@ class SceneWriter:
         scenery_rng = scene_rng(config, index, 1)
         reach = float(scene.ego.tracks.s[0, -1])
         self.scenery = make_scenery(config, scene.road, scene.actors, at_start, reach, scenery_rng)
-        self.studio = Studio(scene, self.scenery, config.image_width_px, config.image_height_px, scene_rng(config, index, 2))
+        self.studio = Studio(
+            scene, self.scenery, config.image_width_px, config.image_height_px, scene_rng(config, index, 2)
+        )
         self.clock = scene_rng(config, index, 3)
         self.start_us = EPOCH_US + index * SCENE_GAP_US + int(self.clock.integers(0, 1_000_000_000))
-        self.key_times = [self._quantised(k / KEY_FRAME_RATE_HZ + self._jitter()) for k in range(config.key_frames_per_scene)]
+        self.key_times = [
+            self._quantised(k / KEY_FRAME_RATE_HZ + self._jitter()) for k in range(config.key_frames_per_scene)
+        ]
         self.name = f"scene-{self._token('drive')}-1"
 
     def write(self) -> Tables:
@@ -89,7 +100,7 @@ class SceneWriter:
         (self.folder / self._filename(shot)).write_bytes(data)
 
     def _write_radars(self) -> tuple[list[tuple[_Shot, int]], list[Array]]:
-        """All radar sweeps; returns the shots with their point counts and, per key frame, its points in local coordinates."""
+        """All radar sweeps; returns shots with point counts and, per key frame, its points in local coordinates."""
         mounts = [self.rig[name] for name in RADARS]
         rng = scene_rng(self.config, self.index, 4)
         per_frame = RADAR_RATE_HZ // KEY_FRAME_RATE_HZ
@@ -114,7 +125,7 @@ class SceneWriter:
         return (points.astype(np.float64) @ mount.rotation.T + mount.translation) @ rotation.T + translation
 
     def _write_cameras(self) -> tuple[list[tuple[_Shot, int]], list[tuple[Array, Array]]]:
-        """All images; returns the shots and, per key frame, each actor's own and seen pixels summed over the cameras."""
+        """All images; returns shots and, per key frame, each actor's own and seen pixels over all cameras."""
         rng = scene_rng(self.config, self.index, 5)
         count = len(self.scene.actors)
         per_frame = CAMERA_RATE_HZ // KEY_FRAME_RATE_HZ
@@ -141,7 +152,7 @@ class SceneWriter:
         return shots, pixels
 
     def _write_lidars(self) -> tuple[list[tuple[_Shot, int]], list[Array] | None]:
-        """Key-frame clouds: six scanned ones, or an empty LIDAR_LEFT; returns shots and, if scanned, local points per frame."""
+        """Key-frame clouds, six or an empty LIDAR_LEFT; returns shots and, if scanned, local points per frame."""
         rng = scene_rng(self.config, self.index, 6)
         channels = LIDARS if self.config.lidar else (REFERENCE_CHANNEL,)
         shots, points = [], []
@@ -161,7 +172,9 @@ class SceneWriter:
             points.append(np.concatenate(here))
         return shots, points if self.config.lidar else None
 
-    def _truths(self, pixels: list[tuple[Array, Array]], radar: list[Array], lidar: list[Array] | None) -> list[FrameTruth]:
+    def _truths(
+        self, pixels: list[tuple[Array, Array]], radar: list[Array], lidar: list[Array] | None
+    ) -> list[FrameTruth]:
         rng = scene_rng(self.config, self.index, 7)
         sizes = self.scene.sizes
         frames = []
@@ -185,25 +198,37 @@ class SceneWriter:
             actor, own_rows = scene.actors[n], []
             for k in np.flatnonzero(present[:, n]):
                 truth = frames[k]
-                attribute = attribute_of(actor.kind, float(truth.speeds[n]), has_rider=actor.has_rider, parked=actor.parked)
+                attribute = attribute_of(
+                    actor.kind, float(truth.speeds[n]), has_rider=actor.has_rider, parked=actor.parked
+                )
                 level = visibility_level(int(truth.own_pixels[n]), int(truth.seen_pixels[n]))
                 half = 0.5 * truth.yaws[n]
                 length, width, height = actor.size
-                own_rows.append({
-                    "token": self._token("annotation", n, k), "sample_token": self._token("sample", k),
-                    "instance_token": self._token("instance", n),
-                    "attribute_tokens": [] if attribute is None else [token(seed, "attribute", attribute)],
-                    "visibility_token": "" if level is None else token(seed, "visibility", level),
-                    "translation": rounded(truth.centres[n] + scene.utm_offset, 4),
-                    "size": rounded(np.array([width, length, height]), 4),
-                    "rotation": rounded(np.array([np.cos(half), 0.0, 0.0, np.sin(half)]), 12),
-                    "num_lidar_pts": int(truth.lidar_points[n]), "num_radar_pts": int(truth.radar_points[n]),
-                })  # fmt: skip
+                own_rows.append(
+                    {
+                        "token": self._token("annotation", n, k),
+                        "sample_token": self._token("sample", k),
+                        "instance_token": self._token("instance", n),
+                        "attribute_tokens": [] if attribute is None else [token(seed, "attribute", attribute)],
+                        "visibility_token": "" if level is None else token(seed, "visibility", level),
+                        "translation": rounded(truth.centres[n] + scene.utm_offset, 4),
+                        "size": rounded(np.array([width, length, height]), 4),
+                        "rotation": rounded(np.array([np.cos(half), 0.0, 0.0, np.sin(half)]), 12),
+                        "num_lidar_pts": int(truth.lidar_points[n]),
+                        "num_radar_pts": int(truth.radar_points[n]),
+                    }
+                )
             link_chain(own_rows)
             annotations += own_rows
-            instances.append({"token": self._token("instance", n), "category_token": token(seed, "category", actor.kind.category),
-                              "nbr_annotations": len(own_rows), "first_annotation_token": own_rows[0]["token"],
-                              "last_annotation_token": own_rows[-1]["token"]})  # fmt: skip
+            instances.append(
+                {
+                    "token": self._token("instance", n),
+                    "category_token": token(seed, "category", actor.kind.category),
+                    "nbr_annotations": len(own_rows),
+                    "first_annotation_token": own_rows[0]["token"],
+                    "last_annotation_token": own_rows[-1]["token"],
+                }
+            )
         order = {self._token("sample", k): k for k in range(len(frames))}
         annotations.sort(key=lambda row: order[str(row["sample_token"])])
         return {"sample_annotation": annotations, "instance": instances}
@@ -211,38 +236,76 @@ class SceneWriter:
     def _sample_tables(self, shots: list[tuple[_Shot, int]]) -> Tables:
         """scene, sample, sample_data, ego_pose and weather_annotation."""
         config, scene = self.config, self.scene
-        samples: list[Row] = [{"token": self._token("sample", k), "timestamp": self._stamp(time), "scene_token": self._token()}
-                              for k, time in enumerate(self.key_times)]  # fmt: skip
+        samples: list[Row] = [
+            {"token": self._token("sample", k), "timestamp": self._stamp(time), "scene_token": self._token()}
+            for k, time in enumerate(self.key_times)
+        ]
         link_chain(samples)
         shots = sorted(shots, key=lambda item: (item[0].time_s, item[0].channel))
         data: list[Row] = []
         for shot, points in shots:
             camera = shot.channel in CAMERAS
             stamp = self._stamp(shot.time_s)
-            data.append({
-                "token": self._token("data", shot.channel, stamp), "sample_token": samples[shot.frame]["token"],
-                "ego_pose_token": self._token("pose", stamp), "calibrated_sensor_token": token(config.seed, "calibration", shot.channel),
-                "timestamp": stamp, "fileformat": "jpg" if camera else "pcd", "is_key_frame": shot.is_key,
-                "width": config.image_width_px if camera else points, "height": config.image_height_px if camera else 1,
-                "filename": self._filename(shot),
-            })  # fmt: skip
+            data.append(
+                {
+                    "token": self._token("data", shot.channel, stamp),
+                    "sample_token": samples[shot.frame]["token"],
+                    "ego_pose_token": self._token("pose", stamp),
+                    "calibrated_sensor_token": token(config.seed, "calibration", shot.channel),
+                    "timestamp": stamp,
+                    "fileformat": "jpg" if camera else "pcd",
+                    "is_key_frame": shot.is_key,
+                    "width": config.image_width_px if camera else points,
+                    "height": config.image_height_px if camera else 1,
+                    "filename": self._filename(shot),
+                }
+            )
         link_by(data, "calibrated_sensor_token")
         times = sorted({shot.time_s for shot, _ in shots} | set(self._ego_times()))
         rotations, translations = scene.ego.poses(np.array(times))
-        poses = [{"token": self._token("pose", self._stamp(time)), "timestamp": self._stamp(time), "rotation": rounded(rotation, 12),
-                  "translation": rounded(place, 6)}
-                 for time, rotation, place in zip(times, quaternions(rotations), translations + scene.utm_offset, strict=True)]  # fmt: skip
+        poses = [
+            {
+                "token": self._token("pose", self._stamp(time)),
+                "timestamp": self._stamp(time),
+                "rotation": rounded(rotation, 12),
+                "translation": rounded(place, 6),
+            }
+            for time, rotation, place in zip(
+                times, quaternions(rotations), translations + scene.utm_offset, strict=True
+            )
+        ]
         sky = scene.conditions
-        weather = {"token": self._token("weather"), "precipitation": sky.precipitation_mm, "temperature": sky.temperature_k,
-                   "wind_speed": sky.wind_mps, "wind_direction": sky.wind_rad}  # fmt: skip
-        row = {"token": self._token(), "name": self.name, "description": sky.tags, "log_token": "", "nbr_samples": len(samples),
-               "first_sample_token": samples[0]["token"], "last_sample_token": samples[-1]["token"],
-               "weather_annotation_token": weather["token"]}  # fmt: skip
-        return {"scene": [row], "sample": samples, "sample_data": data, "ego_pose": poses, "weather_annotation": [weather]}
+        weather = {
+            "token": self._token("weather"),
+            "precipitation": sky.precipitation_mm,
+            "temperature": sky.temperature_k,
+            "wind_speed": sky.wind_mps,
+            "wind_direction": sky.wind_rad,
+        }
+        row = {
+            "token": self._token(),
+            "name": self.name,
+            "description": sky.tags,
+            "log_token": "",
+            "nbr_samples": len(samples),
+            "first_sample_token": samples[0]["token"],
+            "last_sample_token": samples[-1]["token"],
+            "weather_annotation_token": weather["token"],
+        }
+        return {
+            "scene": [row],
+            "sample": samples,
+            "sample_data": data,
+            "ego_pose": poses,
+            "weather_annotation": [weather],
+        }
 
     def _ego_times(self) -> list[float]:
         step = 1.0 / self.config.ego_rate_hz
-        return [self._quantised(i * step) for i in range(-int((LEAD_IN_S - 0.1) / step), int((self.config.duration_s + 0.1) / step) + 1)]
+        return [
+            self._quantised(i * step)
+            for i in range(-int((LEAD_IN_S - 0.1) / step), int((self.config.duration_s + 0.1) / step) + 1)
+        ]
 
     def _motion_tables(self) -> Tables:
         """Both ego_motion tables. The chassis one reads zero speed for stretches, as in the real data."""
@@ -251,8 +314,14 @@ class SceneWriter:
         speed, spin = np.stack([v for v, _ in samples]), np.stack([w for _, w in samples])
         accel = np.gradient(speed, np.array(times), axis=0) if len(times) > 1 else np.zeros_like(speed)
         rotations, _ = self.scene.ego.poses(np.array(times))
-        angles = np.stack([np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]), -np.arcsin(rotations[:, 2, 0]),
-                           np.arctan2(rotations[:, 2, 1], rotations[:, 2, 2])], 1)  # fmt: skip
+        angles = np.stack(
+            [
+                np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]),
+                -np.arcsin(rotations[:, 2, 0]),
+                np.arctan2(rotations[:, 2, 1], rotations[:, 2, 2]),
+            ],
+            1,
+        )
         rng = scene_rng(self.config, self.index, 8)
         silent = np.zeros(len(times), dtype=bool)
         for _ in range(int(rng.integers(0, 4))):
@@ -264,9 +333,11 @@ class SceneWriter:
             values = np.concatenate([speed + noise * rng.standard_normal(speed.shape), accel, angles, spin], 1)
             if table == "ego_motion_chassis":
                 values[silent, :2] = 0.0
-            tables[table] = [{"token": self._token(table, i), "timestamp": self._stamp(time)}
-                             | dict(zip(names, rounded(row, 5), strict=True))
-                             for i, (time, row) in enumerate(zip(times, values, strict=True))]  # fmt: skip
+            tables[table] = [
+                {"token": self._token(table, i), "timestamp": self._stamp(time)}
+                | dict(zip(names, rounded(row, 5), strict=True))
+                for i, (time, row) in enumerate(zip(times, values, strict=True))
+            ]
         return tables
 
 

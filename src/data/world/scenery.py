@@ -43,7 +43,9 @@ def _strips(road: Road, s: Array, d0: float, d1: float, height: float) -> Array:
     return np.stack([right[:-1], right[1:], left[1:], left[:-1]], 1)
 
 
-def make_scenery(config: WorldConfig, road: Road, actors: list[Actor], starts: Array, reach_m: float, rng: np.random.Generator) -> Scenery:
+def make_scenery(
+    config: WorldConfig, road: Road, actors: list[Actor], starts: Array, reach_m: float, rng: np.random.Generator
+) -> Scenery:
     """Draw the surroundings; `starts` [N, 2] are the actors' road positions, for frames around gantry signs."""
     s = np.arange(-BEFORE_M, reach_m + AFTER_M, STEP_M)
     pieces: list[tuple[Array, Array, float, bool]] = []  # quads, colours, layer, open
@@ -87,15 +89,24 @@ def make_scenery(config: WorldConfig, road: Road, actors: list[Actor], starts: A
         pieces.append((_rail_quads(road, s, d), np.tile(np.array(RAIL), (len(s) - 1, 1)), 1.0, True))
         posts = _post_quads(road, s + 2.0, d)
         pieces.append((posts, np.tile(np.array((120, 122, 124)), (len(posts), 1)), 1.0, True))
-    mesh = Mesh(corners=np.concatenate([p[0] for p in pieces]), colours=np.concatenate([p[1] for p in pieces]).astype(np.float32),
-                glows=np.zeros(sum(len(p[0]) for p in pieces), dtype=bool),
-                open=np.concatenate([np.full(len(p[0]), p[3]) for p in pieces]))  # fmt: skip
+    mesh = Mesh(
+        corners=np.concatenate([p[0] for p in pieces]),
+        colours=np.concatenate([p[1] for p in pieces]).astype(np.float32),
+        glows=np.zeros(sum(len(p[0]) for p in pieces), dtype=bool),
+        open=np.concatenate([np.full(len(p[0]), p[3]) for p in pieces]),
+    )
     layer = np.concatenate([np.full(len(p[0]), p[2]) for p in pieces])
     upright, upright_points = _upright(road, actors, starts, s[0], s[-1], rng)
     whole = Mesh.join([mesh, upright])
     clutter, rcs = _clutter(config, road, s[0], s[-1], upright_points, rng)
-    return Scenery(mesh=whole, layer=np.concatenate([layer, np.ones(len(upright))]), s=_along(road, whole.corners.mean(1)),
-                   clutter=clutter, clutter_rcs_db=rcs, clutter_s=_along(road, clutter))  # fmt: skip
+    return Scenery(
+        mesh=whole,
+        layer=np.concatenate([layer, np.ones(len(upright))]),
+        s=_along(road, whole.corners.mean(1)),
+        clutter=clutter,
+        clutter_rcs_db=rcs,
+        clutter_s=_along(road, clutter),
+    )
 
 
 def _along(road: Road, points: Array) -> Array:
@@ -117,7 +128,7 @@ def _post_quads(road: Road, s: Array, d: float) -> Array:
 
 def _upright(
     road: Road, actors: list[Actor], starts: Array, first: float, last: float, rng: np.random.Generator
-) -> tuple[Mesh, Array]:  # fmt: skip
+) -> tuple[Mesh, Array]:
     """Trees and gantry frames, and the points [P, 4] (s, d, height, rcs) at which they reflect radar."""
     meshes, points = [], []
     for _ in range(int((last - first) / 6.5)):
@@ -158,16 +169,35 @@ def _tree(height: float, rng: np.random.Generator) -> Mesh:
 
 def _clutter(
     config: WorldConfig, road: Road, first: float, last: float, upright: Array, rng: np.random.Generator
-) -> tuple[Array, Array]:  # fmt: skip
+) -> tuple[Array, Array]:
     """Points that reflect radar without being an actor: rail posts, vegetation, uprights. Positions and RCS in dB."""
     span = last - first
     rows = [upright]
     for d in (-road.rail_m, road.rail_m, -0.7, 0.7):
         n = int(0.28 * span * config.clutter_density)
-        rows.append(np.stack([rng.uniform(first, last, n), d + rng.normal(0, 0.08, n), rng.uniform(0.2, 0.8, n), rng.normal(-3, 4, n)], 1))
+        rows.append(
+            np.stack(
+                [
+                    rng.uniform(first, last, n),
+                    d + rng.normal(0, 0.08, n),
+                    rng.uniform(0.2, 0.8, n),
+                    rng.normal(-3, 4, n),
+                ],
+                1,
+            )
+        )
     n = int(1.1 * span * config.clutter_density)
     side = rng.choice([-1, 1], n)
-    rows.append(np.stack([rng.uniform(first, last, n), side * (road.rail_m + 1 + rng.gamma(1.3, 12.0, n)), rng.gamma(1.5, 0.7, n),
-                          rng.normal(-5, 5, n)], 1))  # fmt: skip
+    rows.append(
+        np.stack(
+            [
+                rng.uniform(first, last, n),
+                side * (road.rail_m + 1 + rng.gamma(1.3, 12.0, n)),
+                rng.gamma(1.5, 1.1, n),
+                rng.normal(-5, 5, n),
+            ],
+            1,
+        )
+    )
     s, d, height, rcs = np.concatenate(rows).T
     return road.place(s, d, height), rcs

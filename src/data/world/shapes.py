@@ -1,326 +1,39 @@
-"""How each kind of object looks. Origin: middle of the box's underside; x forward; everything labelled lies inside the box."""
+"""The mesh of every kind of object."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-
-from src.data.world.mesh import Colour, Mesh, MeshMaker
+from src.data.world import small_shapes, vehicle_shapes
+from src.data.world.mesh import Mesh, MeshMaker
 from src.data.world.placement import Actor
 
-GLASS: Colour = (38, 48, 60)
-RUBBER: Colour = (24, 24, 26)
-STEEL: Colour = (90, 92, 96)
-SKIN: Colour = (214, 170, 140)
-POST: Colour = (150, 152, 154)
-
-
-def _shade(colour: Colour, factor: float) -> Colour:
-    return tuple(int(min(255, c * factor)) for c in colour)  # type: ignore[return-value]
-
-
-def _car(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    belt = 0.58 * h
-    m.frustum((-l, l, -w, w), (-l * 0.98, l * 0.97, -w * 0.97, w * 0.97), 0.17 * h, belt, a.colour)
-    m.frustum((-0.86 * l, 0.45 * l, -0.92 * w, 0.92 * w), (-0.62 * l, 0.12 * l, -0.76 * w, 0.76 * w), belt, h, GLASS, top=a.colour)
-    m.wheels([-0.58 * l, 0.62 * l], w, 0.22 * h)
-    m.lights(l, -l, 0.94 * w, 0.38 * h, 0.13 * h)
-    m.panel(l + 0.01, -0.5 * w, 0.5 * w, 0.2 * h, 0.34 * h, 1, (40, 40, 42))
-    m.panel(-l - 0.01, -0.28 * w, 0.28 * w, 0.3 * h, 0.4 * h, -1, (245, 245, 240))
-
-
-def _van(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    m.box(-l, 0.45 * l, -w, w, 0.12 * h, h, a.colour)
-    m.frustum((0.45 * l, l, -w, w), (0.45 * l, 0.62 * l, -0.94 * w, 0.94 * w), 0.12 * h, 0.97 * h, a.colour)
-    m.quad([(0.845 * l, -0.85 * w, 0.48 * h), (0.845 * l, 0.85 * w, 0.48 * h), (0.66 * l, 0.85 * w, 0.9 * h), (0.66 * l, -0.85 * w, 0.9 * h)],
-           GLASS, two_sided=True)  # fmt: skip
-    for side in (-1, 1):
-        m.side_panel(side * (w + 0.01), 0.36 * l, 0.7 * l, 0.52 * h, 0.85 * h, GLASS)
-    m.panel(-l - 0.01, -0.8 * w, 0.8 * w, 0.55 * h, 0.85 * h, -1, GLASS)
-    m.wheels([-0.6 * l, 0.66 * l], w, 0.15 * h)
-    m.lights(l, -l, 0.94 * w, 0.28 * h, 0.09 * h)
-
-
-def _cab(m: MeshMaker, a: Actor, front: float, depth: float) -> None:
-    """A cab-over driver's cabin that ends at x = front."""
-    w, h = 0.5 * a.size[1], a.size[2]
-    back = front - depth
-    m.frustum((back, front, -w, w), (back, front - 0.25, -w, w), 0.13 * h, h, a.colour)
-    m.quad([(front - 0.09, -0.9 * w, 0.5 * h), (front - 0.09, 0.9 * w, 0.5 * h), (front - 0.16, 0.9 * w, 0.8 * h),
-            (front - 0.16, -0.9 * w, 0.8 * h)], GLASS, two_sided=True)  # fmt: skip
-    m.panel(front + 0.01, -0.7 * w, 0.7 * w, 0.17 * h, 0.42 * h, 1, (36, 36, 40))
-    for side in (-1, 1):
-        m.side_panel(side * (w + 0.01), front - 0.6 * depth, front - 0.25, 0.5 * h, 0.78 * h, GLASS)
-
-
-def _tractor_unit(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    _cab(m, a, l, 2.3)
-    m.box(-l, l - 2.3, -0.4 * w, 0.4 * w, 0.17 * h, 0.28 * h, STEEL)
-    m.wheels([l - 1.4, -l + 1.1], w - 0.02, 0.5)
-    m.lights(l, -l, 0.94 * w, 0.2 * h, 0.2)
-
-
-def _rigid_truck(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    cargo: Colour = ((238, 238, 236), (205, 200, 190), (70, 110, 170))[a.variant % 3]
-    _cab(m, a, l, 2.1)
-    m.box(-l, l - 2.3, -w, w, 0.3 * h, h, cargo, top=_shade(cargo, 0.9))
-    m.box(-l, l - 2.1, -0.4 * w, 0.4 * w, 0.14 * h, 0.3 * h, STEEL)
-    m.wheels([l - 1.3, -l + 1.4, -l + 2.6], w - 0.02, 0.5)
-    m.lights(l, -l, 0.94 * w, 0.18 * h, 0.2)
-    m.panel(-l - 0.01, -0.04, 0.04, 0.32 * h, 0.98 * h, -1, _shade(cargo, 0.55))
-
-
-def _trailer(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    m.box(-l, l, -w, w, 0.28 * h, h, a.colour, top=_shade(a.colour, 0.9))
-    m.box(-l, 0.3 * l, -0.4 * w, 0.4 * w, 0.16 * h, 0.28 * h, STEEL)
-    m.wheels([-0.72 * l, -0.5 * l, -0.28 * l], w - 0.02, 0.5)
-    for side in (-1, 1):
-        m.side_panel(side * (w + 0.01), -l, l, 0.28 * h, 0.32 * h, (190, 30, 30))
-        m.side_panel(side * (w + 0.01), -0.5 * l, 0.55 * l, 0.5 * h, 0.78 * h, _shade(a.colour, 0.62))
-        m.side_panel(side * (w - 0.05), -0.1 * l, 0.5 * l, 0.12 * h, 0.27 * h, (70, 72, 76))
-    m.lights(l - 0.05, -l, 0.94 * w, 0.2 * h, 0.22)
-    m.panel(-l - 0.01, -0.05, 0.05, 0.3 * h, 0.98 * h, -1, _shade(a.colour, 0.45))
-    for y in (-0.95 * w, 0.55 * w):
-        m.panel(-l - 0.012, y, y + 0.4 * w, 0.29 * h, 0.35 * h, -1, (230, 190, 40))
-
-
-def _bus(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    m.box(-l, l, -w, w, 0.1 * h, h, a.colour, top=(225, 225, 225))
-    for side in (-1, 1):
-        for k in range(6):
-            x0 = -0.94 * l + k * 0.315 * l
-            m.side_panel(side * (w + 0.01), x0, x0 + 0.27 * l, 0.47 * h, 0.84 * h, GLASS)
-    m.side_panel(-w - 0.015, 0.7 * l, 0.84 * l, 0.12 * h, 0.82 * h, (60, 72, 86))
-    m.panel(l + 0.01, -0.92 * w, 0.92 * w, 0.36 * h, 0.84 * h, 1, GLASS)
-    m.panel(l + 0.015, -0.7 * w, 0.7 * w, 0.86 * h, 0.96 * h, 1, (255, 170, 40), glow=True)
-    m.panel(-l - 0.01, -0.85 * w, 0.85 * w, 0.55 * h, 0.85 * h, -1, GLASS)
-    m.wheels([0.55 * l, -0.5 * l], w, 0.5)
-    m.lights(l, -l, 0.94 * w, 0.17 * h, 0.2)
-
-
-def _bendy_bus(m: MeshMaker, a: Actor) -> None:
-    _bus(m, a)
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    for side in (-1, 1):
-        m.side_panel(side * (w + 0.03), -0.12 * l, 0.06 * l, 0.1 * h, h, (40, 40, 42))
-    m.wheels([-0.2 * l], w, 0.5)
-
-
-def _excavator(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    for side in (-1, 1):
-        m.box(-0.95 * l, 0.3 * l, side * w * 0.62 - 0.38 * w, side * w * 0.62 + 0.38 * w, 0.0, 0.26 * h, (44, 44, 46))
-    m.box(-l, 0.25 * l, -0.85 * w, 0.85 * w, 0.3 * h, 0.62 * h, a.colour)
-    m.box(-0.25 * l, 0.25 * l, 0.05 * w, 0.85 * w, 0.62 * h, h, GLASS, top=a.colour)
-    m.frustum((0.1 * l, 0.3 * l, -0.35 * w, -0.05 * w), (0.55 * l, 0.7 * l, -0.35 * w, -0.05 * w), 0.5 * h, 0.98 * h, a.colour)
-    m.frustum((0.82 * l, 0.95 * l, -0.33 * w, -0.07 * w), (0.55 * l, 0.7 * l, -0.33 * w, -0.07 * w), 0.25 * h, 0.98 * h, a.colour)
-    m.box(0.7 * l, l, -0.55 * w, 0.15 * w, 0.02 * h, 0.26 * h, (70, 70, 72))
-
-
-def _farm_tractor(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    m.box(-0.1 * l, l, -0.4 * w, 0.4 * w, 0.3 * h, 0.6 * h, a.colour)
-    m.frustum((-0.9 * l, 0.05 * l, -0.6 * w, 0.6 * w), (-0.8 * l, -0.05 * l, -0.55 * w, 0.55 * w), 0.4 * h, h, GLASS, top=a.colour)
-    for side in (-1, 1):
-        m.wheel(-0.5 * l, side * w, 0.3 * h, side, hub=(230, 200, 60))
-        m.wheel(0.65 * l, side * 0.85 * w, 0.2 * h, side, hub=(230, 200, 60))
-        m.box(-0.95 * l, -0.1 * l, side * 0.8 * w - 0.15 * w, side * 0.8 * w + 0.15 * w, 0.5 * h, 0.6 * h, a.colour)
-    m.lights(l, -0.9 * l, 0.4 * w, 0.45 * h, 0.18)
-
-
-def _rider(m: MeshMaker, x: float, seat: float, top: float, width: float, coat: Colour, helmet: Colour) -> None:
-    height = top - seat
-    m.frustum((x - 0.3, x + 0.05, -width, width), (x - 0.12, x + 0.18, -width, width), seat, seat + 0.66 * height, coat)
-    m.box(x - 0.02, x + 0.22, -0.14, 0.14, seat + 0.66 * height, top, helmet)
-    for side in (-1, 1):
-        m.box(x - 0.1, x + 0.25, side * width - 0.07, side * width + 0.07, seat - 0.5, seat + 0.02, (40, 44, 60))
-
-
-def _motorcycle(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    for x in (-0.66 * l, 0.66 * l):
-        m.wheel(x, 0.05, 0.33 * l, 1)
-        m.wheel(x, -0.05, 0.33 * l, -1)
-    top = 0.55 * h if a.has_rider else 0.78 * h
-    m.frustum((-0.7 * l, 0.6 * l, -0.16, 0.16), (-0.85 * l, 0.45 * l, -0.2, 0.2), 0.24 * h, top, a.colour)
-    m.box(0.35 * l, 0.45 * l, -w, w, 0.62 * h, 0.68 * h, STEEL)
-    m.lights(0.6 * l, -0.85 * l, 0.14, 0.42 * h, 0.16)
-    if a.has_rider:
-        _rider(m, -0.12 * l, 0.5 * h, h, 0.25, (44, 46, 54), ((240, 240, 240), (200, 30, 30), (250, 200, 20))[a.variant % 3])
-
-
-def _bicycle(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    for x in (-0.6 * l, 0.6 * l):
-        m.wheel(x, 0.0, 0.38 * l, 1, hub=(150, 170, 150))
-    m.box(-0.55 * l, 0.55 * l, -0.03, 0.03, 0.42, 0.5, a.colour)
-    m.frustum((-0.1, 0.02, -0.03, 0.03), (-0.3, -0.18, -0.03, 0.03), 0.3, 0.95, a.colour)
-    m.box(0.5 * l, 0.58 * l, -w, w, 0.98, 1.04, STEEL)
-    if a.has_rider:
-        coats: tuple[Colour, ...] = ((40, 110, 200), (220, 210, 40), (200, 40, 70), (60, 150, 80))
-        _rider(m, -0.1, 0.92, h, 0.2, coats[a.variant % 4], (235, 235, 235))
-
-
-def _person(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    trousers: Colour = ((50, 54, 70), (80, 70, 60), (36, 36, 40))[a.variant % 3]
-    for side, lean in ((-1, 0.35), (1, -0.35)):
-        m.frustum((lean * l - 0.09, lean * l + 0.09, side * 0.1 - 0.08, side * 0.1 + 0.08),
-                  (-0.09, 0.09, side * 0.1 - 0.08, side * 0.1 + 0.08), 0.0, 0.48 * h, trousers)  # fmt: skip
-        m.frustum((-lean * l - 0.06, -lean * l + 0.06, side * 0.82 * w - 0.06, side * 0.82 * w + 0.06),
-                  (-0.06, 0.06, side * 0.7 * w - 0.06, side * 0.7 * w + 0.06), 0.45 * h, 0.8 * h, _shade(a.colour, 0.85))  # fmt: skip
-    m.frustum((-0.13, 0.13, -0.6 * w, 0.6 * w), (-0.13, 0.13, -0.68 * w, 0.68 * w), 0.46 * h, 0.83 * h, a.colour)
-    m.box(-0.1, 0.1, -0.1, 0.1, 0.85 * h, h, SKIN, top=(70, 50, 36))
-
-
-def _worker(m: MeshMaker, a: Actor) -> None:
-    _person(m, a)
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    m.box(-0.14, 0.14, -0.66 * w, 0.66 * w, 0.6 * h, 0.66 * h, (240, 240, 220))
-    helmet: Colour = (250, 220, 30) if a.name == "worker" else (30, 40, 90)
-    m.box(-0.13, 0.13, -0.13, 0.13, 0.93 * h, h + 0.01, helmet)
-
-
-def _cone(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    m.box(-l, l, -w, w, 0.0, 0.07 * h, (50, 50, 50))
-    bands = ((0.07, 0.4, a.colour), (0.4, 0.65, (245, 245, 245)), (0.65, 1.0, a.colour))
-    for low, high, colour in bands:
-        r0, r1 = 0.72 * l * (1.05 - low), 0.72 * l * (1.05 - high)
-        m.frustum((-r0, r0, -r0, r0), (-r1, r1, -r1, r1), low * h, high * h, colour)
-
-
-def _barrier(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    for y in (-0.75 * w, 0.75 * w):
-        m.box(-l, l, y - 0.06, y + 0.06, 0.0, 0.5 * h, STEEL)
-    for z0, z1, shift in ((0.35, 0.6, 0), (0.7, 1.0, 1)):
-        m.box(-0.06, 0.06, -w, w, z0 * h, z1 * h, (240, 240, 240))
-        for k in range(3):
-            y0 = -w + (2 * k + shift) * w / 3
-            for facing in (1, -1):
-                m.panel(facing * 0.075, y0, y0 + w / 3, z0 * h, z1 * h, facing, a.colour)
-
-
-def _animal(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    m.box(-l, 0.55 * l, -0.85 * w, 0.85 * w, 0.42 * h, 0.8 * h, a.colour)
-    for x in (-0.82 * l, 0.42 * l):
-        for side in (-1, 1):
-            m.box(x - 0.07, x + 0.07, side * 0.6 * w - 0.07, side * 0.6 * w + 0.07, 0.0, 0.42 * h, _shade(a.colour, 0.75))
-    m.frustum((0.3 * l, 0.55 * l, -0.3 * w, 0.3 * w), (0.55 * l, 0.8 * l, -0.3 * w, 0.3 * w), 0.65 * h, 0.9 * h, a.colour)
-    m.box(0.55 * l, l, -0.35 * w, 0.35 * w, 0.78 * h, h, _shade(a.colour, 0.9), front=_shade(a.colour, 0.6))
-    if a.name == "cow":
-        for side in (-1, 1):
-            m.side_panel(side * (0.85 * w + 0.01), -0.6 * l, -0.05 * l, 0.5 * h, 0.78 * h, (40, 36, 34) if a.colour[0] > 150 else (230, 225, 220))
-
-
-def _pole(m: MeshMaker, y: float, floor: float) -> None:
-    m.box(-0.05, 0.05, y - 0.05, y + 0.05, -floor, 0.05, POST)
-
-
-def _disc(m: MeshMaker, x: float, z: float, radius: float, colour: Colour, corners: int = 8) -> None:
-    """A flat polygon that faces forwards."""
-    angles = np.pi / corners + np.arange(corners) * 2 * np.pi / corners
-    ring = [(x, radius * np.cos(a), z + radius * np.sin(a)) for a in angles]
-    for k in range(1, corners - 2, 2):
-        m.quad([ring[0], ring[k], ring[k + 1], ring[k + 2]], colour)
-
-
-def _sign(m: MeshMaker, a: Actor) -> None:
-    _, w, h = a.size * [0.5, 0.5, 1.0]
-    radius = min(w, 0.5 * h)
-    middle = 0.5 * h
-    _pole(m, 0.0, a.kind.floor_m)
-    face = a.variant % 4
-    if face == 0:  # speed limit
-        layers = ((1.0, (205, 20, 25)), (0.72, (248, 248, 248)))
-    elif face == 1:  # no overtaking ends, drawn as a grey rim
-        layers = ((1.0, (60, 60, 60)), (0.85, (246, 246, 246)))
-    elif face == 2:  # mandatory
-        layers = ((1.0, (25, 80, 180)), (0.35, (246, 246, 246)))
-    else:
-        layers = ()
-        m.quad([(0.02, -w, 0.0), (0.02, w, 0.0), (0.02, 0.02, h), (0.02, -0.02, h)], (205, 20, 25))
-        m.quad([(0.03, -0.62 * w, 0.14 * h), (0.03, 0.62 * w, 0.14 * h), (0.03, 0.02, 0.74 * h), (0.03, -0.02, 0.74 * h)], (248, 248, 248))
-    for k, (share, colour) in enumerate(layers):
-        _disc(m, 0.02 + 0.01 * k, middle, share * radius, colour)
-    if face == 0:
-        m.panel(0.045, -0.35 * w, -0.05 * w, 0.35 * h, 0.65 * h, 1, (20, 20, 20))
-        m.panel(0.045, 0.08 * w, 0.38 * w, 0.35 * h, 0.65 * h, 1, (20, 20, 20))
-    m.box(-0.03, 0.0, -0.9 * radius, 0.9 * radius, middle - 0.8 * radius, middle + 0.8 * radius, POST)
-
-
-def _board(m: MeshMaker, a: Actor, *, poles: bool) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    ink: Colour = (245, 245, 245) if a.colour[2] > 100 else (20, 20, 20)
-    m.box(-0.3 * l, 0.3 * l, -w, w, 0.0, h, POST, front=ink)
-    m.panel(0.3 * l + 0.02, -0.96 * w, 0.96 * w, 0.04 * h, 0.96 * h, 1, a.colour)
-    for k, (y0, y1) in enumerate(((-0.75, 0.3), (-0.75, 0.55), (-0.75, 0.1))):
-        z = (0.7 - 0.24 * k) * h
-        m.panel(0.3 * l + 0.04, y0 * w, y1 * w, z, z + 0.13 * h, 1, ink)
-    m.panel(0.3 * l + 0.04, 0.68 * w, 0.8 * w, 0.15 * h, 0.8 * h, 1, ink)
-    if poles:
-        for y in (-0.6 * w, 0.6 * w):
-            _pole(m, y, a.kind.floor_m)
-
-
-def _guide_sign(m: MeshMaker, a: Actor) -> None:
-    _board(m, a, poles=True)
-
-
-def _gantry_sign(m: MeshMaker, a: Actor) -> None:
-    _board(m, a, poles=False)
-
-
-def _temporary_sign(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    m.box(-0.03, 0.0, -w, w, 0.0, h, POST)
-    m.panel(0.01, -w, w, 0.0, h, 1, a.colour)
-    m.quad([(0.03, -0.8 * w, 0.12 * h), (0.03, 0.8 * w, 0.12 * h), (0.03, 0.02, 0.88 * h), (0.03, -0.02, 0.88 * h)], (205, 20, 25))
-    m.quad([(0.04, -0.45 * w, 0.22 * h), (0.04, 0.45 * w, 0.22 * h), (0.04, 0.02, 0.65 * h), (0.04, -0.02, 0.65 * h)], (248, 248, 248))
-    for y in (-0.7 * w, 0.7 * w):
-        m.box(-0.2, 0.2, y - 0.05, y + 0.05, -a.kind.floor_m, 0.05, STEEL)
-
-
-def _post(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    m.box(-0.5 * l, 0.5 * l, -0.5 * w, 0.5 * w, 0.0, 0.72 * h, a.colour)
-    m.box(-0.5 * l, 0.5 * l, -0.5 * w, 0.5 * w, 0.72 * h, 0.9 * h, (30, 30, 30))
-    m.box(-0.5 * l, 0.5 * l, -0.5 * w, 0.5 * w, 0.9 * h, h, a.colour)
-
-
-def _crate(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    m.box(-l, l, -w, w, 0.0, h, a.colour, top=_shade(a.colour, 1.1))
-
-
-def _bush(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    m.frustum((-0.7 * l, 0.7 * l, -0.7 * w, 0.7 * w), (-l, l, -w, w), 0.0, 0.45 * h, a.colour)
-    m.frustum((-l, l, -w, w), (-0.4 * l, 0.4 * l, -0.4 * w, 0.4 * w), 0.45 * h, h, _shade(a.colour, 1.12))
-
-
-def _lamp_post(m: MeshMaker, a: Actor) -> None:
-    h = a.size[2]
-    m.box(-0.09, 0.09, -0.09, 0.09, 0.0, h, a.colour)
-    m.box(-0.08, 0.08, -0.9, 0.9, h - 0.15, h, a.colour)
-
-
 _SHAPES: dict[str, Callable[[MeshMaker, Actor], None]] = {
-    "car": _car, "van": _van, "tractor_unit": _tractor_unit, "rigid_truck": _rigid_truck, "trailer": _trailer, "bus": _bus,
-    "bendy_bus": _bendy_bus, "excavator": _excavator, "farm_tractor": _farm_tractor, "motorcycle": _motorcycle,
-    "bicycle": _bicycle, "person": _person, "worker": _worker, "cone": _cone, "barrier": _barrier, "animal": _animal,
-    "sign": _sign, "guide_sign": _guide_sign, "gantry_sign": _gantry_sign, "temporary_sign": _temporary_sign, "post": _post,
-    "crate": _crate, "bush": _bush, "lamp_post": _lamp_post,
-}  # fmt: skip
+    "car": vehicle_shapes.add_car,
+    "van": vehicle_shapes.add_van,
+    "tractor_unit": vehicle_shapes.add_tractor_unit,
+    "rigid_truck": vehicle_shapes.add_rigid_truck,
+    "trailer": vehicle_shapes.add_trailer,
+    "bus": vehicle_shapes.add_bus,
+    "bendy_bus": vehicle_shapes.add_bendy_bus,
+    "excavator": vehicle_shapes.add_excavator,
+    "farm_tractor": vehicle_shapes.add_farm_tractor,
+    "motorcycle": small_shapes.add_motorcycle,
+    "bicycle": small_shapes.add_bicycle,
+    "person": small_shapes.add_person,
+    "worker": small_shapes.add_worker,
+    "cone": small_shapes.add_cone,
+    "barrier": small_shapes.add_barrier,
+    "animal": small_shapes.add_animal,
+    "sign": small_shapes.add_sign,
+    "guide_sign": small_shapes.add_guide_sign,
+    "gantry_sign": small_shapes.add_gantry_sign,
+    "temporary_sign": small_shapes.add_temporary_sign,
+    "post": small_shapes.add_post,
+    "crate": small_shapes.add_crate,
+    "bush": small_shapes.add_bush,
+    "lamp_post": small_shapes.add_lamp_post,
+}
 
 
 def build_mesh(actor: Actor) -> Mesh:

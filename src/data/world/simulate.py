@@ -19,6 +19,8 @@ Array = np.ndarray
 EGO_CENTRE_M = 2.1
 """From the ego origin (under the rear axle) to the middle of the truck."""
 EGO_LENGTH_M = 7.5
+MIN_REACH_M = 80.0
+"""Roadside objects are spread at least this far ahead, however short the scene is."""
 HITCH_OVERLAP_M = {"tractor_unit": 1.9, "rigid_truck": -1.2}
 """How far a trailer reaches over its truck; negative for a drawbar."""
 
@@ -60,30 +62,54 @@ def make_scene(config: WorldConfig, index: int) -> Scene:
     s, s_rate, d, d_rate = simulate_traffic(fleet, road, steps, rng)
     ego_s = s[:1] - EGO_CENTRE_M
     shift = float(np.interp(LEAD_IN_S, np.arange(steps) * STEP_S, ego_s[0]))
-    ego_tracks = Tracks(road=road, s=ego_s - shift, s_rate=s_rate[:1], d=d[:1], d_rate=d_rate[:1], turn=np.zeros((1, steps)))
+    ego_tracks = Tracks(
+        road=road, s=ego_s - shift, s_rate=s_rate[:1], d=d[:1], d_rate=d_rate[:1], turn=np.zeros((1, steps))
+    )
     actors, rows = _split_trains(fleet, s - shift, s_rate, d, d_rate, rng)
-    reach = float(ego_tracks.s[0, -1])
+    reach = max(float(ego_tracks.s[0, -1]), MIN_REACH_M)
     for actor, start in bystanders(config, road, reach, rng):
         time = np.arange(steps) * STEP_S - LEAD_IN_S
         still = np.ones(steps)
-        rows.append((start.s + start.s_rate * time, start.s_rate * still, start.d + start.d_rate * time, start.d_rate * still,
-                     start.turn * still))  # fmt: skip
+        rows.append(
+            (
+                start.s + start.s_rate * time,
+                start.s_rate * still,
+                start.d + start.d_rate * time,
+                start.d_rate * still,
+                start.turn * still,
+            )
+        )
         actors.append(actor)
     columns = [np.stack(column) for column in zip(*rows, strict=True)]
     tracks = Tracks(road=road, s=columns[0], s_rate=columns[1], d=columns[2], d_rate=columns[3], turn=columns[4])
     offset = np.array([7.0e5, 5.3e6, 0.0]) + np.array([rng.uniform(-2e4, 2e4), rng.uniform(-2e4, 2e4), 0.0])
-    return Scene(index=index, split=split, conditions=conditions, road=road, actors=actors, tracks=tracks,
-                 ego=EgoMotion.draw(ego_tracks, rng), utm_offset=np.round(offset, 3))  # fmt: skip
+    return Scene(
+        index=index,
+        split=split,
+        conditions=conditions,
+        road=road,
+        actors=actors,
+        tracks=tracks,
+        ego=EgoMotion.draw(ego_tracks, rng),
+        utm_offset=np.round(offset, 3),
+    )
 
 
 def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.Generator) -> list[Vehicle]:
     """The ego truck first, then a bus, motorcycles and a slow machine near it, then ordinary traffic in every lane."""
     slow = road.lanes - 1
     fleet = [Vehicle("ego", 1, slow, EGO_CENTRE_M - LEAD_IN_S * ego_mps, ego_mps, EGO_LENGTH_M, may_change=False)]
-    company = [("bus", slow if road.lanes == 2 else slow - int(rng.integers(0, 2)), rng.uniform(1, 4), rng.choice([-55, -38, 40, 62, 85])),
-               ("motorcycle", int(rng.integers(0, slow)), rng.uniform(1, 8), rng.uniform(-70, 20)),
-               ("motorcycle", int(rng.integers(0, slow + 1)), rng.uniform(-1, 4), rng.choice([-30, 28, 50])),
-               ("farm_tractor" if rng.random() < 0.4 else "excavator", slow, rng.uniform(-3.5, -1), rng.uniform(70, 120))]  # fmt: skip
+    company = [
+        (
+            "bus",
+            slow if road.lanes == 2 else slow - int(rng.integers(0, 2)),
+            rng.uniform(1, 4),
+            rng.choice([-55, -38, 40, 62, 85]),
+        ),
+        ("motorcycle", int(rng.integers(0, slow)), rng.uniform(1, 8), rng.uniform(-70, 20)),
+        ("motorcycle", int(rng.integers(0, slow + 1)), rng.uniform(-1, 4), rng.choice([-30, 28, 50])),
+        ("farm_tractor" if rng.random() < 0.5 else "excavator", slow, rng.uniform(-3.5, -1), rng.uniform(70, 120)),
+    ]
     for kind, lane, faster, place in company:
         chosen = "bendy_bus" if kind == "bus" and rng.random() < 0.3 else kind
         if rng.random() < 0.75 * config.rare_objects:
@@ -100,9 +126,16 @@ def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.
 
 
 def _add(
-    fleet: list[Vehicle], kind: str, direction: int, lane: int, place: float, wanted: float, *, has_trailer: bool = False,
+    fleet: list[Vehicle],
+    kind: str,
+    direction: int,
+    lane: int,
+    place: float,
+    wanted: float,
+    *,
+    has_trailer: bool = False,
     may_change: bool = True,
-) -> None:  # fmt: skip
+) -> None:
     """Put a vehicle into a lane unless something is too close already."""
     with_trailer = has_trailer and kind in HITCH_OVERLAP_M
     length = KINDS[kind].size_m[0]
@@ -121,16 +154,20 @@ def _draw_vehicle(road: Road, lane: int, rng: np.random.Generator) -> tuple[str,
     """Kind and wanted speed (m/s) of ordinary traffic in a lane; up to 50 m/s (180 km/h) on the left."""
     from_right = road.lanes - 1 - lane
     if from_right == 0:
-        kind = rng.choice(["car", "tractor_unit", "rigid_truck", "van", "bus", "motorcycle"], p=[0.5, 0.24, 0.12, 0.1, 0.02, 0.02])
+        kind = rng.choice(
+            ["car", "tractor_unit", "rigid_truck", "van", "bus", "motorcycle"], p=[0.5, 0.24, 0.12, 0.1, 0.02, 0.02]
+        )
     elif from_right == 1:
-        kind = rng.choice(["car", "tractor_unit", "rigid_truck", "van", "bus", "motorcycle"], p=[0.83, 0.03, 0.03, 0.08, 0.015, 0.015])
+        kind = rng.choice(
+            ["car", "tractor_unit", "rigid_truck", "van", "bus", "motorcycle"], p=[0.83, 0.03, 0.03, 0.08, 0.015, 0.015]
+        )
     else:
         kind = rng.choice(["car", "van", "motorcycle"], p=[0.94, 0.04, 0.02])
     if kind in ("tractor_unit", "rigid_truck"):
         return str(kind), float(np.clip(rng.normal(23.5, 1.0), 20, 27))
     if kind == "bus":
         return "bendy_bus" if rng.random() < 0.25 else "bus", float(np.clip(rng.normal(26, 1.5), 22, 29))
-    mean = {0: 34.0, 1: 42.0}.get(from_right, 44.5)
+    mean = {0: 35.0, 1: 44.0}.get(from_right, 46.5)
     return str(kind), float(np.clip(rng.normal(mean, 3.2), 25, 50))
 
 
@@ -150,12 +187,26 @@ def _split_trains(
             across = np.concatenate([np.full(late, d[i, 0]), d[i]])[: d.shape[1]]
             along_rate = s_rate[i] * vehicle.direction
             turn = np.arctan2(sideways * vehicle.direction, np.maximum(along_rate, 2.0))
-            rows.append((s[i] + vehicle.direction * offset, s_rate[i], across, sideways,
-                         turn + (np.pi if vehicle.direction < 0 else 0.0)))  # fmt: skip
+            rows.append(
+                (
+                    s[i] + vehicle.direction * offset,
+                    s_rate[i],
+                    across,
+                    sideways,
+                    turn + (np.pi if vehicle.direction < 0 else 0.0),
+                )
+            )
             actors.append(_actor(KINDS[name], name, size, rng))
     return actors, rows
 
 
 def _actor(kind: Kind, name: str, size: Array, rng: np.random.Generator) -> Actor:
-    return Actor(kind=kind, name=name, size=size, colour=kind.colours[int(rng.integers(len(kind.colours)))], has_rider=True,
-                 parked=False, variant=int(rng.integers(1 << 16)))  # fmt: skip
+    return Actor(
+        kind=kind,
+        name=name,
+        size=size,
+        colour=kind.colours[int(rng.integers(len(kind.colours)))],
+        has_rider=True,
+        parked=False,
+        variant=int(rng.integers(1 << 16)),
+    )

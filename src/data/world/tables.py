@@ -16,9 +16,21 @@ Row = dict[str, object]
 Tables = dict[str, list[Row]]
 
 TABLE_NAMES = (
-    "attribute", "calibrated_sensor", "category", "ego_motion_cabin", "ego_motion_chassis", "ego_pose", "instance", "sample",
-    "sample_annotation", "sample_data", "scene", "sensor", "visibility", "weather_annotation",
-)  # fmt: skip
+    "attribute",
+    "calibrated_sensor",
+    "category",
+    "ego_motion_cabin",
+    "ego_motion_chassis",
+    "ego_pose",
+    "instance",
+    "sample",
+    "sample_annotation",
+    "sample_data",
+    "scene",
+    "sensor",
+    "visibility",
+    "weather_annotation",
+)
 
 
 def token(*parts: object) -> str:
@@ -29,13 +41,26 @@ def token(*parts: object) -> str:
 def quaternions(rotations: Array) -> Array:
     """(w, x, y, z) with w >= 0 of rotation matrices [T, 3, 3] whose angle is below 180 degrees or exactly there."""
     m = np.asarray(rotations)
-    squares = np.stack([1 + m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2], 1 + m[:, 0, 0] - m[:, 1, 1] - m[:, 2, 2],
-                        1 - m[:, 0, 0] + m[:, 1, 1] - m[:, 2, 2], 1 - m[:, 0, 0] - m[:, 1, 1] + m[:, 2, 2]], 1)  # fmt: skip
+    squares = np.stack(
+        [
+            1 + m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2],
+            1 + m[:, 0, 0] - m[:, 1, 1] - m[:, 2, 2],
+            1 - m[:, 0, 0] + m[:, 1, 1] - m[:, 2, 2],
+            1 - m[:, 0, 0] - m[:, 1, 1] + m[:, 2, 2],
+        ],
+        1,
+    )
     # Row k of this symmetric matrix is 4 q_k q; the row with the largest diagonal is the best conditioned.
     products = np.zeros((len(m), 4, 4))
     products[:, range(4), range(4)] = squares
-    for a, b, value in ((0, 1, m[:, 2, 1] - m[:, 1, 2]), (0, 2, m[:, 0, 2] - m[:, 2, 0]), (0, 3, m[:, 1, 0] - m[:, 0, 1]),
-                        (1, 2, m[:, 1, 0] + m[:, 0, 1]), (1, 3, m[:, 0, 2] + m[:, 2, 0]), (2, 3, m[:, 2, 1] + m[:, 1, 2])):  # fmt: skip
+    for a, b, value in (
+        (0, 1, m[:, 2, 1] - m[:, 1, 2]),
+        (0, 2, m[:, 0, 2] - m[:, 2, 0]),
+        (0, 3, m[:, 1, 0] - m[:, 0, 1]),
+        (1, 2, m[:, 1, 0] + m[:, 0, 1]),
+        (1, 3, m[:, 0, 2] + m[:, 2, 0]),
+        (2, 3, m[:, 2, 1] + m[:, 1, 2]),
+    ):
         products[:, a, b] = products[:, b, a] = value
     best = products[np.arange(len(m)), squares.argmax(1)]
     best = best / np.linalg.norm(best, axis=1, keepdims=True)
@@ -51,20 +76,37 @@ def shared_tables(seed: int, rig: dict[str, Mount]) -> Tables:
     """Categories, attributes, visibilities, sensors and calibration: the same vehicle in every scene."""
     shares = ("0-40", "40-60", "60-80", "80-100")
     return {
-        "category": [{"token": token(seed, "category", name), "name": name, "description": name.replace(".", " "), "index": i}
-                     for i, name in enumerate(ALL_CATEGORIES)],
-        "attribute": [{"token": token(seed, "attribute", name), "name": name, "description": name.replace(".", " ")}
-                      for name in ATTRIBUTES],
-        "visibility": [{"token": token(seed, "visibility", i + 1), "level": i + 1, "description": f"{share} % visible in the images"}
-                       for i, share in enumerate(shares)],
-        "sensor": [{"token": token(seed, "sensor", name), "channel": name, "modality": mount.modality} for name, mount in rig.items()],
-        "calibrated_sensor": [
-            {"token": token(seed, "calibration", name), "sensor_token": token(seed, "sensor", name),
-             "translation": rounded(mount.translation, 6), "rotation": rounded(quaternions(mount.rotation[None])[0], 12),
-             "camera_intrinsic": [] if mount.intrinsic is None else [rounded(row, 9) for row in mount.intrinsic]}
+        "category": [
+            {"token": token(seed, "category", name), "name": name, "description": name.replace(".", " "), "index": i}
+            for i, name in enumerate(ALL_CATEGORIES)
+        ],
+        "attribute": [
+            {"token": token(seed, "attribute", name), "name": name, "description": name.replace(".", " ")}
+            for name in ATTRIBUTES
+        ],
+        "visibility": [
+            {
+                "token": token(seed, "visibility", i + 1),
+                "level": i + 1,
+                "description": f"{share} % visible in the images",
+            }
+            for i, share in enumerate(shares)
+        ],
+        "sensor": [
+            {"token": token(seed, "sensor", name), "channel": name, "modality": mount.modality}
             for name, mount in rig.items()
         ],
-    }  # fmt: skip
+        "calibrated_sensor": [
+            {
+                "token": token(seed, "calibration", name),
+                "sensor_token": token(seed, "sensor", name),
+                "translation": rounded(mount.translation, 6),
+                "rotation": rounded(quaternions(mount.rotation[None])[0], 12),
+                "camera_intrinsic": [] if mount.intrinsic is None else [rounded(row, 9) for row in mount.intrinsic],
+            }
+            for name, mount in rig.items()
+        ],
+    }
 
 
 def link_chain(rows: list[Row]) -> None:

@@ -28,7 +28,9 @@ class Vehicle:
     may_change: bool = True
 
 
-def simulate_traffic(fleet: list[Vehicle], road: Road, steps: int, rng: np.random.Generator) -> tuple[Array, Array, Array, Array]:
+def simulate_traffic(
+    fleet: list[Vehicle], road: Road, steps: int, rng: np.random.Generator
+) -> tuple[Array, Array, Array, Array]:
     """Positions along s and d with their rates, each [N, steps] on a grid of STEP_S.
 
     Following is the intelligent driver model (Treiber et al. 2000); s is integrated from the stored speeds by the
@@ -58,7 +60,9 @@ def simulate_traffic(fleet: list[Vehicle], road: Road, steps: int, rng: np.rando
         accel = 1.2 * (1 - (speed / np.maximum(goal, 1.0)) ** 4 - (target / np.maximum(gap, 0.5)) ** 2)
         accel = np.clip(accel, -6.0, 1.5)
         if step % 10 == 0:
-            _change_lanes(fleet, now, along, speed, length, gap, closing, lane, move_from, move_to, move_start, road, rng)
+            _change_lanes(
+                fleet, now, along, speed, length, gap, closing, lane, move_from, move_to, move_start, road, rng
+            )
         new_speed = np.maximum(speed + accel * STEP_S, 0.0)
         along = along + 0.5 * (speed + new_speed) * STEP_S
         speed = new_speed
@@ -80,9 +84,20 @@ def _leaders(along: Array, speed: Array, length: Array, lane_key: Array) -> tupl
 
 
 def _change_lanes(
-    fleet: list[Vehicle], now: float, along: Array, speed: Array, length: Array, gap: Array, closing: Array, lane: Array,
-    move_from: Array, move_to: Array, move_start: Array, road: Road, rng: np.random.Generator,
-) -> None:  # fmt: skip
+    fleet: list[Vehicle],
+    now: float,
+    along: Array,
+    speed: Array,
+    length: Array,
+    gap: Array,
+    closing: Array,
+    lane: Array,
+    move_from: Array,
+    move_to: Array,
+    move_start: Array,
+    road: Road,
+    rng: np.random.Generator,
+) -> None:
     """Let vehicles that are held up pull out to the left, and some free ones return, where the other lane has room."""
     for i in range(1, len(fleet)):
         if not fleet[i].may_change or now - move_start[i] < LANE_CHANGE_S + 1.0:

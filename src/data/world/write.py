@@ -29,7 +29,8 @@ CONFIG_FILE = "world.json"
 def ensure_world(config: WorldConfig, root: Path, progress: bool = True) -> Path:
     """The world of this config at `root`, written now unless it is there already.
 
-    Raises ConfigError if the world at `root` has another config, DataError if `root` holds something else or half a world.
+    Raises ConfigError if the world at `root` has another config, DataError if `root` holds something else or half of
+    a world.
     """
     root = Path(root)
     if not root.exists() or (root.is_dir() and not any(root.iterdir())):
@@ -46,12 +47,14 @@ def ensure_world(config: WorldConfig, root: Path, progress: bool = True) -> Path
 def write_world(config: WorldConfig, root: Path, progress: bool = True) -> Path:
     """Write a world to `root`, which must not exist or be empty, and return `root`.
 
-    Everything goes into a hidden folder beside `root` that is renamed at the end, so an interrupted run leaves no `root`.
-    The bytes depend on the config alone, not on `num_workers`. Raises DataError if `root` is taken.
+    Everything goes into a hidden folder beside `root` that is renamed at the end, so an interrupted run leaves no
+    `root`. The bytes depend on the config alone, not on `num_workers`. Raises DataError if `root` is taken.
     """
     root = Path(root)
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
-        raise DataError(f"{root}: a world needs a new or empty folder, but this one is in use; choose another or remove it")
+        raise DataError(
+            f"{root}: a world needs a new or empty folder, but this one is in use; choose another or remove it"
+        )
     root.parent.mkdir(parents=True, exist_ok=True)
     partial_root = root.parent / f".{root.name}.partial-{uuid.uuid4().hex[:8]}"
     try:
@@ -72,9 +75,13 @@ def _read_stored(root: Path) -> dict[str, object]:
     try:
         stored = json.loads((root / CONFIG_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise DataError(f"{root}: not a complete synthetic world ({CONFIG_FILE}: {error}); remove the folder or choose another") from error
+        raise DataError(
+            f"{root}: not a complete synthetic world ({CONFIG_FILE}: {error}); remove the folder or choose another"
+        ) from error
     if not isinstance(stored, dict):
-        raise DataError(f"{root / CONFIG_FILE}: expected an object, but found {type(stored).__name__}; remove the folder")
+        raise DataError(
+            f"{root / CONFIG_FILE}: expected an object, but found {type(stored).__name__}; remove the folder"
+        )
     missing = [name for name in TABLE_NAMES if not (root / VERSION / f"{name}.json").is_file()]
     if missing:
         raise DataError(f"{root}: a synthetic world without its tables {missing}; remove the folder to make it again")

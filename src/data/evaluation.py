@@ -1,0 +1,53 @@
+"""The annotations of a split as the metric wants them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from src.data.schema import LABEL_RACK, DatasetIndex
+from src.data.splits import split_samples
+from src.errors import DataError
+from src.structures.detections import DetectionTable, EvaluationSet
+
+
+def evaluation_set(index: DatasetIndex, split: str) -> EvaluationSet:
+    """Samples in table order with ego positions, scene tags, ground truth before any filter, and bicycle racks.
+
+    Raises DataError for a release without annotations.
+    """
+    if not index.annotated:
+        raise DataError(f"{index.root / index.version}: has no annotations, so nothing can be scored; choose another split")
+    samples = split_samples(index, split)
+    return EvaluationSet(
+        tokens=[str(token) for token in index.sample_tokens[samples]],
+        ego_centers=index.pose_translations[index.frame_poses[samples]],
+        scene_tags=[
+            tuple(str(index.scene_descriptions[scene]).split(";")) for scene in index.sample_scenes[samples]
+        ],
+        ground_truth=_table(index, samples, index.box_labels >= 0),
+        racks=_table(index, samples, index.box_labels == LABEL_RACK),
+    )
+
+
+def _table(
+    index: DatasetIndex,
+    samples: np.ndarray,  # [n]
+    wanted: np.ndarray,  # [A] bool
+) -> DetectionTable:
+    rows = [np.arange(index.box_starts[sample], index.box_starts[sample + 1]) for sample in samples]
+    counts = [len(of_sample) for of_sample in rows]
+    flat = np.concatenate(rows) if rows else np.zeros(0, np.int64)
+    owner = np.repeat(np.arange(len(samples)), counts)
+    keep = wanted[flat]
+    flat, owner = flat[keep], owner[keep]
+    return DetectionTable(
+        samples=owner.astype(np.int64),
+        labels=np.maximum(index.box_labels[flat], 0).astype(np.int64),
+        centers=index.box_centers[flat],
+        sizes=index.box_sizes[flat],
+        rotations=index.box_rotations[flat],
+        velocities=index.box_velocities[flat][:, :2],
+        attributes=index.box_attributes[flat].astype(np.int64),
+        scores=np.zeros(len(flat)),
+        num_points=index.box_points[flat].astype(np.int64),
+    )

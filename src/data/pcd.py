@@ -1,0 +1,110 @@
+"""Point files (PCD 0.7): the header is checked before a byte of data is believed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from src.errors import DataError
+
+Array = np.ndarray
+
+RADAR_FIELDS = ("x", "y", "z", "vrel_x", "vrel_y", "vrel_z", "rcs")
+MAX_POINTS = 1_000_000
+"""More than any sensor gives in one sweep; a larger number is a damaged header."""
+MAX_HEADER_BYTES = 4096
+_KINDS = {("F", 4): "<f4", ("F", 8): "<f8", ("I", 2): "<i2", ("I", 4): "<i4", ("U", 1): "u1", ("U", 2): "<u2", ("U", 4): "<u4"}  # fmt: skip
+
+
+def read_radar_points(
+    path: Path,
+) -> Array:  # [n, 7] float32 in the order of RADAR_FIELDS, sensor frame
+    """Positions (m), relative radial velocity vectors (m/s) and RCS of one radar sweep; a file may hold no point.
+
+    Fields are taken by name, in any order, from `binary` or `ascii` data. Raises DataError naming the file, what was
+    expected and what was found.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    header, start = _header(path, content)
+    names, kinds = _columns(path, header)
+    count = _count(path, header)
+    missing = [name for name in RADAR_FIELDS if name not in names]
+    if missing:
+        raise DataError(f"{path}: a radar file has the fields {list(RADAR_FIELDS)}, but here {missing} are missing: {names}")
+    encoding = header.get("DATA", [""])[0]
+    if encoding == "binary":
+        dtype = np.dtype(list(zip(names, kinds, strict=True)))
+        expected = start + count * dtype.itemsize
+        if len(content) != expected:
+            raise DataError(f"{path}: {count} points end at byte {expected}, but the file has {len(content)} bytes")
+        if names == list(RADAR_FIELDS) and set(kinds) == {"<f4"}:
+            points = np.frombuffer(content, "<f4", offset=start).reshape(count, len(RADAR_FIELDS))
+        else:
+            table = np.frombuffer(content, dtype, count, start)
+            points = np.stack([table[name] for name in RADAR_FIELDS], axis=1).astype(np.float32)
+    elif encoding == "ascii":
+        points = _ascii_points(path, content[start:], names, count)
+    else:
+        raise DataError(f"{path}: DATA must be binary or ascii for a radar file, but got {encoding!r}")
+    if not np.isfinite(points).all():
+        row = int(np.argmin(np.isfinite(points).all(axis=1)))
+        raise DataError(f"{path}: point {row} is not finite: {points[row].tolist()}")
+    return points
+
+
+def _header(path: Path, content: bytes) -> tuple[dict[str, list[str]], int]:
+    """Header entries, and the byte at which the data begin."""
+    entries: dict[str, list[str]] = {}
+    at = 0
+    while at < min(len(content), MAX_HEADER_BYTES):
+        end = content.find(b"\n", at)
+        if end < 0:
+            break
+        words = content[at:end].decode("ascii", "replace").split()
+        at = end + 1
+        if words and not words[0].startswith("#"):
+            entries[words[0]] = words[1:]
+            if words[0] == "DATA":
+                return entries, at
+    raise DataError(f"{path}: not a PCD file: no DATA line in the first {min(len(content), MAX_HEADER_BYTES)} bytes")
+
+
+def _columns(path: Path, header: dict[str, list[str]]) -> tuple[list[str], list[str]]:
+    names, sizes, types = (header.get(key, []) for key in ("FIELDS", "SIZE", "TYPE"))
+    counts = header.get("COUNT", ["1"] * len(names))
+    if not names or len(set(names)) != len(names) or not len(names) == len(sizes) == len(types) == len(counts):
+        raise DataError(f"{path}: FIELDS, SIZE, TYPE and COUNT do not fit together: {names}, {sizes}, {types}, {counts}")
+    if set(counts) != {"1"}:
+        raise DataError(f"{path}: every field must have COUNT 1, but got {counts}")
+    kinds = [_KINDS.get((kind, int(size) if size.isdigit() else 0)) for kind, size in zip(types, sizes, strict=True)]
+    if None in kinds:
+        at = kinds.index(None)
+        raise DataError(f"{path}: field {names[at]} has TYPE {types[at]} SIZE {sizes[at]}, which is not supported")
+    return names, kinds
+
+
+def _count(path: Path, header: dict[str, list[str]]) -> int:
+    numbers = {}
+    for key in ("WIDTH", "HEIGHT", "POINTS"):
+        words = header.get(key, [])
+        if len(words) != 1 or not words[0].isdigit():
+            raise DataError(f"{path}: {key} must be one whole number, but got {words}")
+        numbers[key] = int(words[0])
+    if numbers["POINTS"] > MAX_POINTS or numbers["WIDTH"] * numbers["HEIGHT"] != numbers["POINTS"]:
+        raise DataError(f"{path}: WIDTH x HEIGHT must equal POINTS, at most {MAX_POINTS}, but got {numbers}")
+    return numbers["POINTS"]
+
+
+def _ascii_points(path: Path, text: bytes, names: list[str], count: int) -> Array:
+    words = text.split()
+    if len(words) != count * len(names):
+        raise DataError(f"{path}: {count} points of {len(names)} fields expected, but {len(words)} numbers found")
+    try:
+        table = np.array(words, dtype=np.float64).reshape(count, len(names))
+    except ValueError as error:
+        raise DataError(f"{path}: not a number in the data ({error})") from error
+    return table[:, [names.index(name) for name in RADAR_FIELDS]].astype(np.float32)

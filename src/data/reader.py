@@ -1,0 +1,299 @@
+"""One key frame with its sensors, as one batch of one (spec sections 1.1 to 1.3, facts on TruckScenes)."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+
+from src.data.augment import AugmentationConfig, draw_bev_transform, draw_crop, frame_generator
+from src.data.images import read_image, width_fit
+from src.data.pcd import read_radar_points
+from src.data.schema import CHANNELS, DatasetIndex
+from src.errors import DataError
+from src.geometry.camera import pixels_from_points
+from src.geometry.transforms import invert_rigid, pose_matrix, quaternion_to_matrix, rotation_vector, yaw_of
+from src.structures.batch import RADAR_POINT_FIELDS, FrameBatch
+from src.structures.boxes import Boxes3D
+from src.structures.taxonomy import CAMERAS, RADARS
+
+Array = np.ndarray
+T = TypeVar("T")
+
+VELOCITY_WINDOW_US = 100_000
+"""Ego velocity is the pose difference over +- this time; the chassis table reads zero for long stretches."""
+MAX_EGO_SPEED_MPS = 100.0
+"""Faster poses are a jump in the pose table, not a truck."""
+
+_log = logging.getLogger(__name__)
+
+
+class OnBadFile(Enum):
+    """What an unreadable sensor file does."""
+
+    error = "error"
+    skip = "skip"  # counted; a radar file gives no points, an image a masked camera
+
+
+@dataclass(frozen=True)
+class ReaderSettings:
+    """What is read of a frame."""
+
+    num_sweeps: int  # past sweeps of each radar, the key frame's included
+    min_distance_m: float  # points nearer than this in both x and y (sensor frame) are dropped
+    propagate_points: bool  # move points by their own radial velocity to the key frame's time
+    on_bad_file: OnBadFile
+    image_size_px: tuple[int, int] | None  # (height, width); None: images are not read
+    test_resize_offset: float  # added to the scale that fits the width, without augmentation
+
+
+class FrameReader:
+    """Reads the frames of one release."""
+
+    def __init__(self, index: DatasetIndex, settings: ReaderSettings) -> None:
+        self.index = index
+        self.settings = settings
+        self._root = Path(os.path.realpath(index.root))
+        self._reported: set[str] = set()
+
+    def read(self, sample: int, augmentation: AugmentationConfig | None, seed: int = 0, epoch: int = 0) -> FrameBatch:
+        """The frame at row `sample` of the sample table; random draws depend on (seed, epoch, token) alone.
+
+        Raises DataError for an unreadable file (unless skipped) and for poses that jump.
+        """
+        index = self.index
+        token = str(index.sample_tokens[sample])
+        rng = frame_generator(seed, epoch, token)
+        bev = augmentation.bev if augmentation is not None else None
+        aug_from_ego = np.eye(4) if bev is None else draw_bev_transform(bev, rng)
+        pose = index.frame_poses[sample]
+        global_from_ego = pose_matrix(index.pose_rotations[pose], index.pose_translations[pose])
+        skipped: dict[str, int] = {}
+        points = self._radar_points(sample, global_from_ego, aug_from_ego, skipped)
+        batch = {
+            "tokens": [token],
+            "timestamps_s": torch.tensor([1e-6 * float(index.frame_times_us[sample])], dtype=torch.float64),
+            "global_from_ego": torch.from_numpy(global_from_ego[None]),
+            "aug_from_ego": torch.from_numpy(aug_from_ego[None].astype(np.float32)),
+            "radar_points": torch.from_numpy(points),
+            "radar_batch": torch.zeros(len(points), dtype=torch.int64),
+            "skipped": skipped,
+        }
+        if self.settings.image_size_px is not None:
+            batch |= self._images(sample, global_from_ego, aug_from_ego, augmentation, rng, skipped)
+        if index.annotated:
+            batch["boxes"] = [self._boxes(sample, global_from_ego).transform(torch.from_numpy(aug_from_ego))]
+        return FrameBatch(**batch)
+
+    # ---------------------------------------------------------------- radar
+
+    def _radar_points(
+        self,
+        sample: int,
+        global_from_ego: Array,  # [4, 4]
+        aug_from_ego: Array,  # [4, 4]
+        skipped: dict[str, int],
+    ) -> Array:  # [P, 7] float32, see RADAR_POINT_FIELDS
+        """All sweeps, moved to ego(t) and compensated for the ego motion by the full mount (spec section 1.3)."""
+        rows, clouds = [], []
+        for channel in RADARS:
+            row = int(self.index.key_data[sample, CHANNELS.index(channel)])
+            if row < 0:
+                _count(skipped, f"{channel} (not recorded)")
+            for _ in range(self.settings.num_sweeps):
+                if row < 0:
+                    break
+                cloud = self._guarded(channel, row, read_radar_points, skipped)
+                if cloud is not None:
+                    rows.append(row)
+                    clouds.append(cloud)
+                row = int(self.index.data_previous[row])
+        if not clouds:
+            return np.zeros((0, len(RADAR_POINT_FIELDS)), np.float32)
+        compensated = compensate_sweeps(
+            self.index, np.array(rows), clouds, int(self.index.frame_times_us[sample]), global_from_ego, self.settings
+        )
+        linear = aug_from_ego[:3, :3]
+        compensated[:, :3] = compensated[:, :3] @ linear.T + aug_from_ego[:3, 3]
+        compensated[:, 4:6] = compensated[:, 4:6] @ linear[:2, :2].T
+        return compensated.astype(np.float32)
+
+    # ---------------------------------------------------------------- cameras
+
+    def _images(
+        self,
+        sample: int,
+        global_from_ego: Array,  # [4, 4]
+        aug_from_ego: Array,  # [4, 4]
+        augmentation: AugmentationConfig | None,
+        rng: np.random.Generator,
+        skipped: dict[str, int],
+    ) -> dict[str, torch.Tensor]:
+        """Images at network size and P_n by each camera's own pose; a missing camera stays black and masked."""
+        index, settings = self.index, self.settings
+        images = np.zeros((len(CAMERAS), 3, *settings.image_size_px), np.uint8)
+        valid = np.zeros(len(CAMERAS), bool)
+        pix_from_aug = np.tile(np.eye(4), (len(CAMERAS), 1, 1))
+        ida = augmentation.image if augmentation is not None else None
+        for view, channel in enumerate(CAMERAS):
+            row = int(index.key_data[sample, CHANNELS.index(channel)])
+            if row < 0:
+                _count(skipped, f"{channel} (not recorded)")
+                continue
+            source_px = tuple(int(n) for n in index.data_sizes[row])
+            crop = (
+                width_fit(source_px, settings.image_size_px, settings.test_resize_offset)
+                if ida is None
+                else draw_crop(ida, rng, source_px, settings.image_size_px)
+            )
+            image = self._guarded(channel, row, lambda path, px=source_px, c=crop: read_image(path, px, c), skipped)
+            if image is not None:
+                images[view], valid[view] = image, True
+            pose = index.data_poses[row]
+            global_from_cam = (
+                pose_matrix(index.pose_rotations[pose], index.pose_translations[pose])
+                @ index.ego_from_sensor[index.data_calibrations[row]]
+            )
+            cam_from_aug = invert_rigid(global_from_cam) @ global_from_ego @ np.linalg.inv(aug_from_ego)
+            pix_from_aug[view] = pixels_from_points(
+                index.intrinsics[index.data_calibrations[row]], cam_from_aug, crop.matrix()
+            )
+        return {
+            "images": torch.from_numpy(images[None]),
+            "image_valid": torch.from_numpy(valid[None]),
+            "pix_from_aug": torch.from_numpy(pix_from_aug[None].astype(np.float32)),
+        }
+
+    # ---------------------------------------------------------------- annotations
+
+    def _boxes(self, sample: int, global_from_ego: Array) -> Boxes3D:
+        """Boxes of the 12 classes in ego(t); velocities by the devkit's rule, NaN where unknown."""
+        index = self.index
+        rows = np.arange(index.box_starts[sample], index.box_starts[sample + 1])
+        rows = rows[index.box_labels[rows] >= 0]
+        ego_from_global = invert_rigid(global_from_ego)
+        rotation = ego_from_global[:3, :3]
+
+        def floats(values: Array) -> torch.Tensor:
+            return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+
+        return Boxes3D(
+            centers=floats(index.box_centers[rows] @ rotation.T + ego_from_global[:3, 3]),
+            sizes=floats(index.box_sizes[rows][:, [1, 0, 2]]),
+            yaws=floats(yaw_of(rotation @ quaternion_to_matrix(index.box_rotations[rows]))),
+            velocities=floats((index.box_velocities[rows] @ rotation.T)[:, :2]),
+            labels=torch.from_numpy(index.box_labels[rows].astype(np.int64)),
+            attributes=torch.from_numpy(index.box_attributes[rows].astype(np.int64)),
+            num_points=torch.from_numpy(index.box_points[rows].astype(np.int64)),
+        )
+
+    # ---------------------------------------------------------------- files
+
+    def _guarded(
+        self, channel: str, row: int, read: Callable[[Path], T], skipped: dict[str, int]
+    ) -> T | None:
+        """Read a sensor file; when it cannot be, raise or count and return None, as `on_bad_file` says."""
+        name = self.index.filename(row)
+        try:
+            return read(self._inside(name))
+        except DataError as error:
+            if self.settings.on_bad_file is OnBadFile.error:
+                raise DataError(f"{error}; restore the file, or count and pass over such files with data.on_bad_file=skip") from error
+            _count(skipped, channel)
+            if name not in self._reported:
+                self._reported.add(name)
+                _log.warning("skipped: %s", error)
+            return None
+
+    def _inside(self, name: str) -> Path:
+        """The file's path, refused when a symbolic link leads out of the data set."""
+        path = Path(os.path.realpath(self._root / name))
+        if not path.is_relative_to(self._root):
+            raise DataError(f"{self._root / name}: leads to {path}, which is outside the dataset folder")
+        return path
+
+
+def compensate_sweeps(
+    index: DatasetIndex,
+    rows: Array,  # [S] rows of sensor files
+    clouds: list[Array],  # S of [n, 7] as stored, sensor frame
+    key_time_us: int,
+    global_from_ego: Array,  # [4, 4] ego(t)
+    settings: ReaderSettings,
+) -> Array:  # [P, 7] float64: x, y, z (m, ego(t)), rcs, vx, vy (m/s over ground, radial, ego(t) axes), dt (s)
+    """Move sweeps to ego(t) and turn relative radial velocities into velocities over ground (spec section 1.3).
+
+    r_hat points from the sensor to the target, v_s is the sensor's own velocity from poses, lever arm included:
+    v_r = vrel . r_hat + v_s . r_hat, zero for whatever stands still.
+    """
+    calibrations, poses = index.data_calibrations[rows], index.data_poses[rows]
+    ego_from_sensor = index.ego_from_sensor[calibrations]  # [S, 4, 4]
+    global_from_sweep = pose_matrix(index.pose_rotations[poses], index.pose_translations[poses])
+    key_from_sweep = invert_rigid(global_from_ego) @ global_from_sweep  # [S, 4, 4]
+    velocity, rate = ego_motion(index, index.data_times_us[rows])  # [S, 3] each, ego axes
+    sensor_velocity = velocity + np.cross(rate, ego_from_sensor[:, :3, 3])
+    elapsed_s = 1e-6 * (key_time_us - index.data_times_us[rows])
+
+    points = np.concatenate(clouds).astype(np.float64)
+    sweep = np.repeat(np.arange(len(rows)), [len(cloud) for cloud in clouds])
+    distance = np.linalg.norm(points[:, :3], axis=1)
+    near = (np.abs(points[:, :2]) < settings.min_distance_m).all(axis=1) | (distance < 1e-6)
+    points, sweep, distance = points[~near], sweep[~near], distance[~near]
+
+    def rotate(matrices: Array, vectors: Array) -> Array:  # [S, 3, 3], [P, 3] -> [P, 3]
+        return np.einsum("pij,pj->pi", matrices[sweep], vectors)
+
+    direction = points[:, :3] / distance[:, None]  # sensor frame
+    direction_ego = rotate(ego_from_sensor[:, :3, :3], direction)
+    speed = (points[:, 3:6] * direction).sum(axis=1) + (sensor_velocity[sweep] * direction_ego).sum(axis=1)
+    key_from_sensor = key_from_sweep @ ego_from_sensor
+    position = rotate(key_from_sensor[:, :3, :3], points[:, :3]) + key_from_sensor[sweep, :3, 3]
+    ground_velocity = speed[:, None] * rotate(key_from_sweep[:, :3, :3], direction_ego)
+    lag = elapsed_s[sweep]
+    if settings.propagate_points:
+        position[:, :2] += ground_velocity[:, :2] * lag[:, None]
+    return np.concatenate([position, points[:, 6:7], ground_velocity[:, :2], lag[:, None]], axis=1)
+
+
+def ego_motion(
+    index: DatasetIndex,
+    times_us: Array,  # [S] int64
+) -> tuple[Array, Array]:  # [S, 3] m/s, [S, 3] rad/s, both in ego axes
+    """Velocity and rotation rate by finite differences of the ego poses within +-0.1 s.
+
+    Raises DataError when poses are too sparse for a difference or jump.
+    """
+    stamps = index.pose_times_us
+    first = np.searchsorted(stamps, times_us - VELOCITY_WINDOW_US, side="left")
+    last = np.searchsorted(stamps, times_us + VELOCITY_WINDOW_US, side="right") - 1
+    elapsed_s = 1e-6 * (stamps[last.clip(0)] - stamps[first.clip(max=len(stamps) - 1)])
+    if (last <= first).any() or (elapsed_s <= 0).any():
+        at = int(np.argmax((last <= first) | (elapsed_s <= 0)))
+        raise DataError(
+            f"{index.root / index.version}/ego_pose.json: fewer than two ego poses within 0.1 s of time "
+            f"{int(times_us[at])} us, so the ego velocity is unknown; unpack the release again"
+        )
+    start, end = quaternion_to_matrix(index.pose_rotations[first]), quaternion_to_matrix(index.pose_rotations[last])
+    middle = quaternion_to_matrix(index.pose_rotations[(first + last) // 2])
+    shift = (index.pose_translations[last] - index.pose_translations[first]) / elapsed_s[:, None]
+    velocity = np.einsum("sji,sj->si", middle, shift)
+    rate = rotation_vector(np.swapaxes(start, -1, -2) @ end) / elapsed_s[:, None]
+    speed = np.linalg.norm(velocity, axis=1)
+    if not (speed <= MAX_EGO_SPEED_MPS).all():
+        at = int(np.argmax(speed))
+        raise DataError(
+            f"{index.root / index.version}/ego_pose.json: the poses around time {int(times_us[at])} us move at "
+            f"{speed[at]:.0f} m/s; a truck stays below {MAX_EGO_SPEED_MPS:.0f}, so the pose table is damaged there"
+        )
+    return velocity, rate
+
+
+def _count(skipped: dict[str, int], name: str) -> None:
+    skipped[name] = skipped.get(name, 0) + 1
