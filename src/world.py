@@ -7,8 +7,12 @@ from pathlib import Path
 
 from src.assembly import data_root
 from src.config import compose_config, run_command
+from src.data.world.preview import WorldPreview
 from src.errors import ConfigError
-from src.pictures.world import draw_world_preview
+from src.pictures.cameras import CameraViews
+from src.pictures.contents import PictureBoxes
+from src.pictures.world import draw_scene_preview
+from src.structures.taxonomy import CAMERAS
 
 logger = logging.getLogger(__name__)
 
@@ -22,7 +26,16 @@ def main(overrides: list[str]) -> None:
     print(f"world: {root}")
     if config.preview:
         folder = Path(config.out) if config.out else Path(config.paths.outputs) / "previews" / root.name
-        for path in draw_world_preview(root, folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        for number, (_, frame) in enumerate(WorldPreview(root).frames()):
+            path = folder / f"scene_{number:03d}.png"
+            draw_scene_preview(
+                path,
+                CameraViews(frame.images, frame.pix_from_ego, CAMERAS),
+                PictureBoxes(frame.centers, frame.sizes, frame.yaws, frame.velocities, frame.labels),
+                frame.radar_points,
+                frame.title,
+            )
             print(f"picture: {path}")
 
 

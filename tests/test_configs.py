@@ -80,8 +80,8 @@ def test_mistakes_are_named(overrides, message):
 def test_relations_with_the_grid_are_named():
     from src.assembly import build_model
 
-    config, _ = compose_config(["scale=debug", "grid.cells=[382,384]"])
-    with pytest.raises(ConfigError, match=r"grid.cells=.*382.*multiple of"):
+    config, _ = compose_config(["scale=debug", "grid.cells=[383,384]"])
+    with pytest.raises(ConfigError, match=r"grid.cells=.*383.*multiple of"):
         build_model(config)
     config, _ = compose_config(["scale=debug", "grid.cells=[8,8]", "model.kggi.num_radar_keypoints=100"])
     with pytest.raises(ConfigError, match="num_radar_keypoints"):

@@ -54,7 +54,7 @@ class FrameDataset(Dataset[FrameBatch]):
     """Frames by (epoch, row of the sample table): the epoch seeds the augmentation, also in worker processes.
 
     A fault comes back as a value rather than an exception: a loader would wrap an exception of a worker into a
-    traceback and lose its message. `collate` passes it on and the DataModule raises it.
+    traceback and lose its message. `collate` passes it on and `FrameLoader` raises it.
     """
 
     def __init__(self, reader: FrameReader, augmentation: AugmentationConfig | None, seed: int) -> None:
@@ -97,6 +97,24 @@ class FrameSampler(Sampler[tuple[int, int]]):
             samples = np.random.default_rng((self.shuffle_seed, epoch)).permutation(samples)
         for sample in samples[self.rank :: self.world_size][: len(self)]:
             yield epoch, int(sample)
+
+
+class FrameLoader(DataLoader):
+    """A loader whose workers' faults arrive as the errors they are."""
+
+    def __iter__(self) -> Iterator[FrameBatch]:
+        """Batches of the epoch; raises the first DataError met, or one for a worker that died."""
+        try:
+            for batch in super().__iter__():
+                if isinstance(batch, HorizonError):
+                    raise batch
+                yield batch
+        except RuntimeError as error:
+            if "DataLoader worker" not in str(error):
+                raise
+            raise DataError(
+                f"{str(error).splitlines()[0]}; the usual cause is too little memory: lower data.num_workers"
+            ) from error
 
 
 class DetectionDataModule(L.LightningDataModule):
@@ -167,6 +185,11 @@ class DetectionDataModule(L.LightningDataModule):
     ) -> DataLoader:
         config, trainer = self.config, self.trainer
         world_size = trainer.world_size if trainer is not None else 1
+        if config.batch_size % world_size:
+            raise ConfigError(
+                f"data.batch_size={config.batch_size} is the total over all devices and must be divisible by their "
+                f"number, {world_size}"
+            )
         sampler = FrameSampler(
             samples,
             rank=trainer.global_rank if trainer is not None else 0,
@@ -175,7 +198,7 @@ class DetectionDataModule(L.LightningDataModule):
             shuffle_seed=shuffle_seed,
             epoch=lambda: trainer.current_epoch if trainer is not None else 0,
         )
-        return DataLoader(
+        return FrameLoader(
             FrameDataset(self.reader, augmentation, self.seed),
             batch_size=config.batch_size // world_size,
             sampler=sampler,
@@ -187,12 +210,8 @@ class DetectionDataModule(L.LightningDataModule):
             worker_init_fn=_one_thread,
         )
 
-    def transfer_batch_to_device(
-        self, batch: FrameBatch | HorizonError, device: torch.device, dataloader_idx: int
-    ) -> FrameBatch:
-        """Move a batch, or raise the fault that a worker met instead of one."""
-        if isinstance(batch, HorizonError):
-            raise batch
+    def transfer_batch_to_device(self, batch: FrameBatch, device: torch.device, dataloader_idx: int) -> FrameBatch:
+        """Move a batch, from page-locked memory while the device computes."""
         return batch.to(device, non_blocking=True)
 
 

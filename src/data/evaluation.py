@@ -16,7 +16,7 @@ def evaluation_set(index: DatasetIndex, split: str) -> EvaluationSet:
     Raises DataError for a release without annotations.
     """
     if not index.annotated:
-        raise DataError(f"{index.root / index.version}: has no annotations, so nothing can be scored; choose another split")
+        raise DataError(f"{index.root / index.version}: no annotations, so nothing can be scored; choose another split")
     samples = split_samples(index, split)
     return EvaluationSet(
         tokens=[str(token) for token in index.sample_tokens[samples]],

@@ -58,35 +58,42 @@ def read_image(
     Raises DataError naming the file when it is missing, no image, truncated, a bomb or of another size.
     """
     try:
-        with Image.open(path) as image:
+        # Only JPEG: other decoders of Pillow start programs or unpack without bounds.
+        with Image.open(path, formats=("JPEG",)) as image:
             width, height = image.size
             if (height, width) != tuple(source_px):
-                raise DataError(f"{path}: the tables say {source_px[1]} x {source_px[0]} pixels, the file has {width} x {height}")
+                stated = f"{source_px[1]} x {source_px[0]}"
+                raise DataError(f"{path}: the tables say {stated} pixels, the file has {width} x {height}")
             if width * height > MAX_PIXELS:
                 raise DataError(f"{path}: {width} x {height} pixels are more than any camera gives ({MAX_PIXELS})")
-            return _resample(image.convert("RGB"), crop)
+            # Decode at 1/2, 1/4 or 1/8 where that still has more pixels than needed: half the time of a frame.
+            image.draft(image.mode, (math.ceil(width * crop.resize), math.ceil(height * crop.resize)))
+            return _resample(image.convert("RGB"), crop, (height, width))
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such file") from error
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path}: not a readable image ({error})") from error
 
 
-def _resample(image: Image.Image, crop: ImageCrop) -> Array:
+def _resample(
+    image: Image.Image,  # decoded, perhaps at a power of two below the source size
+    crop: ImageCrop,
+    source_px: tuple[int, int],  # (height, width)
+) -> Array:  # [3, H, W] uint8
     """Cut the source rectangle behind the crop and resize it in one step; what lies outside stays black."""
     height, width = crop.size_px
+    reduction = round(source_px[1] / image.width)  # exactly that; an odd last row or column is half padding
     left, top = crop.offset_px
     # Whole network pixels whose source lies inside the image.
     x0, y0 = max(0, -left), max(0, -top)
-    x1 = min(width, math.floor(crop.resize * image.width - left + 1e-6))
-    y1 = min(height, math.floor(crop.resize * image.height - top + 1e-6))
+    x1 = min(width, math.floor(crop.resize * source_px[1] - left + 1e-6))
+    y1 = min(height, math.floor(crop.resize * source_px[0] - top + 1e-6))
     canvas = Image.new("RGB", (width, height))
     if x1 > x0 and y1 > y0:
         box = tuple(
-            min(max(0.0, edge / crop.resize), limit)
-            for edge, limit in (
-                (x0 + left, image.width), (y0 + top, image.height), (x1 + left, image.width), (y1 + top, image.height)
-            )
-        )  # fmt: skip
+            min(max(0.0, edge / crop.resize), limit) / reduction
+            for edge, limit in zip((x0 + left, y0 + top, x1 + left, y1 + top), 2 * source_px[::-1], strict=True)
+        )
         canvas.paste(image.resize((x1 - x0, y1 - y0), Image.Resampling.BILINEAR, box=box), (x0, y0))
     if crop.flip:
         canvas = canvas.transpose(Image.Transpose.FLIP_LEFT_RIGHT)

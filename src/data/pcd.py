@@ -14,7 +14,8 @@ RADAR_FIELDS = ("x", "y", "z", "vrel_x", "vrel_y", "vrel_z", "rcs")
 MAX_POINTS = 1_000_000
 """More than any sensor gives in one sweep; a larger number is a damaged header."""
 MAX_HEADER_BYTES = 4096
-_KINDS = {("F", 4): "<f4", ("F", 8): "<f8", ("I", 2): "<i2", ("I", 4): "<i4", ("U", 1): "u1", ("U", 2): "<u2", ("U", 4): "<u4"}  # fmt: skip
+_KINDS = {(kind, size): f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)}
+_KINDS |= {("F", 4): "<f4", ("F", 8): "<f8"}
 
 
 def read_radar_points(
@@ -34,7 +35,7 @@ def read_radar_points(
     count = _count(path, header)
     missing = [name for name in RADAR_FIELDS if name not in names]
     if missing:
-        raise DataError(f"{path}: a radar file has the fields {list(RADAR_FIELDS)}, but here {missing} are missing: {names}")
+        raise DataError(f"{path}: a radar file has the fields {list(RADAR_FIELDS)}, but {missing} are not in {names}")
     encoding = header.get("DATA", [""])[0]
     if encoding == "binary":
         dtype = np.dtype(list(zip(names, kinds, strict=True)))
@@ -77,7 +78,8 @@ def _columns(path: Path, header: dict[str, list[str]]) -> tuple[list[str], list[
     names, sizes, types = (header.get(key, []) for key in ("FIELDS", "SIZE", "TYPE"))
     counts = header.get("COUNT", ["1"] * len(names))
     if not names or len(set(names)) != len(names) or not len(names) == len(sizes) == len(types) == len(counts):
-        raise DataError(f"{path}: FIELDS, SIZE, TYPE and COUNT do not fit together: {names}, {sizes}, {types}, {counts}")
+        lines = f"{names}, {sizes}, {types}, {counts}"
+        raise DataError(f"{path}: FIELDS, SIZE, TYPE and COUNT must have one entry per field, but got {lines}")
     if set(counts) != {"1"}:
         raise DataError(f"{path}: every field must have COUNT 1, but got {counts}")
     kinds = [_KINDS.get((kind, int(size) if size.isdigit() else 0)) for kind, size in zip(types, sizes, strict=True)]

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -110,7 +111,7 @@ class FrameReader:
             for _ in range(self.settings.num_sweeps):
                 if row < 0:
                     break
-                cloud = self._guarded(channel, row, read_radar_points, skipped)
+                cloud = self._guarded(sample, channel, row, read_radar_points, skipped)
                 if cloud is not None:
                     rows.append(row)
                     clouds.append(cloud)
@@ -153,7 +154,8 @@ class FrameReader:
                 if ida is None
                 else draw_crop(ida, rng, source_px, settings.image_size_px)
             )
-            image = self._guarded(channel, row, lambda path, px=source_px, c=crop: read_image(path, px, c), skipped)
+            read = partial(read_image, source_px=source_px, crop=crop)
+            image = self._guarded(sample, channel, row, read, skipped)
             if image is not None:
                 images[view], valid[view] = image, True
             pose = index.data_poses[row]
@@ -197,7 +199,7 @@ class FrameReader:
     # ---------------------------------------------------------------- files
 
     def _guarded(
-        self, channel: str, row: int, read: Callable[[Path], T], skipped: dict[str, int]
+        self, sample: int, channel: str, row: int, read: Callable[[Path], T], skipped: dict[str, int]
     ) -> T | None:
         """Read a sensor file; when it cannot be, raise or count and return None, as `on_bad_file` says."""
         name = self.index.filename(row)
@@ -205,7 +207,8 @@ class FrameReader:
             return read(self._inside(name))
         except DataError as error:
             if self.settings.on_bad_file is OnBadFile.error:
-                raise DataError(f"{error}; restore the file, or count and pass over such files with data.on_bad_file=skip") from error
+                remedy = "restore the file, or count and pass over such files with data.on_bad_file=skip"
+                raise DataError(f"{error} (sample {self.index.sample_tokens[sample]}); {remedy}") from error
             _count(skipped, channel)
             if name not in self._reported:
                 self._reported.add(name)
@@ -237,7 +240,7 @@ def compensate_sweeps(
     ego_from_sensor = index.ego_from_sensor[calibrations]  # [S, 4, 4]
     global_from_sweep = pose_matrix(index.pose_rotations[poses], index.pose_translations[poses])
     key_from_sweep = invert_rigid(global_from_ego) @ global_from_sweep  # [S, 4, 4]
-    velocity, rate = ego_motion(index, index.data_times_us[rows])  # [S, 3] each, ego axes
+    velocity, rate = ego_motion(index, index.data_times_us[rows], global_from_sweep[:, :3, :3])  # [S, 3] each
     sensor_velocity = velocity + np.cross(rate, ego_from_sensor[:, :3, 3])
     elapsed_s = 1e-6 * (key_time_us - index.data_times_us[rows])
 
@@ -265,6 +268,7 @@ def compensate_sweeps(
 def ego_motion(
     index: DatasetIndex,
     times_us: Array,  # [S] int64
+    global_from_ego: Array,  # [S, 3, 3] rotations at those times
 ) -> tuple[Array, Array]:  # [S, 3] m/s, [S, 3] rad/s, both in ego axes
     """Velocity and rotation rate by finite differences of the ego poses within +-0.1 s.
 
@@ -281,9 +285,8 @@ def ego_motion(
             f"{int(times_us[at])} us, so the ego velocity is unknown; unpack the release again"
         )
     start, end = quaternion_to_matrix(index.pose_rotations[first]), quaternion_to_matrix(index.pose_rotations[last])
-    middle = quaternion_to_matrix(index.pose_rotations[(first + last) // 2])
     shift = (index.pose_translations[last] - index.pose_translations[first]) / elapsed_s[:, None]
-    velocity = np.einsum("sji,sj->si", middle, shift)
+    velocity = np.einsum("sji,sj->si", global_from_ego, shift)
     rate = rotation_vector(np.swapaxes(start, -1, -2) @ end) / elapsed_s[:, None]
     speed = np.linalg.norm(velocity, axis=1)
     if not (speed <= MAX_EGO_SPEED_MPS).all():

@@ -10,7 +10,9 @@ from src.structures.taxonomy import CAMERAS
 
 
 def a_box(x, y, velocity):
-    return PictureBoxes(np.array([[x, y, 1.0]]), np.array([[4.5, 1.9, 1.5]]), np.zeros(1), np.array([velocity]), np.zeros(1))
+    return PictureBoxes(
+        np.array([[x, y, 1.0]]), np.array([[4.5, 1.9, 1.5]]), np.zeros(1), np.array([velocity]), np.zeros(1)
+    )
 
 
 def preview(path, boxes, points):
@@ -36,5 +38,7 @@ def test_preview_shows_radar_boxes_and_arrows(tmp_path):
 def test_radar_comparison_is_drawn(tmp_path):
     rng = np.random.default_rng(0)
     sweep = np.concatenate([rng.uniform(10, 90, (50, 3)), rng.normal(0, 9, (50, 4))], 1)
-    draw_radar_comparison(tmp_path / "r.png", sweep, rng.normal(0, 9, 50), [sweep, sweep[:20]], [np.zeros(50), np.zeros(20)])
+    draw_radar_comparison(
+        tmp_path / "r.png", sweep, rng.normal(0, 9, 50), [sweep, sweep[:20]], [np.zeros(50), np.zeros(20)]
+    )
     assert Image.open(tmp_path / "r.png").size == (1600, 1180)

@@ -34,7 +34,9 @@ class WorldConfig:
     camera_sweeps: bool  # also write the 10 Hz images between key frames
 
     radar_sweeps_per_key_frame: int  # sweeps written up to and including a key frame, 10 = all of the 20 Hz
-    returns_density: float  # scales the returns of objects and of clutter alike; about 6 for the density of the real sensor
+    returns_density: (
+        float  # scales the returns of objects and of clutter alike; about 6 for the density of the real sensor
+    )
     clutter_density: float  # scales the number of clutter points and of look-alikes
     ghost_fraction: float  # multipath copies per real return
     false_alarms_per_sweep: float  # mean number of returns from nowhere

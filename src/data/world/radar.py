@@ -51,9 +51,8 @@ def simulate_sweeps(
 
     vrel is relative to the moving sensor, along the line of sight, positive when the range grows.
     """
-    poses = [scene.ego.pose(t) for t in times_s]
-    rates = [scene.ego.rates(t) for t in times_s]
-    rotation, origin = np.stack([p[0] for p in poses]), np.stack([p[1] for p in poses])
+    rotation, origin = scene.ego.poses(np.array(times_s))
+    speed, turning = scene.ego.rates_at(np.array(times_s))
     parts = [
         _object_returns(config, scene, mounts, times_s, rotation, origin, rng),
         _clutter_returns(config, scene, scenery, mounts, times_s[0], rotation, origin, rng),
@@ -64,7 +63,7 @@ def simulate_sweeps(
     found = _ghosts(config, found, rng)
     sensor_from_ego = np.stack([m.rotation.T for m in mounts])
     places = np.stack([m.translation for m in mounts])
-    sensor_speed = np.stack([v + np.cross(w, m.translation) for m, (v, w) in zip(mounts, rates, strict=True)])
+    sensor_speed = speed + np.cross(turning, places)
     relative = found.point - places[found.radar]
     distance = np.linalg.norm(relative, axis=1)
     sight = relative / np.maximum(distance, 1e-6)[:, None]

@@ -62,19 +62,8 @@ def draw_quads(
     row0 = np.clip(np.ceil(v.min(1) - 0.5), 0, height).astype(np.int64)
     rows = np.clip(np.ceil(v.max(1) - 0.5), 0, height).astype(np.int64) - row0
     rows[(u.max(1) < 0) | (u.min(1) > width)] = 0
-    span_of, y = _expand(row0, rows)
+    span_of, y, pixel_span, x = _fill(u, v, row0, rows, width)
     line = y + 0.5
-    left, right = np.full(len(y), np.inf), np.full(len(y), -np.inf)
-    for a in range(4):
-        b = (a + 1) % 4
-        va, vb = v[span_of, a], v[span_of, b]
-        hit = np.flatnonzero((va <= line) != (vb <= line))
-        va, vb, ua, ub = va[hit], vb[hit], u[span_of[hit], a], u[span_of[hit], b]
-        x = ua + (line[hit] - va) * (ub - ua) / (vb - va)
-        left[hit], right[hit] = np.minimum(left[hit], x), np.maximum(right[hit], x)
-    col0 = np.clip(np.ceil(np.minimum(left, 1e6) - 0.5), 0, width).astype(np.int64)
-    cols = np.clip(np.ceil(np.maximum(right, -1e6) - 0.5), 0, width).astype(np.int64) - col0
-    pixel_span, x = _expand(col0, np.maximum(cols, 0))
     # 1/depth is affine in pixels on a plane: n.(ray * depth) = plane.
     row = source[span_of]
     scale = layer[row] / plane[row]
@@ -90,8 +79,29 @@ def draw_quads(
     quad = np.where(buffer > 0, buffer & 0xFFFFFFFF, -1)
     nearest = (buffer >> 32).astype(np.int32).view(np.float32)
     depth = np.where(buffer > 0, 1.0 / np.maximum(nearest, 1e-6), np.inf)
-    own, seen = _count(group[owner], pixel, np.where(quad >= 0, group[quad], -1), num_groups, width * height)
+    own, seen = _count(group[owner], pixel, np.append(group, -1)[quad], num_groups, width * height)
     return Drawn(quad=quad, depth_m=depth, own_pixels=own, seen_pixels=seen)
+
+
+def _fill(u: Array, v: Array, row0: Array, rows: Array, width: int) -> tuple[Array, Array, Array, Array]:
+    """Pixels whose centres lie in convex polygons [P, 4] of image corners.
+
+    Returns per span (one pixel row of one polygon) its polygon and row, and per pixel its span and column.
+    """
+    span_of, y = _expand(row0, rows)
+    line = y + 0.5
+    left, right = np.full(len(y), np.inf), np.full(len(y), -np.inf)
+    for a in range(4):
+        b = (a + 1) % 4
+        va, vb = v[span_of, a], v[span_of, b]
+        hit = np.flatnonzero((va <= line) != (vb <= line))
+        va, vb, ua, ub = va[hit], vb[hit], u[span_of[hit], a], u[span_of[hit], b]
+        x = ua + (line[hit] - va) * (ub - ua) / (vb - va)
+        left[hit], right[hit] = np.minimum(left[hit], x), np.maximum(right[hit], x)
+    col0 = np.clip(np.ceil(np.minimum(left, 1e6) - 0.5), 0, width).astype(np.int64)
+    cols = np.clip(np.ceil(np.maximum(right, -1e6) - 0.5), 0, width).astype(np.int64) - col0
+    pixel_span, x = _expand(col0, np.maximum(cols, 0))
+    return span_of, y, pixel_span, x
 
 
 def _expand(first: Array, count: Array) -> tuple[Array, Array]:

@@ -310,8 +310,7 @@ class SceneWriter:
     def _motion_tables(self) -> Tables:
         """Both ego_motion tables. The chassis one reads zero speed for stretches, as in the real data."""
         times = self._ego_times()
-        samples = [self.scene.ego.rates(time) for time in times]
-        speed, spin = np.stack([v for v, _ in samples]), np.stack([w for _, w in samples])
+        speed, spin = self.scene.ego.rates_at(np.array(times))
         accel = np.gradient(speed, np.array(times), axis=0) if len(times) > 1 else np.zeros_like(speed)
         rotations, _ = self.scene.ego.poses(np.array(times))
         angles = np.stack(

@@ -55,7 +55,10 @@ def test_stored_point_counts_are_those_of_the_devkit(devkit):
     for name in RADARS:
         row = devkit.get("sample_data", sample["data"][name])
         cloud = RadarPointCloud.from_file(devkit.get_sample_data_path(row["token"])).points[:3]
-        for table, token in (("calibrated_sensor", row["calibrated_sensor_token"]), ("ego_pose", row["ego_pose_token"])):
+        for table, token in (
+            ("calibrated_sensor", row["calibrated_sensor_token"]),
+            ("ego_pose", row["ego_pose_token"]),
+        ):
             place = devkit.get(table, token)
             turn = truckscenes.utils.data_classes.Quaternion(place["rotation"]).rotation_matrix
             cloud = turn @ cloud + np.array(place["translation"])[:, None]
@@ -124,7 +127,9 @@ def test_lidar_world_is_read_with_times_and_hits_boxes(make_config, tmp_path):
 
     from src.data.world.write import write_world
 
-    config = make_config(num_train_scenes=1, num_val_scenes=0, key_frames_per_scene=2, lidar=True, radar_sweeps_per_key_frame=1)
+    config = make_config(
+        num_train_scenes=1, num_val_scenes=0, key_frames_per_scene=2, lidar=True, radar_sweeps_per_key_frame=1
+    )
     root = write_world(config, tmp_path / "lidar", progress=False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

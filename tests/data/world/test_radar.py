@@ -40,14 +40,31 @@ def straight_scene(kind, ahead_m, speed_mps=0.0):
         still = np.zeros((1, STEPS))
         return Tracks(road=road, s=start + speed * time[None], s_rate=moving, d=still, d_rate=still, turn=still)
 
-    actor = Actor(kind=KINDS[kind], name=kind, size=np.array(KINDS[kind].size_m), colour=(0, 0, 0), has_rider=True,
-                  parked=False, variant=0)  # fmt: skip
+    actor = Actor(
+        kind=KINDS[kind],
+        name=kind,
+        size=np.array(KINDS[kind].size_m),
+        colour=(0, 0, 0),
+        has_rider=True,
+        parked=False,
+        variant=0,
+    )
     ego = EgoMotion(tracks=track(0.0, EGO_MPS), sway=np.zeros((4, 3)))
-    return Scene(index=0, split="train", conditions=None, road=road, actors=[actor], tracks=track(ahead_m, speed_mps),
-                 ego=ego, utm_offset=np.zeros(3))  # fmt: skip
+    return Scene(
+        index=0,
+        split="train",
+        conditions=None,
+        road=road,
+        actors=[actor],
+        tracks=track(ahead_m, speed_mps),
+        ego=ego,
+        utm_offset=np.zeros(3),
+    )
 
 
-NOTHING = Scenery(mesh=None, layer=None, s=None, clutter=np.zeros((0, 3)), clutter_rcs_db=np.zeros(0), clutter_s=np.zeros(0))
+NOTHING = Scenery(
+    mesh=None, layer=None, s=None, clutter=np.zeros((0, 3)), clutter_rcs_db=np.zeros(0), clutter_s=np.zeros(0)
+)
 
 
 @pytest.fixture()
@@ -72,8 +89,10 @@ def sweep_of(make_config, scene, **changes):
 
 @pytest.mark.parametrize(("kind", "near_m", "far_m"), [("adult", 105.0, 175.0), ("bollard", 80.0, 150.0)])
 def test_returns_fall_with_the_fourth_power_of_range_where_the_signal_is_weak(kind, near_m, far_m, front_sweep):
-    near, far = (len(front_sweep(straight_scene(kind, r + 5.26), returns_density=3000.0 * (r / near_m) ** 2)[0])
-                 for r in (near_m, far_m))  # fmt: skip
+    near, far = (
+        len(front_sweep(straight_scene(kind, r + 5.26), returns_density=3000.0 * (r / near_m) ** 2)[0])
+        for r in (near_m, far_m)
+    )
     ratio = near / (far / (far_m / near_m) ** 2)
     assert 0.6 < ratio / (far_m / near_m) ** 4 < 1.2
 
@@ -84,8 +103,13 @@ def test_larger_and_nearer_objects_give_more_returns(front_sweep):
 
 
 def test_returns_lie_on_the_side_that_faces_the_radar(front_sweep):
-    points, _, _ = front_sweep(straight_scene("semi_trailer", 50.0), returns_density=40.0, azimuth_noise_deg=0.0,
-                               elevation_noise_deg=0.0, range_noise_m=0.0)  # fmt: skip
+    points, _, _ = front_sweep(
+        straight_scene("semi_trailer", 50.0),
+        returns_density=40.0,
+        azimuth_noise_deg=0.0,
+        elevation_noise_deg=0.0,
+        range_noise_m=0.0,
+    )
     length = KINDS["semi_trailer"].size_m[0]
     on_rear = np.abs(points[:, 0] - (50.0 - length / 2)) < 0.5
     assert on_rear.mean() > 0.7
@@ -161,8 +185,12 @@ def test_distributions_are_in_the_range_of_the_real_sweep(world):
         distance = np.linalg.norm(points[:, :3], axis=1)
         azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
         elevation = np.degrees(np.arcsin(points[:, 2] / distance))
-        return {"range": np.percentile(distance, [25, 50, 75, 90]), "rcs": np.percentile(points[:, 6], [25, 50, 75]),
-                "azimuth": [azimuth.std()], "elevation": [elevation.std()]}  # fmt: skip
+        return {
+            "range": np.percentile(distance, [25, 50, 75, 90]),
+            "rcs": np.percentile(points[:, 6], [25, 50, 75]),
+            "azimuth": [azimuth.std()],
+            "elevation": [elevation.std()],
+        }
 
     slack = {"range": 25.0, "rcs": 5.0, "azimuth": 8.0, "elevation": 1.2}
     here, there = figures(mine), figures(real)

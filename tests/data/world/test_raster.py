@@ -16,8 +16,16 @@ def facing(x0, x1, y0, y1, z):
 def draw(quads, two_sided=False, layer=1.0, groups=None):
     n = len(quads)
     groups = np.arange(n) if groups is None else np.array(groups)
-    return draw_quads(np.array(quads, dtype=float).reshape(n, 4, 3), np.full(n, two_sided), np.full(n, layer), groups,
-                      max(int(groups.max(initial=-1)) + 1, 1), INTRINSIC, WIDTH, HEIGHT)  # fmt: skip
+    return draw_quads(
+        np.array(quads, dtype=float).reshape(n, 4, 3),
+        np.full(n, two_sided),
+        np.full(n, layer),
+        groups,
+        max(int(groups.max(initial=-1)) + 1, 1),
+        INTRINSIC,
+        WIDTH,
+        HEIGHT,
+    )
 
 
 def test_a_square_fills_its_pixels_at_its_depth():

@@ -32,7 +32,10 @@ def test_a_faster_car_brakes_behind_a_slower_one_or_passes_it():
     road = make_road(np.random.default_rng(0))
     road.lanes = 2
     for may_change in (False, True):
-        fleet = [Vehicle("car", 1, 1, 60.0, 20.0, 5.0, may_change=False), Vehicle("car", 1, 1, 0.0, 35.0, 5.0, may_change=may_change)]
+        fleet = [
+            Vehicle("car", 1, 1, 60.0, 20.0, 5.0, may_change=False),
+            Vehicle("car", 1, 1, 0.0, 35.0, 5.0, may_change=may_change),
+        ]
         s, rate, d, _ = simulate_traffic(fleet, road, 400, np.random.default_rng(5))
         same_lane = np.abs(d[0] - d[1]) < 1.5
         assert ((s[0] - s[1])[same_lane & (s[0] > s[1])] > 5.0).all()
@@ -53,7 +56,9 @@ def test_velocities_and_rates_are_the_derivatives_of_the_poses(config, index):
         r, _ = scene.ego.pose(now)
         linear, angular = scene.ego.rates(now)
         np.testing.assert_allclose(r @ linear, (t1 - t0) / (2 * h), atol=0.05)
-        np.testing.assert_allclose(r @ np.cross(angular, [5.0, 1.0, 2.0]), (r1 - r0) @ [5.0, 1.0, 2.0] / (2 * h), atol=0.02)
+        np.testing.assert_allclose(
+            r @ np.cross(angular, [5.0, 1.0, 2.0]), (r1 - r0) @ [5.0, 1.0, 2.0] / (2 * h), atol=0.02
+        )
         np.testing.assert_allclose(r @ r.T, np.eye(3), atol=1e-12)
 
 
@@ -92,9 +97,17 @@ def test_labelled_objects_lie_inside_their_boxes(config):
 
 def test_points_are_counted_in_turned_boxes_with_their_borders():
     nothing = np.zeros(1, dtype=int)
-    truth = FrameTruth(time_s=0.0, centres=np.array([[10.0, 5.0, 1.0]]), yaws=np.array([np.pi / 2]), speeds=nothing,
-                       distance_m=np.array([11.0]), own_pixels=nothing, seen_pixels=nothing, radar_points=nothing,
-                       lidar_points=nothing)  # fmt: skip
+    truth = FrameTruth(
+        time_s=0.0,
+        centres=np.array([[10.0, 5.0, 1.0]]),
+        yaws=np.array([np.pi / 2]),
+        speeds=nothing,
+        distance_m=np.array([11.0]),
+        own_pixels=nothing,
+        seen_pixels=nothing,
+        radar_points=nothing,
+        lidar_points=nothing,
+    )
     points = np.array([[10.0, 7.0, 1.0], [11.0, 5.0, 0.0], [10.0, 7.1, 1.0], [12.0, 5.0, 1.0], [10.0, 5.0, 2.1]])
     assert count_inside(truth, np.array([[4.0, 2.0, 2.0]]), points).tolist() == [2]
     assert count_inside(truth, np.array([[4.0, 2.0, 2.0]]), np.zeros((0, 3))).tolist() == [0]
@@ -123,9 +136,16 @@ def test_quaternions_turn_vectors_as_their_matrices_do():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("key_frames_per_scene", 0), ("camera_fov_deg", 170.0), ("returns_density", -1.0), ("doppler_noise_mps", float("nan")),
-     ("radar_sweeps_per_key_frame", 11), ("image_width_px", 8), ("jpeg_quality", 100)],
-)  # fmt: skip
+    [
+        ("key_frames_per_scene", 0),
+        ("camera_fov_deg", 170.0),
+        ("returns_density", -1.0),
+        ("doppler_noise_mps", float("nan")),
+        ("radar_sweeps_per_key_frame", 11),
+        ("image_width_px", 8),
+        ("jpeg_quality", 100),
+    ],
+)
 def test_impossible_worlds_are_refused_by_name(default_values, name, value):
     with pytest.raises(ConfigError, match=f"{name} must be"):
         WorldConfig(**(default_values | {name: value}))

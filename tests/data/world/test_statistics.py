@@ -1,8 +1,8 @@
-"""The figures that the world is held to: those of 21 real highway frames, widened for the rare classes.
+"""The figures that the world is held to: those of 21 real highway frames, with rare classes on top.
 
-Real frames (authors' project page, cars, trucks, trailers and signs only): 30 boxes a frame, distances 56 / 111 / 159 m and
-speeds 26 / 39 m/s at the quartiles of half and three quarters. The world adds about 15 small and rare objects a frame,
-most of them near the road beside the truck, because twelve validation classes must have enough boxes to be scored.
+Real frames (authors' project page; nearly only cars, trucks, trailers and signs): 30 boxes a frame, distances
+56 / 111 / 159 m at the quartiles, speeds 26 and 39 m/s at the median and the upper quartile. The world adds about 15
+small and rare objects a frame, most of them near the truck, because twelve validation classes need boxes to be scored.
 """
 
 from collections import Counter
@@ -49,8 +49,10 @@ def check(table, frames, slack):
     middle, high = np.nanpercentile(table["speed"][like_real], [50, 75])
     assert abs(middle - 26) < 6 * slack and abs(high - 39) < 4 * slack
     assert np.nanmax(table["speed"]) < 52
-    near, far = (table["radar"][(table["klass"] == "car") & (table["distance"] >= a) & (table["distance"] < b)]
-                 for a, b in ((5, 40), (80, 150)))  # fmt: skip
+    near, far = (
+        table["radar"][(table["klass"] == "car") & (table["distance"] >= a) & (table["distance"] < b)]
+        for a, b in ((5, 40), (80, 150))
+    )
     assert near.mean() > 3 * far.mean()
     assert (near == 0).mean() < 0.3 < (far == 0).mean()
     ranges = np.array([CLASS_RANGE_M[name] for name in table["klass"]])
@@ -60,8 +62,16 @@ def check(table, frames, slack):
 
 
 def test_a_small_world_looks_like_the_real_frames(make_config, tmp_path, stored_world):
-    config = make_config(num_train_scenes=6, num_val_scenes=0, key_frames_per_scene=8, image_width_px=96, image_height_px=46,
-                         radar_sweeps_per_key_frame=1, ego_rate_hz=10, seed=0)  # fmt: skip
+    config = make_config(
+        num_train_scenes=6,
+        num_val_scenes=0,
+        key_frames_per_scene=8,
+        image_width_px=96,
+        image_height_px=46,
+        radar_sweeps_per_key_frame=1,
+        ego_rate_hz=10,
+        seed=0,
+    )
     world = stored_world(write_world(config, tmp_path / "w", progress=False))
     table = table_of(world)
     check(table, 48, slack=1.6)
@@ -75,9 +85,11 @@ def test_the_default_world_looks_like_the_real_frames_and_holds_every_class(defa
     table = table_of(world)
     check(table, config.num_scenes * config.key_frames_per_scene, slack=1.0)
     val = {row["token"] for row in world["scene"][config.num_train_scenes :]}
-    counted = (np.array([scene in val for scene in table["scene"]]) & (table["radar"] + table["lidar"] > 0)
-               & (table["distance"] < np.array([CLASS_RANGE_M[name] for name in table["klass"]])))  # fmt: skip
+    counted = (
+        np.array([scene in val for scene in table["scene"]])
+        & (table["radar"] + table["lidar"] > 0)
+        & (table["distance"] < np.array([CLASS_RANGE_M[name] for name in table["klass"]]))
+    )
     boxes = Counter(table["klass"][counted])
     assert set(boxes) == set(CLASSES)
     assert min(boxes.values()) >= 55, boxes
-

@@ -20,7 +20,13 @@ from src.data.world.write import VERSION, ensure_world, write_world
 from src.errors import ConfigError, DataError
 from src.structures.taxonomy import CAMERAS, CATEGORY_TO_CLASS, CLASSES, RADARS
 
-TINY = {"num_train_scenes": 1, "num_val_scenes": 1, "key_frames_per_scene": 2, "image_width_px": 64, "image_height_px": 32}
+TINY = {
+    "num_train_scenes": 1,
+    "num_val_scenes": 1,
+    "key_frames_per_scene": 2,
+    "image_width_px": 64,
+    "image_height_px": 32,
+}
 
 
 def fingerprint(root):
@@ -43,12 +49,20 @@ def test_every_table_is_there_with_its_rows(world, config):
 
 def test_tokens_are_unique_and_every_link_leads_somewhere(world):
     targets = {
-        "sample_token": "sample", "ego_pose_token": "ego_pose", "calibrated_sensor_token": "calibrated_sensor",
-        "sensor_token": "sensor", "instance_token": "instance", "category_token": "category", "scene_token": "scene",
-        "visibility_token": "visibility", "first_sample_token": "sample", "last_sample_token": "sample",
-        "first_annotation_token": "sample_annotation", "last_annotation_token": "sample_annotation",
+        "sample_token": "sample",
+        "ego_pose_token": "ego_pose",
+        "calibrated_sensor_token": "calibrated_sensor",
+        "sensor_token": "sensor",
+        "instance_token": "instance",
+        "category_token": "category",
+        "scene_token": "scene",
+        "visibility_token": "visibility",
+        "first_sample_token": "sample",
+        "last_sample_token": "sample",
+        "first_annotation_token": "sample_annotation",
+        "last_annotation_token": "sample_annotation",
         "weather_annotation_token": "weather_annotation",
-    }  # fmt: skip
+    }
     for name, table in world.tables.items():
         assert len(world.rows[name]) == len(table), name
         for row in table:
@@ -74,8 +88,11 @@ def test_chains_run_forward_in_time_within_a_scene_and_channel(world):
         assert [row["next"] for row in rows] == [row["token"] for row in rows[1:]] + [""]
         assert len({row["timestamp"] for row in rows}) == len(rows)
     first = world.rows["sample"][world["scene"][0]["first_sample_token"]]
-    key = next(r for r in world["sample_data"] if r["sample_token"] == first["token"] and r["is_key_frame"]
-               and world.channel(r) == RADARS[0])  # fmt: skip
+    key = next(
+        r
+        for r in world["sample_data"]
+        if r["sample_token"] == first["token"] and r["is_key_frame"] and world.channel(r) == RADARS[0]
+    )
     assert key["prev"] != ""  # sweeps exist before the first key frame
 
 
@@ -100,7 +117,9 @@ def test_files_are_what_the_tables_say(world, config):
             assert len(world.radar(row)) == row["width"] <= 800
         else:
             assert row["width"] == 0 and b"binary_compressed" in path.read_bytes()
-    on_disk = {str(p.relative_to(world.root)) for kind in ("samples", "sweeps") for p in (world.root / kind).rglob("*.*")}
+    on_disk = {
+        str(p.relative_to(world.root)) for kind in ("samples", "sweeps") for p in (world.root / kind).rglob("*.*")
+    }
     assert on_disk == {row["filename"] for row in world["sample_data"]}
 
 
@@ -208,7 +227,9 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch, make_config):
 
 def test_a_killed_write_leaves_nothing_that_looks_complete(tmp_path, make_config):
     root = tmp_path / "w"
-    child = multiprocessing.get_context("spawn").Process(target=write_world, args=(make_config(key_frames_per_scene=20), root, False))
+    child = multiprocessing.get_context("spawn").Process(
+        target=write_world, args=(make_config(key_frames_per_scene=20), root, False)
+    )
     child.start()
     end = time.monotonic() + 30
     while not list(tmp_path.rglob("*.jpg")) and time.monotonic() < end:
@@ -218,3 +239,11 @@ def test_a_killed_write_leaves_nothing_that_looks_complete(tmp_path, make_config
     assert not root.exists()
     assert not list(tmp_path.rglob("world.json"))
     assert ensure_world(make_config(**TINY), root, progress=False) == root
+
+
+def test_camera_sweeps_fill_the_time_between_key_frames(tmp_path, make_config, stored_world):
+    values = TINY | {"num_val_scenes": 0, "camera_sweeps": True, "radar_sweeps_per_key_frame": 1}
+    world = stored_world(write_world(make_config(**values), tmp_path / "w", progress=False))
+    rows = [row for row in world["sample_data"] if world.channel(row) == CAMERAS[0]]
+    assert [row["is_key_frame"] for row in rows] == [False, False, False, False, True] * 2
+    np.testing.assert_allclose(np.diff([row["timestamp"] for row in rows]) * 1e-6, 0.1, atol=0.02)

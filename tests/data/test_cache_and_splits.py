@@ -1,0 +1,90 @@
+import json
+import logging
+import os
+
+import numpy as np
+import pytest
+from tiny_set import VERSION
+
+from src.data import cache
+from src.data.cache import load_index
+from src.data.splits import OFFICIAL_LISTS, split_samples
+from src.errors import DataError
+
+
+def test_second_start_reads_the_cache(broken_tables, tmp_path, monkeypatch):
+    first = load_index(broken_tables.root, VERSION, tmp_path / "cache")
+    monkeypatch.setattr(cache, "build_index", lambda *_: pytest.fail("the tables were read again"))
+    second = load_index(broken_tables.root, VERSION, tmp_path / "cache")
+    for name, value in vars(first).items():
+        np.testing.assert_array_equal(getattr(second, name), value)
+
+
+def test_changed_tables_are_read_again(broken_tables, tmp_path):
+    load_index(broken_tables.root, VERSION, tmp_path / "cache")
+    broken_tables.edit("scene", 0, name="scene-renamed-0")
+    assert "scene-renamed-0" in load_index(broken_tables.root, VERSION, tmp_path / "cache").scene_names
+
+
+@pytest.mark.parametrize("damage", ["truncated", "flipped", "text", "pickle"])
+def test_broken_cache_is_built_again(broken_tables, tmp_path, caplog, damage):
+    folder = tmp_path / "cache"
+    load_index(broken_tables.root, VERSION, folder)
+    (file,) = folder.glob("*.npz")
+    content = bytearray(file.read_bytes())
+    if damage == "flipped":
+        content[len(content) // 2] ^= 0xFF
+    broken = {"truncated": content[: len(content) // 2], "text": b"hello", "flipped": content}.get(damage)
+    if damage == "pickle":
+        np.savez(file, scene_names=np.array([{"a": 1}], dtype=object), annotated=np.array(True))
+    else:
+        file.write_bytes(bytes(broken))
+    assert len(load_index(broken_tables.root, VERSION, folder)) == 6
+    assert "broken" in caplog.text
+    caplog.clear()
+    load_index(broken_tables.root, VERSION, folder)
+    assert "broken" not in caplog.text
+
+
+def test_cache_that_cannot_be_written_is_done_without(broken_tables, tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with caplog.at_level(logging.WARNING):
+        assert len(load_index(broken_tables.root, VERSION, tmp_path / "cache")) == 6
+    assert "No space left" in caplog.text and not list((tmp_path / "cache").iterdir())
+
+
+def test_own_split_file_wins(data_set):
+    index = load_index(data_set.root, VERSION, None)
+    assert split_samples(index, "train").tolist() == [0, 1, 2]
+    assert split_samples(index, "val").tolist() == [3, 4, 5]
+    with pytest.raises(DataError, match=r"split 'test'.*\['train', 'val'\]"):
+        split_samples(index, "test")
+
+
+def test_bad_split_files(broken_tables):
+    index = load_index(broken_tables.root, VERSION, None)
+    path = broken_tables.root / "splits.json"
+    for text, words in (("{", "JSON"), ('["train"]', "scene names"), ('{"train": ["no-such-scene"]}', "none of its 1")):
+        path.write_text(text)
+        with pytest.raises(DataError, match=words):
+            split_samples(index, "train")
+
+
+def test_official_lists():
+    lists = json.loads(OFFICIAL_LISTS.read_text())
+    counts = {name: len(set(scenes)) for name, scenes in lists["splits"].items()}
+    assert counts == {"train": 523, "val": 75, "test": 149, "mini_train": 8, "mini_val": 2}
+    assert "Apache-2.0" in lists["source"]
+    devkit = pytest.importorskip("truckscenes.utils.splits", reason="devkit not installed")
+    official = devkit.create_splits_scenes()
+    assert {name: sorted(official[name]) for name in counts} == {n: sorted(s) for n, s in lists["splits"].items()}
+
+
+def test_official_splits_follow_the_release(broken_tables):
+    (broken_tables.root / "splits.json").unlink()
+    scene = json.loads(OFFICIAL_LISTS.read_text())["splits"]["val"][0]
+    broken_tables.edit("scene", 1, name=scene)
+    index = load_index(broken_tables.root, VERSION, None)
+    assert split_samples(index, "val").tolist() == [3, 4, 5]
+    with pytest.raises(DataError, match=r"'mini_val'.*\['train', 'val'\]"):
+        split_samples(index, "mini_val")

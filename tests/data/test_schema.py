@@ -1,0 +1,148 @@
+"""Every way in which tables can be wrong, and what the error has to say."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from tiny_set import START_S, TARGET_VELOCITY, VERSION, token
+
+from src.data.schema import CHANNELS, build_index
+from src.errors import DataError
+
+
+def build(data_set):
+    return build_index(data_set.root, VERSION)
+
+
+def test_links_of_the_intact_set(data_set):
+    index = build(data_set)
+    assert len(index) == 6 and index.annotated
+    key = index.key_data[1]
+    assert (key[: len(CHANNELS) - 6] >= 0).all()
+    lidar = key[CHANNELS.index("LIDAR_LEFT")]
+    assert index.frame_times_us[1] == index.data_times_us[lidar] == int(START_S * 1e6) + 500_000
+    radar = key[CHANNELS.index("RADAR_LEFT_SIDE")]
+    before = index.data_previous[radar]
+    assert index.data_times_us[radar] - index.data_times_us[before] == 50_000
+    assert index.filename(before).startswith("sweeps/RADAR_LEFT_SIDE/")
+    np.testing.assert_array_equal(index.pose_times_us[index.data_poses], index.data_times_us)
+    assert np.diff(index.box_starts).tolist() == [2, 2, 1, 2, 2, 1]  # car and sign | car and rack | car
+    np.testing.assert_allclose(index.box_velocities[0], TARGET_VELOCITY, atol=1e-6)
+    assert np.isnan(index.box_velocities[1]).all()  # one annotation only
+
+
+def case(table, row, change, *words, name):
+    return pytest.param(table, row, change, words, id=name)
+
+
+@pytest.mark.parametrize(
+    "table, row, change, words",
+    [
+        case("sample", 1, {"scene_token": "f" * 32}, "f" * 32, "scene", name="dangling"),
+        case("sample_data", 3, {"sample_token": token("sensor", "LIDAR_LEFT")}, "table sample", name="foreign-key"),
+        case("sample", 1, {"token": token("sample", "train-0")}, "token of its own", name="duplicate-token"),
+        case("sample", 1, {"token": ""}, "not empty", name="empty-token"),
+        case("sample", 1, {"timestamp": int(START_S * 1e6)}, "earlier", name="equal-times"),
+        case("sample", 1, {"timestamp": int(START_S * 1e6), "prev": ""}, "another time than", name="equal-unlinked"),
+        case("sample", 2, {"timestamp": int(START_S * 1e6) - 5}, "later", name="reversed-times"),
+        case("sample", 1, {"timestamp": 1.5}, "1.5", "int", name="float-time"),
+        case("sample", 1, {"timestamp": 10**30}, "64 bits", name="huge-time"),
+        case("ego_pose", 0, {"rotation": [2.0, 0, 0, 0]}, "[2.0, 0.0", "length 1", name="not-unit"),
+        case("ego_pose", 0, {"rotation": [float("nan"), 0, 0, 0]}, "nan", "finite", name="nan-rotation"),
+        case("ego_pose", 0, {"translation": [1.0, 2.0]}, "3 numbers", name="short-vector"),
+        case("ego_pose", 0, {"translation": ["1", "2", "3"]}, "3 numbers", name="text-vector"),
+        case("calibrated_sensor", 0, {"camera_intrinsic": [[0] * 3] * 3}, "invertible", name="singular"),
+        case("calibrated_sensor", 0, {"camera_intrinsic": []}, "3x3", name="no-intrinsics"),
+        case("category", 0, {"name": "vehicle.ufo"}, "vehicle.ufo", "27", name="unknown-category"),
+        case("attribute", 0, {"name": "vehicle.flying"}, "vehicle.flying", name="unknown-attribute"),
+        case("sample_annotation", 0, {"attribute_tokens": [token("attribute", "vehicle.moving")] * 2}, "at most one",
+             name="two-attributes"),
+        case("sample_annotation", 0, {"size": [1.0, 0.0, 1.0]}, "above 0", name="zero-size"),
+        case("sample_annotation", 0, {"size": [1.0, -2.0, 1.0]}, "-2.0", name="negative-size"),
+        case("sample_annotation", 0, {"translation": [float("nan"), 0, 0]}, "finite", name="nan-centre"),
+        case("sample_annotation", 1, {"prev": token("sample_annotation", "train", "sign", 0)}, "same instance",
+             name="chain-of-another"),
+        case("sample_data", 0, {"filename": "/etc/passwd"}, "/etc/passwd", "outside the dataset", name="absolute"),
+        case("sample_data", 0, {"filename": "samples/../../x"}, "outside the dataset", name="parent"),
+        case("sample_data", 0, {"width": 0}, "pixels", name="no-width"),
+        case("scene", 1, {"name": "scene-train-0"}, "of its own", name="same-scene-name"),
+    ],
+)  # fmt: skip
+def test_bad_values_are_named(broken_tables, table, row, change, words):
+    broken_tables.edit(table, row, **change)
+    with pytest.raises(DataError) as error:
+        build(broken_tables)
+    text = str(error.value)
+    assert f"{table}.json" in text and "restore the file" in text
+    for word in words:
+        assert word in text
+
+
+def test_error_names_the_record(broken_tables):
+    record = broken_tables.edit("ego_pose", 7, rotation=[0.0, 0.0, 0.0, 0.0])
+    with pytest.raises(DataError, match=f"ego_pose '{record['token']}'.*record 7.*rotation"):
+        build(broken_tables)
+
+
+@pytest.mark.parametrize(
+    "content, words",
+    [
+        ('[\n{"token": "a"},\n{"tok', "line 3"),
+        ("", "line 1"),
+        ('{"token": "a"}', "list of records"),
+        ("[1, 2]", "record 0 must be an object"),
+        ('[{"name": "x"}]', "no field 'token'"),
+        (b"\xff\xfe\x00", "UTF-8"),
+        ("[" * 100_000, "not a table"),
+    ],
+    ids=["truncated", "empty", "object", "numbers", "no-token", "binary", "nested"],
+)
+def test_files_that_are_no_tables(broken_tables, content, words):
+    path = broken_tables.table("sensor")
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(DataError, match="sensor.json") as error:
+        build(broken_tables)
+    assert words in str(error.value)
+
+
+def test_missing_field(broken_tables):
+    records = broken_tables.records("sample_data")
+    del records[4]["ego_pose_token"]
+    broken_tables.table("sample_data").write_text(json.dumps(records))
+    with pytest.raises(DataError, match="record 4.*no field 'ego_pose_token'"):
+        build(broken_tables)
+
+
+def test_missing_table_version_and_root(broken_tables):
+    with pytest.raises(DataError, match=rf"data.version='v1.0-mini'.*{VERSION}"):
+        build_index(broken_tables.root, "v1.0-mini")
+    with pytest.raises(DataError, match="data.version='..'"):
+        build_index(broken_tables.root, "..")
+    with pytest.raises(DataError, match="data.root=.*no such folder"):
+        build_index(broken_tables.root / "nowhere", VERSION)
+    broken_tables.table("sample_data").unlink()
+    with pytest.raises(DataError, match="missing tables.*sample_data"):
+        build(broken_tables)
+
+
+def test_weather_may_be_missing(broken_tables):
+    broken_tables.table("weather_annotation").unlink()
+    assert len(build(broken_tables)) == 6
+
+
+def test_test_release_has_no_boxes(broken_tables):
+    folder = broken_tables.root / "v1.2-test"
+    shutil.move(broken_tables.root / VERSION, folder)
+    for name in ("sample_annotation", "instance"):
+        (folder / f"{name}.json").unlink()
+    index = build_index(broken_tables.root, "v1.2-test")
+    assert not index.annotated and index.box_starts.tolist() == [0] * 7
+
+
+def test_sample_without_reference_uses_the_closest_pose(broken_tables, caplog):
+    records = [r for r in broken_tables.records("sample_data") if "LIDAR_LEFT" not in r["filename"]]
+    broken_tables.table("sample_data").write_text(json.dumps(records))
+    index = build(broken_tables)
+    assert "no LIDAR_LEFT key frame" in caplog.text
+    assert (np.abs(index.pose_times_us[index.frame_poses] - index.frame_times_us) <= 10_000).all()
