@@ -8,7 +8,7 @@ PYTHON := $(if $(ACTIVE),python,.venv/bin/python)
 STAMP := $(if $(ACTIVE),$(ACTIVE),.venv)/.horizon3d-installed
 SCALE_ARG := $(if $(SCALE),scale=$(SCALE))
 
-.PHONY: help install world train benchmark test check
+.PHONY: help install world train report benchmark test check
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -26,6 +26,9 @@ world: $(STAMP) ## write the synthetic highway (preview: ARGS="preview=true")
 
 train: $(STAMP) ## train PHASE=1 [SCALE=debug|mini|paper] [ARGS="optim.lr=2e-4 ..."]
 	$(PYTHON) -m src.train phase=phase$(PHASE) $(SCALE_ARG) $(ARGS)
+
+report: $(STAMP) ## finished runs into the table reports/phase1_mini.md
+	$(PYTHON) -m src.report $(SCALE_ARG) $(ARGS)
 
 benchmark: $(STAMP) ## time and memory of every part [ARGS="suite=metric"]
 	$(PYTHON) -m src.benchmark $(SCALE_ARG) $(ARGS)

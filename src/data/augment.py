@@ -86,13 +86,13 @@ def draw_bev_transform(
 
 
 def _check_range(name: str, value: list[float], above: float) -> None:
-    if len(value) != 2 or not above < value[0] <= value[1]:
-        raise ConfigError(f"{name}={value}: must be [low, high] with {above} < low <= high")
+    if len(value) != 2 or not above < value[0] <= value[1] < float("inf"):
+        raise ConfigError(f"{name}={value}: must be [low, high] with {above} < low <= high, both finite")
 
 
 def _check_not_negative(name: str, value: float) -> None:
-    if not value >= 0:
-        raise ConfigError(f"{name}={value}: must not be negative")
+    if not 0 <= value < float("inf"):
+        raise ConfigError(f"{name}={value}: must be a finite number of at least 0")
 
 
 def _check_probability(name: str, value: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -104,17 +105,26 @@ class FrameLoader(DataLoader):
 
     def __iter__(self) -> Iterator[FrameBatch]:
         """Batches of the epoch; raises the first DataError met, or one for a worker that died."""
-        try:
+        with dead_workers_named():
             for batch in super().__iter__():
                 if isinstance(batch, HorizonError):
                     raise batch
                 yield batch
-        except RuntimeError as error:
-            if "DataLoader worker" not in str(error):
-                raise
-            raise DataError(
-                f"{str(error).splitlines()[0]}; the usual cause is too little memory: lower data.num_workers"
-            ) from error
+
+
+@contextmanager
+def dead_workers_named() -> Iterator[None]:
+    """Turn torch's RuntimeError for a killed worker into a DataError.
+
+    Torch raises it from a signal handler, so it can strike anywhere in a training step: wrap the whole fit as well.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if "DataLoader worker" not in str(error):
+            raise
+        remedy = "the usual cause is too little memory: lower data.num_workers, then give the same command to go on"
+        raise DataError(f"{str(error).splitlines()[0]}; {remedy}") from error
 
 
 class DetectionDataModule(L.LightningDataModule):

@@ -141,7 +141,7 @@ def version_folder(root: Path, version: str) -> Path:
     if not root.is_dir():
         raise DataError(f"data.root={root}: no such folder; set it to the folder that holds samples/ and the tables")
     folder = root / version
-    if not version or not folder.is_dir() or folder.parent != root:
+    if version in ("", ".", "..") or "/" in version or not folder.is_dir():
         found = sorted(path.parent.name for path in root.glob("*/scene.json"))
         raise DataError(f"data.version={version!r}: no such folder of tables in {root}; there are {found}")
     return folder
@@ -208,6 +208,7 @@ def _data_columns(
 
     table = Table(folder / "sample_data.json")
     data_samples = table.links("sample_token", samples)
+    scenes = parts["sample_scenes"][data_samples]
     parts["data_poses"] = sorted_row[table.links("ego_pose_token", poses)]
     rows = table.links("calibrated_sensor_token", calibrations[0])
     parts["data_calibrations"] = rows.astype(np.int32)
@@ -216,7 +217,8 @@ def _data_columns(
     previous = table.links("prev", table, optional=True)
     table.links("next", table, optional=True)
     tokens = table.values("prev")
-    table.check((previous < 0) | (channels[previous] == channels), "prev", tokens, "a file of the same channel")
+    same = (channels[previous] == channels) & (scenes[previous] == scenes)
+    table.check((previous < 0) | same, "prev", tokens, "a file of the same channel and scene")
     table.check((previous < 0) | (stamps[previous] < stamps), "prev", tokens, "an earlier file")
     parts["data_previous"] = previous.astype(np.int32)
 
@@ -228,6 +230,11 @@ def _data_columns(
         good[cameras] = [type(values[row]) is int and 0 < values[row] < 2**15 for row in cameras]
         table.check(good, field, values, "the image's size in pixels, above 0")
         sizes[cameras, column] = [values[row] for row in cameras]
+    # A calibration of images of another size has its principal point near or beyond this image's edge.
+    centres = parts["intrinsics"][rows, :2, 2]
+    centred = np.ones(len(table), bool)
+    centred[cameras] = ((centres > 0) & (centres < sizes[:, ::-1]))[cameras].all(axis=1)
+    table.check(centred, "width, height", sizes[:, ::-1], "an image that holds its camera's principal point")
 
     names = table.values("filename")
     inside = np.array([_stays_inside(name) for name in names], bool)
@@ -286,15 +293,20 @@ def _box_columns(folder: Path, samples: Table, annotated: bool, parts: dict[str,
     table.links("visibility_token", Table(folder / "visibility.json"), optional=True)
     labels = _category_labels(categories)[instances.links("category_token", categories)[instance_rows]]
 
-    centers = table.vectors("translation", 3)
-    sizes = table.vectors("size", 3)
-    table.check((sizes > 0).all(axis=1), "size", sizes, "width, length and height above 0 m")
+    centers = table.vectors("translation", 3, finite=False)
+    sizes = table.vectors("size", 3, finite=False)
     attribute_ids = _box_attributes(table, attributes, labels >= 0)
     points = table.integers("num_lidar_pts") + table.integers("num_radar_pts")
     velocities = _box_velocities(table, instance_rows, 1e-6 * parts["sample_times_us"][sample_rows], centers)
     rotations = table.quaternions("rotation")
 
-    kept = np.flatnonzero(labels != LABEL_IGNORED)
+    sound = np.isfinite(centers).all(axis=1) & np.isfinite(sizes).all(axis=1) & (sizes > 0).all(axis=1)
+    if not sound.all():
+        _log.warning(
+            "%s: %d annotations without a finite centre or a positive size are left out (first: %s)",
+            table.path, int((~sound).sum()), table.tokens[int(np.argmin(sound))],
+        )  # fmt: skip
+    kept = np.flatnonzero((labels != LABEL_IGNORED) & sound)
     kept = kept[np.argsort(sample_rows[kept], kind="stable")]
     parts["box_starts"] = np.searchsorted(sample_rows[kept], np.arange(len(samples) + 1))
     columns = {"labels": labels, "centers": centers, "sizes": sizes, "rotations": rotations}

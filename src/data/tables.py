@@ -86,9 +86,9 @@ class Table:
         self.check(stamps > 0, "timestamp", stamps, "microseconds since 1970, above 0")
         return stamps
 
-    def vectors(self, field: str, width: int) -> Array:  # [n, width] float64
-        """A list of `width` finite numbers per record."""
-        return self._numbers(self.values(field, list), field, (width,))
+    def vectors(self, field: str, width: int, finite: bool = True) -> Array:  # [n, width] float64
+        """A list of `width` numbers per record; NaN and infinity are refused unless `finite` is False."""
+        return self._numbers(self.values(field, list), field, (width,), finite=finite)
 
     def quaternions(self, field: str) -> Array:  # [n, 4] float64 (w, x, y, z), unit length
         """Rotations; a length more than 1e-3 away from 1 is refused, smaller rounding is taken out."""
@@ -119,8 +119,10 @@ class Table:
         self.check(rows >= (-1 if optional else 0), field, tokens, f"a token of the table {other.name}")
         return rows
 
-    def _numbers(self, column: list[Any], field: str, shape: tuple[int, ...], first_row: int = 0) -> Array:
-        """Finite numbers of one shape per record, float64."""
+    def _numbers(
+        self, column: list[Any], field: str, shape: tuple[int, ...], first_row: int = 0, finite: bool = True
+    ) -> Array:
+        """Numbers of one shape per record, float64."""
         try:
             raw = np.array(column) if column else np.zeros((0, *shape))
         except ValueError:  # ragged
@@ -129,9 +131,9 @@ class Table:
             row = _first(column, lambda value: not _is_numeric(value, shape))
             self.fail(first_row + row, field, column[row], f"{'x'.join(map(str, shape))} numbers")
         result = raw.astype(np.float64)
-        finite = np.isfinite(result).reshape(len(column), -1).all(axis=1)
-        if not finite.all():
-            row = int(np.argmin(finite))
+        good = np.isfinite(result).all(axis=tuple(range(1, result.ndim)))
+        if finite and not good.all():
+            row = int(np.argmin(good))
             self.fail(first_row + row, field, column[row], "finite numbers")
         return result
 

@@ -163,7 +163,7 @@ def paint_gaussians(axes: Axes, gaussians: PictureGaussians | None) -> None:
             continue
         edge = np.tile(to_rgba(SOURCE_COLOURS[SOURCES[source]]), (len(rows), 1))
         face = edge.copy()
-        edge[:, 3] = 0.25 + 0.7 * opacity[rows]
+        edge[:, 3] = 0.4 + 0.6 * opacity[rows]
         face[:, 3] = 0.35 * opacity[rows]
         axes.add_collection(
             PolyCollection(outlines[rows], facecolors=face, edgecolors=edge, linewidths=0.9, zorder=2.5), autolim=False

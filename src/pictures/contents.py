@@ -47,7 +47,7 @@ SOURCE_COLOURS: dict[str, Colour] = {
 }
 INK = "#1B1F24"
 MUTED = "#8A929B"
-OCCUPANCY_COLOUR = (0.93, 0.67, 0.10)
+OCCUPANCY_COLOUR = (0.62, 0.47, 0.82)
 BOX_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 FRONT_FACE = (0, 1, 5, 4)
 MATCH_DISTANCE_M = 2.0

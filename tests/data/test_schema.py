@@ -44,8 +44,7 @@ def case(table, row, change, *words, name):
         case("sample", 1, {"token": token("sample", "train-0")}, "token of its own", name="duplicate-token"),
         case("sample", 1, {"token": ""}, "not empty", name="empty-token"),
         case("sample", 1, {"timestamp": int(START_S * 1e6)}, "earlier", name="equal-times"),
-        case("sample", 1, {"timestamp": int(START_S * 1e6), "prev": ""}, "another time than", name="equal-unlinked"),
-        case("sample", 2, {"timestamp": int(START_S * 1e6) - 5}, "later", name="reversed-times"),
+        case("sample", 2, {"timestamp": int(START_S * 1e6) - 5}, "earlier", name="reversed-times"),
         case("sample", 1, {"timestamp": 1.5}, "1.5", "int", name="float-time"),
         case("sample", 1, {"timestamp": 10**30}, "64 bits", name="huge-time"),
         case("ego_pose", 0, {"rotation": [2.0, 0, 0, 0]}, "[2.0, 0.0", "length 1", name="not-unit"),
@@ -58,14 +57,14 @@ def case(table, row, change, *words, name):
         case("attribute", 0, {"name": "vehicle.flying"}, "vehicle.flying", name="unknown-attribute"),
         case("sample_annotation", 0, {"attribute_tokens": [token("attribute", "vehicle.moving")] * 2}, "at most one",
              name="two-attributes"),
-        case("sample_annotation", 0, {"size": [1.0, 0.0, 1.0]}, "above 0", name="zero-size"),
-        case("sample_annotation", 0, {"size": [1.0, -2.0, 1.0]}, "-2.0", name="negative-size"),
-        case("sample_annotation", 0, {"translation": [float("nan"), 0, 0]}, "finite", name="nan-centre"),
         case("sample_annotation", 1, {"prev": token("sample_annotation", "train", "sign", 0)}, "same instance",
              name="chain-of-another"),
         case("sample_data", 0, {"filename": "/etc/passwd"}, "/etc/passwd", "outside the dataset", name="absolute"),
         case("sample_data", 0, {"filename": "samples/../../x"}, "outside the dataset", name="parent"),
         case("sample_data", 0, {"width": 0}, "pixels", name="no-width"),
+        case("sample_data", 0, {"width": 120}, "[120, 114]", "principal point", name="calibration-of-another-size"),
+        case("sample_data", 30, {"prev": token("sample_data", "CAMERA_LEFT_FRONT", int(START_S * 1e6) + 19_000)},
+             "same channel", name="file-chain-of-another"),
         case("scene", 1, {"name": "scene-train-0"}, "of its own", name="same-scene-name"),
     ],
 )  # fmt: skip
@@ -77,6 +76,38 @@ def test_bad_values_are_named(broken_tables, table, row, change, words):
     assert f"{table}.json" in text and "restore the file" in text
     for word in words:
         assert word in text
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"size": [1.0, 0.0, 1.0]}, {"size": [1.0, -2.0, 1.0]}, {"translation": [float("nan"), 0, 0]}],
+    ids=["zero-size", "negative-size", "nan-centre"],
+)
+def test_boxes_that_cannot_be_are_left_out_and_counted(broken_tables, caplog, change):
+    record = broken_tables.edit("sample_annotation", 0, **change)
+    index = build(broken_tables)
+    assert np.diff(index.box_starts).tolist() == [1, 2, 1, 2, 2, 1]
+    assert "1 annotations" in caplog.text and record["token"] in caplog.text
+    assert np.isfinite(index.box_centers).all() and (index.box_sizes > 0).all()
+
+
+def test_sweeps_of_another_scene_are_not_linked(broken_tables):
+    """A chain across scenes would mix radar sweeps of two drives."""
+    records = broken_tables.records("sample_data")
+    name = "RADAR_LEFT_SIDE"
+    of_channel = [row for row, record in enumerate(records) if f"/{name}/" in record["filename"]]
+    starts = [row for row in of_channel if not records[row]["prev"]]
+    last_of_first = of_channel[of_channel.index(starts[1]) - 1]
+    broken_tables.edit("sample_data", starts[1], prev=records[last_of_first]["token"])
+    with pytest.raises(DataError, match="same channel and scene"):
+        build(broken_tables)
+
+
+def test_equal_times_of_samples_that_are_not_linked(broken_tables):
+    broken_tables.edit("sample", 0, next="")
+    broken_tables.edit("sample", 1, prev="", timestamp=int(START_S * 1e6))
+    with pytest.raises(DataError, match=f"another time than sample '{token('sample', 'train-0')}'"):
+        build(broken_tables)
 
 
 def test_error_names_the_record(broken_tables):

@@ -22,9 +22,9 @@ IMAGE_PX = (114, 240)  # height, width
 SPEED_MPS, YAW_RATE = 20.0, 0.2
 START_S = 1_695_473_000.0
 ORIGIN = np.array([691_000.0, 5_334_000.0, 0.0])
-TARGET_VELOCITY = np.array([-9.0, 14.0, 0.0])  # global
+TARGET_VELOCITY = np.array([14.0, 9.0, 0.0])  # global
 STATIC = ORIGIN + np.random.default_rng(3).uniform([-80, -80, 0], [80, 80, 6], size=(20, 3))
-BLOB = ORIGIN + np.array([16.0, 1.0, 1.5])  # seen by CAMERA_LEFT_FRONT
+BLOB = ORIGIN + np.array([36.0, 17.0, 1.5])  # seen by both front cameras of the first frames
 
 
 def token(*names: object) -> str:
@@ -154,7 +154,8 @@ def write_scene(writer: Writer, number: int, split: str) -> None:
     names = [f"{split}-{k}" for k in range(3)]
     links = ["", *(token("sample", name) for name in names), ""]
     for k, name in enumerate(names):
-        writer.add("sample", name, timestamp=keys[k], scene_token=token("scene", split), prev=links[k], next=links[k + 2])
+        writer.add("sample", name, timestamp=keys[k], scene_token=token("scene", split), prev=links[k],
+                   next=links[k + 2])  # fmt: skip
     writer.add("scene", split, name=f"scene-{split}-0", description="weather.clear;area.highway", log_token="",
                nbr_samples=3, first_sample_token=links[1], last_sample_token=links[3],
                weather_annotation_token="")  # fmt: skip
@@ -163,7 +164,7 @@ def write_scene(writer: Writer, number: int, split: str) -> None:
     for order, channel in enumerate((*CAMERAS, *RADARS, "LIDAR_LEFT")):
         radar = channel in RADARS
         # Radar key frames lie up to 7 ms beside the sample, the first one after it.
-        shift = 0 if channel == "LIDAR_LEFT" else 7_000 - 3_000 * order
+        shift = 0 if channel == "LIDAR_LEFT" else 19_000 - 3_000 * order
         stamps = [base + 50_000 * j + shift for j in range(-10 if radar else 0, 21)]
         stamps = [t for t in stamps if radar or (t - base - shift) % 500_000 == 0]
         tokens = ["", *(token("sample_data", channel, t) for t in stamps), ""]
@@ -228,10 +229,10 @@ class DataSet:
     def table(self, name: str) -> Path:
         return self.root / VERSION / f"{name}.json"
 
-    def edit(self, name: str, row: int, **fields: Any) -> dict[str, Any]:
-        records = json.loads(self.table(name).read_text())
+    def edit(self, table: str, row: int, /, **fields: Any) -> dict[str, Any]:
+        records = json.loads(self.table(table).read_text())
         records[row].update(fields)
-        self.table(name).write_text(json.dumps(records))
+        self.table(table).write_text(json.dumps(records))
         return records[row]
 
     def records(self, name: str) -> list[dict[str, Any]]:

@@ -19,7 +19,7 @@ from src.structures.sparse_bev import SparseBEV, SparseMap
 
 # x, y, z (m), rcs (dB), vx, vy (m/s), dt (s) divided by these (spec section 1.3)
 POINT_SCALES = (150.0, 150.0, 5.0, 20.0, 20.0, 20.0, 0.5)
-BACKBONE_NORM = {"eps": 1e-3, "momentum": 0.01}
+BACKBONE_NORM_EPS = 1e-3
 SHARED_NORM = {"eps": 1e-5, "momentum": 0.1}  # the public code leaves torch's defaults here
 
 
@@ -42,6 +42,7 @@ class RadarEncoderConfig:
     blocks_per_stage: int  # residual blocks
     max_voxels: int  # guard, per sample
     conv_out: ConvOut
+    norm_momentum: float  # weight of a new batch in the running statistics; few steps need a large one
     point_count_channel: bool  # log of the number of points as one more input channel
 
     def __post_init__(self) -> None:
@@ -57,6 +58,8 @@ class RadarEncoderConfig:
         for key, value, least in (("blocks_per_stage", self.blocks_per_stage, 0), ("max_voxels", self.max_voxels, 1)):
             if value < least:
                 raise ConfigError(f"model.radar_encoder.{key}={value}: must be at least {least}")
+        if not 0 < self.norm_momentum <= 1:
+            raise ConfigError(f"model.radar_encoder.norm_momentum={self.norm_momentum}: must lie in (0, 1]")
 
 
 class RadarEncoder(nn.Module):
@@ -84,17 +87,18 @@ class RadarEncoder(nn.Module):
         self.input_shape = plane if self.ndim == 2 else (layers + 1, *plane)
         self.register_buffer("point_scales", torch.tensor(POINT_SCALES), persistent=False)
 
+        norm = {"eps": BACKBONE_NORM_EPS, "momentum": config.norm_momentum}
         inputs = len(POINT_SCALES) + config.point_count_channel
-        self.conv_input = ConvNormReLU(SubmanifoldConv(inputs, widths[0], 3, self.ndim, bias=False), **BACKBONE_NORM)
+        self.conv_input = ConvNormReLU(SubmanifoldConv(inputs, widths[0], 3, self.ndim, bias=False), **norm)
         self.stages = nn.ModuleList(
-            _stage(widths[index - 1] if index else None, width, config.blocks_per_stage, self.ndim)
+            _stage(widths[index - 1] if index else None, width, config.blocks_per_stage, self.ndim, norm)
             for index, width in enumerate(widths)
         )
         if config.conv_out is ConvOut.sparse:
             conv_out = SparseConv(widths[-1], channels, 3, 2, bias=False, stride=1, padding=1)
         else:
             conv_out = SubmanifoldConv(widths[-1], channels, 3, 2, bias=False)
-        self.conv_out = ConvNormReLU(conv_out, **BACKBONE_NORM)
+        self.conv_out = ConvNormReLU(conv_out, **norm)
         self.shared_conv = ConvNormReLU(SubmanifoldConv(channels, channels, 3, 2, bias=True), **SHARED_NORM)
 
     def forward(
@@ -164,13 +168,13 @@ class RadarEncoder(nn.Module):
         return SparseBEV(sites, features)
 
 
-def _stage(in_channels: int | None, channels: int, blocks: int, ndim: int) -> nn.Sequential:
+def _stage(in_channels: int | None, channels: int, blocks: int, ndim: int, norm: dict[str, float]) -> nn.Sequential:
     """Residual blocks, behind a convolution of stride 2 unless the stage is the first (`in_channels` None)."""
     layers: list[nn.Module] = []
     if in_channels is not None:
         conv = SparseConv(in_channels, channels, 3, ndim, bias=False, stride=2, padding=1)
-        layers.append(ConvNormReLU(conv, **BACKBONE_NORM))
-    layers += [ResidualBlock(channels, ndim, **BACKBONE_NORM) for _ in range(blocks)]
+        layers.append(ConvNormReLU(conv, **norm))
+    layers += [ResidualBlock(channels, ndim, **norm) for _ in range(blocks)]
     return nn.Sequential(*layers)
 
 

@@ -20,6 +20,7 @@ PILLARS = RadarEncoderConfig(
     blocks_per_stage=1,
     max_voxels=10_000,
     conv_out=ConvOut.subm,
+    norm_momentum=0.01,
     point_count_channel=True,
 )
 VOXELS = replace(PILLARS, voxel_size_m=[0.2, 0.2, 1.0], stage_channels=[4, 6, 8, 8], conv_out=ConvOut.sparse)
@@ -29,6 +30,7 @@ FULL = RadarEncoderConfig(
     blocks_per_stage=2,
     max_voxels=60_000,
     conv_out=ConvOut.sparse,
+    norm_momentum=0.01,
     point_count_channel=False,
 )
 both = pytest.mark.parametrize("config", [PILLARS, VOXELS], ids=["pillars", "voxels"])

@@ -170,6 +170,7 @@ def make_config():
                 blocks_per_stage=1,
                 max_voxels=10000,
                 conv_out=ConvOut.subm,
+                norm_momentum=0.01,
                 point_count_channel=True,
             ),
             kggi=None if radar_only else KGGIConfig(**kggi),

@@ -1,0 +1,105 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_set import pcd_bytes
+
+from src.data.pcd import RADAR_FIELDS, read_radar_points
+from src.errors import DataError
+
+POINTS = np.random.default_rng(0).normal(size=(9, 7)).astype(np.float32)
+REAL = Path(__file__).resolve().parents[3] / "shared/real/truckscenes_radar"
+
+
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "RADAR_1.pcd"
+
+
+def test_binary_and_ascii(file):
+    file.write_bytes(pcd_bytes(POINTS))
+    np.testing.assert_array_equal(read_radar_points(file), POINTS)
+    file.write_bytes(pcd_bytes(POINTS, data="ascii"))
+    np.testing.assert_array_equal(read_radar_points(file), POINTS)
+    file.write_bytes(pcd_bytes(POINTS[:1], data="ascii"))
+    np.testing.assert_array_equal(read_radar_points(file), POINTS[:1])
+
+
+def test_fields_are_taken_by_name(file):
+    order = [6, 2, 0, 1, 5, 4, 3]
+    file.write_bytes(pcd_bytes(POINTS[:, order], fields=" ".join(RADAR_FIELDS[i] for i in order)))
+    np.testing.assert_array_equal(read_radar_points(file), POINTS)
+
+
+def test_other_types_are_converted(file):
+    content = pcd_bytes(POINTS).replace(b"TYPE F F F F F F F", b"TYPE F F F F F F I")
+    rcs = np.arange(9, dtype="<i4").view("<f4")
+    body = np.concatenate([POINTS[:, :6], rcs[:, None]], axis=1).astype("<f4").tobytes()
+    file.write_bytes(content[: -len(body)] + body)
+    assert read_radar_points(file)[:, 6].tolist() == list(range(9))
+
+
+@pytest.mark.parametrize("data", ["binary", "ascii"])
+def test_no_point_is_fine(file, data):
+    file.write_bytes(pcd_bytes(POINTS[:0], data=data))
+    assert read_radar_points(file).shape == (0, 7)
+
+
+def replaced(old, new):
+    return pcd_bytes(POINTS).replace(old, new)
+
+
+@pytest.mark.parametrize(
+    "content, words",
+    [
+        (pcd_bytes(POINTS)[:-40], "9 points end at byte 436, but the file has 396 bytes"),
+        (pcd_bytes(POINTS)[:60], "no DATA line"),
+        (b"", "no DATA line"),
+        (b"hello\n", "no DATA line"),
+        (bytes(range(256)) * 100, "no DATA line"),
+        (pcd_bytes(POINTS, fields="x y z vrel_x vrel_y vrel_z snr"), r"\['rcs'\] are not in"),
+        (replaced(b"HEIGHT 1", b"HEIGHT 2"), "WIDTH x HEIGHT"),
+        (replaced(b"POINTS 9", b"POINTS 8"), "WIDTH x HEIGHT"),
+        (replaced(b"WIDTH 9", b"WIDTH -9"), "WIDTH must be one whole number"),
+        (replaced(b"WIDTH 9", b"WIDTH 4000000000").replace(b"POINTS 9", b"POINTS 4000000000"), "at most 1000000"),
+        (replaced(b"SIZE 4 4", b"SIZE 4"), "one entry per field"),
+        (replaced(b"SIZE 4", b"SIZE 3"), "SIZE 3, which is not supported"),
+        (replaced(b"COUNT 1", b"COUNT 2"), "COUNT 1"),
+        (replaced(b"DATA binary", b"DATA gzip"), "binary or ascii"),
+        (pcd_bytes(np.where(POINTS == POINTS[4, 2], np.nan, POINTS)), "point 4 is not finite"),
+        (pcd_bytes(np.where(POINTS == POINTS[2, 5], np.inf, POINTS)), "point 2 is not finite"),
+        (pcd_bytes(POINTS, data="ascii") + b"7 7", "63 numbers|65 numbers|9 points of 7 fields"),
+        (pcd_bytes(POINTS[:0], data="ascii").replace(b" 0\n", b" 1\n") + b"a b c d e f g", "not a number"),
+    ],
+)
+def test_bad_files_name_file_and_fault(file, content, words):
+    file.write_bytes(content)
+    with pytest.raises(DataError, match=words) as error:
+        read_radar_points(file)
+    assert str(file) in str(error.value)
+
+
+def test_missing_file(file):
+    with pytest.raises(DataError, match="No such file"):
+        read_radar_points(file)
+
+
+def test_real_sweep():
+    if not REAL.is_dir():
+        pytest.skip(f"{REAL} is not there")
+    (path,) = REAL.glob("*.pcd")
+    points = read_radar_points(path).astype(np.float64)
+    assert points.shape == (612, 7)
+    distance = np.linalg.norm(points[:, :3], axis=1)
+    assert distance.min() > 9.8 and distance.max() < 190
+    np.testing.assert_array_equal(points[:, 6], np.round(points[:, 6]))
+    unit = points[:, :3] / distance[:, None]
+    radial = (points[:, 3:6] * unit).sum(1, keepdims=True) * unit
+    np.testing.assert_allclose(points[:, 3:6], radial, atol=1e-4)  # vrel is purely radial
+
+
+def test_pypcd4_agrees(file):
+    pypcd4 = pytest.importorskip("pypcd4", reason="comes with the devkit")
+    cloud = pypcd4.PointCloud.from_points(POINTS, RADAR_FIELDS, (np.float32,) * 7)
+    cloud.save(str(file), pypcd4.Encoding.BINARY)
+    np.testing.assert_array_equal(read_radar_points(file), POINTS)

@@ -1,0 +1,283 @@
+"""One frame: radar compensation, projection under augmentation, boxes, bad files (spec section 15, points 5 to 7)."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tiny_set import BLOB, START_S, STATIC, TARGET_VELOCITY, VERSION, ego_pose, mount, pcd_bytes, reader_settings
+
+from src.data.augment import AugmentationConfig, BevAugmentationConfig, ImageAugmentationConfig
+from src.data.cache import load_index
+from src.data.pcd import read_radar_points
+from src.data.reader import FrameReader, OnBadFile, compensate_sweeps, ego_motion
+from src.errors import DataError
+from src.geometry.camera import project
+from src.geometry.transforms import invert_rigid, quaternion_to_matrix, rigid
+from src.structures.taxonomy import CAMERAS, CLASSES, RADARS
+
+REAL = Path(__file__).resolve().parents[3] / "shared/real/truckscenes_radar"
+AUGMENTATION = AugmentationConfig(
+    image=ImageAugmentationConfig(resize=[-0.06, 0.11], rotation_deg=5.4, flip_probability=0.5),
+    bev=BevAugmentationConfig(scale=[0.95, 1.05], rotation_rad=0.3925, flip_probability=0.5),
+)
+KEY_S = START_S + 0.5  # of sample 1
+TARGET_RCS = len(STATIC)
+
+
+def apply(matrix, points):
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+@pytest.fixture(scope="module")
+def frame(data_set):
+    return data_set.reader().read(1, None)
+
+
+def split_points(frame):
+    points = frame.radar_points.double().numpy()
+    moving = points[:, 3] == TARGET_RCS
+    return points[~moving], points[moving]
+
+
+def test_static_points_stand_still_and_coincide(frame):
+    """Seen by six turned and tilted mounts, one upside down, on a truck that drives a curve."""
+    static, _ = split_points(frame)
+    assert len(static) == 6 * 10 * len(STATIC)
+    assert np.abs(static[:, 4:6]).max() < 5e-3  # the truck does 20 m/s
+    truth = apply(invert_rigid(ego_pose(KEY_S)), STATIC)
+    np.testing.assert_allclose(static[:, :3], truth[static[:, 3].astype(int)], atol=2e-3)
+
+
+def test_moving_target_keeps_its_radial_velocity(frame):
+    _, moving = split_points(frame)
+    ego_from_global = invert_rigid(ego_pose(KEY_S))
+    for k, channel in enumerate(RADARS):
+        for row in moving[10 * k : 10 * (k + 1)]:
+            sensor = apply(ego_from_global, (ego_pose(KEY_S - row[6]) @ mount(channel))[:3, 3])
+            unit = (row[:3] - sensor) / np.linalg.norm(row[:3] - sensor)
+            truth = (TARGET_VELOCITY @ ego_from_global[:3, :3].T) @ unit * unit
+            np.testing.assert_allclose(row[4:6], truth[:2], atol=0.01)
+    assert np.linalg.norm(moving[:, 4:6], axis=1).max() > 10
+
+
+def test_age_of_sweeps_is_signed(frame):
+    ages = frame.radar_points[:, 6].double().numpy().reshape(6, 10, -1)[:, :, 0]
+    np.testing.assert_allclose(np.diff(ages, axis=1), 0.05, atol=1e-6)
+    np.testing.assert_allclose(ages[:, 0], np.array([-7, -4, -1, 2, 5, 8]) / 1000, atol=1e-6)  # late files are negative
+
+
+def test_sweeps_end_where_the_scene_begins(data_set):
+    frame = data_set.reader(num_sweeps=15, image_size_px=None).read(0, None)
+    assert len(frame.radar_points) == 6 * 11 * 21 and frame.images is None
+
+
+def test_moved_points_meet_the_target(data_set):
+    """The target drives nearly straight away from the sensors, so radial propagation undoes most of the smear."""
+    spread = {}
+    for moved in (False, True):
+        _, target = split_points(data_set.reader(propagate_points=moved, image_size_px=None).read(1, None))
+        spread[moved] = np.ptp(target[:10, :2], axis=0).max()
+    assert spread[False] > 4 and spread[True] < 0.6 * spread[False]
+
+
+def test_near_points_are_dropped(data_set, broken_files):
+    index = load_index(broken_files.root, VERSION, None)
+    cloud = np.zeros((4, 7))
+    cloud[:, :3] = [[0.9, -0.9, 3], [0.9, 1.1, 0], [1.1, 0.2, 0], [0, 0, 0]]
+    row = index.key_data[1, len(CAMERAS)]
+    (broken_files.root / index.filename(row)).write_bytes(pcd_bytes(cloud))
+    frame = broken_files.reader(num_sweeps=1, image_size_px=None).read(1, None)
+    assert int((frame.radar_points[:, 6] == frame.radar_points[0, 6]).sum()) == 2
+
+
+def test_ego_motion_on_the_circle(data_set):
+    index = load_index(data_set.root, VERSION, None)
+    times = index.data_times_us[:40]
+    rotations = quaternion_to_matrix(index.pose_rotations[index.data_poses[:40]])
+    velocity, rate = ego_motion(index, times, rotations)
+    for row, time in enumerate(times):
+        pose = ego_pose(1e-6 * time)
+        heading = 0.3 + 0.2 * (1e-6 * time - START_S)
+        global_velocity = 20 * np.array([np.cos(heading), np.sin(heading), 0])
+        np.testing.assert_allclose(velocity[row], global_velocity @ pose[:3, :3], atol=0.3)  # one-sided at the ends
+        np.testing.assert_allclose(rate[row], [0, 0, 0.2] @ pose[:3, :3], atol=1e-3)
+
+
+def test_jumping_and_sparse_poses_are_refused(broken_tables):
+    index = load_index(broken_tables.root, VERSION, None)
+    stamp, rotations = index.data_times_us[:1], np.eye(3)[None]
+    jump = index.pose_translations.copy()
+    jump[index.pose_times_us > stamp[0]] += 100
+    with pytest.raises(DataError, match="ego_pose.json.*m/s"):
+        ego_motion(replace(index, pose_translations=jump), stamp, rotations)
+    with pytest.raises(DataError, match="fewer than two ego poses"):
+        ego_motion(replace(index, pose_times_us=index.pose_times_us * 100), stamp * 100, rotations)
+
+
+def test_real_sweep_is_explained_by_one_speed(data_set):
+    if not REAL.is_dir():
+        pytest.skip(f"{REAL} is not there")
+    (path,) = REAL.glob("*.pcd")
+    times = START_S * 1e6 + np.arange(-20, 21) * 10_000
+    index = load_index(data_set.root, VERSION, None)
+    turn = np.deg2rad(-19.6) / 2
+    index = replace(
+        index,
+        pose_times_us=times.astype(np.int64),
+        pose_translations=np.stack([23.8 * (1e-6 * times - START_S), *np.zeros((2, 41))], axis=1),
+        pose_rotations=np.tile([1.0, 0, 0, 0], (41, 1)),
+        data_times_us=np.array([START_S * 1e6]).astype(np.int64),
+        data_poses=np.array([20]),
+        data_calibrations=np.array([0]),
+        ego_from_sensor=rigid(quaternion_to_matrix([np.cos(turn), 0, 0, np.sin(turn)]), [5.26, 1.23, 2.01])[None],
+    )
+    points = compensate_sweeps(
+        index, np.array([0]), [read_radar_points(path)], int(START_S * 1e6), np.eye(4), reader_settings()
+    )
+    slow = np.linalg.norm(points[:, 4:6], axis=1) < 0.6
+    assert len(points) == 612 and slow.sum() >= 535
+
+
+@pytest.mark.parametrize("image", [True, False])
+def test_projection_follows_the_picture_under_augmentation(data_set, image):
+    """The spot painted at BLOB appears where P_n maps the augmented 3D point."""
+    augmentation = AUGMENTATION if image else replace(AUGMENTATION, image=None)
+    reader = data_set.reader(image_size_px=(76, 160))
+    frames = [reader.read(sample, augmentation, 0, epoch) for epoch in range(8) for sample in (0, 1)]
+    found = sum(spots_in_place(frame) for frame in frames)
+    assert found >= (12 if image else 16)  # a strong crop may cut the spot off
+
+
+def spots_in_place(frame):
+    """Number of views that show the whole spot; it must lie where the projection says."""
+    aug_from_global = frame.aug_from_ego[0].double().numpy() @ invert_rigid(frame.global_from_ego[0].numpy())
+    found = 0
+    for view in range(4):
+        picture = frame.images[0, view, 0].numpy().astype(float)
+        if picture.max() < 150:
+            continue
+        pixel, depth = project(apply(aug_from_global, BLOB), frame.pix_from_aug[0, view].double().numpy())
+        picture[picture < 50] = 0
+        y, x = np.mgrid[: picture.shape[0], : picture.shape[1]] + 0.5
+        centroid = np.array([(picture * x).sum(), (picture * y).sum()]) / picture.sum()
+        if 6 < centroid[0] < 154 and 6 < centroid[1] < 70:
+            np.testing.assert_allclose(pixel, centroid, atol=0.35)
+            assert 15 < depth < 45
+            found += 1
+    return found
+
+
+def test_augmentation_moves_points_and_boxes_together(data_set):
+    reader = data_set.reader(image_size_px=None)
+    plain, turned = reader.read(1, None), reader.read(1, AUGMENTATION, 0, 3)
+    matrix = turned.aug_from_ego[0].double().numpy()
+    assert not np.allclose(matrix, np.eye(4))
+    before, after = plain.radar_points.double().numpy(), turned.radar_points.double().numpy()
+    np.testing.assert_allclose(after[:, :3], apply(matrix, before[:, :3]), atol=1e-4)
+    np.testing.assert_allclose(after[:, 4:6], before[:, 4:6] @ matrix[:2, :2].T, atol=1e-5)
+    np.testing.assert_array_equal(after[:, [3, 6]], before[:, [3, 6]])
+    old, new = plain.boxes[0], turned.boxes[0]
+    np.testing.assert_allclose(new.centers, apply(matrix, old.centers.double().numpy()), atol=1e-4)
+    np.testing.assert_allclose(new.sizes, old.sizes * abs(np.cbrt(np.linalg.det(matrix))), rtol=1e-5)
+
+
+def test_draws_depend_on_seed_epoch_and_token_alone(data_set):
+    reader = data_set.reader()
+    first = reader.read(2, AUGMENTATION, 5, 1)
+    reader.read(0, AUGMENTATION, 5, 1)
+    again = data_set.reader().read(2, AUGMENTATION, 5, 1)
+    assert torch.equal(first.images, again.images) and torch.equal(first.radar_points, again.radar_points)
+    for seed, epoch in ((5, 2), (6, 1)):
+        assert not torch.equal(first.aug_from_ego, reader.read(2, AUGMENTATION, seed, epoch).aug_from_ego)
+    other = reader.read(1, AUGMENTATION, 5, 1)
+    assert not torch.equal(first.aug_from_ego, other.aug_from_ego)
+    matrices = first.pix_from_aug[0]
+    assert not torch.allclose(matrices[0, :, :3], matrices[1, :, :3])
+
+
+def test_boxes_in_ego(frame, data_set):
+    boxes = frame.boxes[0]  # rack and stroller are left out
+    assert [CLASSES[label] for label in boxes.labels] == ["car"] and boxes.num_points.tolist() == [6]
+    np.testing.assert_allclose(boxes.sizes[0], [4.6, 1.9, 1.6])
+    rotation = invert_rigid(ego_pose(KEY_S))[:3, :3]
+    np.testing.assert_allclose(boxes.velocities[0], (rotation @ TARGET_VELOCITY)[:2], atol=1e-4)
+    assert float(boxes.yaws[0]) == pytest.approx(2.1 - 0.3 - 0.1, abs=2e-3)  # heading is 0.3 + 0.2 * 0.5
+    first = data_set.reader(image_size_px=None).read(0, None).boxes[0]
+    assert torch.isnan(first.velocities[1]).all() and first.attributes[1] >= 0
+
+
+def radar_path(data_set, sample=1):
+    index = load_index(data_set.root, VERSION, None)
+    return data_set.root / index.filename(index.key_data[sample, len(CAMERAS)]), str(index.sample_tokens[sample])
+
+
+def test_bad_files_stop_or_are_counted(broken_files, caplog):
+    radar, token = radar_path(broken_files)
+    radar.write_bytes(radar.read_bytes()[:-5])
+    index = load_index(broken_files.root, VERSION, None)
+    (broken_files.root / index.filename(index.key_data[1, 2])).unlink()
+    with pytest.raises(DataError, match=f"{radar.name}.*{token}.*data.on_bad_file=skip"):
+        broken_files.reader().read(1, None)
+    reader = broken_files.reader(on_bad_file=OnBadFile.skip)
+    for _ in range(2):
+        frame = reader.read(1, None)
+        assert frame.skipped == {RADARS[0]: 1, CAMERAS[2]: 1}
+        assert frame.image_valid.tolist() == [[True, True, False, True]] and not frame.images[0, 2].any()
+        assert len(frame.radar_points) == (60 - 1) * 21
+    assert caplog.text.count(radar.name) == 1  # told once
+
+
+def test_link_out_of_the_data_set_is_refused(broken_files, tmp_path_factory):
+    radar, _ = radar_path(broken_files)
+    outside = tmp_path_factory.mktemp("outside") / "x.pcd"
+    radar.rename(outside)
+    radar.symlink_to(outside)
+    with pytest.raises(DataError, match="outside the dataset folder"):
+        broken_files.reader().read(1, None)
+
+
+def test_sensors_that_were_not_recorded_are_masked(broken_files):
+    gone = (CAMERAS[1], RADARS[3])
+    records = [r for r in broken_files.records("sample_data") if r["filename"].split("/")[1] not in gone]
+    broken_files.table("sample_data").write_text(json.dumps(records))
+    frame = broken_files.reader().read(1, None)
+    assert frame.image_valid.tolist() == [[True, False, True, True]]
+    assert frame.skipped == {f"{name} (not recorded)": 1 for name in gone}
+    assert torch.linalg.inv(frame.pix_from_aug).isfinite().all()
+
+
+def test_nothing_at_all_is_a_frame(broken_files):
+    records = [r for r in broken_files.records("sample_data") if "LIDAR" in r["filename"]]
+    broken_files.table("sample_data").write_text(json.dumps(records))
+    broken_files.table("sample_annotation").write_text("[]")
+    broken_files.table("instance").write_text("[]")
+    frame = broken_files.reader().read(1, AUGMENTATION)
+    assert frame.radar_points.shape == (0, 7) and len(frame.boxes[0]) == 0 and not frame.image_valid.any()
+
+
+def test_devkit_agrees(data_set):
+    """Positions and lags of the devkit's multi-sweep reader, boxes and velocities of its evaluation."""
+    devkit = pytest.importorskip("truckscenes", reason="devkit not installed")
+    from truckscenes.utils.data_classes import RadarPointCloud
+
+    scenes = devkit.TruckScenes(VERSION, str(data_set.root), verbose=False)
+    reader = FrameReader(load_index(data_set.root, VERSION, None), reader_settings(num_sweeps=7, image_size_px=None))
+    for row, sample in enumerate(scenes.sample):
+        frame = reader.read(row, None)
+        clouds, lags = [], []
+        for channel in RADARS:
+            cloud, lag = RadarPointCloud.from_file_multisweep(scenes, sample, channel, "LIDAR_LEFT", 7)
+            clouds.append(apply(mount("LIDAR_LEFT"), cloud.points[:3].T))
+            lags.append(lag[0])
+        np.testing.assert_allclose(frame.radar_points[:, :3], np.concatenate(clouds), atol=2e-3)
+        np.testing.assert_allclose(frame.radar_points[:, 6], np.concatenate(lags), atol=1e-6)
+        pose = ego_pose(1e-6 * sample["timestamp"])
+        category = {token: scenes.get("sample_annotation", token)["category_name"] for token in sample["anns"]}
+        kept = [token for token, name in category.items() if name in ("vehicle.car", "static_object.traffic_sign")]
+        truth = np.array([scenes.box_velocity(t) for t in kept]) @ pose[:3, :3]
+        np.testing.assert_allclose(frame.boxes[0].velocities, truth[:, :2], atol=1e-4)
+        centres = np.array([scenes.get_box(t).center for t in kept])
+        np.testing.assert_allclose(frame.boxes[0].centers, apply(invert_rigid(pose), centres), atol=1e-4)

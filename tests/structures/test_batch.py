@@ -1,0 +1,73 @@
+import dataclasses
+
+import pytest
+import torch
+
+from src.structures.batch import FrameBatch
+from src.structures.boxes import Boxes3D
+
+
+def batch(**changes):
+    values = {
+        "tokens": ["a", "b", "c"],
+        "timestamps_s": torch.arange(3, dtype=torch.float64),
+        "global_from_ego": torch.eye(4, dtype=torch.float64).repeat(3, 1, 1),
+        "aug_from_ego": torch.eye(4).repeat(3, 1, 1),
+        "radar_points": torch.arange(28.0).reshape(4, 7),
+        "radar_batch": torch.tensor([0, 0, 2, 2]),
+        "images": torch.zeros(3, 4, 3, 8, 16, dtype=torch.uint8),
+        "image_valid": torch.ones(3, 4, dtype=torch.bool),
+        "pix_from_aug": torch.eye(4).repeat(3, 4, 1, 1),
+        "boxes": [Boxes3D.empty() for _ in range(3)],
+    }
+    return FrameBatch(**(values | changes))
+
+
+def test_a_sample_may_lack_points_boxes_and_images():
+    assert len(batch()) == 3
+    bare = batch(images=None, image_valid=None, pix_from_aug=None, boxes=None)
+    assert bare.images is None and bare.boxes is None and bare.skipped == {}
+    nothing = batch(radar_points=torch.zeros(0, 7), radar_batch=torch.zeros(0, dtype=torch.int64))
+    assert len(nothing) == 3
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("timestamps_s", torch.arange(3.0)),  # float32 loses the fraction of a second
+        ("global_from_ego", torch.eye(4).repeat(3, 1, 1)),  # and half a metre
+        ("aug_from_ego", torch.eye(4).repeat(2, 1, 1)),
+        ("radar_points", torch.zeros(4, 6)),
+        ("radar_batch", torch.tensor([0, 0, 2])),
+        ("radar_batch", torch.tensor([0, 2, 0, 2])),
+        ("radar_batch", torch.tensor([0, 0, 2, 3])),
+        ("radar_batch", torch.tensor([-1, 0, 0, 2])),
+        ("images", torch.zeros(3, 4, 3, 8, 16)),
+        ("images", torch.zeros(2, 4, 3, 8, 16, dtype=torch.uint8)),
+        ("image_valid", None),
+        ("image_valid", torch.ones(3, 4)),
+        ("pix_from_aug", torch.eye(4).repeat(3, 3, 1, 1)),
+        ("boxes", [Boxes3D.empty()]),
+    ],
+)
+def test_what_does_not_fit_is_named(name, value):
+    with pytest.raises(ValueError, match=f"FrameBatch.{name} must"):
+        batch(**{name: value})
+
+
+def test_moving_keeps_every_value():
+    original = batch(skipped={"RADAR_LEFT_SIDE": 2})
+    same = original.to("cpu")
+    assert same.tokens == original.tokens and same.skipped == original.skipped and len(same.boxes) == 3
+    for field in dataclasses.fields(FrameBatch):
+        value = getattr(original, field.name)
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(getattr(same, field.name), value)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_page_locked():
+    pinned = batch().pin_memory()
+    assert pinned.radar_points.is_pinned() and pinned.boxes[0].centers.is_pinned()
+    assert torch.equal(pinned.to("cuda", non_blocking=True).radar_points.cpu(), batch().radar_points)
