@@ -11,7 +11,6 @@ import platform
 import resource
 import statistics
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from torch import Tensor
 
 from src.assembly import build_datamodule, build_model, data_root
 from src.config import BenchmarkSuite, Config, compose_config, run_command
-from src.errors import DataError, HorizonError
+from src.errors import DataError
 from src.metrics.benchmark import compare_with_devkit
 from src.models.detector import Detector
 from src.ops.allocator import tune_cpu_allocator
@@ -62,7 +61,7 @@ def benchmark_model(config: Config) -> dict[str, Any]:
     torch.manual_seed(config.seed)
     config.data.batch_size, config.data.num_workers = 1, 0
     datamodule = build_datamodule(config, data_root(config))
-    batch = first_batch(iter(datamodule.train_dataloader()))
+    batch = next(iter(datamodule.train_dataloader()))
     device = torch.device("cuda" if torch.cuda.is_available() and config.trainer.accelerator != "cpu" else "cpu")
     model, batch = build_model(config).to(device).train(), batch.to(device)
     timings: dict[str, list[float]] = {}
@@ -129,7 +128,7 @@ def benchmark_reader(config: Config) -> dict[str, Any]:
     config.data.batch_size, config.data.num_workers = 1, 0
     datamodule = build_datamodule(config, data_root(config))
     batches = iter(datamodule.train_dataloader())
-    first_batch(batches)  # tables and first-use caches
+    next(batches)  # tables and first-use caches
     count, begin = 0, time.process_time()
     for _ in range(READER_FRAMES):
         if next(batches, None) is None:
@@ -137,14 +136,6 @@ def benchmark_reader(config: Config) -> dict[str, Any]:
         count += 1
     seconds = time.process_time() - begin
     return {"frames": count, "cpu_seconds": seconds, "frames_per_second": count / seconds}
-
-
-def first_batch(batches: Iterator[FrameBatch | HorizonError]) -> FrameBatch:
-    """The next batch; a fault that the loader met is raised."""
-    batch = next(batches)
-    if isinstance(batch, HorizonError):
-        raise batch
-    return batch
 
 
 def machine() -> dict[str, Any]:

@@ -46,6 +46,7 @@ class DetectionModule(L.LightningModule):
         self.metric = DetectionMetric(evaluation_set)
         self.loss_means = nn.ModuleDict()
         self.scores: DetectionScores | None = None
+        self.scored_step = -1
         self.skipped: dict[str, int] = {}
 
     # ---------------------------------------------------------------- training
@@ -136,6 +137,7 @@ class DetectionModule(L.LightningModule):
     def on_validation_epoch_end(self) -> None:
         """Score, and log the headline numbers; the full table stays in `scores`."""
         self.scores = self.metric.compute()
+        self.scored_step = self.trainer.global_step
         for name, value in self.scores.headline().items():
             self.log(f"val/{name}", value)
 

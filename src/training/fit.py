@@ -10,7 +10,7 @@ import lightning as L
 from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers.logger import Logger
 
-from src.data.datamodule import DetectionDataModule
+from src.data.datamodule import DetectionDataModule, dead_workers_named
 from src.errors import InterruptedRunError
 from src.training.checkpoints import AtomicCheckpointIO, read_checkpoint
 from src.training.detection import DetectionModule
@@ -106,8 +106,10 @@ def fit(
     """
     try:
         module.skipped.clear()
-        trainer.fit(module, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
-        trainer.validate(module, datamodule=datamodule, verbose=False)
+        with dead_workers_named():
+            trainer.fit(module, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
+            if module.scored_step != trainer.global_step:  # the last epoch was none to be validated
+                trainer.validate(module, datamodule=datamodule, verbose=False)
     except SystemExit as error:  # Lightning's way to end on Ctrl-C and SIGTERM
         raise InterruptedRunError("training was stopped; the same command goes on from the last checkpoint") from error
 

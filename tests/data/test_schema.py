@@ -32,6 +32,29 @@ def test_links_of_the_intact_set(data_set):
     assert np.isnan(index.box_velocities[1]).all()  # one annotation only
 
 
+def test_order_of_the_file_table_means_nothing(broken_tables):
+    """Sweeps name the following sample: only the key-frame flag tells them from its key frame."""
+    before = build(broken_tables)
+    broken_tables.table("sample_data").write_text(json.dumps(broken_tables.records("sample_data")[::-1]))
+    after = build(broken_tables)
+    known = before.key_data >= 0
+    np.testing.assert_array_equal(after.key_data >= 0, known)
+    names = [[index.filename(row) for row in index.key_data[known]] for index in (before, after)]
+    assert names[0] == names[1] and all(name.startswith("samples/") for name in names[0])
+
+
+def test_velocities_are_known_up_to_the_devkits_intervals(broken_tables):
+    """1.5 s to one neighbour, 3 s from the previous to the next."""
+    start = int(START_S * 1e6)
+    for row, seconds in ((1, 1.6), (2, 2.9)):
+        broken_tables.edit("sample", row, timestamp=start + round(seconds * 1e6))
+    index = build(broken_tables)
+    cars = index.box_velocities[[0, 2, 4]]  # in samples 0, 1 and 2
+    assert np.isnan(cars[0]).all()
+    np.testing.assert_allclose(cars[1], TARGET_VELOCITY / 2.9, atol=1e-6)  # 1 s of driving between first and last
+    np.testing.assert_allclose(cars[2], TARGET_VELOCITY / 2.6, atol=1e-6)
+
+
 def case(table, row, change, *words, name):
     return pytest.param(table, row, change, words, id=name)
 

@@ -169,7 +169,8 @@ def write_scene(writer: Writer, number: int, split: str) -> None:
         stamps = [t for t in stamps if radar or (t - base - shift) % 500_000 == 0]
         tokens = ["", *(token("sample_data", channel, t) for t in stamps), ""]
         for j, stamp in enumerate(stamps):
-            write_file(writer, channel, stamp, (stamp - base - shift) % 500_000 == 0, tokens[j], tokens[j + 2],
+            key = stamp >= base + shift and (stamp - base - shift) % 500_000 == 0
+            write_file(writer, channel, stamp, key, tokens[j], tokens[j + 2],
                        names[max(0, -((base + shift - stamp) // 500_000))])  # fmt: skip
     write_boxes(writer, split, names)
 
