@@ -44,7 +44,8 @@ class FrameBatch:
         self._expect("radar_batch", (self.radar_points.shape[0],), torch.int64)
         owners = self.radar_batch
         # Values are looked at where the batch is built; on a GPU the look would stall every step.
-        if owners.device.type == "cpu" and len(owners) and not (owners[0] >= 0 and owners[-1] < b and bool((owners.diff() >= 0).all())):
+        looked_at = owners.device.type == "cpu" and len(owners) > 0
+        if looked_at and not (owners[0] >= 0 and owners[-1] < b and bool((owners.diff() >= 0).all())):
             raise ValueError(f"FrameBatch.radar_batch must ascend within 0..{b - 1}")
         if self.images is not None:
             n, _, h, w = self.images.shape[1:]

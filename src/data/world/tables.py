@@ -15,23 +15,6 @@ Array = np.ndarray
 Row = dict[str, object]
 Tables = dict[str, list[Row]]
 
-TABLE_NAMES = (
-    "attribute",
-    "calibrated_sensor",
-    "category",
-    "ego_motion_cabin",
-    "ego_motion_chassis",
-    "ego_pose",
-    "instance",
-    "sample",
-    "sample_annotation",
-    "sample_data",
-    "scene",
-    "sensor",
-    "visibility",
-    "weather_annotation",
-)
-
 
 def token(*parts: object) -> str:
     """32 hexadecimal digits that depend on the parts alone."""

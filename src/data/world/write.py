@@ -13,10 +13,11 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from src.data.schema import TABLES
 from src.data.world.config import WorldConfig, stored_config, world_digest
 from src.data.world.rig import sensor_rig
 from src.data.world.scene_writer import write_scene
-from src.data.world.tables import TABLE_NAMES, Tables, shared_tables
+from src.data.world.tables import Tables, shared_tables
 from src.errors import ConfigError, DataError
 from src.structures.taxonomy import CAMERAS, LIDARS, RADARS
 
@@ -82,7 +83,7 @@ def _read_stored(root: Path) -> dict[str, object]:
         raise DataError(
             f"{root / CONFIG_FILE}: expected an object, but found {type(stored).__name__}; remove the folder"
         )
-    missing = [name for name in TABLE_NAMES if not (root / VERSION / f"{name}.json").is_file()]
+    missing = [name for name in TABLES if not (root / VERSION / f"{name}.json").is_file()]
     if missing:
         raise DataError(f"{root}: a synthetic world without its tables {missing}; remove the folder to make it again")
     return stored
@@ -95,7 +96,7 @@ def _fill(config: WorldConfig, folder: Path, progress: bool) -> None:
         (folder / "samples" / channel).mkdir(parents=True)
         if channel not in lidars:
             (folder / "sweeps" / channel).mkdir(parents=True)
-    tables: Tables = {name: [] for name in TABLE_NAMES} | shared_tables(config.seed, sensor_rig(config))
+    tables: Tables = {name: [] for name in TABLES} | shared_tables(config.seed, sensor_rig(config))
     names = []
     bar = tqdm(total=config.num_scenes, desc="writing the synthetic world", unit="scene", disable=not progress)
     with bar:

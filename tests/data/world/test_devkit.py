@@ -84,7 +84,8 @@ def test_projected_boxes_meet_what_the_image_shows(devkit, world):
             orange = (pixels[..., 0] > 1.5 * pixels[..., 2]) & (pixels[..., 0] > 1.3 * pixels[..., 1])
             for box in boxes:
                 corners = camera_from_global[:3, :3] @ box.corners() + camera_from_global[:3, 3:]
-                if box.name != "movable_object.trafficcone" or corners[2].min() < 2 or corners[2].max() > 25:
+                # Farther cones are five pixels high, and JPEG halves the resolution of colour.
+                if box.name != "movable_object.trafficcone" or corners[2].min() < 2 or corners[2].max() > 13:
                     continue
                 u, v = (intrinsic @ corners)[:2] / corners[2]
                 left, right, top, bottom = (int(round(x)) for x in (u.min(), u.max(), v.min(), v.max()))
