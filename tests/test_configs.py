@@ -47,6 +47,62 @@ def test_paper_values():
     assert vovnet.backbone.image_size_px == [640, 960] and vovnet.backbone.lr_multiplier == 0.1
 
 
+# Specification 16: the keys that phase 1 has, and their values at full size.
+FULL_SIZE = {
+    "grid": {"cells": [384, 384], "cell_m": 0.8, "centre_m": [0.0, 0.0], "z_range_m": [-3.0, 5.0]},
+    "backbone": {
+        "name": "resnet50", "image_size_px": [256, 864], "weights": None, "lr_multiplier": 1.0, "neck": "fpn",
+        "trim_padding": False,
+    },
+    "model": {"channels": 128},
+    "model.radar_encoder": {
+        "voxel_size_m": [0.1, 0.1, 0.2], "stage_channels": [16, 32, 64, 128, 128, 128], "max_voxels": 60000,
+        "conv_out": "sparse",
+    },
+    "model.kggi": {
+        "initialization": "both", "num_radar_keypoints": 1024, "num_camera_keypoints": 256,
+        "num_random_keypoints": 256, "num_depth_bins": 80, "depth_range_m": [1.0, 160.0], "depth_target": "box",
+        "keypoint_nms_cells": None, "property_head": True,
+    },
+    "model.ocsf": {
+        "num_layers": 2, "num_learnable_points": 6, "margin_m": 4.8, "occupancy_threshold": 0.1,
+        "max_occupied_cells": 32768, "scale_range_m": [0.2, 3.2], "max_mean_shift_m": 4.0, "max_speed_mps": 60.0,
+        "support_sigmas": 3.0, "cross_attention": "parallel", "refine_from": "self_encoding", "gate_kernel_size": 1,
+    },
+    "model.head": {"nms": "per_group", "score_threshold": 0.1, "max_boxes": 500, "attributes": "rule"},
+    "model.loss": {
+        "kggi_weight": 1.0, "ocsf_weight": 5.0, "heatmap_weight": 1.0, "box_weight": 0.25, "keypoint_weight": 1.0,
+        "depth_weight": 1.0, "radar_objectness_weight": 1.0, "occupancy_focal_weight": 1.0,
+        "occupancy_dice_weight": 1.0, "gaussian_velocity_weight": 0.25, "gaussian_velocity_in_phase1": False,
+    },
+    "phase": {"epochs": 24, "velocity_code_weight": 0.2},
+    "optim": {
+        "lr": 1e-4, "weight_decay": 0.01, "clip_norm": 35.0, "peak_lr_ratio": 10.0, "final_lr_ratio": 1e-4,
+        "rise_fraction": 0.4, "betas": [0.95, 0.99], "cycled_beta1": [0.95, 0.85], "ema_decay": None,
+    },
+    "data": {
+        "train_split": "train", "split": "val", "batch_size": 8, "num_sweeps": 10, "min_distance_m": 1.0,
+        "propagate_points": False, "on_bad_file": "error", "test_resize_offset": 0.0,
+    },
+    "data.augmentation.image": {"resize": [-0.06, 0.11], "rotation_deg": 5.4, "flip_probability": 0.5},
+    "data.augmentation.bev": {"scale": [0.95, 1.05], "rotation_rad": 0.3925, "flip_probability": 0.5},
+    "paths": {"outputs": "outputs", "reports": "reports"},
+    "": {
+        "precision": "bf16-mixed", "seed": 0, "resume": "auto", "checkpoint": None, "predictions": None, "out": None,
+        "preview": False, "suite": "model",
+    },
+}  # fmt: skip
+
+
+def test_full_size_values_are_those_of_the_specification():
+    _, tree = compose_config(["scale=paper", "data.root=x"])
+    for group, values in FULL_SIZE.items():
+        node = tree
+        for name in group.split(".") if group else []:
+            node = node[name]
+        assert {name: node.get(name, "no such key") for name in values} == values, group
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from src.errors import DataError
+from src.errors import ConfigError, DataError
 from src.geometry.camera import image_transform
 
 Array = np.ndarray
@@ -41,8 +41,16 @@ def width_fit(
     flip: bool = False,
     rotation_rad: float = 0.0,
 ) -> ImageCrop:
-    """Scale so that the width fits (plus an offset), keep the bottom, crop or pad the top (spec sections 3, 9)."""
+    """Scale so that the width fits (plus an offset), keep the bottom, crop or pad the top (spec sections 3, 9).
+
+    Raises ConfigError when the offset leaves no positive scale.
+    """
     resize = size_px[1] / source_px[1] + resize_offset
+    if not resize > 0:
+        raise ConfigError(
+            f"data.augmentation.image.resize or data.test_resize_offset adds {resize_offset:g} to the scale "
+            f"{size_px[1] / source_px[1]:g} that fits {source_px[1]} pixels into {size_px[1]}: the sum must be positive"
+        )
     spare = max(0, math.floor(resize * source_px[1]) - size_px[1])
     offset = (round(shift * spare), math.floor(resize * source_px[0] + 1e-6) - size_px[0])
     return ImageCrop(resize, offset, size_px, flip, rotation_rad)

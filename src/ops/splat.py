@@ -70,9 +70,9 @@ def splat_gaussians(
     batch: Tensor,  # [G] int64, sample of each Gaussian, any order
     grid: BEVGrid,
     batch_size: int,
-    threshold: float = 0.1,
-    max_cells: int = 32768,
-    support_sigmas: float = 3.0,
+    threshold: float,
+    max_cells: int,
+    support_sigmas: float,
     smooth_cap: bool = False,
 ) -> Splat:
     """Splat Gaussians onto BEV cells (Eq. 4-6, specification 5.6).

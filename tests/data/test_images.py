@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from src.data.images import read_image, width_fit
-from src.errors import DataError
+from src.errors import ConfigError, DataError
 
 SIZE = (60, 120)  # network input, height and width
 
@@ -27,6 +27,11 @@ def test_paper_geometry():
     assert crop.resize == pytest.approx(0.4364, abs=1e-4) and crop.offset_px == (0, 155)
     padded = width_fit((943, 1980), (640, 960))
     assert padded.offset_px == (0, -183)  # black rows on top
+
+
+def test_an_offset_that_leaves_no_scale_is_refused_rather_than_drawn_black():
+    with pytest.raises(ConfigError, match=r"-0\.45 to the scale 0\.436364.*must be positive"):
+        width_fit((943, 1980), (256, 864), resize_offset=-0.45)
 
 
 @pytest.mark.parametrize("source", [(100, 240), (101, 243), (400, 960), (1001, 2003)])

@@ -1,5 +1,6 @@
 import json
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -7,13 +8,16 @@ import pytest
 import torch
 
 from src.geometry.bev_grid import BEVGrid
-from src.ops import log1mexp, splat_gaussians
+from src.ops import log1mexp
+from src.ops import splat_gaussians as splat
 
 ROOT = Path(__file__).parents[2]
 GOLDEN = np.load(ROOT / "tests" / "golden" / "splat" / "case.npz")
 DEMO = ROOT.parent / "shared" / "real" / "horizon3d_page" / "ocsf_demo.json"
 GRID = BEVGrid(cells=(384, 384), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
 SMALL = BEVGrid(cells=(6, 8), cell_m=0.8, centre_m=(0.4, -0.2), z_range_m=(-3.0, 5.0))
+
+splat_gaussians = partial(splat, threshold=0.1, max_cells=32768, support_sigmas=3.0)  # as in conf/ at full size
 
 
 def golden(key):

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.sparse_layers import ConvNormReLU, ResidualBlock, SparseConv, SubmanifoldConv
-from src.ops.bags import bag_sum, bags
+from src.ops.bags import segment_sum
 from src.ops.sites import Sites
 from src.ops.voxelize import voxelize
 from src.structures.sparse_bev import SparseBEV, SparseMap
@@ -164,7 +164,7 @@ class RadarEncoder(nn.Module):
         features = features.to(torch.promote_types(features.dtype, torch.float32))  # many terms: not in half precision
         sites, rows = Sites.unique(cells, shape)
         if len(sites) > 0:  # without sites the (empty) features stay as they are, in the graph of their parameters
-            features = bag_sum(features, *bags(rows, len(sites)))
+            features = segment_sum(features, rows, len(sites))
         return SparseBEV(sites, features)
 
 

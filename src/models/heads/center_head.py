@@ -78,6 +78,7 @@ class HeadOutput:
     bev: SparseBEV  # cells with the shared features that the regression branches read
     logits: Tensor  # [M, 12] float32, columns as taxonomy.CLASSES
     codes: Tensor | None  # [M, 7, CODE_SIZE (+ 11 attributes)] in training with `all`, else evaluated where needed
+    targets: HeadTargets | None = None  # what the loss compared with, once there was one; for diagnostics
 
 
 class Branches(nn.Module):
@@ -167,7 +168,7 @@ class CenterHead(nn.Module):
         Focal loss per group over its positive cells, L1 per group over its objects (section 8.1). Without objects the
         box term is 0 with zero gradients.
         """
-        targets = self.targets(output, boxes)
+        targets = output.targets = self.targets(output, boxes)
         group_of_class = targets.labels.new_tensor(GROUP_OF_CLASS)
         none = output.logits.new_zeros(len(HEAD_GROUPS))
         terms: dict[str, Tensor] = {}

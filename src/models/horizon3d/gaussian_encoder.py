@@ -18,6 +18,7 @@ from src.models.horizon3d.cross_attention import (
 )
 from src.models.horizon3d.views import CameraViews
 from src.models.sparse_layers import SubmanifoldConv
+from src.ops.bags import segment_mean
 from src.ops.sites import Sites
 from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV
@@ -112,8 +113,7 @@ class SelfEncoding(nn.Module):
         sample = torch.div(picks, g, rounding_mode="floor")
         sites, rows = Sites.unique(torch.cat([sample[:, None], cells], dim=1), (b, *self.grid.cells))
         flat = features.flatten(0, 1).index_select(0, picks)  # [V, C]
-        count = torch.bincount(rows, minlength=len(sites)).to(flat.dtype)
-        x = SparseBEV(sites, flat.new_zeros(len(sites), c).index_add(0, rows, flat) / count[:, None])
+        x = SparseBEV(sites, segment_mean(flat, rows, len(sites)))
         for conv, norm in zip(self.convs, self.norms, strict=True):
             x = conv(x)
             x = x.with_features(norm(x.features).relu())

@@ -196,7 +196,8 @@ class KGGI(nn.Module):
         features = self.slots[name].features + self.source_embedding.weight[source]  # [K, C]
         features, raw = features.expand(*valid.shape, -1), self.slots[name].attributes.expand(*valid.shape, -1)
         if local is not None and self.config.property_head:
-            change = self.property_heads[name](local).float()
+            with torch.autocast(local.device.type, enabled=False):  # attributes are float32 also under autocast
+                change = self.property_heads[name](local.float())
             features, raw = features + change[..., : features.shape[-1]], raw + change[..., features.shape[-1] :]
         return GaussianSet(
             means=torch.where(valid[..., None], means.float(), self.centre_m),

@@ -147,7 +147,11 @@ class Horizon3D(Detector):
 
     @torch.no_grad()
     def diagnostics(self, output: Horizon3DOutput) -> dict[str, Tensor]:
-        """Cells per frame, share of the grid that Gaussians open, cells cut by the guard, Gaussians by source."""
+        """Cells per frame, share of the grid that Gaussians open, cells cut by the guard, Gaussians by source.
+
+        After a loss also the objects per frame: those the head learns, those without a cell near enough, and those
+        that share their cell with another of their group, so that the head cannot meet both.
+        """
         frames = output.radar_bev.batch_size
         values: dict[str, Tensor | float] = {
             "radar_cells": len(output.radar_bev) / frames,
@@ -162,5 +166,10 @@ class Horizon3D(Detector):
                 values[f"gaussians_{source.name.lower()}"] = number / frames
             opacity = gaussians.opacity_logits.sigmoid() * gaussians.valid
             values["opacity"] = opacity.sum() / gaussians.valid.sum().clamp(min=1)
+        targets = output.head.targets
+        if targets is not None:
+            values["objects"] = len(targets.rows) / frames
+            values["distant_objects"] = targets.num_distant / frames
+            values["shared_objects"] = targets.num_shared / frames
         device = output.radar_bev.features.device
         return {name: torch.as_tensor(value, dtype=torch.float32, device=device) for name, value in values.items()}

@@ -168,6 +168,18 @@ def test_property_head_changes_nothing_at_step_zero(make_config, grid, make_view
     assert not a.velocities.any()
 
 
+def test_attributes_are_float32_numbers_under_autocast(make_config, grid):
+    """Not only their type: a product in bfloat16 would keep three digits of an opacity and of a speed."""
+    kggi = make_kggi(make_config, grid)
+    torch.nn.init.normal_(kggi.property_heads["radar"].weight)
+    valid, local = torch.ones(1, 24, dtype=torch.bool), torch.randn(1, 24, 16).bfloat16()
+    plain = kggi._gaussians(Source.RADAR, torch.zeros(1, 24, 2), valid, local.float())
+    with torch.autocast("cpu", torch.bfloat16):
+        halved = kggi._gaussians(Source.RADAR, torch.zeros(1, 24, 2), valid, local)
+    for name in ("scales", "directions", "opacity_logits", "velocities", "features"):
+        assert torch.equal(getattr(halved, name), getattr(plain, name)), name
+
+
 @pytest.mark.parametrize(
     ("mode", "counts"),
     [(Initialization.both, (24, 12, 8)), (Initialization.keypoint, (24, 12, 0)), (Initialization.random, (0, 0, 44))],

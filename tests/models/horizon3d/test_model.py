@@ -232,6 +232,21 @@ def test_diagnostics_count_cells_and_gaussians(make_model, make_batch):
     assert found["occupied_share"] == pytest.approx(len(output.ocsf.splat.bev) / (2 * 48 * 64))
     assert found["opacity"] == pytest.approx(0.25, abs=0.05)
     assert found["cut_cells"] == 0.0
+    assert "objects" not in found  # nothing has been compared with annotations yet
+
+
+def test_diagnostics_count_objects_that_the_head_cannot_meet(make_model, make_batch):
+    model, batch = make_model().eval(), make_batch(points=(150, 0), boxes=(6, 4))
+    with torch.no_grad():
+        for layer in model.ocsf.encoder.layers:
+            layer.refinement.output.bias[6] = -30.0  # no Gaussian opens a cell: the second frame has none
+        batch.boxes[0] = batch.boxes[0][torch.tensor([0, 1, 1, 2])]  # one object twice
+        output = model(batch)
+        model.loss(output, batch)
+    found = {name: float(value) for name, value in model.diagnostics(output).items()}
+    assert found["objects"] + found["distant_objects"] == 4.0  # 8 in 2 frames
+    assert found["distant_objects"] >= 2.0  # all of the second frame
+    assert found["shared_objects"] == 1.0
 
 
 def test_no_state_stays_on_the_module(make_model, make_batch):
