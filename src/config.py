@@ -49,6 +49,7 @@ OUTSIDE_IDENTITY = (
     "preview",
     "suite",
     "data.num_workers",
+    "data.root",
     "data.world.num_workers",
 )
 

@@ -53,7 +53,7 @@ def parameter_groups(
     decayed = {
         id(module.weight)
         for module in model.modules()
-        if isinstance(module, (nn.Linear, nn.Conv2d, SparseKernel))
+        if isinstance(module, (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, SparseKernel))
     }
     in_backbone = {id(parameter) for parameter in backbone.parameters()} if backbone is not None else set()
     groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}
