@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +18,33 @@ from src.training.detection import DetectionModule
 
 logger = logging.getLogger(__name__)
 
+MAX_WORKERS_PER_CORE = 4
+
 
 def data_root(config: Config, write: bool = True) -> Path:
     """Folder to read, written first when it is a synthetic world that does not exist yet.
 
-    With `write` false an existing folder is read as it is, whatever made it (evaluation on other data).
+    With `write` false a given root is read as it is, whatever made it, and never written (evaluation on other data: a
+    mistyped folder must not become a synthetic world that is then scored).
     Raises ConfigError when there is neither a root nor a world to write; DataError when the folder holds another world.
     """
     data = config.data
-    if data.root is not None and Path(data.root).exists() and (not write or data.world is None):
-        return Path(data.root)
-    if data.world is None:
-        if data.root is None:
-            raise ConfigError("data.root is null and there is no data.world to write; give data.root=FOLDER")
+    if data.root is not None and (not write or data.world is None):
         return Path(data.root)  # the reader says what is missing
+    if data.world is None:
+        raise ConfigError("data.root is null and there is no data.world to write; give data.root=FOLDER")
     root = Path(data.root) if data.root else Path(config.paths.outputs) / "worlds" / world_digest(data.world)
     return ensure_world(data.world, root)
 
 
 def build_datamodule(config: Config, root: Path) -> DetectionDataModule:
     """The data of a run; images are left out for a model that uses none."""
+    cores = os.cpu_count() or 1
+    if config.data.num_workers > MAX_WORKERS_PER_CORE * cores:
+        raise ConfigError(
+            f"data.num_workers={config.data.num_workers}: at most {MAX_WORKERS_PER_CORE} for each of the {cores} cores "
+            "of this machine, more would only take memory"
+        )
     return DetectionDataModule(
         config.data,
         root=root,

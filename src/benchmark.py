@@ -18,13 +18,14 @@ import torch
 from torch import Tensor
 
 from src.assembly import build_datamodule, build_model, data_root
-from src.config import BenchmarkSuite, Config, compose_config, run_command
+from src.config import Accelerator, BenchmarkSuite, Config, compose_config, run_command
 from src.errors import DataError
 from src.metrics.benchmark import compare_with_devkit
 from src.models.detector import Detector
 from src.ops.allocator import tune_cpu_allocator
 from src.structures.batch import FrameBatch
-from src.training.run_folder import write_json
+from src.training.fit import check_devices
+from src.training.run_folder import make_writable, write_json
 
 REPEATS = 3
 READER_FRAMES = 40
@@ -41,13 +42,14 @@ def main(overrides: list[str]) -> None:
         BenchmarkSuite.metric: lambda config: compare_with_devkit(**VAL_SIZED, seed=config.seed),
         BenchmarkSuite.reader: benchmark_reader,
     }
+    if config.out:
+        make_writable(Path(config.out), "out")
     result = {"suite": config.suite.value, "overrides": overrides, "machine": machine()}
     result |= {"result": suites[config.suite](config)}
     text = markdown(result)
     print(text)
     if config.out:
         folder = Path(config.out)
-        folder.mkdir(parents=True, exist_ok=True)
         name = f"{config.suite.value}_{config.scale}" if config.suite is not BenchmarkSuite.metric else "metric"
         write_json(folder / f"{name}.json", result)
         (folder / f"{name}.md").write_text(text + "\n")
@@ -62,7 +64,9 @@ def benchmark_model(config: Config) -> dict[str, Any]:
     config.data.batch_size, config.data.num_workers = 1, 0
     datamodule = build_datamodule(config, data_root(config))
     batch = next(iter(datamodule.train_dataloader()))
-    device = torch.device("cuda" if torch.cuda.is_available() and config.trainer.accelerator != "cpu" else "cpu")
+    check_devices(config.trainer.accelerator.value, 1)
+    on_gpu = torch.cuda.is_available() and config.trainer.accelerator is not Accelerator.cpu
+    device = torch.device("cuda" if on_gpu else "cpu")
     model, batch = build_model(config).to(device).train(), batch.to(device)
     timings: dict[str, list[float]] = {}
     for _ in range(REPEATS):

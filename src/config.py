@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import errno
 import hashlib
 import json
 import logging
 import math
+import shutil
+import signal
 import sys
 import traceback
 from collections.abc import Callable
@@ -36,6 +39,23 @@ from src.training.optim import OptimConfig
 from src.training.run_folder import Resume
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
+GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir())
+
+# Lines of Hydra's messages that tell a user nothing, or to do what is refused here (`+key`).
+HYDRA_INTERNALS = (
+    "full_key:",
+    "object_type=",
+    "reference_type=",
+    "schema_",
+    "Config search path",
+    "provider=",
+    "To append to your",
+    "See https",
+    "3. To sweep",
+)
+
+# What the system says when it refuses to write; the path and the free space are then all a user needs.
+DISK_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
 
 # What cannot change the result of a run is left out of its identity.
 OUTSIDE_IDENTITY = (
@@ -78,25 +98,37 @@ class PhaseConfig:
     velocity_code_weight: float  # weight of velocity in the box loss
 
     def __post_init__(self) -> None:
+        if not (CONF / "phase" / f"{self.name}.yaml").is_file():
+            known = ", ".join(sorted(path.stem for path in (CONF / "phase").glob("*.yaml")))
+            raise ConfigError(f"phase.name={self.name}: must be one of {known}; choose with phase=...")
+        if not self.velocity_code_weight >= 0:
+            raise ConfigError(f"phase.velocity_code_weight must be at least 0, but got {self.velocity_code_weight}")
         for name in ("epochs", "validate_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"phase.{name} must be at least 1, but got {getattr(self, name)}")
+
+
+class Accelerator(Enum):
+    """Where a run computes; `auto` takes a GPU where torch sees one."""
+
+    auto = "auto"
+    cpu = "cpu"
+    gpu = "gpu"
 
 
 @dataclass(kw_only=True)
 class TrainerConfig:
     """Where a run computes and how often it reports."""
 
-    accelerator: str  # auto, cpu, gpu
+    accelerator: Accelerator
     devices: int
     log_every_steps: int
     num_pictures: int  # validation frames drawn at the end
 
     def __post_init__(self) -> None:
-        if self.devices < 1:
-            raise ConfigError(f"trainer.devices must be at least 1, but got {self.devices}")
-        if self.log_every_steps < 1:
-            raise ConfigError(f"trainer.log_every_steps must be at least 1, but got {self.log_every_steps}")
+        for name, least in {"devices": 1, "log_every_steps": 1, "num_pictures": 0}.items():
+            if getattr(self, name) < least:
+                raise ConfigError(f"trainer.{name} must be at least {least}, but got {getattr(self, name)}")
 
 
 @dataclass(kw_only=True)
@@ -120,6 +152,10 @@ class PathsConfig:
 
     outputs: str  # runs, worlds, caches
     reports: str
+
+    def __post_init__(self) -> None:
+        for name in ("outputs", "reports"):
+            _refuse_empty(f"paths.{name}", getattr(self, name))
 
 
 class Precision(Enum):
@@ -163,13 +199,23 @@ class Config:
     def __post_init__(self) -> None:
         if not isinstance(self.precision, str) or self.precision not in [p.value for p in Precision]:
             raise ConfigError(f"precision must be one of {[p.value for p in Precision]}, but got {self.precision!r}")
-        if self.seed < 0:
-            raise ConfigError(f"seed must be at least 0, but got {self.seed}")
+        if not 0 <= self.seed < 2**32:
+            raise ConfigError(f"seed must be at least 0 and below 2**32, but got {self.seed}")
+        if self.model.name not in MODEL_CONFIGS:
+            raise ConfigError(f"model.name={self.model.name}: must be one of {', '.join(MODEL_CONFIGS)}")
+        for name in ("checkpoint", "predictions", "out"):
+            _refuse_empty(name, getattr(self, name))
+        _refuse_empty("data.root", self.data.root)
         if self.data.batch_size % self.trainer.devices:
             raise ConfigError(
                 f"data.batch_size={self.data.batch_size} is the total over all devices and must be divisible by "
                 f"trainer.devices={self.trainer.devices}"
             )
+
+
+def _refuse_empty(key: str, value: str | None) -> None:
+    if value is not None and not value.strip():
+        raise ConfigError(f"{key} is empty; give a path, or leave {key} out (was an unset shell variable meant?)")
 
 
 def _register() -> None:
@@ -186,24 +232,36 @@ def compose_config(overrides: list[str]) -> tuple[Config, dict[str, Any]]:
     Returns the configuration and the same as a plain tree (what a checkpoint and `config.yaml` keep).
     Raises ConfigError naming the key for anything unknown, mistyped, missing or impossible.
     """
+    tree = _compose(overrides)
+    return build_config(tree), OmegaConf.to_container(tree, resolve=True, enum_to_str=True)
+
+
+def _compose(overrides: list[str]) -> DictConfig:
+    """conf/ with the overrides, types checked but values not yet; see `compose_config`."""
     _register()
     for override in overrides:
         if override.startswith("-"):
             raise ConfigError(f"{override}: options are written key=value, without dashes")
+        if override.startswith("~"):
+            raise ConfigError(f"{override}: keys cannot be removed; a part is switched off with {override[1:]}=null")
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
-            tree = compose("config", overrides=overrides)
+            return compose("config", overrides=overrides)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_hydra_message(error)) from error
-    return build_config(tree), OmegaConf.to_container(tree, resolve=True, enum_to_str=True)
+    except (ValueError, AssertionError) as error:  # Hydra's own words for these name neither the key nor the remedy
+        raise ConfigError(
+            f"{' '.join(overrides)}: a choice of conf/ ({', '.join(GROUPS)}) needs one of its names, and a key below a "
+            f"part that is null needs the part first, as in logger=wandb logger.wandb.project=... ({error})"
+        ) from error
 
 
 def build_config(tree: DictConfig) -> Config:
     """Turn a composed tree into dataclasses; see `compose_config`."""
-    missing = OmegaConf.missing_keys(tree)
-    if missing:
-        raise ConfigError(f"{min(missing)} has no value; give {min(missing)}=... on the command line")
     try:
+        missing = OmegaConf.missing_keys(tree)
+        if missing:
+            raise ConfigError(f"{min(missing)} has no value; give {min(missing)}=... on the command line")
         config = OmegaConf.to_object(tree)
     except OmegaConfBaseException as error:
         raise ConfigError(_hydra_message(error)) from error
@@ -214,18 +272,20 @@ def build_config(tree: DictConfig) -> Config:
 def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     """A configuration as a checkpoint stores it, with the keys named in `overrides` replaced.
 
-    A group choice (`data=truckscenes`) replaces that whole group.
-    Raises CheckpointError when the stored tree does not fit this version of the code.
+    A group choice (`data=truckscenes`) replaces that whole group, at the checkpoint's scale.
+    Raises CheckpointError when the stored tree does not fit this version of the code, ConfigError for another scale.
     """
-    _, fresh = compose_config(overrides)
-    tree = OmegaConf.create(stored)
-    for override in OverridesParser.create().parse_overrides(overrides):
-        key = override.key_or_group.lstrip("+~")
-        OmegaConf.update(tree, key, OmegaConf.select(OmegaConf.create(fresh), key), merge=False)
-    schema = OmegaConf.structured(Config)
-    model = stored.get("model", {}).get("name")
+    model = stored["model"].get("name") if isinstance(stored.get("model"), dict) else None
     if model not in MODEL_CONFIGS:
         raise CheckpointError(f"the checkpoint is of model {model!r}; this version knows {sorted(MODEL_CONFIGS)}")
+    scale = stored.get("scale")
+    changes = {change.key_or_group: change for change in OverridesParser.create().parse_overrides(overrides)}
+    if "scale" in changes and changes["scale"].value() != scale:
+        raise ConfigError(f"scale={changes['scale'].value()}: the checkpoint is of scale={scale}; leave scale= out")
+    tree, fresh = OmegaConf.create(stored), _compose([f"scale={scale}", *overrides])
+    for key in changes:
+        OmegaConf.update(tree, key, OmegaConf.select(fresh, key), merge=False)
+    schema = OmegaConf.structured(Config)
     try:
         schema.model = OmegaConf.structured(MODEL_CONFIGS[model])
         return build_config(OmegaConf.merge(schema, tree))
@@ -235,11 +295,15 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
 
 def _hydra_message(error: Exception) -> str:
     """Hydra's message in one paragraph, with the nearest key there is."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     cause = error.__cause__
-    if cause is not None:
-        lines += [line.strip() for line in str(cause).splitlines() if line.strip() and line.strip() not in lines]
+    lines = [line.strip() for line in [*str(error).splitlines(), *str(cause or "").splitlines()]]
+    lines = [line for line in dict.fromkeys(lines) if line.strip("^") and not line.startswith(HYDRA_INTERNALS)]
     text = " | ".join(lines)
+    if "/override_grammar/" in str(error):
+        text += (
+            " | options are key=value; a value with characters like = , ~ { or a blank is quoted twice, "
+            """key='"value"', and ~ is written as $HOME"""
+        )
     unknown = getattr(cause or error, "full_key", None)
     if unknown:
         near = difflib.get_close_matches(str(unknown), _known_keys(), n=1, cutoff=0.6)
@@ -303,15 +367,34 @@ def run_command(main: Callable[[list[str]], None]) -> None:
     logging.basicConfig(level=logging.INFO, format=line, datefmt="%H:%M:%S")
     for noisy in ("matplotlib", "PIL", "lightning.pytorch.utilities.rank_zero"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl-C does: temporary files are removed
     try:
         main(sys.argv[1:])
     except HorizonError as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        print(f"\n{type(error).__name__}: {error}", file=sys.stderr)  # a progress bar may stand on the line
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        print("Interrupted; the same command goes on from the last checkpoint.", file=sys.stderr)
+        print("\nInterrupted; the same command goes on from where it can.", file=sys.stderr)
         sys.exit(InterruptedRunError.exit_code)
-    except Exception:
+    except Exception as error:
+        known = _machine_fault(error)
+        if known is not None:
+            print(f"\n{known[0]}", file=sys.stderr)
+            sys.exit(known[1])
         traceback.print_exc()
         print("This is a defect of the program; please report it with the lines above.", file=sys.stderr)
         sys.exit(1)
+
+
+def _machine_fault(error: Exception) -> tuple[str, int] | None:
+    """Message and exit code where the machine is at fault: a full or locked disk, too little memory."""
+    if isinstance(error, OSError) and error.errno in DISK_FAULTS:
+        place = Path(str(error.filename or "")).absolute().parent
+        place = place if place.is_dir() else Path.cwd()
+        free = shutil.disk_usage(place).free // 2**20
+        what = f"{error.filename or 'A file'} could not be written or read: {error.strerror}"
+        return f"{what}; {free} MiB are free in {place}; make room or choose another folder", ConfigError.exit_code
+    if "allocate memory" in str(error) or "out of memory" in str(error):  # torch's words on CPU and on GPU
+        remedy = "lower data.batch_size or data.num_workers, or choose a smaller scale or backbone"
+        return f"Out of memory: {error}; {remedy}", 1
+    return None

@@ -14,8 +14,8 @@ from src.metrics.scores import DetectionScores
 from src.metrics.submission import load_submission
 from src.ops.allocator import tune_cpu_allocator
 from src.training.checkpoints import load_model_weights, read_checkpoint
-from src.training.fit import build_evaluation_trainer
-from src.training.run_folder import write_json
+from src.training.fit import build_evaluation_trainer, check_devices
+from src.training.run_folder import make_writable, write_json
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ def main(overrides: list[str]) -> None:
         raise ConfigError("give either checkpoint=PATH or predictions=FILE.json")
     source = Path(config.checkpoint or config.predictions)
     out = Path(config.out) if config.out else Path(config.paths.outputs) / "evaluations" / source.stem
-    out.mkdir(parents=True, exist_ok=True)
+    make_writable(out, "out")
     scores = score_checkpoint(source, overrides, out) if config.checkpoint else score_file(source, config)
     write_json(out / "metrics.json", scores.as_dict())
     print(format_scores(scores.as_dict()))
@@ -46,13 +46,16 @@ def score_checkpoint(path: Path, overrides: list[str], out: Path) -> DetectionSc
     checkpoint = read_checkpoint(path)
     tree = checkpoint["horizon3d"]["config"]
     config = restore_config(tree, overrides)
+    check_devices(config.trainer.accelerator.value, 1)
     datamodule = build_datamodule(config, data_root(config, write=False))
     module = build_module(config, tree, datamodule)
     load_model_weights(module.model, checkpoint, path)
-    build_evaluation_trainer(config.precision, config.trainer.accelerator).validate(
+    build_evaluation_trainer(config.precision, config.trainer.accelerator.value).validate(
         module, datamodule=datamodule, verbose=False
     )
     save_submission(module, out / "submission.json")
+    if module.skipped:
+        print(f"sensor files passed over: {module.skipped}")
     return module.scores
 
 

@@ -9,6 +9,7 @@ from src.config import compose_config, run_command
 from src.errors import DataError
 from src.reporting.results import read_runs
 from src.reporting.tables import experiment_tables
+from src.training.run_folder import make_writable
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +42,7 @@ def main(overrides: list[str]) -> None:
             changes = " ".join([*settings, f"seed={seed}"])
             text += f"python -m src.train phase={config.phase.name} scale={config.scale} {changes}\n"
     path = Path(config.paths.reports) / f"{config.phase.name}_{config.scale}.md"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_writable(path.parent, "paths.reports")
     path.write_text(f"{text}```\n\n{tables}\n")
     print(tables)
     print(f"\nwritten: {path}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import platform
 import resource
@@ -19,11 +18,12 @@ import yaml
 from src.assembly import build_datamodule, build_module, data_root, save_submission
 from src.config import Config, compose_config, run_command, run_identity
 from src.data.datamodule import DetectionDataModule
+from src.errors import DataError
 from src.metrics.report import format_scores
 from src.ops.allocator import tune_cpu_allocator
 from src.pictures.curves import draw_curves, draw_scores
 from src.training.detection import DetectionModule
-from src.training.fit import build_loggers, build_trainer, fit
+from src.training.fit import build_loggers, build_trainer, check_devices, fit
 from src.training.run_folder import RunFolder, current_commit, write_json
 from src.training.snapshots import draw_frames
 
@@ -33,6 +33,7 @@ logger = logging.getLogger(__name__)
 def main(overrides: list[str]) -> None:
     """Train one run, or show it when it has finished already."""
     config, tree = compose_config(overrides)
+    check_devices(config.trainer.accelerator.value, config.trainer.devices)
     folder = RunFolder(Path(config.paths.outputs), run_identity(tree))
     folder.open(config.resume)
     if folder.finished:
@@ -59,6 +60,7 @@ def main(overrides: list[str]) -> None:
     seconds = time.monotonic() - training_started
 
     scores = module.scores.as_dict()
+    write_json(folder.metrics_json, scores)  # what took long is safe; run.json, the last file, marks the run finished
     draw_pictures(config, module, datamodule, folder, scores)
     save_submission(module, folder.path / "submission.json")
     record = {
@@ -84,10 +86,9 @@ def main(overrides: list[str]) -> None:
             "numpy": np.__version__,
         },
     }
-    write_json(folder.metrics_json, scores)
     write_json(folder.record, record)
     logger.info("finished in %.0f s", record["seconds"]["all"])
-    print_result(folder, record)
+    print_result(folder, record, scores)
 
 
 def draw_pictures(
@@ -123,7 +124,7 @@ def make_trainer(config: Config, tree: dict[str, Any], folder: RunFolder, resume
         epochs=config.phase.epochs,
         validate_every=config.phase.validate_every,
         precision=config.precision,
-        accelerator=config.trainer.accelerator,
+        accelerator=config.trainer.accelerator.value,
         devices=config.trainer.devices,
         log_every_steps=config.trainer.log_every_steps,
         ema_decay=config.optim.ema_decay,
@@ -141,24 +142,32 @@ def peak_memory_mib() -> dict[str, int]:
 
 
 def show_finished(folder: RunFolder) -> None:
-    """Print a finished run, and say when other code than today's made it."""
-    record = folder.read_record()
-    if record["commit"] != current_commit():
-        logger.warning(
-            "this run was made by commit %s, the code is at %s; resume=restart trains it anew",
-            record["commit"],
-            current_commit(),
-        )
-    print_result(folder, record)
+    """Print a finished run, and say when other code than today's made it. Raises DataError for edited results."""
+    record, scores = folder.read_result()
+    try:
+        if record["commit"] != current_commit():
+            logger.warning(
+                "this run was made by commit %s, the code is at %s; resume=restart trains it anew",
+                record["commit"],
+                current_commit(),
+            )
+        print_result(folder, record, scores)
+    except (KeyError, TypeError, ValueError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise DataError(
+            f"{folder.record} or metrics.json beside it is not as written ({reason}); delete it to have it made again"
+        ) from error
 
 
-def print_result(folder: RunFolder, record: dict[str, Any]) -> None:
+def print_result(folder: RunFolder, record: dict[str, Any], scores: dict[str, Any]) -> None:
     """The table people wait for, and where everything lies."""
-    print(format_scores(json.loads(folder.metrics_json.read_text())))
+    print(format_scores(scores))
     print(
         f"\n{folder.run_id}: {record['epochs']} epochs, {record['steps']} steps, {record['parameters'] / 1e6:.2f} M "
         f"parameters, {record['seconds']['all']:.0f} s, {record['peak_memory_mib']['process']} MiB"
     )
+    if record["skipped_files"]:
+        print(f"sensor files passed over: {record['skipped_files']}")
     print(f"run folder: {folder.path}  (metrics.json, metrics.csv, config.yaml, log.txt, pictures/, submission.json)")
 
 

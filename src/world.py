@@ -13,6 +13,7 @@ from src.pictures.cameras import CameraViews
 from src.pictures.contents import PictureBoxes
 from src.pictures.world import draw_scene_preview
 from src.structures.taxonomy import CAMERAS
+from src.training.run_folder import make_writable
 
 logger = logging.getLogger(__name__)
 
@@ -26,7 +27,7 @@ def main(overrides: list[str]) -> None:
     print(f"world: {root}")
     if config.preview:
         folder = Path(config.out) if config.out else Path(config.paths.outputs) / "previews" / root.name
-        folder.mkdir(parents=True, exist_ok=True)
+        make_writable(folder, "out")
         for number, (_, frame) in enumerate(WorldPreview(root).frames()):
             path = folder / f"scene_{number:03d}.png"
             draw_scene_preview(

@@ -1,13 +1,15 @@
 """Every shipped configuration composes; every mistake is named."""
 
 import math
+import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from src.config import CONF, compose_config, restore_config, run_identity
+from src.config import CONF, compose_config, restore_config, run_command, run_identity
 from src.errors import CheckpointError, ConfigError
 
 SCALES = sorted(p.stem for p in (CONF / "scale").glob("*.yaml"))
@@ -126,6 +128,24 @@ def test_full_size_values_are_those_of_the_specification():
         (["data.world.num_train_scenes=-1"], "num_train_scenes"),
         (["scale=paper"], "data.root has no value"),
         (["phase.epochs=0"], "phase.epochs"),
+        (["foo=1"], "^(?!.*[+]foo).*foo"),  # Hydra's advice, +foo=1, would be refused as well
+        (["model=null"], "model=null.*one of its names"),
+        (["logger.wandb.project=x"], "logger=wandb"),
+        (["~model.kggi"], "model.kggi=null"),
+        (["checkpoint=a=b.ckpt"], "quoted"),
+        (["data.root=~/x"], "HOME"),
+        (["seed=${nothing}"], "nothing"),
+        (["seed=4294967296"], "seed.*4294967296"),
+        (["model.name=other"], "model.name.*horizon3d"),
+        (["phase.name=../x"], "phase.name.*phase1"),
+        (["phase.velocity_code_weight=-1"], "velocity_code_weight"),
+        (["optim.final_lr_ratio=-1"], "final_lr_ratio"),
+        (["trainer.accelerator=cuda9"], "accelerator.*gpu"),
+        (["trainer.num_pictures=-1"], "num_pictures"),
+        (["paths.outputs="], "paths.outputs is empty"),
+        (["checkpoint="], "checkpoint is empty"),
+        (["data.root="], "data.root is empty"),
+        (["data.world.returns_density=1e9"], "returns_density"),
     ],
 )
 def test_mistakes_are_named(overrides, message):
@@ -171,6 +191,50 @@ def test_a_stored_configuration_of_other_code_is_refused(change):
     _, tree = compose_config(["scale=debug"])
     with pytest.raises(CheckpointError):
         restore_config(tree | change, [])
+
+
+def test_another_scale_than_the_checkpoints_is_refused():
+    _, tree = compose_config(["scale=debug"])
+    with pytest.raises(ConfigError, match="scale=mini.*scale=debug"):
+        restore_config(tree, ["scale=mini"])
+
+
+def test_another_data_choice_is_taken_at_the_checkpoints_scale():
+    _, tree = compose_config(["scale=paper", "data.root=/real"])
+    config = restore_config(tree, ["data=truckscenes", "data.root=/elsewhere"])
+    assert config.data.num_sweeps == 10 and not config.data.propagate_points
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_every_scale_reads_recorded_data(scale):
+    config, _ = compose_config([f"scale={scale}", "data=truckscenes", "data.root=x"])
+    assert config.data.world is None and config.data.root == "x"
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (OSError(28, "No space left on device", "/x/metrics.csv"), 3, r"/x/metrics\.csv.*No space left.*MiB are free"),
+        (PermissionError(13, "Permission denied", "/x/y"), 3, "/x/y.*Permission denied"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: 9 bytes"), 1, "data.batch_size"),
+        (ValueError("a bug"), 1, "defect of the program"),
+        (KeyboardInterrupt(), 6, "same command"),
+    ],
+)
+def test_a_command_ends_with_a_message_and_its_exit_code(monkeypatch, capsys, error, code, words):
+    def main(_overrides):
+        raise error
+
+    monkeypatch.setattr("sys.argv", ["x"])
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        with pytest.raises(SystemExit) as ended:
+            run_command(main)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert ended.value.code == code
+    text = capsys.readouterr().err
+    assert re.search(words, text) and ("Traceback" in text) == (words == "defect of the program")
 
 
 def test_exit_code_of_a_configuration_error():

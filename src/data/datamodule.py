@@ -169,9 +169,9 @@ class DetectionDataModule(L.LightningDataModule):
         }
 
     def validation_frames(self, count: int) -> list[FrameBatch]:
-        """`count` frames spread evenly over the validation split, batches of one."""
+        """Up to `count` different frames spread evenly over the validation split, batches of one."""
         samples = split_samples(self.index, self.config.split)
-        picks = np.linspace(0, len(samples) - 1, 2 * count + 1)[1::2].round().astype(int)
+        picks = np.unique(np.linspace(0, len(samples) - 1, 2 * count + 1)[1::2].round().astype(int))
         return [self.reader.read(int(samples[pick]), None) for pick in picks]
 
     def train_dataloader(self) -> DataLoader:

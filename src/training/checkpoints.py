@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import shutil
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from torch import nn
 
 from src.errors import CheckpointError
 
-_BROKEN = (RuntimeError, EOFError, OSError, KeyError, ValueError, pickle.UnpicklingError)
+_BROKEN = (RuntimeError, EOFError, OSError, KeyError, ValueError)
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -49,19 +50,47 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"checkpoint {path} does not exist; runs keep theirs in outputs/<run_id>/checkpoints")
     try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()  # torch itself loads flipped bits without a word
+        if damaged is not None:
+            raise CheckpointError(f"checkpoint {path} is damaged: the checksum of {damaged} in it is wrong")
         content = torch.load(path, map_location="cpu", weights_only=True)
+    except zipfile.BadZipFile as error:
+        raise CheckpointError(f"checkpoint {path} is truncated, or no checkpoint at all ({error})") from error
+    except pickle.UnpicklingError as error:
+        raise CheckpointError(
+            f"checkpoint {path} holds more than tensors and plain values, so it is not of this project; "
+            "nothing in it was executed"
+        ) from error
     except _BROKEN as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CheckpointError(f"checkpoint {path} is truncated, damaged or no plain checkpoint ({reason})") from error
-    if not isinstance(content, dict) or "horizon3d" not in content or "state_dict" not in content:
-        raise CheckpointError(f"checkpoint {path} is not of this project: it lacks 'horizon3d' or 'state_dict'")
+        raise CheckpointError(f"checkpoint {path} is truncated or damaged ({reason})") from error
+    if not _is_ours(content):
+        raise CheckpointError(
+            f"checkpoint {path} is not of this project: it lacks 'state_dict' (tensors by name) or the configuration "
+            "in 'horizon3d'"
+        )
     return content
+
+
+def _is_ours(content: object) -> bool:
+    """Whether a file holds what `DetectionModule` and Lightning write: weights by name and the run's configuration."""
+    if not isinstance(content, dict):
+        return False
+    about, state = content.get("horizon3d"), content.get("state_dict")
+    return (
+        isinstance(about, dict)
+        and isinstance(about.get("config"), dict)
+        and isinstance(state, dict)
+        and all(isinstance(key, str) and isinstance(value, torch.Tensor) for key, value in state.items())
+    )
 
 
 def load_model_weights(model: nn.Module, checkpoint: dict[str, Any], path: Path) -> None:
     """Put a checkpoint's weights into `model`.
 
-    Raises CheckpointError naming the keys that are missing, unexpected or of another shape; never loads a part.
+    Raises CheckpointError naming the keys that are missing, unexpected, of another shape or not finite; never loads a
+    part.
     """
     prefix = "model."
     state = {key[len(prefix) :]: value for key, value in checkpoint["state_dict"].items() if key.startswith(prefix)}
@@ -76,4 +105,7 @@ def load_model_weights(model: nn.Module, checkpoint: dict[str, Any], path: Path)
     if problems:
         more = f" and {len(problems) - 6} more" if len(problems) > 6 else ""
         raise CheckpointError(f"checkpoint {path} is of another model: {'; '.join(problems[:6])}{more}")
+    broken = [key for key, value in state.items() if not torch.isfinite(value).all()]
+    if broken:
+        raise CheckpointError(f"checkpoint {path} holds weights that are not finite, {broken[0]} for one")
     model.load_state_dict(state)

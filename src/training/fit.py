@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import logging
+import signal
 from pathlib import Path
 from typing import Any
 
 import lightning as L
+import torch
 from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers.logger import Logger
 
 from src.data.datamodule import DetectionDataModule, dead_workers_named
-from src.errors import InterruptedRunError
+from src.errors import ConfigError, InterruptedRunError
 from src.training.checkpoints import AtomicCheckpointIO, read_checkpoint
 from src.training.detection import DetectionModule
 from src.training.metrics_csv import MetricsCSV
@@ -31,6 +33,18 @@ class LossProgressBar(TQDMProgressBar):
             name.removeprefix("step/").removeprefix("val/"): f"{value:.3g}" if isinstance(value, float) else value
             for name, value in items.items()
         }
+
+
+def check_devices(accelerator: str, devices: int) -> None:
+    """Raise ConfigError when this machine lacks what the configuration asks for."""
+    gpus = torch.cuda.device_count() or int(torch.backends.mps.is_available())
+    if accelerator == "gpu" and not gpus:
+        raise ConfigError(
+            "trainer.accelerator=gpu, but torch sees no GPU on this machine; use trainer.accelerator=cpu, or install a "
+            "torch build for your GPU"
+        )
+    if devices > 1:
+        raise ConfigError(f"trainer.devices={devices}: this phase trains on one device; use trainer.devices=1")
 
 
 def build_trainer(
@@ -104,6 +118,7 @@ def fit(
 
     Raises InterruptedRunError when stopped from outside; the same command then goes on.
     """
+    outer = signal.signal(signal.SIGTERM, signal.SIG_DFL)  # so that Lightning's own handler ends the running step first
     try:
         module.skipped.clear()
         with dead_workers_named():
@@ -112,6 +127,8 @@ def fit(
                 trainer.validate(module, datamodule=datamodule, verbose=False)
     except SystemExit as error:  # Lightning's way to end on Ctrl-C and SIGTERM
         raise InterruptedRunError("training was stopped; the same command goes on from the last checkpoint") from error
+    finally:
+        signal.signal(signal.SIGTERM, outer)
 
 
 def build_evaluation_trainer(precision: str, accelerator: str) -> L.Trainer:

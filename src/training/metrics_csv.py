@@ -14,8 +14,8 @@ from lightning.pytorch.utilities import rank_zero_only
 class MetricsCSV(Logger):
     """A Lightning logger over one CSV file.
 
-    Lightning's own deletes the file of an earlier start; this one keeps its rows up to the step that the checkpoint
-    resumes from, so the file of an interrupted run equals that of an uninterrupted one.
+    Lightning's own deletes the file of an earlier start; this one keeps the rows of the `resume_step` steps (counted
+    from 0) that the checkpoint has behind it, so the file of an interrupted run equals that of an uninterrupted one.
     """
 
     def __init__(self, path: Path, resume_step: int) -> None:
@@ -27,7 +27,7 @@ class MetricsCSV(Logger):
         if path.is_file():
             with path.open(newline="") as file:
                 for row in csv.DictReader(file):
-                    if row.get("step", "").isdigit() and int(row["step"]) <= resume_step:
+                    if row.get("step", "").isdigit() and int(row["step"]) < resume_step:
                         self._add({key: value for key, value in row.items() if key and value})
 
     def _add(self, row: dict[str, str]) -> None:

@@ -31,8 +31,9 @@ class OptimConfig:
         for name in ("lr", "clip_norm", "peak_lr_ratio"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"optim.{name} must be above 0, but got {getattr(self, name)}")
-        if not self.weight_decay >= 0:
-            raise ConfigError(f"optim.weight_decay must be at least 0, but got {self.weight_decay}")
+        for name in ("weight_decay", "final_lr_ratio"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"optim.{name} must be at least 0, but got {getattr(self, name)}")
         if not 0 <= self.rise_fraction <= 1:
             raise ConfigError(f"optim.rise_fraction must lie in [0, 1], but got {self.rise_fraction}")
         for name in ("betas", "cycled_beta1"):

@@ -12,7 +12,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from src.errors import CheckpointError, ConfigError
+from src.errors import CheckpointError, ConfigError, DataError
+from src.training.checkpoints import read_checkpoint
 
 logger = logging.getLogger(__name__)
 
@@ -59,13 +60,7 @@ class RunFolder:
             self.path.rename(aside)
             self._release()
             logger.info("moved the old run to %s", aside)
-        try:
-            self.checkpoints.mkdir(parents=True, exist_ok=True)
-            probe = self.path / ".probe"
-            probe.write_text("")
-            probe.unlink()
-        except OSError as error:
-            raise ConfigError(f"{self.path} cannot be written ({error}); choose another paths.outputs") from error
+        make_writable(self.checkpoints, "paths.outputs")
         self._acquire()
 
     def _acquire(self) -> None:
@@ -80,16 +75,46 @@ class RunFolder:
         self._lock = None
 
     def newest_checkpoint(self) -> Path | None:
-        """The checkpoint an unfinished run goes on from."""
-        last = self.checkpoints / "last.ckpt"
-        return last if last.is_file() else None
+        """The checkpoint an unfinished run goes on from: the last one, or the best where the last is damaged.
 
-    def read_record(self) -> dict[str, Any]:
-        """run.json of a finished run."""
-        try:
-            return json.loads(self.record.read_text())
-        except (OSError, ValueError) as error:
-            raise CheckpointError(f"{self.record} is not readable ({error}); retrain with resume=restart") from error
+        Raises CheckpointError when there are some and none can be read: training would silently start anew.
+        """
+        damage: list[str] = []
+        for path in (self.checkpoints / "last.ckpt", self.checkpoints / "best.ckpt"):
+            if path.is_file():
+                try:
+                    read_checkpoint(path)
+                    return path
+                except CheckpointError as error:
+                    logger.warning("%s", error)
+                    damage.append(str(error))
+        if damage:
+            raise CheckpointError(f"{'; '.join(damage)}; resume=restart moves the run aside and trains anew")
+        return None
+
+    def read_result(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """run.json and metrics.json of a finished run."""
+        contents = []
+        for path in (self.record, self.metrics_json):
+            try:
+                content = json.loads(path.read_text())
+            except (OSError, ValueError) as error:
+                raise DataError(f"{path} is not readable ({error}); delete it to have it made again") from error
+            if not isinstance(content, dict):
+                raise DataError(f"{path} must hold an object, but holds a {type(content).__name__}; delete it")
+            contents.append(content)
+        return contents[0], contents[1]
+
+
+def make_writable(folder: Path, key: str) -> None:
+    """Make a folder and try to write in it; raises ConfigError naming the setting `key` that chose it."""
+    probe = folder / f".probe-{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.write_text("")
+        probe.unlink()
+    except OSError as error:
+        raise ConfigError(f"{folder} cannot be written ({error.strerror}); choose another {key}=FOLDER") from error
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

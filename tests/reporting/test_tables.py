@@ -29,7 +29,7 @@ def write_run(outputs, name, overrides, seed, value, root="world", scale="mini")
 def test_seeds_are_averaged_and_the_best_is_bold(tmp_path):
     for seed, value in enumerate((0.3, 0.4, 0.5)):
         write_run(tmp_path, f"a{seed}", [f"seed={seed}", "phase=phase1"], seed, value)
-    write_run(tmp_path, "b", ["model.kggi=null", "model.ocsf=null", "paths.outputs=x"], 0, 0.1)
+    write_run(tmp_path, "b", ["model.kggi=null", "model.ocsf=null", "paths.outputs=x", "data.root=y"], 0, 0.1)
     write_run(tmp_path, "c", [], 0, 0.9, scale="debug")
     runs = read_runs(tmp_path, "mini", "phase1")
     lines = experiment_tables(runs, {(): "ours", ("model.kggi=null", "model.ocsf=null"): "radar only"}).splitlines()
@@ -52,3 +52,19 @@ def test_broken_records_are_named(tmp_path, content):
     (folder / "run.json").write_text(content)
     with pytest.raises(DataError, match=r"run\.json"):
         read_runs(tmp_path, "mini", "phase1")
+
+
+def test_a_number_edited_into_text_is_named(tmp_path):
+    folder = write_run(tmp_path, "a", [], 0, 0.3)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics["classes"]["car"]["AP"] = "0.3"
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    with pytest.raises(DataError, match=r"metrics\.json.*classes\.car\.AP"):
+        read_runs(tmp_path, "mini", "phase1")
+
+
+def test_unfinished_and_replaced_runs_are_left_out(tmp_path):
+    write_run(tmp_path, "a", [], 0, 0.3)
+    write_run(tmp_path, "a.before-20260101-000000", [], 0, 0.9)
+    (write_run(tmp_path, "b", [], 1, 0.9) / "metrics.json").unlink()
+    assert [run.metrics["mAP"] for run in read_runs(tmp_path, "mini", "phase1")] == [0.3]

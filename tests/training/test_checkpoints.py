@@ -24,15 +24,22 @@ def test_round_trip(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["last.ckpt"]
 
 
-@pytest.mark.parametrize("damage", ["empty", "truncated", "text", "foreign"])
+@pytest.mark.parametrize("damage", ["empty", "truncated", "flipped", "text", "foreign", "other values"])
 def test_damaged_files_are_named(tmp_path, damage):
     path = tmp_path / "x.ckpt"
-    AtomicCheckpointIO().save_checkpoint(content(nn.Linear(30, 20)), path)
+    model = nn.Linear(30, 20)
+    AtomicCheckpointIO().save_checkpoint(content(model), path)
     data = path.read_bytes()
+    flipped = bytearray(data)
+    flipped[data.index(model.weight.detach().numpy().tobytes())] ^= 0xFF  # one bit pattern of one weight
     if damage == "foreign":
         torch.save({"weights": torch.zeros(2)}, path)
+    elif damage == "other values":
+        torch.save({"state_dict": {"model.weight": "hello"}, "horizon3d": {"config": {}}}, path)
     else:
-        path.write_bytes({"empty": b"", "truncated": data[: len(data) // 2], "text": b"hello"}[damage])
+        path.write_bytes(
+            {"empty": b"", "truncated": data[: len(data) // 2], "flipped": bytes(flipped), "text": b"hello"}[damage]
+        )
     with pytest.raises(CheckpointError, match=r"x\.ckpt"):
         read_checkpoint(path)
 
@@ -46,7 +53,7 @@ def test_code_in_a_checkpoint_is_not_run(tmp_path):
 
     path = tmp_path / "x.ckpt"
     torch.save({"state_dict": Malicious(), "horizon3d": {}}, path)
-    with pytest.raises(CheckpointError):
+    with pytest.raises(CheckpointError, match="nothing in it was executed"):
         read_checkpoint(path)
     assert not canary.exists()
 
@@ -54,6 +61,15 @@ def test_code_in_a_checkpoint_is_not_run(tmp_path):
 def test_a_checkpoint_of_another_model_names_the_keys(tmp_path):
     with pytest.raises(CheckpointError, match=r"bias.*weight is \[2, 3\], the model has \[2, 4\]"):
         load_model_weights(nn.Linear(4, 2), content(nn.Linear(3, 2, bias=False)), tmp_path / "x.ckpt")
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path):
+    model = nn.Linear(3, 2)
+    broken = content(model)
+    broken["state_dict"]["model.bias"] = torch.tensor([0.0, float("nan")])
+    with pytest.raises(CheckpointError, match="not finite, bias"):
+        load_model_weights(model, broken, tmp_path / "x.ckpt")
+    assert torch.isfinite(model.bias).all()
 
 
 def test_missing_file(tmp_path):

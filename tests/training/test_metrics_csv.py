@@ -21,12 +21,12 @@ def test_new_columns_and_values(tmp_path):
 
 def test_a_resumed_run_keeps_the_rows_up_to_its_checkpoint(tmp_path):
     log = MetricsCSV(tmp_path / "m.csv", resume_step=-1)
-    for step in range(1, 6):
+    for step in range(5):
         log.log_metrics({"loss": float(step), "epoch": 0}, step=step)
-    resumed = MetricsCSV(tmp_path / "m.csv", resume_step=3)
-    resumed.log_metrics({"loss": 40.0, "epoch": 1}, step=4)
+    resumed = MetricsCSV(tmp_path / "m.csv", resume_step=3)  # the checkpoint after steps 0, 1 and 2
+    resumed.log_metrics({"loss": 30.0, "epoch": 1}, step=3)
     assert [(row["step"], row["loss"]) for row in rows(tmp_path / "m.csv")] == [
-        ("1", "1"), ("2", "2"), ("3", "3"), ("4", "40"),
+        ("0", "0"), ("1", "1"), ("2", "2"), ("3", "30"),
     ]  # fmt: skip
 
 

@@ -2,8 +2,9 @@ import json
 
 import pytest
 
-from src.errors import CheckpointError, ConfigError
-from src.training.run_folder import Resume, RunFolder, write_json
+from src.errors import CheckpointError, ConfigError, DataError
+from src.training.checkpoints import AtomicCheckpointIO
+from src.training.run_folder import Resume, RunFolder, make_writable, write_json
 
 
 def finish(folder):
@@ -19,7 +20,7 @@ def test_a_new_run_is_unfinished_and_a_finished_one_is_kept(tmp_path):
     folder._release()
     again = RunFolder(tmp_path, "run")
     again.open(Resume.auto)
-    assert again.finished and again.read_record() == {"commit": "abc"}
+    assert again.finished and again.read_result() == ({"commit": "abc"}, {"mAP": 0.5})
 
 
 def test_never_refuses_and_restart_moves_the_old_folder_aside(tmp_path):
@@ -49,12 +50,33 @@ def test_a_folder_that_cannot_be_written_is_named_before_training(tmp_path):
         RunFolder(tmp_path / "outputs", "run").open(Resume.auto)
 
 
-def test_a_broken_record_is_named(tmp_path):
+@pytest.mark.parametrize("name", ["run.json", "metrics.json"])
+@pytest.mark.parametrize("content", ["{", "5"])
+def test_a_broken_result_is_named(tmp_path, name, content):
     folder = RunFolder(tmp_path, "run")
     folder.open(Resume.auto)
-    folder.record.write_text("{")
-    with pytest.raises(CheckpointError, match=r"run\.json.*resume=restart"):
-        folder.read_record()
+    finish(folder)
+    (folder.path / name).write_text(content)
+    with pytest.raises(DataError, match=rf"{name}.*delete it"):
+        folder.read_result()
+
+
+def test_a_damaged_last_checkpoint_gives_way_to_the_best(tmp_path):
+    folder = RunFolder(tmp_path, "run")
+    folder.open(Resume.auto)
+    last, best = (folder.checkpoints / f"{name}.ckpt" for name in ("last", "best"))
+    AtomicCheckpointIO().save_checkpoint({"state_dict": {}, "horizon3d": {"config": {}}}, best)
+    last.write_bytes(best.read_bytes()[:-40])
+    assert folder.newest_checkpoint() == best
+    best.write_bytes(b"")
+    with pytest.raises(CheckpointError, match=r"last\.ckpt.*best\.ckpt.*resume=restart"):
+        folder.newest_checkpoint()
+
+
+def test_a_folder_that_cannot_be_made_names_its_setting(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="out=FOLDER"):
+        make_writable(tmp_path / "file", "out")
 
 
 def test_json_with_nan_is_refused_rather_than_written(tmp_path):

@@ -88,6 +88,12 @@ class WorldConfig:
             "key_frames_per_scene": 60,
             "ghost_fraction": 1.0,
             "lidar_step_deg": 10.0,
+            "image_width_px": 8192,
+            "image_height_px": 8192,
+            "returns_density": 100.0,
+            "clutter_density": 100.0,
+            "false_alarms_per_sweep": 1000.0,
+            "rare_objects": 10.0,
         }
         for name, low in at_least.items():
             value, high = getattr(self, name), at_most.get(name, math.inf)

@@ -49,17 +49,24 @@ def write_world(config: WorldConfig, root: Path, progress: bool = True) -> Path:
     """Write a world to `root`, which must not exist or be empty, and return `root`.
 
     Everything goes into a hidden folder beside `root` that is renamed at the end, so an interrupted run leaves no
-    `root`. The bytes depend on the config alone, not on `num_workers`. Raises DataError if `root` is taken.
+    `root`. The bytes depend on the config alone, not on `num_workers`. Raises DataError if `root` is taken or cannot be
+    written.
     """
     root = Path(root)
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise DataError(
             f"{root}: a world needs a new or empty folder, but this one is in use; choose another or remove it"
         )
-    root.parent.mkdir(parents=True, exist_ok=True)
     partial_root = root.parent / f".{root.name}.partial-{uuid.uuid4().hex[:8]}"
     try:
-        _fill(config, partial_root, progress)
+        try:
+            root.parent.mkdir(parents=True, exist_ok=True)
+            _fill(config, partial_root, progress)
+        except OSError as error:
+            raise DataError(
+                f"{root}: the world could not be written ({error.strerror or error}); make room, or choose another "
+                "data.root or paths.outputs"
+            ) from error
         try:
             os.replace(partial_root, root)
         except OSError as error:

@@ -1,0 +1,40 @@
+"""What the entry points share: where data come from, and what a machine can do."""
+
+import pytest
+
+from src.assembly import build_datamodule, data_root
+from src.config import compose_config
+from src.errors import ConfigError, DataError
+from src.training.fit import check_devices
+
+
+def test_evaluation_never_writes_a_world_into_a_mistyped_folder(tmp_path):
+    config, _ = compose_config(["scale=debug", f"data.root={tmp_path / 'mistyped'}", f"paths.outputs={tmp_path}"])
+    with pytest.raises(DataError, match="mistyped"):
+        build_datamodule(config, data_root(config, write=False))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_root_with_something_else_is_refused_for_training(tmp_path):
+    (tmp_path / "thesis.txt").write_text("years of work")
+    config, _ = compose_config(["scale=debug", f"data.root={tmp_path}"])
+    with pytest.raises(DataError, match="not a complete synthetic world"):
+        data_root(config)
+    assert (tmp_path / "thesis.txt").read_text() == "years of work"
+
+
+def test_too_many_workers_are_refused(tmp_path):
+    config, _ = compose_config(["scale=debug", "data.num_workers=100000"])
+    with pytest.raises(ConfigError, match="data.num_workers=100000"):
+        build_datamodule(config, tmp_path)
+
+
+def test_devices_that_are_not_there_are_named(monkeypatch):
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
+    monkeypatch.setattr("torch.backends.mps.is_available", lambda: False)
+    check_devices("auto", 1)
+    check_devices("cpu", 1)
+    with pytest.raises(ConfigError, match="sees no GPU.*trainer.accelerator=cpu"):
+        check_devices("gpu", 1)
+    with pytest.raises(ConfigError, match="trainer.devices=2"):
+        check_devices("cpu", 2)
