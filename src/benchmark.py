@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from src.assembly import build_datamodule, build_model, data_root
-from src.config import Accelerator, BenchmarkSuite, Config, compose_config, run_command
+from src.command import run_command
+from src.config import Accelerator, BenchmarkSuite, Config, compose_config
 from src.errors import DataError
 from src.metrics.benchmark import compare_with_devkit
 from src.models.detector import Detector

@@ -6,7 +6,8 @@ import logging
 from pathlib import Path
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
-from src.config import Config, compose_config, restore_config, run_command
+from src.command import run_command
+from src.config import Config, compose_config, restore_config
 from src.errors import ConfigError
 from src.metrics.detection import score_detections
 from src.metrics.report import format_scores

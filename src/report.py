@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from src.config import compose_config, run_command
+from src.command import run_command
+from src.config import compose_config
 from src.errors import DataError
 from src.reporting.results import read_runs
 from src.reporting.tables import experiment_tables

@@ -16,7 +16,8 @@ import torch
 import yaml
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
-from src.config import Config, compose_config, run_command, run_identity
+from src.command import run_command
+from src.config import Config, compose_config, run_identity
 from src.data.datamodule import DetectionDataModule
 from src.errors import DataError
 from src.metrics.report import format_scores

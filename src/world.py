@@ -6,7 +6,8 @@ import logging
 from pathlib import Path
 
 from src.assembly import data_root
-from src.config import compose_config, run_command
+from src.command import run_command
+from src.config import compose_config
 from src.data.world.preview import WorldPreview
 from src.errors import ConfigError
 from src.pictures.cameras import CameraViews

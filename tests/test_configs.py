@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from src.config import CONF, compose_config, restore_config, run_command, run_identity
+from src.command import run_command
+from src.config import CONF, compose_config, restore_config, run_identity
 from src.errors import CheckpointError, ConfigError
 
 SCALES = sorted(p.stem for p in (CONF / "scale").glob("*.yaml"))

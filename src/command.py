@@ -1,0 +1,59 @@
+"""What every entry point does around its work: logging, messages instead of tracebacks, exit codes."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import shutil
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+
+from src.errors import ConfigError, HorizonError, InterruptedRunError
+
+# What the system says when it refuses to write; the path and the free space are then all a user needs.
+DISK_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
+
+
+def run_command(main: Callable[[list[str]], None]) -> None:
+    """Run an entry point on the command line's `key=value`s; known errors end with one message and their exit code.
+
+    Exit codes: 0 finished, 3 configuration or checkpoint, 4 data, 5 diverged, 6 interrupted and resumable, 1 a defect.
+    """
+    line = "%(asctime)s %(levelname).1s %(name)s: %(message)s"
+    logging.basicConfig(level=logging.INFO, format=line, datefmt="%H:%M:%S")
+    for noisy in ("matplotlib", "PIL", "lightning.pytorch.utilities.rank_zero"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl-C does: temporary files are removed
+    try:
+        main(sys.argv[1:])
+    except HorizonError as error:
+        print(f"\n{type(error).__name__}: {error}", file=sys.stderr)  # a progress bar may stand on the line
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        print("\nInterrupted; the same command goes on from where it can.", file=sys.stderr)
+        sys.exit(InterruptedRunError.exit_code)
+    except Exception as error:
+        known = _machine_fault(error)
+        if known is not None:
+            print(f"\n{known[0]}", file=sys.stderr)
+            sys.exit(known[1])
+        traceback.print_exc()
+        print("This is a defect of the program; please report it with the lines above.", file=sys.stderr)
+        sys.exit(1)
+
+
+def _machine_fault(error: Exception) -> tuple[str, int] | None:
+    """Message and exit code where the machine is at fault: a full or locked disk, too little memory."""
+    if isinstance(error, OSError) and error.errno in DISK_FAULTS:
+        place = Path(str(error.filename or "")).absolute().parent
+        place = place if place.is_dir() else Path.cwd()
+        free = shutil.disk_usage(place).free // 2**20
+        what = f"{error.filename or 'A file'} could not be written or read: {error.strerror}"
+        return f"{what}; {free} MiB are free in {place}; make room or choose another folder", ConfigError.exit_code
+    if "allocate memory" in str(error) or "out of memory" in str(error):  # torch's words on CPU and on GPU
+        remedy = "lower data.batch_size or data.num_workers, or choose a smaller scale or backbone"
+        return f"Out of memory: {error}; {remedy}", 1
+    return None
