@@ -90,7 +90,7 @@ class WorldConfig:
             "lidar_step_deg": 10.0,
             "image_width_px": 8192,
             "image_height_px": 8192,
-            "returns_density": 100.0,
+            "returns_density": 10_000.0,
             "clutter_density": 100.0,
             "false_alarms_per_sweep": 1000.0,
             "rare_objects": 10.0,
