@@ -38,4 +38,4 @@ test: $(STAMP) ## run every test
 
 check: $(STAMP) ## lint and the fast tests, under a minute
 	$(PYTHON) -m ruff check .
-	$(PYTHON) -m pytest -q -n auto --dist loadfile -m "not slow and not gpu" $(ARGS)
+	OMP_NUM_THREADS=1 $(PYTHON) -m pytest -q -n auto --dist loadfile -m "not slow and not gpu" $(ARGS)

@@ -34,9 +34,7 @@ class WorldConfig:
     camera_sweeps: bool  # also write the 10 Hz images between key frames
 
     radar_sweeps_per_key_frame: int  # sweeps written up to and including a key frame, 10 = all of the 20 Hz
-    returns_density: (
-        float  # scales the returns of objects and of clutter alike; about 6 for the density of the real sensor
-    )
+    returns_density: float  # scales the returns of objects and of clutter; about 6 for the real sensor's density
     clutter_density: float  # scales the number of clutter points and of look-alikes
     ghost_fraction: float  # multipath copies per real return
     false_alarms_per_sweep: float  # mean number of returns from nowhere
@@ -90,7 +88,7 @@ class WorldConfig:
             "lidar_step_deg": 10.0,
             "image_width_px": 8192,
             "image_height_px": 8192,
-            "returns_density": 10_000.0,
+            "returns_density": 100_000.0,
             "clutter_density": 100.0,
             "false_alarms_per_sweep": 1000.0,
             "rare_objects": 10.0,
