@@ -186,14 +186,15 @@ def test_distributions_are_in_the_range_of_the_real_sweep(world):
         azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
         elevation = np.degrees(np.arcsin(points[:, 2] / distance))
         return {
-            "range": np.percentile(distance, [25, 50, 75, 90]),
+            "range": np.percentile(distance, [25, 50, 75]),
+            "far range": np.percentile(distance, [90]),
             "rcs": np.percentile(points[:, 6], [25, 50, 75]),
             "azimuth": [azimuth.std()],
             "elevation": [elevation.std()],
         }
 
-    # One real sweep against three small scenes: the far tail moves by 30 m from one small world to the next.
-    slack = {"range": 35.0, "rcs": 5.0, "azimuth": 8.0, "elevation": 1.2}
+    # The far tail moves by 30 m from one small world to the next; test_statistics.py holds the default world to 25 m.
+    slack = {"range": 25.0, "far range": 35.0, "rcs": 5.0, "azimuth": 8.0, "elevation": 1.2}
     here, there = figures(mine), figures(real)
     for name, allowed in slack.items():
         np.testing.assert_allclose(here[name], there[name], atol=allowed, err_msg=name)

@@ -6,6 +6,7 @@ small and rare objects a frame, most of them near the truck, because twelve vali
 """
 
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,9 @@ from src.data.world.config import WorldConfig
 from src.data.world.write import write_world
 from src.structures.taxonomy import CATEGORY_TO_CLASS, CLASS_RANGE_M, CLASSES
 
+REPOSITORY = Path(__file__).resolve().parents[3]
+REAL_SWEEPS = REPOSITORY.parent / "shared" / "real" / "truckscenes_radar"
+REAL_SWEEP = REAL_SWEEPS / "RADAR_LEFT_FRONT_1692868171703999.pcd"
 REAL_CLASSES = ("car", "truck", "trailer", "traffic_sign")
 
 
@@ -78,10 +82,29 @@ def test_a_small_world_looks_like_the_real_frames(make_config, tmp_path, stored_
     assert set(table["klass"]) == set(CLASSES)
 
 
-@pytest.mark.slow
-def test_the_default_world_looks_like_the_real_frames_and_holds_every_class(default_values, tmp_path, stored_world):
+@pytest.fixture(scope="module")
+def default_world(default_values, tmp_path_factory, stored_world):
     config = WorldConfig(**default_values)
-    world = stored_world(write_world(config, tmp_path / "w", progress=False))
+    return config, stored_world(write_world(config, tmp_path_factory.mktemp("default") / "w", progress=False))
+
+
+@pytest.mark.slow
+def test_the_ranges_of_the_default_world_are_those_of_the_real_sweep(default_world):
+    if not REAL_SWEEP.is_file():
+        pytest.skip(f"no real radar file at {REAL_SWEEP.name}")
+    _, world = default_world
+    rows = [row for row in world["sample_data"] if world.channel(row) == "RADAR_LEFT_FRONT"]
+    real = np.frombuffer(REAL_SWEEP.read_bytes().split(b"DATA binary\n")[1], "<f4").reshape(-1, 7)
+    here, there = (
+        np.percentile(np.linalg.norm(points[:, :3], axis=1), [25, 50, 75, 90])
+        for points in (np.concatenate([world.radar(row) for row in rows]), real)
+    )
+    np.testing.assert_allclose(here, there, atol=25.0)
+
+
+@pytest.mark.slow
+def test_the_default_world_looks_like_the_real_frames_and_holds_every_class(default_world):
+    config, world = default_world
     table = table_of(world)
     check(table, config.num_scenes * config.key_frames_per_scene, slack=1.0)
     val = {row["token"] for row in world["scene"][config.num_train_scenes :]}
