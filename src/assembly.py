@@ -15,6 +15,7 @@ from src.metrics.submission import write_submission
 from src.models import build_model as build_model_of
 from src.models.detector import Detector
 from src.training.detection import DetectionModule
+from src.training.temporal import TemporalModule
 
 logger = logging.getLogger(__name__)
 
@@ -51,6 +52,7 @@ def build_datamodule(config: Config, root: Path) -> DetectionDataModule:
         image_size_px=tuple(config.backbone.image_size_px) if config.model.uses_images else None,
         seed=config.seed,
         cache=Path(config.paths.outputs) / "cache",
+        temporal=config.phase.temporal,
     )
 
 
@@ -63,8 +65,7 @@ def build_model(config: Config) -> Detector:
 
 def save_submission(module: DetectionModule, path: Path) -> bool:
     """Write the boxes of the module's last validation as a submission; False, with a warning, when there is none."""
-    with module.metric.sync_context():
-        table, _ = module.metric.collected()
+    table = module.detections
     if not len(table):
         logger.warning("no box reached the score threshold, so there is no valid submission to write")
         return False
@@ -80,7 +81,8 @@ def save_submission(module: DetectionModule, path: Path) -> bool:
 
 def build_module(config: Config, tree: dict[str, Any], datamodule: DetectionDataModule) -> DetectionModule:
     """The LightningModule of a run; `tree` is the configuration as plain values."""
-    return DetectionModule(
+    kind = TemporalModule if config.phase.temporal else DetectionModule
+    return kind(
         build_model(config),
         optim=config.optim,
         backbone_lr_multiplier=config.backbone.lr_multiplier,

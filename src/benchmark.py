@@ -25,7 +25,7 @@ from src.metrics.benchmark import compare_with_devkit
 from src.models.detector import Detector
 from src.ops.allocator import tune_cpu_allocator
 from src.structures.batch import FrameBatch
-from src.training.fit import check_devices
+from src.training.processes import check_devices
 from src.training.run_folder import make_writable, write_json
 
 REPEATS = 3
@@ -83,7 +83,7 @@ def benchmark_model(config: Config) -> dict[str, Any]:
         "peak_memory_mib": int(peak_bytes / 2**20),
         "parameters": {name: sum(p.numel() for p in part.parameters()) for name, part in model.named_children()},
         "radar_points": len(batch.radar_points),
-        "state": {name: float(value) for name, value in model.diagnostics(model(batch)).items()},
+        "state": {name: float(value) for name, value in model.diagnostics(model(batch)[0]).items()},
     }
 
 
@@ -108,7 +108,7 @@ def timed_step(
         )
     begin = now()
     with torch.autocast(device.type, dtype=torch.bfloat16, enabled=autocast):
-        output = model(batch)
+        output, _ = model(batch)
         forward = now()
         terms = model.loss(output, batch)
     loss = now()

@@ -33,6 +33,7 @@ from src.training.run_folder import Resume
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir())
+PHASES = sorted(path.stem for path in (CONF / "phase").glob("*.yaml"))
 
 # Lines of Hydra's messages that tell a user nothing, or to do what is refused here (`+key`).
 HYDRA_INTERNALS = (
@@ -56,8 +57,10 @@ OUTSIDE_IDENTITY = (
     "checkpoint",
     "predictions",
     "out",
+    "scene",
     "preview",
     "suite",
+    "phase.train_missing",
     "data.num_workers",
     "data.root",
     "data.world.num_workers",
@@ -83,14 +86,17 @@ class PhaseConfig:
     """One training phase."""
 
     name: str
+    temporal: bool  # clips in order with memory; false: shuffled single frames, and the model has no temporal part
+    init_from: str | None  # a phase, that is the run of the same command in that phase; or the path of a checkpoint
+    train_missing: bool  # train the run that init_from names when it has not finished yet
     epochs: int
     validate_every: int  # epochs
     velocity_code_weight: float  # weight of velocity in the box loss
 
     def __post_init__(self) -> None:
-        if not (CONF / "phase" / f"{self.name}.yaml").is_file():
-            known = ", ".join(sorted(path.stem for path in (CONF / "phase").glob("*.yaml")))
-            raise ConfigError(f"phase.name={self.name}: must be one of {known}; choose with phase=...")
+        if self.name not in PHASES:
+            raise ConfigError(f"phase.name={self.name}: must be one of {', '.join(PHASES)}; choose with phase=...")
+        _refuse_empty("phase.init_from", self.init_from)
         if not self.velocity_code_weight >= 0:
             raise ConfigError(f"phase.velocity_code_weight must be at least 0, but got {self.velocity_code_weight}")
         for name in ("epochs", "validate_every"):
@@ -111,14 +117,23 @@ class TrainerConfig:
     """Where a run computes and how often it reports."""
 
     accelerator: Accelerator
-    devices: int
+    devices: int  # processes on each machine
+    num_nodes: int  # machines
     log_every_steps: int
+    checkpoint_every_steps: int | None  # null: after every epoch
     num_pictures: int  # validation frames drawn at the end
 
     def __post_init__(self) -> None:
-        for name, least in {"devices": 1, "log_every_steps": 1, "num_pictures": 0}.items():
-            if getattr(self, name) < least:
-                raise ConfigError(f"trainer.{name} must be at least {least}, but got {getattr(self, name)}")
+        least_of = {"devices": 1, "num_nodes": 1, "log_every_steps": 1, "checkpoint_every_steps": 1, "num_pictures": 0}
+        for name, least in least_of.items():
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ConfigError(f"trainer.{name} must be at least {least}, but got {value}")
+
+    @property
+    def num_processes(self) -> int:
+        """Ranks that train together."""
+        return self.devices * self.num_nodes
 
 
 @dataclass(kw_only=True)
@@ -183,6 +198,7 @@ class Config:
     checkpoint: str | None
     predictions: str | None
     out: str | None
+    scene: str | None
     preview: bool
     suite: BenchmarkSuite
 
@@ -193,13 +209,13 @@ class Config:
             raise ConfigError(f"seed must be at least 0 and below 2**32, but got {self.seed}")
         if self.model.name not in MODEL_CONFIGS:
             raise ConfigError(f"model.name={self.model.name}: must be one of {', '.join(MODEL_CONFIGS)}")
-        for name in ("checkpoint", "predictions", "out"):
+        for name in ("checkpoint", "predictions", "out", "scene"):
             _refuse_empty(name, getattr(self, name))
         _refuse_empty("data.root", self.data.root)
-        if self.data.batch_size % self.trainer.devices:
+        if self.data.batch_size % self.trainer.num_processes:
             raise ConfigError(
                 f"data.batch_size={self.data.batch_size} is the total over all devices and must be divisible by "
-                f"trainer.devices={self.trainer.devices}"
+                f"trainer.devices={self.trainer.devices} times trainer.num_nodes={self.trainer.num_nodes}"
             )
 
 
@@ -236,7 +252,10 @@ def _compose(overrides: list[str]) -> DictConfig:
             raise ConfigError(f"{override}: keys cannot be removed; a part is switched off with {override[1:]}=null")
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
-            return compose("config", overrides=overrides)
+            tree = compose("config", overrides=overrides)
+        if not tree.phase.temporal:
+            tree.model.dptf = None  # in code: a later at_scale file would revive a part that a phase file sets to null
+        return tree
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_hydra_message(error)) from error
     except (ValueError, AssertionError) as error:  # Hydra's own words for these name neither the key nor the remedy
@@ -334,9 +353,16 @@ def _check_tree(value: Any, node: Any, path: str) -> None:
         raise ConfigError(f"{path} must be a finite number, but got {value}")
 
 
-def run_identity(tree: dict[str, Any]) -> str:
-    """`<model>-<phase>-<scale>-<8 hex>`: the hex is a digest of all that can change the result of a run."""
+def run_identity(tree: dict[str, Any], source: str | None = None) -> str:
+    """`<model>-<phase>-<scale>-<8 hex>`: the hex is a digest of all that can change the result of a run.
+
+    `source` identifies the weights that the run starts from, None for fresh ones.
+    """
     tree = json.loads(json.dumps(tree))
+    if source is not None:
+        tree["phase"]["init_from"] = source
+    if not tree["phase"]["temporal"]:
+        tree["data"].pop("groups_per_scene")
     for key in OUTSIDE_IDENTITY:
         *parents, leaf = key.split(".")
         node = tree

@@ -15,7 +15,8 @@ from src.metrics.scores import DetectionScores
 from src.metrics.submission import load_submission
 from src.ops.allocator import tune_cpu_allocator
 from src.training.checkpoints import load_model_weights, read_checkpoint
-from src.training.fit import build_evaluation_trainer, check_devices
+from src.training.fit import build_evaluation_trainer
+from src.training.processes import check_devices
 from src.training.run_folder import make_writable, write_json
 
 logger = logging.getLogger(__name__)

@@ -20,11 +20,22 @@ from src.command import run_command
 from src.config import Config, compose_config, run_identity
 from src.data.datamodule import DetectionDataModule
 from src.errors import DataError
+from src.handoff import Source, find_source, hand_over, train_source
 from src.metrics.report import format_scores
 from src.ops.allocator import tune_cpu_allocator
 from src.pictures.curves import draw_curves, draw_scores
 from src.training.detection import DetectionModule
-from src.training.fit import build_loggers, build_trainer, check_devices, fit
+from src.training.fit import build_loggers, build_trainer, fit
+from src.training.processes import (
+    build_strategy,
+    check_devices,
+    created_externally,
+    decided_by_main,
+    end_processes,
+    is_main_process,
+    launch,
+    process_group,
+)
 from src.training.run_folder import RunFolder, current_commit, write_json
 from src.training.snapshots import draw_frames
 
@@ -32,33 +43,67 @@ logger = logging.getLogger(__name__)
 
 
 def main(overrides: list[str]) -> None:
-    """Train one run, or show it when it has finished already."""
+    """Train one run, or show it when it has finished; start its processes first when there are to be several."""
+    started = time.monotonic()
     config, tree = compose_config(overrides)
-    check_devices(config.trainer.accelerator.value, config.trainer.devices)
-    folder = RunFolder(Path(config.paths.outputs), run_identity(tree))
+    where = (config.trainer.accelerator.value, config.trainer.devices, config.trainer.num_nodes)
+    check_devices(*where)
+    source = find_source(config, overrides)
+    folder = RunFolder(Path(config.paths.outputs), run_identity(tree, source.identity if source is not None else None))
+    if config.trainer.num_processes > 1 and not created_externally():
+        if source is not None and not source.ready and not folder.finished:
+            train_source(source, config.phase.train_missing, processes_exist=False)
+        launch("src.train", overrides, config.trainer.devices)
+        return
+    with process_group(*where):
+        start = decided_by_main(lambda: prepare(config, tree, folder, source))
+        if start is not None:
+            run(config, tree, folder, source, start, started, overrides)
+
+
+def prepare(config: Config, tree: dict[str, Any], folder: RunFolder, source: Source | None) -> dict[str, Any] | None:
+    """What one process decides for all: the checkpoint to go on from and the data folder; None for a finished run."""
     folder.open(config.resume)
     if folder.finished:
         show_finished(folder)
-        return
-    started = time.monotonic()
-    tune_cpu_allocator()
-    L.seed_everything(config.seed, verbose=False)
+        return None
+    resume_from = folder.newest_checkpoint()
+    if resume_from is None and source is not None and not source.ready:
+        train_source(source, config.phase.train_missing, processes_exist=config.trainer.num_processes > 1)
     log = logging.FileHandler(folder.log)
     log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logging.getLogger().addHandler(log)
     folder.config.write_text(yaml.safe_dump(tree, sort_keys=False))
     logger.info("run %s in %s", folder.run_id, folder.path)
+    return {"resume_from": resume_from and str(resume_from), "root": str(data_root(config))}
 
-    root = data_root(config)
-    datamodule = build_datamodule(config, root)
+
+def run(
+    config: Config,
+    tree: dict[str, Any],
+    folder: RunFolder,
+    source: Source | None,
+    start: dict[str, Any],  # see `prepare`
+    started: float,  # time.monotonic()
+    overrides: list[str],
+) -> None:
+    """Train on every process; the main one then leaves results and pictures."""
+    tune_cpu_allocator()
+    L.seed_everything(config.seed, verbose=False)
+    datamodule = build_datamodule(config, Path(start["root"]))
     module = build_module(config, tree, datamodule)
-    resume_from = folder.newest_checkpoint()
+    resume_from = Path(start["resume_from"]) if start["resume_from"] else None
     if resume_from is not None:
         logger.info("going on from %s", resume_from)
+    elif source is not None:
+        hand_over(module.model, source, tree)
     trainer = make_trainer(config, tree, folder, resume_from)
     training_started = time.monotonic()
     fit(trainer, module, datamodule, resume_from)
     seconds = time.monotonic() - training_started
+    end_processes()
+    if not is_main_process():
+        return
 
     scores = module.scores.as_dict()
     write_json(folder.metrics_json, scores)  # what took long is safe; run.json, the last file, marks the run finished
@@ -71,6 +116,7 @@ def main(overrides: list[str]) -> None:
         "seed": config.seed,
         "data": datamodule.identity(),
         "commit": current_commit(),
+        "initialized_from": source.identity if source is not None else None,
         "epochs": config.phase.epochs,
         "steps": trainer.global_step,
         "parameters": sum(p.numel() for p in module.model.parameters()),
@@ -79,6 +125,7 @@ def main(overrides: list[str]) -> None:
         "peak_memory_mib": peak_memory_mib(),
         "skipped_files": module.skipped,
         "device": str(module.device),
+        "processes": config.trainer.num_processes,
         "threads": torch.get_num_threads(),
         "versions": {
             "python": platform.python_version(),
@@ -108,18 +155,17 @@ def draw_pictures(
         {name: values["mAP"] for name, values in scores["ranges"].items()},
         folder.run_id,
     )
-    frames = datamodule.validation_frames(config.trainer.num_pictures)
-    draw_frames(module.model, [frame.to(module.device) for frame in frames], config.grid.build(), folder.pictures)
+    length = config.model.dptf.num_frames + 1 if config.phase.temporal and config.model.dptf is not None else 1
+    clips = datamodule.validation_clips(config.trainer.num_pictures, length)
+    draw_frames(module.model, clips, config.grid.build(), folder.pictures)
 
 
 def make_trainer(config: Config, tree: dict[str, Any], folder: RunFolder, resume_from: Path | None) -> L.Trainer:
-    """The Trainer of this configuration."""
+    """The Trainer of this configuration; the main process alone logs."""
     wandb = config.logger.wandb
-    loggers = build_loggers(
-        folder,
-        resume_from,
-        None if wandb is None else {"project": wandb.project, "offline": wandb.offline, "config": tree},
-    )
+    about = None if wandb is None else {"project": wandb.project, "offline": wandb.offline, "config": tree}
+    loggers = build_loggers(folder, resume_from, about) if is_main_process() else []
+    where = (config.trainer.accelerator.value, config.trainer.devices, config.trainer.num_nodes)
     return build_trainer(
         folder,
         epochs=config.phase.epochs,
@@ -127,6 +173,9 @@ def make_trainer(config: Config, tree: dict[str, Any], folder: RunFolder, resume
         precision=config.precision,
         accelerator=config.trainer.accelerator.value,
         devices=config.trainer.devices,
+        num_nodes=config.trainer.num_nodes,
+        strategy=build_strategy(*where),
+        checkpoint_every_steps=config.trainer.checkpoint_every_steps,
         log_every_steps=config.trainer.log_every_steps,
         ema_decay=config.optim.ema_decay,
         loggers=loggers,

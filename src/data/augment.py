@@ -1,4 +1,4 @@
-"""Image augmentation per frame and view (IDA) and BEV augmentation per frame (BDA), spec section 9."""
+"""Image augmentation per frame and view (IDA) and BEV augmentation per frame or clip (BDA), spec sections 6.4, 9."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ImageAugmentationConfig:
 
 @dataclass(kw_only=True)
 class BevAugmentationConfig:
-    """BDA: drawn for every frame."""
+    """BDA: drawn for every frame, or once for a clip."""
 
     scale: list[float]  # [low, high]
     rotation_rad: float  # +-

@@ -14,7 +14,7 @@ import numpy as np
 
 from src.data.schema import TABLES, DatasetIndex, build_index, version_folder
 
-FORMAT = 2  # raise it when DatasetIndex or a check changes: older caches are then built again
+FORMAT = 3  # raise it when DatasetIndex or a check changes: older caches are then built again
 
 _log = logging.getLogger(__name__)
 _PLAIN = ("root", "version", "annotated")

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset
 
 from src.data.augment import AugmentationConfig
 from src.data.cache import load_index
+from src.data.clips import (
+    FrameKey,
+    Schedule,
+    ScheduleSampler,
+    frames_in_order,
+    scenes_of,
+    shuffled_frames,
+    streamed_groups,
+    whole_scenes,
+)
 from src.data.evaluation import evaluation_set
 from src.data.reader import FrameReader, OnBadFile, ReaderSettings
 from src.data.schema import DatasetIndex
@@ -33,7 +45,8 @@ class DataConfig:
     version: str  # table folder, e.g. v1.2-trainval
     train_split: str
     split: str  # what validation and evaluation read
-    batch_size: int  # total over all devices
+    batch_size: int  # total over all devices; the lanes when clips are streamed
+    groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; spec section 6.4
     num_workers: int  # loader processes per device
     num_sweeps: int  # past sweeps of each radar
     min_distance_m: float  # nearer points are the truck itself
@@ -44,7 +57,8 @@ class DataConfig:
     world: WorldConfig | None  # the synthetic highway to write on first use; null = recorded data
 
     def __post_init__(self) -> None:
-        for name, least in {"batch_size": 1, "num_workers": 0, "num_sweeps": 1, "min_distance_m": 0}.items():
+        least_values = {"batch_size": 1, "groups_per_scene": 1, "num_workers": 0, "num_sweeps": 1, "min_distance_m": 0}
+        for name, least in least_values.items():
             if not getattr(self, name) >= least:
                 raise ConfigError(f"data.{name}={getattr(self, name)}: must be at least {least}")
         if not -0.5 < self.test_resize_offset < 1:
@@ -52,7 +66,7 @@ class DataConfig:
 
 
 class FrameDataset(Dataset[FrameBatch]):
-    """Frames by (epoch, row of the sample table): the epoch seeds the augmentation, also in worker processes.
+    """Frames by key: its epoch and clip seed the augmentation, also in worker processes.
 
     A fault comes back as a value rather than an exception: a loader would wrap an exception of a worker into a
     traceback and lose its message. `collate` passes it on and `FrameLoader` raises it.
@@ -61,43 +75,18 @@ class FrameDataset(Dataset[FrameBatch]):
     def __init__(self, reader: FrameReader, augmentation: AugmentationConfig | None, seed: int) -> None:
         self.reader, self.augmentation, self.seed = reader, augmentation, seed
 
-    def __getitem__(self, key: tuple[int, int]) -> FrameBatch | HorizonError:
-        epoch, sample = key
+    def __getitem__(self, key: FrameKey) -> FrameBatch | HorizonError:
+        clip = None if key.clip is None else str(self.reader.index.sample_tokens[key.clip])
         try:
-            return self.reader.read(sample, self.augmentation, self.seed, epoch)
+            frame = self.reader.read(key.sample, self.augmentation, self.seed, key.epoch, clip)
         except HorizonError as error:
             return error
+        return frame if key.lane is None else in_lane(frame, key.lane, key.starts)
 
 
-class FrameSampler(Sampler[tuple[int, int]]):
-    """(epoch, sample) pairs of one rank: shuffled by (seed, epoch) for training, in order without padding otherwise.
-
-    In training every rank gets the same number of whole batches; the last incomplete ones are left out.
-    """
-
-    def __init__(
-        self,
-        samples: np.ndarray,  # [n] int64
-        rank: int,
-        world_size: int,
-        batch_size: int,  # of one rank
-        shuffle_seed: int | None,
-        epoch: Callable[[], int],
-    ) -> None:
-        self.samples, self.rank, self.world_size = samples, rank, world_size
-        self.batch_size, self.shuffle_seed, self.epoch = batch_size, shuffle_seed, epoch
-
-    def __len__(self) -> int:
-        if self.shuffle_seed is None:
-            return len(range(self.rank, len(self.samples), self.world_size))
-        return len(self.samples) // (self.world_size * self.batch_size) * self.batch_size
-
-    def __iter__(self) -> Iterator[tuple[int, int]]:
-        epoch, samples = self.epoch(), self.samples
-        if self.shuffle_seed is not None:
-            samples = np.random.default_rng((self.shuffle_seed, epoch)).permutation(samples)
-        for sample in samples[self.rank :: self.world_size][: len(self)]:
-            yield epoch, int(sample)
+def in_lane(frame: FrameBatch, lane: int, starts: bool) -> FrameBatch:
+    """A batch of one, marked as the next frame of a lane."""
+    return replace(frame, lanes=torch.tensor([lane]), starts=torch.tensor([starts]))
 
 
 class FrameLoader(DataLoader):
@@ -130,7 +119,9 @@ def dead_workers_named() -> Iterator[None]:
 class DetectionDataModule(L.LightningDataModule):
     """Key frames of the training and the validation split as `FrameBatch`.
 
-    `image_size_px` None leaves images unread. Raises DataError when tables, split or files are not right.
+    `image_size_px` None leaves images unread. `temporal` streams clips, with `lanes` and `starts` in every batch;
+    without it training reads shuffled frames and validation reads frames in table order.
+    Raises DataError when tables, split or files are not right.
     """
 
     def __init__(
@@ -140,9 +131,11 @@ class DetectionDataModule(L.LightningDataModule):
         image_size_px: tuple[int, int] | None,  # (height, width)
         seed: int,
         cache: Path,
+        *,
+        temporal: bool,
     ) -> None:
         super().__init__()
-        self.config, self.root, self.seed = config, root, seed
+        self.config, self.root, self.seed, self.temporal = config, root, seed, temporal
         self.settings = ReaderSettings(
             num_sweeps=config.num_sweeps,
             min_distance_m=config.min_distance_m,
@@ -171,52 +164,110 @@ class DetectionDataModule(L.LightningDataModule):
     def validation_frames(self, count: int) -> list[FrameBatch]:
         """Up to `count` different frames spread evenly over the validation split, batches of one."""
         samples = split_samples(self.index, self.config.split)
-        picks = np.unique(np.linspace(0, len(samples) - 1, 2 * count + 1)[1::2].round().astype(int))
-        return [self.reader.read(int(samples[pick]), None) for pick in picks]
+        return [self.reader.read(int(sample), None) for sample in _evenly_spread(samples, count)]
+
+    def validation_clips(self, count: int, length: int) -> list[list[FrameBatch]]:
+        """Up to `count` clips that end at the frames of `validation_frames`, batches of one in lane 0.
+
+        A clip has `length` consecutive frames, fewer where its scene begins later than that.
+        """
+        samples = split_samples(self.index, self.config.split)
+        scenes = scenes_of(self.index, samples)
+        clips = []
+        for sample in _evenly_spread(samples, count):
+            (scene,) = (scene for scene in scenes if sample in scene)
+            end = int(np.flatnonzero(scene == sample)[0]) + 1
+            clips.append(list(self._in_order(scene[max(0, end - length) : end])))
+        return clips
+
+    def scene_names(self) -> list[str]:
+        """Names of the validation split's scenes, in the order of `stream`."""
+        return list(self._scenes())
+
+    def stream(self, scenes: list[str] | None = None) -> Iterator[FrameBatch]:
+        """The frames of some or all scenes of the validation split one by one, in lane 0; each scene is a clip.
+
+        Raises ConfigError for a scene that the split does not have.
+        """
+        known = self._scenes()
+        for name in scenes or ():
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=5, cutoff=0.0)
+                raise ConfigError(
+                    f"scene {name!r}: the split {self.config.split!r} has no such scene; the nearest of its "
+                    f"{len(known)} names are {near}"
+                )
+        wanted = known if scenes is None else scenes
+        return (frame for name in wanted for frame in self._in_order(known[name]))
+
+    def _scenes(self) -> dict[str, np.ndarray]:
+        """Frames of the validation split's scenes by name."""
+        scenes = scenes_of(self.index, split_samples(self.index, self.config.split))
+        return {str(self.index.scene_names[self.index.sample_scenes[scene[0]]]): scene for scene in scenes}
+
+    def _in_order(self, samples: np.ndarray) -> Iterator[FrameBatch]:
+        """One clip in lane 0, without augmentation."""
+        for at, sample in enumerate(samples):
+            yield in_lane(self.reader.read(int(sample), None), 0, at == 0)
 
     def train_dataloader(self) -> DataLoader:
-        """Shuffled, augmented batches; raises DataError when there are too few frames for one."""
-        config = self.config
-        samples = split_samples(self.index, config.train_split)
+        """Augmented batches of the training split, shuffled frames or clips.
+
+        It starts where the trainer stands: after `global_step` steps, in the middle of an epoch if need be. One
+        optimiser step per batch is assumed. Raises DataError when there are too few frames for one batch.
+        """
+        config, seed, index = self.config, self.seed, self.index
+        samples = split_samples(index, config.train_split)
         if len(samples) < config.batch_size:
             raise DataError(
                 f"data.batch_size={config.batch_size}: the split {config.train_split!r} has only {len(samples)} frames"
             )
-        if not self.index.annotated:
-            raise DataError(f"{self.index.root / self.index.version}: has no annotations to train on")
-        return self._loader(samples, config.augmentation, self.seed)
+        if not index.annotated:
+            raise DataError(f"{index.root / index.version}: has no annotations to train on")
+        schedule: Callable[[int], Schedule]
+        if self.temporal:
+            scenes = scenes_of(index, samples)
+            schedule = partial(streamed_groups, scenes, config.groups_per_scene, config.batch_size, seed)
+        else:
+            schedule = partial(shuffled_frames, samples, config.batch_size, seed)
+        return self._loader(ScheduleSampler(schedule, *self._rank(), self._position), config.augmentation)
 
     def val_dataloader(self) -> DataLoader:
-        """Batches of the validation split in table order, each frame once over all ranks."""
-        return self._loader(split_samples(self.index, self.config.split), None, None)
+        """Batches of the validation split, each frame once over all ranks: in table order, or scene by scene."""
+        samples = split_samples(self.index, self.config.split)
+        rank, world_size = self._rank()
+        if self.temporal:
+            schedule = whole_scenes(scenes_of(self.index, samples), self.config.batch_size, world_size)
+        else:
+            schedule = frames_in_order(samples, self.config.batch_size)
+        return self._loader(ScheduleSampler(lambda epoch: schedule, rank, world_size), None)
 
-    def _loader(
-        self, samples: np.ndarray, augmentation: AugmentationConfig | None, shuffle_seed: int | None
-    ) -> DataLoader:
-        config, trainer = self.config, self.trainer
-        world_size = trainer.world_size if trainer is not None else 1
-        if config.batch_size % world_size:
+    def _rank(self) -> tuple[int, int]:
+        """This process's rank and the number of processes, which must divide the batch."""
+        rank, world_size = (self.trainer.global_rank, self.trainer.world_size) if self.trainer is not None else (0, 1)
+        if self.config.batch_size % world_size:
             raise ConfigError(
-                f"data.batch_size={config.batch_size} is the total over all devices and must be divisible by their "
-                f"number, {world_size}"
+                f"data.batch_size={self.config.batch_size} is the total over all devices and must be divisible by "
+                f"their number, {world_size}"
             )
-        sampler = FrameSampler(
-            samples,
-            rank=trainer.global_rank if trainer is not None else 0,
-            world_size=world_size,
-            batch_size=config.batch_size // world_size,
-            shuffle_seed=shuffle_seed,
-            epoch=lambda: trainer.current_epoch if trainer is not None else 0,
-        )
+        return rank, world_size
+
+    def _position(self, steps: int) -> tuple[int, int]:
+        """(epoch, steps done in it), from the optimiser steps that the trainer has counted or restored."""
+        if self.trainer is None:
+            return 0, 0
+        return divmod(self.trainer.global_step, min(steps, self.trainer.num_training_batches))
+
+    def _loader(self, sampler: ScheduleSampler, augmentation: AugmentationConfig | None) -> DataLoader:
+        workers = self.config.num_workers
         return FrameLoader(
             FrameDataset(self.reader, augmentation, self.seed),
-            batch_size=config.batch_size // world_size,
-            sampler=sampler,
-            num_workers=config.num_workers,
+            batch_sampler=sampler,
+            num_workers=workers,
             collate_fn=collate,
             pin_memory=torch.cuda.is_available(),
-            persistent_workers=config.num_workers > 0,
-            prefetch_factor=4 if config.num_workers else None,
+            persistent_workers=workers > 0,
+            prefetch_factor=4 if workers else None,
             worker_init_fn=_one_thread,
         )
 
@@ -244,6 +295,12 @@ def collate(frames: list[FrameBatch | HorizonError]) -> FrameBatch | HorizonErro
         name: sum(frame.skipped.get(name, 0) for frame in frames) for frame in frames for name in frame.skipped
     }
     return FrameBatch(**values)
+
+
+def _evenly_spread(samples: np.ndarray, count: int) -> np.ndarray:
+    """Up to `count` different ones, each in the middle of an equal share."""
+    picks = np.linspace(0, len(samples) - 1, 2 * count + 1)[1::2].round().astype(int)
+    return samples[np.unique(picks)]
 
 
 def _one_thread(worker: int) -> None:

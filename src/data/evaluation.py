@@ -21,9 +21,7 @@ def evaluation_set(index: DatasetIndex, split: str) -> EvaluationSet:
     return EvaluationSet(
         tokens=[str(token) for token in index.sample_tokens[samples]],
         ego_centers=index.pose_translations[index.frame_poses[samples]],
-        scene_tags=[
-            tuple(str(index.scene_descriptions[scene]).split(";")) for scene in index.sample_scenes[samples]
-        ],
+        scene_tags=[tuple(str(index.scene_descriptions[scene]).split(";")) for scene in index.sample_scenes[samples]],
         ground_truth=_table(index, samples, index.box_labels >= 0),
         racks=_table(index, samples, index.box_labels == LABEL_RACK),
     )

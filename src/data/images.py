@@ -76,15 +76,15 @@ def read_image(
                 raise DataError(f"{path}: {width} x {height} pixels are more than any camera gives ({MAX_PIXELS})")
             # Decode at 1/2, 1/4 or 1/8 where that still has more pixels than needed: half the time of a frame.
             image.draft(image.mode, (math.ceil(width * crop.resize), math.ceil(height * crop.resize)))
-            return _resample(image.convert("RGB"), crop, (height, width))
+            return resample(image.convert("RGB"), crop, (height, width))
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such file") from error
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path}: not a readable image ({error})") from error
 
 
-def _resample(
-    image: Image.Image,  # decoded, perhaps at a power of two below the source size
+def resample(
+    image: Image.Image,  # RGB, perhaps decoded at a power of two below the source size
     crop: ImageCrop,
     source_px: tuple[int, int],  # (height, width)
 ) -> Array:  # [3, H, W] uint8

@@ -64,9 +64,18 @@ class FrameReader:
         self._root = Path(os.path.realpath(index.root))
         self._reported: set[str] = set()
 
-    def read(self, sample: int, augmentation: AugmentationConfig | None, seed: int = 0, epoch: int = 0) -> FrameBatch:
+    def read(
+        self,
+        sample: int,
+        augmentation: AugmentationConfig | None,
+        seed: int = 0,
+        epoch: int = 0,
+        clip: str | None = None,
+    ) -> FrameBatch:
         """The frame at row `sample` of the sample table; random draws depend on (seed, epoch, token) alone.
 
+        `clip` is the token of the first frame of the clip that this frame is part of: A_t is then that frame's, so
+        that it stays the same throughout the clip (spec section 6.4).
         Raises DataError for an unreadable file (unless skipped) and for poses that jump.
         """
         index = self.index
@@ -74,6 +83,8 @@ class FrameReader:
         rng = frame_generator(seed, epoch, token)
         bev = augmentation.bev if augmentation is not None else None
         aug_from_ego = np.eye(4) if bev is None else draw_bev_transform(bev, rng)
+        if bev is not None and clip is not None:
+            aug_from_ego = draw_bev_transform(bev, frame_generator(seed, epoch, clip))
         pose = index.frame_poses[sample]
         global_from_ego = pose_matrix(index.pose_rotations[pose], index.pose_translations[pose])
         skipped: dict[str, int] = {}
@@ -230,22 +241,39 @@ def compensate_sweeps(
     key_time_us: int,
     global_from_ego: Array,  # [4, 4] ego(t)
     settings: ReaderSettings,
+) -> Array:  # [P, 7] float64, as `compensate_clouds`
+    """Sweeps of the tables, with mounts, poses and ego motion looked up there; see `compensate_clouds`."""
+    calibrations, poses = index.data_calibrations[rows], index.data_poses[rows]
+    global_from_sweep = pose_matrix(index.pose_rotations[poses], index.pose_translations[poses])
+    velocity, rate = ego_motion(index, index.data_times_us[rows], global_from_sweep[:, :3, :3])  # [S, 3] each
+    return compensate_clouds(
+        clouds,
+        ego_from_sensor=index.ego_from_sensor[calibrations],
+        key_from_sweep=invert_rigid(global_from_ego) @ global_from_sweep,
+        velocity=velocity,
+        rate=rate,
+        elapsed_s=1e-6 * (key_time_us - index.data_times_us[rows]),
+        settings=settings,
+    )
+
+
+def compensate_clouds(
+    clouds: list[Array],  # S of [n, 7] in the order of RADAR_FIELDS, sensor frame
+    ego_from_sensor: Array,  # [S, 4, 4]
+    key_from_sweep: Array,  # [S, 4, 4] ego(t) from the ego frame at each sweep
+    velocity: Array,  # [S, 3] m/s of the ego at each sweep, its own axes
+    rate: Array,  # [S, 3] rad/s, same axes
+    elapsed_s: Array,  # [S] key frame minus sweep
+    settings: ReaderSettings,
 ) -> Array:  # [P, 7] float64: x, y, z (m, ego(t)), rcs, vx, vy (m/s over ground, radial, ego(t) axes), dt (s)
     """Move sweeps to ego(t) and turn relative radial velocities into velocities over ground (spec section 1.3).
 
-    r_hat points from the sensor to the target, v_s is the sensor's own velocity from poses, lever arm included:
+    r_hat points from the sensor to the target, v_s is the sensor's own velocity, lever arm included:
     v_r = vrel . r_hat + v_s . r_hat, zero for whatever stands still.
     """
-    calibrations, poses = index.data_calibrations[rows], index.data_poses[rows]
-    ego_from_sensor = index.ego_from_sensor[calibrations]  # [S, 4, 4]
-    global_from_sweep = pose_matrix(index.pose_rotations[poses], index.pose_translations[poses])
-    key_from_sweep = invert_rigid(global_from_ego) @ global_from_sweep  # [S, 4, 4]
-    velocity, rate = ego_motion(index, index.data_times_us[rows], global_from_sweep[:, :3, :3])  # [S, 3] each
     sensor_velocity = velocity + np.cross(rate, ego_from_sensor[:, :3, 3])
-    elapsed_s = 1e-6 * (key_time_us - index.data_times_us[rows])
-
     points = np.concatenate(clouds).astype(np.float64)
-    sweep = np.repeat(np.arange(len(rows)), [len(cloud) for cloud in clouds])
+    sweep = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
     distance = np.linalg.norm(points[:, :3], axis=1)
     near = (np.abs(points[:, :2]) < settings.min_distance_m).all(axis=1) | (distance < 1e-6)
     points, sweep, distance = points[~near], sweep[~near], distance[~near]

@@ -273,6 +273,12 @@ def _frame_columns(samples: Table, data_samples: Array, data_key: Array, parts: 
     safe = reference if files else np.full(len(reference), -1)
     parts["frame_times_us"] = np.where(known, parts["data_times_us"][safe] if files else 0, sample_times)
     parts["frame_poses"] = np.where(known, parts["data_poses"][safe] if files else 0, closest).astype(np.int32)
+    frame_times, scenes = parts["frame_times_us"], parts["sample_scenes"]
+    order = np.lexsort((sample_times, scenes))
+    advances = np.ones(len(samples), bool)
+    advances[order[1:]] = (np.diff(frame_times[order]) > 0) | (np.diff(scenes[order]) > 0)
+    expected = f"a {REFERENCE_CHANNEL} key frame that is later than the one of the scene's sample before"
+    samples.check(advances, "timestamp", frame_times, expected)
 
 
 def _box_columns(folder: Path, samples: Table, annotated: bool, parts: dict[str, Array]) -> None:

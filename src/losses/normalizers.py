@@ -9,14 +9,18 @@ from torch import Tensor
 
 @torch.no_grad()
 def mean_over_ranks(
-    count: Tensor | int,  # any shape
+    count: Tensor,  # any shape, on the device of the process
 ) -> Tensor:
-    """Mean of a count over all ranks, at least 1: a rank without objects neither explodes nor weighs more."""
-    count = torch.as_tensor(count).to(torch.float32, copy=True)
-    if dist.is_available() and dist.is_initialized():
-        dist.all_reduce(count)
-        count /= dist.get_world_size()
-    return count.clamp_(min=1.0)
+    """Mean of a count over all ranks, whose total counts as at least 1.
+
+    Gradients are averaged over ranks, so that N ranks divide as one process with the batch of all of them does, also
+    where one object is all there is; a rank without objects neither explodes nor weighs more. Every rank must call it.
+    """
+    count = count.to(torch.float32, copy=True)
+    if not (dist.is_available() and dist.is_initialized()):
+        return count.clamp_(min=1.0)
+    dist.all_reduce(count)
+    return count.clamp_(min=1.0) / dist.get_world_size()
 
 
 def full_precision(x: Tensor) -> Tensor:

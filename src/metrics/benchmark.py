@@ -37,7 +37,7 @@ def compare_with_devkit(
     timed: dict[str, float] = {}
     for name, by_range in (("ours_s", False), ("ours_ranges_s", True)):
         start = time.process_time()
-        ours = score_detections(evaluation_set, predictions, by_range=by_range, by_tag=False)
+        ours = score_detections(evaluation_set, predictions, by_range=by_range, by_tag=False, by_speed=False)
         timed[name] = time.process_time() - start
 
     official = _OfficialEvaluation(devkit, evaluation_set, predictions)
@@ -74,9 +74,7 @@ def random_problem(num_samples: int, gts: int, preds: int, seed: int) -> tuple[E
     if len(truth):
         near = np.flatnonzero(rng.random(len(predictions)) < 0.5)
         source = predictions.samples[near] * gts + rng.integers(0, gts, len(near))
-        predictions.labels[near] = np.where(
-            rng.random(len(near)) < 0.9, truth.labels[source], predictions.labels[near]
-        )
+        predictions.labels[near] = np.where(rng.random(len(near)) < 0.9, truth.labels[source], predictions.labels[near])
         predictions.centers[near] = truth.centers[source] + rng.normal(0, 1.5, (len(near), 3))
         predictions.sizes[near] = truth.sizes[source] * rng.uniform(0.7, 1.4, (len(near), 3))
         predictions.attributes[near] = truth.attributes[source]

@@ -25,7 +25,14 @@ from src.metrics.curves import (
     mean_error,
     precision_and_confidence,
 )
-from src.metrics.filtering import RANGE_BINS_M, ego_distances, expand_ranges, official_filter
+from src.metrics.filtering import (
+    RANGE_BINS_M,
+    SPEED_CLASSES_MPS,
+    ego_distances,
+    expand_ranges,
+    official_filter,
+    speed_classes,
+)
 from src.metrics.ranking import Matching, Ranking, find_candidates, match_predictions, rank_predictions
 from src.metrics.scores import (
     CLASS_WITHOUT_ERRORS,
@@ -74,12 +81,14 @@ def score_detections(
     samples: Array | None = None,  # [S] bool, the samples to score; all without it
     by_range: bool = True,
     by_tag: bool = True,
+    by_speed: bool = True,
 ) -> DetectionScores:
-    """Score predictions as the official evaluator does, and by distance bin and scene tag.
+    """Score predictions as the official evaluator does, and by distance bin, scene tag and speed class.
 
     A sample of the set without predictions is scored as empty. `samples` restricts ground truth and predictions to
     some samples (the part of a split that was seen so far). Tags follow the official rule: samples whose scene carries
-    the tag, NaN for the tags in TAGS_WITHOUT_SCORE. Distance bins are our own: see RANGE_BINS_M.
+    the tag, NaN for the tags in TAGS_WITHOUT_SCORE. Distance bins are our own: see RANGE_BINS_M; so are speed
+    classes: see `_score_speeds`.
 
     Raises DataError for predictions that cannot be scored (see `check_predictions`) and for matched ground truth
     whose size is not positive, as the official evaluator does.
@@ -102,6 +111,7 @@ def score_detections(
         overall=_score_subset(ranking, matching, everyone, every_truth),
         ranges={},
         tags={},
+        speeds={},
         truth_kept=truth_kept,
         predictions_kept=kept,
     )
@@ -117,27 +127,31 @@ def score_detections(
         }
     if by_tag:
         scores.tags = {tag: _score_tag(ranking, matching, tag) for tag in SCENE_TAGS}
+    if by_speed:
+        scores.speeds = _score_speeds(ranking, matching)
     return scores
 
 
 def _score_subset(
     ranking: Ranking,
     matching: Matching,
-    members: Array,  # [n] bool over the ranked predictions
+    members: Array,  # [n] or, by threshold, [4, n] bool over the ranked predictions
     truth_members: Array,  # [k] bool over the ground truth that counts
 ) -> SubsetScores:
-    """Curves and scores of some predictions and ground truth that were matched only with one another."""
+    """Curves and scores of some predictions and ground truth; members that matched did so with one another."""
     num_classes, num_points = len(CLASSES), len(RECALLS)
     num_gt = np.bincount(ranking.truth_labels[truth_members], minlength=num_classes)
-    places = np.flatnonzero(members)
-    scores = ranking.scores[places]
-    class_starts = np.searchsorted(places, ranking.class_starts)
     precision = np.zeros((num_classes, len(DISTANCE_THRESHOLDS_M), num_points))
     confidence = np.zeros_like(precision)
     error_curves = np.ones((num_classes, len(ERRORS), num_points))
     errors = np.ones((num_classes, len(ERRORS)))
     for t, threshold in enumerate(DISTANCE_THRESHOLDS_M):
-        chosen = members[matching.places[t]]
+        if t == 0 or members.ndim == 2:
+            of_threshold = members if members.ndim == 1 else members[t]
+            places = np.flatnonzero(of_threshold)
+            scores = ranking.scores[places]
+            class_starts = np.searchsorted(places, ranking.class_starts)
+        chosen = of_threshold[matching.places[t]]
         matched = np.searchsorted(places, matching.places[t][chosen])  # place within the subset
         match_starts = np.searchsorted(matched, class_starts)
         match_errors = matching.errors[chosen] if threshold == ERROR_THRESHOLD_M else None
@@ -169,6 +183,26 @@ def _score_tag(ranking: Ranking, matching: Matching, tag: str) -> SubsetScores:
     if tag in TAGS_WITHOUT_SCORE:
         scores.ap, scores.errors = np.full_like(scores.ap, np.nan), np.full_like(scores.errors, np.nan)
     return scores
+
+
+def _score_speeds(ranking: Ranking, matching: Matching) -> dict[str, SubsetScores]:
+    """Scores by speed class (facts: section 5, speed classes), from the matches of the overall score.
+
+    A ground truth belongs to the class of its own speed, one of unknown velocity (NaN) to none. A prediction follows
+    the ground truth it matches at that threshold, whatever speed it states: matched within the class it is a true
+    positive there, matched elsewhere it is left out, so a wrong speed costs velocity error and no precision. One
+    that matches nothing is a false positive in the class of the speed it states; stating none (NaN) it belongs to no
+    class, as ground truth of unknown velocity does, and lowers the overall score alone.
+    """
+    truth = speed_classes(ranking.evaluation_set.ground_truth.velocities[ranking.truth_rows])
+    stated = speed_classes(ranking.predictions.velocities[ranking.rows])
+    followed = np.tile(stated, (len(DISTANCE_THRESHOLDS_M), 1))
+    for t, places in enumerate(matching.places):
+        followed[t, places] = truth[matching.ground_truth[t]]
+    return {
+        name: _score_subset(ranking, matching, followed == place, truth == place)
+        for place, name in enumerate(SPEED_CLASSES_MPS)
+    }
 
 
 class DetectionMetric(Metric):
@@ -262,9 +296,7 @@ _NUM_COLUMNS = sum(_COLUMNS.values())
 
 def _as_rows(sample: int, table: DetectionTable) -> Array:
     """The table as [n, 17] float64, which holds every index exactly, with `sample` as the sample of each box."""
-    columns = [
-        getattr(table, name).reshape(len(table), width).astype(np.float64) for name, width in _COLUMNS.items()
-    ]
+    columns = [getattr(table, name).reshape(len(table), width).astype(np.float64) for name, width in _COLUMNS.items()]
     columns[0] = np.full((len(table), 1), float(sample))
     return np.concatenate(columns, axis=1)
 

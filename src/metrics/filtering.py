@@ -13,6 +13,11 @@ Array = np.ndarray
 RANGE_BINS_M = ((0.0, 25.0), (25.0, 50.0), (50.0, 100.0), (100.0, 150.0))
 """Our distance bins [low, high): after the official filters, each box by its own distance. Not part of the devkit."""
 
+SPEED_CLASSES_MPS = {"0-0.5": 0.0, "0.5-10": 0.5, "10-25": 10.0, "25+": 25.0}
+"""Our speed classes, by name the speed at which each begins (it belongs to the class). Not part of the devkit."""
+
+UNKNOWN_SPEED = -1
+
 _CYCLES = (CLASSES.index("bicycle"), CLASSES.index("motorcycle"))
 
 
@@ -39,6 +44,15 @@ def official_filter(
         cycles = np.flatnonzero(kept & np.isin(table.labels, _CYCLES))
         kept[cycles[_inside_rack(table[cycles], evaluation_set.racks)]] = False
     return kept
+
+
+def speed_classes(
+    velocities: Array,  # [n, 2] m/s, NaN where unknown
+) -> Array:
+    """Place in SPEED_CLASSES_MPS of each box, UNKNOWN_SPEED where the velocity is NaN: [n] int64."""
+    speeds = np.sqrt(np.vecdot(velocities, velocities))
+    places = np.digitize(speeds, list(SPEED_CLASSES_MPS.values())) - 1
+    return np.where(np.isnan(speeds), UNKNOWN_SPEED, places)
 
 
 def _inside_rack(boxes: DetectionTable, racks: DetectionTable) -> Array:

@@ -39,6 +39,7 @@ class Matching:
     """Matches at every threshold, by place of the prediction, and the errors of those at 2 m."""
 
     places: list[Array]  # 4 x [m] ascending
+    ground_truth: list[Array]  # 4 x [m] row within `Ranking.truth_rows` that the prediction took
     errors: Array  # [m at 2 m, 5]
 
 
@@ -96,15 +97,16 @@ def match_predictions(ranking: Ranking, pairs: Pairs) -> Matching:
 
     Raises DataError when matched ground truth has a size that is not positive, as the official evaluator does.
     """
-    places, errors = [], np.zeros((0, len(ERRORS)))
+    places, ground_truth, errors = [], [], np.zeros((0, len(ERRORS)))
     for threshold in DISTANCE_THRESHOLDS_M:
         near = pairs[pairs.distances < threshold]
         matches = near[match_greedily(near, len(ranking.truth_rows))]
         _check_sizes(ranking, matches)
         places.append(matches.predictions)
+        ground_truth.append(matches.ground_truth)
         if threshold == ERROR_THRESHOLD_M:
             errors = _match_errors(ranking, matches)
-    return Matching(places, errors)
+    return Matching(places, ground_truth, errors)
 
 
 def _check_sizes(ranking: Ranking, matches: Pairs) -> None:

@@ -9,22 +9,39 @@ from src.metrics.scores import ERRORS
 
 
 def format_scores(metrics: Mapping[str, Any]) -> str:
-    """Tables of the content of metrics.json: a summary by distance bin, then every class with its AP by distance bin.
+    """Tables of the content of metrics.json: a summary by distance bin, every class by distance bin, speed classes.
 
-    `metrics` is `DetectionScores.as_dict()`, fresh or read back. mAP, NDS and AP in percent, errors in their own
-    units (m, 1 - IoU, rad, m/s, 1 - accuracy); "-" where a number is undefined.
+    `metrics` is `DetectionScores.as_dict()`, fresh or read back; a file written before there were speed classes has
+    no table of them. mAP, NDS and AP in percent, errors in their own units (m, 1 - IoU, rad, m/s, 1 - accuracy); "-"
+    where a number is undefined. By speed, means are over the classes that have ground truth there.
     """
     parts = {"all": metrics} | metrics["ranges"]
     summary = [["range (m)", "mAP", "NDS", *(f"m{name}" for name in ERRORS), "boxes"]]
     for name, part in parts.items():
         errors = [_plain(part[f"m{error}"]) for error in ERRORS]
-        boxes = sum(of_class["num_gt"] for of_class in part["classes"].values())
-        summary.append([name, _percent(part["mAP"]), _percent(part["NDS"]), *errors, str(boxes)])
+        summary.append([name, _percent(part["mAP"]), _percent(part["NDS"]), *errors, _boxes(part)])
     classes = [["class", "AP", *(f"AP {name}" for name in metrics["ranges"]), *ERRORS, "boxes"]]
     for name, overall in metrics["classes"].items():
         aps = [_percent(part["classes"][name]["AP"]) for part in parts.values()]
         classes.append([name, *aps, *(_plain(overall[error]) for error in ERRORS), str(overall["num_gt"])])
-    return _align(summary) + "\n\n" + _align(classes)
+    tables = [summary, classes]
+    if metrics.get("speeds"):
+        tables.append(_speeds(metrics["speeds"]))
+    return "\n\n".join(map(_align, tables))
+
+
+def _speeds(parts: Mapping[str, Any]) -> list[list[str]]:
+    rows = [["speed (m/s)", "mAP", *(f"m{name}" for name in ERRORS), "car AP", "car AVE", "classes", "boxes"]]
+    for name, part in parts.items():
+        errors = [_plain(part[f"m{error}_present"]) for error in ERRORS]
+        car, there = part["classes"]["car"], sum(values["num_gt"] > 0 for values in part["classes"].values())
+        cars = [_percent(car["AP"]), _plain(car["AVE"])] if car["num_gt"] else ["-", "-"]
+        rows.append([name, _percent(part["mAP_present"]), *errors, *cars, str(there), _boxes(part)])
+    return rows
+
+
+def _boxes(part: Mapping[str, Any]) -> str:
+    return str(sum(values["num_gt"] for values in part["classes"].values()))
 
 
 def _percent(value: float | None) -> str:

@@ -32,7 +32,7 @@ MEAN_AP_WEIGHT = 5
 
 @dataclass
 class SubsetScores:
-    """Scores of one part of an evaluation: everything, one distance bin or one scene tag. Fractions of 1."""
+    """Scores of one part of an evaluation: everything, a distance bin, a scene tag or a speed class. Fractions of 1."""
 
     num_gt: Array  # [12] int64, ground-truth boxes after the filters
     ap: Array  # [12, 4] by class and distance threshold
@@ -54,16 +54,26 @@ class SubsetScores:
     @property
     def mean_errors(self) -> Array:
         """mATE, mASE, mAOE, mAVE, mAAE, [5]: mean over the classes for which the error is defined."""
-        defined = ~np.isnan(self.errors)
-        counts = defined.sum(axis=0)
-        sums = np.where(defined, self.errors, 0.0).sum(axis=0)
-        return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+        return _mean_defined(self.errors)
 
     @property
     def nds(self) -> float:
         """nuScenes detection score: (5 mAP + sum of max(0, 1 - error)) / 10."""
         total = MEAN_AP_WEIGHT * self.mean_ap + np.maximum(0.0, 1.0 - self.mean_errors).sum()
         return float(total / (MEAN_AP_WEIGHT + len(ERRORS)))
+
+    def present_means(self) -> dict[str, float | None]:
+        """`mAP_present`, `mATE_present` ...: the means over those classes alone that have ground truth in this part.
+
+        They are what to read where most classes cannot occur, as in a speed class: cones and signs stand still, so
+        above 0.5 m/s they take the mAP over all 12 classes down whatever the detector does, and their errors of 1
+        take the mean errors towards 1. None where no such class is there. A class that is there but never reaches
+        recall 0.1 keeps the official error of 1, which for velocity (1 m/s) may flatter: read it beside the AP.
+        """
+        present = self.num_gt > 0
+        values = np.concatenate([_mean_defined(self.class_ap[present, None]), _mean_defined(self.errors[present])])
+        names = ("AP", *ERRORS)
+        return {f"m{name}_present": _number(value) for name, value in zip(names, values, strict=True)}
 
     def as_dict(self) -> dict[str, object]:
         """Plain numbers for JSON: mAP, NDS, the mean errors and `classes`; NaN becomes None."""
@@ -83,11 +93,12 @@ class SubsetScores:
 
 @dataclass
 class DetectionScores:
-    """An evaluation: over everything, by distance bin (`"0-25"` ...) and by scene tag (`"weather.clear"` ...)."""
+    """An evaluation: over everything, by distance bin (`"0-25"` ...), scene tag and speed class (`"0.5-10"` ...)."""
 
     overall: SubsetScores
     ranges: dict[str, SubsetScores]  # empty where not asked for
     tags: dict[str, SubsetScores]  # empty where not asked for
+    speeds: dict[str, SubsetScores]  # empty where not asked for
     truth_kept: Array  # [k] bool, ground truth that survives the official filters
     predictions_kept: Array  # [n] bool
 
@@ -97,11 +108,25 @@ class DetectionScores:
         return {"mAP": self.overall.mean_ap, "NDS": self.overall.nds} | {f"m{name}": value for name, value in errors}
 
     def as_dict(self) -> dict[str, object]:
-        """The content of metrics.json: fractions of 1, None where a number is undefined."""
+        """The content of metrics.json: fractions of 1, None where a number is undefined.
+
+        A part counts a class without ground truth as the official score does (AP 0, errors 1); entries of `speeds`
+        also hold the means over the classes that are there, see `SubsetScores.present_means`.
+        """
         return self.overall.as_dict() | {
             "ranges": {name: scores.as_dict() for name, scores in self.ranges.items()},
             "tags": {name: scores.as_dict() for name, scores in self.tags.items()},
+            "speeds": {name: scores.as_dict() | scores.present_means() for name, scores in self.speeds.items()},
         }
+
+
+def _mean_defined(
+    values: Array,  # [classes, m]
+) -> Array:
+    """Mean over the classes of what is not NaN, NaN where nothing is: [m]."""
+    defined = ~np.isnan(values)
+    counts = defined.sum(axis=0)
+    return np.where(counts > 0, np.where(defined, values, 0.0).sum(axis=0) / np.maximum(counts, 1), np.nan)
 
 
 def _number(value: float) -> float | None:

@@ -247,9 +247,7 @@ def submission_rows(tokens: Sequence[str], table: DetectionTable) -> Iterator[li
             boxes.scores.tolist(),
             [ATTRIBUTES[attribute] if attribute >= 0 else "" for attribute in boxes.attributes],
         )
-        yield [
-            {"sample_token": token} | dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)
-        ]
+        yield [{"sample_token": token} | dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)]
 
 
 def _complete_meta(meta: Mapping[str, bool | str]) -> dict[str, bool | str]:

@@ -1,14 +1,32 @@
-"""What every detector offers to training and evaluation: forward, loss, decode."""
+"""What every detector offers to training and inference: forward, loss, decode, and memory as a value."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, Protocol, Self
 
+import torch
 from torch import Tensor, nn
 
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
+
+
+class TemporalMemory(Protocol):
+    """What a temporal detector carries from frame to frame, detached, one row per lane."""
+
+    def select(
+        self,
+        rows: Tensor,  # [B'] int64, row of each lane of the next batch in this memory
+        keep: Tensor,  # [B'] bool, False: the lane starts anew
+    ) -> Self:
+        """Memory for the next batch's lanes."""
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same memory on another device."""
+
+    def state(self) -> list[dict[str, Any]]:
+        """Tensors and plain containers, for a checkpoint; `Detector.restore_memory` reads them."""
 
 
 class Detector(nn.Module, ABC):
@@ -20,8 +38,18 @@ class Detector(nn.Module, ABC):
         return None
 
     @abstractmethod
-    def forward(self, batch: FrameBatch) -> Any:  # each model returns its own dataclass
-        """Everything that `loss` and `decode` need for the B frames of a batch."""
+    def forward(
+        self, batch: FrameBatch, memory: Any = None
+    ) -> tuple[Any, Any]:  # each model returns its own dataclass and memory
+        """Everything that `loss` and `decode` need for the B frames of a batch, and the memory with these frames added.
+
+        `memory` is what the call for the previous frames of the same lanes returned, row by row (see
+        `TemporalMemory.select`); None where there is none. A detector of single frames takes and returns None.
+        """
+
+    def restore_memory(self, state: list[dict[str, Any]]) -> Any:
+        """The memory that `TemporalMemory.state` described. Raises NotImplementedError for single-frame detectors."""
+        raise NotImplementedError(f"{type(self).__name__} has no memory")
 
     @abstractmethod
     def loss(self, output: Any, batch: FrameBatch) -> dict[str, Tensor]:

@@ -3,6 +3,7 @@
 from src.ops.allocator import tune_cpu_allocator
 from src.ops.bags import segment_mean, segment_sum
 from src.ops.deform_sample import deform_attend_bev, deform_attend_images, sample_sparse_bev
+from src.ops.farthest_point import farthest_points
 from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
 from src.ops.nms import maxpool_peaks, nms_circle, nms_rotated, rotated_iou
 from src.ops.sites import Sites, union
@@ -16,6 +17,7 @@ __all__ = [
     "Splat",
     "deform_attend_bev",
     "deform_attend_images",
+    "farthest_points",
     "log1mexp",
     "maxpool_peaks",
     "nms_circle",

@@ -90,10 +90,10 @@ def frame_axes(axes: Axes, right_m: tuple[float, float], up_m: tuple[float, floa
         spine.set_color("#C9CED4")
     wide = right_m[1] - right_m[0] > 150
     turn = np.deg2rad(38 if wide else 62)  # from forward to the right, where roads seldom lead
-    for radius in RINGS_M[1:] if wide else RINGS_M[:2]:
+    for radius in RINGS_M[1:] if wide else RINGS_M:
         axes.add_patch(Circle((0, 0), radius, fill=False, edgecolor="#D5D9DE", linewidth=1.0, zorder=0.5))
         right, up = radius * np.sin(turn), radius * np.cos(turn)
-        if right < right_m[1] - 3:
+        if right_m[0] + 3 < right < right_m[1] - 3 and up_m[0] + 2 < up < up_m[1] - 2:
             axes.text(
                 right, up, f"{radius} m", color="#6C757D", fontsize=8.5, ha="center", va="center", zorder=6,
                 bbox={"boxstyle": "square,pad=0.15", "fc": "#FBFBFC", "ec": "none", "alpha": 0.85},
@@ -103,7 +103,7 @@ def frame_axes(axes: Axes, right_m: tuple[float, float], up_m: tuple[float, floa
 def paint_ego(axes: Axes) -> None:
     """The truck: origin under the rear axle, cab in front, a pale windscreen."""
     if axes.get_xlim()[1] > 75:
-        axes.text(5, 0, "ego", color=INK, fontsize=8.5, va="center", zorder=6)
+        axes.text(5, 0, "ego", color=INK, fontsize=8.5, va="center", zorder=6, clip_on=True)
     body = np.array([[-1.2, -1.25], [-1.2, 1.25], [6.0, 1.25], [6.0, -1.25]])
     screen = np.array([[5.0, -1.05], [5.0, 1.05], [5.7, 1.05], [5.7, -1.05]])
     axes.add_patch(Polygon(upright(body), facecolor=INK, edgecolor="white", linewidth=0.8, zorder=5))
@@ -150,7 +150,7 @@ def paint_radar(axes: Axes, points: Array | None) -> None:
 
 
 def paint_gaussians(axes: Axes, gaussians: PictureGaussians | None) -> None:
-    """One-sigma ellipses in the colour of their source, filled by opacity; rare sources on top."""
+    """One-sigma ellipses in the colour of their source, filled by opacity; history dotted, rare sources on top."""
     if gaussians is None or len(gaussians) == 0:
         return
     outlines = upright(gaussians.outlines())
@@ -168,6 +168,9 @@ def paint_gaussians(axes: Axes, gaussians: PictureGaussians | None) -> None:
         axes.add_collection(
             PolyCollection(outlines[rows], facecolors=face, edgecolors=edge, linewidths=0.9, zorder=2.5), autolim=False
         )
+        if SOURCES[source] == "history":  # told apart from its neighbours by form as well
+            dots = {"linestyle": "none", "marker": ".", "markersize": 3.2, "mew": 0, "zorder": 2.6}
+            axes.plot(*upright(gaussians.means[rows]).T, color=SOURCE_COLOURS["history"], **dots)
 
 
 def paint_boxes(axes: Axes, boxes: PictureBoxes, predicted: bool, arrows: bool = True) -> None:

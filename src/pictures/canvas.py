@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from src.pictures.contents import INK
 
@@ -58,8 +60,13 @@ class Canvas:
                 borderaxespad=0, handlelength=1.9, handletextpad=0.5, columnspacing=1.5, labelcolor=INK,
             )  # fmt: skip
 
-    def save(self, path: Path | str) -> None:
-        """Write the PNG, making the folder where needed."""
+    def save(self, path: Path | str, photographs: bool = True) -> None:
+        """Write the PNG, making the folder where needed; without photographs 256 colours do, in a third of the size."""
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})
+        if photographs:
+            self.figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})
+            return
+        self.figure.canvas.draw()
+        picture = Image.fromarray(np.asarray(self.figure.canvas.buffer_rgba())).convert("RGB")
+        picture.quantize(256, dither=Image.Dither.NONE).save(path, format="PNG", optimize=True)

@@ -1,4 +1,4 @@
-"""What a picture shows: boxes, Gaussians and a grid as plain numpy arrays, and the colours they are drawn in."""
+"""What a picture shows: boxes, Gaussians, memory and a grid as plain numpy arrays, and the colours of each."""
 
 from __future__ import annotations
 
@@ -114,6 +114,17 @@ class PictureBoxes:
         cos, sin = np.cos(self.yaws)[:, None], np.sin(self.yaws)[:, None]
         return self.centers[:, None] + np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
 
+    def cover(
+        self,
+        xy: Array,  # [n, 2] m
+    ) -> Array:  # [n] bool
+        """Which points lie on the footprint of at least one box."""
+        cos, sin = np.cos(self.yaws), np.sin(self.yaws)
+        away = xy[:, None] - self.centers[:, :2]  # [n, K, 2]
+        along = cos * away[..., 0] + sin * away[..., 1]
+        across = cos * away[..., 1] - sin * away[..., 0]
+        return ((np.abs(along) <= self.sizes[:, 0] / 2) & (np.abs(across) <= self.sizes[:, 1] / 2)).any(axis=1)
+
     def colours(self) -> list[Colour]:
         """The class colour of each box."""
         return [CLASS_COLOURS[CLASSES[label]] for label in self.labels]
@@ -142,6 +153,15 @@ class PictureGaussians:
     def __len__(self) -> int:
         return len(self.sources)
 
+    @classmethod
+    def empty(cls) -> PictureGaussians:
+        """No Gaussian at all."""
+        return cls(*(np.zeros((0, 2)),) * 3, *(np.zeros(0),) * 2)
+
+    def __getitem__(self, rows: Array) -> PictureGaussians:
+        """The Gaussians at `rows` (a boolean mask or indices)."""
+        return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
     def outlines(self, corners: int = 24) -> Array:
         """The one-sigma ellipses as polygons [G, corners, 2] m."""
         turn = np.linspace(0, 2 * np.pi, corners, endpoint=False)
@@ -149,6 +169,68 @@ class PictureGaussians:
         length = np.linalg.norm(self.directions, axis=1, keepdims=True)
         cos, sin = (self.directions / np.where(length > 0, length, 1)).T[..., None]
         return self.means[:, None] + np.stack([cos * along - sin * across, sin * along + cos * across], axis=-1)
+
+
+@dataclass
+class PictureMemory:
+    """n things remembered from past key frames, in today's ego metres: BEV cells, or Gaussians where these are given.
+
+    Raises ValueError when shapes disagree.
+    """
+
+    moved: Array  # [n, 2] m, carried along by the ego motion and by their own velocity (Eq. 8)
+    velocities: Array  # [n, 2] m/s over ground, today's axes
+    elapsed_s: Array  # [n] s since each was seen
+    gaussians: PictureGaussians | None = None  # n, their shapes; means as in `moved`
+    compensated: bool = True  # whether the model read them at `moved`, or at `stayed`
+
+    def __post_init__(self) -> None:
+        for name in ("moved", "velocities", "elapsed_s"):
+            setattr(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+        n = len(self.elapsed_s)
+        check_shapes("PictureMemory", vars(self), {"moved": (n, 2), "velocities": (n, 2), "elapsed_s": (n,)})
+        if self.gaussians is not None and len(self.gaussians) != n:
+            raise ValueError(f"PictureMemory.gaussians must be {n}, but got {len(self.gaussians)}")
+
+    def __len__(self) -> int:
+        return len(self.elapsed_s)
+
+    def __getitem__(self, rows: Array) -> PictureMemory:
+        """What lies at `rows` (a boolean mask or indices)."""
+        return replace(
+            self,
+            moved=self.moved[rows],
+            velocities=self.velocities[rows],
+            elapsed_s=self.elapsed_s[rows],
+            gaussians=None if self.gaussians is None else self.gaussians[rows],
+        )
+
+    @classmethod
+    def read_at(
+        cls,
+        xy: Array,  # [n, 2] m, where the model read them
+        velocities: Array,  # [n, 2] m/s over ground
+        elapsed_s: Array,  # [n] s
+        compensated: bool,  # whether `xy` already holds the travel by `velocities`
+        gaussians: PictureGaussians | None = None,
+    ) -> PictureMemory:
+        """A memory as the model saw it, with or without velocity compensation."""
+        travel = np.asarray(velocities) * np.asarray(elapsed_s)[:, None]
+        moved = xy if compensated else xy + travel
+        return cls(moved, velocities, elapsed_s, gaussians, compensated)
+
+    @property
+    def stayed(self) -> Array:
+        """Where they would lie by the ego motion alone [n, 2] m: exact, as velocities hold over ground."""
+        return self.moved - self.velocities * self.elapsed_s[:, None]
+
+    def drawable(self) -> PictureMemory:
+        """The finite ones, oldest first, so that the freshest come out on top."""
+        finite = np.isfinite(np.c_[self.moved, self.velocities, self.elapsed_s]).all(axis=1)
+        if self.gaussians is not None:
+            finite &= np.isfinite(self.gaussians.outlines()).all(axis=(1, 2)) & np.isfinite(self.gaussians.opacities)
+        rows = np.flatnonzero(finite)
+        return self[rows[np.argsort(-self.elapsed_s[rows], kind="stable")]]
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,8 @@ def gaussian_keys(scene: BevScene) -> list[Artist]:
         counts = np.bincount(scene.gaussians.sources, minlength=len(SOURCES))
         for name, count in zip(SOURCES, counts, strict=True):
             colour = SOURCE_COLOURS[name]
-            key = Line2D([], [], linestyle="none", marker="o", markersize=10, mec=colour, mfc=to_rgba(colour, 0.35))
+            form = r"$\odot$" if name == "history" and count else "o"
+            key = Line2D([], [], linestyle="none", marker=form, markersize=10, mec=colour, mfc=to_rgba(colour, 0.35))
             key.set_label(f"{name} {count}")
             keys.append(key)
     if scene.occupancy is not None:

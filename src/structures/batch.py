@@ -33,6 +33,10 @@ class FrameBatch:
     image_valid: Tensor | None = None  # [B, N] bool, False where a camera is missing
     pix_from_aug: Tensor | None = None  # [B, N, 4, 4] float32: P_n over (0, 0, 0, 1); (u*d, v*d, d, 1) = P (x, y, z, 1)
     boxes: list[Boxes3D] | None = None  # B, aug frame
+    lanes: Tensor | None = (
+        None  # [B] int64, the stream of consecutive frames each row belongs to, unique; None: unordered
+    )
+    starts: Tensor | None = None  # [B] bool, the row begins a clip: memory of its lane ends here; given with `lanes`
     skipped: dict[str, int] = field(default_factory=dict)  # unreadable files passed over, by channel
 
     def __post_init__(self) -> None:
@@ -52,6 +56,11 @@ class FrameBatch:
             self._expect("images", (b, n, 3, h, w), torch.uint8)
             self._expect("image_valid", (b, n), torch.bool)
             self._expect("pix_from_aug", (b, n, 4, 4), torch.float32)
+        if (self.lanes is None) != (self.starts is None):
+            raise ValueError("FrameBatch.lanes and FrameBatch.starts must be given together")
+        if self.lanes is not None:
+            self._expect("lanes", (b,), torch.int64)
+            self._expect("starts", (b,), torch.bool)
         if self.boxes is not None and len(self.boxes) != b:
             raise ValueError(f"FrameBatch.boxes must hold {b} entries, one per sample, but got {len(self.boxes)}")
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 
@@ -57,8 +59,34 @@ class GaussianSet:
     def __len__(self) -> int:
         return self.valid.shape[1]
 
+    def transform(
+        self,
+        dst_from_src: Tensor,  # [B, 4, 4] rotation, reflection and uniform scale, with translation
+    ) -> GaussianSet:
+        """The Gaussians seen in another frame; the z = 0 plane is kept (specification 6.2, 9).
+
+        Directions become those of their transformed unit vectors, scales and velocities take the scale along.
+        """
+        matrix = dst_from_src[:, None].to(self.means.dtype)  # [B, 1, 4, 4]
+
+        def turn(vectors: Tensor) -> Tensor:  # [B, G, 2]; a matrix product would be rounded by autocast
+            return matrix[..., :2, 0] * vectors[..., :1] + matrix[..., :2, 1] * vectors[..., 1:]
+
+        scale = torch.linalg.det(matrix[..., :2, :2]).abs().sqrt()[..., None]
+        return replace(
+            self,
+            means=turn(self.means) + matrix[..., :2, 3],
+            scales=self.scales * scale,
+            directions=F.normalize(turn(self.directions), dim=-1),
+            velocities=turn(self.velocities),
+        )
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> GaussianSet:
+        """The set with `function` applied to every tensor."""
+        return GaussianSet(**{field.name: function(getattr(self, field.name)) for field in fields(self)})
+
     @staticmethod
     def concatenate(parts: list[GaussianSet]) -> GaussianSet:
         """Join sets of the same samples along G."""
-        names = GaussianSet.__dataclass_fields__
+        names = [field.name for field in fields(GaussianSet)]
         return GaussianSet(**{name: torch.cat([getattr(part, name) for part in parts], dim=1) for name in names})

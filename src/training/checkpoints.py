@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import shutil
 import zipfile
 from pathlib import Path
@@ -86,16 +87,19 @@ def _is_ours(content: object) -> bool:
     )
 
 
-def load_model_weights(model: nn.Module, checkpoint: dict[str, Any], path: Path) -> None:
-    """Put a checkpoint's weights into `model`.
+def load_model_weights(
+    model: nn.Module, checkpoint: dict[str, Any], path: Path, may_be_new: re.Pattern[str] | None = None
+) -> list[str]:
+    """Put a checkpoint's weights into `model`; keys that match `may_be_new` may be missing and keep their values.
 
-    Raises CheckpointError naming the keys that are missing, unexpected, of another shape or not finite; never loads a
-    part.
+    Returns those keys. Raises CheckpointError naming the keys that are missing, unexpected, of another shape or not
+    finite; never loads a part.
     """
     prefix = "model."
     state = {key[len(prefix) :]: value for key, value in checkpoint["state_dict"].items() if key.startswith(prefix)}
     wanted = model.state_dict()
-    problems = [f"missing {key}" for key in wanted if key not in state]
+    new = [key for key in wanted if key not in state and may_be_new is not None and may_be_new.match(key)]
+    problems = [f"missing {key}" for key in wanted if key not in state and key not in new]
     problems += [f"unexpected {key}" for key in state if key not in wanted]
     problems += [
         f"{key} is {list(state[key].shape)}, the model has {list(wanted[key].shape)}"
@@ -108,4 +112,5 @@ def load_model_weights(model: nn.Module, checkpoint: dict[str, Any], path: Path)
     broken = [key for key, value in state.items() if not torch.isfinite(value).all()]
     if broken:
         raise CheckpointError(f"checkpoint {path} holds weights that are not finite, {broken[0]} for one")
-    model.load_state_dict(state)
+    model.load_state_dict({key: wanted[key] for key in new} | state)
+    return new

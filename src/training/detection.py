@@ -7,17 +7,18 @@ from typing import Any
 
 import lightning as L
 import torch
+import torch.distributed as dist
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from src.errors import DivergedError
-from src.metrics.detection import DetectionMetric
+from src.metrics.detection import DetectionMetric, score_detections
 from src.metrics.scores import DetectionScores
 from src.metrics.submission import to_global
 from src.models.detector import Detector
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
-from src.structures.detections import EvaluationSet
+from src.structures.detections import DetectionTable, EvaluationSet
 from src.training.optim import OptimConfig, build_optimizer
 
 
@@ -25,7 +26,7 @@ class DetectionModule(L.LightningModule):
     """Trains and validates a detector one key frame at a time.
 
     `config` is the run's resolved configuration as plain values; it travels in the checkpoint, so that a checkpoint
-    alone tells how to rebuild its model.
+    alone tells how to rebuild its model. After a validation `scores` and `detections` are the same on every process.
     """
 
     def __init__(
@@ -46,8 +47,14 @@ class DetectionModule(L.LightningModule):
         self.metric = DetectionMetric(evaluation_set)
         self.loss_means = nn.ModuleDict()
         self.scores: DetectionScores | None = None
+        self.detections: DetectionTable | None = None
         self.scored_step = -1
         self.skipped: dict[str, int] = {}
+
+    def run(self, batch: FrameBatch) -> Any:
+        """The model's own output for a batch, in training and validation."""
+        output, _ = self.model(batch)
+        return output
 
     # ---------------------------------------------------------------- training
 
@@ -58,7 +65,7 @@ class DetectionModule(L.LightningModule):
 
     def training_step(self, batch: FrameBatch, batch_idx: int) -> Tensor:
         """Forward and loss of one batch; every term is logged under its own name."""
-        output = self.model(batch)
+        output = self.run(batch)
         terms = self.model.loss(output, batch)
         self._check_finite(terms, batch)
         self._count_skipped(batch)
@@ -99,9 +106,11 @@ class DetectionModule(L.LightningModule):
 
     def on_train_epoch_end(self) -> None:
         """Log the epoch's means over all ranks and frames."""
-        for name, metric in self.loss_means.items():
-            self.log(name, metric.compute())
-            metric.reset()
+        # A term may be missing on a rank that never saw its objects; each compute is a meeting of all ranks.
+        for name in sorted(set().union(*gather_by_rank(list(self.loss_means)))):
+            mean = self._mean(name)
+            self.log(name, mean.compute())
+            mean.reset()
         self.log("lr", self.trainer.optimizers[0].param_groups[0]["lr"])
 
     def configure_optimizers(self) -> dict[str, Any]:
@@ -132,11 +141,16 @@ class DetectionModule(L.LightningModule):
 
     def detect(self, batch: FrameBatch) -> list[Boxes3D]:
         """Boxes of each sample in its ego frame."""
-        return self.model.decode(self.model(batch))
+        return self.model.decode(self.run(batch))
 
     def on_validation_epoch_end(self) -> None:
-        """Score, and log the headline numbers; the full table stays in `scores`."""
-        self.scores = self.metric.compute()
+        """Score the boxes of all ranks and log the headline numbers.
+
+        The full table stays in `scores` and the boxes in `detections`, so that one rank alone can write them later.
+        """
+        with self.metric.sync_context():
+            self.detections, _ = self.metric.collected()
+        self.scores = score_detections(self.metric.evaluation_set, self.detections)
         self.scored_step = self.trainer.global_step
         for name, value in self.scores.headline().items():
             self.log(f"val/{name}", value)
@@ -144,5 +158,49 @@ class DetectionModule(L.LightningModule):
     # ---------------------------------------------------------------- checkpoint
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the configuration beside the weights: plain values, so it loads without executing code."""
-        checkpoint["horizon3d"] = {"config": self.config}
+        """Keep the configuration and what each rank has gathered since its epoch began beside the weights.
+
+        Plain values and tensors, so that the file loads without executing code. All ranks take part.
+        """
+        checkpoint["horizon3d"] = {"config": self.config, "ranks": gather_by_rank(self.rank_state())}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Go on with the own rank's part of an unfinished epoch; with another number of ranks, with what can be moved.
+
+        A checkpoint from the end of an epoch has nothing to go on with.
+        """
+        states = checkpoint["horizon3d"].get("ranks", [])
+        if len(states) == self.trainer.world_size:
+            self.restore_rank(states[self.trainer.global_rank])
+        elif self.trainer.global_rank == 0:
+            self.adopt_ranks(states)
+
+    def rank_state(self) -> dict[str, Any]:
+        """This rank's part of an unfinished epoch, as plain values and tensors on the CPU."""
+        sums = {name: [float(mean.mean_value), float(mean.weight)] for name, mean in self.loss_means.items()}
+        return {"means": {name: values for name, values in sums.items() if values[1] > 0}}
+
+    def restore_rank(self, state: dict[str, Any]) -> None:
+        """Go on from what `rank_state` gave."""
+        for name, (total, weight) in state["means"].items():
+            mean = self._mean(name)
+            mean.update(0.0, 0.0)  # so that it knows it has values
+            mean.mean_value.fill_(total)
+            mean.weight.fill_(weight)
+
+    def adopt_ranks(self, states: list[dict[str, Any]]) -> None:
+        """On rank 0, go on from the states of another number of ranks: the epoch's means stay right in total."""
+        totals: dict[str, list[float]] = {}
+        for state in states:
+            for name, values in state["means"].items():
+                totals[name] = [a + b for a, b in zip(totals.get(name, [0.0, 0.0]), values, strict=True)]
+        DetectionModule.restore_rank(self, {"means": totals})
+
+
+def gather_by_rank(value: Any) -> list[Any]:
+    """The `value`s of all ranks in their order; every rank must call it. One value without a process group."""
+    if not (dist.is_available() and dist.is_initialized()):
+        return [value]
+    values: list[Any] = [None] * dist.get_world_size()
+    dist.all_gather_object(values, value)
+    return values

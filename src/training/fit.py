@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import logging
-import signal
+import warnings
 from pathlib import Path
 from typing import Any
 
 import lightning as L
-import torch
 from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers.logger import Logger
+from lightning.pytorch.strategies import Strategy
 
 from src.data.datamodule import DetectionDataModule, dead_workers_named
-from src.errors import ConfigError, InterruptedRunError
-from src.training.checkpoints import AtomicCheckpointIO, read_checkpoint
+from src.errors import InterruptedRunError
+from src.training.checkpoints import AtomicCheckpointIO, load_model_weights, read_checkpoint
 from src.training.detection import DetectionModule
+from src.training.interruption import Interruption
 from src.training.metrics_csv import MetricsCSV
 from src.training.run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
+
+EXPECTED_WARNINGS = (
+    ".*resuming from a checkpoint that ended before the epoch ended",  # the sampler knows its place by the step
+    ".*recommended to use `self.log.*sync_dist=True",  # everything logged by epoch is the same on all ranks
+)
 
 
 class LossProgressBar(TQDMProgressBar):
@@ -35,18 +41,6 @@ class LossProgressBar(TQDMProgressBar):
         }
 
 
-def check_devices(accelerator: str, devices: int) -> None:
-    """Raise ConfigError when this machine lacks what the configuration asks for."""
-    gpus = torch.cuda.device_count() or int(torch.backends.mps.is_available())
-    if accelerator == "gpu" and not gpus:
-        raise ConfigError(
-            "trainer.accelerator=gpu, but torch sees no GPU on this machine; use trainer.accelerator=cpu, or install a "
-            "torch build for your GPU"
-        )
-    if devices > 1:
-        raise ConfigError(f"trainer.devices={devices}: this phase trains on one device; use trainer.devices=1")
-
-
 def build_trainer(
     folder: RunFolder,
     *,
@@ -58,13 +52,20 @@ def build_trainer(
     log_every_steps: int,
     ema_decay: float | None,
     loggers: list[Logger],
+    checkpoint_every_steps: int | None = None,
+    strategy: Strategy | str = "auto",
+    num_nodes: int = 1,
 ) -> L.Trainer:
-    """A Trainer that keeps `last.ckpt` of every epoch and `best.ckpt` by validation mAP in the run's folder."""
+    """A Trainer that keeps `last.ckpt` of every epoch and `best.ckpt` by validation mAP in the run's folder.
+
+    With `checkpoint_every_steps`, `last.ckpt` is written inside epochs too. `devices` counts those of one node.
+    """
     # Checkpoint names carry no metric: an unquoted `=` in a path cannot be typed after checkpoint=.
     fixed_name = {"dirpath": folder.checkpoints, "auto_insert_metric_name": False, "enable_version_counter": False}
     callbacks: list[L.Callback] = [
         ModelCheckpoint(filename="best", monitor="val/mAP", mode="max", save_top_k=1, **fixed_name),
         ModelCheckpoint(filename="last", save_top_k=1, save_on_train_epoch_end=True, **fixed_name),
+        Interruption(folder.checkpoints / "last.ckpt", checkpoint_every_steps),
         LossProgressBar(refresh_rate=10),
     ]
     if ema_decay is not None:
@@ -75,6 +76,8 @@ def build_trainer(
         precision=precision,
         accelerator=accelerator,
         devices=devices,
+        num_nodes=num_nodes,
+        strategy=strategy,
         logger=loggers,
         callbacks=callbacks,
         plugins=[AtomicCheckpointIO()],
@@ -111,24 +114,26 @@ def build_loggers(folder: RunFolder, resume_from: Path | None, wandb: dict[str, 
     return loggers
 
 
-def fit(
-    trainer: L.Trainer, module: DetectionModule, datamodule: DetectionDataModule, resume_from: Path | None
-) -> None:
+def fit(trainer: L.Trainer, module: DetectionModule, datamodule: DetectionDataModule, resume_from: Path | None) -> None:
     """Train to the last epoch, from `resume_from` where given, then validate the final weights into `module.scores`.
 
     Raises InterruptedRunError when stopped from outside; the same command then goes on.
     """
-    outer = signal.signal(signal.SIGTERM, signal.SIG_DFL)  # so that Lightning's own handler ends the running step first
+    interruption = next(callback for callback in trainer.callbacks if isinstance(callback, Interruption))
+    module.skipped.clear()
     try:
-        module.skipped.clear()
-        with dead_workers_named():
+        with interruption.listening(), dead_workers_named(), warnings.catch_warnings():
+            for expected in EXPECTED_WARNINGS:
+                warnings.filterwarnings("ignore", message=expected)
             trainer.fit(module, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
-            if module.scored_step != trainer.global_step:  # the last epoch was none to be validated
-                trainer.validate(module, datamodule=datamodule, verbose=False)
-    except SystemExit as error:  # Lightning's way to end on Ctrl-C and SIGTERM
+            if not interruption.began:  # stopped after the last step: its moving average is not in the module yet
+                load_model_weights(module.model, read_checkpoint(resume_from), resume_from)
+            if module.scored_step != trainer.global_step and not interruption.requested:
+                trainer.validate(module, datamodule=datamodule, verbose=False)  # the last epoch was not to be validated
+    except SystemExit as error:  # Lightning's way to end on a KeyboardInterrupt
         raise InterruptedRunError("training was stopped; the same command goes on from the last checkpoint") from error
-    finally:
-        signal.signal(signal.SIGTERM, outer)
+    if interruption.requested:
+        raise InterruptedRunError("stopped after the last step; the same command scores and writes the results")
 
 
 def build_evaluation_trainer(precision: str, accelerator: str) -> L.Trainer:

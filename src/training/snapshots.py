@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,36 +13,53 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.models.detector import Detector
+from src.models.horizon3d.dptf import DPTFConfig
 from src.pictures.bev import BevScene
 from src.pictures.cameras import CameraViews
-from src.pictures.contents import PictureBoxes, PictureGaussians, PictureGrid
+from src.pictures.contents import PictureBoxes, PictureGaussians, PictureGrid, PictureMemory
 from src.pictures.frame import draw_frame
+from src.pictures.memory import MemoryScene, draw_memory
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
+from src.structures.gaussians import GaussianSet
 from src.structures.taxonomy import CAMERAS, CLASS_RANGE_M, CLASSES
 
 SHOWN_SCORE = 0.25
 """Boxes below are left out of pictures: a person looks for what the detector is sure of, the metric for all."""
 
 
+def clip_length(model: Detector) -> int:
+    """Frames to stream, the drawn one included, until a model's memory is full; 1 for a model of single frames."""
+    dptf = _memory_config(model)
+    paths = [] if dptf is None else [dptf.bev_path, dptf.gaussian_path]
+    return 1 + max((path.num_frames for path in paths if path is not None), default=0)
+
+
 @torch.no_grad()
-def draw_frames(model: Detector, frames: list[FrameBatch], grid: BEVGrid, folder: Path) -> list[Path]:
-    """One PNG per frame (batches of one): cameras, BEV, Gaussians, boxes. Returns the paths."""
-    was_training = model.training
+def draw_frames(model: Detector, clips: Iterable[list[FrameBatch]], grid: BEVGrid, folder: Path) -> list[Path]:
+    """PNGs of the last frame of each clip of consecutive frames (batches of one), on whatever device they lie.
+
+    `frame_*` shows cameras, BEV, Gaussians and boxes; for a model with memory, which streams the clip, `memory_*`
+    what it remembered. A model of single frames needs clips of one frame. Returns the paths.
+    """
+    was_training, device = model.training, next(model.parameters()).device
     model.eval()
     paths = []
-    for number, batch in enumerate(frames):
-        output = model(batch)
+    for number, clip in enumerate(clips):
+        memory = None
+        for frame in clip:
+            batch = frame.to(device)
+            output, memory = model(batch, memory)
         (predictions,) = model.decode(output)
-        path = folder / f"frame_{number}_{re.sub('[^0-9A-Za-z_-]', '_', batch.tokens[0])[:12]}.png"
-        draw_frame(
-            path,
-            scene_of(batch, predictions, output, grid),
-            views_of(batch),
-            title=f"Sample {batch.tokens[0][:12]}",
-            score_threshold=SHOWN_SCORE,
-        )
-        paths.append(path)
+        name = f"{number}_{re.sub('[^0-9A-Za-z_-]', '_', batch.tokens[0])[:12]}.png"
+        scene = scene_of(batch, predictions, output, grid)
+        title = f"Sample {batch.tokens[0][:12]}"
+        paths.append(folder / f"frame_{name}")
+        draw_frame(paths[-1], scene, views_of(batch), title, SHOWN_SCORE)
+        remembered = memory_of(model, output, scene)
+        if remembered is not None:
+            paths.append(folder / f"memory_{name}")
+            draw_memory(paths[-1], remembered, f"{title}: what was remembered")
     model.train(was_training)
     return paths
 
@@ -66,18 +84,42 @@ def scene_of(
     )
     ocsf = getattr(output, "ocsf", None)
     if ocsf is not None:
-        gaussians, keep = ocsf.gaussians, ocsf.gaussians.valid[0]
-        scene.gaussians = PictureGaussians(
-            means=_numpy(gaussians.means[0][keep]),
-            scales=_numpy(gaussians.scales[0][keep]),
-            directions=_numpy(gaussians.directions[0][keep]),
-            opacities=_numpy(gaussians.opacity_logits[0][keep].sigmoid()),
-            sources=_numpy(gaussians.sources[0][keep]),
-        )
+        scene.gaussians = _gaussians(ocsf.gaussians)
         cells = ocsf.splat.cells
         rows = _numpy(cells.support % (grid.rows * grid.cols))
         scene.occupancy = (np.stack([rows // grid.cols, rows % grid.cols], axis=1), _numpy(cells.occupancy))
     return scene
+
+
+def memory_of(
+    model: Detector,
+    output: Any,  # the model's own output for one frame
+    scene: BevScene,  # of the same frame
+) -> MemoryScene | None:
+    """What the memory picture shows; None for a model without memory, empty memories where it remembers nothing yet."""
+    config, dptf = _memory_config(model), getattr(output, "dptf", None)
+    if config is None or dptf is None:
+        return None
+    remembered = MemoryScene(scene.grid, scene.ground_truth)
+    if config.gaussian_path is not None:
+        gaussians, velocities, elapsed_s = PictureGaussians.empty(), np.zeros((0, 2)), np.zeros(0)
+        if dptf.history is not None:
+            keep, gaussians = dptf.history.valid[0], _gaussians(dptf.history)
+            velocities, elapsed_s = _numpy(dptf.history.velocities[0][keep]), _numpy(dptf.history.elapsed_s[0][keep])
+        compensated = config.gaussian_path.velocity_compensation
+        remembered.gaussians = PictureMemory.read_at(gaussians.means, velocities, elapsed_s, compensated, gaussians)
+    if config.bev_path is not None:
+        xy, velocities, elapsed_s = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
+        if dptf.warped is not None:
+            cells = dptf.warped
+            xy, velocities, elapsed_s = _numpy(cells.xy), _numpy(cells.velocities), _numpy(cells.elapsed_s)
+        compensated = config.bev_path.velocity_compensation
+        remembered.cells = PictureMemory.read_at(xy, velocities, elapsed_s, compensated)
+    return remembered
+
+
+def _memory_config(model: Detector) -> DPTFConfig | None:
+    return getattr(getattr(model, "config", None), "dptf", None)
 
 
 def views_of(batch: FrameBatch) -> CameraViews | None:
@@ -90,6 +132,18 @@ def views_of(batch: FrameBatch) -> CameraViews | None:
         images=[image if seen else None for image, seen in zip(images, valid, strict=True)],
         pix_from_ego=_numpy(batch.pix_from_aug[0]),
         names=CAMERAS,
+    )
+
+
+def _gaussians(gaussians: GaussianSet) -> PictureGaussians:
+    """The valid Gaussians of the first sample."""
+    keep = gaussians.valid[0]
+    return PictureGaussians(
+        means=_numpy(gaussians.means[0][keep]),
+        scales=_numpy(gaussians.scales[0][keep]),
+        directions=_numpy(gaussians.directions[0][keep]),
+        opacities=_numpy(gaussians.opacity_logits[0][keep].sigmoid()),
+        sources=_numpy(gaussians.sources[0][keep]),
     )
 
 

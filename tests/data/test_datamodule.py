@@ -1,6 +1,9 @@
 import gc
+import json
 import os
 import pickle
+import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,11 +11,12 @@ import lightning as L
 import numpy as np
 import pytest
 import torch
-from tiny_set import VERSION
+from tiny_set import START_S, VERSION, DataSet, Writer, token
 
-from src.data.augment import AugmentationConfig, BevAugmentationConfig
+from src.data.augment import AugmentationConfig, BevAugmentationConfig, ImageAugmentationConfig
 from src.data.cache import load_index
-from src.data.datamodule import DataConfig, DetectionDataModule, FrameSampler, collate, dead_workers_named
+from src.data.clips import shuffled_frames
+from src.data.datamodule import DataConfig, DetectionDataModule, collate, dead_workers_named
 from src.data.reader import OnBadFile
 from src.errors import ConfigError, DataError, HorizonError
 from src.structures.taxonomy import RADARS
@@ -22,15 +26,46 @@ BEV = BevAugmentationConfig(scale=[0.95, 1.05], rotation_rad=0.4, flip_probabili
 
 def config(**changes):
     values = dict(
-        root=None, version=VERSION, train_split="train", split="val", batch_size=2, num_workers=0, num_sweeps=2,
+        root=None, version=VERSION, train_split="train", split="val", batch_size=2, groups_per_scene=2, num_workers=0, num_sweeps=2,
         min_distance_m=1.0, propagate_points=False, on_bad_file=OnBadFile.error, test_resize_offset=0.0,
         augmentation=AugmentationConfig(image=None, bev=BEV), world=None,
     )  # fmt: skip
     return DataConfig(**(values | changes))
 
 
-def module(data_set, image_size_px=(32, 80), seed=0, **changes):
-    return DetectionDataModule(config(**changes), data_set.root, image_size_px, seed, data_set.root / "cache")
+def module(data_set, image_size_px=(32, 80), seed=0, temporal=False, **changes):
+    cache = data_set.root / "cache"
+    return DetectionDataModule(config(**changes), data_set.root, image_size_px, seed, cache, temporal=temporal)
+
+
+@pytest.fixture
+def drives(data_set, tmp_path):
+    """Scenes of 5, 3 and 7 frames for training, of 4, 1 and 3 for validation; poses and boxes, but no other sensor."""
+    shutil.copytree(data_set.root / VERSION, tmp_path / VERSION)
+    writer = Writer(tmp_path)
+    samples, scenes, files, at_s = [], [], [], START_S
+    for split, lengths in {"train": (5, 3, 7), "val": (4, 1, 3)}.items():
+        for number, length in enumerate(lengths):
+            names = [f"{split}-{number}-{k}" for k in range(length)]
+            links = ["", *(token("sample", name) for name in names), ""]
+            scene = f"scene-{split}-{number}"
+            scenes.append({"token": token("scene", scene), "name": scene, "description": "",
+                           "first_sample_token": links[1], "last_sample_token": links[-2]})  # fmt: skip
+            for k, name in enumerate(names):
+                stamp = round(1e6 * (at_s + 0.5 * k))
+                samples.append({"token": token("sample", name), "timestamp": stamp, "prev": links[k],
+                                "next": links[k + 2], "scene_token": token("scene", scene)})  # fmt: skip
+                files.append({"token": token("file", name), "sample_token": token("sample", name), "timestamp": stamp,
+                              "ego_pose_token": writer.pose(stamp), "is_key_frame": True, "prev": "", "next": "",
+                              "calibrated_sensor_token": token("calibrated_sensor", "LIDAR_LEFT"),
+                              "filename": f"samples/{name}.pcd"})  # fmt: skip
+            at_s += 30
+    content = {"sample": samples, "scene": scenes, "sample_data": files, "ego_pose": writer.tables["ego_pose"]}
+    for table, records in (content | {"sample_annotation": [], "instance": []}).items():
+        (tmp_path / VERSION / f"{table}.json").write_text(json.dumps(records))
+    names = {split: [f"scene-{split}-{number}" for number in range(3)] for split in ("train", "val")}
+    (tmp_path / "splits.json").write_text(json.dumps(names))
+    return DataSet(tmp_path)
 
 
 @pytest.fixture
@@ -39,34 +74,6 @@ def quick_end(monkeypatch):
     monkeypatch.setattr(torch.utils.data._utils, "MP_STATUS_CHECK_INTERVAL", 0.2)
     yield
     gc.collect()
-
-
-def samplers(n, world_size, batch_size, seed, epoch=0):
-    return [FrameSampler(np.arange(n), rank, world_size, batch_size, seed, lambda: epoch) for rank in range(world_size)]
-
-
-def test_training_ranks_get_equal_whole_batches_without_repeats():
-    parts = [[sample for _, sample in s] for s in samplers(23, 3, 2, seed=4)]
-    assert [len(part) for part in parts] == [6, 6, 6] == [len(s) for s in samplers(23, 3, 2, seed=4)]
-    assert len(set(sum(parts, []))) == 18
-
-
-def test_steps_hold_the_same_frames_on_any_number_of_devices():
-    alone = [sample for _, sample in samplers(24, 1, 6, seed=4)[0]]
-    parts = [[sample for _, sample in s] for s in samplers(24, 3, 2, seed=4)]
-    for step in range(4):
-        assert set(alone[6 * step : 6 * step + 6]) == {x for part in parts for x in part[2 * step : 2 * step + 2]}
-
-
-def test_order_follows_seed_and_epoch():
-    orders = {(seed, epoch): tuple(samplers(20, 1, 1, seed, epoch)[0]) for seed in (0, 1) for epoch in (0, 1)}
-    assert len({tuple(sample for _, sample in order) for order in orders.values()}) == 4
-    assert {epoch for epoch, _ in orders[0, 1]} == {1}
-
-
-def test_validation_covers_every_frame_once():
-    parts = [[sample for _, sample in s] for s in samplers(7, 3, 2, seed=None)]
-    assert sorted(sum(parts, [])) == list(range(7)) and [len(part) for part in parts] == [3, 2, 2]
 
 
 @pytest.mark.parametrize("num_workers", [0, 2])
@@ -143,7 +150,7 @@ def test_errors_travel_between_processes():
 
 @pytest.mark.parametrize(
     "change",
-    [{"batch_size": 0}, {"num_sweeps": 0}, {"num_workers": -1}, {"min_distance_m": float("nan")},
+    [{"batch_size": 0}, {"groups_per_scene": 0}, {"num_sweeps": 0}, {"num_workers": -1}, {"min_distance_m": float("nan")},
      {"test_resize_offset": float("nan")}],
     ids=str,
 )  # fmt: skip
@@ -186,33 +193,204 @@ def test_identity_holds_no_path(data_set):
     assert str(data_set.root.parent) not in str(module(data_set).identity())
 
 
-class Recorder(L.LightningModule):
-    """Notes which frames come in which epoch."""
+def test_streamed_batches_mark_lanes_and_clip_starts(drives):
+    data = module(drives, None, temporal=True, batch_size=2)
+    index = data.index
+    last = {}
+    batches = list(data.train_dataloader())
+    assert len(batches) == 7 == len(data.train_dataloader())
+    for batch in batches:
+        assert batch.lanes.tolist() == [0, 1] and batch.starts.dtype == torch.bool
+        for lane, (name, start) in enumerate(zip(batch.tokens, batch.starts.tolist(), strict=True)):
+            row = index.sample_tokens.tolist().index(name)
+            assert start or (row == last[lane] + 1 and index.sample_scenes[row] == index.sample_scenes[last[lane]])
+            last[lane] = row
+    assert sum(int(batch.starts.sum()) for batch in batches) <= 7
+    for batch in (*module(drives, None).train_dataloader(), *module(drives, None).val_dataloader()):
+        assert batch.lanes is None and batch.starts is None
 
-    def __init__(self):
+
+def test_streamed_validation_reads_whole_scenes_and_batches_shrink(drives):
+    batches = list(module(drives, None, temporal=True, batch_size=2).val_dataloader())
+    assert [batch.lanes.tolist() for batch in batches] == [[0, 1]] * 4
+    assert [batch.starts.tolist() for batch in batches] == [[1, 1], [0, 1], [0, 0], [0, 0]]
+    many = list(module(drives, None, temporal=True, batch_size=6).val_dataloader())
+    assert [len(batch) for batch in many] == [3, 2, 2, 1]  # fewer scenes than lanes
+    tokens = sorted(name for batch in many for name in batch.tokens)
+    assert tokens == sorted(module(drives, None).evaluation_set().tokens)
+
+
+def test_rigid_augmentation_lasts_for_a_clip(drives):
+    data = module(drives, None, temporal=True, batch_size=1)
+    matrices, starts = [], []
+    for batch in data.train_dataloader():
+        matrices.append(batch.aug_from_ego[0])
+        starts.append(bool(batch.starts))
+    for before, after, start in zip(matrices, matrices[1:], starts[1:], strict=False):
+        assert torch.equal(before, after) != start
+    assert len({float(matrix.sum()) for matrix in matrices}) == sum(starts) == 6
+
+
+def test_images_are_augmented_frame_by_frame_within_a_clip(data_set):
+    image = ImageAugmentationConfig(resize=[-0.06, 0.11], rotation_deg=5.4, flip_probability=0.5)
+    augmentation = AugmentationConfig(image=image, bev=BEV)
+    reader = module(data_set).reader
+    tokens = [str(name) for name in reader.index.sample_tokens]
+    first, second = (reader.read(row, augmentation, 3, 1, clip=tokens[0]) for row in (0, 1))
+    alone, other = (reader.read(row, augmentation, 3, 1) for row in (0, 1))
+    assert torch.equal(first.aug_from_ego, second.aug_from_ego) and torch.equal(first.aug_from_ego, alone.aug_from_ego)
+    assert not torch.equal(second.aug_from_ego, other.aug_from_ego)
+    assert torch.equal(first.images, alone.images) and torch.equal(second.images, other.images)
+
+    def crops(frame):  # pixels per metre in the truck's own frame do not know A_t
+        return frame.pix_from_aug[0] @ frame.aug_from_ego[0]
+
+    torch.testing.assert_close(crops(second), crops(other), rtol=1e-4, atol=1e-2)
+    # The pictures' geometry and the boxes follow the clip's matrix, not the frame's.
+    plain = reader.read(1, None)
+    matrix = second.aug_from_ego[0].double()
+    centres = torch.cat([plain.boxes[0].centers.double(), torch.ones(len(plain.boxes[0]), 1)], 1) @ matrix.T
+    torch.testing.assert_close(second.boxes[0].centers.double(), centres[:, :3], rtol=0, atol=1e-4)
+    points = torch.cat([plain.radar_points[:, :3].double(), torch.ones(len(plain.radar_points), 1)], 1) @ matrix.T
+    torch.testing.assert_close(second.radar_points[:, :3].double(), points[:, :3], rtol=0, atol=1e-4)
+    torch.testing.assert_close(second.global_from_ego, plain.global_from_ego)  # memory lives here, unaugmented
+
+
+def test_stream_of_scenes(drives):
+    data = module(drives, None)
+    assert data.scene_names() == ["scene-val-0", "scene-val-1", "scene-val-2"]
+    frames = list(data.stream())
+    assert [frame.tokens[0] for frame in frames] == data.evaluation_set().tokens
+    assert [bool(frame.starts) for frame in frames] == [1, 0, 0, 0, 1, 1, 0, 0]
+    assert all(len(frame) == 1 and frame.lanes.tolist() == [0] for frame in frames)
+    assert torch.equal(frames[0].aug_from_ego[0], torch.eye(4))
+    one = list(data.stream(["scene-val-2"]))
+    assert [frame.tokens for frame in one] == [frame.tokens for frame in frames[5:]] and bool(one[0].starts)
+    with pytest.raises(ConfigError, match="scene 'scene-val-9': the split 'val' has no such.*'scene-val-0'"):
+        data.stream(["scene-val-9"])  # before the first frame is read
+    with pytest.raises(ConfigError, match="'scene-train-0': the split 'val'"):
+        data.stream(["scene-train-0"])
+
+
+def test_clips_for_pictures_end_at_spread_frames(drives):
+    data = module(drives, None)
+    order = data.evaluation_set().tokens
+    clips = data.validation_clips(2, 3)
+    ends = [frame.tokens[0] for frame in data.validation_frames(2)]
+    assert [clip[-1].tokens[0] for clip in clips] == ends == [order[2], order[5]]
+    assert [[frame.tokens[0] for frame in clip] for clip in clips] == [order[:3], order[5:6]]
+    assert [[bool(frame.starts) for frame in clip] for clip in clips] == [[1, 0, 0], [1]]
+
+
+def test_dropped_key_frame_is_a_longer_step_of_the_same_clip(drives):
+    samples = drives.records("sample")
+    (lost,) = (record for record in samples if record["token"] == token("sample", "val-0-1"))
+    for record in samples:
+        record["next"] = lost["next"] if record["next"] == lost["token"] else record["next"]
+        record["prev"] = lost["prev"] if record["prev"] == lost["token"] else record["prev"]
+    drives.table("sample").write_text(json.dumps([record for record in samples if record is not lost]))
+    files = [record for record in drives.records("sample_data") if record["sample_token"] != lost["token"]]
+    drives.table("sample_data").write_text(json.dumps(files))
+    frames = list(module(drives, None, temporal=True).stream(["scene-val-0"]))
+    times = torch.cat([frame.timestamps_s for frame in frames])
+    torch.testing.assert_close(times.diff(), torch.tensor([1.0, 0.5], dtype=torch.float64), rtol=0, atol=1e-5)
+    assert [bool(frame.starts) for frame in frames] == [1, 0, 0]
+
+
+@pytest.mark.parametrize("field", ["timestamp", "prev"])
+@pytest.mark.parametrize("shift_us", [0, -100], ids=["duplicate", "reversed"])
+def test_time_that_stands_still_or_runs_back_within_a_scene(drives, shift_us, field):
+    """By the samples' own time stamps, or by those of the key frames that give the frames their time."""
+    table = "sample" if field == "prev" else "sample_data"
+    first = drives.records(table)[0]["timestamp"]
+    drives.edit(table, 1, timestamp=first + shift_us)
+    with pytest.raises(
+        DataError, match=f"sample.json: sample '{token('sample', 'train-0-1')}'.*{field}=.*(later|earl)"
+    ):
+        module(drives, None, temporal=True)
+
+
+@pytest.mark.parametrize("split", ["train", "val"])
+def test_poses_that_jump_between_frames(drives, split):
+    pose = 2 if split == "train" else 16
+    translation = drives.records("ego_pose")[pose]["translation"]
+    drives.edit("ego_pose", pose, translation=[translation[0] + 500, *translation[1:]])
+    data = module(drives, None, temporal=True)
+    with pytest.raises(DataError, match=f"{token('sample', f'{split}-0-1')}.*m/s.*damaged"):
+        data.train_dataloader() if split == "train" else data.val_dataloader()
+
+
+@pytest.mark.parametrize("temporal", [False, True])
+def test_training_goes_on_where_the_trainer_stands_and_validation_does_not(drives, temporal):
+    def read(steps, limit=float("inf"), kind="train"):
+        data = module(drives, None, temporal=temporal, batch_size=3)
+        data.trainer = SimpleNamespace(world_size=1, global_rank=0, global_step=steps, num_training_batches=limit)
+        loader = data.train_dataloader() if kind == "train" else data.val_dataloader()
+        assert len(loader) == (5 if kind == "train" else 4 if temporal else 3)
+        return [tuple(batch.tokens) for batch in loader]
+
+    epochs = [read(0), read(5), read(10)]
+    assert len(set(sum(epochs, []))) > 10 and all(len(epoch) == 5 for epoch in epochs)
+    assert read(3) == epochs[0][3:] and read(7) == epochs[1][2:] and read(14) == epochs[2][4:]
+    assert read(5, limit=4) == epochs[1][1:]  # Trainer(limit_train_batches=4): step 5 is the second of epoch 1
+    assert read(7, kind="val") == read(0, kind="val")
+
+
+def test_ranks_of_the_module_read_one_process_s_batches(drives):
+    def read(rank, world_size, kind):
+        data = module(drives, None, temporal=True, batch_size=4)
+        data.trainer = SimpleNamespace(
+            world_size=world_size, global_rank=rank, global_step=0, num_training_batches=float("inf")
+        )
+        loader = data.train_dataloader() if kind == "train" else data.val_dataloader()
+        return [list(zip(batch.lanes.tolist(), batch.tokens, batch.starts.tolist(), strict=True)) for batch in loader]
+
+    alone, parts = read(0, 1, "train"), [read(rank, 2, "train") for rank in range(2)]
+    assert alone == [left + right for left, right in zip(*parts, strict=True)]
+    tokens = [entry[1] for rank in range(4) for batch in read(rank, 4, "val") for entry in batch]
+    assert sorted(tokens) == sorted(module(drives, None).evaluation_set().tokens)
+
+
+class Recorder(L.LightningModule):
+    """Notes which frames come in which epoch, and when validation runs; may save and stop before a step."""
+
+    def __init__(self, stop_at=None, checkpoint=None):
         super().__init__()
         self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.stop_at, self.checkpoint = stop_at, checkpoint
         self.seen = []
 
+    def on_train_batch_start(self, batch, index):
+        if self.trainer.global_step == self.stop_at:
+            self.trainer.save_checkpoint(self.checkpoint)
+            raise Stopped
+
     def training_step(self, batch, index):
-        self.seen.append((self.current_epoch, batch.tokens[0], float(batch.aug_from_ego.sum())))
+        starts = None if batch.starts is None else tuple(batch.starts.tolist())
+        self.seen.append((self.current_epoch, index, *batch.tokens, starts, float(batch.aug_from_ego.sum())))
         return self.weight**2
 
     def validation_step(self, batch, index):
         assert len(batch)
+        self.seen.append(("validation", self.trainer.global_step, *batch.tokens))
 
     def configure_optimizers(self):
         return torch.optim.SGD(self.parameters(), 0.1)
 
 
-def fit(data, folder, epochs, checkpoint=None, resume=None):
+class Stopped(Exception):
+    pass
+
+
+def fit(data, folder, epochs, checkpoint=None, resume=None, stop_at=None):
     trainer = L.Trainer(
         max_epochs=epochs, accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False,
         enable_checkpointing=False, use_distributed_sampler=False, num_sanity_val_steps=0, default_root_dir=folder,
     )  # fmt: skip
-    recorder = Recorder()
-    trainer.fit(recorder, data, ckpt_path=resume, weights_only=True)
-    if checkpoint:
+    recorder = Recorder(stop_at, checkpoint)
+    with pytest.raises(Stopped) if stop_at is not None else nullcontext():
+        trainer.fit(recorder, data, ckpt_path=resume, weights_only=True)
+    if checkpoint and stop_at is None:
         trainer.save_checkpoint(checkpoint)
     return recorder.seen
 
@@ -223,12 +401,32 @@ def test_lightning_epochs_differ_and_resume_goes_on(data_set, tmp_path, num_work
         return module(data_set, None, batch_size=1, num_workers=num_workers)
 
     whole = fit(make(), tmp_path, 3)
-    epochs = [[entry[1:] for entry in whole if entry[0] == epoch] for epoch in range(3)]
-    assert all(len({token for token, _ in epoch}) == 3 for epoch in epochs)
-    assert len({matrix for epoch in epochs for _, matrix in epoch}) == 9  # fresh augmentation every time
-    expected = [sample for _, sample in FrameSampler(np.arange(3), 0, 1, 1, 0, lambda: 2)]
+    epochs = [[entry for entry in whole if entry[0] == epoch] for epoch in range(3)]
+    assert all(len({entry[2] for entry in epoch}) == 3 for epoch in epochs)
+    assert len({entry[-1] for epoch in epochs for entry in epoch}) == 9  # fresh augmentation every time
+    expected = shuffled_frames(np.arange(3), 1, 0, 2).samples.ravel()
     index = load_index(data_set.root, VERSION, None)
-    assert [token for token, _ in epochs[2]] == list(index.sample_tokens[expected])
+    assert [entry[2] for entry in epochs[2]] == list(index.sample_tokens[expected])
     first = fit(make(), tmp_path, 2, checkpoint=tmp_path / "two.ckpt")
     rest = fit(make(), tmp_path, 3, resume=tmp_path / "two.ckpt")
+    assert first + rest == whole
+
+
+@pytest.mark.parametrize(
+    ("temporal", "num_workers", "stop_at"),
+    [(True, 0, 2), (True, 1, 7), (True, 0, 5), (True, 0, 9), (False, 0, 7), (False, 1, 5)],
+)
+def test_lightning_resumes_in_the_middle_of_an_epoch(drives, tmp_path, temporal, num_workers, stop_at, quick_end):
+    """Frames, augmentation, epochs and validations of a run cut in two are those of a run in one piece."""
+
+    def make():
+        return module(drives, None, temporal=temporal, batch_size=3, num_workers=num_workers)
+
+    whole = fit(make(), tmp_path, 3)
+    assert [entry[:2] for entry in whole if entry[0] != "validation"] == [(e, i) for e in range(3) for i in range(5)]
+    validated = sorted({entry[1] for entry in whole if entry[0] == "validation"})
+    assert validated == [5, 10, 15]
+    first = fit(make(), tmp_path, 3, checkpoint=tmp_path / "mid.ckpt", stop_at=stop_at)
+    rest = fit(make(), tmp_path, 3, resume=tmp_path / "mid.ckpt")
+    assert len([entry for entry in first if entry[0] != "validation"]) == stop_at
     assert first + rest == whole

@@ -1,70 +1,91 @@
-import json
+"""Tables of experiments: means over seeds, what is best, what is missing, gains seed by seed."""
 
 import pytest
 
-from src.errors import DataError
 from src.reporting.results import read_runs
-from src.reporting.tables import RANGES, experiment_tables
-
-CLASSES = ("car", "truck")
-
-
-def write_run(outputs, name, overrides, seed, value, root="world", scale="mini"):
-    folder = outputs / f"horizon3d-phase1-{scale}-{name}"
-    folder.mkdir(parents=True)
-    record = {
-        "run_id": folder.name, "overrides": overrides, "scale": scale, "seed": seed, "parameters": 2_500_000,
-        "data": {"name": "synthetic highway", "root": root}, "seconds": {"all": 12.0},
-        "peak_memory_mib": {"process": 900},
-    }  # fmt: skip
-    metrics = {
-        "mAP": value, "NDS": value, "classes": {c: {"AP": value} for c in CLASSES},
-        "ranges": {r: {"mAP": value} for r in RANGES},
-    }  # fmt: skip
-    (folder / "run.json").write_text(json.dumps(record))
-    (folder / "metrics.json").write_text(json.dumps(metrics))
-    return folder
+from src.reporting.tables import (
+    BY_SPEED,
+    ERROR_BY_SPEED,
+    SUMMARY,
+    Column,
+    class_table,
+    cost_table,
+    gain_table,
+    group_runs,
+    mean_and_spread,
+    score_table,
+)
 
 
-def test_seeds_are_averaged_and_the_best_is_bold(tmp_path):
+def unnamed(run):
+    return None
+
+
+def test_seeds_are_averaged_and_the_best_is_bold(tmp_path, write_run):
     for seed, value in enumerate((0.3, 0.4, 0.5)):
-        write_run(tmp_path, f"a{seed}", [f"seed={seed}", "phase=phase1"], seed, value)
-    write_run(tmp_path, "b", ["model.kggi=null", "model.ocsf=null", "paths.outputs=x", "data.root=y"], 0, 0.1)
-    write_run(tmp_path, "c", [], 0, 0.9, scale="debug")
-    runs = read_runs(tmp_path, "mini", "phase1")
-    lines = experiment_tables(runs, {(): "ours", ("model.kggi=null", "model.ocsf=null"): "radar only"}).splitlines()
+        write_run(f"a{seed}", [f"seed={seed}", "phase=phase1"], seed, value)
+    write_run("b", ["model.kggi=null", "model.ocsf=null", "paths.outputs=x", "data.root=y"], 0, 0.1)
+    write_run("c", [], 0, 0.9, scale="debug")
+    names = {(): "ours", ("model.kggi=null", "model.ocsf=null"): "radar only"}
+    experiments = group_runs(read_runs(tmp_path, "mini", ["phase1"]), lambda run: names[run.settings])
+    lines = score_table(experiments, SUMMARY).splitlines()
     assert lines[0].startswith("| experiment | mAP | NDS | car AP | mAP 0-25 m")
     assert lines[2].startswith("| ours | **40.0 ± 10.0** |")
     assert lines[3].startswith("| radar only | 10.0 |")
-    assert any(line.startswith("| ours | 0, 1, 2 | 2.50 M | 12 | 900 |") for line in lines)
+    assert class_table(experiments).splitlines()[0] == "| experiment | car | truck |"
+    assert "| ours | 0, 1, 2 | 2.50 M | 12 | 900 |" in cost_table(experiments)
+    assert "| ours | 0, 1, 2 | 6 | 2.50 M | 12 | 900 |" in cost_table(experiments, epochs=True)
 
 
-def test_different_data_never_share_a_table(tmp_path):
-    write_run(tmp_path, "a", [], 0, 0.3)
-    write_run(tmp_path, "b", [], 1, 0.3, root="other")
+def test_different_data_never_share_a_table(tmp_path, write_run):
+    write_run("a", [], 0, 0.3)
+    write_run("b", [], 1, 0.3, root="other")
     with pytest.raises(ValueError, match="never mixes data"):
-        experiment_tables(read_runs(tmp_path, "mini", "phase1"), {})
+        group_runs(read_runs(tmp_path, "mini", ["phase1"]), unnamed)
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"scale": "mini", "run_id": "x-phase1-y"}'])
-def test_broken_records_are_named(tmp_path, content):
-    folder = write_run(tmp_path, "a", [], 0, 0.3)
-    (folder / "run.json").write_text(content)
-    with pytest.raises(DataError, match=r"run\.json"):
-        read_runs(tmp_path, "mini", "phase1")
+def test_experiments_of_one_name_show_their_settings(tmp_path, write_run):
+    write_run("a", ["phase.epochs=2"], 0, 0.3)
+    write_run("b", ["phase.epochs=3"], 0, 0.4)
+    experiments = group_runs(read_runs(tmp_path, "mini", ["phase1"]), lambda run: "more")
+    assert [e.label for e in experiments] == ["more (`phase.epochs=3`)", "more (`phase.epochs=2`)"]
 
 
-def test_a_number_edited_into_text_is_named(tmp_path):
-    folder = write_run(tmp_path, "a", [], 0, 0.3)
-    metrics = json.loads((folder / "metrics.json").read_text())
-    metrics["classes"]["car"]["AP"] = "0.3"
-    (folder / "metrics.json").write_text(json.dumps(metrics))
-    with pytest.raises(DataError, match=r"metrics\.json.*classes\.car\.AP"):
-        read_runs(tmp_path, "mini", "phase1")
+def test_what_a_run_was_not_scored_by_is_a_dash(tmp_path, write_run):
+    write_run("a", ["x=1"], 0, 0.3)
+    write_run("b", [], 0, 0.2, speeds=True)
+    write_run("c", ["y=1"], 0, 0.1, speeds=True)
+    write_run("d", ["y=1"], 1, 0.9)  # the mean of the other seed alone would not compare
+    experiments = group_runs(read_runs(tmp_path, "mini", ["phase1"]), unnamed)
+    rows = {line.split(" | ")[0]: line for line in score_table(experiments, BY_SPEED + ERROR_BY_SPEED).splitlines()}
+    assert rows["| `x=1`"] == "| `x=1` |" + " - |" * 8
+    assert rows["| `y=1`"] == "| `y=1` |" + " - |" * 8
+    assert rows["| `defaults`"] == "| `defaults` |" + " **20.0** |" * 4 + " **1.80** |" * 4
 
 
-def test_unfinished_and_replaced_runs_are_left_out(tmp_path):
-    write_run(tmp_path, "a", [], 0, 0.3)
-    write_run(tmp_path, "a.before-20260101-000000", [], 0, 0.9)
-    (write_run(tmp_path, "b", [], 1, 0.9) / "metrics.json").unlink()
-    assert [run.metrics["mAP"] for run in read_runs(tmp_path, "mini", "phase1")] == [0.3]
+def test_the_smaller_error_is_the_better(tmp_path, write_run):
+    write_run("a", ["x=1"], 0, 0.3, speeds=True)
+    write_run("b", [], 0, 0.2, speeds=True)
+    table = score_table(group_runs(read_runs(tmp_path, "mini", ["phase1"]), unnamed), ERROR_BY_SPEED)
+    assert "| `x=1` | **1.70** |" in table and "| `defaults` | 1.80 |" in table
+
+
+def test_gains_are_paired_by_seed(tmp_path, write_run):
+    for seed, (before, after) in enumerate([(0.10, 0.15), (0.30, 0.37), (0.50, 0.54)]):
+        write_run(f"a{seed}", [], seed, before)
+        write_run(f"b{seed}", ["x=1"], seed, after, speeds=True)
+    write_run("b7", ["x=1"], 7, 0.9)  # no partner
+    write_run("c", ["y=1"], 9, 0.1)
+    better, plain, lone = group_runs(read_runs(tmp_path, "mini", ["phase1"]), unnamed)
+    lines = gain_table(better, [plain, lone], [Column("mAP", "mAP"), BY_SPEED[0]]).splitlines()
+    assert lines[0] == "| `x=1` over | seeds | mAP | mAP 0-0.5 m/s |"
+    assert lines[2] == "| `defaults` | 3 | +5.3 ± 1.5 | - |"  # 5, 7, 4: far less than the spread over seeds
+    assert lines[3] == "| `y=1` | 0 | - | - |"
+    assert "| 3 | -5.3 ± 1.5 |" in gain_table(plain, [better], [Column("mAP", "mAP")])
+
+
+def test_spread_of_one_and_of_none():
+    column = Column("error", "x", 1.0, 2, min)
+    assert mean_and_spread([], column) is None
+    assert mean_and_spread([0.5], column) == (0.5, 0.0)
+    assert mean_and_spread([0.2, 0.4], Column("AP", "x")) == (pytest.approx(30), pytest.approx(14.1421, abs=1e-4))

@@ -16,6 +16,7 @@ from src.models.horizon3d.cross_attention import (
     attention_linear,
     linear_relu_norm,
 )
+from src.models.horizon3d.temporal_attention import TemporalSelfAttention
 from src.models.horizon3d.views import CameraViews
 from src.models.sparse_layers import SubmanifoldConv
 from src.ops.bags import segment_mean
@@ -166,8 +167,10 @@ class EncoderLayer(nn.Module):
         bounds: GaussianBounds,
         chained_attention: bool,
         refine_before_self_encoding: bool,
+        temporal_heads: int | None,
     ) -> None:
         super().__init__()
+        self.temporal_attention = TemporalSelfAttention(channels, temporal_heads) if temporal_heads else None
         num_points = len(FIXED_POINTS) + num_learnable_points
         self.chained_attention = chained_attention
         self.refine_before_self_encoding = refine_before_self_encoding
@@ -206,6 +209,8 @@ class EncoderLayer(nn.Module):
     ) -> GaussianSet:
         """Features and attributes after this layer."""
         f = gaussians.features
+        if self.temporal_attention is not None:
+            f = f + self.temporal_attention(f, embedding, gaussians)
         query = f + embedding
         points = self.sampling_points(query, gaussians)
         x = f + self.radar_attention(query, points, radar_bev)
@@ -236,6 +241,7 @@ class GaussianEncoder(nn.Module):
         bounds: GaussianBounds,
         chained_attention: bool,
         refine_before_self_encoding: bool,
+        temporal_heads: int | None,
     ) -> None:
         super().__init__()
         self.anchor = AnchorEncoder(channels, grid, bounds)
@@ -250,6 +256,7 @@ class GaussianEncoder(nn.Module):
                 bounds,
                 chained_attention,
                 refine_before_self_encoding,
+                temporal_heads,
             )
             for _ in range(num_layers)
         )

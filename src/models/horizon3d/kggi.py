@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import torch
@@ -140,8 +140,8 @@ class KGGI(nn.Module):
         self.register_buffer("centre_m", torch.tensor(grid.centre_m), persistent=False)
         self.register_buffer("half_extent_m", torch.tensor(grid.half_extent_m), persistent=False)
 
-    def forward(self, radar_bev: SparseBEV, views: CameraViews) -> KGGIOutput:
-        """G_0: radar, camera, then random Gaussians."""
+    def forward(self, radar_bev: SparseBEV, views: CameraViews, history: GaussianSet | None = None) -> KGGIOutput:
+        """G_0: radar, camera, random, then history Gaussians, which bring their own attributes and features (4.4)."""
         parts: list[GaussianSet] = []
         logits = camera = None
         if self.config.uses_keypoints:
@@ -153,6 +153,8 @@ class KGGI(nn.Module):
             means = means.expand(radar_bev.batch_size, -1, -1)
             valid = torch.ones(means.shape[:2], dtype=torch.bool, device=means.device)
             parts.append(self._gaussians(Source.RANDOM, means, valid, None))
+        if history is not None:
+            parts.append(replace(history, features=history.features + self.source_embedding.weight[Source.HISTORY]))
         return KGGIOutput(GaussianSet.concatenate(parts), logits, camera)
 
     def _radar_gaussians(

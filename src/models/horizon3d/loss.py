@@ -1,4 +1,4 @@
-"""The training objective L = L_det + lambda_kggi L_kggi + lambda_ocsf L_ocsf (Eq. 10, supplement A) by named terms."""
+"""The objective L = L_det + lambda_kggi L_kggi + lambda_ocsf L_ocsf + lambda_dptf L_dptf (Eq. 10) by named terms."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import depth_cross_entropy, penalty_reduced_focal, sigmoid_focal
 from src.losses.normalizers import mean_over_ranks
-from src.losses.regression import masked_smooth_l1
-from src.losses.segmentation import occupancy_losses
+from src.losses.regression import masked_l1, masked_smooth_l1
+from src.losses.segmentation import dice, lovasz_foreground, occupancy_losses
+from src.models.horizon3d.bev_path import CellPrediction
 from src.models.horizon3d.kggi import KGGIConfig, KGGIOutput
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.horizon3d.views import CameraViews
@@ -31,6 +32,7 @@ class LossConfig:
 
     kggi_weight: float  # lambda_kggi, on keypoint, depth and radar objectness
     ocsf_weight: float  # lambda_ocsf, on the two occupancy terms
+    dptf_weight: float  # lambda_dptf, on the four cell terms and the Gaussian velocities
     heatmap_weight: float | None
     box_weight: float | None
     keypoint_weight: float | None
@@ -38,6 +40,10 @@ class LossConfig:
     radar_objectness_weight: float | None
     occupancy_focal_weight: float | None
     occupancy_dice_weight: float | None
+    cell_focal_weight: float | None
+    cell_dice_weight: float | None
+    cell_lovasz_weight: float | None
+    cell_velocity_weight: float | None
     gaussian_velocity_weight: float | None
     gaussian_velocity_in_phase1: bool  # supervise Gaussian velocities (Eq. 9) already without memory
 
@@ -88,7 +94,7 @@ def ocsf_losses(
     margin_m: float,
     config: LossConfig,
 ) -> dict[str, Tensor]:
-    """Occupancy of the splat against enlarged boxes, and velocities where asked for (5.6, Eq. 9), weighted."""
+    """Occupancy of the splat against the enlarged boxes (specification 5.6), weighted."""
     terms: dict[str, Tensor] = {}
     if config.occupancy_focal_weight is not None or config.occupancy_dice_weight is not None:
         cells = ocsf.splat.cells
@@ -99,13 +105,50 @@ def ocsf_losses(
             terms["occupancy_focal"] = config.occupancy_focal_weight * focal / normalizer
         if config.occupancy_dice_weight is not None:
             terms["occupancy_dice"] = config.occupancy_dice_weight * dice
-    terms = _times(terms, config.ocsf_weight)
-    if config.gaussian_velocity_in_phase1 and config.gaussian_velocity_weight is not None:
-        target = velocity_raster(boxes, grid, margin_m).at(ocsf.splat.peak_cells.flatten())  # [B*G, 2]
-        errors = masked_smooth_l1(ocsf.gaussians.velocities.flatten(0, 1), target)
-        normalizer = mean_over_ranks((~target.isnan()).sum())
-        terms["gaussian_velocity"] = config.gaussian_velocity_weight * errors.sum() / normalizer
-    return terms
+    return _times(terms, config.ocsf_weight)
+
+
+def gaussian_velocity_loss(
+    ocsf: OCSFOutput,
+    boxes: list[Boxes3D],  # B, aug frame
+    grid: BEVGrid,
+    margin_m: float,
+    config: LossConfig,
+) -> dict[str, Tensor]:
+    """Velocities of Gaussians against the enlarged box at the cell where each contributes most (Eq. 9), weighted."""
+    if config.gaussian_velocity_weight is None:
+        return {}
+    target = velocity_raster(boxes, grid, margin_m).at(ocsf.splat.peak_cells.flatten())  # [B*G, 2]
+    errors = masked_smooth_l1(ocsf.gaussians.velocities.flatten(0, 1), target)
+    value = config.gaussian_velocity_weight * errors.sum() / mean_over_ranks((~target.isnan()).sum())
+    return _times({"gaussian_velocity": value}, config.dptf_weight)
+
+
+def cell_losses(
+    cells: CellPrediction,
+    fused: SparseBEV,
+    boxes: list[Boxes3D],  # B, aug frame
+    grid: BEVGrid,
+    config: LossConfig,
+) -> dict[str, Tensor]:
+    """Occupancy and velocity of the cells of F_fuse against the tight boxes (specification 6.1, 8.1), weighted."""
+    terms: dict[str, Tensor] = {}
+    keys, sample = fused.sites.linear(), fused.indices[:, 0]
+    target = cells_are_occupied(keys, occupied_cells(boxes, grid, 0.0))  # [M]
+    if config.cell_focal_weight is not None:
+        total = sigmoid_focal(cells.occupancy_logits, target).sum()
+        terms["cell_focal"] = config.cell_focal_weight * total / mean_over_ranks(target.sum())
+    score = cells.occupancy_logits.sigmoid()
+    if config.cell_dice_weight is not None:
+        terms["cell_dice"] = config.cell_dice_weight * dice(score, target, sample, len(boxes))
+    if config.cell_lovasz_weight is not None:
+        terms["cell_lovasz"] = config.cell_lovasz_weight * lovasz_foreground(score, target, sample, len(boxes))
+    if config.cell_velocity_weight is not None:
+        wanted = velocity_raster(boxes, grid, 0.0).at(keys)  # [M, 2]
+        errors = masked_l1(cells.velocities, wanted)
+        normalizer = mean_over_ranks((~wanted.isnan()).sum())
+        terms["cell_velocity"] = config.cell_velocity_weight * errors.sum() / normalizer
+    return _times(terms, config.dptf_weight)
 
 
 def _keypoint_loss(kggi: KGGIOutput, views: CameraViews, seen: BoxViews, settings: KGGIConfig) -> Tensor:

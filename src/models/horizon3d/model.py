@@ -1,8 +1,9 @@
-"""Horizon3D on single frames: encode, initialise Gaussians, fuse through them, detect (Fig. 2 without memory)."""
+"""Horizon3D: encode, recall, initialise Gaussians, fuse through them, aggregate over time, detect (Fig. 2)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,8 +15,10 @@ from src.models.backbones.sparse_voxel import RadarEncoder, RadarEncoderConfig
 from src.models.detector import Detector
 from src.models.heads.center_head import CenterHead, HeadConfig, HeadOutput
 from src.models.horizon3d.cross_attention import NUM_HEADS
+from src.models.horizon3d.dptf import DPTF, DPTFConfig, DPTFOutput
 from src.models.horizon3d.kggi import KGGI, KGGIConfig, KGGIOutput
-from src.models.horizon3d.loss import LossConfig, kggi_losses, ocsf_losses
+from src.models.horizon3d.loss import LossConfig, cell_losses, gaussian_velocity_loss, kggi_losses, ocsf_losses
+from src.models.horizon3d.memory import Memory
 from src.models.horizon3d.ocsf import OCSF, OCSFConfig, OCSFOutput
 from src.models.horizon3d.views import CameraViews
 from src.structures.batch import FrameBatch
@@ -36,6 +39,7 @@ class Horizon3DConfig:
     radar_encoder: RadarEncoderConfig
     kggi: KGGIConfig | None  # null together with ocsf: radar only
     ocsf: OCSFConfig | None
+    dptf: DPTFConfig | None  # null: single frames, phase 1
     head: HeadConfig
     loss: LossConfig
 
@@ -45,6 +49,11 @@ class Horizon3DConfig:
             raise ConfigError(
                 f"model.{off}=null while model.{on} is set: one makes the Gaussians, the other uses them; set both to "
                 "null for radar only, or model.kggi.initialization=random for OCSF without keypoints"
+            )
+        if self.ocsf is None and self.dptf is not None and self.dptf.gaussian_path is not None:
+            raise ConfigError(
+                "model.dptf.gaussian_path is set, but model.ocsf=null makes no Gaussians to remember; set "
+                "model.dptf.gaussian_path=null as well"
             )
         if self.channels < 1 or self.channels % CHANNEL_MULTIPLE:
             raise ConfigError(
@@ -57,21 +66,25 @@ class Horizon3DConfig:
         """Whether images are read and encoded."""
         return self.ocsf is not None
 
+    @property
+    def temporal_heads(self) -> int | None:
+        """Heads of the temporal self-attention, None where it is off."""
+        path = self.dptf.gaussian_path if self.dptf is not None else None
+        attention = path.self_attention if path is not None else None
+        return attention.num_heads if attention is not None else None
+
 
 @dataclass
 class Horizon3DOutput:
-    """One frame through the model; the Gaussian parts are None for radar only."""
+    """One frame through the model; the Gaussian parts are None for radar only, DPTF for single frames."""
 
     radar_bev: SparseBEV  # F_R
     views: CameraViews | None
     kggi: KGGIOutput | None  # G_0 and the keypoint maps
     ocsf: OCSFOutput | None  # G_L, its splat and F_fuse
+    fused_bev: SparseBEV  # F_fuse, or F_R where there is nothing to fuse
+    dptf: DPTFOutput | None  # recollections and F_out; None in phase 1
     head: HeadOutput
-
-    @property
-    def fused_bev(self) -> SparseBEV:
-        """F_fuse, or F_R where there is nothing to fuse."""
-        return self.radar_bev if self.ocsf is None else self.ocsf.fused_bev
 
 
 class Horizon3D(Detector):
@@ -98,7 +111,8 @@ class Horizon3D(Detector):
             self.image_encoder = ImageEncoder(backbone)
             width, levels = self.image_encoder.channels, len(self.image_encoder.strides)
             self.kggi = KGGI(config.kggi, channels, width, grid, config.ocsf.bounds)
-            self.ocsf = OCSF(config.ocsf, channels, width, len(CAMERAS), levels, grid)
+            self.ocsf = OCSF(config.ocsf, channels, width, len(CAMERAS), levels, grid, config.temporal_heads)
+        self.dptf = DPTF(config.dptf, channels, grid) if config.dptf is not None else None
         self.head = CenterHead(config.head, channels, grid, velocity_code_weight)
 
     @property
@@ -106,15 +120,30 @@ class Horizon3D(Detector):
         """Backbone without its neck."""
         return None if self.image_encoder is None else self.image_encoder.backbone
 
-    def forward(self, batch: FrameBatch) -> Horizon3DOutput:
-        """Detect in B independent frames. Raises ValueError when images are needed and absent."""
-        radar_bev = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
-        if self.image_encoder is None:
-            return Horizon3DOutput(radar_bev, None, None, None, self.head(radar_bev))
-        views = self._encode_views(batch)
-        kggi = self.kggi(radar_bev, views)
-        ocsf = self.ocsf(kggi.gaussians, radar_bev, views)
-        return Horizon3DOutput(radar_bev, views, kggi, ocsf, self.head(ocsf.fused_bev))
+    def forward(self, batch: FrameBatch, memory: Memory | None = None) -> tuple[Horizon3DOutput, Memory | None]:
+        """Detect in the frames of B lanes, given what is remembered of them; the new memory is detached.
+
+        Raises ValueError when images are needed and absent, or when the memory is of another number of lanes.
+        """
+        if memory is not None and memory.frames and memory.batch_size != len(batch):
+            raise ValueError(f"the memory holds {memory.batch_size} lanes, but the batch {len(batch)} frames")
+        recollection = self.dptf.recall(memory, batch) if self.dptf is not None else None
+        radar_bev = fused = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
+        views = kggi = ocsf = None
+        if self.image_encoder is not None:
+            views = self._encode_views(batch)
+            kggi = self.kggi(radar_bev, views, recollection.history if recollection is not None else None)
+            ocsf = self.ocsf(kggi.gaussians, radar_bev, views)
+            fused = ocsf.fused_bev
+        if self.dptf is None:
+            return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, None, self.head(fused)), None
+        dptf = self.dptf.aggregate(fused, recollection)
+        output = Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, dptf, self.head(dptf.bev))
+        return output, self.dptf.remember(memory, batch, fused, dptf, ocsf)
+
+    def restore_memory(self, state: list[dict[str, Any]]) -> Memory:
+        """The memory that `Memory.state` described."""
+        return Memory.from_state(state)
 
     def _encode_views(self, batch: FrameBatch) -> CameraViews:
         if batch.images is None or batch.image_valid is None or batch.pix_from_aug is None:
@@ -138,6 +167,12 @@ class Horizon3D(Detector):
                     output.kggi, output.radar_bev, output.views, batch.boxes, self.grid, config.kggi, config.loss
                 )
                 terms |= ocsf_losses(output.ocsf, batch.boxes, self.grid, config.ocsf.margin_m, config.loss)
+                if config.dptf is not None or config.loss.gaussian_velocity_in_phase1:
+                    terms |= gaussian_velocity_loss(
+                        output.ocsf, batch.boxes, self.grid, config.ocsf.margin_m, config.loss
+                    )
+            if output.dptf is not None and output.dptf.cells is not None:
+                terms |= cell_losses(output.dptf.cells, output.fused_bev, batch.boxes, self.grid, config.loss)
         zero = torch.zeros((), device=batch.device)
         return terms | {"total": sum(terms.values(), zero)}
 
@@ -166,6 +201,13 @@ class Horizon3D(Detector):
                 values[f"gaussians_{source.name.lower()}"] = number / frames
             opacity = gaussians.opacity_logits.sigmoid() * gaussians.valid
             values["opacity"] = opacity.sum() / gaussians.valid.sum().clamp(min=1)
+        if output.dptf is not None:
+            if output.dptf.cells is not None:
+                kept = output.dptf.cells.occupancy_logits.sigmoid() > self.config.dptf.bev_path.memory_threshold
+                values["remembered_cells"] = kept.sum() / frames
+                values["head_cells"] = len(output.dptf.bev) / frames
+            if output.dptf.history is not None:
+                values["gaussians_history"] = output.dptf.history.valid.sum() / frames
         targets = output.head.targets
         if targets is not None:
             values["objects"] = len(targets.rows) / frames

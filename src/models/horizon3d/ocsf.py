@@ -88,7 +88,14 @@ class OCSF(nn.Module):
     """Gaussian encoder, splatting and sparse fusion (specification section 5)."""
 
     def __init__(
-        self, config: OCSFConfig, channels: int, image_channels: int, num_views: int, num_levels: int, grid: BEVGrid
+        self,
+        config: OCSFConfig,
+        channels: int,
+        image_channels: int,
+        num_views: int,
+        num_levels: int,
+        grid: BEVGrid,
+        temporal_heads: int | None,  # of the self-attention over current and history Gaussians, None without
     ) -> None:
         super().__init__()
         self.config, self.grid = config, grid
@@ -103,6 +110,7 @@ class OCSF(nn.Module):
             config.bounds,
             chained_attention=config.cross_attention is CrossAttention.chained,
             refine_before_self_encoding=config.refine_from is RefineFrom.cross_attention,
+            temporal_heads=temporal_heads,
         )
         self.fusion = SparseFusion(channels, config.gate_kernel_size)
 

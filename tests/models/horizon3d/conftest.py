@@ -11,6 +11,9 @@ from src.models.backbones.sparse_voxel import ConvOut, RadarEncoderConfig
 from src.models.backbones.weights import BackboneName
 from src.models.heads.center_head import HeadConfig, TrainRegression
 from src.models.heads.decode import AttributeSource, Suppression
+from src.models.horizon3d.bev_path import BEVPathConfig
+from src.models.horizon3d.dptf import DPTFConfig
+from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling, SelfAttentionConfig
 from src.models.horizon3d.kggi import Initialization, KGGIConfig
 from src.models.horizon3d.loss import LossConfig
 from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
@@ -119,7 +122,7 @@ def backbone():
 def make_config():
     """Smallest configuration with every part on; keyword arguments replace values of kggi, ocsf and loss by name."""
 
-    def build(radar_only=False, **changes):
+    def build(radar_only=False, dptf=None, **changes):
         kggi = {
             "initialization": Initialization.both,
             "num_radar_keypoints": 24,
@@ -155,6 +158,11 @@ def make_config():
             "radar_objectness_weight": 1.0,
             "occupancy_focal_weight": 1.0,
             "occupancy_dice_weight": 1.0,
+            "dptf_weight": 1.0,
+            "cell_focal_weight": 1.0,
+            "cell_dice_weight": 1.0,
+            "cell_lovasz_weight": 1.0,
+            "cell_velocity_weight": 0.25,
             "gaussian_velocity_weight": 0.25,
             "gaussian_velocity_in_phase1": False,
         }
@@ -175,11 +183,38 @@ def make_config():
             ),
             kggi=None if radar_only else KGGIConfig(**kggi),
             ocsf=None if radar_only else OCSFConfig(**ocsf),
+            dptf=dptf,
             head=head_config(),
             loss=LossConfig(**loss),
         )
 
     return build
+
+
+def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, **changes):
+    """A small memory with both paths; keyword arguments replace values of either path by name."""
+    bev = {
+        "num_frames": 3,
+        "memory_threshold": 0.1,
+        "max_cells_per_frame": 200,
+        "velocity_compensation": True,
+        "spatial_dilation": False,
+    }
+    gaussian = {
+        "num_frames": 2,
+        "gaussians_per_frame": 8,
+        "sampling": Sampling.farthest_point,
+        "velocity_compensation": True,
+        "self_attention": SelfAttentionConfig(num_heads=4),
+    }
+    for part in (bev, gaussian):
+        part.update({name: value for name, value in changes.items() if name in part})
+    assert changes.keys() <= bev.keys() | gaussian.keys()
+    return DPTFConfig(
+        max_age_s=max_age_s,
+        bev_path=BEVPathConfig(**bev) if bev_path else None,
+        gaussian_path=GaussianPathConfig(**gaussian) if gaussian_path else None,
+    )
 
 
 def head_config():

@@ -1,0 +1,212 @@
+"""Frames from one's own sensors: the same arithmetic as the reader of recorded data, without tables or files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from PIL import Image
+
+from src.data.images import MAX_PIXELS, resample, width_fit
+from src.data.pcd import RADAR_FIELDS
+from src.data.reader import MAX_EGO_SPEED_MPS, ReaderSettings, compensate_clouds
+from src.errors import DataError
+from src.geometry.camera import pixels_from_points
+from src.geometry.transforms import invert_rigid
+from src.structures.batch import RADAR_POINT_FIELDS, FrameBatch
+from src.structures.taxonomy import CAMERAS
+
+Array = np.ndarray
+
+MAX_SWEEP_AGE_S = 2.0
+"""An older sweep is a stalled sensor or a clock in other units; models are trained on about half a second."""
+MAX_SWEEP_LEAD_S = 0.1
+"""Sensors are triggered some milliseconds apart; a sweep further ahead of its frame has another clock."""
+RIGID_TOLERANCE = 1e-3
+FLOAT32_REACH_M = 1e5
+"""Beyond, float32 coordinates are wrong by centimetres and soon by half a metre (spec section 1.1)."""
+
+
+@dataclass(kw_only=True)
+class Camera:
+    """One undistorted image with its pinhole; z looks forward, x right, y down."""
+
+    image: Array  # [H, W, 3] uint8 RGB
+    intrinsics: Array  # [3, 3] K in pixels of `image`, pixel centres at +0.5
+    ego_from_camera: Array  # [4, 4] mount
+    global_from_ego: Array | None = None  # [4, 4] ego pose at the exposure; None: that of the frame
+
+
+@dataclass(kw_only=True)
+class RadarSweep:
+    """One sweep of one radar as the sensor gives it, Doppler relative to the moving sensor."""
+
+    points: Array  # [n, 7] x, y, z (m), vrel_x, vrel_y, vrel_z (m/s, radial), rcs (dB), sensor frame; n may be 0
+    ego_from_sensor: Array  # [4, 4] mount
+    timestamp_s: float
+    ego_velocity_mps: Array  # [3] velocity of the ego's origin at the sweep, ego axes
+    ego_rate_radps: Array = (0.0, 0.0, 0.0)  # [3] rotation rate at the sweep, ego axes
+    global_from_ego: Array | None = None  # [4, 4] ego pose at the sweep; None: that of the frame
+
+
+def frame_from_sensors(
+    timestamp_s: float,
+    global_from_ego: Array,  # [4, 4] float64; any fixed frame serves, the same one for all frames
+    cameras: Mapping[str, Camera | None],
+    radars: Mapping[str, Sequence[RadarSweep]],
+    settings: ReaderSettings,
+    token: str = "",
+) -> FrameBatch:
+    """A batch of one frame, without annotations and augmentation, as `FrameReader.read` makes it from a data set.
+
+    Ego is x forward, y left, z up, its origin on the ground under the rear axle. `cameras` go by the names in
+    `taxonomy.CAMERAS`; one that is absent or None is masked, and where `settings.image_size_px` is None none is looked
+    at. `radars` go by any name; of each the newest `settings.num_sweeps` sweeps are used, in whatever order they come.
+
+    Raises DataError naming the sensor, what was expected and what was found.
+    """
+    timestamp_s = float(_array(timestamp_s, (), "timestamp_s of the frame"))
+    global_from_ego = _rigid(global_from_ego, "global_from_ego of the frame")
+    points = _radar_points(timestamp_s, global_from_ego, radars, settings)
+    batch = {
+        "tokens": [token or f"{timestamp_s:.6f}"],
+        "timestamps_s": torch.tensor([timestamp_s], dtype=torch.float64),
+        "global_from_ego": torch.from_numpy(global_from_ego[None]),
+        "aug_from_ego": torch.eye(4)[None],
+        "radar_points": torch.from_numpy(points),
+        "radar_batch": torch.zeros(len(points), dtype=torch.int64),
+    }
+    if settings.image_size_px is not None:
+        batch |= _images(global_from_ego, cameras, settings)
+    return FrameBatch(**batch)
+
+
+def _radar_points(
+    timestamp_s: float,
+    global_from_ego: Array,  # [4, 4]
+    radars: Mapping[str, Sequence[RadarSweep]],
+    settings: ReaderSettings,
+) -> Array:  # [P, 7] float32, see RADAR_POINT_FIELDS
+    clouds, mounts, poses, velocities, rates, ages = [], [], [], [], [], []
+    for name, sweeps in radars.items():
+        newest = sorted(sweeps, key=lambda sweep: sweep.timestamp_s, reverse=True)[: settings.num_sweeps]
+        for number, sweep in enumerate(newest):
+            where = f"radar {name}, sweep {number} (0 is the newest)"
+            age = timestamp_s - sweep.timestamp_s
+            if not -MAX_SWEEP_LEAD_S <= age <= MAX_SWEEP_AGE_S:
+                raise DataError(
+                    f"{where}: is {age:g} s older than its frame, expected {-MAX_SWEEP_LEAD_S:g} to "
+                    f"{MAX_SWEEP_AGE_S:g}; give all times in seconds of one clock and leave older sweeps out"
+                )
+            clouds.append(_points(sweep.points, where))
+            mounts.append(_rigid(sweep.ego_from_sensor, f"{where}: ego_from_sensor"))
+            pose = sweep.global_from_ego
+            poses.append(global_from_ego if pose is None else _rigid(pose, f"{where}: global_from_ego"))
+            velocity = _array(sweep.ego_velocity_mps, (3,), f"{where}: ego_velocity_mps")
+            speed = np.linalg.norm(velocity)
+            if speed > MAX_EGO_SPEED_MPS:
+                limit = f"below {MAX_EGO_SPEED_MPS:.0f} m/s"
+                raise DataError(f"{where}: ego_velocity_mps must be {limit}, but got {speed:.0f} m/s")
+            velocities.append(velocity)
+            rates.append(_array(sweep.ego_rate_radps, (3,), f"{where}: ego_rate_radps"))
+            ages.append(age)
+    if not clouds:
+        return np.zeros((0, len(RADAR_POINT_FIELDS)), np.float32)
+    return compensate_clouds(
+        clouds,
+        ego_from_sensor=np.stack(mounts),
+        key_from_sweep=invert_rigid(global_from_ego) @ np.stack(poses),
+        velocity=np.stack(velocities),
+        rate=np.stack(rates),
+        elapsed_s=np.array(ages),
+        settings=settings,
+    ).astype(np.float32)
+
+
+def _images(
+    global_from_ego: Array,  # [4, 4]
+    cameras: Mapping[str, Camera | None],
+    settings: ReaderSettings,
+) -> dict[str, torch.Tensor]:
+    """Images at network size and P_n by each camera's own pose; a missing camera stays black and masked."""
+    unknown = [name for name in cameras if name not in CAMERAS]
+    if unknown:
+        raise DataError(f"camera {unknown[0]!r}: must be one of {', '.join(CAMERAS)}, by where it looks")
+    images = np.zeros((len(CAMERAS), 3, *settings.image_size_px), np.uint8)
+    valid = np.zeros(len(CAMERAS), bool)
+    pix_from_ego = np.tile(np.eye(4), (len(CAMERAS), 1, 1))
+    for view, name in enumerate(CAMERAS):
+        camera = cameras.get(name)
+        if camera is None:
+            continue
+        image = _image(camera.image, f"camera {name}: image")
+        intrinsics = _intrinsics(camera.intrinsics, f"camera {name}: intrinsics")
+        mount = _rigid(camera.ego_from_camera, f"camera {name}: ego_from_camera")
+        pose = camera.global_from_ego
+        pose = global_from_ego if pose is None else _rigid(pose, f"camera {name}: global_from_ego")
+        crop = width_fit(image.shape[:2], settings.image_size_px, settings.test_resize_offset)
+        images[view], valid[view] = resample(Image.fromarray(image), crop, image.shape[:2]), True
+        cam_from_ego = invert_rigid(pose @ mount) @ global_from_ego
+        pix_from_ego[view] = pixels_from_points(intrinsics, cam_from_ego, crop.matrix())
+    return {
+        "images": torch.from_numpy(images[None]),
+        "image_valid": torch.from_numpy(valid[None]),
+        "pix_from_aug": torch.from_numpy(pix_from_ego[None].astype(np.float32)),
+    }
+
+
+# -------------------------------------------------------------------- checks
+
+
+def _array(value: object, shape: tuple[int | None, ...], name: str) -> Array:
+    """Finite float64 of the given shape, None standing for any length. Raises DataError."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{name} must be an array of numbers ({error})") from None
+    wanted = list("n" if length is None else length for length in shape)
+    if array.ndim != len(shape) or any(w not in (None, n) for w, n in zip(shape, array.shape, strict=True)):
+        raise DataError(f"{name} must have the shape {wanted}, but got {list(array.shape)}")
+    if not np.isfinite(array).all():
+        raise DataError(f"{name} must be finite, but entry {np.argwhere(~np.isfinite(array))[0].tolist()} is not")
+    return array
+
+
+def _points(value: object, where: str) -> Array:  # [n, 7]
+    return _array(value, (None, len(RADAR_FIELDS)), f"{where}: points ({', '.join(RADAR_FIELDS)})")
+
+
+def _rigid(value: object, name: str) -> Array:  # [4, 4]
+    matrix = _array(value, (4, 4), name)
+    rotation = matrix[:3, :3]
+    orthogonal = np.abs(rotation @ rotation.T - np.eye(3)).max() < RIGID_TOLERANCE
+    if not (orthogonal and np.linalg.det(rotation) > 0 and np.array_equal(matrix[3], [0, 0, 0, 1])):
+        raise DataError(
+            f"{name} must be a rotation without mirroring or scale and a translation over the row 0 0 0 1, but got "
+            f"{matrix.round(4).tolist()}"
+        )
+    far = np.abs(matrix[:3, 3]).max()
+    if getattr(value, "dtype", None) == np.float32 and far > FLOAT32_REACH_M:
+        raise DataError(f"{name} is float32 and {far:.0f} m from the origin, which rounds poses; give float64")
+    return matrix
+
+
+def _intrinsics(value: object, name: str) -> Array:  # [3, 3]
+    matrix = _array(value, (3, 3), name)
+    focal = matrix[0, 0] > 0 and matrix[1, 1] > 0
+    if not (focal and np.array_equal(matrix[2], [0, 0, 1]) and abs(np.linalg.det(matrix)) > 1e-9):
+        raise DataError(
+            f"{name} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy, but got {matrix.tolist()}"
+        )
+    return matrix
+
+
+def _image(value: object, name: str) -> Array:  # [H, W, 3] uint8
+    if not isinstance(value, np.ndarray) or value.dtype != np.uint8 or value.ndim != 3 or value.shape[2] != 3:
+        found = f"{list(value.shape)} {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
+        raise DataError(f"{name} must be an array [H, W, 3] uint8 in RGB order, but got {found}")
+    if not 0 < value.shape[0] * value.shape[1] <= MAX_PIXELS:
+        raise DataError(f"{name} must have 1 to {MAX_PIXELS} pixels, but got {value.shape[1]} x {value.shape[0]}")
+    return np.ascontiguousarray(value)

@@ -1,0 +1,153 @@
+"""From one phase to the next: which run a phase starts from, and its weights, strictly (`phase.init_from`)."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from torch import nn
+
+from src.config import PHASES, Config, compose_config, run_identity
+from src.errors import CheckpointError, ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
+from src.training.checkpoints import load_model_weights, read_checkpoint
+from src.training.run_folder import RunFolder
+
+logger = logging.getLogger(__name__)
+
+MAY_BE_NEW = re.compile(r"dptf\.|ocsf\.encoder\.layers\.\d+\.temporal_attention\.")
+"""Parameters that a later phase adds; every other one must come from the checkpoint."""
+NOT_OF_THE_SOURCE = ("phase", "model.dptf", "data.groups_per_scene", "resume")
+"""Overrides that concern the later phase only."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a run's first weights come from."""
+
+    identity: str  # run id, or a digest of the file
+    checkpoint: Path
+    overrides: list[str] | None  # of the run that makes it; None for a given file
+    folder: RunFolder | None
+
+    @property
+    def ready(self) -> bool:
+        """Whether the weights are those of a finished run, or a given file."""
+        return self.folder is None or (self.folder.finished and self.checkpoint.is_file())
+
+    @property
+    def command(self) -> str:
+        """What makes it."""
+        return "python -m src.train " + " ".join(self.overrides or [])
+
+
+def find_source(config: Config, overrides: list[str]) -> Source | None:
+    """The run or file that `phase.init_from` names, finished or not; None for fresh weights.
+
+    A phase's name means the run of the same command in that phase, less the overrides of the later phase's own parts.
+    Raises CheckpointError when a given file does not exist.
+    """
+    name = config.phase.init_from
+    if name is None:
+        return None
+    if name not in PHASES:
+        path = Path(name)
+        if not path.is_file():
+            raise CheckpointError(
+                f"phase.init_from={name}: there is no such checkpoint, and no phase of that name ({', '.join(PHASES)})"
+            )
+        return Source(hashlib.sha256(path.read_bytes()).hexdigest()[:16], path, None, None)
+    kept = [override for override in overrides if not _is_of(override, NOT_OF_THE_SOURCE)]
+    wanted = [f"phase={name}", *kept]
+    _, tree = compose_config(wanted)
+    folder = RunFolder(Path(config.paths.outputs), run_identity(tree))
+    return Source(folder.run_id, folder.checkpoints / "last.ckpt", wanted, folder)
+
+
+def train_source(source: Source, train_missing: bool, processes_exist: bool) -> None:
+    """Train the run that a phase starts from, in a process of its own, which prints its progress here.
+
+    `processes_exist` says that ranks are already running side by side, so none of them can start a training of all.
+    Raises ConfigError when it may not be trained here, and the error of its exit code when it fails.
+    """
+    reason = None
+    if not train_missing:
+        reason = "phase.train_missing=false"
+    elif processes_exist:
+        reason = "the processes of this run were started from outside, and they cannot train another run first"
+    if reason is not None:
+        raise ConfigError(
+            f"the run {source.identity} that phase.init_from names has not finished ({reason}); make it with\n"
+            f"    {source.command}\nor give the path of a checkpoint as phase.init_from=PATH"
+        )
+    logger.info("no finished run %s to start from: training it first", source.identity)
+    code = _run_command([sys.executable, "-m", "src.train", *source.overrides])
+    if code != 0:
+        kinds: dict[int, type[HorizonError]] = {
+            kind.exit_code: kind for kind in (ConfigError, DataError, DivergedError, InterruptedRunError)
+        }
+        raise kinds.get(code, HorizonError)(
+            f"the run {source.identity} that comes first ended with exit code {code}, see above; {source.command}"
+        )
+
+
+def hand_over(model: nn.Module, source: Source, tree: dict[str, Any]) -> None:
+    """Give `model` the source's weights; what the new phase adds keeps its own. Settings that differ are logged.
+
+    Raises CheckpointError naming every key that does not fit.
+    """
+    checkpoint = read_checkpoint(source.checkpoint)
+    new = load_model_weights(model, checkpoint, source.checkpoint, MAY_BE_NEW)
+    parts = sorted({key.split(".temporal_attention.")[0].split(".")[0] for key in new})
+    logger.info("weights from %s; new: %d tensors in %s", source.checkpoint, len(new), ", ".join(parts) or "nothing")
+    for key, (old, now) in differing_settings(checkpoint["horizon3d"]["config"], tree).items():
+        logger.warning("%s was %s in the run these weights come from and is %s now", key, old, now)
+
+
+def differing_settings(old: dict[str, Any], new: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Dotted keys of the model, the backbone and the grid that both have and whose values differ."""
+
+    def flat(node: Any, prefix: str) -> dict[str, Any]:
+        if not isinstance(node, dict):
+            return {prefix: node}
+        return {key: value for name in node for key, value in flat(node[name], f"{prefix}.{name}").items()}
+
+    def settings(tree: dict[str, Any]) -> dict[str, Any]:
+        return {
+            key: value for name in ("model", "backbone", "grid") for key, value in flat(tree.get(name), name).items()
+        }
+
+    before, after = settings(old), settings(new)
+    return {
+        key: (before[key], after[key])
+        for key in before.keys() & after.keys()
+        if before[key] != after[key] and not key.startswith(("model.loss.", "model.dptf"))
+    }
+
+
+def _is_of(override: str, keys: tuple[str, ...]) -> bool:
+    name = override.lstrip("+").split("=")[0]
+    return any(name == key or name.startswith(f"{key}.") for key in keys)
+
+
+def _run_command(command: list[str]) -> int:
+    """Run a child to its end; a SIGTERM to this process goes to the child, whose exit code then tells the rest."""
+    child = subprocess.Popen(command)
+
+    def forward(number: int, frame: FrameType | None) -> None:
+        child.send_signal(number)
+
+    before = signal.signal(signal.SIGTERM, forward)
+    try:
+        return child.wait()
+    except KeyboardInterrupt:  # the terminal gave it to the child as well, which ends after a checkpoint
+        return child.wait()
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,209 @@
+"""BEV path of DPTF: remember occupied cells, move them to the present, aggregate over time (Eq. 7-8, Fig. 5; 6.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.horizon3d.kggi import best_rows
+from src.models.horizon3d.memory import Memory, StoredCells
+from src.models.horizon3d.time_embedding import TimeEmbedding
+from src.models.sparse_layers import ConvNormReLU, RowNorm, SparseKernel, SubmanifoldConv
+from src.ops.bags import segment_mean
+from src.ops.sites import Sites
+from src.ops.sparse_conv import sparse_conv, strided_map, temporal_map
+from src.structures.batch import FrameBatch
+from src.structures.sparse_bev import SparseBEV, SparseMap
+
+OCCUPANCY_BIAS = -4.6
+"""An untrained cell is occupied with probability 0.01, well below the memory threshold (specification 6.1)."""
+TIME_CHANNELS = 32
+VELOCITY_UNIT_MPS = 10.0
+"""The velocity head is linear in tens of m/s, so that one learning rate suits it and its neighbours."""
+NORM = {"eps": 1e-5, "momentum": 0.1}
+
+
+@dataclass(kw_only=True)
+class BEVPathConfig:
+    """Settings of the BEV path (`model.dptf.bev_path`)."""
+
+    num_frames: int  # remembered key frames
+    memory_threshold: float  # tau_mem, occupancy from which a cell is remembered
+    max_cells_per_frame: int  # guard: the best cells of a frame
+    velocity_compensation: bool  # move cells by their own velocity; off: by the ego motion alone (Table 6)
+    spatial_dilation: bool  # literal strided convolutions, which spread every cell to its neighbours
+
+    def __post_init__(self) -> None:
+        for name in ("num_frames", "max_cells_per_frame"):
+            if getattr(self, name) < 1:
+                raise ConfigError(
+                    f"model.dptf.bev_path.{name}={getattr(self, name)}: must be at least 1; bev_path=null switches "
+                    "the path off"
+                )
+        if not 0 <= self.memory_threshold < 1:
+            raise ConfigError(
+                f"model.dptf.bev_path.memory_threshold={self.memory_threshold}: must be at least 0 and below 1"
+            )
+
+
+@dataclass
+class CellPrediction:
+    """What the two heads say about the cells of F_fuse (Eq. 7)."""
+
+    occupancy_logits: Tensor  # [M] float32, delta before its sigmoid
+    velocities: Tensor  # [M, 2] float32, u in m/s over ground, augmented axes
+
+
+@dataclass
+class WarpedCells:
+    """Remembered cells at their place in the current augmented frame, inside the grid; several may share a cell."""
+
+    indices: Tensor  # [n, 4] int64 (batch, slot, row, col), the oldest slot first, the current frame's last
+    xy: Tensor  # [n, 2] m, before quantisation
+    velocities: Tensor  # [n, 2] m/s over ground, augmented axes
+    elapsed_s: Tensor  # [n]
+    features: Tensor  # [n, C]
+
+
+class TemporalConv(SparseKernel):
+    """3x3x3 convolution over (t, y, x) that halves the time axis and, unless dilating, keeps to occupied columns."""
+
+    def __init__(self, in_channels: int, out_channels: int, dilating: bool) -> None:
+        super().__init__(in_channels, out_channels, kernel_size=3, ndim=3, bias=False)
+        self.dilating = dilating
+
+    def forward(self, x: SparseMap) -> SparseMap:
+        build = strided_map if self.dilating else temporal_map
+        kernel_map, sites = build(x.sites, self.kernel_size, (2, 1, 1), 1)
+        return SparseMap(sites, sparse_conv(x.features, self.weight, kernel_map, self.bias))
+
+
+class BEVPath(nn.Module):
+    """Sparse memory of occupied BEV cells (specification 6.1)."""
+
+    def __init__(self, config: BEVPathConfig, channels: int, grid: BEVGrid) -> None:
+        super().__init__()
+        self.config, self.grid = config, grid
+        self.occupancy = _cell_head(channels, 1)
+        self.velocity = _cell_head(channels, 2)
+        nn.init.constant_(self.occupancy[1].bias, OCCUPANCY_BIAS)
+        self.time = TimeEmbedding(TIME_CHANNELS)
+        self.convs, self.norms = nn.ModuleList(), nn.ModuleList()
+        slots, width = self.num_slots, channels + TIME_CHANNELS
+        while slots > 1:
+            self.convs.append(TemporalConv(width, channels, config.spatial_dilation))
+            self.norms.append(RowNorm(channels, **NORM))
+            slots, width = (slots + 1) // 2, channels
+        # Untrained, the path adds exactly zero. A ReLU behind this norm would sit at 0 and never pass a gradient.
+        nn.init.zeros_(self.norms[-1].weight)
+
+    @property
+    def num_slots(self) -> int:
+        """T, the remembered frames and the current one."""
+        return self.config.num_frames + 1
+
+    def predict(self, fused: SparseBEV) -> CellPrediction:
+        """Occupancy and velocity of every cell of F_fuse."""
+        values = []
+        for conv, output in (self.occupancy, self.velocity):
+            hidden = conv(fused).features
+            with torch.autocast(hidden.device.type, enabled=False):
+                values.append(output(hidden.float()))
+        return CellPrediction(values[0].squeeze(1), VELOCITY_UNIT_MPS * values[1])
+
+    @torch.no_grad()
+    def store(self, fused: SparseBEV, cells: CellPrediction, batch: FrameBatch) -> StoredCells:
+        """Cells above the memory threshold, detached, in the unaugmented ego frame."""
+        score = cells.occupancy_logits.sigmoid()
+        worth = (score > self.config.memory_threshold).nonzero().squeeze(1)
+        indices = fused.indices[worth]
+        best = best_rows(score[worth], indices[:, 0], len(batch), self.config.max_cells_per_frame).flatten()
+        best = best[best >= 0]  # sample by sample, so the owners ascend
+        worth, indices = worth[best], indices[best]
+        ego_from_aug = torch.linalg.inv_ex(batch.aug_from_ego).inverse[indices[:, 0]]  # [n, 4, 4]
+        features = fused.features.detach()[worth]
+        if torch.is_autocast_enabled(features.device.type):
+            features = features.to(torch.get_autocast_dtype(features.device.type))
+        return StoredCells(
+            xy=_move(ego_from_aug, self.grid.centre_of(indices[:, 1:])),
+            velocities=_rotate(ego_from_aug, cells.velocities.detach()[worth]),
+            features=features,
+            rows=indices[:, 0],
+        )
+
+    @torch.no_grad()
+    def recall(self, memory: Memory, batch: FrameBatch, max_age_s: float) -> WarpedCells | None:
+        """Remembered cells in the batch's augmented frame (Eq. 8); None when nothing is remembered.
+
+        x' = A_t T (x + u dt), always from the original frame, so positions are quantised once.
+        """
+        parts: list[tuple[Tensor, ...]] = []
+        for age, frame in enumerate(memory.frames):
+            past = frame.cells
+            if past is None:
+                continue
+            motion = frame.motion(batch, max_age_s)
+            matrix, elapsed = motion.aug_from_past[past.rows], motion.elapsed_s[past.rows]
+            xy = past.xy
+            if self.config.velocity_compensation:
+                xy = xy + past.velocities * elapsed[:, None]
+            xy = _move(matrix, xy)
+            keep = motion.usable[past.rows] & self.grid.contains(xy)
+            slot = torch.full_like(past.rows, self.config.num_frames - 1 - age)
+            indices = torch.cat([past.rows[:, None], slot[:, None], self.grid.cell_of(xy)], dim=1)
+            values = (indices, xy, _rotate(matrix, past.velocities), elapsed, past.features)
+            parts.append(tuple(value[keep] for value in values))
+        return WarpedCells(*(torch.cat(values) for values in zip(*parts, strict=True))) if parts else None
+
+    def aggregate(self, fused: SparseBEV, warped: WarpedCells | None) -> SparseBEV:
+        """F_out = F_fuse + what sparse convolutions over time make of both, on the sites of either."""
+        b, (rows, cols) = fused.batch_size, self.grid.cells
+        shape = (b, self.num_slots, rows, cols)
+        cell = fused.indices
+        now = torch.full_like(cell[:, :1], self.config.num_frames)
+        indices = torch.cat([cell[:, :1], now, cell[:, 1:]], dim=1)
+        elapsed, features = torch.zeros_like(cell[:, 0], dtype=torch.float32), fused.features
+        if warped is not None:
+            indices = torch.cat([warped.indices, indices])
+            elapsed = torch.cat([warped.elapsed_s, elapsed])
+            features = torch.cat([warped.features.to(features.dtype), features])
+        sites, owners = Sites.unique(indices, shape)
+        features = torch.cat([features, self.time(elapsed).to(features.dtype)], dim=1)
+        x = SparseMap(sites, segment_mean(features, owners, len(sites)))
+        for number, (conv, norm) in enumerate(zip(self.convs, self.norms, strict=True)):
+            x = conv(x)
+            y = norm(x.features)
+            x = x.with_features(y if number == len(self.convs) - 1 else F.relu(y))
+        if len(x.sites) == len(fused.sites):  # nothing but the current cells: keep their kernel maps
+            return fused.with_features(fused.features + x.features)
+        sites = Sites.from_linear(x.sites.linear(), (b, rows, cols))
+        spread = torch.zeros_like(x.features).index_copy(0, sites.rows_of(cell), fused.features.to(x.features.dtype))
+        return SparseBEV(sites, spread + x.features)
+
+
+def _cell_head(channels: int, outputs: int) -> nn.ModuleList:
+    """Submanifold 3x3, norm, ReLU, then one linear layer per cell."""
+    hidden = channels // 2
+    conv = SubmanifoldConv(channels, hidden, 3, 2, bias=False)
+    return nn.ModuleList([ConvNormReLU(conv, **NORM), nn.Linear(hidden, outputs)])
+
+
+def _move(
+    matrix: Tensor,  # [n, 4, 4]
+    xy: Tensor,  # [n, 2] m
+) -> Tensor:  # [n, 2]
+    """Points of the z = 0 plane in another frame."""
+    return _rotate(matrix, xy) + matrix[:, :2, 3]
+
+
+def _rotate(
+    matrix: Tensor,  # [n, 4, 4]
+    vectors: Tensor,  # [n, 2]
+) -> Tensor:  # [n, 2]
+    # No matrix product: autocast would round positions to half precision.
+    return matrix[:, :2, 0] * vectors[:, :1] + matrix[:, :2, 1] * vectors[:, 1:]

@@ -1,0 +1,112 @@
+"""DPTF, dual-path temporal fusion: a memory of BEV cells and one of Gaussians (Sec. 3.3; specification 6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.horizon3d.bev_path import BEVPath, BEVPathConfig, CellPrediction, WarpedCells
+from src.models.horizon3d.gaussian_path import GaussianPath, GaussianPathConfig
+from src.models.horizon3d.memory import Memory, MemoryFrame
+from src.models.horizon3d.ocsf import OCSFOutput
+from src.structures.batch import FrameBatch
+from src.structures.gaussians import GaussianSet
+from src.structures.sparse_bev import SparseBEV
+
+
+@dataclass(kw_only=True)
+class DPTFConfig:
+    """Settings of the temporal part (`model.dptf`). Raises ConfigError when there is nothing to remember."""
+
+    max_age_s: float  # older memory is not used
+    bev_path: BEVPathConfig | None
+    gaussian_path: GaussianPathConfig | None
+
+    def __post_init__(self) -> None:
+        if not self.max_age_s > 0:
+            raise ConfigError(f"model.dptf.max_age_s={self.max_age_s}: must be positive")
+        if self.bev_path is None and self.gaussian_path is None:
+            raise ConfigError(
+                "model.dptf.bev_path=null and model.dptf.gaussian_path=null leave nothing to remember; use "
+                "model.dptf=null for a model without memory"
+            )
+
+    @property
+    def num_frames(self) -> int:
+        """How many past key frames are remembered at most."""
+        return max(path.num_frames for path in (self.bev_path, self.gaussian_path) if path is not None)
+
+
+@dataclass
+class Recollection:
+    """The memory as it looks in the current frame."""
+
+    history: GaussianSet | None  # None: nothing remembered, or the path is off
+    warped: WarpedCells | None
+
+
+@dataclass
+class DPTFOutput:
+    """What the losses, the head and pictures read."""
+
+    history: GaussianSet | None
+    warped: WarpedCells | None
+    cells: CellPrediction | None  # on the cells of F_fuse; None without the BEV path
+    bev: SparseBEV  # F_out
+
+
+class DPTF(nn.Module):
+    """Both memory paths; a path that is off costs nothing."""
+
+    def __init__(self, config: DPTFConfig, channels: int, grid: BEVGrid) -> None:
+        super().__init__()
+        self.config = config
+        self.bev_path = BEVPath(config.bev_path, channels, grid) if config.bev_path is not None else None
+        self.gaussian_path = (
+            GaussianPath(config.gaussian_path, channels, grid) if config.gaussian_path is not None else None
+        )
+
+    def recall(self, memory: Memory | None, batch: FrameBatch) -> Recollection:
+        """Bring the memory to the batch's time and frame."""
+        history = warped = None
+        if memory is not None and self.gaussian_path is not None:
+            history = self.gaussian_path.recall(memory, batch, self.config.max_age_s)
+        if memory is not None and self.bev_path is not None:
+            warped = self.bev_path.recall(memory, batch, self.config.max_age_s)
+        return Recollection(history, warped)
+
+    def aggregate(self, fused: SparseBEV, recollection: Recollection) -> DPTFOutput:
+        """F_fuse and the remembered cells into F_out."""
+        cells, bev = None, fused
+        if self.bev_path is not None:
+            cells = self.bev_path.predict(fused)
+            bev = self.bev_path.aggregate(fused, recollection.warped)
+        return DPTFOutput(recollection.history, recollection.warped, cells, bev)
+
+    def remember(
+        self,
+        memory: Memory | None,
+        batch: FrameBatch,
+        fused: SparseBEV,
+        output: DPTFOutput,
+        ocsf: OCSFOutput | None,  # None for radar only, which has no Gaussians
+    ) -> Memory:
+        """The memory with the current frame added."""
+        cells = gaussians = None
+        if self.bev_path is not None:
+            cells = self.bev_path.store(fused, output.cells, batch)
+        if self.gaussian_path is not None:
+            gaussians = self.gaussian_path.store(ocsf.gaussians, ocsf.splat.active, batch)
+        frame = MemoryFrame(
+            batch.timestamps_s,
+            batch.global_from_ego,
+            torch.ones_like(batch.timestamps_s, dtype=torch.bool),
+            cells,
+            gaussians,
+        )
+        paths = (self.config.bev_path, self.config.gaussian_path)
+        return (memory or Memory(())).push(frame, *(path.num_frames if path is not None else 0 for path in paths))

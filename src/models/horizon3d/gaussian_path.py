@@ -1,0 +1,147 @@
+"""Gaussian path of DPTF: which Gaussians are remembered, and how they return as history (specification 6.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.horizon3d.memory import Memory
+from src.models.horizon3d.time_embedding import TimeEmbedding
+from src.ops.farthest_point import farthest_points
+from src.structures.batch import FrameBatch
+from src.structures.gaussians import GaussianSet, Source
+
+
+class Sampling(Enum):
+    """Which active Gaussians are remembered (Table 7)."""
+
+    farthest_point = "farthest_point"
+    top_opacity = "top_opacity"
+    random = "random"
+
+
+@dataclass(kw_only=True)
+class SelfAttentionConfig:
+    """Settings of the temporal self-attention (`model.dptf.gaussian_path.self_attention`)."""
+
+    num_heads: int
+
+    def __post_init__(self) -> None:
+        if self.num_heads < 1:
+            raise ConfigError(
+                f"model.dptf.gaussian_path.self_attention.num_heads={self.num_heads}: must be at least 1; "
+                "self_attention=null switches it off"
+            )
+
+
+@dataclass(kw_only=True)
+class GaussianPathConfig:
+    """Settings of the Gaussian path (`model.dptf.gaussian_path`)."""
+
+    num_frames: int  # remembered key frames
+    gaussians_per_frame: int
+    sampling: Sampling
+    velocity_compensation: bool  # move history by its own velocity; off: by the ego motion alone (Table 6)
+    self_attention: SelfAttentionConfig | None
+
+    def __post_init__(self) -> None:
+        for name in ("num_frames", "gaussians_per_frame"):
+            if getattr(self, name) < 1:
+                raise ConfigError(
+                    f"model.dptf.gaussian_path.{name}={getattr(self, name)}: must be at least 1; "
+                    "gaussian_path=null switches the path off"
+                )
+
+    @property
+    def num_history_gaussians(self) -> int:
+        """K_hist."""
+        return self.num_frames * self.gaussians_per_frame
+
+
+class GaussianPath(nn.Module):
+    """Remembers a covering subset of the active Gaussians and brings it back as history (specification 6.2)."""
+
+    def __init__(self, config: GaussianPathConfig, channels: int, grid: BEVGrid) -> None:
+        super().__init__()
+        self.config, self.grid = config, grid
+        self.time = TimeEmbedding(channels)
+        self.register_buffer("centre_m", torch.tensor(grid.centre_m), persistent=False)
+
+    def recall(self, memory: Memory, batch: FrameBatch, max_age_s: float) -> GaussianSet | None:
+        """History Gaussians in the batch's augmented frame, newest first; None when nothing is remembered.
+
+        m' = A_t T (m + v dt); what is too old, not in the past or outside the grid is padding.
+        """
+        parts = []
+        for frame in memory.frames:
+            past = frame.gaussians
+            if past is None:
+                continue
+            motion = frame.motion(batch, max_age_s)
+            elapsed = motion.elapsed_s[:, None].expand_as(past.valid)
+            if self.config.velocity_compensation:
+                past = replace(past, means=past.means + past.velocities * elapsed[..., None])
+            moved = past.transform(motion.aug_from_past)
+            valid = moved.valid & motion.usable[:, None] & self.grid.contains(moved.means)
+            parts.append(
+                replace(
+                    moved,
+                    means=torch.where(valid[..., None], moved.means, self.centre_m),
+                    features=past.features + self.time(elapsed),
+                    sources=torch.full_like(past.sources, int(Source.HISTORY)),
+                    elapsed_s=elapsed,
+                    valid=valid,
+                )
+            )
+        return GaussianSet.concatenate(parts) if parts else None
+
+    @torch.no_grad()
+    def store(
+        self,
+        gaussians: GaussianSet,  # G_L
+        active: Tensor,  # [B, G] bool, the Gaussian reaches an occupied cell
+        batch: FrameBatch,
+    ) -> GaussianSet:  # [B, gaussians_per_frame] in the unaugmented ego frame
+        """A subset of the active Gaussians of any source; what exists where fewer are active."""
+        picks = self._sample(gaussians, active & gaussians.valid, batch)  # [B, K], -1 for none
+        rows = picks.clamp(min=0)
+        chosen = gaussians.map(lambda value: _gather(value.detach(), rows))
+        ego = chosen.transform(torch.linalg.inv_ex(batch.aug_from_ego).inverse)
+        features = ego.features
+        if torch.is_autocast_enabled(features.device.type):
+            features = features.to(torch.get_autocast_dtype(features.device.type))
+        return replace(ego, features=features, valid=picks >= 0)
+
+    def _sample(self, gaussians: GaussianSet, active: Tensor, batch: FrameBatch) -> Tensor:
+        count = self.config.gaussians_per_frame
+        opacity = gaussians.opacity_logits.detach()
+        if self.config.sampling is Sampling.farthest_point:
+            start = torch.where(active, opacity, -torch.inf).argmax(dim=1)
+            return farthest_points(gaussians.means.detach(), active, start, count)
+        score = opacity if self.config.sampling is Sampling.top_opacity else _draws(batch, active)
+        score, picks = torch.where(active, score, -torch.inf).topk(min(count, active.shape[1]), dim=1)
+        picks = torch.where(score > -torch.inf, picks, -1)
+        return F.pad(picks, (0, count - picks.shape[1]), value=-1)
+
+
+def _gather(
+    value: Tensor,  # [B, G, ...]
+    rows: Tensor,  # [B, K] int64
+) -> Tensor:  # [B, K, ...]
+    index = rows.view(*rows.shape, *(1,) * (value.dim() - 2)).expand(*rows.shape, *value.shape[2:])
+    return value.gather(1, index)
+
+
+def _draws(batch: FrameBatch, active: Tensor) -> Tensor:  # [B, G] in 0..1
+    """Numbers drawn from each frame's own time stamp, so that an evaluation can be repeated."""
+    rows = []
+    for stamp in batch.timestamps_s.tolist():
+        generator = torch.Generator().manual_seed(round(1e6 * stamp) % 2**63)
+        rows.append(torch.rand(active.shape[1], generator=generator))
+    return torch.stack(rows).to(active.device)

@@ -1,0 +1,38 @@
+"""Farthest point sampling: a subset of points that covers the set (specification 6.2)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+@torch.no_grad()
+def farthest_points(
+    points: Tensor,  # [B, G, 2] m
+    valid: Tensor,  # [B, G] bool
+    start: Tensor,  # [B] int64, first pick of each sample; of no meaning where a sample has no valid point
+    count: int,
+) -> Tensor:  # [B, count] int64 rows in order of picking, -1 where a sample has fewer valid points
+    """Each pick is the valid point farthest from all earlier ones, ties by lowest row.
+
+    Raises ValueError when shapes disagree.
+    """
+    b, g = valid.shape
+    if points.shape != (b, g, 2) or start.shape != (b,):
+        raise ValueError(
+            f"points {list(points.shape)}, valid {list(valid.shape)} and start {list(start.shape)} must be [B, G, 2], "
+            "[B, G] and [B]"
+        )
+    picks = start.new_full((b, count), -1)
+    if g == 0:
+        return picks
+    gap = torch.where(valid, torch.inf, -1.0)  # squared distance to the nearest pick; -1: not to be picked (again)
+    samples = torch.arange(b, device=points.device)
+    pick = start.clone()
+    for step in range(min(count, g)):
+        picks[:, step] = torch.where(gap[samples, pick] >= 0, pick, -1)
+        squared = (points - points[samples, pick, None]).square().sum(-1)
+        gap = torch.where(gap >= 0, torch.minimum(gap, squared), gap)
+        gap[samples, pick] = -1.0
+        pick = gap.argmax(dim=1)
+    return picks

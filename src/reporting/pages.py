@@ -1,0 +1,133 @@
+"""The pages under reports/: which runs belong on one, what experiments are called, and the text around the tables."""
+
+from __future__ import annotations
+
+from src.reporting.results import RunResult
+from src.reporting.tables import (
+    BY_RANGE,
+    BY_SPEED,
+    ERROR_BY_SPEED,
+    SUMMARY,
+    SUMMARY_WITH_VELOCITY,
+    Experiment,
+    class_table,
+    cost_table,
+    gain_table,
+    group_runs,
+    score_table,
+)
+
+PHASES_OF = {"phase2": ("phase1", "phase2")}
+"""Whose runs a phase's page reads; other phases' pages read their own."""
+
+GOES_ON = "phase.init_from="
+CONTINUED = "phase 1, as many further epochs"
+
+NAMES = {
+    ("phase1",): "KGGI + OCSF",
+    ("phase1", "model.kggi.initialization=random"): "OCSF, random Gaussians",
+    ("phase1", "model.kggi.initialization=keypoint"): "KGGI + OCSF, keypoints only",
+    ("phase1", "model.kggi=null", "model.ocsf=null"): "radar only",
+}
+NAMES_OF_COMPARISON = {
+    ("phase1",): "phase 1",
+    ("phase2",): "phase 2",
+    (
+        "phase2",
+        "model.dptf.bev_path.velocity_compensation=false",
+        "model.dptf.gaussian_path.velocity_compensation=false",
+    ): "phase 2, no velocity compensation",
+    ("phase2", "model.dptf.gaussian_path=null"): "phase 2, BEV path only",
+    ("phase2", "model.dptf.bev_path=null"): "phase 2, Gaussian path only",
+    ("phase2", "model.dptf.gaussian_path.self_attention=null"): "phase 2, no self-attention",
+    ("phase2", "model.dptf.max_age_s=0.55"): "phase 2, 0.5 s of memory",
+}
+"""By phase and sorted settings, in the order of the page; phase 1 that went on stands after phase 1."""
+
+METRIC = "official TruckScenes metric on the validation split; percent, mean ± standard deviation over seeds."
+
+BY_SPEED_TEXT = """By speed of the ground truth (a match follows its ground truth whatever speed it states, a false
+positive the speed it states). Means over the classes that occur at that speed; the velocity error (m/s, at 2 m) of a
+class that does not reach a recall of 0.1 counts as 1, the official rule, so read it beside the AP."""
+
+GAIN_TEXT = """Differences between runs of the same seed, mean ± standard deviation: points of percent, and m/s for the
+velocity error, where less is better."""
+
+
+def runs_on_page(runs: list[RunResult], phase: str) -> list[RunResult]:
+    """Those of `runs` that the page of `phase` shows; none when there is none of the phase itself.
+
+    Phase 1 that went on from phase 1 is what phase 2 is held against, so it stands on that page and not on its own;
+    there, phase 1 stands as it is, without its ablations.
+    """
+    if phase in PHASES_OF:
+        shown = [run for run in runs if run.phase == phase or not run.settings or _goes_on(run)]
+    else:
+        shown = [run for run in runs if run.phase != "phase1" or not _goes_on(run)]
+    return shown if any(run.phase == phase for run in shown) else []
+
+
+def phase_page(runs: list[RunResult], scale: str, epochs: int) -> str:
+    """The runs of one phase: summary, AP by class, cost. Raises ValueError when they are of different data."""
+    experiments = group_runs(runs, lambda run: NAMES.get((run.phase, *run.settings)))
+    tables = [score_table(experiments, SUMMARY), class_table(experiments), cost_table(experiments)]
+    return _page(runs[0].phase, scale, f"{epochs} epochs", runs) + "\n\n".join(tables) + "\n"
+
+
+def compared_experiments(runs: list[RunResult]) -> list[Experiment]:
+    """The experiments of phase 2's page, in its order. Raises ValueError when the runs are of different data."""
+    epochs = {run.epochs for run in runs if (run.phase, *run.settings) == ("phase2",)}
+
+    def name(run: RunResult) -> str | None:
+        free = ("phase.epochs=", "phase.velocity_code_weight=")
+        if f"{GOES_ON}phase1" in run.settings and all(s.startswith((GOES_ON, *free)) for s in run.settings):
+            return CONTINUED if {run.epochs} == epochs else f"phase 1, {run.epochs} further epochs"
+        known = NAMES_OF_COMPARISON.get((run.phase, *run.settings))
+        return known or f"{run.phase.replace('phase', 'phase ')}, `{' '.join(run.settings)}`"
+
+    def place(experiment: Experiment) -> float:
+        known = list(NAMES_OF_COMPARISON)
+        if experiment.key in known:
+            return known.index(experiment.key)
+        return 0.5 if experiment.key[0] == "phase1" else len(known)
+
+    return sorted(group_runs(runs, name), key=place)
+
+
+def comparison_page(experiments: list[Experiment], scale: str, picture: str) -> str:
+    """Phase 2 against phase 1 and against its own parts: scores, by speed, by class, cost, and gains seed by seed.
+
+    `experiments` are `compared_experiments`; `picture` is the address of their bars, seen from the page.
+    """
+    runs = [run for experiment in experiments for run in experiment.runs]
+    text = _page("phase2", scale, "a row of phase 2, and one of further epochs, starts from its seed's phase 1", runs)
+    text += f"![Scores by distance and by speed]({picture})\n\n{score_table(experiments, SUMMARY_WITH_VELOCITY)}\n\n"
+    text += f"## By speed\n\n{BY_SPEED_TEXT}\n\n{score_table(experiments, BY_SPEED)}\n\n"
+    text += f"{score_table(experiments, ERROR_BY_SPEED)}\n\n## AP by class\n\n{class_table(experiments)}\n\n"
+    text += (
+        f"## Cost\n\nOf the phase itself, without the one it starts from.\n\n{cost_table(experiments, epochs=True)}\n"
+    )
+    subject = next((experiment for experiment in experiments if experiment.key == ("phase2",)), None)
+    others = [experiment for experiment in experiments if experiment is not subject]
+    if subject is None or not others:
+        return text
+    text += f"\n## Gain of phase 2\n\n{GAIN_TEXT}\n\n"
+    parts = (SUMMARY_WITH_VELOCITY[:4], BY_RANGE, BY_SPEED, ERROR_BY_SPEED)
+    return text + "\n\n".join(gain_table(subject, others, columns) for columns in parts) + "\n"
+
+
+def _goes_on(run: RunResult) -> bool:
+    return any(setting.startswith(GOES_ON) for setting in run.settings)
+
+
+def _page(phase: str, scale: str, epochs: str, runs: list[RunResult]) -> str:
+    """Title, conventions and the commands of the runs."""
+    text = (
+        f"# {phase}, scale {scale}\n\n"
+        f"Data: {runs[0].data}; {epochs}; {METRIC} Written by "
+        f"`python -m src.report phase={phase} scale={scale}` from the runs\n\n```\n"
+    )
+    for run in sorted(runs, key=lambda run: (run.phase, run.settings, run.seed)):
+        changes = " ".join([*run.settings, f"seed={run.seed}"])
+        text += f"python -m src.train phase={run.phase} scale={scale} {changes}\n"
+    return f"{text}```\n\n"

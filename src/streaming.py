@@ -1,0 +1,135 @@
+"""Detection one frame at a time with memory, for whoever brings frames: a data set's or one's own sensors'."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from src.assembly import build_model
+from src.config import Config, Precision, restore_config
+from src.data.reader import ReaderSettings
+from src.data.sensors import Camera, RadarSweep, frame_from_sensors
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.detector import Detector
+from src.structures.batch import FrameBatch
+from src.structures.boxes import Boxes3D
+from src.structures.taxonomy import CAMERAS
+from src.training.checkpoints import load_model_weights, read_checkpoint
+
+
+class StreamingDetector:
+    """A trained detector of either phase that takes consecutive frames of one vehicle and remembers them.
+
+    What a frame may use of the past is decided frame by frame, by its time and pose (specification 6.4):
+
+    - On the first frame, after `reset`, and on a frame that says so (`FrameBatch.starts`) nothing is remembered.
+    - Frames older than `model.dptf.max_age_s` are not used, so a long gap is as a first frame.
+    - Frames that are not in the past of the present one are not used. A frame given twice is detected as if it came
+      for the first time. When the clock jumps back, nothing from after the jump's target is used until the clock has
+      passed it again, or until newer frames have pushed it out; call `reset` when another recording begins.
+    - Frames from which the vehicle could not have come at 100 m/s are not used: the localisation has jumped.
+
+    Any number of frames may be given; only the last few are kept. The memory lives here, as `memory`, never in the
+    model; a detector for a second vehicle can share the model: `StreamingDetector(d.model, d.grid, d.settings)`.
+    """
+
+    def __init__(
+        self,
+        model: Detector,
+        grid: BEVGrid,
+        settings: ReaderSettings,
+        device: torch.device | str = "cpu",
+        bf16: bool = False,
+    ) -> None:
+        self.device = torch.device(device)
+        if self.device.type == "cuda" and not torch.cuda.is_available():
+            raise ConfigError(f"device={device}: torch sees no GPU on this machine; use device=cpu")
+        self.model = model.to(self.device).eval()
+        self.grid = grid
+        self.settings = settings
+        self.bf16 = bf16
+        self.memory: Any = None
+
+    @classmethod
+    def load(cls, checkpoint: Path | str, device: torch.device | str = "cpu") -> Self:
+        """Rebuild a checkpoint's own model from the configuration in it.
+
+        Raises CheckpointError when the file is missing, damaged or not of this project.
+        """
+        path = Path(checkpoint)
+        content = read_checkpoint(path)
+        return cls.restore(restore_config(content["horizon3d"]["config"], []), content, path, device)
+
+    @classmethod
+    def restore(cls, config: Config, checkpoint: dict[str, Any], path: Path, device: torch.device | str) -> Self:
+        """The detector of a checkpoint that has been read already; `path` is for messages."""
+        # Every weight comes from the checkpoint; the file that training began from may not be on this machine.
+        model = build_model(replace(config, backbone=replace(config.backbone, weights=None)))
+        load_model_weights(model, checkpoint, path)
+        settings = ReaderSettings(
+            num_sweeps=config.data.num_sweeps,
+            min_distance_m=config.data.min_distance_m,
+            propagate_points=config.data.propagate_points,
+            on_bad_file=config.data.on_bad_file,
+            image_size_px=tuple(config.backbone.image_size_px) if config.model.uses_images else None,
+            test_resize_offset=config.data.test_resize_offset,
+        )
+        return cls(model, config.grid.build(), settings, device, bf16=config.precision == Precision.bf16.value)
+
+    def reset(self) -> None:
+        """Forget everything: the next frame begins a new recording."""
+        self.memory = None
+
+    def frame(
+        self,
+        timestamp_s: float,
+        global_from_ego: np.ndarray,  # [4, 4] float64; any fixed frame serves, the same one for all frames
+        cameras: Mapping[str, Camera | None],
+        radars: Mapping[str, Sequence[RadarSweep]],
+    ) -> FrameBatch:
+        """A frame of one's own sensors, prepared as this detector was trained; see `frame_from_sensors`."""
+        return frame_from_sensors(timestamp_s, global_from_ego, cameras, radars, self.settings)
+
+    def step(self, frame: FrameBatch) -> Boxes3D:
+        """Boxes of the next frame (a batch of one) in its ego frame, with scores, best first, on the CPU.
+
+        Raises ValueError for a batch that is not one frame, is augmented, or has other images than the model needs.
+        """
+        return self.run(frame)[0].to("cpu")
+
+    @torch.inference_mode()
+    def run(self, frame: FrameBatch) -> tuple[Boxes3D, Any]:
+        """As `step`, with the model's own output beside the boxes, both on the detector's device."""
+        self._check(frame)
+        if frame.starts is not None and bool(frame.starts[0]):
+            self.reset()
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16):
+            output, self.memory = self.model(frame.to(self.device), self.memory)
+            (boxes,) = self.model.decode(output)
+        return boxes, output
+
+    def _check(self, frame: FrameBatch) -> None:
+        if len(frame) != 1:
+            raise ValueError(f"one frame at a time: the batch must hold 1 frame, but got {len(frame)}")
+        known = torch.isfinite(frame.timestamps_s).all() and torch.isfinite(frame.global_from_ego).all()
+        if not known:
+            raise ValueError(f"frame {frame.tokens[0]}: timestamps_s and global_from_ego must be finite")
+        if not torch.equal(frame.aug_from_ego[0].cpu(), torch.eye(4)):
+            raise ValueError(
+                f"frame {frame.tokens[0]}: aug_from_ego must be the identity, augmentation is for training"
+            )
+        if self.settings.image_size_px is None:
+            return
+        wanted = [1, len(CAMERAS), 3, *self.settings.image_size_px]
+        found = None if frame.images is None else list(frame.images.shape)
+        if found != wanted:
+            raise ValueError(
+                f"frame {frame.tokens[0]}: images must be {wanted}, but got {found}; a missing camera is a black image "
+                "with image_valid False"
+            )

@@ -1,0 +1,148 @@
+"""One's own sensors: the frame equals what the reader makes of the same raw data; inputs are checked by name."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tiny_set import INTRINSICS, VERSION, ego_pose, mount, reader_settings
+
+from src.data.cache import load_index
+from src.data.pcd import read_radar_points
+from src.data.reader import ego_motion
+from src.data.schema import CHANNELS
+from src.data.sensors import Camera, RadarSweep, frame_from_sensors
+from src.errors import DataError
+from src.structures.taxonomy import CAMERAS, RADARS
+
+SAMPLE = 1
+
+
+@pytest.fixture(scope="module")
+def index(data_set):
+    return load_index(data_set.root, VERSION, None)
+
+
+@pytest.fixture(scope="module")
+def raw(index):
+    """Time, pose, cameras and radar sweeps of one frame, straight from the files and the analytic world."""
+    cameras, radars = {}, {}
+    for channel in (*CAMERAS, *RADARS):
+        row = int(index.key_data[SAMPLE, CHANNELS.index(channel)])
+        if channel in CAMERAS:
+            image = np.asarray(Image.open(index.root / index.filename(row)).convert("RGB"))
+            pose = ego_pose(1e-6 * index.data_times_us[row])
+            cameras[channel] = Camera(
+                image=image, intrinsics=INTRINSICS, ego_from_camera=mount(channel), global_from_ego=pose
+            )
+            continue
+        sweeps = radars.setdefault(channel, [])
+        while row >= 0:
+            time_us = index.data_times_us[row : row + 1]
+            pose = ego_pose(1e-6 * time_us[0])
+            velocity, rate = ego_motion(index, time_us, pose[None, :3, :3])
+            points = read_radar_points(index.root / index.filename(row))
+            sweeps.append(
+                RadarSweep(
+                    points=points, ego_from_sensor=mount(channel), timestamp_s=1e-6 * time_us[0],
+                    ego_velocity_mps=velocity[0], ego_rate_radps=rate[0], global_from_ego=pose,
+                )
+            )  # fmt: skip
+            row = int(index.data_previous[row])
+        sweeps.reverse()  # as a ring buffer is filled, oldest first
+    time_s = 1e-6 * index.frame_times_us[SAMPLE]
+    return {"timestamp_s": time_s, "global_from_ego": ego_pose(time_s), "cameras": cameras, "radars": radars}
+
+
+@pytest.mark.parametrize("changes", [{}, {"propagate_points": True, "num_sweeps": 3}, {"test_resize_offset": 0.05}])
+def test_a_frame_equals_what_the_reader_makes_of_the_same_files(data_set, raw, changes):
+    expected = data_set.reader(**changes).read(SAMPLE, None)
+    made = frame_from_sensors(**raw, settings=reader_settings(**changes))
+    assert torch.equal(made.images, expected.images) and torch.equal(made.image_valid, expected.image_valid)
+    torch.testing.assert_close(made.pix_from_aug, expected.pix_from_aug, rtol=1e-5, atol=1e-3)
+    assert len(made.radar_points) == len(expected.radar_points) > 300
+    torch.testing.assert_close(made.radar_points, expected.radar_points, rtol=1e-5, atol=1e-4)
+    torch.testing.assert_close(made.global_from_ego, expected.global_from_ego, rtol=0, atol=1e-6)
+    torch.testing.assert_close(made.timestamps_s, expected.timestamps_s, rtol=0, atol=1e-6)
+    assert torch.equal(made.aug_from_ego, expected.aug_from_ego) and made.boxes is None
+
+
+def test_missing_cameras_are_masked_and_missing_radars_give_no_points(raw):
+    cameras = {CAMERAS[0]: raw["cameras"][CAMERAS[0]], CAMERAS[1]: None}
+    frame = frame_from_sensors(**(raw | {"cameras": cameras, "radars": {}}), settings=reader_settings())
+    assert frame.image_valid.tolist() == [[True, False, False, False]]
+    assert frame.images[0, 1:].sum() == 0 and len(frame.radar_points) == 0
+    empty = {"front": [sweep(raw, points=np.zeros((0, 7)))]}
+    frame = frame_from_sensors(**(raw | {"radars": empty}), settings=reader_settings())
+    assert frame.radar_points.shape == (0, 7)
+
+
+def test_a_model_without_images_needs_no_camera(raw):
+    frame = frame_from_sensors(**(raw | {"cameras": {}}), settings=reader_settings(image_size_px=None))
+    assert frame.images is None and len(frame.radar_points) > 0
+
+
+def test_sensors_that_share_the_frames_pose_need_not_state_it(raw):
+    """Without poses of their own, sensors are where the frame says: a point stays in the ego frame of its sweep."""
+    at = np.array([[20.0, 3.0, 1.0, 0.0, 0.0, 0.0, 5.0]])
+    own = RadarSweep(
+        points=at, ego_from_sensor=np.eye(4), timestamp_s=raw["timestamp_s"] - 0.05, ego_velocity_mps=[10.0, 0.0, 0.0]
+    )
+    frame = frame_from_sensors(**(raw | {"radars": {"roof": [own]}}), settings=reader_settings())
+    unit = at[0, :3] / np.linalg.norm(at[0, :3])
+    ground = 10.0 * unit[0] * unit  # a Doppler of zero: it moves away as fast as the sensor follows
+    expected = [20.0, 3.0, 1.0, 5.0, ground[0], ground[1], 0.05]
+    np.testing.assert_allclose(frame.radar_points[0].numpy(), expected, atol=1e-5)
+
+
+def sweep(raw, **changes):
+    return replace(raw["radars"][RADARS[0]][-1], **changes)
+
+
+def camera(raw, **changes):
+    return replace(raw["cameras"][CAMERAS[0]], **changes)
+
+
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+BAD_SWEEPS = {
+    "points .* shape .'n', 7., but got .5, 6.": {"points": np.zeros((5, 6))},
+    "points .* entry .2, 1. is not": {"points": np.where(np.arange(35).reshape(5, 7) == 15, np.nan, 9.0)},
+    "points .* array of numbers": {"points": [["a"] * 7]},
+    "ego_from_sensor must be a rotation": {"ego_from_sensor": MIRROR},
+    "ego_from_sensor must have the shape": {"ego_from_sensor": np.eye(3)},
+    "ego_velocity_mps must be below 100": {"ego_velocity_mps": [300.0, 0.0, 0.0]},
+    "ego_rate_radps must be finite": {"ego_rate_radps": [0.0, 0.0, np.inf]},
+    "s older than its frame": {"timestamp_s": 0.0},
+}
+BAD_CAMERAS = {
+    "image must be an array .H, W, 3. uint8": {"image": np.zeros((4, 4, 3), np.float32)},
+    "but got .4, 4. uint8": {"image": np.zeros((4, 4), np.uint8)},
+    "must have 1 to": {"image": np.zeros((0, 4, 3), np.uint8)},
+    "intrinsics must be .*positive fx": {"intrinsics": np.zeros((3, 3))},
+    "ego_from_camera must be a rotation": {"ego_from_camera": np.diag([2.0, 2.0, 2.0, 1.0])},
+    "global_from_ego is float32": {"global_from_ego": ego_pose(0.0).astype(np.float32)},
+}
+
+
+@pytest.mark.parametrize("message", BAD_SWEEPS)
+def test_a_bad_sweep_is_named(raw, message):
+    radars = {"front": [sweep(raw), sweep(raw, **BAD_SWEEPS[message])]}
+    with pytest.raises(DataError, match=f"radar front, sweep 1.*{message}|radar front, sweep 0.*{message}"):
+        frame_from_sensors(**(raw | {"radars": radars}), settings=reader_settings())
+
+
+@pytest.mark.parametrize("message", BAD_CAMERAS)
+def test_a_bad_camera_is_named(raw, message):
+    cameras = raw["cameras"] | {CAMERAS[0]: camera(raw, **BAD_CAMERAS[message])}
+    with pytest.raises(DataError, match=f"camera {CAMERAS[0]}: .*{message}"):
+        frame_from_sensors(**(raw | {"cameras": cameras}), settings=reader_settings())
+
+
+def test_a_bad_frame_is_named(raw):
+    with pytest.raises(DataError, match="camera 'FRONT': must be one of CAMERA_LEFT_FRONT"):
+        frame_from_sensors(**(raw | {"cameras": {"FRONT": None}}), settings=reader_settings())
+    with pytest.raises(DataError, match="global_from_ego of the frame must be a rotation"):
+        frame_from_sensors(**(raw | {"global_from_ego": np.zeros((4, 4))}), settings=reader_settings())
+    with pytest.raises(DataError, match="timestamp_s of the frame must be finite"):
+        frame_from_sensors(**(raw | {"timestamp_s": float("nan")}), settings=reader_settings())

@@ -1,0 +1,224 @@
+"""Scores by speed class: the convention by hand, and against a slow evaluation written from its text."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from src.metrics.benchmark import random_problem
+from src.metrics.detection import score_detections
+from src.metrics.filtering import speed_classes
+from src.metrics.report import format_scores
+from src.metrics.scores import DISTANCE_THRESHOLDS_M
+from src.structures.detections import DetectionTable, EvaluationSet
+from src.structures.taxonomy import ATTRIBUTES, CLASSES
+
+NAMES = ["0-0.5", "0.5-10", "10-25", "25+"]
+NAN = float("nan")
+
+
+def boxes(rows, label="car", **columns) -> DetectionTable:
+    """Boxes at (x, speed along x, score), all at y = 0."""
+    n = len(rows)
+    x, speed, score = np.array(rows, float).T
+    zeros = np.zeros(n)
+    table = DetectionTable(
+        samples=np.zeros(n, np.int64),
+        labels=np.full(n, CLASSES.index(label)),
+        centers=np.stack([x, zeros, zeros], 1),
+        sizes=np.ones((n, 3)),
+        rotations=np.tile([1.0, 0, 0, 0], (n, 1)),
+        velocities=np.stack([speed, zeros], 1),
+        attributes=np.full(n, ATTRIBUTES.index("vehicle.moving")),
+        scores=score,
+        num_points=np.full(n, 10),
+    )
+    return replace(table, **columns)
+
+
+def speeds_of(truth, predictions):
+    evaluation_set = EvaluationSet(["a"], np.zeros((1, 3)), [()], truth, DetectionTable.empty())
+    return score_detections(evaluation_set, predictions).speeds
+
+
+def test_a_class_begins_at_its_border():
+    velocities = np.array(
+        [[0, 0], [0.4, 0.2], [0.3, -0.4], [-9.99, 0], [6, 8], [0, 24.99], [15, 20], [90, 0], [NAN, 0]]
+    )
+    assert speed_classes(velocities).tolist() == [0, 0, 1, 1, 2, 2, 3, 3, -1]
+
+
+def test_a_wrong_speed_costs_velocity_error_and_no_precision():
+    speeds = speeds_of(boxes([(10, 30, 0)]), boxes([(10, 1, 0.9)]))
+    assert list(speeds) == NAMES
+    assert [part.num_gt[0] for part in speeds.values()] == [0, 0, 0, 1]
+    assert speeds["25+"].class_ap[0] == pytest.approx(1.0)
+    assert speeds["25+"].errors[0, 3] == pytest.approx(29.0)
+    # It is no false positive in the class of the speed it states either.
+    both = speeds_of(boxes([(10, 30, 0), (40, 1, 0)]), boxes([(10, 1, 0.9), (40, 1, 0.8)]))
+    assert both["0.5-10"].class_ap[0] == pytest.approx(1.0)
+    assert both["0.5-10"].errors[0, 3] == pytest.approx(0.0)
+
+
+def test_a_false_positive_counts_in_the_class_of_the_speed_it_states():
+    truth = boxes([(10, 5, 0), (40, 30, 0)])
+    speeds = speeds_of(truth, boxes([(80, 7, 0.9), (10, 5, 0.8), (40, 30, 0.7)]))
+    # The false positive goes first: precision is r / 2 at recall r; the fast class does not see it.
+    behind = np.maximum(np.linspace(0, 1, 101)[11:] / 2 - 0.1, 0).mean() / 0.9
+    assert speeds["0.5-10"].class_ap[0] == pytest.approx(behind)
+    assert speeds["25+"].class_ap[0] == pytest.approx(1.0)
+
+
+def test_a_match_outside_is_ignored_at_that_threshold_only():
+    # 3 m from a slow car and stating 30 m/s: the slow car's match at 4 m, a fast false positive below.
+    speeds = speeds_of(boxes([(10, 5, 0), (40, 30, 0)]), boxes([(13, 30, 0.9), (40, 30, 0.8)]))
+    behind = np.maximum(np.linspace(0, 1, 101)[11:] / 2 - 0.1, 0).mean() / 0.9
+    assert speeds["25+"].ap[0].tolist() == pytest.approx([behind, behind, behind, 1.0])
+    assert speeds["0.5-10"].ap[0].tolist() == pytest.approx([0, 0, 0, 1.0])
+
+
+def test_matching_is_done_once_over_all_speeds():
+    # The better prediction takes the standing car; the second one is left with nothing and is a false positive,
+    # though it would match within its class were classes matched apart.
+    speeds = speeds_of(boxes([(10, 0, 0), (40, 5, 0)]), boxes([(10.1, 5, 0.9), (10.2, 0, 0.8)]))
+    first = (89 * 0.9 + 0.4) / 90 / 0.9  # match, then false positive
+    assert speeds["0-0.5"].class_ap[0] == pytest.approx(first)
+    assert speeds["0.5-10"].class_ap[0] == 0 and speeds["0.5-10"].num_gt[0] == 1
+
+
+def test_unknown_velocities():
+    truth = boxes([(10, NAN, 0), (40, 5, 0), (60, 5, 0)])
+    predictions = boxes([(10, 5, 0.9), (80, NAN, 0.85), (40, 5, 0.8), (60, NAN, 0.7)])
+    speeds = speeds_of(truth, predictions)
+    # Left out: the ground truth without velocity with its match, and the unmatched prediction without velocity.
+    assert [part.num_gt[0] for part in speeds.values()] == [0, 2, 0, 0]
+    assert speeds["0.5-10"].class_ap[0] == pytest.approx(1.0), "a prediction without velocity matches as any other"
+    assert speeds["0.5-10"].errors[0, 3] == pytest.approx(0.0), "and its velocity error is undefined"
+
+
+def test_means_over_the_classes_that_are_there():
+    truth = DetectionTable.concatenate([boxes([(10, 5, 0)]), boxes([(40, 5, 0)], label="truck")])
+    part = speeds_of(truth, boxes([(10.5, 7, 0.9)]))["0.5-10"]
+    means = part.present_means()
+    assert list(means) == ["mAP_present", *(f"m{error}_present" for error in ("ATE", "ASE", "AOE", "AVE", "AAE"))]
+    assert part.mean_ap == pytest.approx(0.75 / 12) and means["mAP_present"] == pytest.approx(0.75 / 2)
+    assert means["mATE_present"] == pytest.approx((0.5 + 1) / 2), "the truck is missed: error 1"
+    assert means["mAVE_present"] == pytest.approx((2 + 1) / 2)
+
+
+def test_means_where_nothing_is_there_are_undefined():
+    cones = boxes([(10, 0, 0.5)], label="traffic_cone")
+    evaluation_set = EvaluationSet(["a"], np.zeros((1, 3)), [()], cones, DetectionTable.empty())
+    content = score_detections(evaluation_set, cones).as_dict()
+    assert set(content["speeds"]["25+"].keys() - content["ranges"]["0-25"].keys()) == {
+        f"m{name}_present" for name in ("AP", "ATE", "ASE", "AOE", "AVE", "AAE")
+    }
+    assert content["speeds"]["25+"]["mAP_present"] is None and content["speeds"]["25+"]["mAP"] == 0
+    standing = content["speeds"]["0-0.5"]
+    assert standing["mAP_present"] == pytest.approx(1.0) and standing["mAVE_present"] is None
+    assert standing["mATE_present"] == pytest.approx(0.0)
+
+
+def test_table_for_the_terminal():
+    truth = boxes([(10, 5, 0)])
+    evaluation_set = EvaluationSet(["a"], np.zeros((1, 3)), [()], truth, DetectionTable.empty())
+    content = score_detections(evaluation_set, boxes([(10, 7, 0.9)])).as_dict()
+    table = [line.split() for line in format_scores(content).split("\n\n")[2].splitlines()]
+    assert table[3] == ["0.5-10", "100.0", "0.000", "0.000", "0.000", "2.000", "0.000", "100.0", "2.000", "1", "1"]
+    assert table[4] == ["10-25", *["-"] * 8, "0", "0"]
+    del content["speeds"]
+    assert len(format_scores(content).split("\n\n")) == 2, "files written before speed classes existed can be shown"
+
+
+# ------------------------------------------------------------------ written again, box by box
+
+
+def slow_scores(truth, predictions, label, low, high):
+    """AP by threshold and (translation, velocity) error of one class and speed class, box after box."""
+
+    def inside(velocity):
+        return low <= float(np.hypot(*velocity)) < high  # False for NaN
+
+    rows = [row for row in range(len(predictions)) if predictions.labels[row] == label]
+    rows.sort(key=lambda row: (-predictions.scores[row], -row))
+    candidates = [row for row in range(len(truth)) if truth.labels[row] == label]
+    count = sum(inside(truth.velocities[row]) for row in candidates)
+    aps, errors = [], (1.0, 1.0)
+    for threshold in DISTANCE_THRESHOLDS_M:
+        taken, listed = set(), []  # listed: (score, hit, translation error, velocity error)
+        for row in rows:
+            best, nearest = np.inf, None
+            for other in candidates:
+                if truth.samples[other] != predictions.samples[row] or other in taken:
+                    continue
+                distance = float(np.linalg.norm(truth.centers[other, :2] - predictions.centers[row, :2]))
+                if distance < best:
+                    best, nearest = distance, other
+            if best < threshold:
+                taken.add(nearest)
+                if inside(truth.velocities[nearest]):
+                    difference = float(np.hypot(*(truth.velocities[nearest] - predictions.velocities[row])))
+                    listed.append((predictions.scores[row], True, best, difference))
+            elif inside(predictions.velocities[row]):
+                listed.append((predictions.scores[row], False, NAN, NAN))
+        hits = [entry for entry in listed if entry[1]]
+        if not hits:
+            aps.append(0.0)
+            continue
+        grid = np.linspace(0, 1, 101)
+        found = np.cumsum([entry[1] for entry in listed]).astype(float)
+        recall = found / count
+        precision = np.interp(grid, recall, found / np.arange(1, len(listed) + 1), right=0)
+        confidence = np.interp(grid, recall, [entry[0] for entry in listed], right=0)
+        aps.append(np.clip(precision[11:] - 0.1, 0, None).mean() / 0.9)
+        if threshold == 2.0:
+            errors = tuple(slow_error([(entry[0], entry[k]) for entry in hits], confidence) for k in (2, 3))
+    return count, aps, errors
+
+
+def slow_error(hits, confidence):
+    values = [value for _, value in hits]
+    if all(np.isnan(value) for value in values):
+        return 1.0
+    means = []
+    for end in range(1, len(values) + 1):
+        valid = [value for value in values[:end] if not np.isnan(value)]
+        means.append(sum(valid) / len(valid) if valid else 0.0)
+    curve = np.interp(confidence[::-1], [score for score, _ in hits][::-1], means[::-1])[::-1]
+    last = max(np.flatnonzero(confidence), default=0)
+    return 1.0 if last < 11 else float(np.mean(curve[11 : last + 1]))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_agrees_with_the_evaluation_written_again(seed):
+    evaluation_set, predictions = random_problem(4, 90, 160, seed)
+    rng = np.random.default_rng(seed)
+    truth = evaluation_set.ground_truth
+    for table in (truth, predictions):  # crowded: three classes near the ego, speeds over all four speed classes
+        table.labels = rng.choice([0, 1, CLASSES.index("barrier")], len(table))
+        table.velocities *= rng.choice([0.02, 0.3, 1.0, 4.0], len(table))[:, None]
+        ego = evaluation_set.ego_centers[table.samples]
+        table.centers = ego + (table.centers - ego) * 0.1
+    scores = score_detections(evaluation_set, predictions)
+    truth, predictions = truth[scores.truth_kept], predictions[scores.predictions_kept]
+    seen = 0
+    for (low, high), part in zip(
+        [(0, 0.5), (0.5, 10), (10, 25), (25, np.inf)], (scores.speeds[name] for name in NAMES), strict=True
+    ):
+        for label in range(len(CLASSES)):
+            count, aps, (translation, velocity) = slow_scores(truth, predictions, label, low, high)
+            assert part.num_gt[label] == count
+            np.testing.assert_allclose(part.ap[label], aps, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(part.errors[label, 0], translation, rtol=0, atol=1e-9)
+            if not np.isnan(part.errors[label, 3]):
+                np.testing.assert_allclose(part.errors[label, 3], velocity, rtol=0, atol=1e-9)
+            seen += aps[3] > 0 and translation != 1.0
+    assert seen >= 6, "the problem must exercise several classes at several speeds"
+
+
+def test_classes_of_speed_share_out_all_ground_truth_of_known_velocity():
+    evaluation_set, predictions = random_problem(10, 40, 80, seed=7)
+    scores = score_detections(evaluation_set, predictions)
+    known = ~np.isnan(evaluation_set.ground_truth.velocities).any(axis=1) & scores.truth_kept
+    assert sum(part.num_gt.sum() for part in scores.speeds.values()) == known.sum() < scores.truth_kept.sum()
+    assert score_detections(evaluation_set, predictions, by_speed=False).speeds == {}

@@ -1,0 +1,101 @@
+"""Which runs stand on which page and what they are called, through the command's own entry."""
+
+import pytest
+from PIL import Image
+
+from src.errors import DataError
+from src.report import main
+
+NO_VELOCITY = [
+    "model.dptf.gaussian_path.velocity_compensation=false",
+    "model.dptf.bev_path.velocity_compensation=false",
+]
+FURTHER = ["phase=phase1", "phase.init_from=phase1", "phase.velocity_code_weight=1.0"]
+
+
+@pytest.fixture
+def report(tmp_path, capsys):
+    def run(phase):
+        main([f"phase={phase}", "scale=mini", f"paths.outputs={tmp_path}", f"paths.reports={tmp_path / 'reports'}"])
+        assert f"{phase}_mini.md" in capsys.readouterr().out
+        return (tmp_path / "reports" / f"{phase}_mini.md").read_text()
+
+    return run
+
+
+@pytest.fixture
+def both_phases(write_run):
+    for seed in (0, 1):
+        write_run(f"plain{seed}", [f"seed={seed}"], seed, 0.30 + 0.1 * seed)  # scored before there were speed classes
+        write_run(f"further{seed}", [*FURTHER, f"seed={seed}"], seed, 0.33 + 0.1 * seed, speeds=True)
+        write_run(f"full{seed}", ["phase=phase2"], seed, 0.38 + 0.1 * seed, phase="phase2", speeds=True)
+        write_run(f"still{seed}", NO_VELOCITY, seed, 0.35 + 0.1 * seed, phase="phase2", speeds=True)
+    write_run("radar", ["model.kggi=null", "model.ocsf=null"], 0, 0.2)
+
+
+def rows(text, heading):
+    """Lines of the table whose heading starts so, by label."""
+    lines = text.split(heading)[1].splitlines()[2:]
+    lines = lines[: next((i for i, line in enumerate(lines) if not line), len(lines))]
+    return {line.split(" | ")[0].strip("| "): line for line in lines}
+
+
+def test_phase_2_is_held_against_phase_1(both_phases, report, tmp_path):
+    text = report("phase2")
+    summary = rows(text, "| experiment | mAP | NDS | mAVE, m/s |")
+    assert list(summary) == [
+        "phase 1", "phase 1, as many further epochs", "phase 2", "phase 2, no velocity compensation"
+    ]  # fmt: skip
+    assert summary["phase 2"].startswith("| phase 2 | **43.0 ± 7.1** | **43.0 ± 7.1** | **1.57 ± 0.07** |")
+    assert rows(text, "| experiment | mAP 0-0.5 m/s |")["phase 1"] == "| phase 1 |" + " - |" * 4
+    gain = rows(text, "| phase 2 over | seeds | mAP |")
+    assert "| 2 | +8.0 ± 0.0 |" in gain["phase 1"]
+    assert "| 2 | +5.0 ± 0.0 |" in gain["phase 1, as many further epochs"]
+    fast = rows(text, "| phase 2 over | seeds | mAVE 0-0.5 m/s |")["phase 2, no velocity compensation"]
+    assert fast.endswith("| -0.03 ± 0.00 |")
+    for command in ("phase=phase1 scale=mini phase.init_from=phase1 phase.velocity_code_weight=1.0 seed=1",
+                    "phase=phase2 scale=mini seed=0"):  # fmt: skip
+        assert f"python -m src.train {command}\n" in text
+    assert Image.open(tmp_path / "reports" / "pictures" / "phase2_mini.png").width == 1600
+    assert "(pictures/phase2_mini.png)" in text
+
+
+def test_phase_1_keeps_its_own_page(both_phases, report):
+    text = report("phase1")
+    assert list(rows(text, "| experiment | mAP | NDS | car AP |")) == ["KGGI + OCSF", "radar only"]
+    assert "init_from" not in text and "phase2" not in text
+
+
+def test_further_epochs_must_be_as_many(both_phases, write_run, report):
+    write_run("longer", [*FURTHER, "phase.epochs=9"], 0, 0.3, epochs=9)
+    write_run("weight", ["phase.init_from=phase1"], 0, 0.3)
+    summary = rows(report("phase2"), "| experiment | mAP | NDS | mAVE, m/s |")
+    assert [name for name in summary if "further" in name] == [
+        "phase 1, as many further epochs (`phase.init_from=phase1 phase.velocity_code_weight=1.0`)",
+        "phase 1, as many further epochs (`phase.init_from=phase1`)",
+        "phase 1, 9 further epochs",
+    ]
+
+
+def test_an_unnamed_setting_shows_itself_last(both_phases, write_run, report):
+    write_run("a", ["model.dptf.gaussian_path.sampling=random"], 0, 0.9, phase="phase2")
+    names = list(rows(report("phase2"), "| experiment | mAP | NDS | mAVE, m/s |"))
+    assert names[-1] == "phase 2, `model.dptf.gaussian_path.sampling=random`"
+
+
+def test_phase_2_without_its_plain_run_has_no_gains(write_run, report):
+    write_run("a", NO_VELOCITY, 0, 0.3, phase="phase2")
+    assert "Gain" not in report("phase2")
+
+
+def test_no_run_of_the_phase_itself(write_run, report):
+    write_run("further", FURTHER, 0, 0.3)
+    for phase in ("phase1", "phase2"):
+        with pytest.raises(DataError, match=f"no finished run of {phase} at scale=mini"):
+            report(phase)
+
+
+def test_other_data_is_refused(both_phases, write_run, report):
+    write_run("other", ["phase=phase2"], 5, 0.3, phase="phase2", root="elsewhere")
+    with pytest.raises(DataError, match="never mixes data.*different folders"):
+        report("phase2")

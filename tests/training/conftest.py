@@ -1,0 +1,155 @@
+"""A detector of a few parameters with a memory of one number per lane, and frames to stream to it."""
+
+from dataclasses import dataclass
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from torch.utils.data import DataLoader, Sampler
+
+from src.models.detector import Detector
+from src.structures.batch import FrameBatch
+from src.structures.boxes import Boxes3D
+from src.structures.detections import DetectionTable, EvaluationSet
+from src.training.optim import OptimConfig
+from src.training.temporal import TemporalModule
+
+STEPS = 3  # of one epoch
+
+
+@dataclass(frozen=True)
+class ToyMemory:
+    """One number per lane."""
+
+    values: torch.Tensor  # [B]
+
+    def select(self, rows, keep):
+        return ToyMemory(torch.where(keep, self.values[rows], 0.0))
+
+    def to(self, device):
+        return ToyMemory(self.values.to(device))
+
+    def state(self):
+        return [{"values": self.values, "nothing": None}]
+
+
+class ToyDetector(Detector):
+    """Mean of the points through a linear layer and dropout, plus what the lane remembers of it."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer, self.dropout = nn.Linear(7, 1), nn.Dropout(0.3)
+
+    def forward(self, batch, memory=None):
+        points = torch.stack([batch.radar_points[batch.radar_batch == row].mean(0) for row in range(len(batch))])
+        past = torch.zeros(len(batch)) if memory is None else memory.values
+        output = self.layer(self.dropout(points)).squeeze(1) + past
+        return output, ToyMemory(output.detach())
+
+    def restore_memory(self, state):
+        return ToyMemory(state[0]["values"])
+
+    def loss(self, output, batch):
+        terms = {"near": (output - 1.0).square().mean(), "small": output.abs().mean()}
+        return terms | {"total": terms["near"] + terms["small"]}
+
+    def decode(self, output):
+        return [Boxes3D.empty() for _ in output]
+
+    def diagnostics(self, output):
+        return {"spread": output.detach().std()}
+
+
+def toy_batch(lanes, starts, number=0):
+    """Random frames of some lanes; None for frames without lanes."""
+    size = len(lanes) if lanes is not None else 2
+    generator = torch.Generator().manual_seed(number)
+    return FrameBatch(
+        tokens=[f"frame {number} {row}" for row in range(size)],
+        timestamps_s=torch.full((size,), float(number), dtype=torch.float64),
+        global_from_ego=torch.eye(4, dtype=torch.float64).repeat(size, 1, 1),
+        aug_from_ego=torch.eye(4).repeat(size, 1, 1),
+        radar_points=torch.randn(3 * size, 7, generator=generator),
+        radar_batch=torch.arange(size).repeat_interleave(3),
+        lanes=None if lanes is None else torch.tensor(lanes),
+        starts=None if lanes is None else torch.tensor(starts),
+    )
+
+
+def toy_evaluation_set():
+    tokens = [f"frame {number} {row}" for number in range(100, 103) for row in range(2)]
+    return EvaluationSet(
+        tokens, np.zeros((len(tokens), 3)), [()] * len(tokens), DetectionTable.empty(), DetectionTable.empty()
+    )
+
+
+class Positions(Sampler):
+    """Steps of the epoch that are left, by the trainer's count."""
+
+    def __init__(self, trainer, read):
+        self.trainer, self.read = trainer, read
+
+    def __len__(self):
+        return STEPS
+
+    def __iter__(self):
+        epoch, done = divmod(self.trainer.global_step, STEPS)
+        for step in range(done, STEPS):
+            self.read.append((epoch, step))
+            yield epoch, step
+
+
+class Frames:
+    """Batches by (epoch, step); lane 1 begins a new clip at step 2."""
+
+    def __getitem__(self, key):
+        epoch, step = key
+        return toy_batch([0, 1], [step == 0, step in (0, 2)], number=10 * epoch + step)
+
+
+class ToyData(L.LightningDataModule):
+    """Clips in two lanes for training, three batches for validation."""
+
+    def __init__(self):
+        super().__init__()
+        self.read = []  # (epoch, step) in the order of reading
+
+    def train_dataloader(self):
+        return DataLoader(Frames(), batch_size=None, sampler=Positions(self.trainer, self.read))
+
+    def val_dataloader(self):
+        frames = [toy_batch([0, 1], [number == 100] * 2, number) for number in (100, 101, 102)]
+        return DataLoader(frames, batch_size=None)
+
+
+def toy_module(module_class=TemporalModule, seed=0):
+    torch.manual_seed(seed)
+    optim = OptimConfig(
+        lr=1e-2, weight_decay=0.01, clip_norm=35.0, peak_lr_ratio=10.0, final_lr_ratio=1e-4, rise_fraction=0.4,
+        betas=[0.95, 0.99], cycled_beta1=[0.95, 0.85], ema_decay=None,
+    )  # fmt: skip
+    return module_class(
+        ToyDetector(),
+        optim=optim,
+        backbone_lr_multiplier=1.0,
+        evaluation_set=toy_evaluation_set(),
+        seed=seed,
+        config={"model": {"name": "toy"}},
+    )
+
+
+@pytest.fixture
+def make_batch():
+    return toy_batch
+
+
+@pytest.fixture
+def make_module():
+    return toy_module
+
+
+@pytest.fixture
+def make_data():
+    return ToyData

@@ -1,0 +1,176 @@
+"""A run that was stopped or killed anywhere ends as if nothing had happened."""
+
+import hashlib
+import os
+import signal
+
+import pytest
+
+from src.errors import InterruptedRunError
+from src.training.checkpoints import read_checkpoint
+from src.training.fit import build_loggers, build_trainer, fit
+from src.training.interruption import Interruption
+from src.training.run_folder import Resume, RunFolder
+from src.training.temporal import TemporalModule
+
+EPOCHS, STEPS = 3, 3
+
+
+class Faulty(TemporalModule):
+    """Does something at one training step, or in one validation batch."""
+
+    at_step = at_validation = None
+    fault = None
+    seen = None
+
+    def training_step(self, batch, batch_idx):
+        if self.trainer.global_step == self.at_step:
+            self.fault()
+        self.seen.append(self.trainer.global_step)
+        return super().training_step(batch, batch_idx)
+
+    def validation_step(self, batch, batch_idx):
+        if (self.trainer.current_epoch, batch_idx) == self.at_validation:
+            self.fault()
+        return super().validation_step(batch, batch_idx)
+
+
+@pytest.fixture
+def run(tmp_path, make_module, make_data):
+    """Train in a folder, from its newest checkpoint where there is one; returns what the run ended with."""
+
+    def start(name, *, fault=None, at_step=None, at_validation=None, ema=None, validate_every=1, every_steps=None):
+        folder = RunFolder(tmp_path, name)
+        folder.open(Resume.auto)
+        module, data = make_module(Faulty), make_data()
+        module.fault, module.at_step, module.at_validation, module.seen = fault, at_step, at_validation, []
+        resume_from = folder.newest_checkpoint()
+        trainer = build_trainer(
+            folder, epochs=EPOCHS, validate_every=validate_every, precision="32-true", accelerator="cpu", devices=1,
+            log_every_steps=1, ema_decay=ema, loggers=build_loggers(folder, resume_from, None),
+            checkpoint_every_steps=every_steps,
+        )  # fmt: skip
+        trainer.progress_bar_callback.disable()
+        try:
+            fit(trainer, module, data, resume_from)
+        finally:
+            folder._release()
+        return result(folder, module), module
+
+    return start
+
+
+def digest(state):
+    return hashlib.sha256(b"".join(state[name].numpy().tobytes() for name in sorted(state))).hexdigest()
+
+
+def result(folder, module):
+    return {
+        "weights": digest(read_checkpoint(folder.checkpoints / "last.ckpt")["state_dict"]),
+        "weights in memory": digest(module.model.state_dict()),
+        "log": folder.metrics_csv.read_text(),
+        "scores": module.scores.headline(),
+    }
+
+
+def terminate():
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+class Killed(Exception):
+    """Stands for kill -9."""
+
+
+def kill():
+    raise Killed
+
+
+STOPPED_OFTEN = pytest.mark.filterwarnings("ignore:Checkpoint directory")
+
+
+@STOPPED_OFTEN
+@pytest.mark.parametrize(("validate_every", "ema"), [(1, None), (2, 0.9)])
+def test_stopped_at_every_step(run, validate_every, ema):
+    options = {"validate_every": validate_every, "ema": ema}
+    expected, whole = run("whole", **options)
+    assert whole.seen == list(range(EPOCHS * STEPS))
+    for step in range(EPOCHS * STEPS):
+        name = f"stopped at {step}"
+        with pytest.raises(InterruptedRunError, match="same command"):
+            run(name, fault=interrupt if step % 2 else terminate, at_step=step, **options)
+        found, module = run(name, **options)
+        assert module.seen == list(range(step + 1, EPOCHS * STEPS))  # the running step ended, the next is the first
+        assert found == expected, step
+
+
+@STOPPED_OFTEN
+def test_stopped_again_and_again(run):
+    expected, _ = run("whole")
+    for step in range(EPOCHS * STEPS):
+        with pytest.raises(InterruptedRunError):
+            run("stopped", fault=terminate, at_step=step)
+    found, module = run("stopped")  # only the results were missing
+    assert found == expected and module.seen == []
+
+
+@STOPPED_OFTEN
+@pytest.mark.parametrize("fault", ["stop", "kill"])
+def test_ended_in_a_validation(run, fault):
+    """The epoch's steps are not repeated; its validation is run again as a whole."""
+    expected, _ = run("whole", ema=0.9)
+    for epoch in range(EPOCHS):
+        error, cause = (InterruptedRunError, terminate) if fault == "stop" else (Killed, kill)
+        with pytest.raises(error):
+            run(f"ended in {epoch}", ema=0.9, fault=cause, at_validation=(epoch, 1))
+        found, module = run(f"ended in {epoch}", ema=0.9)
+        assert module.seen == list(range((epoch + 1) * STEPS, EPOCHS * STEPS))
+        assert found == expected, epoch
+
+
+@STOPPED_OFTEN
+@pytest.mark.parametrize("step", [1, 2, 4, 5, 8])
+def test_killed_between_checkpoints_of_steps(run, step):
+    """From the newest checkpoint of every second step or of the end of an epoch, whichever is later."""
+    expected, _ = run("whole", validate_every=2)
+    with pytest.raises(Killed):
+        run("killed", fault=kill, at_step=step, validate_every=2, every_steps=2)
+    found, module = run("killed", validate_every=2, every_steps=2)
+    behind = max(step // 2 * 2, step // STEPS * STEPS)
+    assert module.seen == list(range(behind, EPOCHS * STEPS))
+    assert found == expected
+
+
+def test_the_earlier_handlers_come_back(run):
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with pytest.raises(InterruptedRunError):
+        run("stopped", fault=terminate, at_step=1)
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_a_second_ctrl_c_after_a_while_ends_at_once(monkeypatch):
+    interruption = Interruption(None, None)
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    with interruption.listening():
+        interrupt()
+        interrupt()  # a launcher passing on what the terminal sent already
+        now[0] += 10.0
+        terminate()
+        assert interruption.requested
+        with pytest.raises(KeyboardInterrupt):
+            interrupt()
+
+
+def test_ignored_signals_stay_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    interruption = Interruption(None, None)
+    try:
+        with interruption.listening():
+            interrupt()
+        assert not interruption.requested and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
