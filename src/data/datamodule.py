@@ -100,6 +100,13 @@ class FrameLoader(DataLoader):
                     raise batch
                 yield batch
 
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: the place in an epoch follows from the trainer's step. Lightning warns of a loader without this."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Nothing to restore."""
+
 
 @contextmanager
 def dead_workers_named() -> Iterator[None]:

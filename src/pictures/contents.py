@@ -228,7 +228,8 @@ class PictureMemory:
         """The finite ones, oldest first, so that the freshest come out on top."""
         finite = np.isfinite(np.c_[self.moved, self.velocities, self.elapsed_s]).all(axis=1)
         if self.gaussians is not None:
-            finite &= np.isfinite(self.gaussians.outlines()).all(axis=(1, 2)) & np.isfinite(self.gaussians.opacities)
+            shapes = (self.gaussians.scales, self.gaussians.directions, self.gaussians.opacities)
+            finite &= np.isfinite(np.column_stack(shapes)).all(axis=1)
         rows = np.flatnonzero(finite)
         return self[rows[np.argsort(-self.elapsed_s[rows], kind="stable")]]
 

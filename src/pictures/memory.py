@@ -198,12 +198,12 @@ def paint_memory(
         scale = axes.get_window_extent().width / (right - left)  # pixels per metre
         points = max(cell_m * scale, 2.0) * 72 / DPI
         axes.scatter(*plot.T, s=points**2, c=colours, marker="s", linewidths=0, antialiased=False, zorder=2)
-    starts, velocities = _arrow_means(xy, memory)
+    starts, velocities = arrow_means(xy, memory)
     if close and len(starts):
         _arrows(axes, starts, velocities, INK, 1.4, 4.4)
 
 
-def _arrow_means(
+def arrow_means(
     xy: Array,  # [n, 2] m
     memory: PictureMemory,
 ) -> tuple[Array, Array]:  # [m, 2] m, [m, 2] m/s

@@ -33,7 +33,8 @@ class RunResult:
     parameters: int
     metrics: dict[str, float | None]
     """By path within metrics.json: mAP, NDS, mAVE, classes.<class>.AP, ranges.<bin>.mAP and, where the run was scored
-    by speed class, speeds.<class>.<mAP_present | mAVE_present> (None where the class of speed is empty)."""
+    by speed class, speeds.<class>.<mAP_present | mAVE_present | car.AP | car.AVE> (None where there is no such ground
+    truth) and speeds.<class>.<boxes | car.boxes>, how much ground truth there is."""
 
 
 def read_runs(outputs: Path, scale: str, phases: Sequence[str]) -> list[RunResult]:
@@ -77,8 +78,17 @@ def _metrics(content: _Record) -> dict[str, float | None]:
     values = {".".join(path): content.get(path, float, int) for path in paths}
     if "speeds" not in content.content:  # written before there were speed classes
         return values
-    speeds = [("speeds", n, key) for n in content.get("speeds", dict) for key in ("mAP_present", "mAVE_present")]
-    return values | {".".join(path): content.get(path, float, int, type(None)) for path in speeds}
+    for name in content.get("speeds", dict):
+        for key in ("mAP_present", "mAVE_present"):
+            values[f"speeds.{name}.{key}"] = content.get(("speeds", name, key), float, int, type(None))
+        classes = ("speeds", name, "classes")
+        boxes = [content.get((*classes, of, "num_gt"), int) for of in content.get(classes, dict)]
+        cars = content.get((*classes, "car", "num_gt"), int)
+        values |= {f"speeds.{name}.boxes": sum(boxes), f"speeds.{name}.car.boxes": cars}
+        for key in ("AP", "AVE"):  # the official numbers of a class without ground truth are 0 and 1, and say nothing
+            value = content.get((*classes, "car", key), float, int)
+            values[f"speeds.{name}.car.{key}"] = value if cars else None
+    return values
 
 
 class _Record:

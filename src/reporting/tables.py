@@ -44,7 +44,9 @@ class Column:
 CAR_AP = Column("car AP", "classes.car.AP")
 BY_RANGE = [Column(f"mAP {name} m", f"ranges.{name}.mAP") for name in RANGES]
 BY_SPEED = [Column(f"mAP {name} m/s", f"speeds.{name}.mAP_present") for name in SPEEDS]
+CAR_BY_SPEED = [Column(f"car AP {name} m/s", f"speeds.{name}.car.AP") for name in SPEEDS]
 ERROR_BY_SPEED = [Column(f"mAVE {name} m/s", f"speeds.{name}.mAVE_present", 1.0, 2, min) for name in SPEEDS]
+CAR_ERROR_BY_SPEED = [Column(f"car AVE {name} m/s", f"speeds.{name}.car.AVE", 1.0, 2, min) for name in SPEEDS]
 SUMMARY = [Column("mAP", "mAP"), Column("NDS", "NDS"), CAR_AP, *BY_RANGE]
 SUMMARY_WITH_VELOCITY = [*SUMMARY[:2], Column("mAVE, m/s", "mAVE", 1.0, 2, min), *SUMMARY[2:]]
 

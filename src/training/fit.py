@@ -18,6 +18,7 @@ from src.training.checkpoints import AtomicCheckpointIO, load_model_weights, rea
 from src.training.detection import DetectionModule
 from src.training.interruption import Interruption
 from src.training.metrics_csv import MetricsCSV
+from src.training.processes import SharedBuffers
 from src.training.run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
@@ -70,6 +71,7 @@ def build_trainer(
     ]
     if ema_decay is not None:
         callbacks.append(EMAWeightAveraging(decay=ema_decay))
+    callbacks.append(SharedBuffers())  # behind the moving average
     return L.Trainer(
         max_epochs=epochs,
         check_val_every_n_epoch=validate_every,

@@ -26,9 +26,9 @@ BEV = BevAugmentationConfig(scale=[0.95, 1.05], rotation_rad=0.4, flip_probabili
 
 def config(**changes):
     values = dict(
-        root=None, version=VERSION, train_split="train", split="val", batch_size=2, groups_per_scene=2, num_workers=0, num_sweeps=2,
-        min_distance_m=1.0, propagate_points=False, on_bad_file=OnBadFile.error, test_resize_offset=0.0,
-        augmentation=AugmentationConfig(image=None, bev=BEV), world=None,
+        root=None, version=VERSION, train_split="train", split="val", batch_size=2, groups_per_scene=2,
+        num_workers=0, num_sweeps=2, min_distance_m=1.0, propagate_points=False, on_bad_file=OnBadFile.error,
+        test_resize_offset=0.0, augmentation=AugmentationConfig(image=None, bev=BEV), world=None,
     )  # fmt: skip
     return DataConfig(**(values | changes))
 
@@ -150,8 +150,8 @@ def test_errors_travel_between_processes():
 
 @pytest.mark.parametrize(
     "change",
-    [{"batch_size": 0}, {"groups_per_scene": 0}, {"num_sweeps": 0}, {"num_workers": -1}, {"min_distance_m": float("nan")},
-     {"test_resize_offset": float("nan")}],
+    [{"batch_size": 0}, {"groups_per_scene": 0}, {"num_sweeps": 0}, {"num_workers": -1},
+     {"min_distance_m": float("nan")}, {"test_resize_offset": float("nan")}],
     ids=str,
 )  # fmt: skip
 def test_impossible_settings(change):
@@ -416,7 +416,9 @@ def test_lightning_epochs_differ_and_resume_goes_on(data_set, tmp_path, num_work
     ("temporal", "num_workers", "stop_at"),
     [(True, 0, 2), (True, 1, 7), (True, 0, 5), (True, 0, 9), (False, 0, 7), (False, 1, 5)],
 )
-def test_lightning_resumes_in_the_middle_of_an_epoch(drives, tmp_path, temporal, num_workers, stop_at, quick_end):
+def test_lightning_resumes_in_the_middle_of_an_epoch(
+    drives, tmp_path, temporal, num_workers, stop_at, quick_end, recwarn
+):
     """Frames, augmentation, epochs and validations of a run cut in two are those of a run in one piece."""
 
     def make():
@@ -430,3 +432,4 @@ def test_lightning_resumes_in_the_middle_of_an_epoch(drives, tmp_path, temporal,
     rest = fit(make(), tmp_path, 3, resume=tmp_path / "mid.ckpt")
     assert len([entry for entry in first if entry[0] != "validation"]) == stop_at
     assert first + rest == whole
+    assert not [warning for warning in recwarn if "resumable" in str(warning.message)]

@@ -19,7 +19,7 @@ from src.pictures.memory import (
     TRUTH_COLOUR,
     AgeScale,
     MemoryScene,
-    _arrow_means,
+    arrow_means,
     close_window,
     draw_memory,
     hits_line,
@@ -124,7 +124,7 @@ def test_window_without_anything_moving_shows_the_ego_and_stays_on_the_grid() ->
     for truth in (PictureBoxes.empty(), boxes([(90, 90, 0, 0), (-90, 90, np.nan, np.nan)])):
         assert inside(close_window(MemoryScene(GRID, truth), WIDTH_M, HEIGHT_M), 0, 0)
     (left, right), (down, up) = close_window(MemoryScene(GRID, boxes([(150, -150, 30, 0)])), WIDTH_M, HEIGHT_M)
-    assert right <= 153.6 and up <= 153.6
+    assert max(right, up) <= 153.6 + 1e-6
     small = PictureGrid(-19.2, -25.6, 0.8, 64, 48)
     (left, right), (down, up) = close_window(MemoryScene(small, boxes([(10, 5, 9, 0)])), WIDTH_M, HEIGHT_M)
     assert ((left + right) / 2, (down + up) / 2) == pytest.approx((0, 0))  # larger than the grid: centred on it
@@ -150,11 +150,11 @@ def test_arrows_are_means_of_the_freshest_in_a_block() -> None:
         np.array([(10.0, 0), (20, 0), (50, 0), (0, 8), (0.2, 0)]),
         np.array([0.5, 0.5, 1.0, 2.0, 0.5]),
     )
-    starts, velocities = _arrow_means(memory.moved, memory)
+    starts, velocities = arrow_means(memory.moved, memory)
     rows = np.argsort(starts[:, 0])
     assert np.allclose(starts[rows], [(1.0, 0.5), (10, 10)])  # the last one stands still
     assert np.allclose(velocities[rows], [(15, 0), (0, 8)])
-    assert [len(part) for part in _arrow_means(np.zeros((0, 2)), cells([], (0.0, 0.0), 1.0))] == [0, 0]
+    assert [len(part) for part in arrow_means(np.zeros((0, 2)), cells([], (0.0, 0.0), 1.0))] == [0, 0]
 
 
 def render(path: Path, scene: MemoryScene) -> np.ndarray:
@@ -163,8 +163,8 @@ def render(path: Path, scene: MemoryScene) -> np.ndarray:
 
 
 def test_cells_lie_behind_the_box_without_velocity_and_on_it_with(tmp_path: Path) -> None:
-    truth = boxes([(0, 60, 20, 0)])
-    patch = [(x, y) for x in np.arange(-2, 2.5, 0.8) for y in np.arange(59.2, 61, 0.8)]
+    truth = PictureBoxes([(0, 60, 0)], [(8, 6, 2)], [0.0], [(20, 0)], [0])
+    patch = [(x, y) for x in np.arange(-2, 2.5, 0.8) for y in np.arange(58, 62.5, 0.8)]
     memory = cells(patch, (20.0, 0.0), 2.0)
     scene = MemoryScene(GRID, truth, cells=memory)
     picture, empty = render(tmp_path / "a.png", scene), render(tmp_path / "b.png", MemoryScene(GRID, truth))
@@ -178,37 +178,36 @@ def test_cells_lie_behind_the_box_without_velocity_and_on_it_with(tmp_path: Path
         return picture[round(row), round(col)]
 
     age = 255 * AgeScale.of(scene).colours(np.array([2.0]))[0, :3]
-    for column, x in ((0, -40.8), (1, -0.8)):
-        assert np.abs(colour_at(x, 60.9, column) - age).sum() < 40, column
-        assert np.abs(colour_at(x, 60.9, 1 - column) - age).sum() > 100, column
+    for column, x in ((0, -41.0), (1, -1.0)):
+        assert np.abs(colour_at(x, 58.1, column) - age).sum() < 40, column
+        assert np.abs(colour_at(x, 58.1, 1 - column) - age).sum() > 100, column
     green = np.abs(picture - 255 * np.array(to_rgb(TRUTH_COLOUR))).sum(axis=2) < 30
     assert green[HEADER_PX:, : 1600 // 2].any() and green[HEADER_PX:, 1600 // 2 :].any()
 
 
 def test_every_kind_of_gap_still_gives_a_picture(tmp_path: Path) -> None:
     truth = boxes([(30, 5, 10, 0), (10, -5, 0, 0)])
-    none_yet = cells([], (0.0, 0.0), 1.0)
     history = gaussians([(30.0, 5.0), (140.0, -20.0)], (12.0, 0.0), 0.5)
     empty_history = PictureMemory(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), PictureGaussians.empty())
     scenes = {
-        "both": MemoryScene(GRID, truth, history, cells([(29, 5), (500, 500)], (12.0, 0.0), 4.0)),
-        "no truth": MemoryScene(GRID, gaussians=history, cells=none_yet),
-        "nothing remembered": MemoryScene(GRID, truth, empty_history, none_yet),
-        "gaussians only": MemoryScene(GRID, truth, history),
-        "broken": MemoryScene(
-            GRID, boxes([(np.inf, 0, 1, 1), (0, 0, np.nan, 1)]), cells=cells([(np.nan, 0)], (1.0, 1.0), 1.0)
+        "no truth, one path": MemoryScene(GRID, gaussians=history),
+        "nothing remembered": MemoryScene(GRID, truth, empty_history, cells([], (0.0, 0.0), 1.0)),
+        "broken and out of sight": MemoryScene(
+            GRID,
+            boxes([(np.inf, 0, 1, 1), (0, 0, np.nan, 1)]),
+            history,
+            PictureMemory(np.array([(np.nan, 0), (500, 500)]), np.ones((2, 2)), np.ones(2)),
         ),
     }
     for name, scene in scenes.items():
         picture = render(tmp_path / f"{name}.png", scene)
         assert picture.shape[1] == 1600 and picture.shape[0] > CLOSE_PX, name
-        assert (tmp_path / f"{name}.png").stat().st_size < 400_000
 
 
-def test_a_full_memory_stays_small_and_quick(tmp_path: Path) -> None:
+def test_a_full_memory_stays_small(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    n = 8 * 4096
-    xy, velocity = rng.uniform(-150, 150, (n, 2)), rng.normal(0, 10, (n, 2))
+    n = 8 * 4096  # all that the paper's settings can remember, along a road
+    xy, velocity = rng.normal(0, (60, 12), (n, 2)), rng.normal(0, (8, 1), (n, 2))
     memory = PictureMemory(xy, velocity, np.repeat(np.arange(8) / 2 + 0.5, 4096))
     render(tmp_path / "a.png", MemoryScene(GRID, boxes([(30, 5, 10, 0)] * 50), cells=memory))
-    assert (tmp_path / "a.png").stat().st_size < 800_000  # noise: what a trained model leaves is a third of it
+    assert (tmp_path / "a.png").stat().st_size < 400_000

@@ -40,7 +40,10 @@ def write_run(tmp_path: Path) -> Callable[..., Path]:
             "ranges": {r: {"mAP": value} for r in RANGES},
         }  # fmt: skip
         if speeds:
-            metrics["speeds"] = {s: {"mAP_present": value, "mAVE_present": 2 - value} for s in SPEEDS}
+            classes = {c: {"AP": value, "AVE": 2 - value, "num_gt": 10} for c in CLASSES}
+            classes["car"]["num_gt"] = 3
+            part = {"mAP_present": value, "mAVE_present": 2 - value, "classes": classes}
+            metrics["speeds"] = {s: part for s in SPEEDS}
         (folder / "run.json").write_text(json.dumps(record))
         (folder / "metrics.json").write_text(json.dumps(metrics))
         return folder

@@ -32,6 +32,8 @@ def test_broken_records_are_named(tmp_path, write_run, content):
         (lambda m: m["speeds"]["25+"].pop("mAVE_present"), r"speeds\.25\+\.mAVE_present is missing"),
         (lambda m: m["speeds"]["0-0.5"].update(mAP_present=True), r"speeds\.0-0\.5\.mAP_present must be float"),
         (lambda m: m.update(speeds=None), r"speeds must be dict"),
+        (lambda m: m["speeds"]["25+"]["classes"].pop("car"), r"speeds\.25\+\.classes\.car is missing"),
+        (lambda m: m["speeds"]["25+"]["classes"]["truck"].clear(), r"speeds\.25\+\.classes\.truck\.num_gt is missing"),
     ],
 )
 def test_a_number_that_is_none_is_named_with_its_file(tmp_path, write_run, change, message):
@@ -52,9 +54,13 @@ def test_speeds_are_read_where_they_are(tmp_path, write_run):
     write_run("a", [], 0, 0.3)
     folder = write_run("b", [], 1, 0.4, speeds=True)
     damage(folder / "metrics.json", lambda m: m["speeds"]["25+"].update(mAP_present=None))  # nothing that fast
+    damage(folder / "metrics.json", lambda m: m["speeds"]["10-25"]["classes"]["car"].update(AP=0, AVE=1, num_gt=0))
     old, new = read_runs(tmp_path, "mini", ["phase1"])
     assert not [key for key in old.metrics if key.startswith("speeds")]
     assert new.metrics["speeds.0-0.5.mAP_present"] == 0.4 and new.metrics["speeds.25+.mAP_present"] is None
+    assert new.metrics["speeds.0-0.5.car.AP"] == 0.4 and new.metrics["speeds.0-0.5.car.AVE"] == 1.6
+    assert new.metrics["speeds.10-25.car.AP"] is None and new.metrics["speeds.10-25.car.AVE"] is None
+    assert new.metrics["speeds.10-25.boxes"] == 10 and new.metrics["speeds.0-0.5.car.boxes"] == 3
     assert new.metrics["ranges.0-25.mAP"] == new.metrics["classes.car.AP"] == 0.4
 
 

@@ -3,17 +3,23 @@
 import hashlib
 import os
 import signal
+import socket
+import time
 
 import pytest
+import torch
+import torch.multiprocessing as mp
+from toys import STEPS, ToyData, toy_module
 
 from src.errors import InterruptedRunError
 from src.training.checkpoints import read_checkpoint
 from src.training.fit import build_loggers, build_trainer, fit
 from src.training.interruption import Interruption
+from src.training.processes import build_strategy, is_main_process, process_group
 from src.training.run_folder import Resume, RunFolder
 from src.training.temporal import TemporalModule
 
-EPOCHS, STEPS = 3, 3
+EPOCHS = 3
 
 
 class Faulty(TemporalModule):
@@ -35,29 +41,31 @@ class Faulty(TemporalModule):
         return super().validation_step(batch, batch_idx)
 
 
-@pytest.fixture
-def run(tmp_path, make_module, make_data):
-    """Train in a folder, from its newest checkpoint where there is one; returns what the run ended with."""
-
-    def start(name, *, fault=None, at_step=None, at_validation=None, ema=None, validate_every=1, every_steps=None):
-        folder = RunFolder(tmp_path, name)
+def train(path, *, fault=None, at_step=None, at_validation=None, ema=None, validate_every=1, every_steps=None, ranks=1):
+    """Train in a folder, from its newest checkpoint where there is one; what the run ended with, and its module."""
+    folder = RunFolder(path.parent, path.name)
+    if is_main_process():
         folder.open(Resume.auto)
-        module, data = make_module(Faulty), make_data()
-        module.fault, module.at_step, module.at_validation, module.seen = fault, at_step, at_validation, []
-        resume_from = folder.newest_checkpoint()
-        trainer = build_trainer(
-            folder, epochs=EPOCHS, validate_every=validate_every, precision="32-true", accelerator="cpu", devices=1,
-            log_every_steps=1, ema_decay=ema, loggers=build_loggers(folder, resume_from, None),
-            checkpoint_every_steps=every_steps,
-        )  # fmt: skip
-        trainer.progress_bar_callback.disable()
-        try:
-            fit(trainer, module, data, resume_from)
-        finally:
+    module, data = toy_module(Faulty), ToyData()
+    module.fault, module.at_step, module.at_validation, module.seen = fault, at_step, at_validation, []
+    resume_from = folder.newest_checkpoint()
+    trainer = build_trainer(
+        folder, epochs=EPOCHS, validate_every=validate_every, precision="32-true", accelerator="cpu", devices=ranks,
+        log_every_steps=1, ema_decay=ema, checkpoint_every_steps=every_steps, strategy=build_strategy("cpu", ranks),
+        loggers=build_loggers(folder, resume_from, None) if is_main_process() else [],
+    )  # fmt: skip
+    trainer.progress_bar_callback.disable()
+    try:
+        fit(trainer, module, data, resume_from)
+    finally:
+        if is_main_process():
             folder._release()
-        return result(folder, module), module
+    return result(folder, module), module
 
-    return start
+
+@pytest.fixture
+def run(tmp_path):
+    return lambda name, **options: train(tmp_path / name, **options)
 
 
 def digest(state):
@@ -174,3 +182,42 @@ def test_ignored_signals_stay_ignored():
         assert not interruption.requested and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def stopped_on_two(rank, port, folder):
+    """As rank `rank`: a whole run, and one that a signal to rank 1 alone stops inside an epoch and that then goes on."""
+    torch.set_num_threads(1)
+    who = {"LOCAL_RANK": rank, "RANK": rank, "WORLD_SIZE": 2, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+    os.environ.update({name: str(value) for name, value in who.items()})
+    with process_group("cpu", 2):
+        expected, whole = train(folder / "whole", ranks=2)
+        for fault in ({"at_step": 1}, {"at_step": 4}, {"at_validation": (2, 0)}):
+            stopped_at = None
+            try:
+                train(folder / "stopped", ranks=2, fault=terminate if rank == 1 else lambda: None, **fault)
+            except InterruptedRunError:
+                stopped_at = fault
+            assert stopped_at is not None
+            torch.distributed.barrier()
+        found, module = train(folder / "stopped", ranks=2)
+        assert module.seen == []
+        assert found == expected
+        assert torch.equal(torch.tensor(module.detections.scores), torch.tensor(whole.detections.scores))
+    (folder / f"done {rank}").touch()
+
+
+@pytest.mark.slow
+def test_a_signal_to_one_rank_stops_all(tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    context = mp.spawn(stopped_on_two, (port, tmp_path), nprocs=2, join=False)
+    deadline = time.monotonic() + 120.0
+    try:
+        while not context.join(timeout=1.0):
+            assert time.monotonic() < deadline, "the two processes hang"
+    finally:
+        for process in context.processes:
+            if process.is_alive():
+                process.kill()
+    assert (tmp_path / "done 0").exists() and (tmp_path / "done 1").exists()

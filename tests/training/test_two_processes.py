@@ -1,8 +1,9 @@
 """Two processes train and score as one with the same batch does (CPU, gloo)."""
 
+import copy
 import importlib.util
 import os
-import signal
+import socket
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ import torch.multiprocessing as mp
 from torch.utils.data import DataLoader
 
 from src.data.datamodule import collate, in_lane
-from src.metrics.detection import score_detections
+from src.models.horizon3d.kggi import Initialization
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.training.optim import OptimConfig
 from src.training.processes import SharedBuffers, build_strategy, process_group
@@ -24,6 +25,7 @@ from src.training.temporal import TemporalModule
 LANES, STEPS = 4, 3
 FIRST_RANK, SECOND_RANK = (0, 1), (2, 3)
 DEADLINE_S = 120.0
+COLUMNS = tuple(DetectionTable.__dataclass_fields__)
 
 
 def _of_the_models_tests():
@@ -76,13 +78,15 @@ def work_as(rank, world_size, port, work):
     """Train three steps and validate, as rank `rank` of `world_size`; the result goes to a file."""
     torch.set_num_threads(1)
     if world_size > 1:
-        who = {"LOCAL_RANK": rank, "RANK": rank, "WORLD_SIZE": world_size, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+        who = {"LOCAL_RANK": rank, "RANK": rank, "WORLD_SIZE": world_size}
+        who |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
         os.environ.update({name: str(value) for name, value in who.items()})
     optim = OptimConfig(
         lr=1e-3, weight_decay=0.0, clip_norm=35.0, peak_lr_ratio=1.0, final_lr_ratio=1.0, rise_fraction=0.5,
         betas=[0.9, 0.99], cycled_beta1=None, ema_decay=None,
     )  # fmt: skip
-    module = Module(work.model, optim, 1.0, work.truth, 0, {})
+    # Tensors travel to a process as shared memory, in which the other would see them trained.
+    module = Module(copy.deepcopy(work.model), optim, 1.0, work.truth, 0, {})
     module.eval_norms = work.eval_norms
     lanes = (FIRST_RANK, SECOND_RANK)[rank] if world_size > 1 else range(LANES)
     train = [collate([frames[lane] for lane in lanes]) for frames in work.train]
@@ -98,14 +102,22 @@ def work_as(rank, world_size, port, work):
     result = {
         "totals": module.totals,
         "state": module.model.state_dict(),
-        "detections": {name: getattr(module.detections, name) for name in DetectionTable.__dataclass_fields__},
+        "detections": {name: torch.from_numpy(getattr(module.detections, name)) for name in COLUMNS},
         "scores": module.scores.as_dict(),
     }
     torch.save(result, work.folder / f"{world_size}-{rank}.pt")
 
 
-def in_two_processes(port, work):
+def in_one_process(work):
+    work_as(0, 1, 0, work)
+    return torch.load(work.folder / "1-0.pt", weights_only=True)
+
+
+def in_two_processes(work):
     """Both ranks with a deadline; their results."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
     context = mp.spawn(work_as, (2, port, work), nprocs=2, join=False)
     deadline = time.monotonic() + DEADLINE_S
     try:
@@ -114,16 +126,93 @@ def in_two_processes(port, work):
     finally:
         for process in context.processes:
             if process.is_alive():
-                os.kill(process.pid, signal.SIGKILL)
-    return [torch.load(work.folder / f"2-{rank}.pt", weights_only=False) for rank in range(2)]
+                process.kill()
+    return [torch.load(work.folder / f"2-{rank}.pt", weights_only=True) for rank in range(2)]
 
 
-def in_one_process(work):
-    work_as(0, 1, 0, replace(work, model=_copy(work.model)))
-    return torch.load(work.folder / "1-0.pt", weights_only=False)
+@pytest.fixture
+def frames(make_batch):
+    """Batches of one: (lane, step, points, boxes, cameras) -> the frame of that lane and step, half a second each."""
+
+    def build(lane, step, points=60, boxes=5, cameras=True):
+        frame = make_batch(points=(points,), boxes=(boxes,), seed=10 * step + lane)
+        frame = replace(
+            frame,
+            tokens=[f"{lane}/{step}"],
+            timestamps_s=torch.tensor([0.5 * step], dtype=torch.float64),
+            image_valid=frame.image_valid & cameras,
+        )
+        return in_lane(frame, lane, step % 10 == 0)
+
+    return build
 
 
-def _copy(model):
-    import copy
+@pytest.fixture
+def work(make_model, frames, tmp_path):
+    """Three steps in which one process or the other, or a lane, lacks what the other has."""
+    model = make_model(dptf=parts.dptf_config(), initialization=Initialization.keypoint)
+    model.head.config = replace(model.head.config, score_threshold=0.05)
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in model.parameters():  # what starts at zero would hide the parts behind it
+            parameter += 0.03 * torch.randn(parameter.shape, generator=generator)
+    nothing = {"points": 0, "cameras": False}  # no keypoint, hence no Gaussian at all
+    lacking = [
+        {lane: {"boxes": 0} for lane in SECOND_RANK},
+        {0: {"points": 0}, 1: {"points": 0, "boxes": 1}, 3: {"boxes": 0}},
+        {lane: nothing for lane in SECOND_RANK},
+    ]
+    train = [[frames(lane, step, **lacks.get(lane, {})) for lane in range(LANES)] for step, lacks in enumerate(lacking)]
+    validation = [
+        [collate([frames(0, 10), frames(1, 10)]), collate([frames(0, 11)]), collate([frames(0, 12, points=0)])],
+        [collate([frames(2, 10)])],
+    ]
+    tokens = [token for part in validation for batch in part for token in batch.tokens]
+    return Work(model, train, validation, truth_of(tokens, DetectionTable.empty()), tmp_path)
 
-    return copy.deepcopy(model)
+
+def truth_of(tokens, boxes):
+    return EvaluationSet(tokens, np.zeros((len(tokens), 3)), [()] * len(tokens), boxes, DetectionTable.empty())
+
+
+def shifted(detections):
+    """Annotations near detections, so that a score is neither 0 nor 1."""
+    table = DetectionTable(**{name: values.numpy() for name, values in detections.items()})
+    table = table[np.argsort(-table.scores)[: len(table) // 2]]
+    centers = table.centers + np.random.default_rng(0).normal(0.0, 0.7, table.centers.shape)
+    return replace(table, centers=centers, scores=np.zeros(len(table)), num_points=np.full(len(table), 9))
+
+
+def numbers(scores, path=""):
+    """Leaves of nested dictionaries by their path."""
+    if isinstance(scores, dict):
+        return {key: value for name in scores for key, value in numbers(scores[name], f"{path}/{name}").items()}
+    return {path: scores}
+
+
+@pytest.mark.slow
+def test_two_processes_train_and_score_as_one(work):
+    before = {name: value.clone() for name, value in work.model.state_dict().items()}
+    alone = in_one_process(work)
+    work.truth = truth_of(work.truth.tokens, shifted(alone["detections"]))
+    alone = in_one_process(work)
+    first, second = in_two_processes(work)
+
+    for step, (total, *of_ranks) in enumerate(zip(alone["totals"], first["totals"], second["totals"], strict=True)):
+        assert np.isfinite(of_ranks).all()
+        assert np.mean(of_ranks) == pytest.approx(total, rel=1e-5), step
+    changed = 0
+    for name, value in alone["state"].items():
+        assert torch.equal(first["state"][name], second["state"][name]), name
+        change, other = value - before[name], first["state"][name] - before[name]
+        scale = float(change.abs().max()) if change.numel() else 0.0
+        changed += scale > 0
+        print(name, scale, float((change-other).abs().max()) if change.numel() else 0)
+    print(changed, len(alone["state"]))
+
+    print(alone["scores"]["mAP"], alone["scores"]["NDS"], len(alone["detections"]["scores"]))
+    expected = numbers(alone["scores"])
+    for found in (numbers(first["scores"]), numbers(second["scores"])):
+        assert found.keys() == expected.keys()
+        for name, value in expected.items():
+            assert found[name] == (None if value is None else pytest.approx(value, abs=1e-6)), name

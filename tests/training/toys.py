@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import lightning as L
 import numpy as np
-import pytest
 import torch
 from torch import nn
 from torch.utils.data import DataLoader, Sampler
@@ -102,25 +101,30 @@ class Positions(Sampler):
 
 
 class Frames:
-    """Batches by (epoch, step); lane 1 begins a new clip at step 2."""
+    """Batches by (epoch, step); the second lane begins a new clip at step 2."""
+
+    def __init__(self, rank):
+        self.rank = rank
 
     def __getitem__(self, key):
         epoch, step = key
-        return toy_batch([0, 1], [step == 0, step in (0, 2)], number=10 * epoch + step)
+        lanes, starts = [2 * self.rank, 2 * self.rank + 1], [step == 0, step in (0, 2)]
+        return toy_batch(lanes, starts, number=1000 * self.rank + 10 * epoch + step)
 
 
 class ToyData(L.LightningDataModule):
-    """Clips in two lanes for training, three batches for validation."""
+    """Clips in two lanes of each rank for training; three batches for validation, the last on every rank."""
 
     def __init__(self):
         super().__init__()
         self.read = []  # (epoch, step) in the order of reading
 
     def train_dataloader(self):
-        return DataLoader(Frames(), batch_size=None, sampler=Positions(self.trainer, self.read))
+        return DataLoader(Frames(self.trainer.global_rank), batch_size=None, sampler=Positions(self.trainer, self.read))
 
     def val_dataloader(self):
-        frames = [toy_batch([0, 1], [number == 100] * 2, number) for number in (100, 101, 102)]
+        numbers = (100, 101, 102) if self.trainer.global_rank == 0 else (102,)
+        frames = [toy_batch([0, 1], [number == 100] * 2, number) for number in numbers]
         return DataLoader(frames, batch_size=None)
 
 
@@ -138,18 +142,3 @@ def toy_module(module_class=TemporalModule, seed=0):
         seed=seed,
         config={"model": {"name": "toy"}},
     )
-
-
-@pytest.fixture
-def make_batch():
-    return toy_batch
-
-
-@pytest.fixture
-def make_module():
-    return toy_module
-
-
-@pytest.fixture
-def make_data():
-    return ToyData

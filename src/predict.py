@@ -1,0 +1,141 @@
+"""`python -m src.predict checkpoint=PATH [scene=NAME] [data.root=DIR data.version=V data.split=S] [out=DIR]`."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from src.assembly import build_datamodule, data_root
+from src.command import run_command
+from src.config import Config, compose_config, restore_config
+from src.data.splits import split_samples
+from src.errors import ConfigError
+from src.metrics.submission import to_global, write_submission
+from src.ops.allocator import tune_cpu_allocator
+from src.pictures.film import Film
+from src.pictures.frame import draw_frame
+from src.streaming import StreamingDetector
+from src.structures.batch import FrameBatch
+from src.structures.boxes import Boxes3D
+from src.structures.detections import DetectionTable
+from src.training.checkpoints import read_checkpoint
+from src.training.processes import check_devices
+from src.training.run_folder import make_writable
+from src.training.snapshots import SHOWN_SCORE, scene_of, views_of
+
+logger = logging.getLogger(__name__)
+
+# What the detector said of one frame: its boxes and where its ego frame lay.
+Prediction = tuple[Boxes3D, np.ndarray]
+
+
+def main(overrides: list[str]) -> None:
+    """Run scenes frame by frame with memory; write submission.json, and pictures of the first scene, into `out`.
+
+    `trainer.num_pictures` is the number of frames in the strip, and 0 leaves pictures out, which take most of the time.
+    """
+    command, _ = compose_config(overrides)
+    if command.checkpoint is None or command.predictions is not None:
+        raise ConfigError("give checkpoint=PATH (predictions=FILE.json is scored by python -m src.evaluate)")
+    tune_cpu_allocator()
+    path = Path(command.checkpoint)
+    checkpoint = read_checkpoint(path)
+    config = restore_config(checkpoint["horizon3d"]["config"], overrides)
+    out = output_folder(path, command, config)
+    make_writable(out, "out")
+    detector = StreamingDetector.restore(config, checkpoint, path, chosen_device(config))
+    datamodule = build_datamodule(config, data_root(config, write=False))
+    frames = datamodule.stream(None if command.scene is None else [command.scene])
+    index, split = datamodule.index, split_samples(datamodule.index, config.data.split)
+    wanted = split if command.scene is None else index.samples_of({command.scene})
+    tokens = [str(token) for token in index.sample_tokens[wanted]]
+
+    film = Film()
+    bar = tqdm(frames, total=len(tokens), desc="predicting", unit="frame")
+    found, skipped = predict(detector, bar, film if command.trainer.num_pictures else None)
+    if film:
+        film.write_strip(out / "strip.png", command.trainer.num_pictures)
+        film.write_animation(out / "scene.gif")
+    written = save_predictions(out / "submission.json", tokens, found, config)
+    print(f"{len(tokens)} frames, {sum(len(boxes) for boxes, _ in found.values())} boxes, written into {out}: ", end="")
+    print(", ".join(["submission.json"] * written + ["scene.gif", "strip.png"] * bool(film)))
+    if skipped:
+        print(f"sensor files passed over: {skipped}")
+    if command.scene is not None:
+        print(
+            f"submission.json holds {command.scene} only; an evaluation wants all {len(split)} samples of the split "
+            f"{config.data.split!r}: leave scene= out for that"
+        )
+
+
+def output_folder(checkpoint: Path, command: Config, config: Config) -> Path:
+    """`out`, or a folder named by the checkpoint's run (else its file) and by what is predicted."""
+    if command.out is not None:
+        return Path(command.out)
+    run = checkpoint.resolve().parent
+    name = run.parent.name if run.name == "checkpoints" else checkpoint.stem
+    return Path(command.paths.outputs) / "predictions" / name / (command.scene or config.data.split)
+
+
+def chosen_device(config: Config) -> str:
+    """A GPU where there is one and `trainer.accelerator` does not say otherwise."""
+    check_devices(config.trainer.accelerator.value, 1)
+    return "cuda" if config.trainer.accelerator.value != "cpu" and torch.cuda.is_available() else "cpu"
+
+
+def predict(
+    detector: StreamingDetector, frames: Iterable[FrameBatch], film: Film | None
+) -> tuple[dict[str, Prediction], dict[str, int]]:
+    """What is detected in each frame by token, and the sensor files passed over; the first scene goes into the film."""
+    found: dict[str, Prediction] = {}
+    skipped: dict[str, int] = {}
+    scenes = 0
+    with tempfile.TemporaryDirectory() as folder:
+        for frame in frames:
+            scenes += bool(frame.starts[0])
+            boxes, output = detector.run(frame)
+            found[frame.tokens[0]] = boxes.to("cpu"), frame.global_from_ego[0].numpy()
+            for channel, count in frame.skipped.items():
+                skipped[channel] = skipped.get(channel, 0) + count
+            if film is not None and scenes == 1 and not film.full:
+                picture = Path(folder) / "frame.png"
+                title = f"Frame {len(film) + 1}, sample {frame.tokens[0][:12]}"
+                draw_picture(picture, detector, frame, boxes, output, title)
+                film.add(picture, float(frame.timestamps_s))
+    return found, skipped
+
+
+def draw_picture(
+    path: Path, detector: StreamingDetector, frame: FrameBatch, boxes: Boxes3D, output: Any, title: str
+) -> None:
+    """One frame on one sheet: cameras, BEV, Gaussians by source, boxes."""
+    frame = frame.to(detector.device)
+    draw_frame(path, scene_of(frame, boxes, output, detector.grid), views_of(frame), title, SHOWN_SCORE)
+
+
+def save_predictions(path: Path, tokens: list[str], found: dict[str, Prediction], config: Config) -> bool:
+    """Write a submission of these samples; False, with a warning, when there is no box in any."""
+    tables = [to_global(*found[token], row) for row, token in enumerate(tokens)]
+    table = DetectionTable.concatenate(tables)
+    if not len(table):
+        logger.warning("no box reached the score threshold, so there is no valid submission to write")
+        return False
+    meta = {
+        "use_camera": config.model.uses_images,
+        "use_radar": True,
+        "method_name": config.model.name,
+        "description": f"scale {config.scale}, seed {config.seed}, frame by frame",
+    }
+    write_submission(path, tokens, table, meta)
+    return True
+
+
+if __name__ == "__main__":
+    run_command(main)

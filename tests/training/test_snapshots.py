@@ -1,0 +1,168 @@
+"""Pictures of a detector: clips are streamed, and the memory is shown as the model read it and as it would lie else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from src.geometry.bev_grid import BEVGrid
+from src.models.detector import Detector
+from src.models.horizon3d.bev_path import BEVPathConfig, WarpedCells
+from src.models.horizon3d.dptf import DPTFConfig, DPTFOutput
+from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling
+from src.structures.batch import FrameBatch
+from src.structures.boxes import Boxes3D
+from src.structures.gaussians import GaussianSet
+from src.training.snapshots import clip_length, draw_frames, memory_of, scene_of
+
+GRID = BEVGrid(cells=(64, 64), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
+VELOCITY = torch.tensor([6.0, -2.0])
+
+
+def frame(number: int) -> FrameBatch:
+    boxes = Boxes3D(
+        centers=torch.tensor([[5.0, 2.0, 0.0]]),
+        sizes=torch.tensor([[4.0, 2.0, 2.0]]),
+        yaws=torch.zeros(1),
+        velocities=VELOCITY[None],
+        labels=torch.zeros(1, dtype=torch.int64),
+        attributes=torch.full((1,), -1),
+        num_points=torch.full((1,), 7),
+    )
+    return FrameBatch(
+        tokens=[f"token/{number}"],
+        timestamps_s=torch.tensor([0.5 * number], dtype=torch.float64),
+        global_from_ego=torch.eye(4, dtype=torch.float64)[None],
+        aug_from_ego=torch.eye(4)[None],
+        radar_points=torch.zeros(0, 7),
+        radar_batch=torch.zeros(0, dtype=torch.int64),
+        boxes=[boxes],
+        lanes=torch.zeros(1, dtype=torch.int64),
+        starts=torch.tensor([number == 0]),
+    )
+
+
+@dataclass
+class Output:
+    dptf: DPTFOutput | None
+
+
+def recollection(compensated: bool) -> tuple[GaussianSet, WarpedCells]:
+    """One thing 1.5 s old of each kind, and a Gaussian that is padding; last seen at (-4, 5)."""
+    xy = torch.tensor([[-4.0, 5.0]]) + (VELOCITY * 1.5 if compensated else 0)
+    g = 2
+    history = GaussianSet(
+        means=xy.expand(1, g, 2).clone(),
+        scales=torch.ones(1, g, 2),
+        directions=torch.tensor([1.0, 0.0]).expand(1, g, 2),
+        opacity_logits=torch.zeros(1, g),
+        velocities=VELOCITY.expand(1, g, 2),
+        features=torch.zeros(1, g, 4),
+        sources=torch.full((1, g), 3),
+        elapsed_s=torch.full((1, g), 1.5),
+        valid=torch.tensor([[True, False]]),
+    )
+    cells = WarpedCells(
+        indices=torch.zeros(1, 4, dtype=torch.int64),
+        xy=xy,
+        velocities=VELOCITY[None],
+        elapsed_s=torch.tensor([1.5]),
+        features=torch.zeros(1, 4),
+    )
+    return history, cells
+
+
+class Recorder(Detector):
+    """Writes down what it is called with; remembers the tokens it has seen."""
+
+    def __init__(self, dptf: DPTFConfig | None) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(1))
+        self.config = SimpleNamespace(dptf=dptf)
+        self.calls: list[tuple[str, Any]] = []
+
+    def forward(self, batch: FrameBatch, memory: Any = None) -> tuple[Output, Any]:
+        assert not self.training and not torch.is_grad_enabled()
+        self.calls.append((batch.tokens[0], memory))
+        if self.config.dptf is None:
+            return Output(None), None
+        history, cells = recollection(True) if memory else (None, None)
+        return Output(DPTFOutput(history, cells, None, None)), [*(memory or []), batch.tokens[0]]
+
+    def loss(self, output: Any, batch: FrameBatch) -> dict[str, torch.Tensor]:
+        raise NotImplementedError
+
+    def decode(self, output: Any) -> list[Boxes3D]:
+        return [Boxes3D.empty()]
+
+
+def config(bev: bool = True, gaussians: bool = True, compensated: bool = True) -> DPTFConfig:
+    bev_path = BEVPathConfig(
+        num_frames=8, memory_threshold=0.1, max_cells_per_frame=9, velocity_compensation=compensated,
+        spatial_dilation=False,
+    )  # fmt: skip
+    gaussian_path = GaussianPathConfig(
+        num_frames=4, gaussians_per_frame=9, sampling=Sampling.random, velocity_compensation=compensated,
+        self_attention=None,
+    )  # fmt: skip
+    return DPTFConfig(
+        max_age_s=6.0, bev_path=bev_path if bev else None, gaussian_path=gaussian_path if gaussians else None
+    )
+
+
+def test_clips_fill_the_longest_memory() -> None:
+    assert clip_length(Recorder(config())) == 9
+    assert clip_length(Recorder(config(bev=False))) == 5
+    assert clip_length(Recorder(None)) == 1
+
+
+def test_clips_are_streamed_and_their_last_frames_drawn(tmp_path: Path) -> None:
+    model = Recorder(config()).train()
+    clips = [[frame(0), frame(1), frame(2)], [frame(7)]]
+    paths = draw_frames(model, iter(clips), GRID, tmp_path)
+    assert [path.name for path in paths] == [
+        "frame_0_token_2.png", "memory_0_token_2.png", "frame_1_token_7.png", "memory_1_token_7.png"
+    ]  # fmt: skip
+    assert all(path.stat().st_size > 5000 for path in paths)
+    assert model.calls == [
+        ("token/0", None), ("token/1", ["token/0"]), ("token/2", ["token/0", "token/1"]), ("token/7", None)
+    ]  # fmt: skip
+    assert model.training
+
+
+def test_a_model_without_memory_gives_the_frame_alone(tmp_path: Path) -> None:
+    paths = draw_frames(Recorder(None).eval(), [[frame(3)]], GRID, tmp_path)
+    assert [path.name for path in paths] == ["frame_0_token_3.png"]
+
+
+@pytest.mark.parametrize("compensated", [True, False])
+def test_both_places_whichever_the_model_used(compensated: bool) -> None:
+    history, cells = recollection(compensated)
+    output = Output(DPTFOutput(history, cells, None, None))
+    scene = scene_of(frame(0), Boxes3D.empty(), output, GRID)
+    shown = memory_of(Recorder(config(compensated=compensated)), output, scene)
+    assert len(shown.ground_truth) == 1
+    for memory in (shown.gaussians, shown.cells):
+        assert len(memory) == 1  # padding is not shown
+        assert np.allclose(memory.stayed, [[-4, 5]]) and np.allclose(memory.moved, [[5, 2]])
+        assert memory.compensated == compensated
+    assert shown.gaussians.gaussians is not None and shown.cells.gaussians is None
+
+
+def test_paths_that_are_off_or_have_nothing_yet() -> None:
+    history, cells = recollection(True)
+    scene = scene_of(frame(0), Boxes3D.empty(), Output(None), GRID)
+    no_cells = memory_of(Recorder(config(bev=False)), Output(DPTFOutput(history, None, None, None)), scene)
+    assert no_cells.cells is None and len(no_cells.gaussians) == 1
+    no_history = memory_of(Recorder(config(gaussians=False)), Output(DPTFOutput(None, cells, None, None)), scene)
+    assert no_history.gaussians is None and len(no_history.cells) == 1
+    first = memory_of(Recorder(config()), Output(DPTFOutput(None, None, None, None)), scene)
+    assert len(first.gaussians) == 0 and len(first.cells) == 0
+    assert memory_of(Recorder(None), Output(None), scene) is None
