@@ -1,12 +1,14 @@
 # `make help` lists the targets. Without an active environment, one is made in .venv and used.
 PHASE ?= 1
 SCALE ?=
+CHECKPOINT ?=
 ARGS ?=
 ACTIVE := $(or $(VIRTUAL_ENV),$(CONDA_PREFIX))
 PYTHON := $(if $(ACTIVE),python,.venv/bin/python)
 # The stamp remembers an install: it is redone when pyproject.toml changes. It lives inside the environment it describes.
 STAMP := $(if $(ACTIVE),$(ACTIVE),.venv)/.horizon3d-installed
 SCALE_ARG := $(if $(SCALE),scale=$(SCALE))
+INIT_ARG := $(if $(CHECKPOINT),phase.init_from=$(CHECKPOINT))
 
 .PHONY: help install world train report benchmark test check
 .DEFAULT_GOAL := help
@@ -24,11 +26,11 @@ install: $(STAMP) ## create .venv (unless an environment is active) and install 
 world: $(STAMP) ## write the synthetic highway (preview: ARGS="preview=true")
 	$(PYTHON) -m src.world $(SCALE_ARG) $(ARGS)
 
-train: $(STAMP) ## train PHASE=1 [SCALE=debug|mini|paper] [ARGS="optim.lr=2e-4 ..."]
-	$(PYTHON) -m src.train phase=phase$(PHASE) $(SCALE_ARG) $(ARGS)
+train: $(STAMP) ## train PHASE=1|2 [CHECKPOINT=PATH] [SCALE=debug|mini|paper] [ARGS="optim.lr=2e-4 ..."]
+	$(PYTHON) -m src.train phase=phase$(PHASE) $(INIT_ARG) $(SCALE_ARG) $(ARGS)
 
-report: $(STAMP) ## finished runs into the table reports/phase1_mini.md
-	$(PYTHON) -m src.report $(SCALE_ARG) $(ARGS)
+report: $(STAMP) ## finished runs into reports/phase1_mini.md, with PHASE=2 reports/phase2_mini.md
+	$(PYTHON) -m src.report phase=phase$(PHASE) $(SCALE_ARG) $(ARGS)
 
 benchmark: $(STAMP) ## time and memory of every part [ARGS="suite=metric"]
 	$(PYTHON) -m src.benchmark $(SCALE_ARG) $(ARGS)

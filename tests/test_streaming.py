@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from untrained import write_checkpoint
 
-from src.assembly import build_model
-from src.config import compose_config
 from src.data.datamodule import collate
 from src.data.sensors import Camera, RadarSweep
 from src.errors import CheckpointError, ConfigError
@@ -18,22 +17,6 @@ from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CAMERAS, RADARS
 
 README = Path(__file__).resolve().parent.parent / "README.md"
-
-
-def write_checkpoint(path, *overrides):
-    """An untrained debug model, made lively enough that boxes and memory depend on what it sees."""
-    config, tree = compose_config(["scale=debug", *overrides])
-    torch.manual_seed(1)
-    model = build_model(replace(config, backbone=replace(config.backbone, weights=None)))
-    with torch.no_grad():
-        for name, value in model.named_parameters():
-            if "temporal" in name or name.startswith("dptf."):  # zero-initialised, and silent, otherwise
-                value.add_(0.3 * torch.randn_like(value))
-            if "occupancy" in name and name.endswith("bias"):
-                value.zero_()  # trained ones remember what they think is occupied, fresh ones nothing
-    content = {"state_dict": {f"model.{key}": value for key, value in model.state_dict().items()}}
-    torch.save(content | {"horizon3d": {"config": tree}}, path)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +204,9 @@ def test_a_radar_only_model_looks_at_no_image(tmp_path):
 @pytest.mark.slow  # a ResNet-50 on disk
 def test_loading_needs_the_checkpoint_alone(tmp_path):
     """The backbone's pretrained file, which training began from, need not be on this machine."""
-    path = write_checkpoint(tmp_path / "a.ckpt", "phase=phase1", "backbone=resnet50", "backbone.weights=/nowhere/weights.pth")
+    path = write_checkpoint(
+        tmp_path / "a.ckpt", "phase=phase1", "backbone=resnet50", "backbone.weights=/nowhere/weights.pth"
+    )
     assert StreamingDetector.load(path).settings.image_size_px == (256, 864)
 
 

@@ -128,8 +128,11 @@ def fit(trainer: L.Trainer, module: DetectionModule, datamodule: DetectionDataMo
             for expected in EXPECTED_WARNINGS:
                 warnings.filterwarnings("ignore", message=expected)
             trainer.fit(module, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
-            if not interruption.began:  # stopped after the last step: its moving average is not in the module yet
+            if not interruption.began:  # only the results were missing
+                # Lightning restores the weights of the last step; the checkpoint states the moving average, if any.
                 load_model_weights(module.model, read_checkpoint(resume_from), resume_from)
+                if trainer.max_epochs % trainer.check_val_every_n_epoch == 0:
+                    trainer.loggers = []  # they have the scores of the last epoch already
             if module.scored_step != trainer.global_step and not interruption.requested:
                 trainer.validate(module, datamodule=datamodule, verbose=False)  # the last epoch was not to be validated
     except SystemExit as error:  # Lightning's way to end on a KeyboardInterrupt

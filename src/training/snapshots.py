@@ -28,13 +28,6 @@ SHOWN_SCORE = 0.25
 """Boxes below are left out of pictures: a person looks for what the detector is sure of, the metric for all."""
 
 
-def clip_length(model: Detector) -> int:
-    """Frames to stream, the drawn one included, until a model's memory is full; 1 for a model of single frames."""
-    dptf = _memory_config(model)
-    paths = [] if dptf is None else [dptf.bev_path, dptf.gaussian_path]
-    return 1 + max((path.num_frames for path in paths if path is not None), default=0)
-
-
 @torch.no_grad()
 def draw_frames(model: Detector, clips: Iterable[list[FrameBatch]], grid: BEVGrid, folder: Path) -> list[Path]:
     """PNGs of the last frame of each clip of consecutive frames (batches of one), on whatever device they lie.

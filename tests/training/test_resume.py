@@ -152,6 +152,15 @@ def test_killed_between_checkpoints_of_steps(run, step):
     assert found == expected
 
 
+@STOPPED_OFTEN
+@pytest.mark.parametrize(("validate_every", "ema"), [(1, 0.9), (2, 0.9)])
+def test_only_the_results_were_missing(run, validate_every, ema):
+    options = {"validate_every": validate_every, "ema": ema}
+    expected, _ = run("run", **options)
+    found, module = run("run", **options)
+    assert module.seen == [] and found == expected
+
+
 def test_the_earlier_handlers_come_back(run):
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     with pytest.raises(InterruptedRunError):
@@ -185,7 +194,7 @@ def test_ignored_signals_stay_ignored():
 
 
 def stopped_on_two(rank, port, folder):
-    """As rank `rank`: a whole run, and one that a signal to rank 1 alone stops inside an epoch and that then goes on."""
+    """As rank `rank`: a whole run, and one that signals to rank 1 alone stop again and again."""
     torch.set_num_threads(1)
     who = {"LOCAL_RANK": rank, "RANK": rank, "WORLD_SIZE": 2, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
     os.environ.update({name: str(value) for name, value in who.items()})

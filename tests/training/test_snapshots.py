@@ -20,7 +20,7 @@ from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.gaussians import GaussianSet
-from src.training.snapshots import clip_length, draw_frames, memory_of, scene_of
+from src.training.snapshots import draw_frames, memory_of, scene_of
 
 GRID = BEVGrid(cells=(64, 64), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
 VELOCITY = torch.tensor([6.0, -2.0])
@@ -115,12 +115,6 @@ def config(bev: bool = True, gaussians: bool = True, compensated: bool = True) -
     return DPTFConfig(
         max_age_s=6.0, bev_path=bev_path if bev else None, gaussian_path=gaussian_path if gaussians else None
     )
-
-
-def test_clips_fill_the_longest_memory() -> None:
-    assert clip_length(Recorder(config())) == 9
-    assert clip_length(Recorder(config(bev=False))) == 5
-    assert clip_length(Recorder(None)) == 1
 
 
 def test_clips_are_streamed_and_their_last_frames_drawn(tmp_path: Path) -> None:

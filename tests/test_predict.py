@@ -1,0 +1,158 @@
+"""`python -m src.predict`: the boxes of `src.evaluate`, scene by scene, with pictures, whole files or none."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from untrained import write_checkpoint
+
+from src import evaluate, predict
+from src.errors import CheckpointError, ConfigError, DataError
+from src.streaming import StreamingDetector
+
+ROOT = Path(__file__).resolve().parent.parent
+FRAMES = 3  # of a scene
+
+
+@pytest.fixture(scope="module")
+def outputs(tmp_path_factory):
+    return tmp_path_factory.mktemp("outputs")
+
+
+@pytest.fixture(scope="module")
+def checkpoints(outputs):
+    """One per phase, in run folders, on a world of two validation scenes."""
+    paths = {phase: outputs / f"run-{phase}" / "checkpoints" / "last.ckpt" for phase in ("phase1", "phase2")}
+    for phase, path in paths.items():
+        path.parent.mkdir(parents=True)
+        write_checkpoint(path, f"phase={phase}", "data.world.num_val_scenes=2", f"paths.outputs={outputs}")
+    return paths
+
+
+def run(checkpoint, *overrides, pictures=0):
+    predict.main([f"checkpoint={checkpoint}", f"trainer.num_pictures={pictures}", *overrides])
+
+
+def results(folder):
+    return json.loads((folder / "submission.json").read_text())["results"]
+
+
+@pytest.fixture(scope="module")
+def whole(checkpoints, outputs):
+    """Phase 2 over the split, into the folder that the command chooses."""
+    run(checkpoints["phase2"], f"paths.outputs={outputs}")
+    return outputs / "predictions" / "run-phase2" / "val"
+
+
+@pytest.mark.parametrize("phase", ["phase1", "phase2"])
+def test_boxes_are_those_of_evaluate(checkpoints, outputs, tmp_path, phase):
+    base = (f"paths.outputs={outputs}",)
+    run(checkpoints[phase], *base, f"out={tmp_path / 'a'}")
+    evaluate.main([f"checkpoint={checkpoints[phase]}", *base, f"out={tmp_path / 'b'}"])
+    ours, theirs = results(tmp_path / "a"), results(tmp_path / "b")
+    assert list(ours) == list(theirs) and len(ours) == 2 * FRAMES
+    for token, boxes in ours.items():
+        assert len(boxes) == len(theirs[token]) > 20
+        for mine, other in zip(boxes, theirs[token], strict=True):
+            for name in ("translation", "size", "rotation", "velocity", "detection_score"):
+                np.testing.assert_allclose(mine[name], other[name], atol=1e-4)
+            assert all(mine[name] == other[name] for name in ("sample_token", "detection_name", "attribute_name"))
+
+
+def scene_names(outputs):
+    (world,) = (outputs / "worlds").iterdir()
+    return json.loads((world / "splits.json").read_text())["val"]
+
+
+def test_one_scene_gives_its_samples_with_the_boxes_they_have_in_the_split(checkpoints, outputs, whole, capsys):
+    first, second = scene_names(outputs)
+    run(checkpoints["phase2"], f"paths.outputs={outputs}", f"scene={second}")
+    printed = capsys.readouterr().out
+    assert f"holds {second} only" in printed and f"all {2 * FRAMES} samples" in printed
+    part, everything = results(whole.with_name(second)), results(whole)
+    assert len(part) == FRAMES and all(everything[token] == boxes for token, boxes in part.items())
+
+
+def test_memory_shows_in_the_boxes_and_its_age_can_be_set(checkpoints, outputs, whole, tmp_path):
+    run(checkpoints["phase2"], f"paths.outputs={outputs}", f"out={tmp_path}", "model.dptf.max_age_s=0.3")
+    forgetful, everything = results(tmp_path), results(whole)
+    changed = [forgetful[token] != boxes for token, boxes in everything.items()]
+    assert sum(changed) == 2 * (FRAMES - 1)  # all but the first frame of each scene
+
+
+def test_pictures_of_the_first_scene(checkpoints, outputs, tmp_path, capsys):
+    run(checkpoints["phase2"], f"paths.outputs={outputs}", f"out={tmp_path}", pictures=2)
+    with Image.open(tmp_path / "scene.gif") as film, Image.open(tmp_path / "strip.png") as strip:
+        assert film.n_frames == FRAMES and film.info["duration"] == 500 and film.info["loop"] == 0
+        assert strip.size == (2 * film.width, film.height) and film.width < film.height < 2 * film.width
+    assert {path.name for path in tmp_path.iterdir()} == {"submission.json", "scene.gif", "strip.png"}
+    assert "submission.json, scene.gif, strip.png" in capsys.readouterr().out
+
+
+def test_without_any_box_there_is_no_submission_and_the_log_says_why(checkpoints, outputs, tmp_path, caplog):
+    run(checkpoints["phase1"], f"paths.outputs={outputs}", f"out={tmp_path}", "model.head.score_threshold=0.99")
+    assert "no box reached the score threshold" in caplog.text and not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_run_leaves_what_was_there(checkpoints, outputs, tmp_path, monkeypatch):
+    (tmp_path / "submission.json").write_text("older")
+    steps, step = [], StreamingDetector.run
+
+    def interrupted(self, frame):
+        steps.append(frame)
+        if len(steps) == 3:
+            raise KeyboardInterrupt
+        return step(self, frame)
+
+    monkeypatch.setattr(StreamingDetector, "run", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(checkpoints["phase1"], f"paths.outputs={outputs}", f"out={tmp_path}", pictures=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["submission.json"]
+    assert (tmp_path / "submission.json").read_text() == "older"
+
+
+def test_bad_input_is_named(checkpoints, outputs, tmp_path):
+    good, base = checkpoints["phase1"], (f"paths.outputs={outputs}", f"out={tmp_path / 'out'}")
+    with pytest.raises(ConfigError, match="give checkpoint=PATH"):
+        predict.main([*base])
+    with pytest.raises(ConfigError, match="give checkpoint=PATH"):
+        run(good, *base, "predictions=a.json")
+    with pytest.raises(CheckpointError, match="does not exist"):
+        run(tmp_path / "none.ckpt", *base)
+    half = tmp_path / "half.ckpt"
+    half.write_bytes(good.read_bytes()[:4000])
+    with pytest.raises(CheckpointError, match="half.ckpt is truncated"):
+        run(half, *base)
+    foreign = tmp_path / "foreign.ckpt"
+    torch.save({"state_dict": {"weight": torch.zeros(1)}}, foreign)
+    with pytest.raises(CheckpointError, match="not of this project"):
+        run(foreign, *base)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="choose another out=FOLDER"):
+        run(good, f"paths.outputs={outputs}", f"out={tmp_path / 'file' / 'out'}")
+    name = scene_names(outputs)[0]
+    with pytest.raises(ConfigError, match=f"no such scene.*nearest.*{name}"):
+        run(good, *base, f"scene={name[:-1]}")
+    with pytest.raises(DataError, match="split 'mini_val'"):
+        run(good, *base, "data.split=mini_val")
+    with pytest.raises(DataError, match="nowhere"):
+        run(good, *base, f"data.root={tmp_path / 'nowhere'}")
+    assert not any((tmp_path / "out").iterdir())
+
+
+@pytest.mark.slow
+def test_the_command_itself(checkpoints, outputs, tmp_path):
+    def command(*overrides):
+        line = [sys.executable, "-m", "src.predict", *overrides, f"paths.outputs={outputs}", f"out={tmp_path}"]
+        return subprocess.run(line, cwd=ROOT, capture_output=True, text=True, timeout=120)
+
+    ended = command(f"checkpoint={checkpoints['phase2']}", "trainer.num_pictures=0")
+    assert ended.returncode == 0 and f"{2 * FRAMES} frames" in ended.stdout and str(tmp_path) in ended.stdout
+    assert "predicting" in ended.stderr and len(results(tmp_path)) == 2 * FRAMES
+    refused = command(f"checkpoint={checkpoints['phase2']}", "scene=nothing")
+    assert refused.returncode == 3 and "no such scene" in refused.stderr and "Traceback" not in refused.stderr
