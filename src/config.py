@@ -281,18 +281,26 @@ def build_config(tree: DictConfig) -> Config:
 def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     """A configuration as a checkpoint stores it, with the keys named in `overrides` replaced.
 
-    A group choice (`data=truckscenes`) replaces that whole group, at the checkpoint's scale.
-    Raises CheckpointError when the stored tree does not fit this version of the code, ConfigError for another scale.
+    A group choice (`data=truckscenes`) replaces that whole group, at the checkpoint's scale and phase.
+    Raises CheckpointError when the stored tree does not fit this version of the code, ConfigError for another scale and
+    for a key below a part that the checkpoint does not have.
     """
-    model = stored["model"].get("name") if isinstance(stored.get("model"), dict) else None
+    model, phase = (
+        stored[key].get("name") if isinstance(stored.get(key), dict) else None for key in ("model", "phase")
+    )
     if model not in MODEL_CONFIGS:
         raise CheckpointError(f"the checkpoint is of model {model!r}; this version knows {sorted(MODEL_CONFIGS)}")
+    if phase not in PHASES:
+        raise CheckpointError(f"the checkpoint is of phase {phase!r}; this version knows {PHASES}")
     scale = stored.get("scale")
     changes = {change.key_or_group: change for change in OverridesParser.create().parse_overrides(overrides)}
     if "scale" in changes and changes["scale"].value() != scale:
         raise ConfigError(f"scale={changes['scale'].value()}: the checkpoint is of scale={scale}; leave scale= out")
-    tree, fresh = OmegaConf.create(stored), _compose([f"scale={scale}", *overrides])
-    for key in changes:
+    tree, fresh = OmegaConf.create(stored), _compose([f"scale={scale}", f"phase={phase}", *overrides])
+    for key in sorted(changes, key=lambda key: key.count(".")):  # a part before what lies in it
+        part = key.rpartition(".")[0]
+        if part and OmegaConf.select(tree, part) is None:
+            raise ConfigError(f"{key}: the checkpoint has no {part}")
         OmegaConf.update(tree, key, OmegaConf.select(fresh, key), merge=False)
     schema = OmegaConf.structured(Config)
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -45,7 +46,7 @@ class Source:
     @property
     def command(self) -> str:
         """What makes it."""
-        return "python -m src.train " + " ".join(self.overrides or [])
+        return shlex.join(["python", "-m", "src.train", *(self.overrides or [])])
 
 
 def find_source(config: Config, overrides: list[str]) -> Source | None:
@@ -66,8 +67,10 @@ def find_source(config: Config, overrides: list[str]) -> Source | None:
         return Source(hashlib.sha256(path.read_bytes()).hexdigest()[:16], path, None, None)
     kept = [override for override in overrides if not _is_of(override, NOT_OF_THE_SOURCE)]
     wanted = [f"phase={name}", *kept]
-    _, tree = compose_config(wanted)
-    folder = RunFolder(Path(config.paths.outputs), run_identity(tree))
+    its_config, tree = compose_config(wanted)
+    its_source = find_source(its_config, wanted)  # what that run starts from is part of its identity
+    identity = run_identity(tree, its_source.identity if its_source is not None else None)
+    folder = RunFolder(Path(config.paths.outputs), identity)
     return Source(folder.run_id, folder.checkpoints / "last.ckpt", wanted, folder)
 
 
@@ -75,7 +78,8 @@ def train_source(source: Source, train_missing: bool, processes_exist: bool) -> 
     """Train the run that a phase starts from, in a process of its own, which prints its progress here.
 
     `processes_exist` says that ranks are already running side by side, so none of them can start a training of all.
-    Raises ConfigError when it may not be trained here, and the error of its exit code when it fails.
+    Raises ConfigError when it may not be trained here, the error of its exit code when it fails, and CheckpointError
+    when it had finished before and has lost its weights since.
     """
     reason = None
     if not train_missing:
@@ -95,6 +99,11 @@ def train_source(source: Source, train_missing: bool, processes_exist: bool) -> 
         }
         raise kinds.get(code, HorizonError)(
             f"the run {source.identity} that comes first ended with exit code {code}, see above; {source.command}"
+        )
+    if not source.ready:
+        raise CheckpointError(
+            f"the run {source.identity} has finished, but {source.checkpoint} is gone; make it anew with\n"
+            f"    {source.command} resume=restart"
         )
 
 

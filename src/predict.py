@@ -127,11 +127,13 @@ def save_predictions(path: Path, tokens: list[str], found: dict[str, Prediction]
     if not len(table):
         logger.warning("no box reached the score threshold, so there is no valid submission to write")
         return False
+    dptf = getattr(config.model, "dptf", None)  # the benchmark's rules are about how far back a detector looks
+    memory = "no memory" if dptf is None else f"memory of up to {dptf.max_age_s:g} s"
     meta = {
         "use_camera": config.model.uses_images,
         "use_radar": True,
         "method_name": config.model.name,
-        "description": f"scale {config.scale}, seed {config.seed}, frame by frame",
+        "description": f"scale {config.scale}, seed {config.seed}, frame by frame, {memory}",
     }
     write_submission(path, tokens, table, meta)
     return True

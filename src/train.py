@@ -36,7 +36,7 @@ from src.training.processes import (
     launch,
     process_group,
 )
-from src.training.run_folder import RunFolder, current_commit, write_json
+from src.training.run_folder import Resume, RunFolder, current_commit, write_json
 from src.training.snapshots import draw_frames
 
 logger = logging.getLogger(__name__)
@@ -51,7 +51,7 @@ def main(overrides: list[str]) -> None:
     source = find_source(config, overrides)
     folder = RunFolder(Path(config.paths.outputs), run_identity(tree, source.identity if source is not None else None))
     if config.trainer.num_processes > 1 and not created_externally():
-        if source is not None and not source.ready and not folder.finished:
+        if source is not None and not source.ready and begins(folder, config.resume):
             train_source(source, config.phase.train_missing, processes_exist=False)
         launch("src.train", overrides, config.trainer.devices)
         return
@@ -59,6 +59,11 @@ def main(overrides: list[str]) -> None:
         start = decided_by_main(lambda: prepare(config, tree, folder, source))
         if start is not None:
             run(config, tree, folder, source, start, started, overrides)
+
+
+def begins(folder: RunFolder, resume: Resume) -> bool:
+    """Whether the run starts from its source's weights: told to, or with nothing of its own to go on from."""
+    return resume is Resume.restart or not (folder.finished or folder.newest_checkpoint() is not None)
 
 
 def prepare(config: Config, tree: dict[str, Any], folder: RunFolder, source: Source | None) -> dict[str, Any] | None:

@@ -7,7 +7,7 @@ import pytest
 
 SRC = Path(__file__).resolve().parent.parent / "src"
 FILES = sorted(path for path in SRC.rglob("*.py"))
-ENTRY = {"train", "evaluate", "world", "report", "benchmark", "predict", "streaming", "assembly", "command", "config"}
+ENTRY = {"train", "evaluate", "world", "report", "benchmark", "predict", "streaming", "assembly", "command", "config", "handoff"}
 
 # room -> rooms it may import from; entry points may import everything.
 ALLOWED = {

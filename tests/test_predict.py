@@ -49,7 +49,7 @@ def whole(checkpoints, outputs):
     return outputs / "predictions" / "run-phase2" / "val"
 
 
-@pytest.mark.parametrize("phase", ["phase1", "phase2"])
+@pytest.mark.parametrize("phase", [pytest.param("phase1", marks=pytest.mark.slow), "phase2"])
 def test_boxes_are_those_of_evaluate(checkpoints, outputs, tmp_path, phase):
     base = (f"paths.outputs={outputs}",)
     run(checkpoints[phase], *base, f"out={tmp_path / 'a'}")
@@ -83,8 +83,11 @@ def test_memory_shows_in_the_boxes_and_its_age_can_be_set(checkpoints, outputs, 
     forgetful, everything = results(tmp_path), results(whole)
     changed = [forgetful[token] != boxes for token, boxes in everything.items()]
     assert sum(changed) == 2 * (FRAMES - 1)  # all but the first frame of each scene
+    for folder, words in ((tmp_path, "memory of up to 0.3 s"), (whole, "memory of up to 6 s")):
+        assert words in json.loads((folder / "submission.json").read_text())["meta"]["description"]
 
 
+@pytest.mark.slow
 def test_pictures_of_the_first_scene(checkpoints, outputs, tmp_path, capsys):
     run(checkpoints["phase2"], f"paths.outputs={outputs}", f"out={tmp_path}", pictures=2)
     with Image.open(tmp_path / "scene.gif") as film, Image.open(tmp_path / "strip.png") as strip:
@@ -111,7 +114,7 @@ def test_an_interrupted_run_leaves_what_was_there(checkpoints, outputs, tmp_path
 
     monkeypatch.setattr(StreamingDetector, "run", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        run(checkpoints["phase1"], f"paths.outputs={outputs}", f"out={tmp_path}", pictures=1)
+        run(checkpoints["phase1"], f"paths.outputs={outputs}", f"out={tmp_path}")
     assert [path.name for path in tmp_path.iterdir()] == ["submission.json"]
     assert (tmp_path / "submission.json").read_text() == "older"
 

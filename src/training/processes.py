@@ -150,6 +150,8 @@ def launch(module: str, overrides: Sequence[str], devices: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         meeting = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(_free_port()), "WORLD_SIZE": str(devices)}
+        # Below errors torch's C++ would advise against looking for unused parameters, see `build_strategy`.
+        meeting["TORCH_CPP_LOG_LEVEL"] = os.environ.get("TORCH_CPP_LOG_LEVEL", "ERROR")
         for rank in range(devices):
             who = {"NODE_RANK": "0", "LOCAL_RANK": str(rank), "RANK": str(rank)}
             command = [sys.executable, "-m", module, *overrides]
@@ -169,7 +171,7 @@ def launch(module: str, overrides: Sequence[str], devices: int) -> None:
 def _wait_for_all(ranks: list[subprocess.Popen], stops: list[float]) -> int:
     """Wait until all have ended, not for ever once one has failed; the exit code that tells most."""
     deadline = None
-    while any(process.poll() is None for process in ranks):
+    while None in [process.poll() for process in ranks]:
         failed = [rank for rank, process in enumerate(ranks) if process.returncode]
         if failed and deadline is None:
             deadline = time.monotonic() + GRACE_S

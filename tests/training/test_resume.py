@@ -4,7 +4,10 @@ import hashlib
 import os
 import signal
 import socket
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -33,6 +36,8 @@ class Faulty(TemporalModule):
         if self.trainer.global_step == self.at_step:
             self.fault()
         self.seen.append(self.trainer.global_step)
+        if self.trainer.global_rank == 1:
+            self._mean("state/of one rank").update(1.0)
         return super().training_step(batch, batch_idx)
 
     def validation_step(self, batch, batch_idx):
@@ -209,8 +214,8 @@ def stopped_on_two(rank, port, folder):
             assert stopped_at is not None
             torch.distributed.barrier()
         found, module = train(folder / "stopped", ranks=2)
-        assert module.seen == []
-        assert found == expected
+        assert module.seen == [] and found == expected
+        assert rank == 1 or "state/of one rank" in found["log"]
         assert torch.equal(torch.tensor(module.detections.scores), torch.tensor(whole.detections.scores))
     (folder / f"done {rank}").touch()
 
@@ -230,3 +235,65 @@ def test_a_signal_to_one_rank_stops_all(tmp_path):
             if process.is_alive():
                 process.kill()
     assert (tmp_path / "done 0").exists() and (tmp_path / "done 1").exists()
+
+
+ROOT = Path(__file__).resolve().parents[2]
+PHASE_2 = (
+    "phase=phase2", "phase.init_from=null", "scale=debug", "phase.epochs=2", "data.world.num_train_scenes=2",
+    "data.world.num_val_scenes=1", "data.world.key_frames_per_scene=4", "trainer.num_pictures=0",
+)  # fmt: skip
+
+
+def command(outputs, world, *overrides):
+    arguments = [*PHASE_2, f"paths.outputs={outputs}", f"data.root={world}", *overrides]
+    return subprocess.Popen(
+        [sys.executable, "-m", "src.train", *arguments],
+        cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+
+
+def finish(process):
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors[-3000:]
+
+
+def end_after(process, outputs, rows, end):
+    """`end` the command once its log has `rows` rows; its exit code."""
+    deadline = time.monotonic() + 120
+    while sum(len(path.read_text().splitlines()) for path in outputs.glob("*/metrics.csv")) <= rows:
+        assert time.monotonic() < deadline and process.poll() is None, process.communicate()[1][-3000:]
+        time.sleep(0.01)
+    end(process.pid)
+    process.communicate(timeout=60)
+    return process.returncode
+
+
+def outcome(outputs):
+    (folder,) = outputs.glob("horizon3d-*")
+    names = ("metrics.csv", "metrics.json", "submission.json")
+    weights = digest(read_checkpoint(folder / "checkpoints" / "last.ckpt")["state_dict"])
+    return {name: (folder / name).read_text() if (folder / name).exists() else None for name in names}, weights
+
+
+@pytest.mark.slow
+def test_commands_go_on_as_if_nothing_had_happened(tmp_path):
+    """The full model on clips: stopped inside either epoch, by Ctrl-C with loader processes, killed, and not at all."""
+    world = tmp_path / "world"
+    finish(command(tmp_path / "whole", world))
+    expected = outcome(tmp_path / "whole")
+    stopped = tmp_path / "stopped"
+    assert end_after(command(stopped, world), stopped, 2, lambda pid: os.kill(pid, signal.SIGTERM)) == 6
+    checkpoint = read_checkpoint(next(stopped.glob("horizon3d-*")) / "checkpoints" / "last.ckpt")
+    assert checkpoint["global_step"] in (2, 3) and checkpoint["horizon3d"]["ranks"][0]["memory"]["lanes"] == [0, 1]
+    by_key = command(stopped, world, "data.num_workers=1")
+    assert end_after(by_key, stopped, 7, lambda pid: os.killpg(pid, signal.SIGINT)) == 6
+    finish(command(stopped, world))
+    assert outcome(stopped) == expected
+
+    killed = tmp_path / "killed"
+    often = "trainer.checkpoint_every_steps=2"
+    assert end_after(command(killed, world, often), killed, 3, lambda pid: os.killpg(pid, signal.SIGKILL)) == -9
+    checkpoint = read_checkpoint(next(killed.glob("horizon3d-*")) / "checkpoints" / "last.ckpt")
+    assert checkpoint["epoch"] == 0 and checkpoint["global_step"] in (2, 4)
+    finish(command(killed, world, often))
+    assert outcome(killed) == expected

@@ -95,7 +95,7 @@ def work_as(rank, world_size, port, work):
     with process_group("cpu", world_size):
         trainer = L.Trainer(
             max_epochs=1, accelerator="cpu", devices=world_size, strategy=build_strategy("cpu", world_size),
-            callbacks=[], logger=False, enable_checkpointing=False, enable_progress_bar=False,
+            callbacks=[SharedBuffers()], logger=False, enable_checkpointing=False, enable_progress_bar=False,
             enable_model_summary=False, num_sanity_val_steps=0, use_distributed_sampler=False,
         )  # fmt: skip
         loaders = [DataLoader(batches, batch_size=None, num_workers=0) for batches in (train, validation)]

@@ -182,7 +182,7 @@ class BEVPath(nn.Module):
         if len(x.sites) == len(fused.sites):  # nothing but the current cells: keep their kernel maps
             return fused.with_features(fused.features + x.features)
         sites = Sites.from_linear(x.sites.linear(), (b, rows, cols))
-        spread = torch.zeros_like(x.features).index_copy(0, sites.rows_of(cell), fused.features.to(x.features.dtype))
+        spread = fused.features.new_zeros(x.features.shape).index_copy(0, sites.rows_of(cell), fused.features)
         return SparseBEV(sites, spread + x.features)
 
 

@@ -54,18 +54,28 @@ class MemoryFrame:
 
         Not usable: an absent lane, a frame that is not in the past or older than `max_age_s`, a pose that jumped.
         """
-        ego_from_past = rigid_inverse(batch.global_from_ego) @ self.global_from_ego
-        elapsed = batch.timestamps_s - self.timestamps_s
-        distance = ego_from_past[:, :3, 3].norm(dim=1)
-        usable = self.present & (elapsed > 0) & (elapsed <= max_age_s) & (distance <= MAX_EGO_SPEED_MPS * elapsed)
+        ego_from_past, elapsed, driven = self._way_to(batch)
+        usable = self.present & driven & (elapsed <= max_age_s)
         matrix = batch.aug_from_ego.double() @ ego_from_past
         # What is not usable must not carry NaN or huge numbers into arithmetic that is masked afterwards.
         matrix = torch.where(usable[:, None, None], matrix, torch.eye(4, dtype=matrix.dtype, device=matrix.device))
         return Motion(matrix.float(), torch.where(usable, elapsed, 0.0).float(), usable)
 
+    def jumped(self, batch: FrameBatch) -> Tensor:  # [B] bool
+        """Lanes whose pose jumped between this frame and the batch's, which is later."""
+        _, elapsed, driven = self._way_to(batch)
+        return self.present & (elapsed > 0) & ~driven
+
+    def _way_to(self, batch: FrameBatch) -> tuple[Tensor, Tensor, Tensor]:
+        """[B, 4, 4] and [B] s from here to the batch, float64, and whether a vehicle can drive it in that time [B]."""
+        ego_from_past = rigid_inverse(batch.global_from_ego) @ self.global_from_ego
+        elapsed = batch.timestamps_s - self.timestamps_s
+        distance = ego_from_past[:, :3, 3].norm(dim=1)
+        return ego_from_past, elapsed, (elapsed > 0) & (distance <= MAX_EGO_SPEED_MPS * elapsed)
+
     def select(
         self,
-        rows: Tensor,  # [B'] int64
+        rows: Tensor,  # [B'] int64, distinct where kept
         keep: Tensor,  # [B'] bool
     ) -> MemoryFrame:
         """The lanes at `rows`, those without `keep` forgotten."""
@@ -107,6 +117,16 @@ class Memory:
         """B, 0 for an empty memory."""
         return len(self.frames[0].present) if self.frames else 0
 
+    def until_jump(self, batch: FrameBatch) -> Memory:
+        """The memory less the lanes whose pose jumped since their last frame, with all that lies before the jump.
+
+        Only neighbouring frames tell: over several seconds the same jump could pass for a drive.
+        """
+        if not self.frames:
+            return self
+        steady = ~self.frames[0].jumped(batch)
+        return Memory(tuple(replace(frame, present=frame.present & steady) for frame in self.frames))
+
     def push(self, frame: MemoryFrame, num_cell_frames: int, num_gaussian_frames: int) -> Memory:
         """Put the current frame first and forget what no path looks at any more, so memory never grows."""
         frames = [frame, *self.frames][: max(num_cell_frames, num_gaussian_frames)]
@@ -123,7 +143,7 @@ class Memory:
 
     def select(
         self,
-        rows: Tensor,  # [B'] int64, row of each new lane in this memory
+        rows: Tensor,  # [B'] int64, row of each new lane in this memory, distinct where kept
         keep: Tensor,  # [B'] bool, False: the lane starts anew
     ) -> Memory:
         """Memory for a batch whose lanes come from these rows; frames that no lane has any more are dropped."""
