@@ -133,7 +133,7 @@ def fit(trainer: L.Trainer, module: DetectionModule, datamodule: DetectionDataMo
                 load_model_weights(module.model, read_checkpoint(resume_from), resume_from)
                 if trainer.max_epochs % trainer.check_val_every_n_epoch == 0:
                     trainer.loggers = []  # they have the scores of the last epoch already
-            if module.scored_step != trainer.global_step and not interruption.requested:
+            if module.scored_step != trainer.global_step:
                 trainer.validate(module, datamodule=datamodule, verbose=False)  # the last epoch was not to be validated
     except SystemExit as error:  # Lightning's way to end on a KeyboardInterrupt
         raise InterruptedRunError("training was stopped; the same command goes on from the last checkpoint") from error

@@ -48,7 +48,7 @@ def test_two_frames_are_overfitted(two_frames):
     optimizer = torch.optim.AdamW(module.model.parameters(), lr=2e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=STEPS)
     for _ in range(STEPS):
-        terms = module.model.loss(module.model(batch), batch)
+        terms = module.model.loss(module.run(batch), batch)
         optimizer.zero_grad()
         terms["total"].backward()
         torch.nn.utils.clip_grad_norm_(module.model.parameters(), 35.0)

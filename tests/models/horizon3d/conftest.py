@@ -236,3 +236,9 @@ def make_model(make_config, grid, backbone):
         return Horizon3D(make_config(**changes), grid, backbone, velocity_code_weight=0.2)
 
     return build
+
+
+@pytest.fixture
+def make_dptf():
+    """`dptf_config`, for tests of this folder, which cannot import this file by its name."""
+    return dptf_config

@@ -1,0 +1,123 @@
+"""DPTF: which path recalls, aggregates and remembers what."""
+
+import pytest
+import torch
+from cells import C, bev_of
+from moving import bare_frame, pose
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.horizon3d.bev_path import CellPrediction
+from src.models.horizon3d.dptf import DPTF, DPTFOutput
+from src.models.horizon3d.ocsf import OCSFOutput
+from src.models.horizon3d.splatting import GaussianSplat
+from src.structures.gaussians import GaussianSet
+
+GRID = BEVGrid(cells=(96, 128), cell_m=0.8, centre_m=(2.0, -1.0), z_range_m=(-3.0, 5.0))
+
+
+@pytest.fixture
+def make_parts(make_dptf):
+    """Path switches and values -> DPTF, and a function that remembers one cell and one Gaussian of a lane."""
+
+    def build(**changes):
+        torch.manual_seed(0)
+        dptf = DPTF(make_dptf(**changes), C, GRID)
+
+        def remember(memory, batch):
+            b = len(batch)
+            cells = torch.stack([torch.arange(b), torch.full((b,), 40), torch.full((b,), 60)], 1)
+            fused, _ = bev_of(cells, GRID, batch_size=b)
+            zeros = torch.zeros(b, 1)
+            gaussians = GaussianSet(
+                means=torch.zeros(b, 1, 2),
+                scales=torch.ones(b, 1, 2),
+                directions=torch.tensor([1.0, 0.0]).expand(b, 1, 2),
+                opacity_logits=zeros,
+                velocities=torch.zeros(b, 1, 2),
+                features=torch.zeros(b, 1, C),
+                sources=zeros.long(),
+                elapsed_s=zeros,
+                valid=torch.ones(b, 1, dtype=torch.bool),
+            )
+            ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, gaussians.valid, zeros.long()), fused)
+            predicted = CellPrediction(torch.ones(b), torch.zeros(b, 2)) if dptf.bev_path is not None else None
+            return dptf.remember(memory, batch, fused, DPTFOutput(None, None, predicted, fused), ocsf)
+
+        return dptf, remember
+
+    return build
+
+
+def counts(recollection, lane):
+    """(cells, Gaussians) that a lane recalls."""
+    cells = int((recollection.warped.indices[:, 0] == lane).sum()) if recollection.warped is not None else None
+    return cells, int(recollection.history.valid[lane].sum()) if recollection.history is not None else None
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected", "parts", "num_frames"),
+    [
+        ({}, [(0, 0), (1, 1), (2, 2), (3, 2), (3, 2)], (True, True), 3),
+        ({"gaussian_path": False}, [(0, None), (1, None), (2, None), (3, None), (3, None)], (True, False), 3),
+        ({"bev_path": False}, [(None, 0), (None, 1), (None, 2), (None, 2), (None, 2)], (False, True), 2),
+    ],
+)
+def test_each_path_recalls_its_own_frames_and_a_path_that_is_off_costs_nothing(
+    make_parts, changes, expected, parts, num_frames
+):
+    dptf, remember = make_parts(**changes)
+    assert dptf.config.num_frames == num_frames
+    assert {name.split(".")[0] for name, _ in dptf.named_parameters()} == {
+        name for name, on in zip(("bev_path", "gaussian_path"), parts, strict=True) if on
+    }
+    memory = None
+    for step in range(5):
+        batch = bare_frame(0.5 * step, [pose(2.0 * step)])
+        found = dptf.recall(memory, batch)
+        assert tuple(value or 0 for value in counts(found, 0)) == tuple(value or 0 for value in expected[step])
+        if memory is not None:
+            assert tuple(value is not None for value in counts(found, 0)) == parts
+        memory = remember(memory, batch)
+        assert memory.frames[0].present.all()
+        assert (memory.frames[0].cells is not None, memory.frames[0].gaussians is not None) == parts
+    assert len(memory.frames) == num_frames
+
+
+def test_without_the_bev_path_the_head_reads_f_fuse(make_parts):
+    dptf, _ = make_parts(bev_path=False)
+    fused, _ = bev_of(torch.tensor([[0, 3, 3]]), GRID)
+    output = dptf.aggregate(fused, dptf.recall(None, bare_frame(0.0, [pose()])))
+    assert output.bev is fused and output.cells is None and output.warped is None and output.history is None
+
+
+def test_neither_path_looks_past_the_age_limit(make_parts):
+    dptf, remember = make_parts(max_age_s=0.55)
+    memory = None
+    for step in range(3):
+        memory = remember(memory, bare_frame(0.5 * step, [pose()]))
+    assert counts(dptf.recall(memory, bare_frame(1.5, [pose()])), 0) == (1, 1)
+    assert counts(dptf.recall(memory, bare_frame(1.6, [pose()])), 0) == (0, 0)
+
+
+def test_a_jump_of_the_pose_forgets_its_lane_for_good_and_no_other(make_parts):
+    """The localisation is 140 m off from the third frame on: over 1.5 s that would be a possible drive."""
+    dptf, remember = make_parts()
+    places, memory = [0.0, 2.0, 144.0, 146.0, 148.0], None
+    for step, place in enumerate(places):
+        batch = bare_frame(0.5 * step, [pose(place), pose(2.0 * step)])
+        found = dptf.recall(memory, batch)
+        if step == 2:
+            assert counts(found, 0) == (0, 0)
+        elif step > 2:
+            assert counts(found, 0) == (step - 2, step - 2)
+        assert step == 0 or counts(found, 1) == (min(step, 3), min(step, 2))
+        memory = remember(memory, batch)
+
+
+def test_impossible_settings_are_refused(make_dptf):
+    with pytest.raises(ConfigError, match="nothing to remember"):
+        make_dptf(bev_path=False, gaussian_path=False)
+    for age in (0.0, -1.0, float("nan")):
+        with pytest.raises(ConfigError, match="max_age_s"):
+            make_dptf(max_age_s=age)

@@ -1,0 +1,141 @@
+"""Losses of the temporal part by hand (specification 6.1, 8.1): cells of F_fuse against tight boxes."""
+
+import math
+
+import pytest
+import torch
+from cells import TINY, bev_of
+
+from src.models.horizon3d.bev_path import CellPrediction
+from src.models.horizon3d.loss import cell_losses, gaussian_velocity_loss
+from src.models.horizon3d.ocsf import OCSFOutput
+from src.models.horizon3d.splatting import GaussianSplat
+from src.structures.boxes import Boxes3D
+from src.structures.gaussians import GaussianSet
+
+NAMES = ["cell_focal", "cell_dice", "cell_lovasz", "cell_velocity"]
+NAN = float("nan")
+
+
+def boxes_of(*rows):
+    """Boxes from rows x, y, l, w, vx, vy on the grid of 5 x 6 cells of 1 m around the origin."""
+    t = torch.tensor(rows).reshape(-1, 6)
+    ones, labels = torch.ones(len(t), 1), torch.zeros(len(t), dtype=torch.int64)
+    return Boxes3D(
+        torch.cat([t[:, :2], ones], 1), torch.cat([t[:, 2:4], ones], 1), t[:, 0] * 0, t[:, 4:], labels, labels - 1
+    )
+
+
+@pytest.fixture
+def settings(make_config):
+    """Loss weights by name, all 1 but where given."""
+
+    def build(**changes):
+        ones = {f"{name}_weight": 1.0 for name in [*NAMES, "gaussian_velocity", "dptf"]}
+        return make_config(**(ones | changes)).loss
+
+    return build
+
+
+@pytest.fixture
+def scene():
+    """Two frames. The first has a box over cells (2, 2) and (2, 3) and one of unknown velocity over (0, 0).
+
+    Its map lacks (2, 3), so one of its three cells lies in the moving box and one in the other; the second has no box.
+    """
+    cells = torch.tensor([[0, 0, 0], [0, 2, 2], [0, 4, 4], [1, 1, 1]])
+    fused, _ = bev_of(cells, TINY, batch_size=2)
+    boxes = [boxes_of((0.0, 0.0, 2.0, 1.0, 7.0, -2.0), (-2.5, -2.0, 1.0, 1.0, NAN, NAN)), boxes_of()]
+    scores = torch.tensor([0.8, 0.3, 0.6, 0.1])
+    prediction = CellPrediction(torch.logit(scores), torch.tensor([[9.0, 9], [4, 1], [9, 9], [9, 9]]))
+    return prediction, fused, boxes
+
+
+def test_each_term_by_hand(settings, scene):
+    found = cell_losses(*scene, TINY, settings())
+    assert list(found) == NAMES
+    # Positives 0.8 and 0.3, negatives 0.6 and 0.1; divided by the two positives.
+    focal = -0.25 * (0.2**2 * math.log(0.8) + 0.7**2 * math.log(0.3))
+    focal -= 0.75 * (0.6**2 * math.log(0.4) + 0.1**2 * math.log(0.9))
+    # The cell that the map lacks counts nowhere.
+    first, second = 1 - (2 * 1.1 + 1) / (1.7 + 2 + 1), 1 - 1 / (0.1 + 0 + 1)
+    # Errors 0.7, 0.6, 0.2 in order; the Jaccard losses after 1, 2 and 3 of them are 1/2, 2/3 and 1.
+    lovasz = 0.7 * 0.5 + 0.6 * (2 / 3 - 1 / 2) + 0.2 * (1 - 2 / 3)
+    expected = [focal / 2, (first + second) / 2, lovasz / 2, (abs(4 - 7) + abs(1 + 2)) / 2]
+    assert [float(found[name]) for name in NAMES] == pytest.approx(expected, rel=1e-5)
+
+
+def test_inner_and_outer_weights_multiply_and_null_switches_off(settings, scene):
+    plain = cell_losses(*scene, TINY, settings())
+    weights = dict(zip(NAMES, (2.0, 3.0, 5.0, 7.0), strict=True))
+    changed = cell_losses(
+        *scene, TINY, settings(dptf_weight=0.5, **{f"{name}_weight": value for name, value in weights.items()})
+    )
+    for name, weight in weights.items():
+        torch.testing.assert_close(changed[name], 0.5 * weight * plain[name])
+        assert set(cell_losses(*scene, TINY, settings(**{f"{name}_weight": None}))) == set(NAMES) - {name}
+
+
+def test_velocity_is_supervised_only_in_boxes_of_known_velocity(settings, scene):
+    prediction, fused, boxes = scene
+    prediction.velocities.requires_grad_()
+    cell_losses(prediction, fused, boxes, TINY, settings())["cell_velocity"].backward()
+    assert prediction.velocities.grad.tolist() == [[0, 0], [-0.5, 0.5], [0, 0], [0, 0]]
+    unknown = [boxes_of((0.0, 0.0, 2.0, 1.0, NAN, NAN)), boxes_of()]
+    assert not cell_losses(prediction, fused, unknown, TINY, settings())["cell_velocity"].any()
+
+
+def test_boxes_are_tight(settings, scene):
+    """A cell next to the box is background, however large the margin of the splatted mask."""
+    prediction, fused, _ = scene
+    near = [boxes_of((0.0, 1.0, 2.0, 1.0, 7.0, -2.0)), boxes_of()]  # one row above cell (2, 2)
+    found = cell_losses(prediction, fused, near, TINY, settings())
+    assert float(found["cell_velocity"]) == 0.0 and float(found["cell_lovasz"]) == 0.0
+
+
+@pytest.mark.parametrize("empty", ["boxes", "cells", "both"])
+def test_nothing_to_supervise_is_finite_with_finite_gradients(settings, scene, empty):
+    prediction, fused, boxes = scene
+    if empty != "boxes":
+        fused, _ = bev_of(torch.zeros(0, 3, dtype=torch.int64), TINY, batch_size=2)
+        prediction = CellPrediction(torch.zeros(0), torch.zeros(0, 2))
+    if empty != "cells":
+        boxes = [boxes_of(), boxes_of()]
+    prediction.occupancy_logits.requires_grad_()
+    prediction.velocities.requires_grad_()
+    found = cell_losses(prediction, fused, boxes, TINY, settings())
+    assert list(found) == NAMES and all(value.isfinite() for value in found.values())
+    sum(found.values()).backward()
+    assert prediction.occupancy_logits.grad.isfinite().all() and not prediction.velocities.grad.any()
+    assert float(found["cell_velocity"]) == 0.0 and float(found["cell_lovasz"]) == 0.0
+
+
+def test_gaussian_velocity_by_hand(settings):
+    """Smooth L1 at the peak cells: in the box, in its margin, beside it, in a box of unknown velocity, nowhere."""
+    velocities = torch.tensor([[7.5, -2.0], [7.0, 1.0], [9.0, 9.0], [9.0, 9.0], [9.0, 9.0]])[None].requires_grad_()
+    zeros = torch.zeros(1, 5)
+    gaussians = GaussianSet(
+        means=torch.zeros(1, 5, 2),
+        scales=torch.ones(1, 5, 2),
+        directions=torch.ones(1, 5, 2),
+        opacity_logits=zeros,
+        velocities=velocities,
+        features=torch.zeros(1, 5, 1),
+        sources=zeros.long(),
+        elapsed_s=zeros,
+        valid=torch.ones(1, 5, dtype=torch.bool),
+    )
+    peaks = torch.tensor([[2 * 6 + 2, 1 * 6 + 2, 4 * 6 + 3, 0, -1]])
+    ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, peaks >= 0, peaks), None)
+    boxes = [boxes_of((0.0, 0.0, 2.0, 1.0, 7.0, -2.0), (-2.5, -2.0, 1.0, 1.0, NAN, NAN))]
+    # Margin 2 m in total: rows 1..3 around the first box, rows and columns 0..1 around the second.
+    terms = gaussian_velocity_loss(ocsf, boxes, TINY, 2.0, settings(dptf_weight=3.0, gaussian_velocity_weight=2.0))
+    expected = 3.0 * 2.0 * (0.5 * 0.5**2 + (3.0 - 0.5)) / 4
+    assert {name: float(value.detach()) for name, value in terms.items()} == {
+        "gaussian_velocity": pytest.approx(expected)
+    }
+    terms["gaussian_velocity"].backward()
+    assert velocities.grad[0, 2:].abs().sum() == 0 and velocities.grad[0, :2].abs().sum() > 0
+    tight = gaussian_velocity_loss(ocsf, boxes, TINY, 0.0, settings())
+    assert float(tight["gaussian_velocity"].detach()) == pytest.approx(0.5 * 0.5**2 / 2)
+    assert gaussian_velocity_loss(ocsf, boxes, TINY, 2.0, settings(gaussian_velocity_weight=None)) == {}
