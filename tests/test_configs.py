@@ -27,6 +27,46 @@ def test_every_scale_composes(scale, radar_only):
     assert config.grid.cells == [384, 384] and config.grid.cell_m == 0.8
 
 
+@pytest.mark.parametrize("scale", SCALES)
+def test_phase_2_composes_at_every_scale(scale):
+    """With every part of the memory on; only counts shrink, and phase 1 drops the part altogether."""
+    config, tree = compose_config([f"scale={scale}", "data.root=x", "phase=phase2"])
+    phase, dptf = config.phase, config.model.dptf
+    assert (phase.name, phase.temporal, phase.init_from, phase.train_missing) == ("phase2", True, "phase1", True)
+    assert dptf.bev_path.velocity_compensation and dptf.gaussian_path.velocity_compensation
+    assert dptf.gaussian_path.sampling.value == "farthest_point" and dptf.max_age_s == 6.0
+    assert config.model.channels % dptf.gaussian_path.self_attention.num_heads == 0
+    assert config.data.groups_per_scene == 2
+    _, single = compose_config([f"scale={scale}", "data.root=x", "phase=phase1"])
+    assert single["model"]["dptf"] is None and tree["model"]["dptf"] is not None
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize(
+    ("overrides", "off"),
+    [
+        (["model.dptf.gaussian_path=null"], {"gaussian_path"}),  # Table 5
+        (["model.dptf.bev_path=null"], {"bev_path"}),
+        (["model.dptf.bev_path.velocity_compensation=false"], set()),  # Table 6
+        (["model.dptf.gaussian_path.velocity_compensation=false", "model.dptf.bev_path=null"], {"bev_path"}),
+        (["model.dptf.gaussian_path.sampling=top_opacity"], set()),  # Table 7
+        (["model.dptf.gaussian_path.sampling=random", "model.dptf.bev_path=null"], {"bev_path"}),
+        (["model.dptf.gaussian_path.self_attention=null"], {"self_attention"}),  # Table 13
+        (["model.kggi.initialization=random"], set()),  # Table 2
+        (["model.kggi=null", "model.ocsf=null", "model.dptf.gaussian_path=null"], {"gaussian_path"}),
+        (["model.dptf.max_age_s=0.55"], set()),
+    ],
+    ids=lambda value: ",".join(value) if isinstance(value, list) else "",
+)
+def test_memory_is_switched_by_configuration_values(scale, overrides, off):
+    config, _ = compose_config([f"scale={scale}", "data.root=x", "phase=phase2", *overrides])
+    dptf = config.model.dptf
+    parts = {"bev_path": dptf.bev_path, "gaussian_path": dptf.gaussian_path}
+    parts["self_attention"] = dptf.gaussian_path and dptf.gaussian_path.self_attention
+    off = off | ({"self_attention"} if "gaussian_path" in off else set())
+    assert {name for name, part in parts.items() if part is None} == off
+
+
 @pytest.mark.parametrize("group", ["backbone", "data", "trainer", "logger"])
 def test_every_choice_composes(group):
     for path in (CONF / group).glob("*.yaml"):
@@ -50,7 +90,7 @@ def test_paper_values():
     assert vovnet.backbone.image_size_px == [640, 960] and vovnet.backbone.lr_multiplier == 0.1
 
 
-# Specification 16: the keys that phase 1 has, and their values at full size.
+# Specification 16: keys and their values at full size.
 FULL_SIZE = {
     "grid": {"cells": [384, 384], "cell_m": 0.8, "centre_m": [0.0, 0.0], "z_range_m": [-3.0, 5.0]},
     "backbone": {
@@ -77,15 +117,17 @@ FULL_SIZE = {
         "kggi_weight": 1.0, "ocsf_weight": 5.0, "heatmap_weight": 1.0, "box_weight": 0.25, "keypoint_weight": 1.0,
         "depth_weight": 1.0, "radar_objectness_weight": 1.0, "occupancy_focal_weight": 1.0,
         "occupancy_dice_weight": 1.0, "gaussian_velocity_weight": 0.25, "gaussian_velocity_in_phase1": False,
+        "dptf_weight": 1.0, "cell_focal_weight": 1.0, "cell_dice_weight": 1.0, "cell_lovasz_weight": 1.0,
+        "cell_velocity_weight": 0.25,
     },
-    "phase": {"epochs": 24, "velocity_code_weight": 0.2},
+    "phase": {"epochs": 24, "velocity_code_weight": 0.2, "init_from": None, "train_missing": True},
     "optim": {
         "lr": 1e-4, "weight_decay": 0.01, "clip_norm": 35.0, "peak_lr_ratio": 10.0, "final_lr_ratio": 1e-4,
         "rise_fraction": 0.4, "betas": [0.95, 0.99], "cycled_beta1": [0.95, 0.85], "ema_decay": None,
     },
     "data": {
         "train_split": "train", "split": "val", "batch_size": 8, "num_sweeps": 10, "min_distance_m": 1.0,
-        "propagate_points": False, "on_bad_file": "error", "test_resize_offset": 0.0,
+        "propagate_points": False, "on_bad_file": "error", "test_resize_offset": 0.0, "groups_per_scene": 2,
     },
     "data.augmentation.image": {"resize": [-0.06, 0.11], "rotation_deg": 5.4, "flip_probability": 0.5},
     "data.augmentation.bev": {"scale": [0.95, 1.05], "rotation_rad": 0.3925, "flip_probability": 0.5},
@@ -97,9 +139,32 @@ FULL_SIZE = {
 }  # fmt: skip
 
 
-def test_full_size_values_are_those_of_the_specification():
-    _, tree = compose_config(["scale=paper", "data.root=x"])
-    for group, values in FULL_SIZE.items():
+# The same for what phase 2 adds or changes.
+FULL_SIZE_PHASE_2 = {
+    "phase": {
+        "epochs": 24, "velocity_code_weight": 1.0, "init_from": "phase1", "train_missing": True, "temporal": True,
+    },
+    "model.dptf": {"max_age_s": 6.0},
+    "model.dptf.bev_path": {
+        "num_frames": 8, "memory_threshold": 0.1, "max_cells_per_frame": 4096, "velocity_compensation": True,
+        "spatial_dilation": False,
+    },
+    "model.dptf.gaussian_path": {
+        "num_frames": 4, "gaussians_per_frame": 256, "sampling": "farthest_point", "velocity_compensation": True,
+        "self_attention": {"num_heads": 8},
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("phase", ["phase1", "phase2"])
+def test_full_size_values_are_those_of_the_specification(phase):
+    config, tree = compose_config(["scale=paper", "data.root=x", f"phase={phase}"])
+    wanted = FULL_SIZE if phase == "phase1" else FULL_SIZE | FULL_SIZE_PHASE_2
+    if phase == "phase2":
+        path = config.model.dptf.gaussian_path
+        assert path.num_history_gaussians == 1024  # K_hist; 2560 Gaussians in all
+        assert path.num_history_gaussians + sum(config.model.kggi.counts.values()) == 2560
+    for group, values in wanted.items():
         node = tree
         for name in group.split(".") if group else []:
             node = node[name]
@@ -147,6 +212,15 @@ def test_full_size_values_are_those_of_the_specification():
         (["checkpoint="], "checkpoint is empty"),
         (["data.root="], "data.root is empty"),
         (["data.world.returns_density=1e9"], "returns_density"),
+        (["phase=phase2", "model.dptf.bev_path=null", "model.dptf.gaussian_path=null"], "model.dptf=null"),
+        (["phase=phase2", "model.kggi=null", "model.ocsf=null"], "model.dptf.gaussian_path=null"),
+        (["phase=phase2", "model.dptf.max_age_s=-1"], "max_age_s=-1.*positive"),
+        (["phase=phase2", "model.dptf.gaussian_path.sampling=best"], "sampling.*farthest_point"),
+        (["phase=phase2", "model.dptf.gaussian_path.num_frames=0"], "num_frames=0.*gaussian_path=null"),
+        (["phase=phase2", "model.dptf.gaussian_path.self_attention.num_heads=0"], "num_heads=0.*self_attention=null"),
+        (["phase=phase2", "model.dptf.gaussian_path.selfattention=null"], "did you mean .*self_attention"),
+        (["data.groups_per_scene=0"], "groups_per_scene"),
+        (["phase.init_from="], "phase.init_from is empty"),
     ],
 )
 def test_mistakes_are_named(overrides, message):
@@ -178,6 +252,50 @@ def test_run_identity_ignores_what_cannot_change_the_result():
         assert identity(override) != base, override
 
 
+def test_run_identity_of_phase_2():
+    """Every knob of the memory makes another run; so do the weights it starts from, by what they are."""
+
+    def identity(*overrides, source="horizon3d-phase1-debug-00000000"):
+        return run_identity(compose_config(["scale=debug", "phase=phase2", *overrides])[1], source)
+
+    base = identity()
+    assert base.startswith("horizon3d-phase2-debug-")
+    assert identity("phase.train_missing=false") == base == identity("phase.init_from=phase1", "resume=restart")
+    assert identity("phase.init_from=some/where.ckpt") == base  # the digest of the weights counts, not the file's name
+    assert identity(source="horizon3d-phase1-debug-11111111") != base
+    for override in (
+        "model.dptf.max_age_s=0.55",
+        "model.dptf.bev_path=null",
+        "model.dptf.gaussian_path.sampling=random",
+        "model.dptf.gaussian_path.self_attention=null",
+        "data.groups_per_scene=1",
+        "phase.epochs=2",
+    ):
+        assert identity(override) != base, override
+
+
+def test_run_identity_of_phase_1_ignores_the_memory():
+    def identity(*overrides):
+        return run_identity(compose_config(["scale=debug", *overrides])[1])
+
+    for override in ("model.dptf.max_age_s=0.55", "model.dptf=null", "data.groups_per_scene=1"):
+        assert identity(override) == identity(), override
+
+
+def test_a_stored_phase_2_comes_back_with_its_memory():
+    """The command's own default phase drops the memory; the checkpoint's phase counts."""
+    _, tree = compose_config(["scale=debug", "phase=phase2", "model.dptf.gaussian_path.gaussians_per_frame=3"])
+    config = restore_config(tree, ["model.dptf.max_age_s=0.55", "data.root=/elsewhere"])
+    assert config.phase.temporal and config.model.dptf.max_age_s == 0.55 and config.data.root == "/elsewhere"
+    assert config.model.dptf.gaussian_path.gaussians_per_frame == 3 and config.model.dptf.bev_path.num_frames == 2
+    assert restore_config(tree, []).model.dptf.max_age_s == 6.0
+    both = restore_config(tree, ["logger.wandb.project=mine", "logger=wandb"])  # the part first, however it is typed
+    assert both.logger.wandb.project == "mine"
+    _, single = compose_config(["scale=debug"])
+    with pytest.raises(ConfigError, match="model.dptf.max_age_s: the checkpoint has no model.dptf"):
+        restore_config(single, ["model.dptf.max_age_s=0.55"])
+
+
 def test_a_stored_configuration_comes_back_with_the_command_lines_changes():
     _, tree = compose_config(["scale=debug", "model.ocsf.margin_m=1.6", "seed=4"])
     config = restore_config(tree, ["data.split=train", "data.root=/elsewhere"])
@@ -187,7 +305,10 @@ def test_a_stored_configuration_comes_back_with_the_command_lines_changes():
     assert whole.data.world is None and whole.data.version == "v1.2-trainval"
 
 
-@pytest.mark.parametrize("change", [{"model": {"name": "other"}}, {"unknown": 1}, {"seed": math.nan}])
+@pytest.mark.parametrize(
+    "change",
+    [{"model": {"name": "other"}}, {"phase": {"name": "x"}}, {"phase": None}, {"unknown": 1}, {"seed": math.nan}],
+)
 def test_a_stored_configuration_of_other_code_is_refused(change):
     _, tree = compose_config(["scale=debug"])
     with pytest.raises(CheckpointError):
@@ -244,4 +365,5 @@ def test_exit_code_of_a_configuration_error():
         [sys.executable, "-m", "src.train", "phase=phase3"], cwd=root, capture_output=True, text=True
     )
     assert result.returncode == 3
-    assert "phase3" in result.stderr and "Traceback" not in result.stderr
+    assert "phase3" in result.stderr and "phase1" in result.stderr and "phase2" in result.stderr
+    assert "Traceback" not in result.stderr

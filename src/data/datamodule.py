@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
@@ -275,7 +276,7 @@ class DetectionDataModule(L.LightningDataModule):
             pin_memory=torch.cuda.is_available(),
             persistent_workers=workers > 0,
             prefetch_factor=4 if workers else None,
-            worker_init_fn=_one_thread,
+            worker_init_fn=_as_helper,
         )
 
     def transfer_batch_to_device(self, batch: FrameBatch, device: torch.device, dataloader_idx: int) -> FrameBatch:
@@ -310,6 +311,11 @@ def _evenly_spread(samples: np.ndarray, count: int) -> np.ndarray:
     return samples[np.unique(picks)]
 
 
-def _one_thread(worker: int) -> None:
-    """Loader processes share the cores with the training process."""
+def _as_helper(worker: int) -> None:
+    """Loader processes share the cores with the training process, and leave signals of the whole group to it.
+
+    It finishes its step and needs their batches; they end with it.
+    """
     torch.set_num_threads(1)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)

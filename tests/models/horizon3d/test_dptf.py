@@ -2,18 +2,15 @@
 
 import pytest
 import torch
-from cells import C, bev_of
+from cells import GRID, C, bev_of
 from moving import bare_frame, pose
 
 from src.errors import ConfigError
-from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.bev_path import CellPrediction
 from src.models.horizon3d.dptf import DPTF, DPTFOutput
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.horizon3d.splatting import GaussianSplat
 from src.structures.gaussians import GaussianSet
-
-GRID = BEVGrid(cells=(96, 128), cell_m=0.8, centre_m=(2.0, -1.0), z_range_m=(-3.0, 5.0))
 
 
 @pytest.fixture
@@ -26,11 +23,11 @@ def make_parts(make_dptf):
 
         def remember(memory, batch):
             b = len(batch)
-            cells = torch.stack([torch.arange(b), torch.full((b,), 40), torch.full((b,), 60)], 1)
+            cells = torch.stack([torch.arange(b), torch.full((b,), 40), torch.full((b,), 120)], 1)  # 47 m ahead
             fused, _ = bev_of(cells, GRID, batch_size=b)
             zeros = torch.zeros(b, 1)
             gaussians = GaussianSet(
-                means=torch.zeros(b, 1, 2),
+                means=torch.tensor([47.0, 0.0]).expand(b, 1, 2),
                 scales=torch.ones(b, 1, 2),
                 directions=torch.tensor([1.0, 0.0]).expand(b, 1, 2),
                 opacity_logits=zeros,
@@ -101,9 +98,9 @@ def test_neither_path_looks_past_the_age_limit(make_parts):
 
 
 def test_a_jump_of_the_pose_forgets_its_lane_for_good_and_no_other(make_parts):
-    """The localisation is 140 m off from the third frame on: over 1.5 s that would be a possible drive."""
+    """The localisation is 55 m off from the third frame on: since the first frame that would be a possible drive."""
     dptf, remember = make_parts()
-    places, memory = [0.0, 2.0, 144.0, 146.0, 148.0], None
+    places, memory = [0.0, 2.0, 59.0, 61.0, 63.0], None
     for step, place in enumerate(places):
         batch = bare_frame(0.5 * step, [pose(place), pose(2.0 * step)])
         found = dptf.recall(memory, batch)

@@ -4,7 +4,6 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from conftest import dptf_config
 from moving import pose
 
 from src.errors import ConfigError
@@ -45,11 +44,11 @@ def lively(model):
 
 
 @pytest.fixture
-def with_past(make_model, make_batch):
+def with_past(make_model, make_batch, make_dptf):
     """A lively model in eval mode, the memory of one frame of two lanes, and the next frames."""
 
     def build(**changes):
-        model = lively(make_model(dptf=dptf_config(**changes))).eval()
+        model = lively(make_model(dptf=make_dptf(**changes))).eval()
         with torch.no_grad():
             _, memory = model(at(make_batch(), 10.0))
         return model, memory, at(make_batch(seed=1), 10.5, 6.0)
@@ -150,9 +149,9 @@ def two_steps(model, first, second):
 
 
 @pytest.mark.parametrize("name", TOGGLES)
-def test_every_row_of_the_tables_trains(make_model, make_batch, name):
+def test_every_row_of_the_tables_trains(make_model, make_batch, make_dptf, name):
     changes = TOGGLES[name]
-    model = make_model(dptf=dptf_config(**changes))
+    model = make_model(dptf=make_dptf(**changes))
     output, terms, memory = two_steps(model, at(make_batch(), 10.0), at(make_batch(seed=1), 10.5, 5.0))
     bev_terms = CELL_TERMS if changes.get("bev_path", True) else set()
     assert set(terms) == PHASE_1_TERMS | bev_terms | {"gaussian_velocity", "total"}
@@ -168,23 +167,23 @@ def test_every_row_of_the_tables_trains(make_model, make_batch, name):
     assert len(model.eval().decode(output)) == 2
 
 
-def test_radar_only_with_the_bev_path(make_model, make_batch):
-    model = make_model(radar_only=True, dptf=dptf_config(gaussian_path=False))
+def test_radar_only_with_the_bev_path(make_model, make_batch, make_dptf):
+    model = make_model(radar_only=True, dptf=make_dptf(gaussian_path=False))
     batches = [at(make_batch(seed=i, images=False), 10.0 + 0.5 * i, 5.0 * i) for i in range(2)]
     output, terms, memory = two_steps(model, *batches)
     assert set(terms) == {"heatmap", "box", "total"} | CELL_TERMS
     assert output.ocsf is None and len(memory.frames) == 2 and memory.frames[0].gaussians is None
 
 
-def test_what_cannot_go_together_is_refused(make_config, make_model):
+def test_what_cannot_go_together_is_refused(make_config, make_model, make_dptf):
     with pytest.raises(ConfigError, match="bev_path=null and model.dptf.gaussian_path=null.*model.dptf=null"):
-        dptf_config(bev_path=False, gaussian_path=False)
+        make_dptf(bev_path=False, gaussian_path=False)
     with pytest.raises(ConfigError, match="model.ocsf=null makes no Gaussians.*gaussian_path=null"):
-        make_config(radar_only=True, dptf=dptf_config())
+        make_config(radar_only=True, dptf=make_dptf())
     with pytest.raises(ConfigError, match="num_heads=3.*model.channels=16"):
-        make_model(dptf=dptf_config(self_attention=SelfAttentionConfig(num_heads=3)))
+        make_model(dptf=make_dptf(self_attention=SelfAttentionConfig(num_heads=3)))
     with pytest.raises(ConfigError, match="max_age_s=0.*positive"):
-        dptf_config(max_age_s=0.0)
+        make_dptf(max_age_s=0.0)
 
 
 def test_a_memory_of_other_lanes_is_refused(with_past, make_batch):
