@@ -240,6 +240,7 @@ def test_every_weight_of_phase_1_arrives_and_what_is_new_keeps_its_own(phase_1, 
     new = [key for key in after if f"model.{key}" not in given]
     assert new and all(MAY_BE_NEW.match(key) for key in new) and f"new: {len(new)} tensors in dptf" in caplog.text
     assert len(after) - len(new) == len(given)
+    assert not [key for key in given if MAY_BE_NEW.match(key.removeprefix("model."))]  # none of phase 1 may be missing
 
 
 def test_step_0_without_memory_is_phase_1(phase_1):

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.models.heads.center_head import VELOCITY_UNIT_MPS
 from src.models.horizon3d.kggi import best_rows
 from src.models.horizon3d.memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
@@ -23,8 +24,6 @@ from src.structures.sparse_bev import SparseBEV, SparseMap
 OCCUPANCY_BIAS = -4.6
 """An untrained cell is occupied with probability 0.01, well below the memory threshold (specification 6.1)."""
 TIME_CHANNELS = 32
-VELOCITY_UNIT_MPS = 10.0
-"""The velocity head is linear in tens of m/s, so that one learning rate suits it and its neighbours."""
 NORM = {"eps": 1e-5, "momentum": 0.1}
 
 
