@@ -37,6 +37,8 @@ from src.errors import ConfigError, DataError, HorizonError
 from src.structures.batch import FrameBatch
 from src.structures.detections import EvaluationSet
 
+TERMINATION_GRACE_S = 10
+
 
 @dataclass(kw_only=True)
 class DataConfig:
@@ -312,10 +314,10 @@ def _evenly_spread(samples: np.ndarray, count: int) -> np.ndarray:
 
 
 def _as_helper(worker: int) -> None:
-    """Loader processes share the cores with the training process, and leave signals of the whole group to it.
+    """Loader processes share the cores with the training process, and outlive a signal to the whole group for a while.
 
-    It finishes its step and needs their batches; they end with it.
+    The training process finishes its step on such a signal and needs their batches; it ends them itself afterwards.
     """
     torch.set_num_threads(1)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda number, frame: signal.alarm(TERMINATION_GRACE_S))  # SIGALRM then ends it
