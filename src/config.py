@@ -370,7 +370,8 @@ def run_identity(tree: dict[str, Any], source: str | None = None) -> str:
     if source is not None:
         tree["phase"]["init_from"] = source
     if not tree["phase"]["temporal"]:
-        tree["data"].pop("groups_per_scene")
+        for key in ("groups_per_scene", "lane_sets"):
+            tree["data"].pop(key)
     for key in OUTSIDE_IDENTITY:
         *parents, leaf = key.split(".")
         node = tree

@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 MAY_BE_NEW = re.compile(r"dptf\.|ocsf\.encoder\.layers\.\d+\.temporal_attention\.")
 """Parameters that a later phase adds; every other one must come from the checkpoint."""
-NOT_OF_THE_SOURCE = ("phase", "model.dptf", "data.groups_per_scene", "resume")
+NOT_OF_THE_SOURCE = ("phase", "model.dptf", "data.groups_per_scene", "data.lane_sets", "resume")
 """Overrides that concern the later phase only."""
 
 

@@ -41,6 +41,7 @@ class Schedule:
 
     samples: Array  # [T, L] int64
     clips: Array | None  # [T, L] int64, first frame of the clip that the frame belongs to; None: frames without order
+    lane_sets: int = 1  # sets of L lanes that take turns: step t reads those of set t % lane_sets
 
 
 def scenes_of(index: DatasetIndex, samples: Array) -> list[Array]:
@@ -89,20 +90,25 @@ def frames_in_order(
     return Schedule(np.concatenate([samples, np.full(missing, -1)]).reshape(-1, num_lanes), None)
 
 
-def streamed_groups(scenes: list[Array], groups_per_scene: int, num_lanes: int, seed: int, epoch: int) -> Schedule:
+def streamed_groups(
+    scenes: list[Array], groups_per_scene: int, num_lanes: int, lane_sets: int, seed: int, epoch: int
+) -> Schedule:
     """Training: scenes cut into groups, the groups shuffled into one stream, the stream cut into equal lanes.
 
-    Lane l reads the l-th N // num_lanes frames of the stream of N, so every lane and every epoch has that number of
-    steps; a group cut by the end of a lane becomes two clips, and the fewer than num_lanes frames left are passed over.
+    There are num_lanes * lane_sets lanes. Lane l reads the l-th part of the stream of N frames, N // lanes long, so
+    every lane and every epoch has that number of frames; a group cut by the end of a lane becomes two clips, and the
+    fewer frames than lanes that are left are passed over. With several sets, neighbouring steps show other scenes.
     """
     groups = [group for scene in scenes for group in np.array_split(scene, min(groups_per_scene, len(scene)))]
     groups = [groups[at] for at in np.random.default_rng((seed, epoch)).permutation(len(groups))]
     stream = np.concatenate(groups)
     group_starts = np.repeat(np.cumsum([0, *map(len, groups[:-1])]), [len(group) for group in groups])
-    steps = len(stream) // num_lanes
-    position = np.arange(steps * num_lanes).reshape(num_lanes, steps)
+    turns = len(stream) // (num_lanes * lane_sets)
+    position = np.arange(turns * num_lanes * lane_sets).reshape(num_lanes * lane_sets, turns)
     begins = np.maximum(group_starts[position], position[:, :1])  # a lane's first frame starts a clip too
-    return Schedule(stream[position].T, stream[begins].T)
+    # [lanes of all sets, turns] -> [turns * sets, lanes of a set]
+    steps, clips = (stream[rows].T.reshape(turns * lane_sets, num_lanes) for rows in (position, begins))
+    return Schedule(steps, clips, lane_sets)
 
 
 def whole_scenes(scenes: list[Array], num_lanes: int, world_size: int) -> Schedule:
@@ -161,9 +167,10 @@ class ScheduleSampler(Sampler[list[FrameKey]]):
         epoch, done = self.position(self._steps)
         schedule = self.schedule(epoch)
         samples = self._mine(schedule.samples)
-        first_lane = self.rank * samples.shape[1]
+        num_lanes = schedule.samples.shape[1]
         clips = None if schedule.clips is None else self._mine(schedule.clips)
         for step in range(done, self._steps):
+            first_lane = step % schedule.lane_sets * num_lanes + self.rank * samples.shape[1]
             yield [
                 FrameKey(epoch, int(sample))
                 if clips is None

@@ -50,6 +50,7 @@ class DataConfig:
     split: str  # what validation and evaluation read
     batch_size: int  # total over all devices; the lanes when clips are streamed
     groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; spec section 6.4
+    lane_sets: int  # sets of lanes that take turns when clips are streamed for training; 1: all lanes at every step
     num_workers: int  # loader processes per device
     num_sweeps: int  # past sweeps of each radar
     min_distance_m: float  # nearer points are the truck itself
@@ -60,7 +61,14 @@ class DataConfig:
     world: WorldConfig | None  # the synthetic highway to write on first use; null = recorded data
 
     def __post_init__(self) -> None:
-        least_values = {"batch_size": 1, "groups_per_scene": 1, "num_workers": 0, "num_sweeps": 1, "min_distance_m": 0}
+        least_values = {
+            "batch_size": 1,
+            "groups_per_scene": 1,
+            "lane_sets": 1,
+            "num_workers": 0,
+            "num_sweeps": 1,
+            "min_distance_m": 0,
+        }
         for name, least in least_values.items():
             if not getattr(self, name) >= least:
                 raise ConfigError(f"data.{name}={getattr(self, name)}: must be at least {least}")
@@ -228,16 +236,20 @@ class DetectionDataModule(L.LightningDataModule):
         """
         config, seed, index = self.config, self.seed, self.index
         samples = split_samples(index, config.train_split)
-        if len(samples) < config.batch_size:
+        lanes = config.batch_size * (config.lane_sets if self.temporal else 1)
+        if len(samples) < lanes:
+            times = f" times data.lane_sets={config.lane_sets}" if self.temporal else ""
             raise DataError(
-                f"data.batch_size={config.batch_size}: the split {config.train_split!r} has only {len(samples)} frames"
+                f"data.batch_size={config.batch_size}{times}: the split {config.train_split!r} has only "
+                f"{len(samples)} frames"
             )
         if not index.annotated:
             raise DataError(f"{index.root / index.version}: has no annotations to train on")
         schedule: Callable[[int], Schedule]
         if self.temporal:
             scenes = scenes_of(index, samples)
-            schedule = partial(streamed_groups, scenes, config.groups_per_scene, config.batch_size, seed)
+            cut = (config.groups_per_scene, config.batch_size, config.lane_sets)
+            schedule = partial(streamed_groups, scenes, *cut, seed)
         else:
             schedule = partial(shuffled_frames, samples, config.batch_size, seed)
         return self._loader(ScheduleSampler(schedule, *self._rank(), self._position), config.augmentation)

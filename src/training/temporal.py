@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from src.models.detector import TemporalMemory
@@ -17,20 +18,24 @@ logger = logging.getLogger(__name__)
 class TemporalModule(DetectionModule):
     """Keeps the memory of its lanes between steps; the model itself stays without state.
 
-    A lane's memory ends where a clip starts, where the lane is missing from a batch, and between passes: each epoch of
-    training and each validation begins without memory. A checkpoint inside an epoch carries it.
+    A lane's memory ends where a clip starts, where the lane is missing from its set's next batch, and between passes:
+    each epoch of training and each validation begins without memory. A checkpoint inside an epoch carries it.
     """
 
-    memory: TemporalMemory | None = None  # detached, one row per entry of `lanes`
-    lanes: Tensor | None = None  # [B] int64, lanes of the last batch
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        # Sets of lanes take turns (`data.lane_sets`): the lanes [B] int64 of each set's last batch, and their memory.
+        self.memories: list[tuple[Tensor, TemporalMemory]] = []
 
     def run(self, batch: FrameBatch) -> Any:
         """The model's output for the next frames of the batch's lanes; they are remembered.
 
         Raises ValueError for a batch without lanes.
         """
-        output, self.memory = self.model(batch, self.recall(batch))
-        self.lanes = batch.lanes
+        output, memory = self.model(batch, self.recall(batch))
+        self.memories = [entry for entry in self.memories if not _common(batch.lanes, entry[0]).any()]
+        if memory is not None:
+            self.memories.append((batch.lanes, memory))
         return output
 
     def recall(self, batch: FrameBatch) -> TemporalMemory | None:
@@ -40,15 +45,16 @@ class TemporalModule(DetectionModule):
                 f"samples {batch.tokens} come without lanes, but a temporal model needs FrameBatch.lanes and "
                 "FrameBatch.starts; read them with a clip sampler"
             )
-        if self.memory is None:
-            return None
-        same = batch.lanes[:, None] == self.lanes  # [B of now, B of before]
-        keep = same.any(dim=1) & ~batch.starts
-        return self.memory.select(same.int().argmax(dim=1), keep) if keep.any() else None
+        for lanes, memory in self.memories:
+            same = _common(batch.lanes, lanes)  # [B of now, B of before]
+            if same.any():
+                keep = same.any(dim=1) & ~batch.starts
+                return memory.select(same.int().argmax(dim=1), keep) if keep.any() else None
+        return None
 
     def forget(self) -> None:
         """Drop the memory of all lanes."""
-        self.memory = self.lanes = None
+        self.memories.clear()
 
     def on_train_epoch_start(self) -> None:
         """Begin without memory; not called when a run goes on inside an epoch."""
@@ -70,27 +76,31 @@ class TemporalModule(DetectionModule):
         self.forget()
 
     def rank_state(self) -> dict[str, Any]:
-        """As the base, with `memory`: None or {lanes: list[int], frames: `TemporalMemory.state`}."""
-        memory = None
-        if self.memory is not None:
-            memory = {"lanes": self.lanes.tolist(), "frames": self.memory.to("cpu").state()}
-        return super().rank_state() | {"memory": memory}
+        """As the base, with `memories`: a list of {lanes: list[int], frames: `TemporalMemory.state`}."""
+        memories = [{"lanes": lanes.tolist(), "frames": memory.to("cpu").state()} for lanes, memory in self.memories]
+        return super().rank_state() | {"memories": memories}
 
     def restore_rank(self, state: dict[str, Any]) -> None:
         """As the base, with the memory of this rank's lanes."""
         super().restore_rank(state)
-        memory = state.get("memory")
-        if memory is not None:
-            self.memory = self.model.restore_memory(memory["frames"]).to(self.device)
-            self.lanes = Tensor(memory["lanes"]).long().to(self.device)
+        for entry in state.get("memories", []):
+            lanes = torch.tensor(entry["lanes"], device=self.device)
+            self.memories.append((lanes, self.model.restore_memory(entry["frames"]).to(self.device)))
 
     def adopt_ranks(self, states: list[dict[str, Any]]) -> None:
         """As the base; lanes are dealt out anew, so they begin without memory, and the log says so."""
         super().adopt_ranks(states)
-        if any(state.get("memory") is not None for state in states):
+        if any(state.get("memories") for state in states):
             logger.warning(
                 "the checkpoint inside an epoch is of %d processes, this run has %d: the lanes begin without memory, "
                 "so the rest of this epoch differs from the uninterrupted run",
                 len(states),
                 self.trainer.world_size,
             )
+
+
+def _common(
+    lanes: Tensor,  # [B] int64
+    others: Tensor,  # [B'] int64
+) -> Tensor:  # [B, B'] bool
+    return lanes[:, None] == others

@@ -32,7 +32,7 @@ def follows(row, before):
 @pytest.mark.parametrize(("lengths", "groups", "lanes"), CASES)
 @pytest.mark.parametrize("epoch", [0, 1])
 def test_training_lanes_hold_consecutive_frames_between_starts(lengths, groups, lanes, epoch):
-    schedule = streamed_groups(scenes(lengths), groups, lanes, 3, epoch)
+    schedule = streamed_groups(scenes(lengths), groups, lanes, 1, 3, epoch)
     total = sum(lengths)
     assert schedule.samples.shape == schedule.clips.shape == (total // lanes, lanes)  # the same in every epoch
     rows = schedule.samples.ravel().tolist()
@@ -50,14 +50,27 @@ def test_training_lanes_hold_consecutive_frames_between_starts(lengths, groups, 
 
 
 def test_a_scene_is_cut_into_groups_of_nearly_equal_length():
-    clips = streamed_groups(scenes([7]), 3, 1, 0, 0).clips[:, 0]
+    clips = streamed_groups(scenes([7]), 3, 1, 1, 0, 0).clips[:, 0]
     assert dict(zip(*np.unique(clips, return_counts=True), strict=True)) == {1000: 3, 1009: 2, 1015: 2}
 
 
 def test_a_group_cut_by_the_end_of_a_lane_becomes_two_clips():
-    schedule = streamed_groups(scenes([7]), 1, 3, 0, 0)
+    schedule = streamed_groups(scenes([7]), 1, 3, 1, 0, 0)
     assert schedule.samples.T.tolist() == [[1000, 1003], [1006, 1009], [1012, 1015]]
     assert schedule.clips.T.tolist() == [[1000] * 2, [1006] * 2, [1012] * 2]
+
+
+@pytest.mark.parametrize("world_size", [1, 2])
+def test_sets_of_lanes_take_turns(world_size):
+    def schedule(lane_sets):
+        return lambda epoch: streamed_groups(scenes([8, 8, 8]), 2, 2 * 3 // lane_sets, lane_sets, 0, epoch)
+
+    together = list(ScheduleSampler(schedule(1), 0, 1))  # six lanes at every step
+    ranks = [list(ScheduleSampler(schedule(3), rank, world_size)) for rank in range(world_size)]
+    turns = [sum(of_step, []) for of_step in zip(*ranks, strict=True)]
+    assert [len(batch) for batch in turns] == [2] * 12
+    # Three steps of two lanes are one step of six: same frames, same lanes, same clips.
+    assert [turns[at] + turns[at + 1] + turns[at + 2] for at in range(0, 12, 3)] == together
 
 
 def test_order_follows_seed_and_epoch():
@@ -65,7 +78,7 @@ def test_order_follows_seed_and_epoch():
         return {(seed, epoch): make(seed, epoch).samples.tobytes() for seed in (0, 1) for epoch in (0, 1)}
 
     for make in (
-        lambda seed, epoch: streamed_groups(scenes([4] * 9), 2, 3, seed, epoch),
+        lambda seed, epoch: streamed_groups(scenes([4] * 9), 2, 3, 1, seed, epoch),
         lambda seed, epoch: shuffled_frames(np.arange(20), 2, seed, epoch),
     ):
         assert len(set(orders(make).values())) == 4 and orders(make) == orders(make)
@@ -112,7 +125,7 @@ def test_rank_without_frames_reports_one_step_and_yields_none():
 def test_ranks_together_read_the_batches_of_one_process(world_size, temporal):
     def schedule(epoch):
         if temporal:
-            return streamed_groups(scenes([7, 9, 3, 12]), 2, 4, 5, epoch)
+            return streamed_groups(scenes([7, 9, 3, 12]), 2, 4, 1, 5, epoch)
         return shuffled_frames(np.arange(31), 4, 5, epoch)
 
     def batches(rank, world_size):
@@ -128,7 +141,9 @@ def test_ranks_together_read_the_batches_of_one_process(world_size, temporal):
 
 def test_iteration_goes_on_from_the_position_asked_for_when_it_begins():
     at = [(0, 0)]
-    sampler = ScheduleSampler(lambda epoch: streamed_groups(scenes([8, 8]), 2, 2, 0, epoch), 0, 1, lambda steps: at[0])
+    sampler = ScheduleSampler(
+        lambda epoch: streamed_groups(scenes([8, 8]), 2, 2, 1, 0, epoch), 0, 1, lambda steps: at[0]
+    )
     whole = {0: list(sampler)}
     started = iter(sampler)
     first = next(started)

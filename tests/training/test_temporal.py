@@ -21,8 +21,9 @@ def module():
     """After one batch of the lanes 5, 3 and 8, which remember 50, 30 and 80."""
     module = toy_module().eval()
     module.run(toy_batch([5, 3, 8], [True] * 3))
-    assert module.memory.values.shape == (3,)
-    module.memory.values[:] = torch.tensor([50.0, 30.0, 80.0])
+    ((_, memory),) = module.memories
+    assert memory.values.shape == (3,)
+    memory.values[:] = torch.tensor([50.0, 30.0, 80.0])
     return module
 
 
@@ -31,7 +32,8 @@ def test_the_first_batch_has_no_memory():
     batch = toy_batch([0, 1], [False, False])
     assert module.recall(batch) is None
     output = module.run(batch)
-    assert torch.equal(module.memory.values, output) and not module.memory.values.requires_grad
+    ((lanes, memory),) = module.memories
+    assert lanes.tolist() == [0, 1] and torch.equal(memory.values, output) and not memory.values.requires_grad
 
 
 def test_rows_follow_their_lanes(module):
@@ -47,6 +49,14 @@ def test_vanished_and_new_lanes(module):
     assert past(module, toy_batch([4, 8], [False] * 2)) == [0, 80]
     module.run(toy_batch([8], [False]))
     assert past(module, toy_batch([5, 3], [False] * 2)) is None  # missed a batch, so they begin anew
+
+
+def test_sets_of_lanes_take_turns(module):
+    module.run(toy_batch([1, 2], [True, True]))
+    assert len(module.memories) == 2 and past(module, toy_batch([3, 5, 8], [False] * 3)) == [30, 50, 80]
+    module.run(toy_batch([5, 3, 8], [False] * 3, number=1))
+    assert sorted(lanes.tolist() for lanes, _ in module.memories) == [[1, 2], [5, 3, 8]]
+    assert past(module, toy_batch([1, 2], [True, False]))[0] == 0
 
 
 def test_nothing_left_is_none(module):
@@ -69,14 +79,14 @@ def test_single_frames_have_no_memory():
     module = toy_module(DetectionModule).eval()
     batch = toy_batch([0, 1], [False, False])
     assert torch.equal(module.run(batch), module.run(batch))
-    assert "memory" not in module.rank_state()
+    assert "memories" not in module.rank_state()
 
 
 def test_memory_ends_between_training_and_validation(module):
     for begins in (module.on_train_epoch_start, module.on_validation_epoch_start):
-        module.memory, module.lanes = "something", torch.tensor([0])
+        module.memories.append((torch.tensor([0]), "something"))
         begins()
-        assert module.memory is None and module.lanes is None
+        assert not module.memories
 
 
 def test_state_is_restored_for_the_same_lanes(module, tmp_path):
@@ -105,7 +115,10 @@ def load(module, states, rank, world_size):
 
 def test_each_rank_takes_its_own_part():
     states = [
-        {"means": {"a": [1.0, 2.0]}, "memory": {"lanes": [rank], "frames": [{"values": torch.tensor([7.0 + rank])}]}}
+        {
+            "means": {"a": [1.0, 2.0]},
+            "memories": [{"lanes": [rank], "frames": [{"values": torch.tensor([7.0 + rank])}]}],
+        }
         for rank in range(2)
     ]
     module = load(toy_module(), states, rank=1, world_size=2)
@@ -115,15 +128,15 @@ def test_each_rank_takes_its_own_part():
 def test_another_number_of_ranks_keeps_the_means_and_drops_the_memory(caplog):
     memory = {"lanes": [0], "frames": [{"values": torch.zeros(1)}]}
     states = [
-        {"means": {"a": [1.0, 2.0], "b": [5.0, 1.0]}, "memory": memory},
-        {"means": {"a": [3.0, 6.0]}, "memory": None},
+        {"means": {"a": [1.0, 2.0], "b": [5.0, 1.0]}, "memories": [memory]},
+        {"means": {"a": [3.0, 6.0]}, "memories": []},
     ]
     with caplog.at_level(logging.WARNING):
         module = load(toy_module(), states, rank=0, world_size=1)
         silent = load(toy_module(), states, rank=2, world_size=3)
-    assert module.memory is None and "2 processes, this run has 1" in caplog.text
+    assert not module.memories and "2 processes, this run has 1" in caplog.text
     assert module.rank_state()["means"] == {"a": [4.0, 8.0], "b": [5.0, 1.0]}
-    assert silent.rank_state() == {"means": {}, "memory": None}
+    assert silent.rank_state() == {"means": {}, "memories": []}
 
 
 def test_a_detector_of_single_frames_has_no_memory_to_restore():
