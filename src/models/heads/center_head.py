@@ -37,9 +37,6 @@ from src.targets.supervision import join_boxes
 HEATMAP_BIAS = -2.19
 CODE_WIDTHS = (2, 1, 3, 2, 2)
 """Branches of the box code: centre, height, log sizes, (cos, sin), velocity."""
-VELOCITY_UNIT_MPS = 10.0
-"""Layers that regress velocities are linear in this unit: their targets are ten times those of their neighbours, which
-one learning rate would otherwise not reach in a short training. Losses and outputs stay in m/s."""
 ATTRIBUTE_WEIGHT = 0.2
 SAMPLED_CELLS = 1024
 
@@ -118,9 +115,6 @@ class CenterHead(nn.Module):
         widths = (*CODE_WIDTHS, len(ATTRIBUTES)) if self.learned else CODE_WIDTHS
         self.regressions = nn.ModuleList(Branches(channels, widths) for _ in HEAD_GROUPS)
         in_group_order = [CLASSES.index(name) for group in HEAD_GROUPS for name in group]
-        units = torch.ones(sum(widths))
-        units[CODE_SIZE - 2 : CODE_SIZE] = VELOCITY_UNIT_MPS
-        self.register_buffer("units", units, persistent=False)
         self.class_columns = [in_group_order.index(label) for label in range(len(CLASSES))]
 
     def forward(self, bev: SparseBEV) -> HeadOutput:
@@ -129,7 +123,7 @@ class CenterHead(nn.Module):
         logits = torch.cat([branches(bev.features) for branches in self.heatmaps], dim=1)[:, self.class_columns]
         codes = None
         if self.training and self.config.train_regression is TrainRegression.all:
-            codes = torch.stack([branches(bev.features) for branches in self.regressions], dim=1) * self.units
+            codes = torch.stack([branches(bev.features) for branches in self.regressions], dim=1)
         return HeadOutput(bev, logits, codes)
 
     def regress(
@@ -154,7 +148,7 @@ class CenterHead(nn.Module):
             chosen = torch.cat([features[rows[mine]], spread])
             if not torch.is_autocast_enabled(chosen.device.type):
                 chosen = chosen.to(branches.hidden.weight.dtype)
-            codes.append(branches(chosen)[: len(mine)] * self.units)
+            codes.append(branches(chosen)[: len(mine)])
             order.append(mine)
         return torch.cat(codes)[torch.cat(order).argsort()]
 

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.heads.center_head import VELOCITY_UNIT_MPS
 from src.models.horizon3d.kggi import best_rows
 from src.models.horizon3d.memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
@@ -24,6 +23,9 @@ from src.structures.sparse_bev import SparseBEV, SparseMap
 OCCUPANCY_BIAS = -4.6
 """An untrained cell is occupied with probability 0.01, well below the memory threshold (specification 6.1)."""
 TIME_CHANNELS = 32
+VELOCITY_UNIT_MPS = 10.0
+"""The velocity head is linear in this unit: its targets are ten times those of its neighbours, which one learning rate
+would otherwise not reach in a short training. Losses and outputs stay in m/s."""
 NORM = {"eps": 1e-5, "momentum": 0.1}
 
 

@@ -10,7 +10,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
-from src.models.heads.center_head import VELOCITY_UNIT_MPS
 from src.models.horizon3d.cross_attention import (
     ImageCrossAttention,
     RadarCrossAttention,
@@ -132,8 +131,6 @@ class Refinement(nn.Module):
         self.trunk = linear_relu_norm(channels, channels)
         self.output = nn.Linear(channels, 2 + len(RAW_ATTRIBUTES))
         self.output_scale = nn.Parameter(torch.ones(2 + len(RAW_ATTRIBUTES)))
-        with torch.no_grad():
-            self.output_scale[-2:] = VELOCITY_UNIT_MPS
         # Untrained, a Gaussian keeps the place and the attributes that KGGI gives it.
         nn.init.normal_(self.output.weight, std=REFINEMENT_STD)
         with torch.no_grad():

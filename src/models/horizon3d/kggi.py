@@ -20,8 +20,6 @@ from src.targets.depth import DepthTarget, check_depth_target, lid_centres
 
 INSIDE = 1.0 - 1e-5
 """Random means stay strictly inside the grid, in units of its half extent."""
-SOURCE_STD = 0.02
-"""The source is a hint beside the slot features, whose spread is about 0.05."""
 
 
 class Initialization(Enum):
@@ -123,7 +121,6 @@ class KGGI(nn.Module):
         counts = config.counts
         self.slots = nn.ModuleDict({source.name.lower(): GaussianSlots(n, channels) for source, n in counts.items()})
         self.source_embedding = nn.Embedding(len(Source), channels)
-        nn.init.normal_(self.source_embedding.weight, std=SOURCE_STD)
         if Source.RANDOM in counts:
             # In units of the half extent, so that one step of Adam is of the order of a metre.
             self.random_means = nn.Parameter(torch.empty(counts[Source.RANDOM], 2).uniform_(-1.0, 1.0))
