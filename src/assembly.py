@@ -14,6 +14,7 @@ from src.errors import ConfigError
 from src.metrics.submission import write_submission
 from src.models import build_model as build_model_of
 from src.models.detector import Detector
+from src.structures.detections import DetectionTable
 from src.training.detection import DetectionModule
 from src.training.temporal import TemporalModule
 
@@ -49,7 +50,7 @@ def build_datamodule(config: Config, root: Path) -> DetectionDataModule:
     return DetectionDataModule(
         config.data,
         root=root,
-        image_size_px=tuple(config.backbone.image_size_px) if config.model.uses_images else None,
+        image_size_px=config.image_size_px,
         seed=config.seed,
         cache=Path(config.paths.outputs) / "cache",
         temporal=config.phase.temporal,
@@ -63,19 +64,20 @@ def build_model(config: Config) -> Detector:
     )
 
 
-def save_submission(module: DetectionModule, path: Path) -> bool:
-    """Write the boxes of the module's last validation as a submission; False, with a warning, when there is none."""
-    table = module.detections
+def save_submission(path: Path, tokens: list[str], table: DetectionTable, config: Config) -> bool:
+    """Write boxes of these samples as a submission; False, with a warning, when there is none."""
     if not len(table):
         logger.warning("no box reached the score threshold, so there is no valid submission to write")
         return False
+    dptf = getattr(config.model, "dptf", None)  # the benchmark's rules are about how far back a detector looks
+    memory = "no memory" if dptf is None else f"memory of up to {dptf.max_age_s:g} s"
     meta = {
-        "use_camera": module.model.image_backbone is not None,
+        "use_camera": config.model.uses_images,
         "use_radar": True,
-        "method_name": module.config["model"]["name"],
-        "description": ", ".join(f"{key} {module.config[key]}" for key in ("scale", "seed")),
+        "method_name": config.model.name,
+        "description": f"scale {config.scale}, seed {config.seed}, {memory}",
     }
-    write_submission(path, module.metric.evaluation_set.tokens, table, meta)
+    write_submission(path, tokens, table, meta)
     return True
 
 

@@ -218,6 +218,11 @@ class Config:
                 f"trainer.devices={self.trainer.devices} times trainer.num_nodes={self.trainer.num_nodes}"
             )
 
+    @property
+    def image_size_px(self) -> tuple[int, int] | None:
+        """(height, width) of the images that the model uses, None for a model without."""
+        return tuple(self.backbone.image_size_px) if self.model.uses_images else None
+
 
 def _refuse_empty(key: str, value: str | None) -> None:
     if value is not None and not value.strip():

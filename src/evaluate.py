@@ -55,7 +55,7 @@ def score_checkpoint(path: Path, overrides: list[str], out: Path) -> DetectionSc
     build_evaluation_trainer(config.precision, config.trainer.accelerator.value).validate(
         module, datamodule=datamodule, verbose=False
     )
-    save_submission(module, out / "submission.json")
+    save_submission(out / "submission.json", module.metric.evaluation_set.tokens, module.detections, config)
     if module.skipped:
         print(f"sensor files passed over: {module.skipped}")
     return module.scores

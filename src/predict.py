@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,12 +11,12 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from src.assembly import build_datamodule, data_root
+from src.assembly import build_datamodule, data_root, save_submission
 from src.command import run_command
 from src.config import Config, compose_config, restore_config
 from src.data.splits import split_samples
 from src.errors import ConfigError
-from src.metrics.submission import to_global, write_submission
+from src.metrics.submission import to_global
 from src.ops.allocator import tune_cpu_allocator
 from src.pictures.film import Film
 from src.pictures.frame import draw_frame
@@ -29,8 +28,6 @@ from src.training.checkpoints import read_checkpoint
 from src.training.processes import check_devices
 from src.training.run_folder import make_writable
 from src.training.snapshots import SHOWN_SCORE, scene_of, views_of
-
-logger = logging.getLogger(__name__)
 
 # What the detector said of one frame: its boxes and where its ego frame lay.
 Prediction = tuple[Boxes3D, np.ndarray]
@@ -63,7 +60,8 @@ def main(overrides: list[str]) -> None:
     if film:
         film.write_strip(out / "strip.png", command.trainer.num_pictures)
         film.write_animation(out / "scene.gif")
-    written = save_predictions(out / "submission.json", tokens, found, config)
+    table = DetectionTable.concatenate([to_global(*found[token], row) for row, token in enumerate(tokens)])
+    written = save_submission(out / "submission.json", tokens, table, config)
     print(f"{len(tokens)} frames, {sum(len(boxes) for boxes, _ in found.values())} boxes, written into {out}: ", end="")
     print(", ".join(["submission.json"] * written + ["scene.gif", "strip.png"] * bool(film)))
     if skipped:
@@ -118,25 +116,6 @@ def draw_picture(
     """One frame on one sheet: cameras, BEV, Gaussians by source, boxes."""
     frame = frame.to(detector.device)
     draw_frame(path, scene_of(frame, boxes, output, detector.grid), views_of(frame), title, SHOWN_SCORE)
-
-
-def save_predictions(path: Path, tokens: list[str], found: dict[str, Prediction], config: Config) -> bool:
-    """Write a submission of these samples; False, with a warning, when there is no box in any."""
-    tables = [to_global(*found[token], row) for row, token in enumerate(tokens)]
-    table = DetectionTable.concatenate(tables)
-    if not len(table):
-        logger.warning("no box reached the score threshold, so there is no valid submission to write")
-        return False
-    dptf = getattr(config.model, "dptf", None)  # the benchmark's rules are about how far back a detector looks
-    memory = "no memory" if dptf is None else f"memory of up to {dptf.max_age_s:g} s"
-    meta = {
-        "use_camera": config.model.uses_images,
-        "use_radar": True,
-        "method_name": config.model.name,
-        "description": f"scale {config.scale}, seed {config.seed}, frame by frame, {memory}",
-    }
-    write_submission(path, tokens, table, meta)
-    return True
 
 
 if __name__ == "__main__":

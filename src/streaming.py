@@ -72,14 +72,7 @@ class StreamingDetector:
         # Every weight comes from the checkpoint; the file that training began from may not be on this machine.
         model = build_model(replace(config, backbone=replace(config.backbone, weights=None)))
         load_model_weights(model, checkpoint, path)
-        settings = ReaderSettings(
-            num_sweeps=config.data.num_sweeps,
-            min_distance_m=config.data.min_distance_m,
-            propagate_points=config.data.propagate_points,
-            on_bad_file=config.data.on_bad_file,
-            image_size_px=tuple(config.backbone.image_size_px) if config.model.uses_images else None,
-            test_resize_offset=config.data.test_resize_offset,
-        )
+        settings = config.data.reader_settings(config.image_size_px)
         return cls(model, config.grid.build(), settings, device, bf16=config.precision == Precision.bf16.value)
 
     def reset(self) -> None:

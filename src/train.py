@@ -113,7 +113,7 @@ def run(
     scores = module.scores.as_dict()
     write_json(folder.metrics_json, scores)  # what took long is safe; run.json, the last file, marks the run finished
     draw_pictures(config, module, datamodule, folder, scores)
-    save_submission(module, folder.path / "submission.json")
+    save_submission(folder.path / "submission.json", module.metric.evaluation_set.tokens, module.detections, config)
     record = {
         "run_id": folder.run_id,
         "overrides": overrides,

@@ -75,6 +75,20 @@ class DataConfig:
         if not -0.5 < self.test_resize_offset < 1:
             raise ConfigError(f"data.test_resize_offset={self.test_resize_offset}: must lie between -0.5 and 1")
 
+    def reader_settings(
+        self,
+        image_size_px: tuple[int, int] | None,  # (height, width); None leaves images unread
+    ) -> ReaderSettings:
+        """How a frame is read."""
+        return ReaderSettings(
+            num_sweeps=self.num_sweeps,
+            min_distance_m=self.min_distance_m,
+            propagate_points=self.propagate_points,
+            on_bad_file=self.on_bad_file,
+            image_size_px=image_size_px,
+            test_resize_offset=self.test_resize_offset,
+        )
+
 
 class FrameDataset(Dataset[FrameBatch]):
     """Frames by key: its epoch and clip seed the augmentation, also in worker processes.
@@ -154,14 +168,7 @@ class DetectionDataModule(L.LightningDataModule):
     ) -> None:
         super().__init__()
         self.config, self.root, self.seed, self.temporal = config, root, seed, temporal
-        self.settings = ReaderSettings(
-            num_sweeps=config.num_sweeps,
-            min_distance_m=config.min_distance_m,
-            propagate_points=config.propagate_points,
-            on_bad_file=config.on_bad_file,
-            image_size_px=image_size_px,
-            test_resize_offset=config.test_resize_offset,
-        )
+        self.settings = config.reader_settings(image_size_px)
         self.index: DatasetIndex = load_index(root, config.version, cache)
         self.reader = FrameReader(self.index, self.settings)
 
