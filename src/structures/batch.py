@@ -61,6 +61,8 @@ class FrameBatch:
         if self.lanes is not None:
             self._expect("lanes", (b,), torch.int64)
             self._expect("starts", (b,), torch.bool)
+            if self.lanes.device.type == "cpu" and len(set(self.lanes.tolist())) != b:
+                raise ValueError(f"FrameBatch.lanes must be unique, but got {self.lanes.tolist()}")
         if self.boxes is not None and len(self.boxes) != b:
             raise ValueError(f"FrameBatch.boxes must hold {b} entries, one per sample, but got {len(self.boxes)}")
 

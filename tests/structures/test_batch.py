@@ -52,6 +52,7 @@ def test_a_sample_may_lack_points_boxes_and_images():
         ("boxes", [Boxes3D.empty()]),
         ("lanes", torch.arange(2)),
         ("lanes", torch.arange(3).int()),
+        ("lanes", torch.tensor([4, 0, 4])),
         ("starts", torch.zeros(3)),
         ("starts", torch.zeros(2, dtype=torch.bool)),
     ],
