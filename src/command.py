@@ -7,14 +7,19 @@ import logging
 import shutil
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 
 from src.errors import ConfigError, HorizonError, InterruptedRunError
 
 # What the system says when it refuses to write; the path and the free space are then all a user needs.
 DISK_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
+
+REPEATED_WITHIN_S = 2.0
+"""Launchers, and a process that shares its parent's terminal, get the same signal several times within milliseconds."""
 
 
 def run_command(main: Callable[[list[str]], None]) -> None:
@@ -26,7 +31,7 @@ def run_command(main: Callable[[list[str]], None]) -> None:
     logging.basicConfig(level=logging.INFO, format=line, datefmt="%H:%M:%S")
     for noisy in ("matplotlib", "PIL", "lightning.pytorch.utilities.rank_zero"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends as Ctrl-C does: temporary files are removed
+    interruptions = _listen()
     try:
         main(sys.argv[1:])
     except HorizonError as error:
@@ -36,6 +41,9 @@ def run_command(main: Callable[[list[str]], None]) -> None:
         print("\nInterrupted; the same command goes on from where it can.", file=sys.stderr)
         sys.exit(InterruptedRunError.exit_code)
     except Exception as error:
+        if interruptions:  # it struck inside a library's compiled code, which made another error of it
+            print(f"\nInterrupted ({error}); the same command goes on from where it can.", file=sys.stderr)
+            sys.exit(InterruptedRunError.exit_code)
         known = _machine_fault(error)
         if known is not None:
             print(f"\n{known[0]}", file=sys.stderr)
@@ -43,6 +51,21 @@ def run_command(main: Callable[[list[str]], None]) -> None:
         traceback.print_exc()
         print("This is a defect of the program; please report it with the lines above.", file=sys.stderr)
         sys.exit(1)
+
+
+def _listen() -> list[int]:
+    """Let SIGTERM end the command as Ctrl-C does, so that temporary files are removed; returns when signals came."""
+    came: list[float] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        came.append(time.monotonic())
+        if len(came) == 1 or came[-1] - came[0] > REPEATED_WITHIN_S:
+            raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # a shell's background job, or one rank of several
+        signal.signal(signal.SIGINT, interrupt)
+    return came
 
 
 def _machine_fault(error: Exception) -> tuple[str, int] | None:

@@ -28,12 +28,19 @@ def main(overrides: list[str]) -> None:
     if (config.checkpoint is None) == (config.predictions is None):
         raise ConfigError("give either checkpoint=PATH or predictions=FILE.json")
     source = Path(config.checkpoint or config.predictions)
-    out = Path(config.out) if config.out else Path(config.paths.outputs) / "evaluations" / source.stem
+    out = Path(config.out) if config.out else Path(config.paths.outputs) / "evaluations" / name_of(source)
     make_writable(out, "out")
     scores = score_checkpoint(source, overrides, out) if config.checkpoint else score_file(source, config)
     write_json(out / "metrics.json", scores.as_dict())
     print(format_scores(scores.as_dict()))
     print(f"\nwritten into {out}: {', '.join(sorted(path.name for path in out.glob('*.json')))}")
+
+
+def name_of(source: Path) -> str:
+    """The file's name, with its run's before it: every run has a last.ckpt, and one must not replace the other's."""
+    folder = source.resolve().parent
+    run = folder.parent.name if folder.name == "checkpoints" else folder.name
+    return f"{run}-{source.stem}"
 
 
 def score_file(path: Path, config: Config) -> DetectionScores:

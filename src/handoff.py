@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -19,6 +20,7 @@ from torch import nn
 from src.config import PHASES, Config, compose_config, run_identity
 from src.errors import CheckpointError, ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
 from src.training.checkpoints import load_model_weights, read_checkpoint
+from src.training.processes import die_with_parent
 from src.training.run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
@@ -97,6 +99,7 @@ def train_source(source: Source, train_missing: bool, processes_exist: bool) -> 
         kinds: dict[int, type[HorizonError]] = {
             kind.exit_code: kind for kind in (ConfigError, DataError, DivergedError, InterruptedRunError)
         }
+        kinds |= dict.fromkeys((-signal.SIGINT, -signal.SIGTERM), InterruptedRunError)  # it was still starting
         raise kinds.get(code, HorizonError)(
             f"the run {source.identity} that comes first ended with exit code {code}, see above; {source.command}"
         )
@@ -147,8 +150,11 @@ def _is_of(override: str, keys: tuple[str, ...]) -> bool:
 
 
 def _run_command(command: list[str]) -> int:
-    """Run a child to its end; a SIGTERM to this process goes to the child, whose exit code then tells the rest."""
-    child = subprocess.Popen(command)
+    """Run a child to its end; a SIGTERM to this process goes to the child, whose exit code then tells the rest.
+
+    When this process is killed, the child gets a SIGTERM too, and so ends after a checkpoint.
+    """
+    child = subprocess.Popen(command, preexec_fn=partial(die_with_parent, signal.SIGTERM))
 
     def forward(number: int, frame: FrameType | None) -> None:
         child.send_signal(number)

@@ -45,11 +45,11 @@ def main(overrides: list[str]) -> None:
     path = Path(command.checkpoint)
     checkpoint = read_checkpoint(path)
     config = restore_config(checkpoint["horizon3d"]["config"], overrides)
-    out = output_folder(path, command, config)
-    make_writable(out, "out")
     detector = StreamingDetector.restore(config, checkpoint, path, chosen_device(config))
     datamodule = build_datamodule(config, data_root(config, write=False))
     frames = datamodule.stream(None if command.scene is None else [command.scene])
+    out = output_folder(path, command, config)  # named by the scene, which is known by now
+    make_writable(out, "out")
     index, split = datamodule.index, split_samples(datamodule.index, config.data.split)
     wanted = split if command.scene is None else index.samples_of({command.scene})
     tokens = [str(token) for token in index.sample_tokens[wanted]]

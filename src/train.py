@@ -1,4 +1,4 @@
-"""`python -m src.train phase=phase1 ...`: one run, from configuration to metrics.json and pictures."""
+"""`python -m src.train phase=phase1|phase2 ...`: one run, from configuration to metrics.json and pictures."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import platform
 import resource
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from src.handoff import Source, find_source, hand_over, train_source
 from src.metrics.report import format_scores
 from src.ops.allocator import tune_cpu_allocator
 from src.pictures.curves import draw_curves, draw_scores
-from src.training.detection import DetectionModule
+from src.training.detection import DetectionModule, gather_by_rank
 from src.training.fit import build_loggers, build_trainer, fit
 from src.training.processes import (
     build_strategy,
@@ -106,10 +107,12 @@ def run(
     training_started = time.monotonic()
     fit(trainer, module, datamodule, resume_from)
     seconds = time.monotonic() - training_started
+    skipped = sum(map(Counter, gather_by_rank(module.skipped)), Counter())
     end_processes()
     if not is_main_process():
         return
 
+    module.to(trainer.strategy.root_device)  # Lightning leaves it on the CPU
     scores = module.scores.as_dict()
     write_json(folder.metrics_json, scores)  # what took long is safe; run.json, the last file, marks the run finished
     draw_pictures(config, module, datamodule, folder, scores)
@@ -128,7 +131,7 @@ def run(
         "resumed": resume_from is not None,
         "seconds": {"fit": round(seconds, 1), "all": round(time.monotonic() - started, 1)},
         "peak_memory_mib": peak_memory_mib(),
-        "skipped_files": module.skipped,
+        "skipped_files": dict(skipped),
         "device": str(module.device),
         "processes": config.trainer.num_processes,
         "threads": torch.get_num_threads(),

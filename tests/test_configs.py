@@ -1,6 +1,7 @@
 """Every shipped configuration composes; every mistake is named."""
 
 import math
+import os
 import re
 import signal
 import subprocess
@@ -349,16 +350,38 @@ def test_a_command_ends_with_a_message_and_its_exit_code(monkeypatch, capsys, er
     def main(_overrides):
         raise error
 
+    assert exit_code_of(main, monkeypatch) == code
+    text = capsys.readouterr().err
+    assert re.search(words, text) and ("Traceback" in text) == (words == "defect of the program")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_that_a_library_turns_into_another_error_is_an_interruption(monkeypatch, capsys, number):
+    """Matplotlib's compiled code makes "Invalid bounding box" of it; launchers send signals twice."""
+
+    def main(_overrides):
+        try:
+            os.kill(os.getpid(), number)
+        except KeyboardInterrupt:
+            os.kill(os.getpid(), number)
+            raise ValueError("Invalid bounding box") from None
+
+    assert exit_code_of(main, monkeypatch) == 6
+    text = capsys.readouterr().err
+    assert "Interrupted (Invalid bounding box)" in text and "Traceback" not in text
+
+
+def exit_code_of(main, monkeypatch):
+    """What `run_command` ends with; the handlers of signals are put back."""
     monkeypatch.setattr("sys.argv", ["x"])
-    before = signal.getsignal(signal.SIGTERM)
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         with pytest.raises(SystemExit) as ended:
             run_command(main)
     finally:
-        signal.signal(signal.SIGTERM, before)
-    assert ended.value.code == code
-    text = capsys.readouterr().err
-    assert re.search(words, text) and ("Traceback" in text) == (words == "defect of the program")
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return ended.value.code
 
 
 def test_exit_code_of_a_configuration_error():

@@ -145,6 +145,8 @@ def test_it_is_not_trained_where_that_is_switched_off_or_impossible(tmp_path):
         (6, InterruptedRunError),
         (1, HorizonError),
         (-9, HorizonError),
+        (-signal.SIGTERM, InterruptedRunError),  # before it listened
+        (-signal.SIGINT, InterruptedRunError),
     ],
 )
 def test_how_the_earlier_run_ended_is_passed_on(monkeypatch, tmp_path, code, kind):
@@ -153,7 +155,7 @@ def test_how_the_earlier_run_ended_is_passed_on(monkeypatch, tmp_path, code, kin
     monkeypatch.setattr(handoff, "_run_command", lambda command: commands.append(command) or code)
     with pytest.raises(HorizonError, match=f"(?s){source.identity}.*exit code {code}") as raised:
         train_source(source, True, False)
-    assert type(raised.value) is kind and raised.value.exit_code == (code if code > 0 else 1)
+    assert type(raised.value) is kind and raised.value.exit_code == kind.exit_code
     assert commands == [[sys.executable, "-m", "src.train", *source.overrides]]
 
 
@@ -185,6 +187,28 @@ def test_a_request_to_stop_goes_to_the_earlier_run(tmp_path):
     threading.Thread(target=stop, daemon=True).start()
     assert handoff._run_command([sys.executable, "-c", script]) == 6
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux alone tells a process of its parent's death")
+def test_the_earlier_run_ends_with_a_command_that_is_killed(tmp_path):
+    child = (
+        "import pathlib, signal, sys, time\n"
+        f"def stop(*_): pathlib.Path({str(tmp_path / 'stopped')!r}).touch(); sys.exit(6)\n"
+        "signal.signal(signal.SIGTERM, stop)\n"
+        f"pathlib.Path({str(tmp_path / 'ready')!r}).touch()\n"
+        "time.sleep(60)\n"
+    )
+    parent = f"import sys; from src.handoff import _run_command; _run_command([sys.executable, '-c', {child!r}])"
+    process = subprocess.Popen([sys.executable, "-c", parent], cwd=ROOT)
+    deadline = time.monotonic() + 100
+    while not (tmp_path / "ready").exists():
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.05)
+    process.kill()
+    process.wait()
+    while not (tmp_path / "stopped").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 def test_several_processes_train_it_only_where_the_run_begins(tmp_path):
@@ -392,6 +416,7 @@ def test_evaluate_gives_the_scores_of_the_training(handed_over, tmp_path):
     checkpoint = f"checkpoint={second / 'checkpoints' / 'last.ckpt'}"
     evaluate.main([checkpoint, f"out={tmp_path / 'same'}", f"paths.outputs={outputs}"])
     assert (tmp_path / "same" / "metrics.json").read_text() == (second / "metrics.json").read_text()
+    assert evaluate.name_of(second / "checkpoints" / "last.ckpt") == f"{second.name}-last"
     short = (checkpoint, "model.dptf.max_age_s=0.55", f"out={tmp_path / 'short'}", f"paths.outputs={outputs}")
     command(*short, module="evaluate")
     assert (

@@ -145,7 +145,10 @@ def test_bad_input_is_named(checkpoints, outputs, tmp_path):
         run(good, *base, "data.split=mini_val")
     with pytest.raises(DataError, match="nowhere"):
         run(good, *base, f"data.root={tmp_path / 'nowhere'}")
-    assert not any((tmp_path / "out").iterdir())
+    (world,) = (outputs / "worlds").iterdir()
+    with pytest.raises(ConfigError, match="no such scene"):
+        run(good, f"paths.outputs={tmp_path / 'new'}", f"data.root={world}", "scene=../../../../elsewhere")
+    assert not (tmp_path / "out").exists() and not (tmp_path / "elsewhere").exists()
 
 
 @pytest.mark.slow

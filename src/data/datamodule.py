@@ -186,15 +186,10 @@ class DetectionDataModule(L.LightningDataModule):
             "root": self.root.name,
         }
 
-    def validation_frames(self, count: int) -> list[FrameBatch]:
-        """Up to `count` different frames spread evenly over the validation split, batches of one."""
-        samples = split_samples(self.index, self.config.split)
-        return [self.reader.read(int(sample), None) for sample in _evenly_spread(samples, count)]
-
     def validation_clips(self, count: int, length: int) -> list[list[FrameBatch]]:
-        """Up to `count` clips that end at the frames of `validation_frames`, batches of one in lane 0.
+        """Up to `count` clips that end at different frames spread evenly over the validation split, in lane 0.
 
-        A clip has `length` consecutive frames, fewer where its scene begins later than that.
+        A clip has `length` consecutive frames in batches of one, fewer where its scene begins later than that.
         """
         samples = split_samples(self.index, self.config.split)
         scenes = scenes_of(self.index, samples)

@@ -33,9 +33,7 @@ class FrameBatch:
     image_valid: Tensor | None = None  # [B, N] bool, False where a camera is missing
     pix_from_aug: Tensor | None = None  # [B, N, 4, 4] float32: P_n over (0, 0, 0, 1); (u*d, v*d, d, 1) = P (x, y, z, 1)
     boxes: list[Boxes3D] | None = None  # B, aug frame
-    lanes: Tensor | None = (
-        None  # [B] int64, the stream of consecutive frames each row belongs to, unique; None: unordered
-    )
+    lanes: Tensor | None = None  # [B] int64, unique: the stream of frames that each row is the next of; None: unordered
     starts: Tensor | None = None  # [B] bool, the row begins a clip: memory of its lane ends here; given with `lanes`
     skipped: dict[str, int] = field(default_factory=dict)  # unreadable files passed over, by channel
 

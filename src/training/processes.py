@@ -155,7 +155,7 @@ def launch(module: str, overrides: Sequence[str], devices: int) -> None:
         for rank in range(devices):
             who = {"NODE_RANK": "0", "LOCAL_RANK": str(rank), "RANK": str(rank)}
             command = [sys.executable, "-m", module, *overrides]
-            ranks.append(subprocess.Popen(command, env=os.environ | meeting | who, preexec_fn=_die_with_parent))
+            ranks.append(subprocess.Popen(command, env=os.environ | meeting | who, preexec_fn=die_with_parent))
         signal.signal(signal.SIGINT, stop)
         if stops:
             _signal_all(ranks, signal.SIGTERM)
@@ -200,10 +200,10 @@ def _free_port() -> int:
         return probe.getsockname()[1]
 
 
-def _die_with_parent() -> None:
-    """In a new process: be killed with the launching one, which then could pass nothing on (Linux only)."""
+def die_with_parent(number: int = signal.SIGKILL) -> None:
+    """In a new process: get this signal when the launching one is killed, which can pass nothing on (Linux only)."""
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_SET_PDEATHSIG, signal.SIGKILL)
+        ctypes.CDLL(None).prctl(_SET_PDEATHSIG, number)
 
 
 # ---------------------------------------------------------------- together

@@ -32,8 +32,10 @@ class TemporalModule(DetectionModule):
 
         Raises ValueError for a batch without lanes.
         """
-        output, memory = self.model(batch, self.recall(batch))
+        past = self.recall(batch)
+        # Before the forward pass: on a GPU the look at the lanes would otherwise wait for all of it.
         self.memories = [entry for entry in self.memories if not _common(batch.lanes, entry[0]).any()]
+        output, memory = self.model(batch, past)
         if memory is not None:
             self.memories.append((batch.lanes, memory))
         return output
@@ -55,6 +57,10 @@ class TemporalModule(DetectionModule):
     def forget(self) -> None:
         """Drop the memory of all lanes."""
         self.memories.clear()
+
+    def on_fit_start(self) -> None:
+        """Bring a restored memory to the device: a checkpoint is read before the module is moved there."""
+        self.memories = [(lanes.to(self.device), memory.to(self.device)) for lanes, memory in self.memories]
 
     def on_train_epoch_start(self) -> None:
         """Begin without memory; not called when a run goes on inside an epoch."""
@@ -84,8 +90,7 @@ class TemporalModule(DetectionModule):
         """As the base, with the memory of this rank's lanes."""
         super().restore_rank(state)
         for entry in state.get("memories", []):
-            lanes = torch.tensor(entry["lanes"], device=self.device)
-            self.memories.append((lanes, self.model.restore_memory(entry["frames"]).to(self.device)))
+            self.memories.append((torch.tensor(entry["lanes"]), self.model.restore_memory(entry["frames"])))
 
     def adopt_ranks(self, states: list[dict[str, Any]]) -> None:
         """As the base; lanes are dealt out anew, so they begin without memory, and the log says so."""

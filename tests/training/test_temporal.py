@@ -113,6 +113,16 @@ def load(module, states, rank, world_size):
     return module
 
 
+def test_a_restored_memory_follows_the_module_to_its_device(module):
+    """A checkpoint is read while the module still lies on the CPU; here a device without values stands for a GPU."""
+    other = toy_module()
+    other.restore_rank(module.rank_state())
+    other.to("meta")
+    other.on_fit_start()
+    ((lanes, memory),) = other.memories
+    assert lanes.device.type == memory.values.device.type == "meta"
+
+
 def test_each_rank_takes_its_own_part():
     states = [
         {

@@ -157,9 +157,12 @@ class BEVPath(nn.Module):
             keep = motion.usable[past.rows] & self.grid.contains(xy)
             slot = torch.full_like(past.rows, self.config.num_frames - 1 - age)
             indices = torch.cat([past.rows[:, None], slot[:, None], self.grid.cell_of(xy)], dim=1)
-            values = (indices, xy, _rotate(matrix, past.velocities), elapsed, past.features)
-            parts.append(tuple(value[keep] for value in values))
-        return WarpedCells(*(torch.cat(values) for values in zip(*parts, strict=True))) if parts else None
+            parts.append((indices, xy, _rotate(matrix, past.velocities), elapsed, past.features, keep))
+        if not parts:
+            return None
+        *values, keep = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
+        kept = keep.nonzero().squeeze(1)  # once for all frames: a GPU waits for it
+        return WarpedCells(*(value[kept] for value in values))
 
     def aggregate(self, fused: SparseBEV, warped: WarpedCells | None) -> SparseBEV:
         """F_out = F_fuse + what sparse convolutions over time make of both, on the sites of either."""
