@@ -52,8 +52,7 @@ def main(overrides: list[str]) -> None:
     source = find_source(config, overrides)
     folder = RunFolder(Path(config.paths.outputs), run_identity(tree, source.identity if source is not None else None))
     if config.trainer.num_processes > 1 and not created_externally():
-        if source is not None and not source.ready and begins(folder, config.resume):
-            train_source(source, config.phase.train_missing, processes_exist=False)
+        ensure_source(config, folder, source, processes_exist=False)
         launch("src.train", overrides, config.trainer.devices)
         return
     with process_group(*where):
@@ -62,20 +61,30 @@ def main(overrides: list[str]) -> None:
             run(config, tree, folder, source, start, started, overrides)
 
 
+def ensure_source(config: Config, folder: RunFolder, source: Source | None, processes_exist: bool) -> None:
+    """Train the run whose weights this one starts from, where it is missing and this run really begins now.
+
+    Comes before the own folder is touched: what fails here leaves everything as it was.
+    """
+    if source is not None and not source.ready and begins(folder, config.resume):
+        train_source(source, config.phase.train_missing, processes_exist)
+
+
 def begins(folder: RunFolder, resume: Resume) -> bool:
     """Whether the run starts from its source's weights: told to, or with nothing of its own to go on from."""
+    if resume is Resume.never and folder.path.exists():
+        return False  # it will be refused
     return resume is Resume.restart or not (folder.finished or folder.newest_checkpoint() is not None)
 
 
 def prepare(config: Config, tree: dict[str, Any], folder: RunFolder, source: Source | None) -> dict[str, Any] | None:
     """What one process decides for all: the checkpoint to go on from and the data folder; None for a finished run."""
+    ensure_source(config, folder, source, processes_exist=config.trainer.num_processes > 1)
     folder.open(config.resume)
     if folder.finished:
         show_finished(folder)
         return None
     resume_from = folder.newest_checkpoint()
-    if resume_from is None and source is not None and not source.ready:
-        train_source(source, config.phase.train_missing, processes_exist=config.trainer.num_processes > 1)
     log = logging.FileHandler(folder.log)
     log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logging.getLogger().addHandler(log)

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from torch.utils.data import Sampler
 
-from src.data.reader import MAX_EGO_SPEED_MPS
 from src.data.schema import DatasetIndex
 from src.errors import DataError
+from src.structures.batch import MAX_EGO_SPEED_MPS
 
 Array = np.ndarray
 

@@ -21,7 +21,7 @@ from src.data.schema import CHANNELS, DatasetIndex
 from src.errors import DataError
 from src.geometry.camera import pixels_from_points
 from src.geometry.transforms import invert_rigid, pose_matrix, quaternion_to_matrix, rotation_vector, yaw_of
-from src.structures.batch import RADAR_POINT_FIELDS, FrameBatch
+from src.structures.batch import MAX_EGO_SPEED_MPS, RADAR_POINT_FIELDS, FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CAMERAS, RADARS
 
@@ -30,8 +30,6 @@ T = TypeVar("T")
 
 VELOCITY_WINDOW_US = 100_000
 """Ego velocity is the pose difference over +- this time; the chassis table reads zero for long stretches."""
-MAX_EGO_SPEED_MPS = 100.0
-"""Faster poses are a jump in the pose table, not a truck."""
 
 _log = logging.getLogger(__name__)
 

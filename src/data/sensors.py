@@ -11,11 +11,11 @@ from PIL import Image
 
 from src.data.images import MAX_PIXELS, resample, width_fit
 from src.data.pcd import RADAR_FIELDS
-from src.data.reader import MAX_EGO_SPEED_MPS, ReaderSettings, compensate_clouds
+from src.data.reader import ReaderSettings, compensate_clouds
 from src.errors import DataError
 from src.geometry.camera import pixels_from_points
 from src.geometry.transforms import invert_rigid
-from src.structures.batch import RADAR_POINT_FIELDS, FrameBatch
+from src.structures.batch import MAX_EGO_SPEED_MPS, RADAR_POINT_FIELDS, FrameBatch
 from src.structures.taxonomy import CAMERAS
 
 Array = np.ndarray

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from src.structures.boxes import Boxes3D
 
+MAX_EGO_SPEED_MPS = 100.0
+"""Poses further apart than this speed allows are a jump of the localisation, not a drive."""
 RADAR_POINT_FIELDS = ("x", "y", "z", "rcs", "vx", "vy", "dt")
 
 

@@ -9,11 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.structures.batch import FrameBatch
+from src.structures.batch import MAX_EGO_SPEED_MPS, FrameBatch
 from src.structures.gaussians import GaussianSet
-
-MAX_EGO_SPEED_MPS = 100.0
-"""Poses further apart than this speed allows are a jump of the localisation: what lies before it is not used."""
 
 
 @dataclass
