@@ -241,9 +241,10 @@ class DetectionDataModule(L.LightningDataModule):
         lanes = config.batch_size * (config.lane_sets if self.temporal else 1)
         if len(samples) < lanes:
             times = f" times data.lane_sets={config.lane_sets}" if self.temporal else ""
+            remedy = ", and a step needs one in each lane; lower one of the two" if self.temporal else "; lower it"
             raise DataError(
                 f"data.batch_size={config.batch_size}{times}: the split {config.train_split!r} has only "
-                f"{len(samples)} frames"
+                f"{len(samples)} frames{remedy}"
             )
         if not index.annotated:
             raise DataError(f"{index.root / index.version}: has no annotations to train on")
