@@ -35,9 +35,12 @@ report: $(STAMP) ## finished runs into reports/phase1_mini.md, with PHASE=2 repo
 benchmark: $(STAMP) ## time and memory of every part [ARGS="suite=metric"]
 	$(PYTHON) -m src.benchmark $(SCALE_ARG) $(ARGS)
 
+# One thread per process: small operators gain nothing from a second one, and side by side they slow each other down.
+PYTEST := OMP_NUM_THREADS=1 $(PYTHON) -m pytest -n auto --dist loadfile
+
 test: $(STAMP) ## run every test
-	$(PYTHON) -m pytest $(ARGS)
+	$(PYTEST) $(ARGS)
 
 check: $(STAMP) ## lint and the fast tests, under a minute
 	$(PYTHON) -m ruff check .
-	OMP_NUM_THREADS=1 $(PYTHON) -m pytest -q -n auto --dist loadfile -m "not slow and not gpu" $(ARGS)
+	$(PYTEST) -q -m "not slow and not gpu" $(ARGS)
