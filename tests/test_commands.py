@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 pytestmark = pytest.mark.slow
 
 
-def command(module, *overrides, expect=0, timeout=240):
+def command(module, *overrides, expect=0, timeout=480):
     result = subprocess.run(
         [sys.executable, "-m", f"src.{module}", *overrides],
         cwd=ROOT, capture_output=True, text=True, timeout=timeout,
@@ -106,7 +106,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_weights(outputs, tmp_path):
         [sys.executable, "-m", "src.train", *arguments, f"paths.outputs={killed}"],
         cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
     )  # fmt: skip
-    deadline = time.monotonic() + 200
+    deadline = time.monotonic() + 400
     while not list(killed.glob("*/checkpoints/last.ckpt")):
         assert time.monotonic() < deadline and process.poll() is None
         time.sleep(0.05)

@@ -155,7 +155,7 @@ def test_bad_input_is_named(checkpoints, outputs, tmp_path):
 def test_the_command_itself(checkpoints, outputs, tmp_path):
     def command(*overrides):
         line = [sys.executable, "-m", "src.predict", *overrides, f"paths.outputs={outputs}", f"out={tmp_path}"]
-        return subprocess.run(line, cwd=ROOT, capture_output=True, text=True, timeout=120)
+        return subprocess.run(line, cwd=ROOT, capture_output=True, text=True, timeout=300)
 
     ended = command(f"checkpoint={checkpoints['phase2']}", "trainer.num_pictures=0")
     assert ended.returncode == 0 and f"{2 * FRAMES} frames" in ended.stdout and str(tmp_path) in ended.stdout

@@ -224,7 +224,7 @@ def start(*command, env=None):
     )  # fmt: skip
 
 
-def finish(*running, expect=None, timeout=150):
+def finish(*running, expect=None, timeout=360):
     """Outputs of commands that must end in time; none of them survives a failure."""
     try:
         outputs = [process.communicate(timeout=timeout)[0] for process in running]
@@ -236,7 +236,7 @@ def finish(*running, expect=None, timeout=150):
     return outputs
 
 
-def wait_for(path, *running, timeout=120):
+def wait_for(path, *running, timeout=300):
     deadline = time.monotonic() + timeout
     while not path():
         assert time.monotonic() < deadline and all(process.poll() is None for process in running), [
@@ -314,7 +314,7 @@ def test_a_run_on_two_nodes_survives_the_loss_of_one(phase1, outputs):
     ]
     wait_for(last_checkpoint(outputs, "phase2"), *nodes)
     nodes[1].kill()
-    left, _ = finish(*nodes, timeout=60)
+    left, _ = finish(*nodes, timeout=180)
     assert nodes[0].returncode == 1 and "another process of this run ended" in left, left[-3000:]
     finish(start(*command, "trainer.devices=2"), expect=0)
     record = json.loads((last_checkpoint(outputs, "phase2")().parents[1] / "run.json").read_text())

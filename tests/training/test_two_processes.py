@@ -25,7 +25,7 @@ from src.training.temporal import TemporalModule
 
 LANES, STEPS = 4, 3
 FIRST_RANK, SECOND_RANK = (0, 1), (2, 3)
-DEADLINE_S = 120.0
+DEADLINE_S = 300.0
 COLUMNS = tuple(DetectionTable.__dataclass_fields__)
 
 
