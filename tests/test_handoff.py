@@ -494,7 +494,8 @@ def test_without_phase_1_and_without_training_it(tmp_path):
 def test_make_hands_the_checkpoint_on():
     def shown(*arguments):
         made = subprocess.run(["make", "-n", *arguments], cwd=ROOT, capture_output=True, text=True, check=True)
-        return made.stdout.split("src.train")[-1].split()
+        (line,) = (line for line in made.stdout.splitlines() if "src.train" in line)
+        return line.split("src.train")[1].split()
 
     assert shown("train", "PHASE=2", "CHECKPOINT=x") == ["phase=phase2", "phase.init_from=x"]
     assert shown("train", "PHASE=2", "SCALE=debug") == ["phase=phase2", "scale=debug"]
