@@ -12,7 +12,16 @@ from src.ops.bags import bag_sum
 from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
 from src.ops.sites import Sites, union
 
-__all__ = ["KernelMap", "Sites", "sparse_conv", "strided_map", "submanifold_map", "temporal_map", "union"]
+__all__ = [
+    "KernelMap",
+    "Sites",
+    "neighbour_sum",
+    "sparse_conv",
+    "strided_map",
+    "submanifold_map",
+    "temporal_map",
+    "union",
+]
 
 # Types of the grouped product, one kernel launch for all offsets; others, and torch without it, go offset by offset.
 GROUPED_DTYPES = (torch.float32, torch.bfloat16, torch.float16) if hasattr(F, "grouped_mm") else ()
@@ -36,6 +45,16 @@ def sparse_conv(
         bias = None if bias is None else bias.to(dtype)
     _check(features, weight, kernel_map, bias)
     return implementation("sparse_conv")(features, weight, kernel_map, bias)
+
+
+@torch.no_grad()
+def neighbour_sum(
+    features: Tensor,  # [M_in, C]
+    kernel_map: KernelMap,
+) -> Tensor:  # [M_out, C]
+    """Sum of the input rows that each output sees: the convolution whose weights are all one. Without gradient."""
+    order, starts = kernel_map.bags_by_output()
+    return bag_sum(features, kernel_map.inputs.index_select(0, order), starts)
 
 
 @register("sparse_conv", "reference")

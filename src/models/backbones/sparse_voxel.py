@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.local_means import LocalMeans
 from src.models.sparse_layers import ConvNormReLU, ResidualBlock, SparseConv, SubmanifoldConv
 from src.ops.bags import segment_sum
 from src.ops.sites import Sites
@@ -44,6 +45,7 @@ class RadarEncoderConfig:
     conv_out: ConvOut
     norm_momentum: float  # weight of a new batch in the running statistics; few steps need a large one
     point_count_channel: bool  # log of the number of points as one more input channel
+    local_means: bool  # mean of the points around a cell, added to F_R
 
     def __post_init__(self) -> None:
         size = self.voxel_size_m
@@ -100,6 +102,7 @@ class RadarEncoder(nn.Module):
             conv_out = SubmanifoldConv(widths[-1], channels, 3, 2, bias=False)
         self.conv_out = ConvNormReLU(conv_out, **norm)
         self.shared_conv = ConvNormReLU(SubmanifoldConv(channels, channels, 3, 2, bias=True), **SHARED_NORM)
+        self.local_means = LocalMeans(self.point_scales, grid, channels) if config.local_means else None
 
     def forward(
         self,
@@ -108,7 +111,8 @@ class RadarEncoder(nn.Module):
         batch_size: int,
     ) -> SparseBEV:
         """F_R; points outside the grid are left out, and no point at all gives a map without sites."""
-        return self.encode(self.voxelise(radar_points, radar_batch, batch_size))
+        bev = self.encode(self.voxelise(radar_points, radar_batch, batch_size))
+        return bev if self.local_means is None else self.local_means(bev, radar_points, radar_batch)
 
     def voxelise(
         self,

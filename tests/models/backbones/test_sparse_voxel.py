@@ -22,6 +22,7 @@ PILLARS = RadarEncoderConfig(
     conv_out=ConvOut.subm,
     norm_momentum=0.01,
     point_count_channel=True,
+    local_means=False,
 )
 VOXELS = replace(PILLARS, voxel_size_m=[0.2, 0.2, 1.0], stage_channels=[4, 6, 8, 8], conv_out=ConvOut.sparse)
 FULL = RadarEncoderConfig(
@@ -32,6 +33,7 @@ FULL = RadarEncoderConfig(
     conv_out=ConvOut.sparse,
     norm_momentum=0.01,
     point_count_channel=False,
+    local_means=False,
 )
 both = pytest.mark.parametrize("config", [PILLARS, VOXELS], ids=["pillars", "voxels"])
 

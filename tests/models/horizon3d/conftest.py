@@ -180,6 +180,7 @@ def make_config():
                 conv_out=ConvOut.subm,
                 norm_momentum=0.01,
                 point_count_channel=True,
+                local_means=True,
             ),
             kggi=None if radar_only else KGGIConfig(**kggi),
             ocsf=None if radar_only else OCSFConfig(**ocsf),
