@@ -7,7 +7,7 @@ from src.ops.farthest_point import farthest_points
 from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
 from src.ops.nms import maxpool_peaks, nms_circle, nms_rotated, rotated_iou
 from src.ops.sites import Sites, union
-from src.ops.sparse_conv import sparse_conv
+from src.ops.sparse_conv import neighbour_sum, sparse_conv
 from src.ops.splat import Splat, log1mexp, splat_gaussians
 from src.ops.voxelize import voxelize
 
@@ -20,6 +20,7 @@ __all__ = [
     "farthest_points",
     "log1mexp",
     "maxpool_peaks",
+    "neighbour_sum",
     "nms_circle",
     "nms_rotated",
     "rotated_iou",

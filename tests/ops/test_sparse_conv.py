@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from src.ops import Sites, sparse_conv, strided_map, submanifold_map, temporal_map
+from src.ops import Sites, neighbour_sum, sparse_conv, strided_map, submanifold_map, temporal_map
 from src.ops.kernel_maps import KernelMap
 
 GOLDEN = np.load(Path(__file__).parents[1] / "golden" / "sparse_conv" / "cases.npz")
@@ -109,6 +109,19 @@ def test_gradcheck(mode):
     torch.manual_seed(0)
     inputs = [torch.randn(*size).double().requires_grad_() for size in ((14, 2), (27, 2, 3), (3,))]
     assert torch.autograd.gradcheck(lambda x, w, b: sparse_conv(x, w, kernel_map, b), inputs)
+
+
+@pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal"])
+def test_neighbour_sum_is_the_convolution_with_unit_weights(mode):
+    sites = random_sites((2, 6, 7, 8), 60)
+    if mode == "submanifold":
+        kernel_map = submanifold_map(sites, 3)
+    else:
+        build = strided_map if mode == "strided" else temporal_map
+        kernel_map, _ = build(sites, 3, (2, 1, 1), 1)
+    features = torch.randn(60, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    unit = torch.eye(5, dtype=torch.float64).expand(27, 5, 5)
+    assert torch.allclose(neighbour_sum(features, kernel_map), sparse_conv(features, unit, kernel_map), atol=1e-12)
 
 
 def test_order_of_the_given_cells_does_not_matter():
