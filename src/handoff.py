@@ -27,8 +27,17 @@ logger = logging.getLogger(__name__)
 
 MAY_BE_NEW = re.compile(r"dptf\.|ocsf\.encoder\.layers\.\d+\.temporal_attention\.")
 """Parameters that a later phase adds; every other one must come from the checkpoint."""
-NOT_OF_THE_SOURCE = ("phase", "model.dptf", "data.groups_per_scene", "data.lane_sets", "resume")
-"""Overrides that concern the later phase only."""
+OF_THIS_RUN = ("phase", "resume")
+"""Overrides that never concern the run whose weights are taken."""
+OF_THE_LATER_PHASE = (
+    *("model.dptf", "data.groups_per_scene", "data.lane_sets"),
+    *(f"model.loss.cell_{term}_weight" for term in ("focal", "dice", "lovasz", "velocity")),
+)
+"""Nor do these, where that run is of the phase before."""
+WEIGHTS_OF_GAUSSIAN_VELOCITY = ("model.loss.dptf_weight", "model.loss.gaussian_velocity_weight")
+"""Nor these, unless `model.loss.gaussian_velocity_in_phase1`."""
+INPUT_SETTINGS = ("num_sweeps", "min_distance_m", "propagate_points", "test_resize_offset")
+"""Of `data`: what the weights have learnt to see."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +63,7 @@ class Source:
 def find_source(config: Config, overrides: list[str]) -> Source | None:
     """The run or file that `phase.init_from` names, finished or not; None for fresh weights.
 
-    A phase's name means the run of the same command in that phase, less the overrides of the later phase's own parts.
+    A phase's name means the run of the same command in that phase, less the overrides of what only the later phase has.
     Raises CheckpointError when a given file does not exist.
     """
     name = config.phase.init_from
@@ -67,7 +76,12 @@ def find_source(config: Config, overrides: list[str]) -> Source | None:
                 f"phase.init_from={name}: there is no such checkpoint, and no phase of that name ({', '.join(PHASES)})"
             )
         return Source(hashlib.sha256(path.read_bytes()).hexdigest()[:16], path, None, None)
-    kept = [override for override in overrides if not _is_of(override, NOT_OF_THE_SOURCE)]
+    others = OF_THIS_RUN
+    if name != config.phase.name:
+        others += OF_THE_LATER_PHASE
+        if not config.model.loss.gaussian_velocity_in_phase1:
+            others += WEIGHTS_OF_GAUSSIAN_VELOCITY
+    kept = [override for override in overrides if not _is_of(override, others)]
     wanted = [f"phase={name}", *kept]
     its_config, tree = compose_config(wanted)
     its_source = find_source(its_config, wanted)  # what that run starts from is part of its identity
@@ -124,7 +138,7 @@ def hand_over(model: nn.Module, source: Source, tree: dict[str, Any]) -> None:
 
 
 def differing_settings(old: dict[str, Any], new: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Dotted keys of the model, the backbone and the grid that both have and whose values differ."""
+    """Dotted keys of the model, the backbone, the grid and of what is read that both have and whose values differ."""
 
     def flat(node: Any, prefix: str) -> dict[str, Any]:
         if not isinstance(node, dict):
@@ -132,9 +146,9 @@ def differing_settings(old: dict[str, Any], new: dict[str, Any]) -> dict[str, tu
         return {key: value for name in node for key, value in flat(node[name], f"{prefix}.{name}").items()}
 
     def settings(tree: dict[str, Any]) -> dict[str, Any]:
-        return {
-            key: value for name in ("model", "backbone", "grid") for key, value in flat(tree.get(name), name).items()
-        }
+        parts = {name: tree.get(name) for name in ("model", "backbone", "grid")}
+        parts["data"] = {name: value for name, value in (tree.get("data") or {}).items() if name in INPUT_SETTINGS}
+        return {key: value for name, part in parts.items() for key, value in flat(part, name).items()}
 
     before, after = settings(old), settings(new)
     return {

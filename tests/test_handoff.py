@@ -67,6 +67,7 @@ def test_phase_1_starts_from_fresh_weights():
         ["model.dptf.bev_path=null"],
         ["phase.epochs=7", "phase.velocity_code_weight=0.5", "phase.train_missing=false"],
         ["data.groups_per_scene=1"],
+        ["model.loss.cell_focal_weight=null", "model.loss.dptf_weight=2", "model.loss.gaussian_velocity_weight=1"],
         ["resume=restart"],
         ["trainer.devices=2", "logger=wandb"],
     ],
@@ -89,6 +90,9 @@ def test_the_run_of_the_same_command_in_phase_1(tmp_path, own):
 def test_other_settings_mean_another_run():
     assert source_of("phase=phase2")[0].identity != source_of("phase=phase2", "model.channels=32")[0].identity
     assert source_of("phase=phase2")[0].identity != source_of("phase=phase2", "seed=1")[0].identity
+    in_phase_1 = "model.loss.gaussian_velocity_in_phase1=true"
+    weights = [source_of("phase=phase2", in_phase_1, f"model.loss.dptf_weight={weight}") for weight in (1, 2)]
+    assert weights[0][0].identity != weights[1][0].identity
 
 
 def test_further_epochs_of_the_same_phase():
@@ -98,6 +102,8 @@ def test_further_epochs_of_the_same_phase():
     source, run = source_of("phase=phase2", "phase.init_from=phase2", "phase.epochs=2")
     assert source.identity == source_of("phase=phase2")[1] != run  # a run known by what it started from itself
     assert source.overrides == ["phase=phase2", "scale=debug"]
+    source, _ = source_of("phase=phase2", "phase.init_from=phase2", "model.dptf.max_age_s=0.55")
+    assert source.overrides == ["phase=phase2", "scale=debug", "model.dptf.max_age_s=0.55"]
 
 
 def test_a_file_counts_by_its_content(tmp_path):
@@ -357,9 +363,11 @@ def test_weights_that_are_not_finite_are_refused(phase_1, tmp_path, value):
 
 def test_settings_without_weights_that_differ_are_told(phase_1, caplog):
     """A margin or a threshold is no tensor: it fits, but the phases then mean different things."""
-    give(phase_1, "phase=phase2", "model.ocsf.margin_m=1.6", "model.loss.ocsf_weight=2", "model.dptf.max_age_s=0.55")
+    harmless = ("model.loss.ocsf_weight=2", "model.dptf.max_age_s=0.55", "data.num_workers=0")
+    give(phase_1, "phase=phase2", "model.ocsf.margin_m=1.6", "data.num_sweeps=1", *harmless)
     warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert warned == ["model.ocsf.margin_m was 4.8 in the run these weights come from and is 1.6 now"]
+    text = "{} in the run these weights come from and is {} now"
+    assert sorted(warned) == [text.format("data.num_sweeps was 2", 1), text.format("model.ocsf.margin_m was 4.8", 1.6)]
 
 
 # ---------------------------------------------------------------- the commands

@@ -118,7 +118,15 @@ def test_frames_that_are_not_in_the_past_are_not_used(phase2):
     later = make_frame(phase2, 10.1, seed=3)
     other = StreamingDetector(phase2.model, phase2.grid, phase2.settings)
     other.step(back)
-    assert not same(phase2.step(later), other.step(later))  # it has passed 10.0 again, which is used again
+    assert same(phase2.step(later), other.step(later))  # nothing is left of what came before the jump
+
+
+def test_a_frame_given_again_is_detected_as_the_first_time(phase2):
+    walk(phase2, 10.0)
+    frame = make_frame(phase2, 10.5, seed=1)
+    first, memory = phase2.step(frame), memory_of(phase2)
+    assert same(phase2.step(frame), first) and not same(first, alone(phase2, frame))
+    assert all(torch.equal(*pair) for pair in zip(memory_of(phase2), memory, strict=True))
 
 
 def test_a_gap_beyond_the_age_limit_is_as_a_first_frame(phase2):

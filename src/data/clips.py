@@ -95,12 +95,14 @@ def streamed_groups(
 ) -> Schedule:
     """Training: scenes cut into groups, the groups shuffled into one stream, the stream cut into equal lanes.
 
-    There are num_lanes * lane_sets lanes. Lane l reads the l-th part of the stream of N frames, N // lanes long, so
-    every lane and every epoch has that number of frames; a group cut by the end of a lane becomes two clips, and the
-    fewer frames than lanes that are left are passed over. With several sets, neighbouring steps show other scenes.
+    With several sets of lanes, neighbouring steps show other scenes; there are at most as many sets as groups to fill
+    their lanes, since more would cut the groups shorter. Lane l of all sets reads the l-th part of the stream of N
+    frames, N // lanes long, so every lane and every epoch has that number of frames; a group cut by the end of a lane
+    becomes two clips, and the fewer frames than lanes that are left are passed over.
     """
     groups = [group for scene in scenes for group in np.array_split(scene, min(groups_per_scene, len(scene)))]
     groups = [groups[at] for at in np.random.default_rng((seed, epoch)).permutation(len(groups))]
+    lane_sets = max(1, min(lane_sets, len(groups) // num_lanes))
     stream = np.concatenate(groups)
     group_starts = np.repeat(np.cumsum([0, *map(len, groups[:-1])]), [len(group) for group in groups])
     turns = len(stream) // (num_lanes * lane_sets)

@@ -50,7 +50,7 @@ class DataConfig:
     split: str  # what validation and evaluation read
     batch_size: int  # total over all devices; the lanes when clips are streamed
     groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; spec section 6.4
-    lane_sets: int  # sets of lanes that take turns when clips are streamed for training; 1: all lanes at every step
+    lane_sets: int  # at most so many sets of lanes take turns when clips are streamed; 1: all lanes at every step
     num_workers: int  # loader processes per device
     num_sweeps: int  # past sweeps of each radar
     min_distance_m: float  # nearer points are the truck itself
@@ -238,13 +238,10 @@ class DetectionDataModule(L.LightningDataModule):
         """
         config, seed, index = self.config, self.seed, self.index
         samples = split_samples(index, config.train_split)
-        lanes = config.batch_size * (config.lane_sets if self.temporal else 1)
-        if len(samples) < lanes:
-            times = f" times data.lane_sets={config.lane_sets}" if self.temporal else ""
-            remedy = ", and a step needs one in each lane; lower one of the two" if self.temporal else "; lower it"
+        if len(samples) < config.batch_size:
             raise DataError(
-                f"data.batch_size={config.batch_size}{times}: the split {config.train_split!r} has only "
-                f"{len(samples)} frames{remedy}"
+                f"data.batch_size={config.batch_size}: the split {config.train_split!r} has only {len(samples)} "
+                "frames; lower it"
             )
         if not index.annotated:
             raise DataError(f"{index.root / index.version}: has no annotations to train on")

@@ -48,7 +48,7 @@ class RadarSweep:
     timestamp_s: float
     ego_velocity_mps: Array  # [3] velocity of the ego's origin at the sweep, ego axes
     ego_rate_radps: Array = (0.0, 0.0, 0.0)  # [3] rotation rate at the sweep, ego axes
-    global_from_ego: Array | None = None  # [4, 4] ego pose at the sweep; None: that of the frame
+    global_from_ego: Array | None = None  # [4, 4] ego pose at the sweep; None: the frame's, driven back to the sweep
 
 
 def frame_from_sensors(
@@ -102,8 +102,6 @@ def _radar_points(
                 )
             clouds.append(_points(sweep.points, where))
             mounts.append(_rigid(sweep.ego_from_sensor, f"{where}: ego_from_sensor"))
-            pose = sweep.global_from_ego
-            poses.append(global_from_ego if pose is None else _rigid(pose, f"{where}: global_from_ego"))
             velocity = _array(sweep.ego_velocity_mps, (3,), f"{where}: ego_velocity_mps")
             speed = np.linalg.norm(velocity)
             if speed > MAX_EGO_SPEED_MPS:
@@ -112,6 +110,10 @@ def _radar_points(
             velocities.append(velocity)
             rates.append(_array(sweep.ego_rate_radps, (3,), f"{where}: ego_rate_radps"))
             ages.append(age)
+            if sweep.global_from_ego is None:
+                poses.append(global_from_ego @ _driven(velocities[-1], rates[-1], -age))
+            else:
+                poses.append(_rigid(sweep.global_from_ego, f"{where}: global_from_ego"))
     if not clouds:
         return np.zeros((0, len(RADAR_POINT_FIELDS)), np.float32)
     return compensate_clouds(
@@ -123,6 +125,18 @@ def _radar_points(
         elapsed_s=np.array(ages),
         settings=settings,
     ).astype(np.float32)
+
+
+def _driven(
+    velocity: Array,  # [3] m/s, ego axes
+    rate: Array,  # [3] rad/s, ego axes
+    seconds: float,
+) -> Array:  # [4, 4] the ego frame after that time in the one before it
+    """Motion with a constant twist, which is the exponential of it."""
+    twist = np.zeros((4, 4))
+    twist[:3, :3] = np.cross(rate, np.eye(3)).T
+    twist[:3, 3] = velocity
+    return torch.linalg.matrix_exp(torch.from_numpy(seconds * twist)).numpy()
 
 
 def _images(

@@ -73,6 +73,13 @@ def test_sets_of_lanes_take_turns(world_size):
     assert [turns[at] + turns[at + 1] + turns[at + 2] for at in range(0, 12, 3)] == together
 
 
+@pytest.mark.parametrize(("lanes", "sets"), [(2, 12), (4, 6), (8, 3), (9, 2), (13, 1), (40, 1)])
+def test_there_are_no_more_sets_of_lanes_than_groups_fill(lanes, sets):
+    """24 groups of ten frames: more sets would tear them into shorter clips."""
+    schedule = streamed_groups(scenes([20] * 12), 2, lanes, 12, 0, 0)
+    assert schedule.lane_sets == sets and schedule.samples.shape == (240 // (lanes * sets) * sets, lanes)
+
+
 def test_order_follows_seed_and_epoch():
     def orders(make):
         return {(seed, epoch): make(seed, epoch).samples.tobytes() for seed in (0, 1) for epoch in (0, 1)}

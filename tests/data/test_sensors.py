@@ -83,8 +83,7 @@ def test_a_model_without_images_needs_no_camera(raw):
     assert frame.images is None and len(frame.radar_points) > 0
 
 
-def test_sensors_that_share_the_frames_pose_need_not_state_it(raw):
-    """Without poses of their own, sensors are where the frame says: a point stays in the ego frame of its sweep."""
+def test_a_sweep_without_a_pose_is_where_the_vehicle_was_by_its_own_speed(raw):
     at = np.array([[20.0, 3.0, 1.0, 0.0, 0.0, 0.0, 5.0]])
     own = RadarSweep(
         points=at, ego_from_sensor=np.eye(4), timestamp_s=raw["timestamp_s"] - 0.05, ego_velocity_mps=[10.0, 0.0, 0.0]
@@ -92,8 +91,22 @@ def test_sensors_that_share_the_frames_pose_need_not_state_it(raw):
     frame = frame_from_sensors(**(raw | {"radars": {"roof": [own]}}), settings=reader_settings())
     unit = at[0, :3] / np.linalg.norm(at[0, :3])
     ground = 10.0 * unit[0] * unit  # a Doppler of zero: it moves away as fast as the sensor follows
-    expected = [20.0, 3.0, 1.0, 5.0, ground[0], ground[1], 0.05]
+    expected = [19.5, 3.0, 1.0, 5.0, ground[0], ground[1], 0.05]
     np.testing.assert_allclose(frame.radar_points[0].numpy(), expected, atol=1e-5)
+    # A quarter turn to the left in one second, on a circle of radius 10: what was ahead is now to the right.
+    turning = {"ego_velocity_mps": [5.0 * np.pi, 0.0, 0.0], "ego_rate_radps": [0.0, 0.0, 0.5 * np.pi]}
+    own = replace(own, timestamp_s=raw["timestamp_s"] - 1.0, **turning)
+    frame = frame_from_sensors(**(raw | {"radars": {"roof": [own]}}), settings=reader_settings())
+    np.testing.assert_allclose(frame.radar_points[0, :3].numpy(), [3.0 - 10.0, -20.0 + 10.0, 1.0], atol=1e-4)
+
+
+def test_in_a_driven_world_poses_and_speeds_place_sweeps_alike(raw):
+    blind = {name: [replace(sweep, global_from_ego=None) for sweep in sweeps] for name, sweeps in raw["radars"].items()}
+    settings = reader_settings()
+    stated = frame_from_sensors(**raw, settings=settings).radar_points
+    derived = frame_from_sensors(**(raw | {"radars": blind}), settings=settings).radar_points
+    assert stated[:, 6].max() > 0.3  # sweeps of several tenths of a second ago, metres away
+    np.testing.assert_allclose(derived[:, :3].numpy(), stated[:, :3].numpy(), atol=0.2)
 
 
 def sweep(raw, **changes):

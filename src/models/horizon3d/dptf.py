@@ -74,7 +74,7 @@ class DPTF(nn.Module):
         """Bring the memory to the batch's time and frame."""
         history = warped = None
         if memory is not None:
-            memory = memory.until_jump(batch)
+            memory = memory.before(batch)
             if self.gaussian_path is not None:
                 history = self.gaussian_path.recall(memory, batch, self.config.max_age_s)
             if self.bev_path is not None:
@@ -97,7 +97,7 @@ class DPTF(nn.Module):
         output: DPTFOutput,
         ocsf: OCSFOutput | None,  # None for radar only, which has no Gaussians
     ) -> Memory:
-        """The memory with the current frame added; what lies before a jump of the pose is forgotten for good."""
+        """The memory with the current frame added, less what is not in its past (`Memory.before`)."""
         cells = gaussians = None
         if self.bev_path is not None:
             cells = self.bev_path.store(fused, output.cells, batch)
@@ -111,5 +111,5 @@ class DPTF(nn.Module):
             gaussians,
         )
         paths = (self.config.bev_path, self.config.gaussian_path)
-        past = memory.until_jump(batch) if memory is not None else Memory(())
+        past = memory.before(batch) if memory is not None else Memory(())
         return past.push(frame, *(path.num_frames if path is not None else 0 for path in paths))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -114,15 +114,20 @@ class Memory:
         """B, 0 for an empty memory."""
         return len(self.frames[0].present) if self.frames else 0
 
-    def until_jump(self, batch: FrameBatch) -> Memory:
-        """The memory less the lanes whose pose jumped since their last frame, with all that lies before the jump.
+    def before(self, batch: FrameBatch) -> Memory:
+        """What of the memory is in the past of the batch, lane by lane; the rest is forgotten for good.
 
-        Only neighbouring frames tell: over several seconds the same jump could pass for a drive.
+        Gone are frames that are not older than the batch's, and, where the pose jumped since a lane's last frame, all
+        that lies before the jump. Only neighbouring frames tell: over several seconds the same jump could pass for a
+        drive.
         """
         if not self.frames:
             return self
         steady = ~self.frames[0].jumped(batch)
-        return Memory(tuple(replace(frame, present=frame.present & steady) for frame in self.frames))
+        return _shared(
+            replace(frame, present=frame.present & steady & (frame.timestamps_s < batch.timestamps_s))
+            for frame in self.frames
+        )
 
     def push(self, frame: MemoryFrame, num_cell_frames: int, num_gaussian_frames: int) -> Memory:
         """Put the current frame first and forget what no path looks at any more, so memory never grows."""
@@ -144,8 +149,7 @@ class Memory:
         keep: Tensor,  # [B'] bool, False: the lane starts anew
     ) -> Memory:
         """Memory for a batch whose lanes come from these rows; frames that no lane has any more are dropped."""
-        frames = tuple(frame.select(rows, keep) for frame in self.frames)
-        return Memory(tuple(frame for frame in frames if bool(frame.present.any())))
+        return _shared(frame.select(rows, keep) for frame in self.frames)
 
     def to(self, device: torch.device | str) -> Memory:
         """The same memory on another device."""
@@ -173,6 +177,15 @@ class Memory:
             }
             frames.append(MemoryFrame(**(entry | parts)))
         return cls(tuple(frames))
+
+
+def _shared(frames: Iterable[MemoryFrame]) -> Memory:
+    """A memory without the frames that no lane has any more, so that they take no place of others."""
+    frames = tuple(frames)
+    if not frames:
+        return Memory(())
+    kept = torch.stack([frame.present.any() for frame in frames]).tolist()  # one look, since a GPU waits for it
+    return Memory(tuple(frame for frame, wanted in zip(frames, kept, strict=True) if wanted))
 
 
 def rigid_inverse(

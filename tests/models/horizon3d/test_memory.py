@@ -124,19 +124,28 @@ def test_a_jump_cuts_off_all_that_lies_before_it_and_only_in_its_lane():
     batch = bare_frame(4.0, [pose(70.0 + 300.0), pose(81.0)])
     assert memory.frames[-1].motion(batch, 6.0).usable.tolist() == [True, True]
     assert memory.frames[0].motion(batch, 6.0).usable.tolist() == [False, True]
-    cut = memory.until_jump(batch)
+    cut = memory.before(batch)
     assert all(frame.present.tolist() == [False, True] for frame in cut.frames)
     assert not any(frame.motion(batch, 6.0).usable[0] for frame in cut.frames)
     assert all(frame.motion(batch, 6.0).usable[1] for frame in cut.frames)
     assert len(cut.select(torch.tensor([0]), torch.tensor([True])).frames) == 0
 
 
-def test_no_jump_where_the_vehicle_drove_stood_or_where_time_did_not_pass():
+def test_no_jump_where_the_vehicle_drove_or_stood():
     memory = frames_of(1, 3)
-    for elapsed, distance in ((0.5, 12.0), (0.5, 0.0), (2.0, 150.0), (0.0, 0.0), (-0.5, 10.0)):
+    for elapsed, distance in ((0.5, 12.0), (0.5, 0.0), (2.0, 150.0)):
         batch = bare_frame(1.0 + elapsed, [pose(20.0 + distance)])
-        assert all(bool(frame.present.all()) for frame in memory.until_jump(batch).frames)
-    assert Memory(()).until_jump(bare_frame(0.0, [pose()])) == Memory(())
+        assert memory.before(batch) == memory
+    assert Memory(()).before(bare_frame(0.0, [pose()])) == Memory(())
+
+
+def test_frames_that_are_not_in_the_past_give_up_their_places():
+    """Frames at 1.0, 0.5 and 0.0 s; in two lanes of different clocks a place is free when both give it up."""
+    for now, left in ((1.0, [0.5, 0.0]), (0.7, [0.5, 0.0]), (0.5, [0.0]), (-1.0, [])):
+        past = frames_of(1, 3).before(bare_frame(now, [pose(20.0)]))
+        assert [float(frame.timestamps_s[0]) for frame in past.frames] == left
+    past = frames_of(2, 3).before(bare_frame([1.0, 0.5], [pose(20.0), pose(11.0)]))
+    assert [frame.present.tolist() for frame in past.frames] == [[True, False], [True, True]]
 
 
 def test_select_follows_lanes_that_move_vanish_restart_and_appear():
