@@ -11,7 +11,7 @@ from torch import Tensor
 def mean_over_ranks(
     count: Tensor,  # any shape, on the device of the process
 ) -> Tensor:
-    """Mean of a count over all ranks, whose total counts as at least 1.
+    """Mean of a count over all ranks, whose total counts as at least 1; the specification clamps the mean instead.
 
     Gradients are averaged over ranks, so that N ranks divide as one process with the batch of all of them does, also
     where one object is all there is; a rank without objects neither explodes nor weighs more. Every rank must call it.
