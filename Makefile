@@ -8,7 +8,8 @@ PYTHON := $(if $(ACTIVE),python,.venv/bin/python)
 # The stamp remembers an install: it is redone when pyproject.toml changes. It lives inside the environment it describes.
 STAMP := $(if $(ACTIVE),$(ACTIVE),.venv)/.horizon3d-installed
 SCALE_ARG := $(if $(SCALE),scale=$(SCALE))
-INIT_ARG := $(if $(CHECKPOINT),phase.init_from=$(CHECKPOINT))
+INIT_ARG := $(if $(CHECKPOINT),'phase.init_from="$(CHECKPOINT)"')
+$(if $(filter 1 2,$(PHASE)),,$(error PHASE=$(PHASE): must be 1 or 2))
 
 .PHONY: help install world train report benchmark test check
 .DEFAULT_GOAL := help

@@ -65,8 +65,9 @@ def build_model(config: Config) -> Detector:
 
 
 def save_submission(path: Path, tokens: list[str], table: DetectionTable, config: Config) -> bool:
-    """Write boxes of these samples as a submission; False, with a warning, when there is none."""
+    """Write boxes of these samples as a submission; False, with a warning and no file, when there is none."""
     if not len(table):
+        path.unlink(missing_ok=True)  # of an earlier command, whose boxes these are not
         logger.warning("no box reached the score threshold, so there is no valid submission to write")
         return False
     dptf = getattr(config.model, "dptf", None)  # the benchmark's rules are about how far back a detector looks

@@ -38,11 +38,12 @@ def run_command(main: Callable[[list[str]], None]) -> None:
         print(f"\n{type(error).__name__}: {error}", file=sys.stderr)  # a progress bar may stand on the line
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        print("\nInterrupted; the same command goes on from where it can.", file=sys.stderr)
+        print("\nInterrupted; the same command goes on from a checkpoint where it writes any.", file=sys.stderr)
         sys.exit(InterruptedRunError.exit_code)
     except Exception as error:
         if interruptions:  # it struck inside a library's compiled code, which made another error of it
-            print(f"\nInterrupted ({error}); the same command goes on from where it can.", file=sys.stderr)
+            what = f"Interrupted ({error}); the same command goes on from a checkpoint where it writes any."
+            print(f"\n{what}", file=sys.stderr)
             sys.exit(InterruptedRunError.exit_code)
         known = _machine_fault(error)
         if known is not None:

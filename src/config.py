@@ -11,6 +11,7 @@ import difflib
 import hashlib
 import json
 import math
+import re
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -255,6 +256,8 @@ def _compose(overrides: list[str]) -> DictConfig:
             raise ConfigError(f"{override}: options are written key=value, without dashes")
         if override.startswith("~"):
             raise ConfigError(f"{override}: keys cannot be removed; a part is switched off with {override[1:]}=null")
+        if override.startswith("phase.name="):
+            raise ConfigError(f"{override}: runs are told apart by this name; choose a phase with phase=...")
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             tree = compose("config", overrides=overrides)
@@ -287,8 +290,8 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     """A configuration as a checkpoint stores it, with the keys named in `overrides` replaced.
 
     A group choice (`data=truckscenes`) replaces that whole group, at the checkpoint's scale and phase.
-    Raises CheckpointError when the stored tree does not fit this version of the code, ConfigError for another scale and
-    for a key below a part that the checkpoint does not have.
+    Raises CheckpointError when the stored tree does not fit this version of the code, ConfigError for another scale or
+    phase and for a key below a part that the checkpoint does not have.
     """
     model, phase = (
         stored[key].get("name") if isinstance(stored.get(key), dict) else None for key in ("model", "phase")
@@ -299,8 +302,9 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
         raise CheckpointError(f"the checkpoint is of phase {phase!r}; this version knows {PHASES}")
     scale = stored.get("scale")
     changes = {change.key_or_group: change for change in OverridesParser.create().parse_overrides(overrides)}
-    if "scale" in changes and changes["scale"].value() != scale:
-        raise ConfigError(f"scale={changes['scale'].value()}: the checkpoint is of scale={scale}; leave scale= out")
+    for key, own in {"scale": scale, "phase": phase, "phase.temporal": stored["phase"].get("temporal")}.items():
+        if key in changes and changes[key].value() != own:
+            raise ConfigError(f"{key}={changes[key].value()}: the checkpoint is of {key}={own}; leave {key}= out")
     tree, fresh = OmegaConf.create(stored), _compose([f"scale={scale}", f"phase={phase}", *overrides])
     for key in sorted(changes, key=lambda key: key.count(".")):  # a part before what lies in it
         part = key.rpartition(".")[0]
@@ -364,6 +368,18 @@ def _check_tree(value: Any, node: Any, path: str) -> None:
             _check_tree(item, node[index], f"{path}[{index}]")
     elif isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f"{path} must be a finite number, but got {value}")
+
+
+def digest_of_changes(overrides: list[str]) -> str:
+    """`-` and 8 hex that tell apart results of one checkpoint by what the command line changes; empty for no change.
+
+    What only says where from, where to and on what machine does not count.
+    """
+    besides = ("checkpoint", "predictions", "out", "scene", "paths", "trainer", "logger", "data.num_workers")
+    changes = sorted(
+        change for change in overrides if not any(re.match(rf"\+*{re.escape(key)}[.=]", change) for key in besides)
+    )
+    return f"-{hashlib.sha256(json.dumps(changes).encode()).hexdigest()[:8]}" if changes else ""
 
 
 def run_identity(tree: dict[str, Any], source: str | None = None) -> str:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
 from src.command import run_command
-from src.config import Config, compose_config, restore_config
-from src.errors import ConfigError
+from src.config import Config, compose_config, digest_of_changes, restore_config
+from src.errors import ConfigError, DataError
 from src.metrics.detection import score_detections
 from src.metrics.report import format_scores
 from src.metrics.scores import DetectionScores
@@ -28,12 +28,20 @@ def main(overrides: list[str]) -> None:
     if (config.checkpoint is None) == (config.predictions is None):
         raise ConfigError("give either checkpoint=PATH or predictions=FILE.json")
     source = Path(config.checkpoint or config.predictions)
-    out = Path(config.out) if config.out else Path(config.paths.outputs) / "evaluations" / name_of(source)
+    if config.predictions and not source.is_file():  # before a world is written for it
+        raise DataError(f"predictions={source}: there is no such file")
+    name = f"{name_of(source)}{digest_of_changes(overrides)}"
+    out = Path(config.out) if config.out else Path(config.paths.outputs) / "evaluations" / name
     make_writable(out, "out")
-    scores = score_checkpoint(source, overrides, out) if config.checkpoint else score_file(source, config)
+    written = ["metrics.json"]
+    if config.checkpoint:
+        scores, has_boxes = score_checkpoint(source, overrides, out)
+        written += ["submission.json"] * has_boxes
+    else:
+        scores = score_file(source, config)
     write_json(out / "metrics.json", scores.as_dict())
     print(format_scores(scores.as_dict()))
-    print(f"\nwritten into {out}: {', '.join(sorted(path.name for path in out.glob('*.json')))}")
+    print(f"\nwritten into {out}: {', '.join(written)}")
 
 
 def name_of(source: Path) -> str:
@@ -49,8 +57,11 @@ def score_file(path: Path, config: Config) -> DetectionScores:
     return score_detections(evaluation_set, load_submission(path, evaluation_set.tokens))
 
 
-def score_checkpoint(path: Path, overrides: list[str], out: Path) -> DetectionScores:
-    """Rebuild the checkpoint's own model, run it over the split and score it; the command line may change its data."""
+def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[DetectionScores, bool]:
+    """Rebuild the checkpoint's own model, run it over the split and score it; the command line may change its data.
+
+    The second value tells whether there was any box, and so a submission.
+    """
     tune_cpu_allocator()
     checkpoint = read_checkpoint(path)
     tree = checkpoint["horizon3d"]["config"]
@@ -62,10 +73,11 @@ def score_checkpoint(path: Path, overrides: list[str], out: Path) -> DetectionSc
     build_evaluation_trainer(config.precision, config.trainer.accelerator.value).validate(
         module, datamodule=datamodule, verbose=False
     )
-    save_submission(out / "submission.json", module.metric.evaluation_set.tokens, module.detections, config)
+    tokens = module.metric.evaluation_set.tokens
+    written = save_submission(out / "submission.json", tokens, module.detections, config)
     if module.skipped:
         print(f"sensor files passed over: {module.skipped}")
-    return module.scores
+    return module.scores, written
 
 
 if __name__ == "__main__":

@@ -124,12 +124,22 @@ def train_source(source: Source, train_missing: bool, processes_exist: bool) -> 
         )
 
 
+def read_source(source: Source) -> dict[str, Any]:
+    """The source's checkpoint. Raises CheckpointError with the remedy when it is damaged."""
+    try:
+        return read_checkpoint(source.checkpoint)
+    except CheckpointError as error:
+        if source.overrides is None:
+            raise
+        raise CheckpointError(f"{error}; make it anew with\n    {source.command} resume=restart") from error
+
+
 def hand_over(model: nn.Module, source: Source, tree: dict[str, Any]) -> None:
     """Give `model` the source's weights; what the new phase adds keeps its own. Settings that differ are logged.
 
     Raises CheckpointError naming every key that does not fit.
     """
-    checkpoint = read_checkpoint(source.checkpoint)
+    checkpoint = read_source(source)
     new = load_model_weights(model, checkpoint, source.checkpoint, MAY_BE_NEW)
     parts = sorted({key.split(".temporal_attention.")[0].split(".")[0] for key in new})
     logger.info("weights from %s; new: %d tensors in %s", source.checkpoint, len(new), ", ".join(parts) or "nothing")

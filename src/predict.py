@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from src.assembly import build_datamodule, data_root, save_submission
 from src.command import run_command
-from src.config import Config, compose_config, restore_config
+from src.config import Config, compose_config, digest_of_changes, restore_config
 from src.data.splits import split_samples
 from src.errors import ConfigError
 from src.metrics.submission import to_global
@@ -48,7 +48,7 @@ def main(overrides: list[str]) -> None:
     detector = StreamingDetector.restore(config, checkpoint, path, chosen_device(config))
     datamodule = build_datamodule(config, data_root(config, write=False))
     frames = datamodule.stream(None if command.scene is None else [command.scene])
-    out = output_folder(path, command, config)  # named by the scene, which is known by now
+    out = output_folder(path, command, config, overrides)  # named by the scene, which is known by now
     make_writable(out, "out")
     index, split = datamodule.index, split_samples(datamodule.index, config.data.split)
     wanted = split if command.scene is None else index.samples_of({command.scene})
@@ -57,6 +57,8 @@ def main(overrides: list[str]) -> None:
     film = Film()
     bar = tqdm(frames, total=len(tokens), desc="predicting", unit="frame")
     found, skipped = predict(detector, bar, film if command.trainer.num_pictures else None)
+    for name in ("strip.png", "scene.gif"):  # of an earlier command, whose boxes these are not
+        (out / name).unlink(missing_ok=True)
     if film:
         film.write_strip(out / "strip.png", command.trainer.num_pictures)
         film.write_animation(out / "scene.gif")
@@ -73,12 +75,13 @@ def main(overrides: list[str]) -> None:
         )
 
 
-def output_folder(checkpoint: Path, command: Config, config: Config) -> Path:
-    """`out`, or a folder named by the checkpoint's run (else its file) and by what is predicted."""
+def output_folder(checkpoint: Path, command: Config, config: Config, overrides: list[str]) -> Path:
+    """`out`, or a folder named by the checkpoint's run (else its file), by what is predicted and by what is changed."""
     if command.out is not None:
         return Path(command.out)
     run = checkpoint.resolve().parent
     name = run.parent.name if run.name == "checkpoints" else checkpoint.stem
+    name += digest_of_changes(overrides)
     return Path(command.paths.outputs) / "predictions" / name / (command.scene or config.data.split)
 
 

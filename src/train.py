@@ -21,7 +21,7 @@ from src.command import run_command
 from src.config import Config, compose_config, run_identity
 from src.data.datamodule import DetectionDataModule
 from src.errors import DataError
-from src.handoff import Source, find_source, hand_over, train_source
+from src.handoff import Source, find_source, hand_over, read_source, train_source
 from src.metrics.report import format_scores
 from src.ops.allocator import tune_cpu_allocator
 from src.pictures.curves import draw_curves, draw_scores
@@ -62,12 +62,15 @@ def main(overrides: list[str]) -> None:
 
 
 def ensure_source(config: Config, folder: RunFolder, source: Source | None, processes_exist: bool) -> None:
-    """Train the run whose weights this one starts from, where it is missing and this run really begins now.
+    """Where this run really begins now: train the run whose weights it starts from, if missing, and try to read them.
 
     Comes before the own folder is touched: what fails here leaves everything as it was.
     """
-    if source is not None and not source.ready and begins(folder, config.resume):
+    if source is None or not begins(folder, config.resume):
+        return
+    if not source.ready:
         train_source(source, config.phase.train_missing, processes_exist)
+    read_source(source)
 
 
 def begins(folder: RunFolder, resume: Resume) -> bool:

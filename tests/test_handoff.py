@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -227,6 +228,18 @@ def test_several_processes_train_it_only_where_the_run_begins(tmp_path):
     assert not train.begins(folder, Resume.auto) and train.begins(folder, Resume.restart)
     folder.record.write_text("{}"), folder.metrics_json.write_text("{}")
     assert not train.begins(folder, Resume.auto) and train.begins(folder, Resume.restart)
+
+
+def test_a_damaged_source_is_found_before_the_own_run_is_touched(tmp_path):
+    overrides = ["phase=phase2", "scale=debug", f"paths.outputs={tmp_path}", "resume=restart"]
+    config, tree = compose_config(overrides)
+    source = find_source(config, overrides)
+    finished(source)
+    folder = RunFolder(tmp_path, run_identity(tree, source.identity))
+    folder.path.mkdir()
+    with pytest.raises(CheckpointError, match="(?s)last.ckpt is truncated.*make it anew.*phase=phase1.*resume=restart"):
+        train.prepare(config, tree, folder, source)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([folder.run_id, source.identity])
 
 
 # ---------------------------------------------------------------- the weights
@@ -503,10 +516,15 @@ def test_make_hands_the_checkpoint_on():
     def shown(*arguments):
         made = subprocess.run(["make", "-n", *arguments], cwd=ROOT, capture_output=True, text=True, check=True)
         (line,) = (line for line in made.stdout.splitlines() if "src.train" in line)
-        return line.split("src.train")[1].split()
+        return shlex.split(line.split("src.train")[1])
 
-    assert shown("train", "PHASE=2", "CHECKPOINT=x") == ["phase=phase2", "phase.init_from=x"]
+    path = "/a folder/x=1, y/last.ckpt"
+    options = shown("train", "PHASE=2", f"CHECKPOINT={path}")
+    assert options[0] == "phase=phase2" and compose_config(options)[0].phase.init_from == path
     assert shown("train", "PHASE=2", "SCALE=debug") == ["phase=phase2", "scale=debug"]
     assert shown("train") == ["phase=phase1"]
+    for phase in ("", "3", "phase2"):
+        wrong = subprocess.run(["make", "-n", "train", f"PHASE={phase}"], cwd=ROOT, capture_output=True, text=True)
+        assert wrong.returncode == 2 and f"PHASE={phase}: must be 1 or 2" in wrong.stderr
     helped = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     assert "PHASE=1|2" in helped and "CHECKPOINT=PATH" in helped

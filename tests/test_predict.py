@@ -97,9 +97,24 @@ def test_pictures_of_the_first_scene(checkpoints, outputs, tmp_path, capsys):
     assert "submission.json, scene.gif, strip.png" in capsys.readouterr().out
 
 
-def test_without_any_box_there_is_no_submission_and_the_log_says_why(checkpoints, outputs, tmp_path, caplog):
-    run(checkpoints["phase1"], f"paths.outputs={outputs}", f"out={tmp_path}", "model.head.score_threshold=0.99")
-    assert "no box reached the score threshold" in caplog.text and not list(tmp_path.iterdir())
+@pytest.mark.parametrize("command", [predict, evaluate])
+def test_without_any_box_there_is_no_submission_not_even_an_older_one(
+    checkpoints, outputs, tmp_path, caplog, capsys, command
+):
+    for name in ("submission.json", "strip.png"):
+        (tmp_path / name).write_text("of an earlier command")
+    none = (f"paths.outputs={outputs}", f"out={tmp_path}", "model.head.score_threshold=0.99", "trainer.num_pictures=0")
+    command.main([f"checkpoint={checkpoints['phase1']}", *none])
+    assert "no box reached the score threshold" in caplog.text and not (tmp_path / "submission.json").exists()
+    assert (tmp_path / "strip.png").exists() == (command is evaluate)
+    assert "submission.json" not in capsys.readouterr().out
+
+
+def test_results_under_other_settings_lie_elsewhere(checkpoints, outputs, tmp_path):
+    (world,) = (outputs / "worlds").iterdir()
+    for own in ("", "trainer.accelerator=cpu", "model.head.score_threshold=0.2", "model.head.score_threshold=0.3"):
+        run(checkpoints["phase1"], f"paths.outputs={tmp_path}", f"data.root={world}", *filter(None, [own]))
+    assert len(list((tmp_path / "predictions").iterdir())) == 3  # an accelerator changes no result
 
 
 def test_an_interrupted_run_leaves_what_was_there(checkpoints, outputs, tmp_path, monkeypatch):
@@ -127,6 +142,14 @@ def test_bad_input_is_named(checkpoints, outputs, tmp_path):
         run(good, *base, "predictions=a.json")
     with pytest.raises(CheckpointError, match="does not exist"):
         run(tmp_path / "none.ckpt", *base)
+    with pytest.raises(CheckpointError, match="is a folder"):
+        run(tmp_path, *base)
+    for command in (predict, evaluate):
+        with pytest.raises(ConfigError, match="phase=phase2: the checkpoint is of phase=phase1"):
+            command.main([f"checkpoint={good}", base[0], f"out={tmp_path / 'never'}", "phase=phase2"])
+    with pytest.raises(DataError, match="none.json: there is no such file"):
+        evaluate.main([f"predictions={tmp_path / 'none.json'}", f"paths.outputs={tmp_path / 'new'}"])
+    assert not (tmp_path / "new").exists()
     half = tmp_path / "half.ckpt"
     half.write_bytes(good.read_bytes()[:4000])
     with pytest.raises(CheckpointError, match="half.ckpt is truncated"):

@@ -27,6 +27,8 @@ MAX_SWEEP_LEAD_S = 0.1
 RIGID_TOLERANCE = 1e-3
 FLOAT32_REACH_M = 1e5
 """Beyond, float32 coordinates are wrong by centimetres and soon by half a metre (spec section 1.1)."""
+FLOAT32_REACH_S = 1e4
+"""Beyond, float32 times are wrong by a millisecond and soon by the half second between frames."""
 
 
 @dataclass(kw_only=True)
@@ -55,7 +57,7 @@ def frame_from_sensors(
     timestamp_s: float,
     global_from_ego: Array,  # [4, 4] float64; any fixed frame serves, the same one for all frames
     cameras: Mapping[str, Camera | None],
-    radars: Mapping[str, Sequence[RadarSweep]],
+    radars: Mapping[str, Sequence[RadarSweep] | None],
     settings: ReaderSettings,
     token: str = "",
 ) -> FrameBatch:
@@ -63,11 +65,12 @@ def frame_from_sensors(
 
     Ego is x forward, y left, z up, its origin on the ground under the rear axle. `cameras` go by the names in
     `taxonomy.CAMERAS`; one that is absent or None is masked, and where `settings.image_size_px` is None none is looked
-    at. `radars` go by any name; of each the newest `settings.num_sweeps` sweeps are used, in whatever order they come.
+    at. `radars` go by any name; of each the newest `settings.num_sweeps` sweeps are used, in whatever order they come,
+    and None is as no sweep.
 
     Raises DataError naming the sensor, what was expected and what was found.
     """
-    timestamp_s = float(_array(timestamp_s, (), "timestamp_s of the frame"))
+    timestamp_s = _seconds(timestamp_s, "timestamp_s of the frame")
     global_from_ego = _rigid(global_from_ego, "global_from_ego of the frame")
     points = _radar_points(timestamp_s, global_from_ego, radars, settings)
     batch = {
@@ -86,15 +89,18 @@ def frame_from_sensors(
 def _radar_points(
     timestamp_s: float,
     global_from_ego: Array,  # [4, 4]
-    radars: Mapping[str, Sequence[RadarSweep]],
+    radars: Mapping[str, Sequence[RadarSweep] | None],
     settings: ReaderSettings,
 ) -> Array:  # [P, 7] float32, see RADAR_POINT_FIELDS
     clouds, mounts, poses, velocities, rates, ages = [], [], [], [], [], []
     for name, sweeps in radars.items():
-        newest = sorted(sweeps, key=lambda sweep: sweep.timestamp_s, reverse=True)[: settings.num_sweeps]
-        for number, sweep in enumerate(newest):
+        if not isinstance(sweeps, Sequence | None) or not all(isinstance(sweep, RadarSweep) for sweep in sweeps or ()):
+            raise DataError(f"radar {name}: must be a list of RadarSweep, or None, but got {type(sweeps).__name__}")
+        timed = [(_seconds(sweep.timestamp_s, f"radar {name}: timestamp_s"), sweep) for sweep in sweeps or ()]
+        newest = sorted(timed, key=lambda pair: pair[0], reverse=True)[: settings.num_sweeps]
+        for number, (time_s, sweep) in enumerate(newest):
             where = f"radar {name}, sweep {number} (0 is the newest)"
-            age = timestamp_s - sweep.timestamp_s
+            age = timestamp_s - time_s
             if not -MAX_SWEEP_LEAD_S <= age <= MAX_SWEEP_AGE_S:
                 raise DataError(
                     f"{where}: is {age:g} s older than its frame, expected {-MAX_SWEEP_LEAD_S:g} to "
@@ -186,6 +192,12 @@ def _array(value: object, shape: tuple[int | None, ...], name: str) -> Array:
     if not np.isfinite(array).all():
         raise DataError(f"{name} must be finite, but entry {np.argwhere(~np.isfinite(array))[0].tolist()} is not")
     return array
+
+
+def _seconds(value: object, name: str) -> float:
+    if getattr(value, "dtype", None) == np.float32 and abs(float(value)) > FLOAT32_REACH_S:
+        raise DataError(f"{name} is float32 and {float(value):.0f} s, which rounds times; give float64")
+    return float(_array(value, (), name))
 
 
 def _points(value: object, where: str) -> Array:  # [n, 7]

@@ -49,7 +49,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     Raises CheckpointError when the file is missing, broken, or not written by this project.
     """
     if not path.is_file():
-        raise CheckpointError(f"checkpoint {path} does not exist; runs keep theirs in outputs/<run_id>/checkpoints")
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise CheckpointError(f"checkpoint {path} {what}; runs keep theirs in outputs/<run_id>/checkpoints/last.ckpt")
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()  # torch itself loads flipped bits without a word

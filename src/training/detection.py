@@ -87,7 +87,8 @@ class DetectionModule(L.LightningModule):
             bad = {name: float(value.detach()) for name, value in terms.items() if not torch.isfinite(value)}
             raise DivergedError(
                 f"step {self.trainer.global_step}: loss terms {bad} are not finite for samples {batch.tokens}; "
-                "the last checkpoint holds the weights before; try a smaller optim.lr or optim.peak_lr_ratio"
+                "the last checkpoint, if there is one yet, holds the weights before; try a smaller optim.lr or "
+                "optim.peak_lr_ratio"
             )
 
     def _count_skipped(self, batch: FrameBatch) -> None:

@@ -138,6 +138,24 @@ BAD_CAMERAS = {
 }
 
 
+def test_what_is_no_list_of_sweeps_is_named_and_none_is_no_sweep(raw):
+    without = raw | {"radars": {"front": None}}
+    assert len(frame_from_sensors(**without, settings=reader_settings()).radar_points) == 0
+    for wrong in (sweep(raw), [sweep(raw), None], 3):
+        with pytest.raises(DataError, match="radar front: must be a list of RadarSweep"):
+            frame_from_sensors(**(raw | {"radars": {"front": wrong}}), settings=reader_settings())
+
+
+def test_float32_times_are_refused_where_they_round(raw):
+    """Seconds since 1970 in float32 are two minutes apart."""
+    with pytest.raises(DataError, match="timestamp_s of the frame is float32"):
+        frame_from_sensors(**(raw | {"timestamp_s": np.float32(1.7e9), "radars": {}}), settings=reader_settings())
+    with pytest.raises(DataError, match="radar front: timestamp_s is float32"):
+        late = sweep(raw, timestamp_s=np.float32(1.7e9))
+        frame_from_sensors(**(raw | {"radars": {"front": [late]}}), settings=reader_settings())
+    frame_from_sensors(**(raw | {"timestamp_s": np.float32(100.5), "radars": {}}), settings=reader_settings())
+
+
 @pytest.mark.parametrize("message", BAD_SWEEPS)
 def test_a_bad_sweep_is_named(raw, message):
     radars = {"front": [sweep(raw), sweep(raw, **BAD_SWEEPS[message])]}

@@ -60,6 +60,11 @@ class Horizon3DConfig:
                 f"model.channels={self.channels}: must be a positive multiple of {CHANNEL_MULTIPLE}, whole norm groups "
                 f"of 4 channels in each of {NUM_HEADS} attention heads"
             )
+        if self.temporal_heads is not None and self.channels % self.temporal_heads:
+            raise ConfigError(
+                f"model.dptf.gaussian_path.self_attention.num_heads={self.temporal_heads}: must divide "
+                f"model.channels={self.channels}"
+            )
 
     @property
     def uses_images(self) -> bool:

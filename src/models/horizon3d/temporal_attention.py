@@ -5,23 +5,15 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import ConfigError
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.structures.gaussians import GaussianSet
 
 
 class TemporalSelfAttention(nn.Module):
-    """Pre-norm multi-head attention over all valid Gaussians; adds exactly zero before it is trained.
-
-    Raises ConfigError when the channels do not split into heads.
-    """
+    """Pre-norm multi-head attention over all valid Gaussians; adds exactly zero before it is trained."""
 
     def __init__(self, channels: int, num_heads: int) -> None:
         super().__init__()
-        if channels % num_heads:
-            raise ConfigError(
-                f"model.dptf.gaussian_path.self_attention.num_heads={num_heads}: must divide model.channels={channels}"
-            )
         self.num_heads = num_heads
         self.norm = nn.LayerNorm(channels)
         self.time = TimeEmbedding(channels)

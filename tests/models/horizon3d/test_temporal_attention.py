@@ -2,11 +2,9 @@
 
 import math
 
-import pytest
 import torch
 import torch.nn.functional as F
 
-from src.errors import ConfigError
 from src.models.horizon3d.temporal_attention import TemporalSelfAttention
 from src.structures.gaussians import GaussianSet
 
@@ -174,8 +172,3 @@ def test_under_autocast():
     with torch.autocast("cpu", torch.bfloat16):
         half = attention(features, embedding, gaussians)
     assert (half.float() - attention(features, embedding, gaussians)).abs().max() < 0.15
-
-
-def test_heads_must_divide_the_channels():
-    with pytest.raises(ConfigError, match=r"self_attention.num_heads=3.*model.channels=16"):
-        TemporalSelfAttention(16, 3)
