@@ -391,7 +391,7 @@ def run_identity(tree: dict[str, Any], source: str | None = None) -> str:
     if source is not None:
         tree["phase"]["init_from"] = source
     if not tree["phase"]["temporal"]:
-        for key in ("groups_per_scene", "lane_sets"):
+        for key in ("groups_per_scene", "lane_sets", "silent_frames"):
             tree["data"].pop(key)
     for key in OUTSIDE_IDENTITY:
         *parents, leaf = key.split(".")

@@ -30,7 +30,7 @@ MAY_BE_NEW = re.compile(r"dptf\.|ocsf\.encoder\.layers\.\d+\.temporal_attention\
 OF_THIS_RUN = ("phase", "resume")
 """Overrides that never concern the run whose weights are taken."""
 OF_THE_LATER_PHASE = (
-    *("model.dptf", "data.groups_per_scene", "data.lane_sets"),
+    *("model.dptf", "data.groups_per_scene", "data.lane_sets", "data.silent_frames"),
     *(f"model.loss.cell_{term}_weight" for term in ("focal", "dice", "lovasz", "velocity")),
 )
 """Nor do these, where that run is of the phase before."""

@@ -129,7 +129,7 @@ FULL_SIZE = {
     "data": {
         "train_split": "train", "split": "val", "batch_size": 8, "num_sweeps": 10, "min_distance_m": 1.0,
         "propagate_points": False, "on_bad_file": "error", "test_resize_offset": 0.0, "groups_per_scene": 2,
-        "lane_sets": 1,
+        "lane_sets": 1, "silent_frames": 0.0,
     },
     "data.augmentation.image": {"resize": [-0.06, 0.11], "rotation_deg": 5.4, "flip_probability": 0.5},
     "data.augmentation.bev": {"scale": [0.95, 1.05], "rotation_rad": 0.3925, "flip_probability": 0.5},
@@ -273,6 +273,7 @@ def test_run_identity_of_phase_2():
         "model.dptf.gaussian_path.sampling=random",
         "model.dptf.gaussian_path.self_attention=null",
         "data.groups_per_scene=1",
+        "data.silent_frames=0.5",
         "phase.epochs=2",
     ):
         assert identity(override) != base, override

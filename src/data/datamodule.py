@@ -51,6 +51,7 @@ class DataConfig:
     batch_size: int  # total over all devices; the lanes when clips are streamed
     groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; spec section 6.4
     lane_sets: int  # at most so many sets of lanes take turns when clips are streamed; 1: all lanes at every step
+    silent_frames: float  # share of streamed frames, never a clip's first, from which all sensor data are taken away
     num_workers: int  # loader processes per device
     num_sweeps: int  # past sweeps of each radar
     min_distance_m: float  # nearer points are the truck itself
@@ -72,6 +73,8 @@ class DataConfig:
         for name, least in least_values.items():
             if not getattr(self, name) >= least:
                 raise ConfigError(f"data.{name}={getattr(self, name)}: must be at least {least}")
+        if not 0 <= self.silent_frames < 1:
+            raise ConfigError(f"data.silent_frames={self.silent_frames}: must be at least 0 and below 1")
         if not -0.5 < self.test_resize_offset < 1:
             raise ConfigError(f"data.test_resize_offset={self.test_resize_offset}: must lie between -0.5 and 1")
 
@@ -97,8 +100,10 @@ class FrameDataset(Dataset[FrameBatch]):
     traceback and lose its message. `collate` passes it on and `FrameLoader` raises it.
     """
 
-    def __init__(self, reader: FrameReader, augmentation: AugmentationConfig | None, seed: int) -> None:
-        self.reader, self.augmentation, self.seed = reader, augmentation, seed
+    def __init__(
+        self, reader: FrameReader, augmentation: AugmentationConfig | None, seed: int, silent_frames: float = 0.0
+    ) -> None:
+        self.reader, self.augmentation, self.seed, self.silent_frames = reader, augmentation, seed, silent_frames
 
     def __getitem__(self, key: FrameKey) -> FrameBatch | HorizonError:
         clip = None if key.clip is None else str(self.reader.index.sample_tokens[key.clip])
@@ -106,12 +111,28 @@ class FrameDataset(Dataset[FrameBatch]):
             frame = self.reader.read(key.sample, self.augmentation, self.seed, key.epoch, clip)
         except HorizonError as error:
             return error
-        return frame if key.lane is None else in_lane(frame, key.lane, key.starts)
+        if key.lane is None:
+            return frame
+        frame = in_lane(frame, key.lane, key.starts)
+        # Without augmentation the same frames in every run and epoch, so that scores compare.
+        draw = (key.sample,) if self.augmentation is None else (key.sample, self.seed, key.epoch)
+        return silence_some(frame, self.silent_frames, draw)
 
 
 def in_lane(frame: FrameBatch, lane: int, starts: bool) -> FrameBatch:
     """A batch of one, marked as the next frame of a lane."""
     return replace(frame, lanes=torch.tensor([lane]), starts=torch.tensor([starts]))
+
+
+def silence_some(frame: FrameBatch, share: float, draw: tuple[int, ...]) -> FrameBatch:
+    """The frame, or with the probability `share` the same without radar points and images, unless it starts a clip."""
+    if frame.starts[0] or np.random.default_rng(draw).random() >= share:
+        return frame
+    silent = replace(frame, radar_points=frame.radar_points[:0], radar_batch=frame.radar_batch[:0])
+    if frame.images is not None:
+        images, valid = torch.zeros_like(frame.images), torch.zeros_like(frame.image_valid)
+        silent = replace(silent, images=images, image_valid=valid)
+    return silent
 
 
 class FrameLoader(DataLoader):
@@ -228,7 +249,8 @@ class DetectionDataModule(L.LightningDataModule):
     def _in_order(self, samples: np.ndarray) -> Iterator[FrameBatch]:
         """One clip in lane 0, without augmentation."""
         for at, sample in enumerate(samples):
-            yield in_lane(self.reader.read(int(sample), None), 0, at == 0)
+            frame = in_lane(self.reader.read(int(sample), None), 0, at == 0)
+            yield silence_some(frame, self.config.silent_frames, (int(sample),))
 
     def train_dataloader(self) -> DataLoader:
         """Augmented batches of the training split, shuffled frames or clips.
@@ -283,7 +305,7 @@ class DetectionDataModule(L.LightningDataModule):
     def _loader(self, sampler: ScheduleSampler, augmentation: AugmentationConfig | None) -> DataLoader:
         workers = self.config.num_workers
         return FrameLoader(
-            FrameDataset(self.reader, augmentation, self.seed),
+            FrameDataset(self.reader, augmentation, self.seed, self.config.silent_frames),
             batch_sampler=sampler,
             num_workers=workers,
             collate_fn=collate,

@@ -27,7 +27,7 @@ BEV = BevAugmentationConfig(scale=[0.95, 1.05], rotation_rad=0.4, flip_probabili
 def config(**changes):
     values = dict(
         root=None, version=VERSION, train_split="train", split="val", batch_size=2, groups_per_scene=2, lane_sets=1,
-        num_workers=0, num_sweeps=2, min_distance_m=1.0, propagate_points=False, on_bad_file=OnBadFile.error,
+        silent_frames=0.0, num_workers=0, num_sweeps=2, min_distance_m=1.0, propagate_points=False, on_bad_file=OnBadFile.error,
         test_resize_offset=0.0, augmentation=AugmentationConfig(image=None, bev=BEV), world=None,
     )  # fmt: skip
     return DataConfig(**(values | changes))
@@ -151,7 +151,7 @@ def test_errors_travel_between_processes():
 @pytest.mark.parametrize(
     "change",
     [{"batch_size": 0}, {"groups_per_scene": 0}, {"lane_sets": 0}, {"num_sweeps": 0}, {"num_workers": -1},
-     {"min_distance_m": float("nan")}, {"test_resize_offset": float("nan")}],
+     {"silent_frames": 1.0}, {"silent_frames": -0.1}, {"min_distance_m": float("nan")}, {"test_resize_offset": float("nan")}],
     ids=str,
 )  # fmt: skip
 def test_impossible_settings(change):
@@ -254,6 +254,28 @@ def test_images_are_augmented_frame_by_frame_within_a_clip(data_set):
     points = torch.cat([plain.radar_points[:, :3].double(), torch.ones(len(plain.radar_points), 1)], 1) @ matrix.T
     torch.testing.assert_close(second.radar_points[:, :3].double(), points[:, :3], rtol=0, atol=1e-4)
     torch.testing.assert_close(second.global_from_ego, plain.global_from_ego)  # memory lives here, unaugmented
+
+
+def test_silent_frames_are_never_a_clips_first_and_in_validation_always_the_same(data_set):
+    def silent(loader):
+        batches = list(loader)
+        for batch in batches:
+            for row, starts in enumerate(batch.starts):
+                points = int((batch.radar_batch == row).sum())
+                assert (points == 0) == (not batch.image_valid[row].any()) == (not batch.images[row].any())
+                assert points > 0 or not starts
+            assert batch.boxes is not None and all(len(boxes) for boxes in batch.boxes)
+        return [
+            token for batch in batches for row, token in enumerate(batch.tokens) if not (batch.radar_batch == row).any()
+        ]
+
+    streamed = {"temporal": True, "batch_size": 1, "groups_per_scene": 1, "split": "train"}
+    made = [module(data_set, seed=seed, silent_frames=0.8, **streamed) for seed in (0, 1)]
+    in_validation = [silent(one.val_dataloader()) for one in made]
+    assert in_validation[0] == in_validation[1] == silent(made[0].val_dataloader())
+    frames = [frame.tokens[0] for frame in made[0].stream() if len(frame.radar_points) == 0]
+    assert sorted(frames) == sorted(in_validation[0]) and len(frames) > 0
+    assert silent(made[0].train_dataloader()) and not silent(module(data_set, **streamed).train_dataloader())
 
 
 def test_stream_of_scenes(drives):
