@@ -11,7 +11,7 @@ from src.command import run_command
 from src.config import compose_config
 from src.errors import DataError
 from src.pictures.comparison import BarPanel, draw_comparison
-from src.reporting.pages import PHASES_OF, compared_experiments, comparison_page, phase_page, runs_on_page
+from src.reporting.pages import PHASES_OF, compared_experiments, comparison_page, phase_page, runs_on_page, seeing
 from src.reporting.results import read_runs
 from src.reporting.tables import BY_RANGE, BY_SPEED, ERROR_BY_SPEED, RANGES, SPEEDS, Experiment, mean_and_spread
 from src.training.run_folder import make_writable
@@ -30,7 +30,7 @@ def main(overrides: list[str]) -> None:
         if phase in PHASES_OF:
             experiments = compared_experiments(runs)
             picture = f"pictures/{phase}_{scale}.png"
-            draw_comparison(reports / picture, bar_panels(experiments), f"{phase}, scale {scale}")
+            draw_comparison(reports / picture, bar_panels(seeing(experiments)), f"{phase}, scale {scale}")
             text = comparison_page(experiments, scale, picture)
         else:
             text = phase_page(runs, scale, config.phase.epochs)

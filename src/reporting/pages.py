@@ -47,12 +47,18 @@ NAMES_OF_COMPARISON = {
 }
 """By phase and sorted settings, in the order of the page; phase 1 that went on stands after phase 1."""
 
+SILENT = "data.silent_frames="
+
 METRIC = "official TruckScenes metric on the validation split; percent, mean ± standard deviation over seeds."
 
 BY_SPEED_TEXT = """By speed of the ground truth (a match follows its ground truth whatever speed it states, a false
 positive the speed it states). Means over the classes that occur at that speed; the velocity error (m/s, at 2 m) of a
 class that does not reach a recall of 0.1 counts as 1, the official rule, so read it beside the AP. Some classes have
 few boxes at a speed; the car's numbers stand on the most."""
+
+SILENT_TEXT = """From the share `data.silent_frames` of the frames, never a clip's first, all sensor data are taken away,
+in training and in validation: what is found there comes from the memory alone. These rows compare with one another
+only."""
 
 GAIN_TEXT = """Differences between runs of the same seed, mean ± standard deviation: points of percent, and m/s for the
 velocity error, where less is better."""
@@ -86,13 +92,16 @@ def compared_experiments(runs: list[RunResult]) -> list[Experiment]:
         free = ("phase.epochs=", "phase.velocity_code_weight=")
         if f"{GOES_ON}phase1" in run.settings and all(s.startswith((GOES_ON, *free)) for s in run.settings):
             return CONTINUED if {run.epochs} == epochs else f"phase 1, {run.epochs} further epochs"
-        known = NAMES_OF_COMPARISON.get((run.phase, *run.settings))
+        silent = [setting for setting in run.settings if setting.startswith(SILENT)]
+        known = NAMES_OF_COMPARISON.get((run.phase, *(s for s in run.settings if s not in silent)))
+        if known and silent:
+            return f"{known}, `{silent[0]}`"
         return known or f"{run.phase.replace('phase', 'phase ')}, `{' '.join(run.settings)}`"
 
     def place(experiment: Experiment) -> float:
-        known = list(NAMES_OF_COMPARISON)
-        if experiment.key in known:
-            return known.index(experiment.key)
+        known, key = list(NAMES_OF_COMPARISON), tuple(part for part in experiment.key if not part.startswith(SILENT))
+        if key in known:
+            return known.index(key)
         return 0.5 if experiment.key[0] == "phase1" else len(known)
 
     return sorted(group_runs(runs, name), key=place)
@@ -104,6 +113,7 @@ def comparison_page(experiments: list[Experiment], scale: str, picture: str) -> 
     `experiments` are `compared_experiments`; `picture` is the address of their bars, seen from the page.
     """
     runs = [run for experiment in experiments for run in experiment.runs]
+    experiments, silent = seeing(experiments), [each for each in experiments if each not in seeing(experiments)]
     text = _page("phase2", scale, "a row of phase 2, and one of further epochs, starts from its seed's phase 1", runs)
     text += f"![Scores by distance and by speed]({picture})\n\n{score_table(experiments, SUMMARY_WITH_VELOCITY)}\n\n"
     by_speed, errors = BY_SPEED + CAR_BY_SPEED, ERROR_BY_SPEED + CAR_ERROR_BY_SPEED
@@ -114,11 +124,20 @@ def comparison_page(experiments: list[Experiment], scale: str, picture: str) -> 
     )
     subject = next((experiment for experiment in experiments if experiment.key == ("phase2",)), None)
     others = [experiment for experiment in experiments if experiment is not subject]
-    if subject is None or not others:
-        return text
-    text += f"\n## Gain of phase 2\n\n{GAIN_TEXT}\n\n"
     parts = (SUMMARY_WITH_VELOCITY[:4], BY_RANGE, by_speed, errors)
-    return text + "\n\n".join(gain_table(subject, others, columns) for columns in parts) + "\n"
+    if subject is not None and others:
+        gains = "\n\n".join(gain_table(subject, others, columns) for columns in parts)
+        text += f"\n## Gain of phase 2\n\n{GAIN_TEXT}\n\n{gains}\n"
+    if silent:
+        scores = [score_table(silent, columns) for columns in (SUMMARY_WITH_VELOCITY, by_speed, errors)]
+        gains = [gain_table(silent[0], silent[1:], columns) for columns in parts if silent[1:]]
+        text += f"\n## With silent frames\n\n{SILENT_TEXT}\n\n" + "\n\n".join([*scores, *gains]) + "\n"
+    return text
+
+
+def seeing(experiments: list[Experiment]) -> list[Experiment]:
+    """Those whose every frame has its sensors."""
+    return [experiment for experiment in experiments if not any(part.startswith(SILENT) for part in experiment.key)]
 
 
 def _boxes_by_speed(runs: list[RunResult]) -> str:

@@ -27,8 +27,9 @@ BEV = BevAugmentationConfig(scale=[0.95, 1.05], rotation_rad=0.4, flip_probabili
 def config(**changes):
     values = dict(
         root=None, version=VERSION, train_split="train", split="val", batch_size=2, groups_per_scene=2, lane_sets=1,
-        silent_frames=0.0, num_workers=0, num_sweeps=2, min_distance_m=1.0, propagate_points=False, on_bad_file=OnBadFile.error,
-        test_resize_offset=0.0, augmentation=AugmentationConfig(image=None, bev=BEV), world=None,
+        silent_frames=0.0, num_workers=0, num_sweeps=2, min_distance_m=1.0, propagate_points=False,
+        on_bad_file=OnBadFile.error, test_resize_offset=0.0,
+        augmentation=AugmentationConfig(image=None, bev=BEV), world=None,
     )  # fmt: skip
     return DataConfig(**(values | changes))
 
@@ -151,7 +152,8 @@ def test_errors_travel_between_processes():
 @pytest.mark.parametrize(
     "change",
     [{"batch_size": 0}, {"groups_per_scene": 0}, {"lane_sets": 0}, {"num_sweeps": 0}, {"num_workers": -1},
-     {"silent_frames": 1.0}, {"silent_frames": -0.1}, {"min_distance_m": float("nan")}, {"test_resize_offset": float("nan")}],
+     {"silent_frames": 1.0}, {"silent_frames": -0.1}, {"min_distance_m": float("nan")},
+     {"test_resize_offset": float("nan")}],
     ids=str,
 )  # fmt: skip
 def test_impossible_settings(change):
