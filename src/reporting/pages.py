@@ -56,9 +56,9 @@ positive the speed it states). Means over the classes that occur at that speed; 
 class that does not reach a recall of 0.1 counts as 1, the official rule, so read it beside the AP. Some classes have
 few boxes at a speed; the car's numbers stand on the most."""
 
-SILENT_TEXT = """From the share `data.silent_frames` of the frames, never a clip's first, all sensor data are taken away,
-in training and in validation: what is found there comes from the memory alone. These rows compare with one another
-only."""
+SILENT_TEXT = """From the share `data.silent_frames` of the frames, never a clip's first, all sensor data are taken
+away, in training and in validation: what is found there comes from the memory alone. These rows compare with one
+another only."""
 
 GAIN_TEXT = """Differences between runs of the same seed, mean ± standard deviation: points of percent, and m/s for the
 velocity error, where less is better."""
