@@ -7,7 +7,7 @@ from pathlib import Path
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
 from src.command import run_command
-from src.config import Config, compose_config, digest_of_changes, restore_config
+from src.config import Config, compose_config, restore_config
 from src.errors import ConfigError, DataError
 from src.metrics.detection import score_detections
 from src.metrics.report import format_scores
@@ -16,6 +16,7 @@ from src.metrics.submission import load_submission
 from src.ops.allocator import tune_cpu_allocator
 from src.training.checkpoints import load_model_weights, read_checkpoint
 from src.training.fit import build_evaluation_trainer
+from src.training.identity import digest_of_changes
 from src.training.processes import check_devices
 from src.training.run_folder import make_writable, write_json
 

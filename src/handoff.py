@@ -17,9 +17,10 @@ from typing import Any
 
 from torch import nn
 
-from src.config import PHASES, Config, compose_config, run_identity
+from src.config import PHASES, Config, compose_config
 from src.errors import CheckpointError, ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
 from src.training.checkpoints import load_model_weights, read_checkpoint
+from src.training.identity import run_identity
 from src.training.processes import die_with_parent
 from src.training.run_folder import RunFolder
 

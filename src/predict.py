@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from src.assembly import build_datamodule, data_root, save_submission
 from src.command import run_command
-from src.config import Config, compose_config, digest_of_changes, restore_config
+from src.config import Config, compose_config, restore_config
 from src.data.splits import split_samples
 from src.errors import ConfigError
 from src.metrics.submission import to_global
@@ -25,6 +25,7 @@ from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
 from src.training.checkpoints import read_checkpoint
+from src.training.identity import digest_of_changes
 from src.training.processes import check_devices
 from src.training.run_folder import make_writable
 from src.training.snapshots import SHOWN_SCORE, scene_of, views_of

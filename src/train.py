@@ -18,7 +18,7 @@ import yaml
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
 from src.command import run_command
-from src.config import Config, compose_config, run_identity
+from src.config import Config, compose_config
 from src.data.datamodule import DetectionDataModule
 from src.errors import DataError
 from src.handoff import Source, find_source, hand_over, read_source, train_source
@@ -27,6 +27,7 @@ from src.ops.allocator import tune_cpu_allocator
 from src.pictures.curves import draw_curves, draw_scores
 from src.training.detection import DetectionModule, gather_by_rank
 from src.training.fit import build_loggers, build_trainer, fit
+from src.training.identity import run_identity
 from src.training.processes import (
     build_strategy,
     check_devices,

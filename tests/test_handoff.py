@@ -17,7 +17,7 @@ from untrained import write_checkpoint
 
 from src import evaluate, handoff, train
 from src.assembly import build_model
-from src.config import compose_config, run_identity
+from src.config import compose_config
 from src.errors import (
     CheckpointError,
     ConfigError,
@@ -27,6 +27,7 @@ from src.errors import (
     InterruptedRunError,
 )
 from src.handoff import MAY_BE_NEW, Source, find_source, hand_over, train_source
+from src.training.identity import run_identity
 from src.training.run_folder import RunFolder
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -1,0 +1,67 @@
+"""Which overrides make another run, and which results of a checkpoint lie apart."""
+
+from src.config import compose_config
+from src.training.identity import digest_of_changes, run_identity
+
+
+def test_run_identity_ignores_what_cannot_change_the_result():
+    def identity(*overrides):
+        return run_identity(compose_config(["scale=debug", *overrides])[1])
+
+    base = identity()
+    assert base.startswith("horizon3d-phase1-debug-") and len(base.rsplit("-", 1)[1]) == 8
+    same = ["paths.outputs=elsewhere", "logger=wandb", "data.num_workers=7", "resume=never", "trainer=cpu"]
+    for override in same:
+        assert identity(override) == base, override
+    for override in ["seed=1", "optim.lr=1e-3", "model.ocsf.margin_m=0.8", "model.kggi.initialization=random"]:
+        assert identity(override) != base, override
+
+
+def test_run_identity_of_phase_2():
+    """Every knob of the memory makes another run; so do the weights it starts from, by what they are."""
+
+    def identity(*overrides, source="horizon3d-phase1-debug-00000000"):
+        return run_identity(compose_config(["scale=debug", "phase=phase2", *overrides])[1], source)
+
+    base = identity()
+    assert base.startswith("horizon3d-phase2-debug-")
+    assert identity("phase.train_missing=false") == base == identity("phase.init_from=phase1", "resume=restart")
+    assert identity("phase.init_from=some/where.ckpt") == base  # the digest of the weights counts, not the file's name
+    assert identity(source="horizon3d-phase1-debug-11111111") != base
+    for override in (
+        "model.dptf.max_age_s=0.55",
+        "model.dptf.bev_path=null",
+        "model.dptf.gaussian_path.sampling=random",
+        "model.dptf.gaussian_path.self_attention=null",
+        "data.groups_per_scene=1",
+        "data.silent_frames=0.5",
+        "phase.epochs=2",
+    ):
+        assert identity(override) != base, override
+
+
+def test_run_identity_of_phase_1_ignores_the_memory():
+    def identity(*overrides):
+        return run_identity(compose_config(["scale=debug", *overrides])[1])
+
+    for override in ("model.dptf.max_age_s=0.55", "model.dptf=null", "data.groups_per_scene=1"):
+        assert identity(override) == identity(), override
+
+
+def test_what_changes_no_result_of_a_checkpoint_makes_no_other_place():
+    where = [
+        "checkpoint=a.ckpt",
+        "out=b",
+        "paths.outputs=c",
+        "trainer.num_pictures=0",
+        "trainer=cpu",
+        "data.num_workers=0",
+    ]
+    assert digest_of_changes(where) == digest_of_changes(["scene=x"]) == ""
+    changed = [
+        digest_of_changes([*where, change])
+        for change in ("data.root=d", "model.dptf.max_age_s=0.55", "data.split=test")
+    ]
+    assert len({"", *changed}) == 4
+    pair = ["data.split=test", "data.root=d"]
+    assert digest_of_changes(pair) == digest_of_changes(pair[::-1]) != ""
