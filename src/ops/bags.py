@@ -1,4 +1,4 @@
-"""Segment sums over the rows of a table: deterministic, and without a tensor that holds one row per pair."""
+"""Sums, means and the best of rows that belong together: deterministic, without a tensor of one row per pair."""
 
 from __future__ import annotations
 
@@ -63,6 +63,23 @@ class _SegmentSum(torch.autograd.Function):
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None, None]:
         (rows,) = ctx.saved_tensors
         return F.embedding(rows, grad.contiguous()), None, None
+
+
+def best_rows(
+    scores: Tensor,  # [M]
+    sample: Tensor,  # [M] int64
+    batch_size: int,
+    count: int,
+) -> Tensor:  # [B, count] int64
+    """Rows of the highest scores of each sample, best first, ties by row; -1 where a sample has fewer."""
+    order = scores.argsort(descending=True, stable=True)
+    order = order[sample[order].argsort(stable=True)]
+    owner = sample[order]
+    sizes = torch.bincount(owner, minlength=batch_size)
+    rank = torch.arange(len(order), device=order.device) - (sizes.cumsum(0) - sizes)[owner]
+    rows = order.new_full((batch_size, count + 1), -1)
+    rows[owner, rank.clamp(max=count)] = order  # everything behind the last place meets in one column that is dropped
+    return rows[:, :count]
 
 
 def weighted_bag(

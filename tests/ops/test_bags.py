@@ -1,7 +1,7 @@
 import torch
 
 from src.ops import segment_mean, segment_sum
-from src.ops.bags import bag_sum, bags, row_products, weighted_bag
+from src.ops.bags import bag_sum, bags, best_rows, row_products, weighted_bag
 
 
 def test_bags_keep_the_order_of_their_pairs():
@@ -45,3 +45,9 @@ def test_row_products_in_chunks(monkeypatch):
     a, b = torch.randn(4, 5), torch.randn(6, 5)
     rows_a, rows_b = torch.randint(0, 4, (10,)), torch.randint(0, 6, (10,))
     torch.testing.assert_close(row_products(a, rows_a, b, rows_b), (a[rows_a] * b[rows_b]).sum(1))
+
+
+def test_best_rows_by_hand():
+    scores, sample = torch.tensor([0.1, 0.9, 0.5, 0.5, 0.7]), torch.tensor([0, 0, 0, 2, 2])
+    assert best_rows(scores, sample, 3, 2).tolist() == [[1, 2], [-1, -1], [4, 3]]
+    assert best_rows(scores[:0], sample[:0], 2, 2).tolist() == [[-1, -1], [-1, -1]]

@@ -14,6 +14,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.heads.keypoint_head import KEYPOINT_BIAS, CameraKeypointHead, CameraMaps, keypoint_scores
 from src.models.horizon3d.gaussian_encoder import RAW_ATTRIBUTES, GaussianBounds
 from src.models.horizon3d.views import CameraViews
+from src.ops.bags import best_rows
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV
 from src.targets.depth import DepthTarget, check_depth_target, lid_centres
@@ -209,23 +210,6 @@ class KGGI(nn.Module):
             valid=valid,
             **self.bounds.activate(raw),
         )
-
-
-def best_rows(
-    scores: Tensor,  # [M]
-    sample: Tensor,  # [M] int64
-    batch_size: int,
-    count: int,
-) -> Tensor:  # [B, count] int64
-    """Rows of the highest scores of each sample, best first, ties by row; -1 where a sample has fewer."""
-    order = scores.argsort(descending=True, stable=True)
-    order = order[sample[order].argsort(stable=True)]
-    owner = sample[order]
-    sizes = torch.bincount(owner, minlength=batch_size)
-    rank = torch.arange(len(order), device=order.device) - (sizes.cumsum(0) - sizes)[owner]
-    rows = order.new_full((batch_size, count + 1), -1)
-    rows[owner, rank.clamp(max=count)] = order  # everything behind the last place meets in one column that is dropped
-    return rows[:, :count]
 
 
 def most_likely_depth(

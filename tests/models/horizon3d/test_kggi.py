@@ -6,7 +6,7 @@ import torch
 from src.errors import ConfigError
 from src.models.heads.keypoint_head import CameraMaps, keypoint_scores
 from src.models.horizon3d.gaussian_encoder import GaussianBounds
-from src.models.horizon3d.kggi import KGGI, Initialization, best_rows, most_likely_depth
+from src.models.horizon3d.kggi import KGGI, Initialization, most_likely_depth
 from src.ops.sites import Sites
 from src.structures.gaussians import Source
 from src.structures.sparse_bev import SparseBEV
@@ -128,12 +128,6 @@ def test_radar_keypoints_are_the_best_cells_and_the_rest_is_padding(make_config,
     expected = grid.centre_of(radar.indices[order, 1:])
     torch.testing.assert_close(gaussians.means[0, :3], expected)
     assert gaussians.valid[0, :5].tolist() == [True, True, True, False, False]
-
-
-def test_best_rows_by_hand():
-    scores, sample = torch.tensor([0.1, 0.9, 0.5, 0.5, 0.7]), torch.tensor([0, 0, 0, 2, 2])
-    assert best_rows(scores, sample, 3, 2).tolist() == [[1, 2], [-1, -1], [4, 3]]
-    assert best_rows(scores[:0], sample[:0], 2, 2).tolist() == [[-1, -1], [-1, -1]]
 
 
 def test_depth_is_the_mean_over_the_best_bin_and_its_neighbours():
