@@ -149,12 +149,10 @@ FULL_SIZE_PHASE_2 = {
     "model.dptf": {"max_age_s": 6.0},
     "model.dptf.bev_path": {
         "num_frames": 8, "memory_threshold": 0.1, "max_cells_per_frame": 4096, "velocity_compensation": True,
-        "min_speed_mps": 0.0,
         "spatial_dilation": False,
     },
     "model.dptf.gaussian_path": {
         "num_frames": 4, "gaussians_per_frame": 256, "sampling": "farthest_point", "velocity_compensation": True,
-        "min_speed_mps": 0.0,
         "self_attention": {"num_heads": 8},
     },
 }  # fmt: skip

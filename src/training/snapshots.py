@@ -14,7 +14,6 @@ from torch import Tensor
 from src.geometry.bev_grid import BEVGrid
 from src.models.detector import Detector
 from src.models.horizon3d.dptf import DPTFConfig
-from src.models.horizon3d.memory import travelled
 from src.pictures.bev import BevScene
 from src.pictures.cameras import CameraViews
 from src.pictures.contents import PictureBoxes, PictureGaussians, PictureGrid, PictureMemory
@@ -99,27 +98,17 @@ def memory_of(
         gaussians, velocities, elapsed_s = PictureGaussians.empty(), np.zeros((0, 2)), np.zeros(0)
         if dptf.history is not None:
             keep, gaussians = dptf.history.valid[0], _gaussians(dptf.history)
-            velocities = _moving(dptf.history.velocities[0][keep], config.gaussian_path.min_speed_mps)
-            elapsed_s = _numpy(dptf.history.elapsed_s[0][keep])
+            velocities, elapsed_s = _numpy(dptf.history.velocities[0][keep]), _numpy(dptf.history.elapsed_s[0][keep])
         compensated = config.gaussian_path.velocity_compensation
         remembered.gaussians = PictureMemory.read_at(gaussians.means, velocities, elapsed_s, compensated, gaussians)
     if config.bev_path is not None:
         xy, velocities, elapsed_s = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
         if dptf.warped is not None:
             cells = dptf.warped
-            velocities = _moving(cells.velocities, config.bev_path.min_speed_mps)
-            xy, elapsed_s = _numpy(cells.xy), _numpy(cells.elapsed_s)
+            xy, velocities, elapsed_s = _numpy(cells.xy), _numpy(cells.velocities), _numpy(cells.elapsed_s)
         compensated = config.bev_path.velocity_compensation
         remembered.cells = PictureMemory.read_at(xy, velocities, elapsed_s, compensated)
     return remembered
-
-
-def _moving(
-    velocities: Tensor,  # [n, 2]
-    min_speed_mps: float,
-) -> np.ndarray:  # [n, 2]
-    """What memory is moved by in a second."""
-    return _numpy(travelled(velocities, torch.ones_like(velocities[:, 0]), min_speed_mps))
 
 
 def _memory_config(model: Detector) -> DPTFConfig | None:

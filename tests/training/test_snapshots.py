@@ -105,12 +105,12 @@ class Recorder(Detector):
 
 def config(bev: bool = True, gaussians: bool = True, compensated: bool = True) -> DPTFConfig:
     bev_path = BEVPathConfig(
-        num_frames=8, memory_threshold=0.1, max_cells_per_frame=9, velocity_compensation=compensated, min_speed_mps=0.0,
+        num_frames=8, memory_threshold=0.1, max_cells_per_frame=9, velocity_compensation=compensated,
         spatial_dilation=False,
     )  # fmt: skip
     gaussian_path = GaussianPathConfig(
         num_frames=4, gaussians_per_frame=9, sampling=Sampling.random, velocity_compensation=compensated,
-        min_speed_mps=0.0, self_attention=None,
+        self_attention=None,
     )  # fmt: skip
     return DPTFConfig(
         max_age_s=6.0, bev_path=bev_path if bev else None, gaussian_path=gaussian_path if gaussians else None

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.horizon3d.memory import Memory, StoredCells, travelled
+from src.models.horizon3d.memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.sparse_layers import ConvNormReLU, RowNorm, SparseKernel, SubmanifoldConv
 from src.ops.bags import best_rows, segment_mean
@@ -36,7 +36,6 @@ class BEVPathConfig:
     memory_threshold: float  # tau_mem, occupancy from which a cell is remembered
     max_cells_per_frame: int  # guard: the best cells of a frame
     velocity_compensation: bool  # move cells by their own velocity; off: by the ego motion alone (Table 6)
-    min_speed_mps: float  # slower cells are moved by the ego motion alone
     spatial_dilation: bool  # literal strided convolutions, which spread every cell to its neighbours
 
     def __post_init__(self) -> None:
@@ -46,8 +45,6 @@ class BEVPathConfig:
                     f"model.dptf.bev_path.{name}={getattr(self, name)}: must be at least 1; bev_path=null switches "
                     "the path off"
                 )
-        if not self.min_speed_mps >= 0:
-            raise ConfigError(f"model.dptf.bev_path.min_speed_mps={self.min_speed_mps}: must be at least 0")
         if not 0 <= self.memory_threshold < 1:
             raise ConfigError(
                 f"model.dptf.bev_path.memory_threshold={self.memory_threshold}: must be at least 0 and below 1"
@@ -154,7 +151,7 @@ class BEVPath(nn.Module):
             matrix, elapsed = motion.aug_from_past[past.rows], motion.elapsed_s[past.rows]
             xy = past.xy
             if self.config.velocity_compensation:
-                xy = xy + travelled(past.velocities, elapsed, self.config.min_speed_mps)
+                xy = xy + past.velocities * elapsed[:, None]
             xy = _move(matrix, xy)
             keep = motion.usable[past.rows] & self.grid.contains(xy)
             slot = torch.full_like(past.rows, self.config.num_frames - 1 - age)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.horizon3d.memory import Memory, travelled
+from src.models.horizon3d.memory import Memory
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.ops.farthest_point import farthest_points
 from src.structures.batch import FrameBatch
@@ -48,12 +48,9 @@ class GaussianPathConfig:
     gaussians_per_frame: int
     sampling: Sampling
     velocity_compensation: bool  # move history by its own velocity; off: by the ego motion alone (Table 6)
-    min_speed_mps: float  # slower history is moved by the ego motion alone
     self_attention: SelfAttentionConfig | None
 
     def __post_init__(self) -> None:
-        if not self.min_speed_mps >= 0:
-            raise ConfigError(f"model.dptf.gaussian_path.min_speed_mps={self.min_speed_mps}: must be at least 0")
         for name in ("num_frames", "gaussians_per_frame"):
             if getattr(self, name) < 1:
                 raise ConfigError(
@@ -89,7 +86,7 @@ class GaussianPath(nn.Module):
             motion = frame.motion(batch, max_age_s)
             elapsed = motion.elapsed_s[:, None].expand_as(past.valid)
             if self.config.velocity_compensation:
-                past = replace(past, means=past.means + travelled(past.velocities, elapsed, self.config.min_speed_mps))
+                past = replace(past, means=past.means + past.velocities * elapsed[..., None])
             moved = past.transform(motion.aug_from_past)
             valid = moved.valid & motion.usable[:, None] & self.grid.contains(moved.means)
             parts.append(

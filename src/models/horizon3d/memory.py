@@ -188,19 +188,6 @@ def _shared(frames: Iterable[MemoryFrame]) -> Memory:
     return Memory(tuple(frame for frame, wanted in zip(frames, kept, strict=True) if wanted))
 
 
-def travelled(
-    velocities: Tensor,  # [..., 2] m/s over ground
-    elapsed_s: Tensor,  # [...]
-    min_speed_mps: float,
-) -> Tensor:  # [..., 2] m
-    """The way covered at constant velocity; what is slower than `min_speed_mps` counts as standing.
-
-    A predicted velocity is never exactly zero, and over four seconds its error carries a post off its cell.
-    """
-    standing = velocities.norm(dim=-1, keepdim=True) < min_speed_mps  # not so where it is NaN
-    return torch.where(standing, 0.0, velocities * elapsed_s[..., None])
-
-
 def rigid_inverse(
     dst_from_src: Tensor,  # [..., 4, 4] rotation and translation
 ) -> Tensor:  # [..., 4, 4]

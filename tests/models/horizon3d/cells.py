@@ -19,7 +19,6 @@ def make_path(grid=GRID, channels=C, **changes):
         "memory_threshold": 0.1,
         "max_cells_per_frame": 4096,
         "velocity_compensation": True,
-        "min_speed_mps": 0.0,
         "spatial_dilation": False,
     }
     torch.manual_seed(0)

@@ -199,7 +199,6 @@ def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, **changes):
         "memory_threshold": 0.1,
         "max_cells_per_frame": 200,
         "velocity_compensation": True,
-        "min_speed_mps": 0.0,
         "spatial_dilation": False,
     }
     gaussian = {
@@ -207,7 +206,6 @@ def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, **changes):
         "gaussians_per_frame": 8,
         "sampling": Sampling.farthest_point,
         "velocity_compensation": True,
-        "min_speed_mps": 0.0,
         "self_attention": SelfAttentionConfig(num_heads=4),
     }
     for part in (bev, gaussian):

@@ -24,7 +24,6 @@ def make_path(**changes):
         "gaussians_per_frame": 5,
         "sampling": Sampling.farthest_point,
         "velocity_compensation": True,
-        "min_speed_mps": 0.0,
         "self_attention": None,
     }
     torch.manual_seed(0)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from moving import UTM, bare_frame, bda, pose, tensors_of
 
-from src.models.horizon3d.memory import Memory, MemoryFrame, StoredCells, rigid_inverse, travelled
+from src.models.horizon3d.memory import Memory, MemoryFrame, StoredCells, rigid_inverse
 from src.structures.gaussians import GaussianSet
 
 DIM = 3
@@ -146,14 +146,6 @@ def test_frames_that_are_not_in_the_past_give_up_their_places():
         assert [float(frame.timestamps_s[0]) for frame in past.frames] == left
     past = frames_of(2, 3).before(bare_frame([1.0, 0.5], [pose(20.0), pose(11.0)]))
     assert [frame.present.tolist() for frame in past.frames] == [[True, False], [True, True]]
-
-
-def test_what_is_slow_counts_as_standing():
-    velocities = torch.tensor([[0.6, -0.6], [0.9, 0.5], [-20.0, 0.0], [0.0, 0.0]])
-    elapsed = torch.tensor([4.0, 4.0, 0.5, 1.0])
-    assert torch.equal(travelled(velocities, elapsed, 0.0), velocities * elapsed[:, None])
-    wanted = torch.tensor([[0.0, 0.0], [3.6, 2.0], [-10.0, 0.0], [0.0, 0.0]])
-    torch.testing.assert_close(travelled(velocities, elapsed, 1.0), wanted)
 
 
 def test_select_follows_lanes_that_move_vanish_restart_and_appear():
