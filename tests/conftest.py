@@ -1,0 +1,9 @@
+"""For all tests: signals as a terminal has them."""
+
+import signal
+
+
+def pytest_configure(config):
+    """A shell's background job ignores SIGINT, and so would the commands that tests start and interrupt."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
