@@ -113,7 +113,8 @@ def comparison_page(experiments: list[Experiment], scale: str, picture: str) -> 
     `experiments` are `compared_experiments`; `picture` is the address of their bars, seen from the page.
     """
     runs = [run for experiment in experiments for run in experiment.runs]
-    experiments, silent = seeing(experiments), [each for each in experiments if each not in seeing(experiments)]
+    seen = seeing(experiments)
+    experiments, silent = seen, [experiment for experiment in experiments if experiment not in seen]
     text = _page("phase2", scale, "a row of phase 2, and one of further epochs, starts from its seed's phase 1", runs)
     text += f"![Scores by distance and by speed]({picture})\n\n{score_table(experiments, SUMMARY_WITH_VELOCITY)}\n\n"
     by_speed, errors = BY_SPEED + CAR_BY_SPEED, ERROR_BY_SPEED + CAR_ERROR_BY_SPEED
