@@ -244,7 +244,7 @@ def _compose(overrides: list[str]) -> DictConfig:
             tree.model.dptf = None  # in code: a later at_scale file would revive a part that a phase file sets to null
         return tree
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(_hydra_message(error)) from error
+        raise ConfigError(hydra_message(error)) from error
     except (ValueError, AssertionError) as error:  # Hydra's own words for these name neither the key nor the remedy
         raise ConfigError(
             f"{' '.join(overrides)}: a choice of conf/ ({', '.join(GROUPS)}) needs one of its names, and a key below a "
@@ -260,7 +260,7 @@ def build_config(tree: DictConfig) -> Config:
             raise ConfigError(f"{min(missing)} has no value; give {min(missing)}=... on the command line")
         config = OmegaConf.to_object(tree)
     except OmegaConfBaseException as error:
-        raise ConfigError(_hydra_message(error)) from error
+        raise ConfigError(hydra_message(error)) from error
     _check_tree(config, tree, "")
     return config
 
@@ -298,7 +298,7 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
         raise CheckpointError(f"the checkpoint's configuration does not fit this code: {error}") from None
 
 
-def _hydra_message(error: Exception) -> str:
+def hydra_message(error: Exception) -> str:
     """Hydra's message in one paragraph, with the nearest key there is."""
     cause = error.__cause__
     lines = [line.strip() for line in [*str(error).splitlines(), *str(cause or "").splitlines()]]
@@ -319,6 +319,7 @@ def _hydra_message(error: Exception) -> str:
 
 def _known_keys() -> list[str]:
     """Every key of the default tree, dotted."""
+    _register()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         tree = compose("config")
 

@@ -1,0 +1,64 @@
+"""The numbers that tables and sweeps may name: meaning, unit, direction. Imports no torch."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+
+from src.errors import ConfigError
+from src.structures.taxonomy import CLASSES
+
+RANGES = ("0-25", "25-50", "50-100", "100-150")
+SPEEDS = ("0-0.5", "0.5-10", "10-25", "25+")
+PARTS = ("image_encoder", "radar_encoder", "kggi", "ocsf", "dptf", "detection_head", "total")
+"""What a frame's latency is made of (Table 15)."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One number of a run as tables show it."""
+
+    name: str  # path within a result's metrics
+    title: str
+    unit: str  # empty where the title says it
+    scale: float  # from the result's unit to the table's: fractions of 1 become percent
+    digits: int
+    higher_is_better: bool
+
+
+def _summary(prefix: str = "", title: str = "") -> dict[str, Metric]:
+    """The official summary; whole, or of a part of the data such as a range."""
+    rows = [("mAP", "%", 100.0, 1, True), ("NDS", "%", 100.0, 1, True)]
+    rows += [("mATE", "m", 1.0, 2, False), ("mASE", "1-IoU", 1.0, 3, False), ("mAOE", "rad", 1.0, 3, False)]
+    rows += [("mAVE", "m/s", 1.0, 2, False), ("mAAE", "1-acc", 1.0, 3, False)]
+    return {prefix + name: Metric(prefix + name, name + title, *rest) for name, *rest in rows}
+
+
+METRICS = _summary()
+for _range in RANGES:
+    METRICS |= _summary(f"ranges.{_range}.", f" {_range} m")
+for _class in CLASSES:
+    for _error, *_rest in (("AP", "%", 100.0, 1, True), ("AVE", "m/s", 1.0, 2, False)):
+        _name = f"classes.{_class}.{_error}"
+        METRICS[_name] = Metric(_name, f"{_class} {_error}".replace("_", " "), *_rest)
+for _speed in SPEEDS:
+    for _key, _words, *_rest in (
+        ("mAP_present", "mAP", "%", 100.0, 1, True),
+        ("mAVE_present", "mAVE", "m/s", 1.0, 2, False),
+        ("car.AP", "car AP", "%", 100.0, 1, True),
+        ("car.AVE", "car AVE", "m/s", 1.0, 2, False),
+    ):
+        METRICS[f"speeds.{_speed}.{_key}"] = Metric(f"speeds.{_speed}.{_key}", f"{_words} {_speed} m/s", *_rest)
+for _part in PARTS:
+    METRICS[f"latency.{_part}"] = Metric(f"latency.{_part}", _part.replace("_", " "), "ms", 1.0, 1, False)
+METRICS["latency.fps"] = Metric("latency.fps", "frames per second", "1/s", 1.0, 2, True)
+METRICS["latency.memory_gb"] = Metric("latency.memory_gb", "memory", "GB", 1.0, 2, False)
+
+
+def find_metric(name: str, where: str) -> Metric:
+    """The metric of this name. Raises ConfigError naming `where` it stands and the nearest names there are."""
+    if name in METRICS:
+        return METRICS[name]
+    near = difflib.get_close_matches(name, METRICS, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(list(METRICS)[:7])}, ..."
+    raise ConfigError(f"{where}: {name} is not a metric; {hint}")

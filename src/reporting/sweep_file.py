@@ -1,0 +1,125 @@
+"""What a file of sweeps/ may say: one question, its rows or its search space, the paper's numbers, and the tables.
+
+The dataclasses are the schema that src/config.py checks each file against; nothing here knows Hydra.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from src.errors import ConfigError
+from src.reporting.metric_names import find_metric
+
+
+@dataclass(kw_only=True)
+class RowConfig:
+    """One row of the question: a change of configuration, trained and scored."""
+
+    label: str
+    overrides: list[str] = field(default_factory=list)  # as after `python -m src.train`
+    paper: dict[str, float] = field(default_factory=dict)  # the paper's numbers by metric, in the paper's units
+    x: float | None = None  # place on the plot's horizontal axis
+
+
+@dataclass(kw_only=True)
+class TableConfig:
+    """One table over the rows: a choice of columns."""
+
+    name: str  # file name under reports/tables, without scale
+    title: str
+    columns: list[str]  # names of src/reporting/metric_names.py
+
+
+@dataclass(kw_only=True)
+class PlotConfig:
+    """One figure over the rows that have an `x`, or bars by label when they have none."""
+
+    metric: str
+    label: str  # of the horizontal axis
+
+
+@dataclass(kw_only=True)
+class PaperRowConfig:
+    """A row that only the paper has: another method, printed beside ours and never trained."""
+
+    label: str
+    paper: dict[str, float]
+
+
+@dataclass(kw_only=True)
+class DimensionConfig:
+    """What a search may try for one key: a range or a list of choices."""
+
+    low: float | None = None
+    high: float | None = None
+    log: bool = False
+    choices: list[Any] | None = None
+
+    def check(self, where: str) -> None:
+        """Raises ConfigError for neither or both, and for an empty or reversed range."""
+        ranged = self.low is not None and self.high is not None
+        if ranged == (self.choices is not None):
+            raise ConfigError(f"{where}: give either low and high or choices")
+        if ranged and not self.low < self.high:
+            raise ConfigError(f"{where}: low must be below high, but got {self.low} and {self.high}")
+        if ranged and self.log and self.low <= 0:
+            raise ConfigError(f"{where}: a logarithmic range starts above 0, but got {self.low}")
+        if self.choices is not None and len(self.choices) < 2:
+            raise ConfigError(f"{where}: choices must be at least two, but got {self.choices}")
+
+
+@dataclass(kw_only=True)
+class SweepConfig:
+    """One question of the paper, or of ours."""
+
+    title: str
+    question: str  # what the rows tell, one sentence
+    name: str = ""  # the file's; filled in when it is read
+    source: str | None = None  # the paper's table(s), as in `Table 12`
+    overrides: list[str] = field(default_factory=list)  # of every row
+    baseline: str | None = None  # label of the row that differences are taken to
+    latency: bool = False  # measure the latency of every finished row, one after the other
+    tables: list[TableConfig] = field(default_factory=list)
+    plots: list[PlotConfig] = field(default_factory=list)
+    rows: list[RowConfig] = field(default_factory=list)
+    paper_rows: list[PaperRowConfig] = field(default_factory=list)
+    space: dict[str, DimensionConfig] = field(default_factory=dict)  # a search instead of rows
+    objective: str = "NDS"  # of a search, larger is better
+    trials: int = 0  # of a search
+
+    def __post_init__(self) -> None:
+        where = f"sweeps/{self.name or '?'}.yaml"
+        if bool(self.rows) == bool(self.space):
+            raise ConfigError(f"{where}: give either rows or space, and at least one entry")
+        labels = [row.label for row in self.rows] + [row.label for row in self.paper_rows]
+        twice = sorted({label for label in labels if labels.count(label) > 1})
+        if twice:
+            raise ConfigError(f"{where}: label {', '.join(twice)} stands more than once; each row needs its own")
+        if self.baseline is not None and self.baseline not in [row.label for row in self.rows]:
+            raise ConfigError(f"{where}: baseline {self.baseline!r} is not the label of a row ({', '.join(labels)})")
+        for row in [*self.rows, *self.paper_rows]:
+            for metric, value in row.paper.items():
+                find_metric(metric, f"{where}, row {row.label!r}, paper")
+                if not math.isfinite(value):
+                    raise ConfigError(f"{where}, row {row.label!r}: {metric}={value} is not a finite number")
+        names = [table.name for table in self.tables]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"{where}: two tables have one name ({', '.join(names)})")
+        for table in self.tables:
+            for column in table.columns:
+                find_metric(column, f"{where}, table {table.name}, columns")
+        for plot in self.plots:
+            find_metric(plot.metric, f"{where}, plots")
+        for key, dimension in self.space.items():
+            dimension.check(f"{where}, space, {key}")
+        if self.space:
+            find_metric(self.objective, f"{where}, objective")
+            if self.trials < 1:
+                raise ConfigError(f"{where}: trials must be at least 1, but got {self.trials}")
+
+    @property
+    def is_search(self) -> bool:
+        """Whether a sampler chooses what to train."""
+        return bool(self.space)
