@@ -2,6 +2,7 @@
 PHASE ?= 1
 SCALE ?=
 CHECKPOINT ?=
+SWEEP ?=
 ARGS ?=
 ACTIVE := $(or $(VIRTUAL_ENV),$(CONDA_PREFIX))
 PYTHON := $(if $(ACTIVE),python,.venv/bin/python)
@@ -11,7 +12,7 @@ SCALE_ARG := $(if $(SCALE),scale=$(SCALE))
 INIT_ARG := $(if $(CHECKPOINT),'phase.init_from="$(CHECKPOINT)"')
 $(if $(filter 1 2,$(PHASE)),,$(error PHASE=$(PHASE): must be 1 or 2))
 
-.PHONY: help install world train report benchmark test check
+.PHONY: help install world train sweep report dashboard benchmark test check
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -30,8 +31,14 @@ world: $(STAMP) ## write the synthetic highway (preview: ARGS="preview=true")
 train: $(STAMP) ## train PHASE=1|2 [CHECKPOINT=PATH] [SCALE=debug|mini|paper] [ARGS="optim.lr=2e-4 ..."]
 	$(PYTHON) -m src.train phase=phase$(PHASE) $(INIT_ARG) $(SCALE_ARG) $(ARGS)
 
-report: $(STAMP) ## finished runs into reports/phase1_mini.md, with PHASE=2 reports/phase2_mini.md
+sweep: $(STAMP) ## train every row of SWEEP=epsilon and write its tables [ARGS="seeds=3 workers=2 dry_run=true"]
+	$(PYTHON) -m src.sweep +sweep=$(SWEEP) $(SCALE_ARG) $(ARGS)
+
+report: $(STAMP) ## everything finished into reports/: results, tables, pages, dashboard.html; shows the page of PHASE
 	$(PYTHON) -m src.report phase=phase$(PHASE) $(SCALE_ARG) $(ARGS)
+
+dashboard: $(STAMP) ## sweeps and runs in the browser, on this machine [ARGS="port=8000" or ARGS="export=FILE"]
+	$(PYTHON) -m src.dashboard $(ARGS)
 
 benchmark: $(STAMP) ## time and memory of every part [ARGS="suite=metric"]
 	$(PYTHON) -m src.benchmark $(SCALE_ARG) $(ARGS)

@@ -28,6 +28,7 @@ from src.models import MODEL_CONFIGS
 from src.models.backbones.image import ImageEncoderConfig
 from src.training.optim import OptimConfig
 from src.training.run_folder import Resume
+from src.training.wandb import WandbConfig
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir())
@@ -117,14 +118,6 @@ class TrainerConfig:
 
 
 @dataclass(kw_only=True)
-class WandbConfig:
-    """Weights & Biases."""
-
-    project: str
-    offline: bool
-
-
-@dataclass(kw_only=True)
 class LoggerConfig:
     """Loggers beside metrics.csv."""
 
@@ -154,6 +147,7 @@ class BenchmarkSuite(Enum):
     """What `python -m src.benchmark` measures."""
 
     model = "model"
+    latency = "latency"
     metric = "metric"
     reader = "reader"
 
@@ -298,8 +292,8 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
         raise CheckpointError(f"the checkpoint's configuration does not fit this code: {error}") from None
 
 
-def hydra_message(error: Exception) -> str:
-    """Hydra's message in one paragraph, with the nearest key there is."""
+def hydra_message(error: Exception, known: list[str] | None = None) -> str:
+    """Hydra's message in one paragraph, with the nearest key there is, of `known` or of a run's configuration."""
     cause = error.__cause__
     lines = [line.strip() for line in [*str(error).splitlines(), *str(cause or "").splitlines()]]
     lines = [line for line in dict.fromkeys(lines) if line.strip("^") and not line.startswith(HYDRA_INTERNALS)]
@@ -311,8 +305,9 @@ def hydra_message(error: Exception) -> str:
         )
     unknown = getattr(cause or error, "full_key", None)
     if unknown:
-        near = difflib.get_close_matches(str(unknown), _known_keys(), n=1, cutoff=0.6)
-        if near and near[0] != unknown:
+        known = _known_keys() if known is None else known
+        near = difflib.get_close_matches(str(unknown), known, n=1, cutoff=0.6) if str(unknown) not in known else []
+        if near:
             text += f" | did you mean {near[0]}?"
     return text
 

@@ -9,6 +9,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -40,6 +41,8 @@ WEIGHTS_OF_GAUSSIAN_VELOCITY = ("model.loss.dptf_weight", "model.loss.gaussian_v
 INPUT_SETTINGS = ("num_sweeps", "min_distance_m", "propagate_points", "test_resize_offset")
 """Of `data`: what the weights have learnt to see."""
 
+Compose = Callable[[list[str]], tuple[Config, dict[str, Any]]]
+
 
 @dataclass(frozen=True)
 class Source:
@@ -61,10 +64,11 @@ class Source:
         return shlex.join(["python", "-m", "src.train", *(self.overrides or [])])
 
 
-def find_source(config: Config, overrides: list[str]) -> Source | None:
+def find_source(config: Config, overrides: list[str], compose: Compose = compose_config) -> Source | None:
     """The run or file that `phase.init_from` names, finished or not; None for fresh weights.
 
     A phase's name means the run of the same command in that phase, less the overrides of what only the later phase has.
+    `compose` may stand for `compose_config` where many command lines are looked at.
     Raises CheckpointError when a given file does not exist.
     """
     name = config.phase.init_from
@@ -84,8 +88,8 @@ def find_source(config: Config, overrides: list[str]) -> Source | None:
             others += WEIGHTS_OF_GAUSSIAN_VELOCITY
     kept = [override for override in overrides if not _is_of(override, others)]
     wanted = [f"phase={name}", *kept]
-    its_config, tree = compose_config(wanted)
-    its_source = find_source(its_config, wanted)  # what that run starts from is part of its identity
+    its_config, tree = compose(wanted)
+    its_source = find_source(its_config, wanted, compose)  # what that run starts from is part of its identity
     identity = run_identity(tree, its_source.identity if its_source is not None else None)
     folder = RunFolder(Path(config.paths.outputs), identity)
     return Source(folder.run_id, folder.checkpoints / "last.ckpt", wanted, folder)

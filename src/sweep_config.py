@@ -5,6 +5,7 @@ A run's configuration knows nothing of sweeps: what concerns the runner is compo
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +17,20 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from src.config import CONF, hydra_message
+from src.config import CONF, GROUPS, Config, hydra_message
 from src.errors import ConfigError
-from src.reporting.sweep_file import SweepConfig
+from src.reporting.sweep_file import (
+    DimensionConfig,
+    PaperRowConfig,
+    PlotConfig,
+    RowConfig,
+    SweepConfig,
+    TableConfig,
+)
 
 SWEEPS = CONF.parent / "sweeps"
 OWN_KEYS = ("sweep", "seeds", "workers", "storage", "dry_run")
+FILE_PARTS = (SweepConfig, RowConfig, TableConfig, PlotConfig, PaperRowConfig, DimensionConfig)
 
 
 @dataclass(kw_only=True)
@@ -50,18 +59,38 @@ def compose_sweep(overrides: list[str]) -> tuple[SweepCommand, list[str]]:
 
     Raises ConfigError for an unknown sweep (naming those there are), a file that says what it may not, and bad values.
     """
-    own = [override for override in overrides if override.lstrip("+").split("=")[0] in OWN_KEYS]
+    own = [override for override in overrides if _key(override) in OWN_KEYS]
     rest = [override for override in overrides if override not in own]
-    chosen = [override for override in own if override.lstrip("+").startswith("sweep=")]
+    _check_rest(rest)
+    chosen = [override.partition("=")[2] for override in own if _key(override) == "sweep"]
     if len(chosen) != 1:
         raise ConfigError(f"give one +sweep=NAME of {', '.join(sweep_files())}; got {' '.join(chosen) or 'none'}")
-    name = chosen[0].split("=", 1)[1]
-    own = [override for override in own if override not in chosen]
+    # Taken as it is: an address may hold `=`, and Hydra's messages would show a password.
+    storages = [override.partition("=")[2].strip("'\"") for override in own if _key(override) == "storage"]
+    own = [override for override in own if _key(override) not in ("sweep", "storage")]
     try:
-        command = _compose(load_sweep(name), own)
+        command = _compose(load_sweep(chosen[0]), own)
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(hydra_message(error)) from error
+        raise ConfigError(hydra_message(error, known=list(OWN_KEYS))) from error
+    if storages and storages[-1] != "null":
+        if not storages[-1].strip():
+            raise ConfigError("storage is empty; give the address of a database, or leave storage= out for SQLite")
+        command.storage = storages[-1]
     return command, rest
+
+
+def _key(override: str) -> str:
+    return override.lstrip("+").partition("=")[0]
+
+
+def _check_rest(overrides: list[str]) -> None:
+    """Refuse what is no key of a run and nearly one of the runner."""
+    of_runs = {field.name for field in dataclasses.fields(Config)} | set(GROUPS)
+    for override in overrides:
+        key = _key(override).lstrip("~")
+        near = difflib.get_close_matches(key, OWN_KEYS, n=1, cutoff=0.75)
+        if near and "." not in key and key not in of_runs:
+            raise ConfigError(f"{override}: did you mean {near[0]}?")
 
 
 def load_sweep(name: str) -> SweepConfig:
@@ -69,15 +98,27 @@ def load_sweep(name: str) -> SweepConfig:
     files = sweep_files()
     if name not in files:
         near = difflib.get_close_matches(name, files, n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        raise ConfigError(f"sweep={name}: there is no sweeps/{name}.yaml{hint} There are {', '.join(files)}")
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise ConfigError(f"sweep={name}: there is no sweeps/{name}.yaml; {hint}there are {', '.join(files)}")
     try:
-        content = OmegaConf.merge(OmegaConf.structured(SweepConfig), OmegaConf.load(files[name]), {"name": name})
-        return OmegaConf.to_object(content)
+        stated = OmegaConf.load(files[name])
+        content = OmegaConf.merge(OmegaConf.structured(SweepConfig), stated, {"name": name})
+        sweep = OmegaConf.to_object(content)
     except ConfigError:
         raise
-    except (OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
+    except OmegaConfBaseException as error:
+        known = [field.name for kind in FILE_PARTS for field in dataclasses.fields(kind)]
+        key = getattr(error, "full_key", None)
+        where = f"sweeps/{name}.yaml" + (f", {key}" if key else "")
+        raise ConfigError(f"{where}: {hydra_message(error, known)}") from error
+    except (YAMLError, ValueError, OSError) as error:
         raise ConfigError(f"sweeps/{name}.yaml: {' '.join(str(error).split())}") from error
+    for row in [*stated.get("rows", []), *stated.get("paper_rows", [])]:
+        if isinstance(row.label, bool):
+            raise ConfigError(
+                f"sweeps/{name}.yaml: YAML reads a label as {row.label}; write on, off, yes and no in quotes"
+            )
+    return sweep
 
 
 def _compose(sweep: SweepConfig, overrides: list[str]) -> SweepCommand:

@@ -15,6 +15,7 @@ import lightning as L
 import numpy as np
 import torch
 import yaml
+from lightning.pytorch.loggers.logger import Logger
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
 from src.command import run_command
@@ -40,6 +41,7 @@ from src.training.processes import (
 )
 from src.training.run_folder import Resume, RunFolder, current_commit, write_json
 from src.training.snapshots import draw_frames
+from src.training.wandb import WandbRun
 
 logger = logging.getLogger(__name__)
 
@@ -116,7 +118,8 @@ def run(
         logger.info("going on from %s", resume_from)
     elif source is not None:
         hand_over(module.model, source, tree)
-    trainer = make_trainer(config, tree, folder, resume_from)
+    loggers = build_loggers(folder, resume_from, config.logger.wandb, tree) if is_main_process() else []
+    trainer = make_trainer(config, folder, loggers)
     training_started = time.monotonic()
     fit(trainer, module, datamodule, resume_from)
     seconds = time.monotonic() - training_started
@@ -158,6 +161,8 @@ def run(
     write_json(folder.record, record)
     logger.info("finished in %.0f s", record["seconds"]["all"])
     print_result(folder, record, scores)
+    for tracked in [own for own in loggers if isinstance(own, WandbRun)]:
+        print(f"W&B: {tracked.finish(scores, folder.pictures) or 'not complete, see the warning above'}")
 
 
 def draw_pictures(
@@ -181,11 +186,8 @@ def draw_pictures(
     draw_frames(module.model, clips, config.grid.build(), folder.pictures)
 
 
-def make_trainer(config: Config, tree: dict[str, Any], folder: RunFolder, resume_from: Path | None) -> L.Trainer:
-    """The Trainer of this configuration; the main process alone logs."""
-    wandb = config.logger.wandb
-    about = None if wandb is None else {"project": wandb.project, "offline": wandb.offline, "config": tree}
-    loggers = build_loggers(folder, resume_from, about) if is_main_process() else []
+def make_trainer(config: Config, folder: RunFolder, loggers: list[Logger]) -> L.Trainer:
+    """The Trainer of this configuration; the main process alone has loggers."""
     where = (config.trainer.accelerator.value, config.trainer.devices, config.trainer.num_nodes)
     return build_trainer(
         folder,

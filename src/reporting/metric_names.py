@@ -12,6 +12,8 @@ RANGES = ("0-25", "25-50", "50-100", "100-150")
 SPEEDS = ("0-0.5", "0.5-10", "10-25", "25+")
 PARTS = ("image_encoder", "radar_encoder", "kggi", "ocsf", "dptf", "detection_head", "total")
 """What a frame's latency is made of (Table 15)."""
+FURTHER_PARTS = ("gaussian_encoder", "view_transform", "temporal_fusion")
+"""The encoder within `ocsf` (Table 14), and what only other methods have (Table 15)."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ for _speed in SPEEDS:
         ("car.AVE", "car AVE", "m/s", 1.0, 2, False),
     ):
         METRICS[f"speeds.{_speed}.{_key}"] = Metric(f"speeds.{_speed}.{_key}", f"{_words} {_speed} m/s", *_rest)
-for _part in PARTS:
+for _part in PARTS + FURTHER_PARTS:
     METRICS[f"latency.{_part}"] = Metric(f"latency.{_part}", _part.replace("_", " "), "ms", 1.0, 1, False)
 METRICS["latency.fps"] = Metric("latency.fps", "frames per second", "1/s", 1.0, 2, True)
 METRICS["latency.memory_gb"] = Metric("latency.memory_gb", "memory", "GB", 1.0, 2, False)

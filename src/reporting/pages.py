@@ -2,6 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable
+from dataclasses import replace
+from typing import Any
+
+import yaml
+
+from src.reporting.escaping import as_code
+from src.reporting.metric_names import SPEEDS
 from src.reporting.results import RunResult
 from src.reporting.tables import (
     BY_RANGE,
@@ -9,7 +17,6 @@ from src.reporting.tables import (
     CAR_BY_SPEED,
     CAR_ERROR_BY_SPEED,
     ERROR_BY_SPEED,
-    SPEEDS,
     SUMMARY,
     SUMMARY_WITH_VELOCITY,
     Experiment,
@@ -64,23 +71,61 @@ GAIN_TEXT = """Differences between runs of the same seed, mean ± standard devia
 velocity error, where less is better."""
 
 
-def runs_on_page(runs: list[RunResult], phase: str) -> list[RunResult]:
-    """Those of `runs` that the page of `phase` shows; none when there is none of the phase itself.
+def runs_on_page(
+    results: Iterable[RunResult], phase: str, in_sweeps: Collection[str], defaults: dict[str, dict[str, Any]]
+) -> list[RunResult]:
+    """Those of `results` that the page of `phase` shows; none when there is none of the phase itself.
 
     Phase 1 that went on from phase 1 is what phase 2 is held against, so it stands on that page and not on its own;
-    there, phase 1 stands as it is, without its ablations.
+    there, phase 1 stands as it is, without its ablations. Runs of sweeps (their ids are `in_sweeps`) have tables of
+    their own: of them only experiments that have a name here are shown. `defaults` are the configurations of runs
+    without settings, by phase.
     """
-    if phase in PHASES_OF:
-        shown = [run for run in runs if run.phase == phase or not run.settings or _goes_on(run)]
-    else:
-        shown = [run for run in runs if run.phase != "phase1" or not _goes_on(run)]
+    names = NAMES_OF_COMPARISON if phase in PHASES_OF else NAMES
+    shown = []
+    for result in results:
+        run = replace(result, overrides=without_defaults(result.overrides, defaults.get(result.phase, {})))
+        if phase in PHASES_OF:
+            belongs = run.phase == phase or (run.phase in PHASES_OF[phase] and (not run.settings or _goes_on(run)))
+        else:
+            belongs = run.phase == phase and not _goes_on(run)
+        known = (run.phase, *_seeing_settings(run)) in names or _goes_on(run)
+        if belongs and (known or run.run_id not in in_sweeps):
+            shown.append(run)
     return shown if any(run.phase == phase for run in shown) else []
 
 
-def phase_page(runs: list[RunResult], scale: str, epochs: int) -> str:
+def without_defaults(overrides: list[str], defaults: dict[str, Any]) -> list[str]:
+    """The last override of each key, less those that say what `defaults` say.
+
+    A sweep spells out the value of its baseline, which is then the same run as one without settings.
+    """
+    last = {override.partition("=")[0].lstrip("+"): override for override in overrides}
+    other = {key: override for key, override in last.items() if not _is_default(key, override, defaults)}
+    parts = tuple(f"{key}." for key in other)  # inside one, another choice has other defaults
+    return [override for key, override in last.items() if key in other or key.startswith(parts)]
+
+
+def _is_default(key: str, override: str, defaults: dict[str, Any]) -> bool:
+    value: Any = defaults
+    for name in key.split("."):
+        if not isinstance(value, dict) or name not in value:
+            return False
+        value = value[name]
+    try:
+        said = yaml.safe_load(override.partition("=")[2])
+    except yaml.YAMLError:
+        return False
+    if isinstance(value, dict):  # a part is chosen by its name
+        return said is not None and said == value.get("name")
+    return said == value and isinstance(said, bool) == isinstance(value, bool)  # to Python, 1 is true
+
+
+def phase_page(runs: list[RunResult], scale: str) -> str:
     """The runs of one phase: summary, AP by class, cost. Raises ValueError when they are of different data."""
     experiments = group_runs(runs, lambda run: NAMES.get((run.phase, *run.settings)))
     tables = [score_table(experiments, SUMMARY), class_table(experiments), cost_table(experiments)]
+    epochs = ", ".join(map(str, sorted({run.epochs for run in runs})))
     return _page(runs[0].phase, scale, f"{epochs} epochs", runs) + "\n\n".join(tables) + "\n"
 
 
@@ -93,10 +138,10 @@ def compared_experiments(runs: list[RunResult]) -> list[Experiment]:
         if f"{GOES_ON}phase1" in run.settings and all(s.startswith((GOES_ON, *free)) for s in run.settings):
             return CONTINUED if {run.epochs} == epochs else f"phase 1, {run.epochs} further epochs"
         silent = [setting for setting in run.settings if setting.startswith(SILENT)]
-        known = NAMES_OF_COMPARISON.get((run.phase, *(s for s in run.settings if s not in silent)))
+        known = NAMES_OF_COMPARISON.get((run.phase, *_seeing_settings(run)))
         if known and silent:
-            return f"{known}, `{silent[0]}`"
-        return known or f"{run.phase.replace('phase', 'phase ')}, `{' '.join(run.settings)}`"
+            return f"{known}, {as_code(silent)}"
+        return known or f"{run.phase.replace('phase', 'phase ')}, {as_code(run.settings)}"
 
     def place(experiment: Experiment) -> float:
         known, key = list(NAMES_OF_COMPARISON), tuple(part for part in experiment.key if not part.startswith(SILENT))
@@ -151,6 +196,10 @@ def _boxes_by_speed(runs: list[RunResult]) -> str:
     return ""
 
 
+def _seeing_settings(run: RunResult) -> tuple[str, ...]:
+    return tuple(setting for setting in run.settings if not setting.startswith(SILENT))
+
+
 def _goes_on(run: RunResult) -> bool:
     return any(setting.startswith(GOES_ON) for setting in run.settings)
 
@@ -159,7 +208,7 @@ def _page(phase: str, scale: str, epochs: str, runs: list[RunResult]) -> str:
     """Title, conventions and the commands of the runs."""
     text = (
         f"# {phase}, scale {scale}\n\n"
-        f"Data: {runs[0].data}; {epochs}; {METRIC} Written by "
+        f"Data: {runs[0].dataset}; {epochs}; {METRIC} Written by "
         f"`python -m src.report phase={phase} scale={scale}` from the runs\n\n```\n"
     )
     for run in sorted(runs, key=lambda run: (run.phase, run.settings, run.seed)):

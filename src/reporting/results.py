@@ -1,107 +1,207 @@
-"""Finished runs as they lie on disk, checked when read. Imports nothing of the rest, and never torch."""
+"""Finished runs as `reports/results/<run_id>.json`: written from a run's folder, checked when read. Never torch."""
 
 from __future__ import annotations
 
+import csv
+import hashlib
 import json
-from collections.abc import Sequence
+import math
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from src.errors import DataError
+from src.reporting.metric_names import METRICS
+from src.reporting.writing import write_whole
 
-NOT_A_SETTING = (
-    "seed=", "scale=", "phase=", "paths.", "trainer", "logger", "resume=", "data.num_workers=", "data.root=",
-    "phase.train_missing=",
+FORMAT = 1
+MAX_POINTS = 200
+"""Of a learning curve."""
+
+OF_A_MACHINE = (
+    "paths.", "trainer", "logger", "resume=", "out=", "checkpoint=", "data.num_workers=", "data.root=",
+    "data.world.num_workers=",
 )  # fmt: skip
-"""Overrides that do not make another experiment."""
+"""Overrides that say where, not what; a result does not repeat them."""
+NOT_A_SETTING = ("seed=", "scale=", "phase=", "phase.train_missing=")
+"""Other overrides that do not make another experiment."""
+KEYS_OF_A_MACHINE = (
+    "paths", "logger", "resume", "checkpoint", "predictions", "out", "scene", "preview", "suite",
+)  # fmt: skip
+ELSEWHERE = re.compile(r"""["']*(/|~|\$|\.\./|file:|[A-Za-z]:[\\/])""")
+"""How a value begins that names a place on one machine."""
+
+KEPT_OF_A_CLASS = ("AP", "AVE", "num_gt")
+"""Within a range or a speed class; the run's metrics.json has the rest."""
+
+NUMBER = (float, int)
+NONE = type(None)
+RECORD = {
+    "run_id": (str,), "scale": (str,), "seed": (int,), "overrides": (list,), "data": (dict,), "commit": (str,),
+    "versions": (dict,), "device": (str,), "processes": (int,), "threads": (int,), "initialized_from": (str, NONE),
+    "epochs": (int,), "steps": (int,), "parameters": (int,), "resumed": (bool,), "seconds": (dict,),
+    "peak_memory_mib": (dict,), "skipped_files": (dict,),
+}  # fmt: skip
+"""What a result takes from run.json as it is, and the types."""
+INSIDE_RECORD = {
+    ("data", "name"): (str,), ("data", "root"): (str,), ("seconds", "all"): NUMBER,
+    ("peak_memory_mib", "process"): (int,),
+}  # fmt: skip
 
 
-@dataclass
+@dataclass(kw_only=True)
 class RunResult:
-    """One finished run: its record (run.json) and its numbers (metrics.json)."""
+    """One finished run: what it was, and its numbers."""
 
     run_id: str
+    model: str
     phase: str
-    settings: tuple[str, ...]  # overrides that define the experiment within its phase, sorted
-    seed: int
     scale: str
-    data: str  # name of the data and digest of the world, what must agree within a table
+    seed: int
+    overrides: list[str]  # as typed, without those of a machine
+    data: dict[str, str]  # name, version, train_split, split, root (the folder's name: of a world its digest)
+    commit: str
+    versions: dict[str, str]
+    device: str
+    processes: int
+    threads: int
+    initialized_from: str | None  # run id, or digest of a checkpoint
     epochs: int  # of this phase
-    seconds: float
-    peak_memory_mib: int
+    steps: int
     parameters: int
+    resumed: bool
+    seconds: dict[str, float]  # fit, all
+    peak_memory_mib: dict[str, int]  # process, largest_worker
+    skipped_files: dict[str, int]
+    config: dict[str, Any]  # tree of config.yaml, without keys of a machine
     metrics: dict[str, float | None]
-    """By path within metrics.json: mAP, NDS, mAVE, classes.<class>.AP, ranges.<bin>.mAP and, where the run was scored
-    by speed class, speeds.<class>.<mAP_present | mAVE_present | car.AP | car.AVE> (None where there is no such ground
-    truth) and speeds.<class>.<boxes | car.boxes>, how much ground truth there is."""
+    """By the names of src/reporting/metric_names.py, as measured: fractions of 1, m/s, ms; None where there is no such
+    ground truth; a name is absent where the run was not scored by it. Also speeds.<class>.<boxes | car.boxes>, how
+    much ground truth there is."""
+    curves: dict[str, list[list[float]]]  # [step, value] by column of metrics.csv: loss/*, val/*
+    latency: dict[str, Any] | None  # content of latency.json
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """Overrides that define the experiment within its phase, sorted."""
+        return tuple(sorted(o for o in self.overrides if not o.lstrip("+").startswith(NOT_A_SETTING)))
+
+    @property
+    def dataset(self) -> str:
+        """Name of the data and digest of the world."""
+        return f"{self.data['name']} {self.data['root']}"
 
 
-def read_runs(outputs: Path, scale: str, phases: Sequence[str]) -> list[RunResult]:
-    """All finished runs of one scale and these phases under `outputs`, by name, without those a restart moved aside.
+def result_path(reports: Path, run_id: str) -> Path:
+    """Where the result of a run lies."""
+    return reports / "results" / f"{run_id}.json"
 
-    Raises DataError naming file and key for a record that cannot be read.
+
+def finished_runs(outputs: Path, scale: str) -> Iterator[Path]:
+    """Folders of one scale's finished runs, by name, without those that a restart moved aside."""
+    for path in sorted(outputs.glob("*/run.json")):
+        folder = path.parent
+        if f"-{scale}-" in folder.name and ".before-" not in folder.name and (folder / "metrics.json").is_file():
+            yield folder
+
+
+def publish_result(run_folder: Path, reports: Path) -> Path:
+    """Write the result of a finished run, unless it is there as it would be written; returns its path.
+
+    Raises DataError naming file and key of a run folder that is not as a run leaves it, OSError naming the result for
+    a disk that does not take it: the older one stays.
     """
-    results = []
-    for record_path in sorted(outputs.glob("*/run.json")):
-        metrics_path = record_path.with_name("metrics.json")
-        if not metrics_path.is_file() or ".before-" in record_path.parent.name:  # unfinished, or replaced by a restart
+    remedy = "delete run.json and metrics.json there and give the run's command again"
+    record, scores = _Json(run_folder / "run.json", remedy), _Json(run_folder / "metrics.json", remedy)
+    config = _read_config(run_folder / "config.yaml")
+    latency_path = run_folder / "latency.json"
+    latency = _Json(latency_path, "delete it and measure again") if latency_path.is_file() else None
+    fields = _record(record)
+    overrides = [_without_place(o) for o in fields["overrides"] if not o.lstrip("+").startswith(OF_A_MACHINE)]
+    _metrics(scores, latency)
+    content = {
+        "format": FORMAT,
+        "model": config["model"]["name"],
+        "phase": config["phase"]["name"],
+        **fields,
+        "overrides": overrides,
+        "config": _without_places(config),
+        "metrics": _slim(scores.content),
+        "curves": _read_curves(run_folder / "metrics.csv"),
+        "latency": latency.content if latency is not None else None,
+    }
+    lines = (f"{json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
+    text = "{\n" + ",\n".join(lines) + "\n}\n"  # a line per key: compact, and a change is seen where it is
+    path = result_path(reports, fields["run_id"])
+    if not path.is_file() or path.read_bytes() != text.encode():
+        write_whole(path, text)
+    return path
+
+
+def read_result(path: Path) -> RunResult:
+    """Read one result. Raises DataError naming file, key, what was expected and found, and the remedy."""
+    file = _Json(path, "delete it and run python -m src.report, which writes it anew from the run's folder")
+    found = file.content.get("format")
+    if found != FORMAT or type(found) is not int:
+        raise file.refusal(("format",), f"must be {FORMAT}, the one that this version reads, but is {found!r:.80}")
+    scores = file.below("metrics")
+    latency = file.below("latency") if file.get("latency", dict, NONE) is not None else None
+    curves = file.get("curves", dict)
+    for name, points in curves.items():
+        if type(points) is not list or not all(map(_is_point, points)):
+            raise file.refusal(("curves", name), f"must be a list of [step, value], but is {points!r:.80}")
+    return RunResult(
+        model=file.get("model", str),
+        phase=file.get("phase", str),
+        **_record(file),
+        config=file.get("config", dict),
+        metrics=_metrics(scores, latency),
+        curves=curves,
+        latency=latency.content if latency is not None else None,
+    )
+
+
+def read_results(reports: Path, scale: str | None = None) -> tuple[dict[str, RunResult], dict[Path, DataError]]:
+    """Every result under reports/results, by run id, and what could not be read, by file."""
+    results, broken = {}, {}
+    for path in sorted((reports / "results").glob("*.json")):
+        if scale is not None and f"-{scale}-" not in path.name:
             continue
-        record = _Record(record_path)
-        run_id = record.get("run_id", str)
-        phase = next((phase for phase in phases if f"-{phase}-" in run_id), None)
-        if record.get("scale", str) != scale or phase is None:
-            continue
-        settings = sorted(o for o in record.get("overrides", list) if not o.startswith(NOT_A_SETTING))
-        results.append(
-            RunResult(
-                run_id=run_id,
-                phase=phase,
-                settings=tuple(settings),
-                seed=record.get("seed", int),
-                scale=scale,
-                data=f"{record.get(('data', 'name'), str)} {record.get(('data', 'root'), str)}",
-                epochs=record.get("epochs", int),
-                seconds=record.get(("seconds", "all"), float, int),
-                peak_memory_mib=record.get(("peak_memory_mib", "process"), int),
-                parameters=record.get("parameters", int),
-                metrics=_metrics(_Record(metrics_path)),
-            )
-        )
-    return results
-
-
-def _metrics(content: _Record) -> dict[str, float | None]:
-    paths = [("mAP",), ("NDS",), ("mAVE",)]
-    paths += [("classes", name, "AP") for name in content.get("classes", dict)]
-    paths += [("ranges", name, "mAP") for name in content.get("ranges", dict)]
-    values = {".".join(path): content.get(path, float, int) for path in paths}
-    if "speeds" not in content.content:  # written before there were speed classes
-        return values
-    for name in content.get("speeds", dict):
-        for key in ("mAP_present", "mAVE_present"):
-            values[f"speeds.{name}.{key}"] = content.get(("speeds", name, key), float, int, type(None))
-        classes = ("speeds", name, "classes")
-        boxes = [content.get((*classes, of, "num_gt"), int) for of in content.get(classes, dict)]
-        cars = content.get((*classes, "car", "num_gt"), int)
-        values |= {f"speeds.{name}.boxes": sum(boxes), f"speeds.{name}.car.boxes": cars}
-        for key in ("AP", "AVE"):  # the official numbers of a class without ground truth are 0 and 1, and say nothing
-            value = content.get((*classes, "car", key), float, int)
-            values[f"speeds.{name}.car.{key}"] = value if cars else None
-    return values
-
-
-class _Record:
-    """A JSON file of a run; whatever it lacks is named with the file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
         try:
-            self.content = json.loads(path.read_text())
+            result = read_result(path)
+        except DataError as error:
+            broken[path] = error
+        else:
+            results[result.run_id] = result
+    return results, broken
+
+
+class _Json:
+    """A JSON object of a file; whatever it lacks is named with the file and what to do."""
+
+    def __init__(self, path: Path, remedy: str, content: Any = None, prefix: tuple[str, ...] = ()) -> None:
+        self.path, self.remedy, self.content, self.prefix = path, remedy, content, prefix
+        if content is not None:
+            return
+        try:
+            text = path.read_text(encoding="utf-8")
+            self.content = json.loads(text)
         except (OSError, ValueError) as error:
-            raise DataError(f"{path}: not readable as JSON ({error}); retrain that run with resume=restart") from error
+            raise DataError(f"{path}: not readable as JSON ({error}); {remedy}") from error
         if not isinstance(self.content, dict):
-            raise DataError(f"{path}: must hold an object, but holds a {type(self.content).__name__}")
+            raise DataError(f"{path}: must hold an object, but holds a {type(self.content).__name__}; {remedy}")
+        if "NaN" in text or "Infinity" in text:  # Python reads them, though they are not JSON
+            for names, value in _leaves(self.content):
+                if isinstance(value, float) and not math.isfinite(value):
+                    raise self.refusal(names, f"must be a finite number, but is {value}")
+
+    def below(self, name: str) -> _Json:
+        """The object at one name, checked as this one is."""
+        return _Json(self.path, self.remedy, self.get(name, dict), (*self.prefix, name))
 
     def get(self, names: str | Sequence[str], *kinds: type) -> Any:
         """The value at one name, or under several names one inside the other; its type is exactly one of `kinds`."""
@@ -109,15 +209,148 @@ class _Record:
         value: Any = self.content
         for depth, name in enumerate(names):
             if not isinstance(value, dict) or name not in value:
-                raise self._refusal(names[: depth + 1], "is missing")
+                raise self.refusal(names[: depth + 1], "is missing")
             value = value[name]
         if type(value) not in kinds:
-            expected = " or ".join("null" if kind is type(None) else kind.__name__ for kind in kinds)
-            raise self._refusal(names, f"must be {expected}, but is {value!r:.80}")
+            expected = " or ".join("null" if kind is NONE else kind.__name__ for kind in kinds)
+            raise self.refusal(names, f"must be {expected}, but is {value!r:.80}")
         return value
 
-    def _refusal(self, names: Sequence[str], fault: str) -> DataError:
-        return DataError(
-            f"{self.path}: {'.'.join(names)} {fault}; delete run.json and metrics.json there and give the run's "
-            "command again"
-        )
+    def refusal(self, names: Sequence[str], fault: str) -> DataError:
+        """What is wrong at `names`."""
+        return DataError(f"{self.path}: {'.'.join((*self.prefix, *names))} {fault}; {self.remedy}")
+
+
+def _record(file: _Json) -> dict[str, Any]:
+    fields = {name: file.get(name, *kinds) for name, kinds in RECORD.items()}
+    for names, kinds in INSIDE_RECORD.items():
+        file.get(names, *kinds)
+    for index, override in enumerate(fields["overrides"]):
+        if type(override) is not str:
+            raise file.refusal(("overrides", str(index)), f"must be str, but is {override!r:.80}")
+    return fields
+
+
+def _metrics(scores: _Json, latency: _Json | None) -> dict[str, float | None]:
+    """See RunResult.metrics."""
+    values: dict[str, float | None] = {}
+    for name in ("mAP", "NDS", "mAVE"):
+        values[name] = scores.get(name, *NUMBER)
+    for name in scores.get("classes", dict):
+        values[f"classes.{name}.AP"] = scores.get(("classes", name, "AP"), *NUMBER)
+    for name in scores.get("ranges", dict):
+        values[f"ranges.{name}.mAP"] = scores.get(("ranges", name, "mAP"), *NUMBER)
+        for of in scores.get(("ranges", name, "classes"), dict):
+            scores.get(("ranges", name, "classes", of), dict)
+    for name in METRICS:
+        path = name.split(".")
+        if name not in values and path[0] not in ("speeds", "latency") and _has(scores.content, path):
+            values[name] = scores.get(path, *NUMBER, NONE)
+    for name in scores.get("speeds", dict) if "speeds" in scores.content else ():  # older runs have no speed classes
+        for key in ("mAP_present", "mAVE_present"):
+            values[f"speeds.{name}.{key}"] = scores.get(("speeds", name, key), *NUMBER, NONE)
+        classes = ("speeds", name, "classes")
+        boxes = [scores.get((*classes, of, "num_gt"), int) for of in scores.get(classes, dict)]
+        cars = scores.get((*classes, "car", "num_gt"), int)
+        values |= {f"speeds.{name}.boxes": sum(boxes), f"speeds.{name}.car.boxes": cars}
+        for key in ("AP", "AVE"):  # the official numbers of a class without ground truth are 0 and 1, and say nothing
+            value = scores.get((*classes, "car", key), *NUMBER)
+            values[f"speeds.{name}.car.{key}"] = value if cars else None
+    if latency is not None:
+        values |= {f"latency.{part}": latency.get(("ms", part), *NUMBER) for part in latency.get("ms", dict)}
+        values |= {f"latency.{name}": latency.get(name, *NUMBER) for name in ("fps", "memory_gb")}
+    return values
+
+
+def _slim(scores: dict[str, Any]) -> dict[str, Any]:
+    """metrics.json without the scores by tag, and by range and speed with less of each class: many are read fast."""
+
+    def shortened(part: dict[str, Any]) -> dict[str, Any]:
+        classes = {
+            name: {key: values[key] for key in KEPT_OF_A_CLASS if key in values}
+            for name, values in part.get("classes", {}).items()
+        }
+        return part | {"classes": classes}
+
+    slim = {name: value for name, value in scores.items() if name != "tags"}
+    for split in ("ranges", "speeds"):
+        if split in slim:
+            slim[split] = {name: shortened(part) for name, part in slim[split].items()}
+    return slim
+
+
+def _has(content: Any, path: Sequence[str]) -> bool:
+    for name in path:
+        if not isinstance(content, dict) or name not in content:
+            return False
+        content = content[name]
+    return True
+
+
+def _leaves(content: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    if isinstance(content, (dict, list)):
+        for name, value in content.items() if isinstance(content, dict) else enumerate(content):
+            yield from _leaves(value, (*names, str(name)))
+    else:
+        yield names, content
+
+
+def _is_point(point: Any) -> bool:
+    return type(point) is list and len(point) == 2 and type(point[0]) is int and type(point[1]) in NUMBER
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    try:
+        content = yaml.load(path.read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        if not all(isinstance(content[part]["name"], str) for part in ("model", "phase")):
+            raise TypeError("model.name and phase.name must be words")
+    except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError) as error:
+        what = " ".join(str(error).split())
+        raise DataError(f"{path}: not a run's configuration ({type(error).__name__}: {what})") from error
+    return content
+
+
+def _read_curves(path: Path) -> dict[str, list[list[float]]]:
+    """The losses and validation scores of metrics.csv, thinned out evenly to at most MAX_POINTS each."""
+    curves: dict[str, list[list[float]]] = {}
+    if not path.is_file():
+        return curves
+    try:
+        with path.open(newline="") as file:
+            for row in csv.DictReader(file):
+                for name, value in row.items():
+                    if name and name.startswith(("loss/", "val/")) and value and math.isfinite(float(value)):
+                        curves.setdefault(name, []).append([int(row["step"]), float(value)])
+    except (OSError, ValueError, TypeError, KeyError, csv.Error) as error:
+        raise DataError(f"{path}: not a run's learning curves ({type(error).__name__}: {error}); delete it") from error
+    return {name: _thinned(points) for name, points in sorted(curves.items())}
+
+
+def _thinned(points: list[list[float]]) -> list[list[float]]:
+    last = len(points) - 1
+    if last < MAX_POINTS:
+        return points
+    return [points[round(index * last / (MAX_POINTS - 1))] for index in range(MAX_POINTS)]
+
+
+def _without_place(text: str) -> str:
+    """`key=value`, or a value; a path that holds on one machine only becomes its last name and a digest."""
+    key, equals, value = text.rpartition("=") if "=" in text else ("", "", text)
+    if not ELSEWHERE.match(value):
+        return text
+    name = re.split(r"[/\\]", value.strip("\"'").rstrip("/\\"))[-1]
+    return f"{key}{equals}{name}@{hashlib.sha256(value.encode()).hexdigest()[:8]}"
+
+
+def _without_places(config: dict[str, Any]) -> dict[str, Any]:
+    def clean(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: clean(inner) for key, inner in value.items()}
+        if isinstance(value, list):
+            return [clean(inner) for inner in value]
+        return _without_place(value) if isinstance(value, str) else value
+
+    kept = {key: value for key, value in config.items() if key not in KEYS_OF_A_MACHINE}
+    if isinstance(kept.get("data"), dict):
+        kept["data"] = {key: value for key, value in kept["data"].items() if key != "root"}
+    return clean(kept)

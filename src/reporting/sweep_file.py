@@ -6,7 +6,7 @@ The dataclasses are the schema that src/config.py checks each file against; noth
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from src.errors import ConfigError
@@ -21,15 +21,18 @@ class RowConfig:
     overrides: list[str] = field(default_factory=list)  # as after `python -m src.train`
     paper: dict[str, float] = field(default_factory=dict)  # the paper's numbers by metric, in the paper's units
     x: float | None = None  # place on the plot's horizontal axis
+    baseline: str | None = None  # label of the row this one is compared with, where it is not the file's
+    scales: list[str] | None = None  # trained at these scales only, elsewhere the paper's numbers stand alone
 
 
 @dataclass(kw_only=True)
 class TableConfig:
-    """One table over the rows: a choice of columns."""
+    """One table over the rows: a choice of columns, and of rows where not all have something to say."""
 
     name: str  # file name under reports/tables, without scale
     title: str
     columns: list[str]  # names of src/reporting/metric_names.py
+    rows: list[str] | None = None  # labels, the paper's own rows included; null: all
 
 
 @dataclass(kw_only=True)
@@ -97,8 +100,12 @@ class SweepConfig:
         twice = sorted({label for label in labels if labels.count(label) > 1})
         if twice:
             raise ConfigError(f"{where}: label {', '.join(twice)} stands more than once; each row needs its own")
-        if self.baseline is not None and self.baseline not in [row.label for row in self.rows]:
-            raise ConfigError(f"{where}: baseline {self.baseline!r} is not the label of a row ({', '.join(labels)})")
+        own = [row.label for row in self.rows]
+        for baseline in (self.baseline, *(row.baseline for row in self.rows)):
+            if baseline is not None and baseline not in own:
+                raise ConfigError(f"{where}: baseline {baseline!r} is not the label of a row ({', '.join(own)})")
+            if any(row.label == baseline and row.scales is not None for row in self.rows):
+                raise ConfigError(f"{where}: baseline {baseline!r} must be for every scale; leave its scales out")
         for row in [*self.rows, *self.paper_rows]:
             for metric, value in row.paper.items():
                 find_metric(metric, f"{where}, row {row.label!r}, paper")
@@ -110,6 +117,9 @@ class SweepConfig:
         for table in self.tables:
             for column in table.columns:
                 find_metric(column, f"{where}, table {table.name}, columns")
+            strange = [label for label in table.rows or () if label not in labels]
+            if strange:
+                raise ConfigError(f"{where}, table {table.name}: there is no row {', '.join(strange)}")
         for plot in self.plots:
             find_metric(plot.metric, f"{where}, plots")
         for key, dimension in self.space.items():
@@ -123,3 +133,13 @@ class SweepConfig:
     def is_search(self) -> bool:
         """Whether a sampler chooses what to train."""
         return bool(self.space)
+
+    def baseline_of(self, label: str) -> str | None:
+        """Label of the row that this one's differences are taken to."""
+        return next((row.baseline for row in self.rows if row.label == label and row.baseline), self.baseline)
+
+    def at_scale(self, scale: str) -> SweepConfig:
+        """The same question at one scale: a row that is not for it becomes one that only the paper has."""
+        rows = [row for row in self.rows if row.scales is None or scale in row.scales]
+        others = [PaperRowConfig(label=row.label, paper=row.paper) for row in self.rows if row not in rows]
+        return replace(self, rows=rows, paper_rows=others + self.paper_rows)

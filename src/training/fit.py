@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import warnings
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,7 @@ from src.training.interruption import Interruption
 from src.training.metrics_csv import MetricsCSV
 from src.training.processes import SharedBuffers
 from src.training.run_folder import RunFolder
-
-logger = logging.getLogger(__name__)
+from src.training.wandb import WandbConfig, start_wandb
 
 EXPECTED_WARNINGS = (
     ".*resuming from a checkpoint that ended before the epoch ended",  # the sampler knows its place by the step
@@ -91,29 +89,17 @@ def build_trainer(
     )
 
 
-def build_loggers(folder: RunFolder, resume_from: Path | None, wandb: dict[str, Any] | None) -> list[Logger]:
-    """metrics.csv always; Weights & Biases where asked for, and a warning instead of a stop when it cannot start."""
+def build_loggers(
+    folder: RunFolder,
+    resume_from: Path | None,
+    wandb: WandbConfig | None,
+    tree: dict[str, Any] | None = None,  # the run's configuration, for W&B
+) -> list[Logger]:
+    """metrics.csv always; Weights & Biases where asked for and able to start."""
     step = -1 if resume_from is None else int(read_checkpoint(resume_from)["global_step"])
-    loggers: list[Logger] = [MetricsCSV(folder.metrics_csv, resume_step=step)]
-    if wandb is not None:
-        try:
-            from lightning.pytorch.loggers import WandbLogger
-
-            run = WandbLogger(
-                project=wandb["project"],
-                name=folder.run_id,
-                id=folder.run_id,
-                offline=wandb["offline"],
-                save_dir=folder.path,
-                log_model=False,
-            )
-            run.log_hyperparams(wandb["config"])
-            loggers.append(run)
-            if wandb["offline"]:
-                logger.info("W&B is offline; send the run later with: wandb sync %s/wandb/offline-run-*", folder.path)
-        except Exception as error:  # wandb raises its own, varying types; the run must not depend on a web service
-            logger.warning("W&B could not start (%s); the run goes on with %s", error, folder.metrics_csv)
-    return loggers
+    metrics = MetricsCSV(folder.metrics_csv, resume_step=step)
+    run = start_wandb(wandb, folder, tree or {}, metrics.rows) if wandb is not None else None
+    return [metrics] if run is None else [metrics, run]
 
 
 def fit(trainer: L.Trainer, module: DetectionModule, datamodule: DetectionDataModule, resume_from: Path | None) -> None:

@@ -42,6 +42,11 @@ class MetricsCSV(Logger):
         return "metrics_csv"
 
     @property
+    def rows(self) -> list[dict[str, str]]:
+        """What the file holds and goes on from, oldest first, without empty cells."""
+        return list(self._rows)
+
+    @property
     def version(self) -> str:
         """There is one version per run folder."""
         return ""

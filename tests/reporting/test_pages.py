@@ -5,6 +5,10 @@ from PIL import Image
 
 from src.errors import DataError
 from src.report import main
+from src.reporting.dashboard import export
+from src.reporting.pages import without_defaults
+from src.reporting.results import result_path
+from src.reporting.sweep_record import record_path, write_record
 
 NO_VELOCITY = [
     "model.dptf.gaussian_path.velocity_compensation=false",
@@ -14,7 +18,15 @@ FURTHER = ["phase=phase1", "phase.init_from=phase1", "phase.velocity_code_weight
 
 
 @pytest.fixture
-def report(tmp_path, capsys):
+def exported(monkeypatch):
+    """What the dashboard was exported from, call by call; it has tests of its own."""
+    calls = []
+    monkeypatch.setattr(export, "export_dashboard", lambda *arguments: calls.append(arguments))
+    return calls
+
+
+@pytest.fixture
+def report(tmp_path, capsys, exported):
     def run(phase):
         main([f"phase={phase}", "scale=mini", f"paths.outputs={tmp_path}", f"paths.reports={tmp_path / 'reports'}"])
         assert f"{phase}_mini.md" in capsys.readouterr().out
@@ -111,5 +123,81 @@ def test_no_run_of_the_phase_itself(write_run, report):
 
 def test_other_data_is_refused(both_phases, write_run, report):
     write_run("other", ["phase=phase2"], 5, 0.3, phase="phase2", root="elsewhere")
-    with pytest.raises(DataError, match="never mixes data.*different folders"):
+    with pytest.raises(DataError, match="never mixes data.*different paths.reports"):
         report("phase2")
+
+
+def test_everything_of_a_scale_is_written(both_phases, report, tmp_path, make_record, exported):
+    record = make_record({"4.8 m": {"mAP": 20.3}}, seeds=1)
+    write_record(record_path(tmp_path / "reports", "epsilon", "mini"), record)
+    write_record(record_path(tmp_path / "reports", "other", "debug"), make_record({"x": {}}, scale="debug"))
+    report("phase1")
+    reports = tmp_path / "reports"
+    assert {path.name for path in reports.iterdir()} >= {"phase1_mini.md", "phase2_mini.md", "results", "tables"}
+    assert len(list((reports / "results").iterdir())) == 9
+    assert {path.name for path in (reports / "tables").iterdir()} == {
+        f"table_epsilon_mini.{ending}" for ending in ("md", "csv", "tex")
+    }
+    assert exported == [(reports, tmp_path, reports / "dashboard.html")]
+
+
+def test_results_outlive_their_runs(both_phases, report, tmp_path):
+    before = report("phase2")
+    for record in tmp_path.glob("*/run.json"):
+        record.unlink()
+    assert report("phase2") == before
+
+
+def test_what_is_broken_is_named_after_the_rest(both_phases, write_run, tmp_path, report):
+    broken = write_run("broken", [], 7, 0.9)
+    (broken / "metrics.json").write_text("{")
+    reports = tmp_path / "reports"
+    (reports / "results").mkdir(parents=True)
+    (reports / "sweeps").mkdir()
+    result_path(reports, "horizon3d-phase1-mini-old").write_text('{"format": 0}')
+    record_path(reports, "torn", "mini").write_text("{")
+    with pytest.raises(DataError) as raised:
+        report("phase2")
+    assert raised.value.exit_code == 4
+    for name in ("broken/metrics.json", "horizon3d-phase1-mini-old.json: format must be 1", "torn_mini.json"):
+        assert name in str(raised.value)
+    assert "phase 2" in (reports / "phase2_mini.md").read_text()
+
+
+def test_sweeps_with_different_data_stop_no_other(both_phases, write_run, tmp_path, report, make_record):
+    for end, root in (("a0", "world"), ("b0", "elsewhere"), ("c0", "world")):
+        write_run(end, [f"x={end}"], 0, 0.3, root=root)
+    reports = tmp_path / "reports"
+    write_record(record_path(reports, "mixed", "mini"), make_record({"a": {}, "b": {}}, seeds=1, name="mixed"))
+    write_record(record_path(reports, "pure", "mini"), make_record({"a": {}}, seeds=1, name="pure"))
+    with pytest.raises(DataError, match="sweep mixed, scale mini: a table never mixes"):
+        report("phase2")
+    assert [path.name for path in (reports / "tables").glob("*.md")] == ["table_pure_mini.md"]
+
+
+def test_rows_of_sweeps_do_not_flood_the_pages(both_phases, write_run, tmp_path, report, make_record):
+    write_run("a0", ["model.ocsf.margin_m=0.8"], 0, 0.9)  # a row of the sweep
+    write_run("b0", ["model.ocsf.margin_m=4.8"], 2, 0.5)  # its baseline, which is the plain run with another seed
+    write_run("c0", ["model.kggi.initialization=random"], 0, 0.2)  # a row that has a name on the page
+    write_run("d0", ["model.ocsf.num_layers=4"], 0, 0.1)  # of no sweep
+    record = make_record({"0.8 m": {}, "4.8 m": {}, "random": {}}, seeds=1)
+    write_record(record_path(tmp_path / "reports", "epsilon", "mini"), record)
+    text = report("phase1")
+    summary = rows(text, "| experiment | mAP | NDS | car AP |")
+    assert list(summary) == ["KGGI + OCSF", "OCSF, random Gaussians", "radar only", "`model.ocsf.num_layers=4`"]
+    assert summary["KGGI + OCSF"].startswith("| KGGI + OCSF | **40.0 ± 10.0** |")  # 30, 40 and 50
+    assert "margin_m" not in text
+    assert "margin_m" not in report("phase2")
+
+
+def test_overrides_that_say_the_default_are_none():
+    defaults = {"seed": 0, "model": {"name": "horizon3d", "kggi": {"init": "both"}, "margin_m": 4.8, "dptf": None},
+                "backbone": {"name": "small", "lr": 1.0}, "flag": True}  # fmt: skip
+    same = ["model=horizon3d", "model.kggi.init=both", "model.margin_m=4.80", "model.dptf=null", "backbone=small",
+            "flag=true", "++model.margin_m=4.8"]  # fmt: skip
+    assert without_defaults(same, defaults) == []
+    other = ["model.kggi=null", "model.margin_m=0.8", "backbone=vovnet99", "backbone.lr=1.0", "flag=1", "new.key=1",
+             "model.list=[1"]  # fmt: skip
+    assert without_defaults(other, defaults) == other  # backbone.lr is inside a backbone with a default of its own
+    assert without_defaults(["model.margin_m=0.8", "model.margin_m=4.8"], defaults) == []  # the later wins
+    assert without_defaults(["model.margin_m=4.8", "model.margin_m=0.8"], {}) == ["model.margin_m=0.8"]

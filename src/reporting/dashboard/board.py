@@ -1,0 +1,268 @@
+"""Everything the dashboard shows, read from paths.reports and, where it is there, paths.outputs."""
+
+from __future__ import annotations
+
+import functools
+import threading
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from src.errors import DataError
+from src.reporting.dashboard.folders import ALIVE_S, RunFolders
+from src.reporting.results import NOT_A_SETTING, RunResult, read_result
+from src.reporting.sweep_record import RunState, SweepRecord, read_record
+from src.reporting.sweep_table import SweepTable
+from src.reporting.sweep_tables import sweep_tables
+
+STALLED_S = 120.0
+"""A runner whose runs write neither log nor numbers for this long has probably ended without a word."""
+SCALES = ("paper", "mini", "debug")
+Stamp = tuple[int, int]  # of a file: time of change and size
+
+
+@dataclass(kw_only=True)
+class Sweep:
+    """One sweep at one scale, as of `now`."""
+
+    record: SweepRecord
+    tables: list[SweepTable]
+    problem: str | None  # why there are no tables
+    written: float  # when the runner or one of its running runs last wrote something, seconds since 1970
+    now: float
+
+    @property
+    def key(self) -> str:
+        """Its part of an address: the record's file name."""
+        return f"{self.record.name}_{self.record.scale}"
+
+    @property
+    def state(self) -> str:
+        """`done`, `running`, `stalled` (a run runs, and the runner is silent), `unfinished`, or `failed`."""
+        if self.record.count("running"):
+            return "stalled" if self.silent_s > STALLED_S else "running"
+        if self.record.count("waiting"):
+            return "unfinished" if self.silent_s > STALLED_S else "running"
+        return "failed" if self.record.count("failed") else "done"
+
+    @property
+    def state_words(self) -> str:
+        """The state as people say it."""
+        return {"failed": "ended with failures", "unfinished": "not finished"}.get(self.state, self.state)
+
+    @property
+    def silent_s(self) -> float:
+        """How long ago the runner, or what it runs, last wrote."""
+        return max(0.0, self.now - self.written)
+
+    @property
+    def left_s(self) -> float | None:
+        """Time left by the mean duration of finished runs and the runs that go side by side; None before the first."""
+        runs = self.record.runs.values()
+        took = [run.ended - run.started for run in runs if run.state == "done" and run.ended and run.started]
+        running = [run for run in runs if run.state == "running"]
+        if not took or self.state != "running":
+            return None
+        mean = sum(took) / len(took)
+        rest = sum(max(0.0, mean - (self.now - (run.started or self.now))) for run in running)
+        return (rest + mean * self.record.count("waiting")) / max(1, len(running))
+
+
+@dataclass(kw_only=True)
+class Run:
+    """One run: finished (with a result), of a sweep, or a folder that is being trained in."""
+
+    run_id: str
+    state: str  # of a sweep record, or `stopped`: unfinished and silent, not part of a sweep
+    result: RunResult | None = None
+    planned: RunState | None = None
+    has_folder: bool = False
+    rows: list[tuple[str, str]] = field(default_factory=list)  # key of a sweep and label of the row, first is shown
+
+    @property
+    def parts(self) -> list[str]:
+        """Model, phase, scale and digest, from its name."""
+        return self.run_id.rsplit("-", 3) if self.run_id.count("-") >= 3 else [self.run_id, "", "", ""]
+
+    @property
+    def phase(self) -> str:
+        """As in `phase1`."""
+        return self.parts[1]
+
+    @property
+    def scale(self) -> str:
+        """As in `mini`."""
+        return self.result.scale if self.result else self.parts[2]
+
+    @property
+    def seed(self) -> int | None:
+        """None where only the folder is known."""
+        return self.result.seed if self.result else self.planned.seed if self.planned else None
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """Overrides that make it another experiment within its phase."""
+        overrides = self.result.overrides if self.result else self.planned.overrides if self.planned else ()
+        return tuple(sorted(override for override in overrides if not override.lstrip("+").startswith(NOT_A_SETTING)))
+
+    @property
+    def title(self) -> str:
+        """Row of its first sweep, or what was changed."""
+        return self.rows[0][1] if self.rows else " ".join(self.settings) or "defaults"
+
+
+@dataclass(kw_only=True)
+class Board:
+    """One reading of everything."""
+
+    sweeps: list[Sweep]
+    runs: dict[str, Run]
+    broken: dict[str, str]  # file, relative to paths.reports, and what is wrong with it
+    folders: RunFolders
+    has_reports: bool
+    now: float
+
+    @property
+    def live(self) -> bool:
+        """Whether something is being trained."""
+        return any(sweep.state == "running" for sweep in self.sweeps) or any(
+            run.state == "running" for run in self.runs.values()
+        )
+
+    @property
+    def scales(self) -> list[str]:
+        """Those there is something of, the largest first."""
+        found = {sweep.record.scale for sweep in self.sweeps} | {run.scale for run in self.runs.values()}
+        return sorted(found, key=lambda scale: (SCALES.index(scale) if scale in SCALES else len(SCALES), scale))
+
+    def sweep(self, key: str) -> Sweep | None:
+        """By its part of an address."""
+        return next((sweep for sweep in self.sweeps if sweep.key == key), None)
+
+    def baseline_of(self, run: Run) -> tuple[Run, str] | None:
+        """What a run is held against, with its name: its sweep's baseline row of the same seed, else plain defaults."""
+        for key, label in run.rows:
+            record = self.sweep(key).record
+            baseline = record.sweep.baseline_of(label) if label in record.rows else None
+            other = record.rows.get(baseline or "", {}).get(run.seed)
+            if other is not None and other != run.run_id and other in self.runs:
+                return self.runs[other], f"{baseline} (baseline)"
+        if not run.settings:
+            return None
+        plain = self._plain_runs.get(_kind(run)) if run.result is not None else None
+        return (plain, "defaults") if plain is not None else None
+
+    @functools.cached_property
+    def _plain_runs(self) -> dict[tuple[Any, ...], Run]:
+        """Finished runs without any setting."""
+        plain = (run for run in self.runs.values() if run.result is not None and not run.settings)
+        return {_kind(run): run for run in plain}
+
+
+class BoardReader:
+    """Reads the board, and only files that changed since the last time; safe to call from several threads."""
+
+    def __init__(self, reports: Path, outputs: Path | None) -> None:
+        self.reports = reports
+        self.outputs = outputs
+        self._files: dict[Path, tuple[Stamp, object]] = {}
+        self._lock = threading.Lock()
+        self._board: Board | None = None
+        self._mark: object = None
+
+    def read(self) -> tuple[Board, str]:
+        """The board, and a mark that changes when it does."""
+        with self._lock:
+            now = time.time()
+            folders = RunFolders(self.outputs)
+            names = folders.names()
+            stamps = {path: stamp for kind in ("sweeps", "results") for path, stamp in _stamps(self.reports / kind)}
+            unfinished = {name: folders.written(name) for name in names if not folders.has_result(name)}
+            mark = (tuple(stamps.items()), tuple(unfinished.items()), tuple(names))
+            # What is shown of time itself (time left, silent for) moves on in steps while something runs.
+            step = 15.0 if self._board is not None and self._board.live else 600.0
+            if self._board is None or mark != self._mark or now - self._board.now > step:
+                self._board, self._mark = self._assemble(stamps, names, unfinished, folders, now), mark
+            return self._board, f"{hash((mark, self._board.now)) & 0xFFFFFFFFFFFFFFFF:016x}"
+
+    def _assemble(
+        self, stamps: dict[Path, Stamp], names: list[str], unfinished: dict[str, float | None],
+        folders: RunFolders, now: float,
+    ) -> Board:  # fmt: skip
+        records, results, broken = [], {}, {}
+        for path, stamp in stamps.items():
+            content = self._cached(path, stamp)
+            if isinstance(content, DataError):
+                # A file that is committed or sent around says nothing of where it was made.
+                broken[str(path.relative_to(self.reports))] = (
+                    str(content).replace(f"{path}: ", "").replace(f"{self.reports}/", "")
+                )
+            elif isinstance(content, SweepRecord):
+                records.append(content)
+            else:
+                results[content.run_id] = content
+        self._files = {path: content for path, content in self._files.items() if path in stamps}
+        runs = {run_id: Run(run_id=run_id, state="done", result=result) for run_id, result in results.items()}
+        for record in records:
+            for run_id, planned in record.runs.items():
+                run = runs.setdefault(run_id, Run(run_id=run_id, state=planned.state))
+                run.planned = run.planned or planned
+            labels = [(label, run_id) for label, by_seed in record.rows.items() for run_id in by_seed.values()]
+            rowed = {run_id for _, run_id in labels}
+            labels += [(planned.label, run_id) for run_id, planned in record.runs.items() if run_id not in rowed]
+            for label, run_id in labels:
+                if run_id in runs:
+                    runs[run_id].rows.append((f"{record.name}_{record.scale}", label))
+        for name in names:
+            alive = now - (unfinished.get(name) or 0.0) < ALIVE_S
+            state = "running" if name in unfinished and alive else "stopped" if name in unfinished else "done"
+            runs.setdefault(name, Run(run_id=name, state=state)).has_folder = True
+        for run_id, run in runs.items():
+            run.has_folder = run_id in names
+        sweeps = [self._sweep(record, results, folders, now) for record in records]
+        return Board(
+            sweeps=sweeps, runs=runs, broken=broken, folders=folders, has_reports=self.reports.is_dir(), now=now
+        )  # fmt: skip
+
+    def _sweep(
+        self, record: SweepRecord, results: dict[str, RunResult], folders: RunFolders, now: float
+    ) -> Sweep:  # fmt: skip
+        running = [run for run in record.runs.values() if run.state == "running"]
+        signs = [folders.written(run.run_id, run.log) for run in running]
+        written = max([record.updated, *(sign for sign in signs if sign is not None)])
+        try:
+            tables, problem = sweep_tables(record, results), None
+        except (ValueError, DataError) as error:
+            tables, problem = [], str(error)
+        return Sweep(record=record, tables=tables, problem=problem, written=written, now=now)
+
+    def _cached(self, path: Path, stamp: Stamp) -> RunResult | SweepRecord | DataError:
+        known = self._files.get(path)
+        if known is not None and known[0] == stamp:
+            return known[1]
+        try:
+            content = read_record(path) if path.parent.name == "sweeps" else read_result(path)
+        except DataError as error:
+            content = error
+        self._files[path] = (stamp, content)
+        return content
+
+
+def _kind(run: Run) -> tuple[Any, ...]:
+    """What two finished runs must share for their numbers to compare."""
+    return (*run.parts[:3], run.result.dataset, run.seed)
+
+
+def _stamps(folder: Path) -> Iterable[tuple[Path, Stamp]]:
+    """JSON files of a folder, by name; temporary files, whose names begin with a dot, are none."""
+    if not folder.is_dir():
+        return
+    for path in sorted(folder.glob("*.json")):
+        if not path.name.startswith("."):
+            try:
+                status = path.stat()
+            except OSError:
+                continue
+            yield path, (status.st_mtime_ns, status.st_size)

@@ -1,0 +1,311 @@
+"""Pages from the board: the Jinja templates, and what each of them is given; for the live and the exported dashboard.
+
+Everything is escaped by the templates; no page names anything outside itself and the dashboard's own addresses.
+"""
+
+from __future__ import annotations
+
+import base64
+import functools
+import hashlib
+import re
+import shlex
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from src.reporting.dashboard.board import Board, Run, Sweep
+from src.reporting.dashboard.figures import headline, run_figures, sweep_figures
+from src.reporting.dashboard.folders import Picture
+from src.reporting.dashboard.tables import table_view
+from src.reporting.metric_names import METRICS, Metric
+
+TEMPLATES = Path(__file__).parent / "templates"
+SUMMARY = tuple(METRICS[name] for name in ("mAP", "NDS", "mAVE"))
+GROUPS = (("Summary", ""), ("By distance", "ranges."), ("By speed", "speeds."), ("By class", "classes."),
+          ("Latency", "latency."))  # fmt: skip
+DRAWN_BY_PAGES = ("curves", "scores")
+"""Pictures of a run folder that pages draw themselves, from the numbers."""
+Address = Callable[..., str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Page:
+    """One page: a section with its id, its title and its content, which is HTML."""
+
+    id: str
+    title: str
+    content: Markup
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricRow:
+    """One number of a run beside another's, as shown; `raw` is in the table's unit."""
+
+    metric: Metric
+    raw: float
+    value: str
+    other: str
+    difference: str
+    verdict: str  # `better`, `worse` or nothing
+
+
+class Renderer:
+    """Renders pages with the addresses of one kind of dashboard.
+
+    `address(kind, name="")` gives the address of `overview` (name: an anchor on it), of a `sweep` or of a `run`;
+    `source(picture)` where a picture is to be had, None where it is left out.
+    """
+
+    def __init__(self, address: Address, source: Callable[[Picture], str | None], live: bool) -> None:
+        self.live = live
+        self.environment = _environment()
+        self.environment.globals.update(address=address, live=live, summary=SUMMARY)
+        self.environment.filters["src"] = source
+
+    def document(self, board: Board, pages: list[Page], mark: str = "") -> str:
+        """The whole HTML document around one page, or around all of them."""
+        note = (
+            "Live from this machine, read only."
+            if self.live
+            else "Exported from the results: complete in itself, opens without a network."
+        )
+        return self.environment.get_template("page.html").render(
+            board=board, pages=pages, mark=mark, note=note, style=Markup(asset("style.css")),
+            script=Markup(asset("script.js")), policy=content_policy(self.live),
+        )  # fmt: skip
+
+    def overview(self, board: Board) -> Page:
+        """All sweeps and all runs."""
+        return Page(id="overview", title="Experiments", content=self._content("overview.html", board=board))
+
+    def sweep(self, board: Board, sweep: Sweep) -> Page:
+        """One sweep: tables, figures, runs, failures."""
+        record = sweep.record
+        states = record.runs
+        failed = [
+            (run, board.folders.log_tail(run.log) if run.log else None)
+            for run in states.values()
+            if run.state == "failed"
+        ]
+        listed = [
+            (label, board.runs[run_id], states[run_id])
+            for label, seeds in record.rows.items()
+            for run_id in seeds.values()
+            if run_id in states
+        ]
+        rowed = {run.run_id for _, run, _ in listed}
+        listed += [(state.label, board.runs[run_id], state) for run_id, state in states.items() if run_id not in rowed]
+        content = self._content(
+            "sweep.html", board=board, sweep=sweep, failed=failed, runs=listed, study=study_command(record.storage),
+            tables=[table_view(table) for table in sweep.tables], figures=sweep_figures(board, sweep),
+        )  # fmt: skip
+        return Page(id=f"sweep-{sweep.key}", title=f"{record.sweep.title}, {record.scale}", content=content)
+
+    def run(self, board: Board, run: Run, against: Run | None = None) -> Page:
+        """One run, alone beside its baseline's numbers, or held against another one."""
+        baseline = board.baseline_of(run)
+        other, other_name = (against, run_name(against)) if against else baseline or (None, "")
+        config = flat_config(run.result.config if run.result else board.folders.config(run.run_id))
+        difference = None
+        if config and other is not None and other.result:
+            difference = config_difference(config, flat_config(other.result.config))
+        both = other is not None and (against is not None or run.result is not None)
+        shown = {"this run": run, other_name: other} if both else {"": run}
+        pictures = shown_pictures(board, run)
+        theirs = {picture.name: picture for picture in shown_pictures(board, against)} if against else {}
+        pairs = [(one, theirs[one.name]) for one in pictures if one.name in theirs]
+        log = board.folders.log_tail(f"{run.run_id}/log.txt")
+        if log is None and run.planned and run.planned.log:
+            log = board.folders.log_tail(run.planned.log)
+        content = self._content(
+            "run.html", board=board, run=run, against=against, other=other, other_name=other_name, config=config,
+            difference=difference, pictures=pictures, pairs=pairs, metrics=metric_rows(run, other), log=log,
+            figures=run_figures(board, shown),
+            choices=_other_runs(board, run) if self.live else [], command=train_command(run),
+            progress=_progress(board, run),
+            silent=max(0.0, board.now - (board.folders.written(run.run_id) or board.now)),
+        )  # fmt: skip
+        return Page(id=f"run-{run.run_id}", title=run_name(run), content=content)
+
+    def compare(self, board: Board) -> Page:
+        """Where the exported file puts two runs side by side."""
+        runs = sorted((run for run in board.runs.values() if run.result), key=run_name)
+        return Page(id="compare", title="Two runs side by side", content=self._content("compare.html", runs=runs))
+
+    def _content(self, template: str, **values: Any) -> Markup:
+        return Markup(self.environment.get_template(template).render(**values))
+
+
+@functools.cache
+def asset(name: str) -> str:
+    """The style sheet or the script."""
+    return (TEMPLATES / name).read_text()
+
+
+def content_policy(live: bool) -> str:
+    """What a page may load: its own style and script, and pictures of the dashboard itself."""
+
+    def digest(name: str) -> str:
+        return f"'sha256-{base64.b64encode(hashlib.sha256(asset(name).encode()).digest()).decode()}'"
+
+    own, pictures = ("'self'", "data: 'self'") if live else ("'none'", "data:")
+    policy = (
+        f"default-src 'none'; style-src {digest('style.css')}; script-src {digest('script.js')}; "
+        f"img-src {pictures}; connect-src {own}; form-action {own}; base-uri 'none'"
+    )
+    return policy + ("; frame-ancestors 'none'" if live else "")
+
+
+def shown_pictures(board: Board, run: Run) -> list[Picture]:
+    """A run's pictures, less those that pages draw themselves."""
+    return [picture for picture in board.folders.pictures(run.run_id) if picture.kind not in DRAWN_BY_PAGES]
+
+
+def run_name(run: Run) -> str:
+    """What a run is called beside others: its row or settings, phase, seed."""
+    seed = f", seed {run.seed}" if run.seed is not None else ""
+    sweep = f"{run.rows[0][0].rpartition('_')[0]}: " if run.rows else ""
+    title = run.title if len(run.title) <= 70 else run.title[:69] + "\N{HORIZONTAL ELLIPSIS}"
+    return f"{sweep}{title}{seed} ({run.phase} {run.run_id[-8:]})"
+
+
+def train_command(run: Run) -> str | None:
+    """What trains this run."""
+    overrides = run.result.overrides if run.result else run.planned.overrides if run.planned else None
+    return " ".join(["python -m src.train", *overrides]) if overrides is not None else None
+
+
+def study_command(storage: str) -> str | None:
+    """What shows a study in Optuna's own dashboard, over a copy; None where it is not a file of this machine."""
+    if not storage.startswith("sqlite:///"):
+        return None
+    path, copy = storage.removeprefix("sqlite:///").removeprefix(f"{Path.cwd()}/"), "/tmp/study_copy.db"
+    backup = "from sqlite3 import connect; from sys import argv; connect(argv[1]).backup(connect(argv[2]))"
+    return (
+        f'python -c "{backup}" {shlex.quote(path)} {copy}\n'
+        f"optuna-dashboard --host 127.0.0.1 --port 8081 sqlite:///{copy}"
+    )
+
+
+def flat_config(tree: Any, prefix: str = "") -> list[tuple[str, str]]:
+    """Dotted keys and values of a configuration, in its order."""
+    if isinstance(tree, dict) and tree:
+        return [
+            pair
+            for key, value in tree.items()
+            for pair in flat_config(value, f"{prefix}.{key}" if prefix else str(key))
+        ]
+    if tree == {}:
+        return []
+    words = {None: "null", True: "true", False: "false"}
+    text = words[tree] if tree is None or isinstance(tree, bool) else str(tree)
+    return [(prefix, text.replace("\n", " "))]
+
+
+def config_difference(mine: list[tuple[str, str]], theirs: list[tuple[str, str]]) -> list[tuple[str, str, str]]:
+    """Keys whose values differ; a dash where one side lacks the key."""
+    left, right = dict(mine), dict(theirs)
+    keys = dict.fromkeys([*left, *right])
+    absent = "\N{EN DASH}"
+    return [(key, left.get(key, absent), right.get(key, absent)) for key in keys if left.get(key) != right.get(key)]
+
+
+def metric_rows(run: Run, other: Run | None) -> dict[str, list[MetricRow]]:
+    """Every number of a run by group, in the table's units, beside the other run's."""
+    groups: dict[str, list[MetricRow]] = {}
+    if run.result is None:
+        return groups
+    theirs = other.result.metrics if other is not None and other.result is not None else {}
+    for metric in METRICS.values():
+        value = run.result.metrics.get(metric.name)
+        if value is None:
+            continue
+        group = next(title for title, prefix in reversed(GROUPS) if metric.name.startswith(prefix))
+        against = theirs.get(metric.name)
+        change = "" if against is None else signed((value - against) * metric.scale, metric.digits)
+        verdict = ""
+        if change and float(change.replace("\N{MINUS SIGN}", "-")):
+            verdict = "better" if (value > against) == metric.higher_is_better else "worse"
+        groups.setdefault(group, []).append(
+            MetricRow(metric=metric, raw=round(value * metric.scale, 6), value=number(value, metric),
+                      other=number(against, metric), difference=change, verdict=verdict)
+        )  # fmt: skip
+    return groups
+
+
+def number(value: float | None, metric: Metric) -> str:
+    """In the table's unit; nothing for None."""
+    return "" if value is None else f"{value * metric.scale:.{metric.digits}f}"
+
+
+def signed(value: float, digits: int) -> str:
+    """With its sign, a true minus."""
+    return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
+
+
+def duration(seconds: float | None) -> str:
+    """`41 s`, `12 min`, `3 h 05 min`, `2 d 4 h`."""
+    if seconds is None:
+        return ""
+    whole = round(seconds)
+    if whole < 90:
+        return f"{whole} s"
+    minutes = round(whole / 60)
+    if minutes < 90:
+        return f"{minutes} min"
+    if minutes < 48 * 60:
+        return f"{minutes // 60} h {minutes % 60:02d} min"
+    return f"{minutes // 1440} d {minutes % 1440 // 60} h"
+
+
+def _other_runs(board: Board, run: Run) -> list[Run]:
+    """What a run can be held against, those of its own scale first."""
+    others = [(other.scale != run.scale, run_name(other), other.run_id) for other in board.runs.values()]
+    return [board.runs[run_id] for *_, run_id in sorted(others) if run_id != run.run_id]
+
+
+def _progress(board: Board, run: Run) -> str:
+    points = [curve[-1][0] for curve in board.folders.curves(run.run_id).values()] if run.result is None else []
+    return f"{int(max(points)) + 1}" if points else ""
+
+
+def _runs_of(board: Board, scale: str) -> list[Run]:
+    """Runs of one scale: what trains first, then by row and seed, those outside sweeps last."""
+    order = ("running", "failed", "stopped", "waiting", "pruned", "done")
+
+    def place(run: Run) -> tuple:
+        return order.index(run.state), not run.rows, run.rows[:1], run.phase, run.title, run.seed or 0, run.run_id
+
+    return sorted((run for run in board.runs.values() if run.scale == scale), key=place)
+
+
+@functools.cache
+def _parsed_templates() -> FileSystemLoader:
+    return FileSystemLoader(TEMPLATES)
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=_parsed_templates(), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters.update(
+        clock=lambda seconds: time.strftime("%H:%M:%S", time.localtime(seconds)),
+        date=lambda seconds: time.strftime("%Y-%m-%d %H:%M", time.localtime(seconds)),
+        duration=duration,
+        headline=headline,
+        lines=lambda pairs: "\n".join(f"{key} = {value}" for key, value in pairs),
+        heading=lambda metric: f"{metric.title}, {metric.unit}" if metric.unit else metric.title,
+        name=run_name,
+        number=number,
+        other_rows=lambda run: "; ".join(f"{key}: {label}" for key, label in run.rows[1:]),
+        runs_of=_runs_of,
+        slug=lambda text: re.sub(r"[^a-z0-9]+", "-", text.lower()),
+        value=lambda run, metric: run.result.metrics.get(metric.name) if run.result else None,
+    )  # fmt: skip
+    return environment

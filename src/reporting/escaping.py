@@ -1,0 +1,31 @@
+"""Labels and notes that people write, into markup: whatever they hold is shown and never obeyed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+MARKDOWN = str.maketrans(
+    {"&": "&amp;", "<": "&lt;", ">": "&gt;", "\n": " ", "\r": " "} | {mark: f"\\{mark}" for mark in "\\|*`[]"}
+)
+LATEX = str.maketrans(
+    {mark: f"\\{mark}" for mark in "%&$#_{}"}
+    | {"\\": "\\textbackslash{}", "~": "\\textasciitilde{}", "^": "\\textasciicircum{}"}
+    | {"<": "\\textless{}", ">": "\\textgreater{}", "|": "\\textbar{}", "[": "{[}", "]": "{]}"}
+    | {"±": "$\\pm$", "–": "--", "−": "$-$", "×": "$\\times$", "→": "$\\to$", "≥": "$\\geq$", "≤": "$\\leq$"}
+    | {"ε": "$\\varepsilon$", "τ": "$\\tau$", "\n": " ", "\r": " "}
+)
+
+
+def escape_markdown(text: str) -> str:
+    """For a cell of a Markdown table or a paragraph."""
+    return text.translate(MARKDOWN)
+
+
+def as_code(words: Iterable[str]) -> str:
+    """Settings as code within a cell of a Markdown table."""
+    return f"`{' '.join(words).replace('`', chr(39)).replace('|', chr(92) + '|')}`"
+
+
+def escape_latex(text: str) -> str:
+    """For LaTeX's text mode."""
+    return text.translate(LATEX)

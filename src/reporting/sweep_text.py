@@ -1,0 +1,168 @@
+"""The words under a sweep's table: what was run, and which of the paper's orderings hold here."""
+
+from __future__ import annotations
+
+import statistics
+
+from src.reporting.metric_names import Metric
+from src.reporting.orderings import LEAST_SEEDS, Ordering, describe_test, find_orderings, paired_gains
+from src.reporting.results import RunResult
+from src.reporting.sweep_record import SweepRecord
+from src.reporting.sweep_table import SweepRow
+
+SYNTHETIC = "synthetic highway"
+MAIN = ("mAP", "NDS")
+"""Columns whose rows are compared one by one; a table without them has its first one compared so."""
+
+
+def describe_runs(record: SweepRecord, results: dict[str, RunResult], complete: bool) -> str:
+    """Data, scale, epochs, seeds, commits and devices of a table."""
+    seeds = sorted({seed for runs in record.rows.values() for seed in runs} or {r.seed for r in record.runs.values()})
+    data = "Data: no run has finished yet"
+    if results:
+        any_result = next(iter(results.values()))
+        data = f"Data: {any_result.dataset}, split {any_result.data.get('split', 'unknown')}"
+    parts = [data, f"scale {record.scale}"]
+    if results:
+        by_phase: dict[str, set[int]] = {}
+        for result in results.values():
+            by_phase.setdefault(result.phase, set()).add(result.epochs)
+        for phase, epochs in sorted(by_phase.items()):
+            parts.append(f"{phase}: {_listed(sorted(epochs))} epochs")
+    spread = "mean ± standard deviation" if len(seeds) > 1 else "one seed, so no spread"
+    parts.append(f"seed{'s' if len(seeds) > 1 else ''} {_listed(seeds)}: {spread}")
+    code, devices, places = set(), set(), set()
+    for result in results.values():
+        code.add(result.commit[:10] + ("+" if result.commit.endswith("+") else ""))
+        threads = f"{_counted(result.processes, 'process')} of {_counted(result.threads, 'thread')}"
+        devices.add(f"{result.device}, {threads}")
+        if result.latency is not None:
+            at = result.latency.get("processor") or result.latency.get("device") or "an unnamed device"
+            places.add(f"{at}, {_counted(result.latency.get('threads', 1), 'thread')}")
+    for words, found in (("code ", code), ("", devices), ("latency on ", places)):
+        parts += [words + _listed(sorted(found))] if found else []
+    text = "; ".join(parts) + "."
+    return text + ("" if complete else " Bold is the best of the rows whose seeds have all finished.")
+
+
+def describe_differences(baselines: list[str], has_paper: bool) -> str:
+    """What a table's differences are taken to, to stand after `describe_runs`."""
+    if not baselines:
+        return ""
+    brackets = "; the paper's in brackets" if has_paper else ""
+    return f" Differences are to {' or '.join(baselines)}, seed by seed{brackets}."
+
+
+def findings(columns: list[Metric], rows: list[SweepRow], result: RunResult | None, complete: bool) -> list[str]:
+    """What the numbers of trained rows say: a frame, then a sentence each. `result` is any of the table's."""
+    if result is None:
+        return ["No run has finished yet."]
+    main = [name for name in MAIN if name in [column.name for column in columns]] or [columns[0].name]
+    baselines = {row.label: row.baseline for row in rows if row.baseline is not None}
+    sentences, tested = [], 0
+    for place, column in enumerate(columns):
+        paper = {row.label: row.cells[place].paper for row in rows if row.cells[place].paper is not None}
+        values = {row.label: row.cells[place].values for row in rows}
+        orderings = find_orderings(paper, values, column.higher_is_better)
+        if orderings:
+            sentences.append(_count(column, orderings, complete))
+        if column.name in main:
+            for first, second in _pairs(orderings, values, baselines):
+                sentences.append(_comparison(column, first, second, paper, values))
+                tested = max(tested, len(paired_gains(values[first], values[second])))
+    if 0 < tested < LEAST_SEEDS:
+        sentences.append(
+            f"With {_counted(tested, 'seed')} no sign test can decide at 5 %, however clear the numbers look: "
+            f"that takes {LEAST_SEEDS} seeds."
+        )
+    if not sentences:
+        alone = "One row is trained here, so there is nothing to compare it with."
+        sentences.append("No two of the rows can be compared yet." if len(rows) > 1 else alone)
+    has_paper = any(cell.paper is not None for row in rows for cell in row.cells)
+    return [_frame(result, has_paper), *sentences]
+
+
+def describe_search(
+    states: list[str], trials: int, objective: Metric, best: tuple[str, list[str], float] | None
+) -> list[str]:
+    """What became of a search's trials, and the best one: its label, what the search chose for it, its objective."""
+    counts = ", ".join(f"{states.count(state)} {state}" for state in ("pruned", "failed"))
+    text = f"{states.count('done')} of {_counted(trials, 'trial')} finished, {counts}."
+    if best is None:
+        return [text]
+    label, chosen, value = best
+    number = f"{objective.title} {value * objective.scale:.{objective.digits}f}"
+    return [
+        text,
+        f"The best one, {label}, reaches {number} with {' '.join(chosen)}. It was chosen on the split that it is "
+        "scored by, which flatters it: train it with other seeds before it is compared.",
+    ]
+
+
+def _frame(result: RunResult, has_paper: bool) -> str:
+    synthetic = result.data["name"] == SYNTHETIC
+    where = f"{f'the {SYNTHETIC}' if synthetic else result.data['name']}, scale {result.scale}"
+    if not has_paper:
+        text = f"Seen on {where}; the paper has no numbers for these rows."
+        return text + (" It says nothing about results on TruckScenes." if synthetic else "")
+    if synthetic:
+        return (
+            f"A check on {where}, of what the paper found on TruckScenes: it can show whether the paper's orderings "
+            "appear here. Its numbers are not results on TruckScenes, and how large they are does not compare with the "
+            "paper's."
+        )
+    size = "" if result.scale == "paper" else ", which is not the paper's size of model and training"
+    return f"A check on {where}{size}, of the paper's orderings."
+
+
+def _pairs(
+    orderings: list[Ordering], values: dict[str, dict[int, float]], baselines: dict[str, str]
+) -> list[tuple[str, str]]:
+    """Rows to compare one by one: each with its baseline; without any, each of the paper's with its next one."""
+    if baselines:
+        pairs = [(label, base) for label, base in baselines.items() if label != base and base in values]
+        return [(label, base) for label, base in pairs if paired_gains(values[label], values[base])]
+    nearest = {ordering.better: ordering for ordering in reversed(orderings)}  # the first one stands nearest
+    return [(ordering.better, ordering.worse) for ordering in orderings if ordering is nearest[ordering.better]]
+
+
+def _count(column: Metric, orderings: list[Ordering], complete: bool) -> str:
+    holding = [ordering for ordering in orderings if ordering.holds]
+    text = (
+        f"{column.title}: {'' if complete else 'so far '}{len(holding)} of the paper's {len(orderings)} orderings of "
+    )
+    text += "two rows hold here in the mean"
+    broken = [f"{ordering.better} before {ordering.worse}" for ordering in orderings if not ordering.holds]
+    return text + (f"; not {', '.join(broken)}." if broken else ".")
+
+
+def _comparison(
+    column: Metric, first: str, second: str, paper: dict[str, float], values: dict[str, dict[int, float]]
+) -> str:
+    """One row against another: the paper's difference, the one here, and the sign test over seeds."""
+    differences = list(paired_gains(values[first], values[second]).values())
+    mean, digits = statistics.mean(differences), column.digits
+    here = f"here {mean:+.{digits}f}"
+    here += f" ± {statistics.stdev(differences):.{digits}f}" if len(differences) > 1 else ""
+    toward = 1.0 if column.higher_is_better else -1.0
+    text, of_paper = f"{column.title}, {first} against {second}: ", 0.0
+    if first in paper and second in paper:
+        of_paper = round(paper[first] - paper[second], 6)
+        text += f"paper {of_paper:+.{digits}f}, "
+    if of_paper:
+        toward = 1.0 if of_paper > 0 else -1.0
+        verdict = ", in the paper's order" if mean * toward > 0 else ", not in the paper's order"
+        side = "on the paper's side"
+    else:
+        verdict, side = "", "better"
+    wins, losses = (sum(sign * toward * d > 0 for d in differences) for sign in (1, -1))
+    seeds = f"{wins} of {_counted(len(differences), 'seed')} {side} ({describe_test(wins, losses)})"
+    return f"{text}{here}{verdict}; {seeds}."
+
+
+def _listed(items: list[object]) -> str:
+    return ", ".join(str(item) for item in items)
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 'es' if noun.endswith('s') else 's'}"

@@ -1,0 +1,156 @@
+"""From a sweep's file, the command line and the seeds to the list of runs, each once, in the order they are trained."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+from src.errors import ConfigError, HorizonError
+from src.reporting.sweep_file import RowConfig, SweepConfig
+
+OF_THE_MACHINE = (
+    *("paths", "trainer", "logger", "resume", "phase.train_missing"),
+    *("data.root", "data.num_workers", "data.world.num_workers"),
+)
+"""Keys that say where and how a run computes: given to its process, but no part of what it is."""
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What a command line after `python -m src.train` comes to."""
+
+    run_id: str
+    scale: str
+    source: list[str] | None  # command line of the run whose weights it starts from
+
+
+Identify = Callable[[list[str]], Identified]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run of the plan."""
+
+    run_id: str
+    overrides: list[str]  # what it is
+    machine: list[str]  # where and how it computes
+    seed: int
+    label: str  # of its first row; for a run that others only start from: what it is
+    needs: str | None  # run whose weights it starts from
+
+    @property
+    def command(self) -> str:
+        """What trains it, to be pasted."""
+        return shlex.join(["python", "-m", "src.train", *self.overrides, *self.machine])
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All runs of a sweep; none yet for a search."""
+
+    sweep: SweepConfig
+    scale: str
+    seeds: list[int]
+    rows: dict[str, dict[int, str]] = field(default_factory=dict)  # run id by label and seed
+    cells: dict[str, Cell] = field(default_factory=dict)  # by run id, what is needed before what needs it
+
+    @property
+    def study(self) -> str:
+        """Name of the study that coordinates it."""
+        return f"{self.sweep.name}-{self.scale}"
+
+    def labels(self, run_id: str) -> list[str]:
+        """Rows that show this run."""
+        return [label for label, runs in self.rows.items() if run_id in runs.values()]
+
+
+def key_of(override: str) -> str:
+    """The dotted key that an override sets."""
+    return override.lstrip("+").split("=")[0]
+
+
+def is_of(override: str, keys: Iterable[str]) -> bool:
+    """Whether an override sets one of these keys or something below it."""
+    name = key_of(override)
+    return any(name == key or name.startswith(f"{key}.") for key in keys)
+
+
+def join_overrides(*parts: list[str]) -> list[str]:
+    """All of them in order, each key once: where its last value stands."""
+    joined: dict[str, str] = {}
+    for override in (override for part in parts for override in part):
+        joined.pop(key_of(override), None)
+        joined[key_of(override)] = override
+    return list(joined.values())
+
+
+def split_machine(overrides: list[str]) -> tuple[list[str], list[str]]:
+    """(what a run is, where and how it computes)."""
+    machine = [override for override in overrides if is_of(override, OF_THE_MACHINE)]
+    return [override for override in overrides if override not in machine], machine
+
+
+def make_plan(sweep: SweepConfig, common: list[str], seeds: list[int], identify: Identify) -> Plan:
+    """Plan every row with every seed; seed by seed, and of each seed first what several rows start from.
+
+    `common` is the command line's part for every run. Raises ConfigError naming file and row for one that does not
+    compose or is of another scale than the others.
+    """
+    scale = compose_file(sweep, common, identify).scale
+    sweep = sweep.at_scale(scale)
+    plan = Plan(sweep, scale, list(seeds))
+    if sweep.is_search:
+        return plan
+    for seed in seeds:
+        needed: list[Cell] = []
+        own: list[Cell] = []
+        for row in sweep.rows:
+            joined = join_overrides(sweep.overrides, row.overrides, common)
+            overrides = join_overrides(joined, [f"seed={seed}"])
+            found = _compose(sweep, row, overrides, common, identify)
+            if found.scale != scale:
+                raise ConfigError(
+                    f"sweeps/{sweep.name}.yaml, row {row.label!r}: scale={found.scale}, but the sweep is of scale "
+                    f"{scale}; a table never mixes scales, give scale=... on the command line"
+                )
+            *sources, cell = cells_of(overrides, seed, row.label, identify)
+            needed += sources
+            own.append(cell)
+            plan.rows.setdefault(row.label, {})[seed] = cell.run_id
+        labelled = {cell.run_id: cell for cell in reversed(own)}  # the first row gives its label
+        for cell in [*needed, *own]:
+            plan.cells.setdefault(cell.run_id, labelled.get(cell.run_id, cell))
+    return plan
+
+
+def compose_file(sweep: SweepConfig, common: list[str], identify: Identify) -> Identified:
+    """What the file's own overrides and the command line come to. Raises ConfigError naming whichever is at fault."""
+    return _compose(sweep, None, join_overrides(sweep.overrides, common), common, identify)
+
+
+def cells_of(overrides: list[str], seed: int, label: str, identify: Identify) -> list[Cell]:
+    """The run of a command line, and before it those it starts from, the first first."""
+    found = identify(overrides)
+    before: list[Cell] = []
+    if found.source is not None:
+        what = label if label.startswith("weights for ") else f"weights for {label}"
+        before = cells_of(found.source, seed, what, identify)
+    needs = before[-1].run_id if before else None
+    return [*before, Cell(found.run_id, *split_machine(overrides), seed, label, needs)]
+
+
+def _compose(
+    sweep: SweepConfig, row: RowConfig | None, overrides: list[str], common: list[str], identify: Identify
+) -> Identified:
+    """Identify a row; blame it for what does not compose, unless the command line alone does not either."""
+    try:
+        return identify(overrides)
+    except HorizonError as error:
+        try:
+            identify(common)
+        except HorizonError as of_command:
+            if str(of_command) == str(error):
+                raise
+        where = f"sweeps/{sweep.name}.yaml" + (f", row {row.label!r}" if row is not None else ", overrides")
+        raise ConfigError(f"{where}: {error}") from error

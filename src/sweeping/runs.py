@@ -1,0 +1,75 @@
+"""What the folder of a run tells the runner: whether it is finished, its numbers, and whether a process is at it."""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether both files that mark a finished run are there."""
+    return (folder / "run.json").is_file() and (folder / "metrics.json").is_file()
+
+
+def is_done(folder: Path) -> bool:
+    """Whether the run is finished and has a score."""
+    return is_finished(folder) and read_score(folder, "mAP") is not None
+
+
+def read_score(folder: Path, metric: str) -> float | None:
+    """One number of metrics.json by its dotted name, None where it is not there or not finite."""
+    try:
+        value = _find(json.loads((folder / "metrics.json").read_text()), metric)
+    except (OSError, ValueError):
+        return None
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if number and math.isfinite(value) else None
+
+
+def _find(node: Any, name: str) -> Any:
+    """Follow a dotted name through nested objects; keys such as `0-0.5` hold dots themselves."""
+    if not isinstance(node, dict):
+        return None
+    if name in node:
+        return node[name]
+    for key in node:
+        if name.startswith(f"{key}."):
+            return _find(node[key], name.removeprefix(f"{key}."))
+    return None
+
+
+def read_seconds(folder: Path) -> float | None:
+    """How long the run took, None where it does not say."""
+    try:
+        return float(json.loads((folder / "run.json").read_text())["seconds"]["all"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def is_busy(folder: Path) -> bool:
+    """Whether a process is training in the folder at this moment (it holds `.lock`)."""
+    try:
+        with (folder / ".lock").open() as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+def read_validations(folder: Path, metric: str) -> dict[int, float]:
+    """Validated values of a metric so far by epoch, from metrics.csv."""
+    values = {}
+    try:
+        with (folder / "metrics.csv").open(newline="") as file:
+            for row in csv.DictReader(file):
+                if row.get(f"val/{metric}") and row.get("epoch"):
+                    values[int(row["epoch"])] = float(row[f"val/{metric}"])
+    except (OSError, ValueError, csv.Error):
+        return values  # a line is being written; the next look sees it whole
+    return values
