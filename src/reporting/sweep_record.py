@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from src.errors import DataError
 from src.reporting.sweep_file import DimensionConfig, PaperRowConfig, PlotConfig, RowConfig, SweepConfig, TableConfig
+from src.reporting.writing import write_whole
 
 FORMAT = 1
 STATES = ("waiting", "running", "done", "failed", "pruned")
@@ -68,13 +68,7 @@ def record_path(reports: Path, sweep: str, scale: str) -> Path:
 
 def write_record(path: Path, record: SweepRecord) -> None:
     """Write the record so that it is never seen half-written, and an older one survives a full disk."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(json.dumps({"format": FORMAT, **dataclasses.asdict(record)}, indent=1) + "\n")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_whole(path, json.dumps({"format": FORMAT, **dataclasses.asdict(record)}, indent=1) + "\n")
 
 
 def read_record(path: Path) -> SweepRecord:

@@ -216,7 +216,7 @@ def format_difference(cell: Cell, metric: Metric, done: int | None = None) -> st
     """What the row has more than the baseline; in brackets the paper's, and n where not all `done` runs have both."""
     text, notes = MISSING, []
     if cell.difference is not None:
-        text = f"{cell.difference:+.{metric.digits}f}"
+        text = f"{round(cell.difference, metric.digits) + 0.0:+.{metric.digits}f}"  # no -0.0
         text += f" ± {cell.difference_spread:.{metric.digits}f}" if cell.difference_spread is not None else ""
         notes += [f"n = {len(cell.differences)}"] if done not in (None, len(cell.differences)) else []
     if cell.paper_difference is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 
@@ -19,4 +20,5 @@ def write_whole(path: Path, text: str) -> None:
     except OSError as error:  # a write that fails does not say where
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # a folder above it may be a file
+            temporary.unlink(missing_ok=True)

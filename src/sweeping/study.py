@@ -79,8 +79,8 @@ def file_lock(path: Path) -> Iterator[Hold]:
 
 
 def default_storage(outputs: Path) -> str:
-    """The SQLite database that studies of one machine share."""
-    return f"sqlite:///{(outputs / 'sweeps' / 'sweeps.db').absolute()}"
+    """The SQLite database that studies of one machine share; its path is as relative as `outputs`."""
+    return f"sqlite:///{outputs / 'sweeps' / 'sweeps.db'}"
 
 
 def masked(url: str) -> str:

@@ -215,7 +215,10 @@ def _x_marks(low: float, high: float, log_x: bool) -> list[tuple[float, str]]:
     powers = range(math.floor(low), math.ceil(high) + 1)
     factors = (1,) if high - low > 2 else (1, 2, 5)
     marks = [factor * 10.0**power for power in powers for factor in factors]
-    return [(mark, tick_text(mark)) for mark in marks if low - 1e-9 <= math.log10(mark) <= high + 1e-9]
+    marks = [mark for mark in marks if low - 1e-9 <= math.log10(mark) <= high + 1e-9]
+    if len(marks) < 2:  # a short piece of a logarithmic axis
+        marks = [mark for mark in nice_ticks(10**low, 10**high, 6) if mark > 0]
+    return [(mark, tick_text(mark)) for mark in marks]
 
 
 def _x_axis(marks: Sequence[tuple[float, str]], left: float, right: float, bottom: float, label: str) -> list[str]:
@@ -264,7 +267,8 @@ def _line(one: Series, x_of: Scale, y_of: Scale, markers: bool) -> str:
             value = one.points[place][1]
             note = one.notes[place] if one.notes else f"{one.label}{': ' if one.label else ''}{value:.6g}"
             parts.append(_marker(one.style, x, y, note))
-    return f'<g class="s{one.style % COLOURS}">{"".join(parts)}<title>{escape(one.label)}</title></g>'
+    name = f"<title>{escape(one.label)}</title>" if one.label else ""
+    return f'<g class="s{one.style % COLOURS}">{"".join(parts)}{name}</g>'
 
 
 def _marker(style: int, x: float, y: float, note: str) -> str:

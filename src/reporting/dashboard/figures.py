@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from markupsafe import Markup
 
 from src.reporting.dashboard.board import Board, Run, Sweep
-from src.reporting.dashboard.charts import Bars, Series, category_chart, line_chart
+from src.reporting.dashboard.charts import Bars, Series, category_chart, line_chart, nice_ticks
 from src.reporting.metric_names import RANGES, SPEEDS, Metric, find_metric
 from src.reporting.results import RunResult
 from src.reporting.sweep_file import PlotConfig
@@ -49,8 +49,9 @@ def knob_figures(sweep: Sweep, plot: PlotConfig, results: dict[str, list[RunResu
     here = {row.label: _mean_and_spread(results.get(row.label, ()), metric) for row in rows}
     paper = {row.label: row.paper.get(metric.name) for row in rows}
     words = f"{metric.title}{f', {metric.unit}' if metric.unit else ''}"
+    spread = any(value is not None and value[1] > 0 for value in here.values())
     titles = (
-        f"{metric.title} here, scale {sweep.record.scale}, ± deviation over seeds",
+        f"{metric.title} here, scale {sweep.record.scale}{', ± deviation over seeds' if spread else ''}",
         f"{metric.title} in the paper, TruckScenes",
     )
     known_paper = any(value is not None for value in paper.values())
@@ -98,7 +99,8 @@ def search_figures(sweep: Sweep) -> list[Markup]:
     by_trial = list(enumerate(values, start=1))
     trials = Series(label="trial", points=by_trial, notes=[run.label for run in tried], joined=False)
     so_far = Series(label="best so far", points=best, style=1)
-    figures = [line_chart(f"{metric.title} by trial", [trials, so_far], "trial", metric.title)]
+    ticks = [(mark, f"{mark:g}") for mark in nice_ticks(1, len(tried)) if mark == round(mark)]
+    figures = [line_chart(f"{metric.title} by trial", [trials, so_far], "trial", metric.title, x_ticks=ticks)]
     for key, dimension in search.space.items():
         if dimension.choices is None:
             settings = (dict(part.lstrip("+").split("=", 1) for part in run.overrides if "=" in part) for run in tried)

@@ -80,6 +80,8 @@ def test_a_logarithmic_axis_leaves_out_what_it_cannot_show():
     assert b - a == pytest.approx(c - b, abs=0.2)
     assert [text for *_, text in x_texts(figure)] == ["1e-05", "0.0001", "0.001"]
     assert not parts(figure, "path", "line")
+    short = line_chart("t", [Series(label="", points=[(2.1e-4, 1), (2.9e-4, 2)])], "rate", "y", log_x=True)
+    assert len(x_texts(short)) >= 2
 
 
 @pytest.mark.parametrize("points", [[(1, 5)], [(1, 5), (2, 5)], [(1, 0), (1, 0)], [(-3, -7), (1e6, 1e9)]])

@@ -78,7 +78,7 @@
     const box = make("div", undefined, parent), result = make("table", undefined, box);
     box.className = "scroll";
     const head = make("tr", undefined, make("thead", undefined, result));
-    for (const title of titles) make("th", title, head);
+    for (const [place, title] of titles.entries()) make("th", title, head).className = place ? "" : "text";
     const body = make("tbody", undefined, result);
     for (const row of rows) {
       const line = make("tr", undefined, body);
@@ -91,19 +91,30 @@
     const out = document.getElementById("compared");
     out.replaceChildren();
     if (!a || !b) return;
-    const names = choices.map((choice) => choice.selectedOptions[0].textContent);
+    const names = ["left", "right"];
     const metrics = [a, b].map((section) => values(section, "tr[data-metric]"));
     make("h2", "Metrics", out);
-    table(out, ["metric", ...names, "difference"], [...metrics[0]].filter(([key]) => metrics[1].has(key)).map(([key, row]) => {
-      const other = metrics[1].get(key), [x, y] = [row, other].map((one) => Number(one.dataset.metric));
+    const columns = make("div", undefined, out), groups = new Map();
+    columns.className = "columns";
+    for (const [key, row] of metrics[0]) {
+      const other = metrics[1].get(key), group = row.closest("table").tHead.rows[0].cells[0].textContent;
+      if (!other) continue;
+      const difference = row.dataset.metric - other.dataset.metric;
       const digits = (row.cells[1].textContent.split(".")[1] ?? "").length;
-      return [row.cells[0].textContent, row.cells[1].textContent, other.cells[1].textContent, (x - y >= 0 ? "+" : "\u2212") + Math.abs(x - y).toFixed(digits)];
-    }));
+      const change = (difference >= 0 ? "+" : "\u2212") + Math.abs(difference).toFixed(digits);
+      if (!groups.has(group)) groups.set(group, []);
+      groups.get(group).push([row.cells[0].textContent, row.cells[1].textContent, other.cells[1].textContent, change]);
+    }
+    for (const [group, rows] of groups) table(columns, [group, ...names, "difference"], rows);
     make("h2", "Configuration, where it differs", out);
-    const configs = [a, b].map((section) => new Map((section.querySelector("pre.config")?.textContent ?? "").split("\n").filter(Boolean).map((line) => line.split(" = "))));
+    const configs = [a, b].map((section) => {
+      const lines = (section.querySelector("pre.config")?.textContent ?? "").split("\n").filter(Boolean);
+      return new Map(lines.map((line) => [line.split(" = ", 1)[0], line.slice(line.indexOf(" = ") + 3)]));
+    });
     const keys = [...new Set([...configs[0].keys(), ...configs[1].keys()])];
     const different = keys.filter((key) => configs[0].get(key) !== configs[1].get(key));
-    if (different.length) table(out, ["key", ...names], different.map((key) => [key, configs[0].get(key) ?? "\u2013", configs[1].get(key) ?? "\u2013"]));
+    const of = (config, key) => config.get(key) ?? "\u2013";
+    if (different.length) table(out, ["key", ...names], different.map((key) => [key, ...configs.map((one) => of(one, key))]));
     else make("p", "The same.", out);
     make("h2", "Learning curves and figures", out);
     const figures = make("div", undefined, out);
