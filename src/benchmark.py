@@ -167,13 +167,14 @@ def clock(device: torch.device) -> Callable[[], float]:
 @contextmanager
 def timed_parts(
     model: nn.Module,
-    parts: dict[
-        str, tuple[str, ...]
-    ],  # by name the methods to time, as in `module.method`; those a model lacks count not
+    parts: dict[str, tuple[str, ...]],  # by name the methods to time, as in `module.method`
     timings: dict[str, list[float]],
     device: torch.device,
 ) -> Iterator[None]:
-    """Within the context every call of these methods appends its seconds to `timings` under the part's name."""
+    """Within the context every call of these methods appends its seconds to `timings` under the part's name.
+
+    A method that the model lacks is left out.
+    """
     now, modules = clock(device), dict(model.named_modules())
 
     def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -20,6 +20,7 @@ from torch import nn
 
 from src.config import PHASES, Config, compose_config
 from src.errors import CheckpointError, ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
+from src.overrides import is_of
 from src.training.checkpoints import load_model_weights, read_checkpoint
 from src.training.identity import run_identity
 from src.training.processes import die_with_parent
@@ -86,7 +87,7 @@ def find_source(config: Config, overrides: list[str], compose: Compose = compose
         others += OF_THE_LATER_PHASE
         if not config.model.loss.gaussian_velocity_in_phase1:
             others += WEIGHTS_OF_GAUSSIAN_VELOCITY
-    kept = [override for override in overrides if not _is_of(override, others)]
+    kept = [override for override in overrides if not is_of(override, others)]
     wanted = [f"phase={name}", *kept]
     its_config, tree = compose(wanted)
     its_source = find_source(its_config, wanted, compose)  # what that run starts from is part of its identity
@@ -171,11 +172,6 @@ def differing_settings(old: dict[str, Any], new: dict[str, Any]) -> dict[str, tu
         for key in before.keys() & after.keys()
         if before[key] != after[key] and not key.startswith(("model.loss.", "model.dptf"))
     }
-
-
-def _is_of(override: str, keys: tuple[str, ...]) -> bool:
-    name = override.lstrip("+").split("=")[0]
-    return any(name == key or name.startswith(f"{key}.") for key in keys)
 
 
 def _run_command(command: list[str]) -> int:

@@ -20,14 +20,16 @@ from src.command import run_command
 from src.config import Config, compose_config
 from src.errors import ConfigError, HorizonError, InterruptedRunError
 from src.handoff import find_source
+from src.overrides import key_of
 from src.reporting.results import publish_result
+from src.reporting.sweep_file import DimensionConfig
 from src.reporting.sweep_record import SweepRecord
 from src.reporting.sweep_tables import write_sweep_tables
 from src.sweep_config import SweepCommand, compose_sweep
 from src.sweeping.keeping import Keeper
 from src.sweeping.latency import measure_latencies
 from src.sweeping.launcher import Launcher
-from src.sweeping.plan import Identified, Plan, compose_file, join_overrides, key_of, make_plan, split_machine
+from src.sweeping.plan import Identified, Plan, compose_file, join_overrides, make_plan, split_machine
 from src.sweeping.progress import progress_line
 from src.sweeping.runner import Runner
 from src.sweeping.runs import is_done
@@ -185,7 +187,7 @@ def describe(plan: Plan, outputs: Path) -> str:
     return "\n".join(lines)
 
 
-def _range(dimension: Any) -> str:
+def _range(dimension: DimensionConfig) -> str:
     if dimension.choices is not None:
         return f"one of {dimension.choices}"
     return f"{dimension.low:g} to {dimension.high:g}" + (", logarithmic" if dimension.log else "")

@@ -19,6 +19,7 @@ from yaml import YAMLError
 
 from src.config import CONF, GROUPS, Config, hydra_message
 from src.errors import ConfigError
+from src.overrides import key_of
 from src.reporting.sweep_file import (
     DimensionConfig,
     PaperRowConfig,
@@ -59,15 +60,15 @@ def compose_sweep(overrides: list[str]) -> tuple[SweepCommand, list[str]]:
 
     Raises ConfigError for an unknown sweep (naming those there are), a file that says what it may not, and bad values.
     """
-    own = [override for override in overrides if _key(override) in OWN_KEYS]
+    own = [override for override in overrides if key_of(override) in OWN_KEYS]
     rest = [override for override in overrides if override not in own]
     _check_rest(rest)
-    chosen = [override.partition("=")[2] for override in own if _key(override) == "sweep"]
+    chosen = [override.partition("=")[2] for override in own if key_of(override) == "sweep"]
     if len(chosen) != 1:
         raise ConfigError(f"give one +sweep=NAME of {', '.join(sweep_files())}; got {' '.join(chosen) or 'none'}")
     # Taken as it is: an address may hold `=`, and Hydra's messages would show a password.
-    storages = [override.partition("=")[2].strip("'\"") for override in own if _key(override) == "storage"]
-    own = [override for override in own if _key(override) not in ("sweep", "storage")]
+    storages = [override.partition("=")[2].strip("'\"") for override in own if key_of(override) == "storage"]
+    own = [override for override in own if key_of(override) not in ("sweep", "storage")]
     try:
         command = _compose(load_sweep(chosen[0]), own)
     except (HydraException, OmegaConfBaseException) as error:
@@ -79,15 +80,11 @@ def compose_sweep(overrides: list[str]) -> tuple[SweepCommand, list[str]]:
     return command, rest
 
 
-def _key(override: str) -> str:
-    return override.lstrip("+").partition("=")[0]
-
-
 def _check_rest(overrides: list[str]) -> None:
     """Refuse what is no key of a run and nearly one of the runner."""
     of_runs = {field.name for field in dataclasses.fields(Config)} | set(GROUPS)
     for override in overrides:
-        key = _key(override).lstrip("~")
+        key = key_of(override).lstrip("~")
         near = difflib.get_close_matches(key, OWN_KEYS, n=1, cutoff=0.75)
         if near and "." not in key and key not in of_runs:
             raise ConfigError(f"{override}: did you mean {near[0]}?")

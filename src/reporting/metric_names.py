@@ -27,6 +27,11 @@ class Metric:
     digits: int
     higher_is_better: bool
 
+    @property
+    def heading(self) -> str:
+        """Title and unit, as over a column."""
+        return f"{self.title}, {self.unit}" if self.unit else self.title
+
 
 def _summary(prefix: str = "", title: str = "") -> dict[str, Metric]:
     """The official summary; whole, or of a part of the data such as a range."""

@@ -16,28 +16,12 @@ class Ordering:
 
     better: str  # label of the row that is better in the paper
     worse: str
-    paper_gain: float  # better minus worse in the metric's direction, so above 0, in the table's unit
-    gains: tuple[float, ...]  # the same here, of each seed that both rows have
-
-    @property
-    def gain(self) -> float:
-        """Mean of the gains."""
-        return statistics.mean(self.gains)
+    gains: tuple[float, ...]  # better minus worse in the metric's direction, here, of each seed that both rows have
 
     @property
     def holds(self) -> bool:
         """Whether the better row is the better one here too, in the mean."""
-        return self.gain > 0
-
-    @property
-    def wins(self) -> int:
-        """Seeds on the paper's side."""
-        return sum(gain > 0 for gain in self.gains)
-
-    @property
-    def losses(self) -> int:
-        """Seeds on the other side; a tie is on neither."""
-        return sum(gain < 0 for gain in self.gains)
+        return statistics.mean(self.gains) > 0
 
 
 def sign_test(wins: int, losses: int) -> float:
@@ -64,9 +48,8 @@ def find_orderings(
     for place, better in enumerate(known):
         for worse in known[place + 1 :]:
             gains = tuple(sign * gain for _, gain in sorted(paired_gains(values[better], values[worse]).items()))
-            paper_gain = sign * (paper[better] - paper[worse])
-            if gains and paper_gain > 0:
-                found.append(Ordering(better, worse, paper_gain, gains))
+            if gains and paper[better] != paper[worse]:
+                found.append(Ordering(better, worse, gains))
     return found
 
 

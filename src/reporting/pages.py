@@ -8,6 +8,7 @@ from typing import Any
 
 import yaml
 
+from src.overrides import key_of
 from src.reporting.escaping import as_code
 from src.reporting.metric_names import SPEEDS
 from src.reporting.results import RunResult
@@ -100,7 +101,7 @@ def without_defaults(overrides: list[str], defaults: dict[str, Any]) -> list[str
 
     A sweep spells out the value of its baseline, which is then the same run as one without settings.
     """
-    last = {override.partition("=")[0].lstrip("+"): override for override in overrides}
+    last = {key_of(override): override for override in overrides}
     other = {key: override for key, override in last.items() if not _is_default(key, override, defaults)}
     parts = tuple(f"{key}." for key in other)  # inside one, another choice has other defaults
     return [override for key, override in last.items() if key in other or key.startswith(parts)]

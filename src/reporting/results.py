@@ -7,14 +7,15 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 
 from src.errors import DataError
+from src.overrides import OUTSIDE_IDENTITY, is_of, key_of, without_keys
 from src.reporting.metric_names import METRICS
 from src.reporting.writing import write_whole
 
@@ -22,22 +23,15 @@ FORMAT = 1
 MAX_POINTS = 200
 """Of a learning curve."""
 
-OF_A_MACHINE = (
-    "paths.", "trainer", "logger", "resume=", "out=", "checkpoint=", "data.num_workers=", "data.root=",
-    "data.world.num_workers=",
-)  # fmt: skip
-"""Overrides that say where, not what; a result does not repeat them."""
-NOT_A_SETTING = ("seed=", "scale=", "phase=", "phase.train_missing=")
-"""Other overrides that do not make another experiment."""
-KEYS_OF_A_MACHINE = (
-    "paths", "logger", "resume", "checkpoint", "predictions", "out", "scene", "preview", "suite",
-)  # fmt: skip
+NOT_A_SETTING = ("seed", "scale", "phase")
+"""Keys that do not make another experiment within a phase and a scale."""
 ELSEWHERE = re.compile(r"""["']*(/|~|\$|\.\./|file:|[A-Za-z]:[\\/])""")
 """How a value begins that names a place on one machine."""
 
 KEPT_OF_A_CLASS = ("AP", "AVE", "num_gt")
 """Within a range or a speed class; the run's metrics.json has the rest."""
 
+Point = TypeVar("Point")
 NUMBER = (float, int)
 NONE = type(None)
 RECORD = {
@@ -62,7 +56,7 @@ class RunResult:
     phase: str
     scale: str
     seed: int
-    overrides: list[str]  # as typed, without those of a machine
+    overrides: list[str]  # as typed, without those outside its identity
     data: dict[str, str]  # name, version, train_split, split, root (the folder's name: of a world its digest)
     commit: str
     versions: dict[str, str]
@@ -77,7 +71,7 @@ class RunResult:
     seconds: dict[str, float]  # fit, all
     peak_memory_mib: dict[str, int]  # process, largest_worker
     skipped_files: dict[str, int]
-    config: dict[str, Any]  # tree of config.yaml, without keys of a machine
+    config: dict[str, Any]  # tree of config.yaml, without keys outside its identity
     metrics: dict[str, float | None]
     """By the names of src/reporting/metric_names.py, as measured: fractions of 1, m/s, ms; None where there is no such
     ground truth; a name is absent where the run was not scored by it. Also speeds.<class>.<boxes | car.boxes>, how
@@ -87,13 +81,18 @@ class RunResult:
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """Overrides that define the experiment within its phase, sorted."""
-        return tuple(sorted(o for o in self.overrides if not o.lstrip("+").startswith(NOT_A_SETTING)))
+        """As `settings_of` its overrides."""
+        return settings_of(self.overrides)
 
     @property
     def dataset(self) -> str:
         """Name of the data and digest of the world."""
         return f"{self.data['name']} {self.data['root']}"
+
+
+def settings_of(overrides: Iterable[str]) -> tuple[str, ...]:
+    """Overrides that define the experiment within its phase, sorted."""
+    return tuple(sorted(override for override in overrides if key_of(override) not in NOT_A_SETTING))
 
 
 def result_path(reports: Path, run_id: str) -> Path:
@@ -121,7 +120,7 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
     latency_path = run_folder / "latency.json"
     latency = _Json(latency_path, "delete it and measure again") if latency_path.is_file() else None
     fields = _record(record)
-    overrides = [_without_place(o) for o in fields["overrides"] if not o.lstrip("+").startswith(OF_A_MACHINE)]
+    overrides = [_without_place(o) for o in fields["overrides"] if not is_of(o, OUTSIDE_IDENTITY)]
     _metrics(scores, latency)
     content = {
         "format": FORMAT,
@@ -129,7 +128,7 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
         "phase": config["phase"]["name"],
         **fields,
         "overrides": overrides,
-        "config": _without_places(config),
+        "config": without_places(config),
         "metrics": _slim(scores.content),
         "curves": _read_curves(run_folder / "metrics.csv"),
         "latency": latency.content if latency is not None else None,
@@ -323,10 +322,11 @@ def _read_curves(path: Path) -> dict[str, list[list[float]]]:
                         curves.setdefault(name, []).append([int(row["step"]), float(value)])
     except (OSError, ValueError, TypeError, KeyError, csv.Error) as error:
         raise DataError(f"{path}: not a run's learning curves ({type(error).__name__}: {error}); delete it") from error
-    return {name: _thinned(points) for name, points in sorted(curves.items())}
+    return {name: thinned(points) for name, points in sorted(curves.items())}
 
 
-def _thinned(points: list[list[float]]) -> list[list[float]]:
+def thinned(points: list[Point]) -> list[Point]:
+    """At most MAX_POINTS of them, evenly; the first and the last stay."""
     last = len(points) - 1
     if last < MAX_POINTS:
         return points
@@ -342,7 +342,9 @@ def _without_place(text: str) -> str:
     return f"{key}{equals}{name}@{hashlib.sha256(value.encode()).hexdigest()[:8]}"
 
 
-def _without_places(config: dict[str, Any]) -> dict[str, Any]:
+def without_places(config: dict[str, Any]) -> dict[str, Any]:
+    """A run's configuration less what is outside its identity, its paths as `_without_place` writes them."""
+
     def clean(value: Any) -> Any:
         if isinstance(value, dict):
             return {key: clean(inner) for key, inner in value.items()}
@@ -350,7 +352,4 @@ def _without_places(config: dict[str, Any]) -> dict[str, Any]:
             return [clean(inner) for inner in value]
         return _without_place(value) if isinstance(value, str) else value
 
-    kept = {key: value for key, value in config.items() if key not in KEYS_OF_A_MACHINE}
-    if isinstance(kept.get("data"), dict):
-        kept["data"] = {key: value for key, value in kept["data"].items() if key != "root"}
-    return clean(kept)
+    return clean(without_keys(config, OUTSIDE_IDENTITY))

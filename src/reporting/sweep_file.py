@@ -1,6 +1,6 @@
 """What a file of sweeps/ may say: one question, its rows or its search space, the paper's numbers, and the tables.
 
-The dataclasses are the schema that src/config.py checks each file against; nothing here knows Hydra.
+The dataclasses are the schema that src/sweep_config.py checks each file against; nothing here knows Hydra.
 """
 
 from __future__ import annotations

@@ -49,12 +49,23 @@ class SweepRecord:
     runs: dict[str, RunState]  # by run id, in the order they are trained
     study: str  # Optuna's name of it
     storage: str  # the study's database, passwords masked
+    trials: int = 0  # of a search: begun so far, each once; two that draw the same values share a run
     updated: float = 0.0  # when the runner last wrote this, seconds since 1970
 
     @property
     def name(self) -> str:
         """Name of the sweep's file."""
         return self.sweep.name
+
+    @property
+    def unchosen(self) -> int:
+        """Trials of a search whose values have not been chosen yet."""
+        return max(0, self.sweep.trials - self.trials) if self.sweep.is_search else 0
+
+    @property
+    def planned(self) -> int:
+        """Runs, those of trials to come included."""
+        return len(self.runs) + self.unchosen
 
     def count(self, state: str) -> int:
         """Runs in this state."""

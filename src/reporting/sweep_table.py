@@ -98,20 +98,25 @@ class SweepTable:
         return list(dict.fromkeys(row.baseline for row in compared if row.baseline is not None))
 
     @property
-    def baseline(self) -> str | None:
-        """The one row that all differences are taken to; None of none or several."""
-        return self.baselines[0] if len(self.baselines) == 1 else None
-
-    @property
     def has_notes(self) -> bool:
         """Whether some row lacks numbers for a reason."""
         return any(row.note for row in self.rows)
 
+    @property
+    def corner(self) -> str:
+        """Head of the labels."""
+        return "trial" if self.is_search else "row"
+
+    def parts(self, column: int) -> list[str]:
+        """What stands under a metric's name: the paper's number and the difference where there are any."""
+        parts = [PAPER] if self.has_paper(column) else []
+        return [*parts, "here", *(["to baseline"] if self.baselines else [])]
+
     def to_markdown(self) -> str:
         """Title, table, caption, text."""
-        header = [self._corner]
+        header = [self.corner]
         for place, column in enumerate(self.columns):
-            header += [f"{_heading(column)}: {name}" for name in self._parts(place)]
+            header += [f"{column.heading}: {name}" for name in self.parts(place)]
         header += self._ends
         lines = [f"| {' | '.join(map(escape_markdown, header))} |", "|---" * len(header) + "|"]
         lines += [f"| {' | '.join(self._line(row, escape_markdown, '**{}**'.format))} |" for row in self.rows]
@@ -122,7 +127,7 @@ class SweepTable:
 
     def to_csv(self) -> str:
         """Plain numbers, one column each, in the table's units; empty where there is none."""
-        header = [self._corner, "state", "note", "seeds done", "seeds planned"]
+        header = [self.corner, "state", "note", "seeds done", "seeds planned"]
         header += ["overrides"] if self.is_search else []
         for column in self.columns:
             header += [f"{column.name} {part}" for part in ("paper", "mean", "std", "n", "diff", "diff std", "diff n")]
@@ -142,10 +147,10 @@ class SweepTable:
     def to_latex(self) -> str:
         """A table environment for booktabs."""
         bold = "\\textbf{{{}}}".format
-        first, second, rules, at = [""], [self._corner], [], 2
+        first, second, rules, at = [""], [self.corner], [], 2
         for place, column in enumerate(self.columns):
-            parts = self._parts(place)
-            first.append(f"\\multicolumn{{{len(parts)}}}{{c}}{{{escape_latex(_heading(column))}}}")
+            parts = self.parts(place)
+            first.append(f"\\multicolumn{{{len(parts)}}}{{c}}{{{escape_latex(column.heading)}}}")
             rules.append(f"\\cmidrule(lr){{{at}-{at + len(parts) - 1}}}")
             second += parts
             at += len(parts)
@@ -166,16 +171,8 @@ class SweepTable:
         )  # fmt: skip
 
     @property
-    def _corner(self) -> str:
-        return "trial" if self.is_search else "row"
-
-    @property
     def _ends(self) -> list[str]:
         return ["seeds", *(["chosen"] if self.is_search else []), *(["state"] if self.has_notes else [])]
-
-    def _parts(self, column: int) -> list[str]:
-        parts = [PAPER] if self.has_paper(column) else []
-        return [*parts, "here", *(["to baseline"] if self.baselines else [])]
 
     def _line(self, row: SweepRow, escape: Callable[[str], str], bold: Callable[[str], str]) -> list[str]:
         """The row's cells, escaped."""
@@ -187,7 +184,7 @@ class SweepTable:
                 "here": (format_here(cell, column, row.done), cell.best),
                 "to baseline": (difference, False),
             }
-            for text, best in map(shown.__getitem__, self._parts(place)):
+            for text, best in map(shown.__getitem__, self.parts(place)):
                 line.append(bold(escape(text)) if best else escape(text))
         seeds = f"{row.done}" if row.done == row.planned else f"{row.done} of {row.planned}"
         line.append(escape(MISSING if row.state == PAPER else seeds))
@@ -222,10 +219,6 @@ def format_difference(cell: Cell, metric: Metric, done: int | None = None) -> st
     if cell.paper_difference is not None:
         notes.append(f"paper {format_paper(cell.paper_difference, metric, signed=True)}")
     return f"{text} ({', '.join(notes)})" if notes else text
-
-
-def _heading(metric: Metric) -> str:
-    return f"{metric.title}, {metric.unit}" if metric.unit else metric.title
 
 
 def _mean(values: dict[int, float]) -> float | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from src.errors import DataError
+from src.overrides import key_of
 from src.reporting.metric_names import METRICS, Metric
 from src.reporting.orderings import paired_gains
 from src.reporting.results import RunResult, read_result, result_path
@@ -108,7 +109,6 @@ def _search_table(record: SweepRecord, results: dict[str, RunResult], config: Ta
     """Trials by objective, the best first; pruned, failed and open ones below."""
     columns = [METRICS[name] for name in config.columns]
     objective = METRICS[record.sweep.objective]
-    keys = tuple(f"{key}=" for key in record.sweep.space)
     scored: list[tuple[SweepRow, float | None]] = []
     for run_id in _run_ids(record):
         run, result = record.runs[run_id], results.get(run_id)
@@ -116,7 +116,7 @@ def _search_table(record: SweepRecord, results: dict[str, RunResult], config: Ta
         state, note = _state(record, {run.seed: run_id}, results)
         if state == "pruned" and run.value is not None:
             note = f"pruned at {objective.title} {run.value * objective.scale:.{objective.digits}f}"
-        chosen = [override for override in run.overrides if override.lstrip("+").startswith(keys)]
+        chosen = [override for override in run.overrides if key_of(override) in record.sweep.space]
         row = SweepRow(run.label, cells, state, note, 1, int(result is not None), None, {run.seed: run_id}, chosen)
         scored.append((row, run.value if result is None else result.metrics.get(objective.name)))
     order = ("done", "pruned", "failed", "running", "waiting")

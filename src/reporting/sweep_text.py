@@ -59,7 +59,7 @@ def findings(columns: list[Metric], rows: list[SweepRow], result: RunResult | No
         return ["No run has finished yet."]
     main = [name for name in MAIN if name in [column.name for column in columns]] or [columns[0].name]
     baselines = {row.label: row.baseline for row in rows if row.baseline is not None}
-    sentences, tested = [], 0
+    sentences, tested = [], []  # `tested`: common seeds of each comparison
     for place, column in enumerate(columns):
         paper = {row.label: row.cells[place].paper for row in rows if row.cells[place].paper is not None}
         values = {row.label: row.cells[place].values for row in rows}
@@ -69,12 +69,15 @@ def findings(columns: list[Metric], rows: list[SweepRow], result: RunResult | No
         if column.name in main:
             for first, second in _pairs(orderings, values, baselines):
                 sentences.append(_comparison(column, first, second, paper, values))
-                tested = max(tested, len(paired_gains(values[first], values[second])))
-    if 0 < tested < LEAST_SEEDS:
+                tested.append(len(paired_gains(values[first], values[second])))
+    decisive = sum(seeds >= LEAST_SEEDS for seeds in tested)
+    if tested and not decisive:
         sentences.append(
-            f"With {_counted(tested, 'seed')} no sign test can decide at 5 %, however clear the numbers look: "
+            f"With {_counted(max(tested), 'seed')} no sign test can decide at 5 %, however clear the numbers look: "
             f"that takes {LEAST_SEEDS} seeds."
         )
+    if decisive > 1:
+        sentences.append(f"The p-values of these {decisive} sign tests are not corrected for their number.")
     if not sentences:
         alone = "One row is trained here, so there is nothing to compare it with."
         sentences.append("No two of the rows can be compared yet." if len(rows) > 1 else alone)
@@ -122,18 +125,21 @@ def _pairs(
     if baselines:
         pairs = [(label, base) for label, base in baselines.items() if label != base and base in values]
         return [(label, base) for label, base in pairs if paired_gains(values[label], values[base])]
-    nearest = {ordering.better: ordering for ordering in reversed(orderings)}  # the first one stands nearest
-    return [(ordering.better, ordering.worse) for ordering in orderings if ordering is nearest[ordering.better]]
+    nearest: dict[str, str] = {}
+    for ordering in orderings:  # the first one of a row stands nearest
+        nearest.setdefault(ordering.better, ordering.worse)
+    return list(nearest.items())
 
 
 def _count(column: Metric, orderings: list[Ordering], complete: bool) -> str:
-    holding = [ordering for ordering in orderings if ordering.holds]
-    text = (
-        f"{column.title}: {'' if complete else 'so far '}{len(holding)} of the paper's {len(orderings)} orderings of "
-    )
-    text += "two rows hold here in the mean"
     broken = [f"{ordering.better} before {ordering.worse}" for ordering in orderings if not ordering.holds]
-    return text + (f"; not {', '.join(broken)}." if broken else ".")
+    so_far = "" if complete else "so far "
+    if len(orderings) == 1:
+        verb = "does not hold" if broken else "holds"
+        return f"{column.title}: {so_far}the paper's one ordering of two rows {verb} here in the mean."
+    text = f"{column.title}: {so_far}{len(orderings) - len(broken)} of the paper's {len(orderings)} orderings of two "
+    text += f"rows {'holds' if len(orderings) - len(broken) == 1 else 'hold'} here in the mean"
+    return text + (f"; those that do not: {', '.join(broken)}." if broken else ".")
 
 
 def _comparison(

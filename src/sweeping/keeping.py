@@ -11,7 +11,7 @@ from src.errors import DataError
 from src.reporting.sweep_record import RunState, SweepRecord, read_record, record_path, write_record
 from src.sweeping.plan import Cell, Plan
 from src.sweeping.runs import is_done
-from src.sweeping.study import Attempt, SweepStudy, masked
+from src.sweeping.study import Attempt, SweepStudy, masked, trials_begun
 
 logger = logging.getLogger(__name__)
 
@@ -59,6 +59,7 @@ class Keeper:
             runs=runs,
             study=self.study.name,
             storage=masked(self.study.url),
+            trials=trials_begun(attempts),
             updated=time.time(),
         )
         self._keep_earlier_seeds(record, latest)

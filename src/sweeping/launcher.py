@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from src.errors import ConfigError, DataError, DivergedError, InterruptedRunError
-from src.sweeping.plan import Cell, key_of
+from src.overrides import key_of
+from src.sweeping.plan import Cell
 
 GRACE_S = 60.0
 """What a run gets to finish its step and write a checkpoint once it is asked to end."""

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from src.errors import ConfigError, HorizonError
+from src.overrides import OUTSIDE_IDENTITY, is_of, key_of
 from src.reporting.sweep_file import RowConfig, SweepConfig
-
-OF_THE_MACHINE = (
-    *("paths", "trainer", "logger", "resume", "phase.train_missing"),
-    *("data.root", "data.num_workers", "data.world.num_workers"),
-)
-"""Keys that say where and how a run computes: given to its process, but no part of what it is."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +60,6 @@ class Plan:
         return [label for label, runs in self.rows.items() if run_id in runs.values()]
 
 
-def key_of(override: str) -> str:
-    """The dotted key that an override sets."""
-    return override.lstrip("+").split("=")[0]
-
-
-def is_of(override: str, keys: Iterable[str]) -> bool:
-    """Whether an override sets one of these keys or something below it."""
-    name = key_of(override)
-    return any(name == key or name.startswith(f"{key}.") for key in keys)
-
-
 def join_overrides(*parts: list[str]) -> list[str]:
     """All of them in order, each key once: where its last value stands."""
     joined: dict[str, str] = {}
@@ -86,8 +70,8 @@ def join_overrides(*parts: list[str]) -> list[str]:
 
 
 def split_machine(overrides: list[str]) -> tuple[list[str], list[str]]:
-    """(what a run is, where and how it computes)."""
-    machine = [override for override in overrides if is_of(override, OF_THE_MACHINE)]
+    """(what a run is, where and how it computes): the second part is given to its process and noted nowhere."""
+    machine = [override for override in overrides if is_of(override, OUTSIDE_IDENTITY)]
     return [override for override in overrides if override not in machine], machine
 
 

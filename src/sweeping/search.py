@@ -18,7 +18,7 @@ from src.sweeping.keeping import cell_from
 from src.sweeping.plan import Cell, Identify, cells_of, join_overrides, split_machine
 from src.sweeping.runner import IDLE_S, Runner, name_of
 from src.sweeping.runs import read_score, read_validations
-from src.sweeping.study import Attempt, CellEndedError
+from src.sweeping.study import Attempt, CellEndedError, SweepStudy, trials_begun
 
 logger = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ class Search(Runner):
             retry = attempt.state == "failed" and attempt.number < self._first_own and not attempt.attrs.get("answer")
             if (attempt.state == "interrupted" or retry) and attempt.number not in tried_again:
                 return attempt, False, False
-        if sum("retry_of" not in attempt.attrs for attempt in begun) < self.sweep.trials:
+        if trials_begun(attempts) < self.sweep.trials:
             return None, True, False
         return None, False, not any(attempt.state == "running" for attempt in attempts)
 
@@ -117,7 +117,7 @@ class Search(Runner):
             reason = self.train(source, worker)
             if reason is not None:
                 self._fail(trial, reason and f"{source.run_id}, which it starts from, failed: {reason}")
-        watch = _Watch(trial, self.outputs / cell.run_id, self.sweep.objective)
+        watch = _Watch(self.study, trial, self.outputs / cell.run_id, self.sweep.objective)
         reason = self.train(cell, worker, watch)
         watch()  # what came since the last look: later trials are compared with all of it
         if watch.pruned and not self.keeper.is_done(cell.run_id):
@@ -147,8 +147,8 @@ def _first(attempt: Attempt) -> int:
 class _Watch:
     """Looks at the validations of a run as they come, and says when it should be ended."""
 
-    def __init__(self, trial: Trial, folder: Path, metric: str) -> None:
-        self._trial, self._folder, self._metric = trial, folder, metric
+    def __init__(self, study: SweepStudy, trial: Trial, folder: Path, metric: str) -> None:
+        self._study, self._trial, self._folder, self._metric = study, trial, folder, metric
         self._seen: set[int] = set()
         self._changed = 0
         self.last = 0.0
@@ -158,19 +158,21 @@ class _Watch:
         try:
             changed = (self._folder / "metrics.csv").stat().st_mtime_ns
         except OSError:
-            return False
+            return self.pruned
         if changed == self._changed:
-            return False
+            return self.pruned
         self._changed = changed
         for epoch, value in read_validations(self._folder, self._metric).items():
-            if epoch not in self._seen:
-                self._seen.add(epoch)
-                self.last = value
-                try:
-                    self._trial.report(value, epoch)
-                    self.pruned = self.pruned or self._trial.should_prune()
-                except optuna.exceptions.UpdateFinishedTrialError:
-                    return False  # another worker took this one for dead
+            if epoch in self._seen:
+                continue
+            try:
+                self.pruned = self._study.report(self._trial, value, epoch) or self.pruned
+            except HorizonError as error:  # a database that is away for a moment must not end a run that trains
+                logger.warning("%s", error)
+                self._changed = 0
+                return self.pruned
+            self._seen.add(epoch)
+            self.last = value
         return self.pruned
 
 

@@ -13,8 +13,8 @@ import re
 import socket
 import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,11 @@ class Attempt:
     value: float | None
     params: dict[str, Any]
     attrs: dict[str, Any]
+
+
+def trials_begun(attempts: Iterable[Attempt]) -> int:
+    """Trials of a search that have got their values; one that goes on with another is that one."""
+    return sum(attempt.run_id is not None and "retry_of" not in attempt.attrs for attempt in attempts)
 
 
 class Hold:
@@ -262,10 +267,15 @@ class SweepStudy:
 
     def note(self, trial: Trial, key: str, value: Any) -> None:
         """Keep something with a trial, unless it was ended from outside."""
-        try:
+        with database_errors(self.url), suppress(optuna.exceptions.UpdateFinishedTrialError):
             trial.set_user_attr(key, value)
-        except optuna.exceptions.UpdateFinishedTrialError:
-            pass
+
+    def report(self, trial: Trial, value: float, step: int) -> bool:
+        """Tell the pruner a value; whether it would end the trial, which it never would of one ended from outside."""
+        with database_errors(self.url), suppress(optuna.exceptions.UpdateFinishedTrialError):
+            trial.report(value, step)
+            return trial.should_prune()
+        return False
 
     def _load(
         self, sampler: optuna.samplers.BaseSampler | None = None, pruner: optuna.pruners.BasePruner | None = None

@@ -4,26 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from typing import Any
 
-# What cannot change the result of a run is left out of its identity.
-OUTSIDE_IDENTITY = (
-    "paths",
-    "logger",
-    "trainer",
-    "resume",
-    "checkpoint",
-    "predictions",
-    "out",
-    "scene",
-    "preview",
-    "suite",
-    "phase.train_missing",
-    "data.num_workers",
-    "data.root",
-    "data.world.num_workers",
-)
+from src.overrides import OUTSIDE_IDENTITY, is_of, without_keys
 
 
 def digest_of_changes(overrides: list[str]) -> str:
@@ -32,9 +15,7 @@ def digest_of_changes(overrides: list[str]) -> str:
     What only says where from, where to and on what machine does not count.
     """
     besides = ("checkpoint", "predictions", "out", "scene", "paths", "trainer", "logger", "data.num_workers")
-    changes = sorted(
-        change for change in overrides if not any(re.match(rf"\+*{re.escape(key)}[.=]", change) for key in besides)
-    )
+    changes = sorted(change for change in overrides if not is_of(change, besides))
     return f"-{hashlib.sha256(json.dumps(changes).encode()).hexdigest()[:8]}" if changes else ""
 
 
@@ -43,18 +24,11 @@ def run_identity(tree: dict[str, Any], source: str | None = None) -> str:
 
     `source` identifies the weights that the run starts from, None for fresh ones.
     """
-    tree = json.loads(json.dumps(tree))
+    tree = without_keys(tree, OUTSIDE_IDENTITY)
     if source is not None:
         tree["phase"]["init_from"] = source
     if not tree["phase"]["temporal"]:
         for key in ("groups_per_scene", "lane_sets", "silent_frames"):
             tree["data"].pop(key)
-    for key in OUTSIDE_IDENTITY:
-        *parents, leaf = key.split(".")
-        node = tree
-        for parent in parents:
-            node = (node or {}).get(parent)
-        if node is not None:
-            node.pop(leaf, None)
     digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:8]
     return f"{tree['model']['name']}-{tree['phase']['name']}-{tree['scale']}-{digest}"

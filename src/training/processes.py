@@ -48,7 +48,9 @@ DECISION_TIMEOUT = timedelta(hours=12)
 GRACE_S = 20.0
 """What the other processes get to end by themselves once one has failed."""
 _LOST_PEER = ("gloo/", "NCCL", "TCPStore", "closed by peer", "reset by peer")
-_SET_PDEATHSIG = 1  # of Linux' prctl: a signal to the child when its parent dies
+_SET_PDEATHSIG = 1  # of Linux' prctl: a signal to the child when the thread that started it dies
+# Looked up here: between fork and exec, a lock that another thread of the parent held would never be free again.
+_PRCTL = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 
 _decisions: dist.ProcessGroup | None = None
 
@@ -203,7 +205,7 @@ def _free_port() -> int:
 def die_with_parent(number: int = signal.SIGKILL) -> None:
     """In a new process: get this signal when the launching one is killed, which can pass nothing on (Linux only)."""
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_SET_PDEATHSIG, number)
+        _PRCTL(_SET_PDEATHSIG, number)
 
 
 # ---------------------------------------------------------------- together

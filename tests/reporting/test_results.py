@@ -67,7 +67,8 @@ def test_publishing_again_changes_nothing_until_the_run_does(write_run, reports)
 
 def test_no_path_of_the_machine_is_published(write_run, reports, tmp_path):
     machine = [
-        f"paths.outputs={tmp_path}", "paths.reports=/r", "trainer.devices=2", "trainer=cpu", "logger=wandb",
+        f"paths.outputs={tmp_path}", "paths.reports=/r", "phase.train_missing=false",
+        "trainer.devices=2", "trainer=cpu", "logger=wandb",
         "resume=never", "data.num_workers=4", f"data.root={tmp_path}", "++data.root=/d",
     ]  # fmt: skip
     places = [f"phase.init_from={tmp_path}/x/last.ckpt", "backbone.weights='~/r50.pth'", "++model.file=../here/y"]
@@ -233,7 +234,7 @@ def test_unfinished_replaced_and_other_runs_are_left_out(tmp_path, write_run):
 
 
 def test_settings_are_what_makes_an_experiment(make_result):
-    overrides = ["seed=0", "phase=phase2", "scale=mini", "phase.train_missing=false", "phase.epochs=2", "+model.a=1"]
+    overrides = ["seed=0", "phase=phase2", "scale=mini", "phase.epochs=2", "+model.a=1"]
     assert make_result("x", {}, overrides=overrides).settings == ("+model.a=1", "phase.epochs=2")
 
 

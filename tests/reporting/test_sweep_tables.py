@@ -76,7 +76,7 @@ def test_a_row_may_have_a_baseline_of_its_own(make_record, results_of):
     (table,) = sweep_tables(record, results_of({"a0": 0.1, "b0": 0.2, "c0": 0.4, "d0": 0.1}))
     text = cells_of(table.to_markdown())
     assert [text[label][2] for label in "abcd"] == [" -10.0 (paper -2.0) ", " baseline ", " +30.0 ", " baseline "]
-    assert table.baselines == ["b", "d"] and table.baseline is None
+    assert table.baselines == ["b", "d"]
     assert "Differences are to b or d, seed by seed; the paper's in brackets." in table.caption
     assert [sentence[:18] for sentence in table.text[2:4]] == ["mAP, a against b: ", "mAP, c against d: "]
 
@@ -202,7 +202,9 @@ def test_orderings_of_the_paper_in_words(make_record, results_of):
     frame, counted, a, c, hint = table.text
     assert "synthetic highway" in frame and "not results on TruckScenes" in frame
     assert "reproduc" not in " ".join(table.text).lower()
-    assert counted == ("mAP: 2 of the paper's 3 orderings of two rows hold here in the mean; not b before c.")
+    assert counted == (
+        "mAP: 2 of the paper's 3 orderings of two rows hold here in the mean; those that do not: b before c."
+    )
     # a minus b: -5, -4, -6
     assert a == (
         "mAP, a against b: paper -2.0, here -5.0 ± 1.0, in the paper's order; 3 of 3 seeds on the paper's side "
@@ -216,6 +218,13 @@ def test_orderings_of_the_paper_in_words(make_record, results_of):
     assert "With 3 seeds no sign test can decide at 5 %" in hint and "6 seeds" in hint
     for sentence in table.text:
         assert sentence in table.to_markdown()
+
+
+def test_several_tests_that_can_decide_say_that_they_are_several(make_record, results_of):
+    record = make_record({"a": {}, "b": {}, "c": {}}, seeds=6, columns=("mAP",), baseline="a")
+    values = {f"{label}{seed}": 0.1 * place for place, label in enumerate("abc") for seed in range(6)}
+    (table,) = sweep_tables(record, results_of(values))
+    assert table.text[-1] == "The p-values of these 2 sign tests are not corrected for their number."
 
 
 def test_six_seeds_can_decide_and_need_no_hint(make_record, results_of):

@@ -12,7 +12,8 @@ import sys
 import time
 from pathlib import Path
 
-from src.sweeping.plan import Identified, is_of, split_machine
+from src.overrides import is_of
+from src.sweeping.plan import Identified, split_machine
 
 SOURCE = ("phase", "model.dptf")
 

@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from src.errors import ConfigError
+from src.sweeping.search import _Watch
 from tests.sweeping.fake_sweep import ROOT, make_runner, make_sweep
 from tests.sweeping.test_runner import fault, finish, record_of, start, trained, wait_for
 
@@ -30,7 +32,7 @@ def test_a_search_finds_its_best_and_ends_after_its_trials(tmp_path):
     best = runner.best()
     assert best.value == max(values.values()) == values[best.run_id]
     assert best.attrs["chosen"][0] == f"fake.score={best.value:.4g}"
-    assert all(set(best.attrs["chosen"]) <= set(record.runs[best.run_id].overrides) for _ in [0])
+    assert set(best.attrs["chosen"]) <= set(record.runs[best.run_id].overrides)
     assert {run.label for run in record.runs.values()} == {f"trial {number}" for number in range(8)}
     assert any("model.x=null" in run.overrides for run in record.runs.values())
     again = search(tmp_path, 8)
@@ -60,10 +62,28 @@ def test_an_objective_that_is_no_number_is_a_failed_trial_and_not_tried_again(tm
     space = {"fake.score": {"choices": ["nan", "nan"]}}
     record = search(tmp_path, 2, space, workers=1).run()
     assert record.count("failed") == 1 and len(record.runs) == 1  # both trials are one run
+    assert record.trials == 2 and record.unchosen == 0 and record.planned == 1
     assert "no finite" in next(iter(record.runs.values())).reason
     begun = trained(tmp_path, "begin").total()
     search(tmp_path, 2, space).run()
     assert trained(tmp_path, "begin").total() == begun == 1
+
+
+def test_a_database_that_is_away_for_a_moment_ends_no_run(tmp_path):
+    (tmp_path / "metrics.csv").write_text("epoch,val/NDS\n0,0.25\n1,0.5\n")
+    answers = [ConfigError("the server is away"), False, True]
+
+    class Study:
+        def report(self, trial, value, step):
+            answer = answers.pop(0)
+            if isinstance(answer, Exception):
+                raise answer
+            return answer
+
+    watch = _Watch(Study(), None, tmp_path, "NDS")
+    assert watch() is False and watch.last == 0.0  # tried again at the next look, with the same numbers
+    assert watch() is True and watch.last == 0.5 and not answers
+    assert watch() is True and watch.pruned  # nothing has changed since; what was said stays said
 
 
 @pytest.mark.slow

@@ -12,10 +12,11 @@ from typing import Any
 
 from src.errors import DataError
 from src.reporting.dashboard.folders import ALIVE_S, RunFolders
-from src.reporting.results import NOT_A_SETTING, RunResult, read_result
+from src.reporting.results import RunResult, read_result, settings_of
 from src.reporting.sweep_record import RunState, SweepRecord, read_record
 from src.reporting.sweep_table import SweepTable
 from src.reporting.sweep_tables import sweep_tables
+from src.reporting.time_left import seconds_left
 
 STALLED_S = 120.0
 """A runner whose runs write neither log nor numbers for this long has probably ended without a word."""
@@ -30,6 +31,7 @@ class Sweep:
     record: SweepRecord
     tables: list[SweepTable]
     problem: str | None  # why there are no tables
+    taken: dict[str, float]  # seconds that finished runs took, by run id
     written: float  # when the runner or one of its running runs last wrote something, seconds since 1970
     now: float
 
@@ -43,7 +45,7 @@ class Sweep:
         """`done`, `running`, `stalled` (a run runs, and the runner is silent), `unfinished`, or `failed`."""
         if self.record.count("running"):
             return "stalled" if self.silent_s > STALLED_S else "running"
-        if self.record.count("waiting"):
+        if self.record.count("waiting") or self.record.unchosen:
             return "unfinished" if self.silent_s > STALLED_S else "running"
         return "failed" if self.record.count("failed") else "done"
 
@@ -59,15 +61,8 @@ class Sweep:
 
     @property
     def left_s(self) -> float | None:
-        """Time left by the mean duration of finished runs and the runs that go side by side; None before the first."""
-        runs = self.record.runs.values()
-        took = [run.ended - run.started for run in runs if run.state == "done" and run.ended and run.started]
-        running = [run for run in runs if run.state == "running"]
-        if not took or self.state != "running":
-            return None
-        mean = sum(took) / len(took)
-        rest = sum(max(0.0, mean - (self.now - (run.started or self.now))) for run in running)
-        return (rest + mean * self.record.count("waiting")) / max(1, len(running))
+        """Time left, with as many runs side by side as now; None before the first has finished, and when none runs."""
+        return seconds_left(self.record, self.taken, 1, self.now) if self.state == "running" else None
 
 
 @dataclass(kw_only=True)
@@ -104,8 +99,7 @@ class Run:
     @property
     def settings(self) -> tuple[str, ...]:
         """Overrides that make it another experiment within its phase."""
-        overrides = self.result.overrides if self.result else self.planned.overrides if self.planned else ()
-        return tuple(sorted(override for override in overrides if not override.lstrip("+").startswith(NOT_A_SETTING)))
+        return settings_of(self.result.overrides if self.result else self.planned.overrides if self.planned else ())
 
     @property
     def title(self) -> str:
@@ -219,8 +213,6 @@ class BoardReader:
             alive = now - (unfinished.get(name) or 0.0) < ALIVE_S
             state = "running" if name in unfinished and alive else "stopped" if name in unfinished else "done"
             runs.setdefault(name, Run(run_id=name, state=state)).has_folder = True
-        for run_id, run in runs.items():
-            run.has_folder = run_id in names
         sweeps = [self._sweep(record, results, folders, now) for record in records]
         return Board(
             sweeps=sweeps, runs=runs, broken=broken, folders=folders, has_reports=self.reports.is_dir(), now=now
@@ -236,7 +228,8 @@ class BoardReader:
             tables, problem = sweep_tables(record, results), None
         except (ValueError, DataError) as error:
             tables, problem = [], str(error)
-        return Sweep(record=record, tables=tables, problem=problem, written=written, now=now)
+        taken = {run_id: results[run_id].seconds["all"] for run_id in record.runs if run_id in results}
+        return Sweep(record=record, tables=tables, problem=problem, taken=taken, written=written, now=now)
 
     def _cached(self, path: Path, stamp: Stamp) -> RunResult | SweepRecord | DataError:
         known = self._files.get(path)
@@ -256,13 +249,12 @@ def _kind(run: Run) -> tuple[Any, ...]:
 
 
 def _stamps(folder: Path) -> Iterable[tuple[Path, Stamp]]:
-    """JSON files of a folder, by name; temporary files, whose names begin with a dot, are none."""
+    """JSON files of a folder, by name."""
     if not folder.is_dir():
         return
     for path in sorted(folder.glob("*.json")):
-        if not path.name.startswith("."):
-            try:
-                status = path.stat()
-            except OSError:
-                continue
-            yield path, (status.st_mtime_ns, status.st_size)
+        try:
+            status = path.stat()
+        except OSError:
+            continue
+        yield path, (status.st_mtime_ns, status.st_size)

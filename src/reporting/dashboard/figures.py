@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import statistics
 from collections.abc import Iterable, Sequence
 
 from markupsafe import Markup
@@ -14,6 +12,7 @@ from src.reporting.metric_names import RANGES, SPEEDS, Metric, find_metric
 from src.reporting.results import RunResult
 from src.reporting.sweep_file import PlotConfig
 from src.reporting.sweep_table import PAPER, format_here, format_paper
+from src.reporting.tables import mean_and_spread
 from src.structures.taxonomy import CLASSES
 
 CURVES = (
@@ -48,7 +47,6 @@ def knob_figures(sweep: Sweep, plot: PlotConfig, results: dict[str, list[RunResu
     rows = sweep.record.sweep.rows
     here = {row.label: _mean_and_spread(results.get(row.label, ()), metric) for row in rows}
     paper = {row.label: row.paper.get(metric.name) for row in rows}
-    words = f"{metric.title}{f', {metric.unit}' if metric.unit else ''}"
     spread = any(value is not None and value[1] > 0 for value in here.values())
     titles = (
         f"{metric.title} here, scale {sweep.record.scale}{', ± deviation over seeds' if spread else ''}",
@@ -59,10 +57,10 @@ def knob_figures(sweep: Sweep, plot: PlotConfig, results: dict[str, list[RunResu
         labels = [row.label for row in rows]
         bars = [Bars(label="", values=[here[row] and here[row][0] for row in labels],
                      spread=[here[row] and here[row][1] for row in labels])]  # fmt: skip
-        figures = [category_chart(titles[0], labels, bars, words, metric.digits)]
+        figures = [category_chart(titles[0], labels, bars, metric.heading, metric.digits)]
         if known_paper:
             shown = [Bars(label="", values=[paper[row] for row in labels], style=1)]
-            figures.append(category_chart(titles[1], labels, shown, words, metric.digits))
+            figures.append(category_chart(titles[1], labels, shown, metric.heading, metric.digits))
         return figures
     ordered = sorted(rows, key=lambda row: row.x)
     measured = [row for row in ordered if here[row.label] is not None]
@@ -83,7 +81,7 @@ def knob_figures(sweep: Sweep, plot: PlotConfig, results: dict[str, list[RunResu
         style=1,
     )
     chosen = ((titles[0], ours), (titles[1], theirs)) if known_paper else ((titles[0], ours),)
-    return [line_chart(t, [one], plot.label, words, x_ticks=ticks, y_span=span or None) for t, one in chosen]
+    return [line_chart(t, [one], plot.label, metric.heading, x_ticks=ticks, y_span=span or None) for t, one in chosen]
 
 
 def search_figures(sweep: Sweep) -> list[Markup]:
@@ -232,13 +230,9 @@ def results_by_row(board: Board, sweep: Sweep) -> dict[str, list[RunResult]]:
 
 
 def _mean_and_spread(results: Iterable[RunResult], metric: Metric) -> tuple[float, float] | None:
-    """In the table's unit; spread is the standard deviation over runs, 0 of one."""
-    values = [metric.scale * value for result in results if (value := result.metrics.get(metric.name)) is not None]
-    if not values:
-        return None
-    mean = statistics.fmean(values)
-    deviation = math.sqrt(sum((value - mean) ** 2 for value in values) / (len(values) - 1)) if len(values) > 1 else 0.0
-    return mean, deviation
+    """Of the runs that have the number, as tables have it."""
+    found = [value for result in results if (value := result.metrics.get(metric.name)) is not None]
+    return mean_and_spread(found, metric)
 
 
 def headline(sweep: Sweep) -> str:

@@ -17,10 +17,9 @@ from typing import Any
 
 import yaml
 
-from src.reporting.results import KEYS_OF_A_MACHINE
+from src.reporting.results import thinned, without_places
 
 TAIL_BYTES = 24_000
-MAX_POINTS = 200
 ALIVE_S = 300.0
 """A run folder without a result counts as running as long as something was written in it this recently."""
 
@@ -111,7 +110,7 @@ class RunFolders:
         return "\n".join(line.rstrip("\r").rpartition("\r")[2] for line in text.split("\n")).strip()
 
     def curves(self, run_id: str) -> Curves:
-        """Losses and scores so far, from metrics.csv: steps and values, at most 200 points each."""
+        """Losses and scores so far, from metrics.csv: steps and values, as thinned as those of a result."""
         folder = self.find(run_id)
         return read_curves(folder / "metrics.csv") if folder is not None else {}
 
@@ -124,11 +123,7 @@ class RunFolders:
             tree = yaml.load((folder / "config.yaml").read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         except (OSError, ValueError, yaml.YAMLError):
             return {}
-        if not isinstance(tree, dict):
-            return {}
-        if isinstance(tree.get("data"), dict):
-            tree["data"].pop("root", None)
-        return {key: value for key, value in tree.items() if key not in KEYS_OF_A_MACHINE}
+        return without_places(tree) if isinstance(tree, dict) else {}
 
     def written(self, run_id: str, log: str | None = None) -> float | None:
         """When a run last wrote numbers, a checkpoint or a line of a log; seconds since 1970, None without a trace."""
@@ -186,7 +181,7 @@ def read_curves(path: Path) -> Curves:
                         curves.setdefault(name, []).append((step, value))
     except (OSError, csv.Error, UnicodeDecodeError):
         return {}
-    return {name: points[:: math.ceil(len(points) / MAX_POINTS)] for name, points in curves.items()}
+    return {name: thinned(points) for name, points in curves.items()}
 
 
 def _is_run(name: str) -> bool:

@@ -24,6 +24,7 @@ from src.reporting.dashboard.figures import headline, run_figures, sweep_figures
 from src.reporting.dashboard.folders import Picture
 from src.reporting.dashboard.tables import table_view
 from src.reporting.metric_names import METRICS, Metric
+from src.reporting.time_left import duration
 
 TEMPLATES = Path(__file__).parent / "templates"
 SUMMARY = tuple(METRICS[name] for name in ("mAP", "NDS", "mAVE"))
@@ -249,21 +250,6 @@ def signed(value: float, digits: int) -> str:
     return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
 
 
-def duration(seconds: float | None) -> str:
-    """`41 s`, `12 min`, `3 h 05 min`, `2 d 4 h`."""
-    if seconds is None:
-        return ""
-    whole = round(seconds)
-    if whole < 90:
-        return f"{whole} s"
-    minutes = round(whole / 60)
-    if minutes < 90:
-        return f"{minutes} min"
-    if minutes < 48 * 60:
-        return f"{minutes // 60} h {minutes % 60:02d} min"
-    return f"{minutes // 1440} d {minutes % 1440 // 60} h"
-
-
 def _other_runs(board: Board, run: Run) -> list[Run]:
     """What a run can be held against, those of its own scale first."""
     others = [(other.scale != run.scale, run_name(other), other.run_id) for other in board.runs.values()]
@@ -285,22 +271,17 @@ def _runs_of(board: Board, scale: str) -> list[Run]:
     return sorted((run for run in board.runs.values() if run.scale == scale), key=place)
 
 
-@functools.cache
-def _parsed_templates() -> FileSystemLoader:
-    return FileSystemLoader(TEMPLATES)
-
-
 def _environment() -> Environment:
     environment = Environment(
-        loader=_parsed_templates(), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+        loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
     environment.filters.update(
         clock=lambda seconds: time.strftime("%H:%M:%S", time.localtime(seconds)),
         date=lambda seconds: time.strftime("%Y-%m-%d %H:%M", time.localtime(seconds)),
         duration=duration,
         headline=headline,
         lines=lambda pairs: "\n".join(f"{key} = {value}" for key, value in pairs),
-        heading=lambda metric: f"{metric.title}, {metric.unit}" if metric.unit else metric.title,
         name=run_name,
         number=number,
         other_rows=lambda run: "; ".join(f"{key}: {label}" for key, label in run.rows[1:]),

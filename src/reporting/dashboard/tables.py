@@ -61,15 +61,13 @@ def table_view(table: SweepTable) -> TableView:
     """The table, with the numbers that its files have."""
     columns, parts = [], []
     for place, metric in enumerate(table.columns):
-        heading = f"{metric.title}, {metric.unit}" if metric.unit else metric.title
-        shown = [PAPER] * table.has_paper(place) + ["here"] + ["to baseline"] * (table.baseline is not None)
+        shown = table.parts(place)
         parts.append(shown)
         columns += [
-            ColumnView(metric=heading, part=part, lower_is_better=not metric.higher_is_better) for part in shown
+            ColumnView(metric=metric.heading, part=part, lower_is_better=not metric.higher_is_better) for part in shown
         ]
     rows = []
     for row in table.rows:
-        is_baseline = row.label == table.baseline
         cells = []
         for metric, cell, shown in zip(table.columns, row.cells, parts, strict=True):
             for part in shown:
@@ -80,20 +78,20 @@ def table_view(table: SweepTable) -> TableView:
                     text = format_here(cell, metric, row.done)
                     cells.append(CellView(text=text, value=cell.mean, kind="here", best=cell.best))
                 else:
-                    text = "baseline" if is_baseline else format_difference(cell, metric)
-                    value = 0.0 if is_baseline else cell.difference
+                    text = "baseline" if row.is_baseline else format_difference(cell, metric, row.done)
+                    value = 0.0 if row.is_baseline else cell.difference
                     gain = round(value or 0.0, metric.digits) * (1 if metric.higher_is_better else -1)
                     kind = "difference" + (" better" if gain > 0 else " worse" if gain < 0 else "")
                     text, _, note = text.replace("-", "\N{MINUS SIGN}").partition(" (")
                     cells.append(CellView(text=text, note=note.rstrip(")"), value=value, kind=kind))
         rows.append(
             RowView(
-                label=row.label, state=row.state, is_paper=row.state == PAPER, is_baseline=is_baseline, cells=cells,
+                label=row.label, state=row.state, is_paper=row.state == PAPER, is_baseline=row.is_baseline, cells=cells,
                 seeds=row.runs, partly=row.done != row.planned, finished=f"{row.done} of {row.planned}",
                 chosen=" ".join(row.overrides), note=row.note,
             )
         )  # fmt: skip
     return TableView(
-        name=table.name, title=table.title, caption=table.caption, corner="trial" if table.is_search else "row",
+        name=table.name, title=table.title, caption=table.caption, corner=table.corner,
         columns=columns, rows=rows, is_search=table.is_search, text=table.text,
     )  # fmt: skip

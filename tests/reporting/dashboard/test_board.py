@@ -10,6 +10,7 @@ from experiments import EVIL, World, epsilon, write_run
 from src.reporting.dashboard import board as board_module
 from src.reporting.dashboard.board import BoardReader, Sweep
 from src.reporting.results import publish_result
+from src.reporting.sweep_file import DimensionConfig, SweepConfig
 from src.reporting.sweep_record import RunState, record_path, write_record
 
 
@@ -24,8 +25,8 @@ def state_of(states, silent_s=0.0, **fields):
         run.state = state
         for name, value in fields.items():
             setattr(run, name, value)
-    now = 10_000.0
-    return Sweep(record=record, tables=[], problem=None, written=now - silent_s, now=now)
+    now, taken = 10_000.0, dict.fromkeys(record.runs, 60.0)
+    return Sweep(record=record, tables=[], problem=None, taken=taken, written=now - silent_s, now=now)
 
 
 @pytest.mark.parametrize(
@@ -36,6 +37,15 @@ def state_of(states, silent_s=0.0, **fields):
 )  # fmt: skip
 def test_state_of_a_sweep(states, silent_s, expected):
     assert state_of(states, silent_s).state == expected
+
+
+def test_a_search_is_not_done_while_trials_are_to_come():
+    sweep = state_of([])
+    search = SweepConfig(title="t", question="q", space={"optim.lr": DimensionConfig(low=0.0, high=1.0)}, trials=7)
+    sweep.record.sweep, sweep.record.trials = search, 6
+    assert sweep.state == "running" and sweep.left_s == pytest.approx(60.0) and sweep.record.planned == 7
+    sweep.record.trials = 7
+    assert sweep.state == "done"
 
 
 def test_time_left_is_what_finished_runs_took():

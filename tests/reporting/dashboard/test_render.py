@@ -1,5 +1,6 @@
 """Numbers and words of the pages: tables as in the files, differences, configurations."""
 
+import dataclasses
 import re
 import shlex
 import sqlite3
@@ -14,7 +15,6 @@ from src.reporting.dashboard.figures import headline
 from src.reporting.dashboard.render import (
     Renderer,
     config_difference,
-    duration,
     flat_config,
     metric_rows,
     signed,
@@ -53,6 +53,19 @@ def test_tables_hold_the_numbers_of_the_files(board):
     for row in view.rows:
         for cell in row.cells:
             assert cell.text in markdown
+
+
+def test_rows_with_baselines_of_their_own_show_their_differences(board):
+    (table,) = board.sweep("epsilon_mini").tables
+    first, second, third = table.rows
+    table = dataclasses.replace(table, rows=[
+        dataclasses.replace(row, baseline=baseline)
+        for row, baseline in ((first, second.label), (second, second.label), (third, third.label))
+    ])  # fmt: skip
+    view = table_view(table)
+    assert [row.is_baseline for row in view.rows] == [False, True, True]
+    assert [row.cells[2].text for row in view.rows][1:] == ["baseline", "baseline"]
+    assert view.rows[0].cells[2].text.startswith("\N{MINUS SIGN}10.0")
 
 
 def test_headline(board):
@@ -109,14 +122,6 @@ def test_configurations_as_lines():
     other = flat_config({"a": {"b": 2, "c": [1, 2], "e": None}, "f": True})
     assert config_difference(flat, other) == [("a.b", "1", "2"), ("g", "two lines", "\N{EN DASH}")]
     assert flat_config({}) == [] and flat_config({1: 1, 0: 0}) == [("1", "1"), ("0", "0")]
-
-
-@pytest.mark.parametrize(
-    "seconds, expected",
-    [(0.4, "0 s"), (89, "89 s"), (95, "2 min"), (5000, "83 min"), (3600 * 3.1, "3 h 06 min"), (200_000, "2 d 7 h")],
-)
-def test_durations(seconds, expected):
-    assert duration(seconds) == expected
 
 
 def test_signs():
