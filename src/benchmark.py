@@ -11,6 +11,7 @@ suite=reader  frames per second of the reader on one core
 
 from __future__ import annotations
 
+import os
 import platform
 import resource
 import statistics
@@ -34,6 +35,7 @@ from src.errors import ConfigError, DataError
 from src.metrics.benchmark import compare_with_devkit
 from src.models.detector import Detector
 from src.ops.allocator import tune_cpu_allocator
+from src.reporting.sweep_text import is_busy
 from src.streaming import StreamingDetector
 from src.structures.batch import FrameBatch
 from src.training.checkpoints import load_model_weights, read_checkpoint
@@ -212,6 +214,11 @@ def report_latency(command: Config, overrides: list[str]) -> None:
     datamodule = build_datamodule(config, data_root(config, write=False))
     dptf = getattr(config.model, "dptf", None)
     result = benchmark_latency(detector, datamodule, dptf.num_frames if dptf is not None else 0)
+    if is_busy(result["load"], result["cores"]):
+        print(
+            f"warning: the load was {result['load']:.1f} on {result['cores']} cores when this began: the machine is "
+            "busy, and the latencies are not those of the model alone; measure again when nothing else runs"
+        )
     content = {"format": LATENCY_FORMAT, **result, "precision": config.precision, "commit": current_commit()}
     if command.out:  # first: what took long is safe
         write_json(Path(command.out) / "latency.json", content)
@@ -229,9 +236,10 @@ def benchmark_latency(
     """Median milliseconds of a frame and of its parts, from the frame on the device to its boxes; reading is not in it.
 
     The spread is the range of the middle half. Frames count once the memory is full, or as full as scenes are long.
+    `load` is how many processes wanted a core over the minute before, of `cores`.
     `memory_gb` is the largest that torch held on a GPU, or the process with its libraries on a CPU, in 1e9 bytes.
     """
-    device, now = detector.device, clock(detector.device)
+    device, now, load = detector.device, clock(detector.device), os.getloadavg()[0]
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
     scenes = scenes_of(datamodule.index, split_samples(datamodule.index, datamodule.config.split))
@@ -258,6 +266,8 @@ def benchmark_latency(
         "device": str(device),
         "processor": torch.cuda.get_device_name() if device.type == "cuda" else processor(),
         "threads": torch.get_num_threads(),
+        "load": round(load, 2),
+        "cores": os.cpu_count() or 1,
     }
 
 

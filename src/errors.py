@@ -13,6 +13,10 @@ class ConfigError(HorizonError):
     exit_code = 3
 
 
+class BusyError(ConfigError):
+    """Another process works in the folder of a run."""
+
+
 class CheckpointError(HorizonError):
     """A weights or checkpoint file that is missing, broken or of another model."""
 

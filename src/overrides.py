@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import hashlib
+import json
 from collections.abc import Iterable
 from typing import Any
 
@@ -37,6 +39,11 @@ def is_of(override: str, keys: Iterable[str]) -> bool:
     """Whether an override sets one of these keys or something below it."""
     name = key_of(override)
     return any(name == key or name.startswith(f"{key}.") for key in keys)
+
+
+def digest_of(changes: list[str]) -> str:
+    """8 hex that tell sets of overrides apart, in whatever order they are given."""
+    return hashlib.sha256(json.dumps(sorted(changes)).encode()).hexdigest()[:8]
 
 
 def without_keys(tree: dict[str, Any], keys: Iterable[str]) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from src.reporting.sweep_file import DimensionConfig
 from src.reporting.sweep_record import SweepRecord
 from src.reporting.sweep_tables import write_sweep_tables
 from src.sweep_config import SweepCommand, compose_sweep
+from src.sweeping.address import default_storage, masked
 from src.sweeping.keeping import Keeper
 from src.sweeping.latency import measure_latencies
 from src.sweeping.launcher import Launcher
@@ -34,7 +35,7 @@ from src.sweeping.progress import progress_line
 from src.sweeping.runner import Runner
 from src.sweeping.runs import is_done
 from src.sweeping.search import Search
-from src.sweeping.study import FORMAT, SweepStudy, default_storage, masked
+from src.sweeping.study import FORMAT, SweepStudy
 from src.training.identity import run_identity
 from src.training.processes import die_with_parent
 from src.training.run_folder import make_writable

@@ -9,6 +9,7 @@ import dataclasses
 import difflib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
@@ -28,9 +29,12 @@ from src.reporting.sweep_file import (
     SweepConfig,
     TableConfig,
 )
+from src.sweeping.address import check_address, masked
 
 SWEEPS = CONF.parent / "sweeps"
+SCALES = sorted(path.stem for path in (CONF / "scale").glob("*.yaml"))
 OWN_KEYS = ("sweep", "seeds", "workers", "storage", "dry_run")
+MOST_SEEDS = 1000
 FILE_PARTS = (SweepConfig, RowConfig, TableConfig, PlotConfig, PaperRowConfig, DimensionConfig)
 
 
@@ -48,6 +52,8 @@ class SweepCommand:
         for name in ("seeds", "workers"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1, but got {getattr(self, name)}")
+        if self.seeds > MOST_SEEDS:
+            raise ConfigError(f"seeds must be at most {MOST_SEEDS}, but got {self.seeds}; seed=... says the first one")
 
 
 def sweep_files() -> dict[str, Path]:
@@ -62,8 +68,9 @@ def compose_sweep(overrides: list[str]) -> tuple[SweepCommand, list[str]]:
     """
     own = [override for override in overrides if key_of(override) in OWN_KEYS]
     rest = [override for override in overrides if override not in own]
-    _check_rest(rest)
+    _check_places(overrides)
     chosen = [override.partition("=")[2] for override in own if key_of(override) == "sweep"]
+    chosen = [name for name in chosen if name]  # `make sweep` without SWEEP says `+sweep=`
     if len(chosen) != 1:
         raise ConfigError(f"give one +sweep=NAME of {', '.join(sweep_files())}; got {' '.join(chosen) or 'none'}")
     # Taken as it is: an address may hold `=`, and Hydra's messages would show a password.
@@ -74,20 +81,26 @@ def compose_sweep(overrides: list[str]) -> tuple[SweepCommand, list[str]]:
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(hydra_message(error, known=list(OWN_KEYS))) from error
     if storages and storages[-1] != "null":
-        if not storages[-1].strip():
-            raise ConfigError("storage is empty; give the address of a database, or leave storage= out for SQLite")
+        check_address(storages[-1])
         command.storage = storages[-1]
     return command, rest
 
 
-def _check_rest(overrides: list[str]) -> None:
-    """Refuse what is no key of a run and nearly one of the runner."""
+def _check_places(overrides: list[str]) -> None:
+    """Refuse what is no key of a run and nearly one of the runner, and passwords anywhere but in `storage`.
+
+    Values are not shown: they may be a mistyped `storage=`.
+    """
     of_runs = {field.name for field in dataclasses.fields(Config)} | set(GROUPS)
     for override in overrides:
-        key = key_of(override).lstrip("~")
-        near = difflib.get_close_matches(key, OWN_KEYS, n=1, cutoff=0.75)
-        if near and "." not in key and key not in of_runs:
-            raise ConfigError(f"{override}: did you mean {near[0]}?")
+        name = key_of(override)
+        key = name.lstrip("~")
+        near = difflib.get_close_matches(key.lower(), OWN_KEYS, n=1, cutoff=0.75)
+        if near and "." not in key and name not in OWN_KEYS and key not in of_runs:
+            raise ConfigError(f"{name}: did you mean {near[0]}?")
+        if name != "storage" and masked(override) != override:
+            name = name if masked(name) == name and "@" not in name else "the command line"
+            raise ConfigError(f"{name}: holds what looks like a password; a database's address is given as storage=...")
 
 
 def load_sweep(name: str) -> SweepConfig:
@@ -99,10 +112,12 @@ def load_sweep(name: str) -> SweepConfig:
         raise ConfigError(f"sweep={name}: there is no sweeps/{name}.yaml; {hint}there are {', '.join(files)}")
     try:
         stated = OmegaConf.load(files[name])
+        _refuse_interpolation(OmegaConf.to_container(stated, resolve=False))
         content = OmegaConf.merge(OmegaConf.structured(SweepConfig), stated, {"name": name})
         sweep = OmegaConf.to_object(content)
-    except ConfigError:
-        raise
+    except ConfigError as error:
+        said = str(error)
+        raise ConfigError(said if said.startswith("sweeps/") else f"sweeps/{name}.yaml: {said}") from error
     except OmegaConfBaseException as error:
         known = [field.name for kind in FILE_PARTS for field in dataclasses.fields(kind)]
         key = getattr(error, "full_key", None)
@@ -115,7 +130,21 @@ def load_sweep(name: str) -> SweepConfig:
             raise ConfigError(
                 f"sweeps/{name}.yaml: YAML reads a label as {row.label}; write on, off, yes and no in quotes"
             )
+    strange = sorted({scale for row in sweep.rows for scale in row.scales or ()} - set(SCALES))
+    if strange:
+        raise ConfigError(
+            f"sweeps/{name}.yaml: scales: there is no scale {', '.join(strange)}; there are {', '.join(SCALES)}"
+        )
     return sweep
+
+
+def _refuse_interpolation(content: Any, where: str = "") -> None:
+    """Raises ConfigError for `${`: labels go on to Hydra as they stand, and a file has nothing to refer to."""
+    if isinstance(content, dict | list):
+        for key, value in content.items() if isinstance(content, dict) else enumerate(content):
+            _refuse_interpolation(value, f"{where}.{key}" if where else str(key))
+    elif isinstance(content, str) and "${" in content:
+        raise ConfigError(f"{where}: must not hold ${{, but is {content!r}")
 
 
 def _compose(sweep: SweepConfig, overrides: list[str]) -> SweepCommand:

@@ -1,6 +1,7 @@
 """`python -m src.benchmark suite=model|latency`: every part of a step or a frame is measured, with a full memory."""
 
 import json
+import os
 import types
 
 import pytest
@@ -69,7 +70,7 @@ def test_latency_of_the_parts_makes_up_that_of_a_frame(outputs, tmp_path, monkey
     assert result["fps"] == pytest.approx(1e3 / total) and 0.1 < result["memory_gb"] < 64
     assert (result["format"], result["frames"], result["device"]) == (1, 4, "cpu")
     assert result["threads"] == torch.get_num_threads() and result["precision"] == "32-true"
-    assert result["processor"] and result["commit"]
+    assert result["processor"] and result["commit"] and result["load"] >= 0 and result["cores"] == os.cpu_count()
     printed = capsys.readouterr().out
     assert f"| total | {total:.1f} |" in printed and "latency.json" in printed
     assert {path.name for path in tmp_path.iterdir()} == {"some.ckpt", "latency.json"}
@@ -123,6 +124,25 @@ def test_frames_count_once_the_memory_is_as_full_as_it_gets(monkeypatch, lengths
     assert result["frames"] == 20 and result["ms"]["total"] == pytest.approx(1e3 * (1 + wanted))
     assert result["spread_ms"]["total"] == 0.0
     assert len(detector.seen) >= 25  # the first ones warm up
+
+
+@pytest.mark.parametrize(("load", "warned"), [(1.9, False), (2.1, True)])
+def test_a_busy_machine_is_warned_of(tmp_path, monkeypatch, capsys, load, warned):
+    monkeypatch.setattr(benchmark, "read_checkpoint", lambda path: {"horizon3d": {"config": None}})
+    config = types.SimpleNamespace(model=types.SimpleNamespace(), precision="32-true", trainer=None)
+    monkeypatch.setattr(benchmark, "restore_config", lambda config_, overrides: config)
+    monkeypatch.setattr(benchmark, "chosen_device", lambda config: torch.device("cpu"))
+    monkeypatch.setattr(benchmark.StreamingDetector, "restore", lambda *_: FakeDetector(0))
+    monkeypatch.setattr(benchmark, "data_root", lambda config, write: None)
+    monkeypatch.setattr(benchmark, "build_datamodule", lambda config, root: FakeData((6, 6)))
+    monkeypatch.setattr(benchmark, "split_samples", lambda index, split: None)
+    monkeypatch.setattr(benchmark, "scenes_of", lambda index, samples: [range(6), range(6)])
+    monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0))
+    monkeypatch.setattr("os.cpu_count", lambda: 4)
+    benchmark.report_latency(types.SimpleNamespace(checkpoint="x", out=str(tmp_path)), [])
+    content = json.loads((tmp_path / "latency.json").read_text())
+    assert (content["load"], content["cores"]) == (load, 4)
+    assert ("warning: the load was" in capsys.readouterr().out) == warned
 
 
 def test_timed_parts_add_up_calls_and_leave_the_model_as_it_was():

@@ -161,8 +161,11 @@ def test_a_real_sweep_ends_with_its_table_and_goes_on_from_there(sweeps, places,
     words = ["+sweep=two", "scale=debug", "phase.epochs=1", "trainer.num_pictures=0", "workers=2", *places]
     sweep.main(words)
     out = capsys.readouterr().out
-    assert "| small | 18.6 |" in out and "two-debug: 2 of 2 done" in out
-    record = read_record(tmp_path / "reports" / "sweeps" / "two_debug.json")
+    (path,) = (tmp_path / "reports" / "sweeps").glob("*.json")
+    record = read_record(path)
+    assert record.changes == ["phase.epochs=1"] and record.stem == path.stem == f"two_debug{record.suffix}"
+    assert "| small | 18.6 |" in out and f"two-debug{record.suffix}: 2 of 2 done" in out
+    assert "scale debug; with phase.epochs=1;" in out
     assert record.count("done") == 2 and record.command.startswith("python -m src.sweep +sweep=two scale=debug")
     outputs = tmp_path / "outputs"
     for run_id, run in record.runs.items():
@@ -173,7 +176,7 @@ def test_a_real_sweep_ends_with_its_table_and_goes_on_from_there(sweeps, places,
         assert run.ended - run.started < made["seconds"]["all"] + 60
         assert (tmp_path / "reports" / "results" / f"{run_id}.json").is_file()
     for suffix in ("md", "csv", "tex"):
-        assert (tmp_path / "reports" / "tables" / f"two_debug.{suffix}").is_file()
+        assert (tmp_path / "reports" / "tables" / f"{record.stem}.{suffix}").is_file()
 
     made = {path: path.stat().st_mtime_ns for path in outputs.glob("horizon3d-*/*") if path.name != ".lock"}
     began = time.monotonic()
@@ -189,4 +192,4 @@ def test_a_real_sweep_ends_with_its_table_and_goes_on_from_there(sweeps, places,
         sweep.main(words)
     said = str(caught.value)
     assert "damaged, seed 0" in said and "damaged.ckpt is truncated" in said and caught.value.exit_code == 1
-    assert "damaged" in (tmp_path / "reports" / "tables" / "two_debug.md").read_text()
+    assert "damaged" in (tmp_path / "reports" / "tables" / f"{record.stem}.md").read_text()

@@ -39,15 +39,40 @@ def test_the_address_of_a_database_is_taken_as_it_is(sweeps, quote):
         (["+sweep=good", "workers=x"], "'x' of type 'str' could not be converted to Integer$"),
         (["+sweep=good", "seeds=1.5"], "1.5"),
         (["+sweep=good", "workers=0"], "workers must be at least 1, but got 0"),
-        (["+sweep=good", "worker=2"], r"worker=2: did you mean workers\?"),
+        (["+sweep=good", "worker=2"], r"worker: did you mean workers\?"),
         (["+sweep=good", "dryrun=true"], r"did you mean dry_run\?"),
         (["+sweep=good", "dry_run=perhaps"], "perhaps"),
         (["+sweep=good", "storage="], "storage is empty"),
+        (["+sweep="], r"give one \+sweep=NAME of good; got none"),
+        (["+sweep=good", "seeds=1001"], "seeds must be at most 1000, but got 1001"),
     ],
 )
 def test_bad_command_lines(sweeps, words, said):
     with pytest.raises(ConfigError, match=said):
         compose_sweep(words)
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "storge=postgresql://me:s3cret@host/db",
+        "storge=me:s3cret",
+        "~storage=s3cret",
+        "STORAGE=s3cret",
+        "database=postgresql://me:s3cret@host/db",
+        "optim.lr=postgresql://me:s3cret@host/db",
+        "seeds=postgresql://me:s3cret@host/db",
+        "sweep=postgresql://me:s3cret@host/db",
+        "db=host password='a s3cret'",
+        "postgresql://me:s3cret@host/db",
+        "postgresql://me:s3cret@host/db?a=b",
+        "storage=postgresql://me:s3@s3cret@host/db",
+    ],
+)
+def test_a_misplaced_password_is_refused_and_not_shown(sweeps, override):
+    with pytest.raises(ConfigError) as caught:
+        compose_sweep(["+sweep=good", override])
+    assert "s3" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -63,6 +88,15 @@ def test_bad_command_lines(sweeps, words, said):
         ("title: t\nquestion: q\nrows: [{label: a, paper: {mAP: .nan}}]\n", "mAP=nan is not a finite number"),
         ("title: t\nquestion: q\nrows: [{label: a, x: abc}]\n", "x: Value 'abc' of type 'str'"),
         ("title: t\nquestion: q\nrows: [{label: off}]\n", "YAML reads a label as False"),
+        (GOOD.replace("label: a", "label: a, scales: [papr]"), "no scale papr; there are debug, mini, paper"),
+        (GOOD.replace("label: a", "label: a, overrides: [seed=3]"), "seed=... is no part of a sweep"),
+        (GOOD + "overrides: [+seed=3]\n", "seed=... is no part of a sweep"),
+        (GOOD.replace("label: a", "label: ' '"), "a label is empty"),
+        (GOOD + "tables: [{name: t, title: T, columns: []}]\n", "table t: columns is empty"),
+        (GOOD + "tables: [{name: a/b, title: T, columns: [mAP]}]\n", "name 'a/b' must be of letters"),
+        (GOOD + "tables: [{name: ../b, title: T, columns: [mAP]}]\n", "name '../b' must be of letters"),
+        (GOOD.replace("label: a", "label: '${title}'"), r"rows.0.label: must not hold \$\{"),
+        ("title: t ${x}\nquestion: q\nrows: [{label: a}]\n", r"title: must not hold \$\{"),
         ("title: t\nquestion: q\nrows: []\n", "give either rows or space"),
         ("title: t\nquestion: q\nrows: [{label: a\n", "while parsing"),
         ("title: t\nquestion: q\nspace: {optim.lr: {low: 3, high: 2}}\n", "low must be below high"),
@@ -76,3 +110,9 @@ def test_bad_files_are_named(sweeps, content, said):
     with pytest.raises(ConfigError, match=said) as caught:
         load_sweep("bad")
     assert str(caught.value).startswith("sweeps/bad.yaml")
+
+
+def test_a_files_name_is_the_sweeps(sweeps):
+    (sweeps / "b d.yaml").write_text(GOOD)
+    with pytest.raises(ConfigError, match="name 'b d' must be of letters"):
+        load_sweep("b d")

@@ -212,7 +212,7 @@ GOOD = {
     "question": "Which?",
     "baseline": "a",
     "tables": [{"name": "t", "title": "T", "columns": ["mAP"]}],
-    "rows": [{"label": "a"}, {"label": "b", "overrides": ["seed=1"]}],
+    "rows": [{"label": "a"}, {"label": "b", "overrides": ["optim.lr=1"]}],
 }
 SPACE = {key: value for key, value in GOOD.items() if key not in ("rows", "baseline")} | {
     "space": {"optim.lr": {"low": 1e-4, "high": 1e-3}},
@@ -254,7 +254,7 @@ def test_what_the_mistakes_are_made_from_is_right(written):
         (GOOD | {"baseline": "c"}, r"baseline 'c' is not the label of a row \(a, b\)"),
         (GOOD | {"rows": [{"label": "a"}, {"label": "b", "baseline": "c"}]}, "baseline 'c' is not the label"),
         (GOOD | {"rows": [{"label": "a", "scales": ["paper"]}]}, "baseline 'a' must be for every scale"),
-        (GOOD | {"tables": [{"name": "t", "title": "T", "columns": [], "rows": ["z"]}]}, "table t: there is no row z"),
+        (GOOD | {"tables": [{"name": "t", "title": "T", "columns": ["mAP"], "rows": ["z"]}]}, "t: there is no row z"),
         (GOOD | {"tables": GOOD["tables"] * 2}, r"two tables have one name \(t, t\)"),
         (GOOD | {"rows": []}, "either rows or space"),
         (SPACE | {"rows": GOOD["rows"]}, "either rows or space"),

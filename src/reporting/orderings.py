@@ -17,11 +17,17 @@ class Ordering:
     better: str  # label of the row that is better in the paper
     worse: str
     gains: tuple[float, ...]  # better minus worse in the metric's direction, here, of each seed that both rows have
+    digits: int  # that are shown
 
     @property
     def holds(self) -> bool:
-        """Whether the better row is the better one here too, in the mean."""
-        return statistics.mean(self.gains) > 0
+        """Whether the better row is the better one here too, in the mean, and by more than the digits shown hide."""
+        return statistics.mean(self.gains) > 0 and not self.ties
+
+    @property
+    def ties(self) -> bool:
+        """Whether the mean difference is none at the digits shown."""
+        return round(statistics.mean(self.gains), self.digits) == 0
 
 
 def sign_test(wins: int, losses: int) -> float:
@@ -40,6 +46,7 @@ def find_orderings(
     paper: dict[str, float],  # by row label
     values: dict[str, dict[int, float]],  # by row label and seed
     higher_is_better: bool,
+    digits: int,  # that are shown
 ) -> list[Ordering]:
     """Every two rows that the paper tells apart and that share a seed here; the paper's best first."""
     sign = 1.0 if higher_is_better else -1.0
@@ -49,7 +56,7 @@ def find_orderings(
         for worse in known[place + 1 :]:
             gains = tuple(sign * gain for _, gain in sorted(paired_gains(values[better], values[worse]).items()))
             if gains and paper[better] != paper[worse]:
-                found.append(Ordering(better, worse, gains))
+                found.append(Ordering(better, worse, gains, digits))
     return found
 
 

@@ -28,6 +28,13 @@ NOT_A_SETTING = ("seed", "scale", "phase")
 ELSEWHERE = re.compile(r"""["']*(/|~|\$|\.\./|file:|[A-Za-z]:[\\/])""")
 """How a value begins that names a place on one machine."""
 
+SHARES = ("AP", "mAP", "NDS", "mAP_present")
+"""Numbers from 0 to 1, by the last part of their names."""
+LARGEST_SCORE, LARGEST = 1e6, 1e15
+"""Of any other number in a table, and of any number in a result: beyond it is damage, not a measurement."""
+SUSPICIOUS = re.compile(r"[\s\[,:]-?(\d{16}|\d[\d.]*[eE]\+?\d\d)|NaN|Infinity")
+"""How a number beyond LARGEST looks in JSON; NaN and Infinity are not JSON, though Python reads them."""
+
 KEPT_OF_A_CLASS = ("AP", "AVE", "num_gt")
 """Within a range or a speed class; the run's metrics.json has the rest."""
 
@@ -144,9 +151,20 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
 def read_result(path: Path) -> RunResult:
     """Read one result. Raises DataError naming file, key, what was expected and found, and the remedy."""
     file = _Json(path, "delete it and run python -m src.report, which writes it anew from the run's folder")
+    try:
+        return _result(file)
+    except RecursionError as error:  # just not too deep to be read, but too deep to be walked through
+        raise file.too_deep() from error
+
+
+def _result(file: _Json) -> RunResult:
     found = file.content.get("format")
     if found != FORMAT or type(found) is not int:
         raise file.refusal(("format",), f"must be {FORMAT}, the one that this version reads, but is {found!r:.80}")
+    if file.get("run_id", str) != file.path.stem:
+        raise file.refusal(
+            ("run_id",), f"must be {file.path.stem}, as the file is named, but is {file.get('run_id', str)}"
+        )
     scores = file.below("metrics")
     latency = file.below("latency") if file.get("latency", dict, NONE) is not None else None
     curves = file.get("curves", dict)
@@ -191,12 +209,16 @@ class _Json:
             self.content = json.loads(text)
         except (OSError, ValueError) as error:
             raise DataError(f"{path}: not readable as JSON ({error}); {remedy}") from error
+        except RecursionError as error:
+            raise self.too_deep() from error
         if not isinstance(self.content, dict):
             raise DataError(f"{path}: must hold an object, but holds a {type(self.content).__name__}; {remedy}")
-        if "NaN" in text or "Infinity" in text:  # Python reads them, though they are not JSON
+        if SUSPICIOUS.search(text):
             for names, value in _leaves(self.content):
                 if isinstance(value, float) and not math.isfinite(value):
                     raise self.refusal(names, f"must be a finite number, but is {value}")
+                if isinstance(value, NUMBER) and abs(value) > LARGEST and names[0] != "config":
+                    raise self.refusal(names, f"must be at most {LARGEST:g} in size, but is {value!r:.80}")
 
     def below(self, name: str) -> _Json:
         """The object at one name, checked as this one is."""
@@ -214,6 +236,20 @@ class _Json:
             expected = " or ".join("null" if kind is NONE else kind.__name__ for kind in kinds)
             raise self.refusal(names, f"must be {expected}, but is {value!r:.80}")
         return value
+
+    def score(self, names: str | Sequence[str], *kinds: type) -> Any:
+        """A number as by `get`, within what a number of this name can be."""
+        names = (names,) if isinstance(names, str) else names
+        value = self.get(names, *NUMBER, *kinds)
+        share = names[-1] in SHARES
+        low, high = (0.0, 1.0) if share else (-LARGEST_SCORE, LARGEST_SCORE)
+        if value is not None and not low - 1e-9 <= value <= high + 1e-9:  # a mean of ones may be 1.0000000000000002
+            raise self.refusal(names, f"must be from {low:g} to {high:g}, but is {value!r:.80}")
+        return value
+
+    def too_deep(self) -> DataError:
+        """What is wrong with a file of too many brackets."""
+        return DataError(f"{self.path}: not readable as JSON (nested too deeply); {self.remedy}")
 
     def refusal(self, names: Sequence[str], fault: str) -> DataError:
         """What is wrong at `names`."""
@@ -234,30 +270,35 @@ def _metrics(scores: _Json, latency: _Json | None) -> dict[str, float | None]:
     """See RunResult.metrics."""
     values: dict[str, float | None] = {}
     for name in ("mAP", "NDS", "mAVE"):
-        values[name] = scores.get(name, *NUMBER)
+        values[name] = scores.score(name)
     for name in scores.get("classes", dict):
-        values[f"classes.{name}.AP"] = scores.get(("classes", name, "AP"), *NUMBER)
+        values[f"classes.{name}.AP"] = scores.score(("classes", name, "AP"))
     for name in scores.get("ranges", dict):
-        values[f"ranges.{name}.mAP"] = scores.get(("ranges", name, "mAP"), *NUMBER)
+        values[f"ranges.{name}.mAP"] = scores.score(("ranges", name, "mAP"))
         for of in scores.get(("ranges", name, "classes"), dict):
             scores.get(("ranges", name, "classes", of), dict)
     for name in METRICS:
         path = name.split(".")
         if name not in values and path[0] not in ("speeds", "latency") and _has(scores.content, path):
-            values[name] = scores.get(path, *NUMBER, NONE)
+            values[name] = scores.score(path, NONE)
     for name in scores.get("speeds", dict) if "speeds" in scores.content else ():  # older runs have no speed classes
         for key in ("mAP_present", "mAVE_present"):
-            values[f"speeds.{name}.{key}"] = scores.get(("speeds", name, key), *NUMBER, NONE)
+            values[f"speeds.{name}.{key}"] = scores.score(("speeds", name, key), NONE)
         classes = ("speeds", name, "classes")
         boxes = [scores.get((*classes, of, "num_gt"), int) for of in scores.get(classes, dict)]
         cars = scores.get((*classes, "car", "num_gt"), int)
         values |= {f"speeds.{name}.boxes": sum(boxes), f"speeds.{name}.car.boxes": cars}
         for key in ("AP", "AVE"):  # the official numbers of a class without ground truth are 0 and 1, and say nothing
-            value = scores.get((*classes, "car", key), *NUMBER)
+            value = scores.score((*classes, "car", key))
             values[f"speeds.{name}.car.{key}"] = value if cars else None
     if latency is not None:
-        values |= {f"latency.{part}": latency.get(("ms", part), *NUMBER) for part in latency.get("ms", dict)}
-        values |= {f"latency.{name}": latency.get(name, *NUMBER) for name in ("fps", "memory_gb")}
+        values |= {f"latency.{part}": latency.score(("ms", part)) for part in latency.get("ms", dict)}
+        values |= {f"latency.{name}": latency.score(name) for name in ("fps", "memory_gb")}
+        for part in latency.get("spread_ms", dict) if "spread_ms" in latency.content else ():
+            latency.score(("spread_ms", part))
+        for name in ("load", "cores"):  # older files have neither
+            if name in latency.content:
+                latency.score(name)
     return values
 
 
@@ -318,7 +359,7 @@ def _read_curves(path: Path) -> dict[str, list[list[float]]]:
         with path.open(newline="") as file:
             for row in csv.DictReader(file):
                 for name, value in row.items():
-                    if name and name.startswith(("loss/", "val/")) and value and math.isfinite(float(value)):
+                    if name and name.startswith(("loss/", "val/")) and value and abs(float(value)) <= LARGEST:
                         curves.setdefault(name, []).append([int(row["step"]), float(value)])
     except (OSError, ValueError, TypeError, KeyError, csv.Error) as error:
         raise DataError(f"{path}: not a run's learning curves ({type(error).__name__}: {error}); delete it") from error

@@ -6,11 +6,16 @@ The dataclasses are the schema that src/sweep_config.py checks each file against
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from src.errors import ConfigError
+from src.overrides import key_of
 from src.reporting.metric_names import find_metric
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+"""Of sweeps and tables: they are file names, parts of addresses and names of studies."""
 
 
 @dataclass(kw_only=True)
@@ -96,8 +101,18 @@ class SweepConfig:
         where = f"sweeps/{self.name or '?'}.yaml"
         if bool(self.rows) == bool(self.space):
             raise ConfigError(f"{where}: give either rows or space, and at least one entry")
+        for name in (self.name, *(table.name for table in self.tables)):
+            if not NAME.fullmatch(name):
+                raise ConfigError(
+                    f"{where}: the name {name!r} must be of letters, digits, _ and -, and begin with a letter or digit"
+                )
+        given = [*self.overrides, *(override for row in self.rows for override in row.overrides), *self.space]
+        if any(key_of(override) == "seed" for override in given):
+            raise ConfigError(f"{where}: seed=... is no part of a sweep; seed= and seeds= of its command say them")
         labels = [row.label for row in self.rows] + [row.label for row in self.paper_rows]
         twice = sorted({label for label in labels if labels.count(label) > 1})
+        if not all(label.strip() for label in labels):
+            raise ConfigError(f"{where}: a label is empty; each row needs its own")
         if twice:
             raise ConfigError(f"{where}: label {', '.join(twice)} stands more than once; each row needs its own")
         own = [row.label for row in self.rows]
@@ -120,6 +135,8 @@ class SweepConfig:
             strange = [label for label in table.rows or () if label not in labels]
             if strange:
                 raise ConfigError(f"{where}, table {table.name}: there is no row {', '.join(strange)}")
+            if not table.columns:
+                raise ConfigError(f"{where}, table {table.name}: columns is empty; name at least one metric")
         for plot in self.plots:
             find_metric(plot.metric, f"{where}, plots")
         for key, dimension in self.space.items():

@@ -6,13 +6,18 @@ The runner writes it whenever something changes; tables and the dashboard read i
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import Any, get_args, get_origin, get_type_hints
 
-from src.errors import DataError
-from src.reporting.sweep_file import DimensionConfig, PaperRowConfig, PlotConfig, RowConfig, SweepConfig, TableConfig
+from src.errors import DataError, HorizonError
+from src.overrides import digest_of
+from src.reporting.sweep_file import SweepConfig
 from src.reporting.writing import write_whole
 
 FORMAT = 1
@@ -49,6 +54,7 @@ class SweepRecord:
     runs: dict[str, RunState]  # by run id, in the order they are trained
     study: str  # Optuna's name of it
     storage: str  # the study's database, passwords masked
+    changes: list[str] = field(default_factory=list)  # by the command line, of every run: it is another experiment
     trials: int = 0  # of a search: begun so far, each once; two that draw the same values share a run
     updated: float = 0.0  # when the runner last wrote this, seconds since 1970
 
@@ -56,6 +62,16 @@ class SweepRecord:
     def name(self) -> str:
         """Name of the sweep's file."""
         return self.sweep.name
+
+    @property
+    def suffix(self) -> str:
+        """What tells the names of this sweep's files from those of the sweep as its file says it."""
+        return suffix_of(self.changes)
+
+    @property
+    def stem(self) -> str:
+        """Name of the record's file, and the sweep's part of an address."""
+        return f"{self.name}_{self.scale}{self.suffix}"
 
     @property
     def unchosen(self) -> int:
@@ -72,9 +88,14 @@ class SweepRecord:
         return sum(run.state == state for run in self.runs.values())
 
 
-def record_path(reports: Path, sweep: str, scale: str) -> Path:
+def suffix_of(changes: Sequence[str]) -> str:
+    """`-` and 8 hex of what a command line changes of a sweep's file; empty for no change."""
+    return f"-{digest_of(list(changes))}" if changes else ""
+
+
+def record_path(reports: Path, sweep: str, scale: str, changes: Sequence[str] = ()) -> Path:
     """Where the record of a sweep lies."""
-    return reports / "sweeps" / f"{sweep}_{scale}.json"
+    return reports / "sweeps" / f"{sweep}_{scale}{suffix_of(changes)}.json"
 
 
 def write_record(path: Path, record: SweepRecord) -> None:
@@ -92,11 +113,13 @@ def read_record(path: Path) -> SweepRecord:
         found = content.pop("format", None)
         if found != FORMAT:
             raise ValueError(f"format is {found!r}, this version reads {FORMAT}")
-        return _record(content)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        record = _built(SweepRecord, content, "")
+        _check(record, path.stem)
+    except (OSError, ValueError, TypeError, ArithmeticError, RecursionError, HorizonError) as error:
         raise DataError(
             f"{path}: not a readable record of a sweep ({type(error).__name__}: {error}); {remedy}"
         ) from error
+    return record
 
 
 def read_records(reports: Path, scale: str | None = None) -> tuple[list[SweepRecord], dict[Path, DataError]]:
@@ -113,16 +136,59 @@ def read_records(reports: Path, scale: str | None = None) -> tuple[list[SweepRec
     return records, broken
 
 
-def _record(content: dict[str, Any]) -> SweepRecord:
-    sweep = dict(content["sweep"])
-    sweep["tables"] = [TableConfig(**table) for table in sweep["tables"]]
-    sweep["plots"] = [PlotConfig(**plot) for plot in sweep["plots"]]
-    sweep["paper_rows"] = [PaperRowConfig(**row) for row in sweep["paper_rows"]]
-    sweep["rows"] = [RowConfig(**row) for row in sweep["rows"]]
-    sweep["space"] = {key: DimensionConfig(**dimension) for key, dimension in sweep["space"].items()}
-    rows = {label: {int(seed): run for seed, run in runs.items()} for label, runs in content["rows"].items()}
-    runs = {run_id: RunState(**run) for run_id, run in content["runs"].items()}
-    for run_id, run in runs.items():
+def _check(record: SweepRecord, stem: str) -> None:
+    """Raises ValueError for parts that do not fit each other."""
+    if record.stem != stem:
+        raise ValueError(f"it is the record of {record.stem}, whose file is {record.stem}.json")
+    for run_id, run in record.runs.items():
+        if run.run_id != run_id:
+            raise ValueError(f"runs.{run_id}.run_id is {run.run_id!r}, must be {run_id!r}")
         if run.state not in STATES:
             raise ValueError(f"runs.{run_id}.state is {run.state!r}, must be one of {', '.join(STATES)}")
-    return SweepRecord(**(content | {"sweep": SweepConfig(**sweep), "rows": rows, "runs": runs}))
+    for label, runs in record.rows.items():
+        for seed, run_id in runs.items():
+            if run_id not in record.runs:
+                raise ValueError(f"rows.{label}.{seed} is {run_id!r}, which is not among runs")
+
+
+def _built(kind: Any, value: Any, where: str) -> Any:
+    """A JSON value as its annotation says, dataclasses built. Raises TypeError and ValueError naming the place."""
+    options = get_args(kind)
+    if kind is Any:
+        return value
+    if NoneType in options:
+        (other,) = set(options) - {NoneType}
+        return None if value is None else _built(other, value, where)
+    if dataclasses.is_dataclass(kind):
+        found, types = _of(dict, value, where), _types_of(kind)
+        strange = sorted(found.keys() - types.keys())
+        missing = [f.name for f in dataclasses.fields(kind) if f.name not in found and _is_required(f)]
+        if strange or missing:
+            raise ValueError(f"{where or 'it'} lacks {missing}, and has {strange}, which this version does not know")
+        prefix = f"{where}." if where else ""
+        return kind(**{name: _built(types[name], inner, f"{prefix}{name}") for name, inner in found.items()})
+    if get_origin(kind) is list:
+        return [_built(options[0], inner, f"{where}.{index}") for index, inner in enumerate(_of(list, value, where))]
+    if get_origin(kind) is dict:
+        read = int if options[0] is int else str  # the keys of a JSON object are words
+        items = _of(dict, value, where).items()
+        return {read(key): _built(options[1], inner, f"{where}.{key}") for key, inner in items}
+    if kind is float and type(value) in (int, float) and math.isfinite(value):
+        return value
+    return _of(kind, value, where)
+
+
+def _of(kind: type, value: Any, where: str) -> Any:
+    if type(value) is not kind or (kind is float and not math.isfinite(value)):
+        names = {dict: "an object", float: "a finite number", int: "a whole number", str: "a text"}
+        raise TypeError(f"{where} must be {names.get(kind, kind.__name__)}, but is {value!r:.80}")
+    return value
+
+
+@functools.cache
+def _types_of(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _is_required(entry: dataclasses.Field) -> bool:
+    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING

@@ -24,7 +24,8 @@ class Cell:
     values: dict[int, float] = field(default_factory=dict)  # here, by seed
     differences: dict[int, float] = field(default_factory=dict)  # to the baseline with the same seed
     paper_difference: float | None = None
-    best: bool = False  # of the finished rows here
+    frames: float | None = None  # of a latency that one run has: half the range of the middle half of its frames
+    best: bool = False  # of the finished rows here; each of those that tie at the digits shown
     paper_best: bool = False
 
     @property
@@ -41,6 +42,12 @@ class Cell:
     def spread(self) -> float | None:
         """Standard deviation over seeds; None of fewer than two."""
         return _spread(self.values)
+
+    @property
+    def uncertainty(self) -> float:
+        """What stands after ±: over seeds, or of one run's frames; 0 where neither is known."""
+        spread = self.spread if self.spread is not None else self.frames
+        return spread if spread is not None else 0.0
 
     @property
     def difference(self) -> float | None:
@@ -192,6 +199,11 @@ class SweepTable:
         return line + ([escape(row.note)] if self.has_notes else [])
 
 
+def rounded(value: float, metric: Metric) -> float:
+    """At the digits that are shown, and never -0.0."""
+    return round(value, metric.digits) + 0.0
+
+
 def format_paper(value: float | None, metric: Metric, signed: bool = False) -> str:
     """A number of the paper with the digits it was given with, at least the metric's."""
     if value is None:
@@ -201,11 +213,12 @@ def format_paper(value: float | None, metric: Metric, signed: bool = False) -> s
 
 
 def format_here(cell: Cell, metric: Metric, done: int) -> str:
-    """Mean ± standard deviation; with n where not all `done` runs of the row have the number."""
+    """Mean ± standard deviation, of one run's latency ± `Cell.frames`; with n where not all `done` runs have it."""
     if cell.mean is None:
         return MISSING
-    text = f"{cell.mean:.{metric.digits}f}"
-    text += f" ± {cell.spread:.{metric.digits}f}" if cell.spread is not None else ""
+    text = f"{rounded(cell.mean, metric):.{metric.digits}f}"
+    known = cell.spread is not None or cell.frames is not None
+    text += f" ± {cell.uncertainty:.{metric.digits}f}" if known else ""
     return text + (f" (n = {cell.seeds})" if cell.seeds != done else "")
 
 
@@ -213,7 +226,7 @@ def format_difference(cell: Cell, metric: Metric, done: int | None = None) -> st
     """What the row has more than the baseline; in brackets the paper's, and n where not all `done` runs have both."""
     text, notes = MISSING, []
     if cell.difference is not None:
-        text = f"{round(cell.difference, metric.digits) + 0.0:+.{metric.digits}f}"  # no -0.0
+        text = f"{rounded(cell.difference, metric):+.{metric.digits}f}"
         text += f" ± {cell.difference_spread:.{metric.digits}f}" if cell.difference_spread is not None else ""
         notes += [f"n = {len(cell.differences)}"] if done not in (None, len(cell.differences)) else []
     if cell.paper_difference is not None:

@@ -8,7 +8,7 @@ from src.reporting.metric_names import Metric
 from src.reporting.orderings import LEAST_SEEDS, Ordering, describe_test, find_orderings, paired_gains
 from src.reporting.results import RunResult
 from src.reporting.sweep_record import SweepRecord
-from src.reporting.sweep_table import SweepRow
+from src.reporting.sweep_table import SweepRow, format_paper, rounded
 
 SYNTHETIC = "synthetic highway"
 MAIN = ("mAP", "NDS")
@@ -23,15 +23,16 @@ def describe_runs(record: SweepRecord, results: dict[str, RunResult], complete: 
         any_result = next(iter(results.values()))
         data = f"Data: {any_result.dataset}, split {any_result.data.get('split', 'unknown')}"
     parts = [data, f"scale {record.scale}"]
+    parts += [f"with {' '.join(record.changes)}"] if record.changes else []
     if results:
         by_phase: dict[str, set[int]] = {}
         for result in results.values():
             by_phase.setdefault(result.phase, set()).add(result.epochs)
         for phase, epochs in sorted(by_phase.items()):
-            parts.append(f"{phase}: {_listed(sorted(epochs))} epochs")
+            parts.append(f"{phase}: {_listed(sorted(epochs))} epoch{'' if epochs == {1} else 's'}")
     spread = "mean ± standard deviation" if len(seeds) > 1 else "one seed, so no spread"
     parts.append(f"seed{'s' if len(seeds) > 1 else ''} {_listed(seeds)}: {spread}")
-    code, devices, places = set(), set(), set()
+    code, devices, places, busy = set(), set(), set(), False
     for result in results.values():
         code.add(result.commit[:10] + ("+" if result.commit.endswith("+") else ""))
         threads = f"{_counted(result.processes, 'process')} of {_counted(result.threads, 'thread')}"
@@ -39,8 +40,10 @@ def describe_runs(record: SweepRecord, results: dict[str, RunResult], complete: 
         if result.latency is not None:
             at = result.latency.get("processor") or result.latency.get("device") or "an unnamed device"
             places.add(f"{at}, {_counted(result.latency.get('threads', 1), 'thread')}")
+            busy = busy or is_busy(result.latency.get("load"), result.latency.get("cores"))
     for words, found in (("code ", code), ("", devices), ("latency on ", places)):
         parts += [words + _listed(sorted(found))] if found else []
+    parts += ["latency measured on a busy machine, so rows may differ by what else ran"] if busy else []
     text = "; ".join(parts) + "."
     return text + ("" if complete else " Bold is the best of the rows whose seeds have all finished.")
 
@@ -53,6 +56,21 @@ def describe_differences(baselines: list[str], has_paper: bool) -> str:
     return f" Differences are to {' or '.join(baselines)}, seed by seed{brackets}."
 
 
+def describe_latency(rows: list[SweepRow]) -> str:
+    """What stands after ± where one run's latency has no deviation over seeds, to stand after `describe_runs`."""
+    if all(cell.frames is None for row in rows for cell in row.cells):
+        return ""
+    return (
+        " After ± of a latency that one run has stands half the range of the middle half of its frames; none is bold "
+        "where the best and the next are no further apart than these."
+    )
+
+
+def is_busy(load: float | None, cores: int | None) -> bool:
+    """Whether more than half of the processor was taken when a measurement began; not known of older files."""
+    return load is not None and cores is not None and load > 0.5 * cores
+
+
 def findings(columns: list[Metric], rows: list[SweepRow], result: RunResult | None, complete: bool) -> list[str]:
     """What the numbers of trained rows say: a frame, then a sentence each. `result` is any of the table's."""
     if result is None:
@@ -63,7 +81,7 @@ def findings(columns: list[Metric], rows: list[SweepRow], result: RunResult | No
     for place, column in enumerate(columns):
         paper = {row.label: row.cells[place].paper for row in rows if row.cells[place].paper is not None}
         values = {row.label: row.cells[place].values for row in rows}
-        orderings = find_orderings(paper, values, column.higher_is_better)
+        orderings = find_orderings(paper, values, column.higher_is_better, column.digits)
         if orderings:
             sentences.append(_count(column, orderings, complete))
         if column.name in main:
@@ -132,13 +150,16 @@ def _pairs(
 
 
 def _count(column: Metric, orderings: list[Ordering], complete: bool) -> str:
-    broken = [f"{ordering.better} before {ordering.worse}" for ordering in orderings if not ordering.holds]
+    ties = sum(ordering.ties for ordering in orderings)
+    holding = sum(ordering.holds for ordering in orderings)
+    broken = [f"{o.better} before {o.worse}" for o in orderings if not (o.holds or o.ties)]
     so_far = "" if complete else "so far "
     if len(orderings) == 1:
-        verb = "does not hold" if broken else "holds"
-        return f"{column.title}: {so_far}the paper's one ordering of two rows {verb} here in the mean."
-    text = f"{column.title}: {so_far}{len(orderings) - len(broken)} of the paper's {len(orderings)} orderings of two "
-    text += f"rows {'holds' if len(orderings) - len(broken) == 1 else 'hold'} here in the mean"
+        verb = "ties at the digits shown" if ties else "does not hold here" if broken else "holds here"
+        return f"{column.title}: {so_far}the paper's one ordering of two rows {verb} in the mean."
+    text = f"{column.title}: {so_far}{holding} of the paper's {len(orderings)} orderings of two "
+    text += f"rows {'holds' if holding == 1 else 'hold'} here in the mean"
+    text += f", {ties} {'ties' if ties == 1 else 'tie'} at the digits shown" if ties else ""
     return text + (f"; those that do not: {', '.join(broken)}." if broken else ".")
 
 
@@ -147,20 +168,22 @@ def _comparison(
 ) -> str:
     """One row against another: the paper's difference, the one here, and the sign test over seeds."""
     differences = list(paired_gains(values[first], values[second]).values())
-    mean, digits = statistics.mean(differences), column.digits
+    mean, digits = rounded(statistics.mean(differences), column), column.digits
     here = f"here {mean:+.{digits}f}"
     here += f" ± {statistics.stdev(differences):.{digits}f}" if len(differences) > 1 else ""
     toward = 1.0 if column.higher_is_better else -1.0
     text, of_paper = f"{column.title}, {first} against {second}: ", 0.0
     if first in paper and second in paper:
-        of_paper = round(paper[first] - paper[second], 6)
-        text += f"paper {of_paper:+.{digits}f}, "
+        of_paper = round(paper[first] - paper[second], 6) + 0.0
+        text += f"paper {format_paper(of_paper, column, signed=True)}, "
     if of_paper:
         toward = 1.0 if of_paper > 0 else -1.0
         verdict = ", in the paper's order" if mean * toward > 0 else ", not in the paper's order"
         side = "on the paper's side"
     else:
         verdict, side = "", "better"
+    if mean == 0:
+        verdict = ", no difference at the digits shown"
     wins, losses = (sum(sign * toward * d > 0 for d in differences) for sign in (1, -1))
     seeds = f"{wins} of {_counted(len(differences), 'seed')} {side} ({describe_test(wins, losses)})"
     return f"{text}{here}{verdict}; {seeds}."

@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
-from dataclasses import replace
 from pathlib import Path
 
 from src.errors import DataError
+from src.overrides import is_of
 from src.reporting.sweep_record import RunState, SweepRecord, read_record, record_path, write_record
+from src.sweeping.address import masked
 from src.sweeping.plan import Cell, Plan
 from src.sweeping.runs import is_done
-from src.sweeping.study import Attempt, SweepStudy, masked, trials_begun
+from src.sweeping.study import Attempt, SweepStudy, trials_begun
 
 logger = logging.getLogger(__name__)
 
 
 class Keeper:
-    """Writes `reports/sweeps/<name>_<scale>.json` whenever asked; several runners may."""
+    """Writes the record of a plan, `reports/sweeps/<stem>.json`, whenever asked; several runners may."""
 
     def __init__(self, plan: Plan, study: SweepStudy, command: str, outputs: Path, reports: Path) -> None:
         self.plan, self.study, self.command, self.outputs, self.reports = plan, study, command, outputs, reports
-        self.path = record_path(reports, plan.sweep.name, plan.scale)
+        self.path = record_path(reports, plan.sweep.name, plan.scale, plan.changes)
         self._done: set[str] = set()
 
     def is_done(self, run_id: str) -> bool:
@@ -59,6 +61,7 @@ class Keeper:
             runs=runs,
             study=self.study.name,
             storage=masked(self.study.url),
+            changes=list(self.plan.changes),
             trials=trials_begun(attempts),
             updated=time.time(),
         )
@@ -76,7 +79,8 @@ class Keeper:
             log=str(log.relative_to(self.outputs)) if log.is_file() else None,
         )
         if attempt is not None:
-            state.started, state.ended, state.value = attempt.started, attempt.ended, attempt.value
+            state.started, state.ended = attempt.started, attempt.ended
+            state.value = attempt.value if attempt.value is not None and math.isfinite(attempt.value) else None
         if attempt is not None and attempt.state == "pruned":
             state.state = "pruned"
         elif attempt is not None and attempt.state == "failed" and self.plan.sweep.is_search:
@@ -99,18 +103,28 @@ class Keeper:
             if any(before.get(seed, run_id) != run_id for seed, run_id in by_seed.items()):
                 return  # the sweep's definition or its command has changed
         for label, by_seed in record.rows.items():
+            today = [_settings(record.runs[run_id]) for run_id in by_seed.values()]
             for seed, run_id in earlier.rows.get(label, {}).items():
-                known = earlier.runs.get(run_id)
-                if seed in by_seed or known is None:
+                known = earlier.runs[run_id]
+                if seed in by_seed or _settings(known) not in today:
                     continue
-                cell = Cell(run_id, known.overrides, [], known.seed, known.label, known.needs)
-                state = self._state(cell, latest.get(run_id))
+                state = self._again(known, latest)
                 if state.state != "waiting":
                     by_seed[seed] = run_id
                     record.runs.setdefault(run_id, state)
                     if known.needs in earlier.runs:
-                        record.runs.setdefault(known.needs, replace(earlier.runs[known.needs]))
+                        record.runs.setdefault(known.needs, self._again(earlier.runs[known.needs], latest))
         record.seeds = sorted({seed for by_seed in record.rows.values() for seed in by_seed} | set(record.seeds))
+
+    def _again(self, known: RunState, latest: dict[str | None, Attempt]) -> RunState:
+        """Where a run of an earlier record stands now."""
+        cell = Cell(known.run_id, known.overrides, [], known.seed, known.label, known.needs)
+        return self._state(cell, latest.get(known.run_id))
+
+
+def _settings(run: RunState) -> set[str]:
+    """What a run is, whatever its seed; all are of one scale."""
+    return {override for override in run.overrides if not is_of(override, ("seed", "scale"))}
 
 
 def cell_from(content: dict) -> Cell:

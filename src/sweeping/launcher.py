@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from src.errors import ConfigError, DataError, DivergedError, InterruptedRunError
+from src.errors import BusyError, ConfigError, DataError, DivergedError, InterruptedRunError
 from src.overrides import key_of
 from src.sweeping.plan import Cell
 
@@ -50,6 +50,11 @@ class Ended:
         stops = (InterruptedRunError.exit_code, -signal.SIGTERM, -signal.SIGINT)
         return self.code in stops or (self.told and self.code == -signal.SIGKILL)
 
+    @property
+    def busy(self) -> bool:
+        """Whether another process had the run's folder. Its exit code is that of all settings: its class tells."""
+        return self.code == BusyError.exit_code and self.reason.startswith(f"{BusyError.__name__}:")
+
 
 class Launcher:
     """Starts runs as processes; `command` and what it does in the new process can be replaced in tests."""
@@ -87,8 +92,7 @@ class Launcher:
 
     def shown_as(self, cell: Cell) -> list[str]:
         """Where Weights & Biases shows the run: its sweep and its row, unless the command line says otherwise."""
-        label = cell.label.replace('"', '\\"')
-        places = [f"logger.wandb.group={self._group}", f'logger.wandb.row="{label}"']
+        places = [f"logger.wandb.group={self._group}", f"logger.wandb.row={quoted(cell.label)}"]
         return [place for place in places if key_of(place) not in map(key_of, cell.machine)]
 
     def run_command(
@@ -141,6 +145,12 @@ class Launcher:
             _kill_group(process)
             process.wait()
             raise
+
+
+def quoted(value: str) -> str:
+    """A text as an override writes it: Hydra reads a backslash as one unless a quote follows."""
+    escaped = re.sub(r'(\\*)("|$)', lambda found: 2 * found[1] + ('\\"' if found[2] else ""), value)
+    return f'"{escaped}"'
 
 
 def explain(code: int, output: str) -> str:

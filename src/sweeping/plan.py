@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from src.errors import ConfigError, HorizonError
 from src.overrides import OUTSIDE_IDENTITY, is_of, key_of
 from src.reporting.sweep_file import RowConfig, SweepConfig
+from src.reporting.sweep_record import suffix_of
 
 
 @dataclass(frozen=True)
@@ -47,13 +48,14 @@ class Plan:
     sweep: SweepConfig
     scale: str
     seeds: list[int]
+    changes: list[str] = field(default_factory=list)  # by the command line, of every row; see `changes_of`
     rows: dict[str, dict[int, str]] = field(default_factory=dict)  # run id by label and seed
     cells: dict[str, Cell] = field(default_factory=dict)  # by run id, what is needed before what needs it
 
     @property
     def study(self) -> str:
         """Name of the study that coordinates it."""
-        return f"{self.sweep.name}-{self.scale}"
+        return f"{self.sweep.name}-{self.scale}{suffix_of(self.changes)}"
 
     def labels(self, run_id: str) -> list[str]:
         """Rows that show this run."""
@@ -75,6 +77,27 @@ def split_machine(overrides: list[str]) -> tuple[list[str], list[str]]:
     return [override for override in overrides if override not in machine], machine
 
 
+def changes_of(sweep: SweepConfig, common: list[str]) -> list[str]:
+    """What the command line makes of a sweep that its file does not say, sorted: with it, it is another experiment.
+
+    Raises ConfigError for a phase other than the file's own.
+    """
+    common = join_overrides(common)
+    told = [override for override in common if key_of(override) == "phase"]
+    for where, overrides in [("overrides", sweep.overrides), *((f"row {r.label!r}", r.overrides) for r in sweep.rows)]:
+        for own in overrides:
+            if told and key_of(own) == "phase" and _value_of(own) != _value_of(told[0]):
+                raise ConfigError(
+                    f"{told[0]} contradicts {own} of sweeps/{sweep.name}.yaml, {where}; leave it out or change the file"
+                )
+    outside = (*OUTSIDE_IDENTITY, "seed", "scale")
+    return sorted(change for change in common if not is_of(change, outside) and change not in sweep.overrides)
+
+
+def _value_of(override: str) -> str:
+    return override.partition("=")[2].strip("'\"")
+
+
 def make_plan(sweep: SweepConfig, common: list[str], seeds: list[int], identify: Identify) -> Plan:
     """Plan every row with every seed; seed by seed, and of each seed first what several rows start from.
 
@@ -83,7 +106,7 @@ def make_plan(sweep: SweepConfig, common: list[str], seeds: list[int], identify:
     """
     scale = compose_file(sweep, common, identify).scale
     sweep = sweep.at_scale(scale)
-    plan = Plan(sweep, scale, list(seeds))
+    plan = Plan(sweep, scale, list(seeds), changes_of(sweep, common))
     if sweep.is_search:
         return plan
     for seed in seeds:

@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
@@ -17,7 +18,7 @@ from optuna.trial import Trial
 from src.errors import HorizonError
 from src.reporting.sweep_record import SweepRecord
 from src.sweeping.keeping import Keeper
-from src.sweeping.launcher import Launcher, Stop
+from src.sweeping.launcher import Ended, Launcher, Stop
 from src.sweeping.plan import Cell, Plan
 from src.sweeping.progress import progress_line
 from src.sweeping.runs import is_busy, is_finished, read_score
@@ -160,33 +161,36 @@ class Runner:
     def _train(self, cell: Cell, worker: int, trial: Trial) -> float:
         """Train a cell that is taken; its score. Raises CellEndedError when there is none."""
         self._guarded(self.keeper.write)
-        reason = self.train(cell, worker)
-        if reason is not None:
-            if reason:
-                self.study.note(trial, "reason", reason)
-            raise CellEndedError(reason)
+        ended = self.train(cell, worker)
+        if ended is not None:
+            if ended.reason:
+                self.study.note(trial, "reason", ended.reason)
+            raise CellEndedError(ended.reason)
         return read_score(self.outputs / cell.run_id, "mAP") or 0.0
 
-    def train(self, cell: Cell, worker: int, watch: Callable[[], bool] | None = None) -> str | None:
-        """Bring one run to its end, here or by whoever has it: None when done, why it failed, empty if interrupted."""
+    def train(self, cell: Cell, worker: int, watch: Callable[[], bool] | None = None) -> Ended | None:
+        """Bring one run to its end, here or by whoever has it: None when done, else how it ended.
+
+        The reason is empty where it was interrupted and can go on.
+        """
         folder = self.outputs / cell.run_id
         while True:
             self._wait_for_others(cell, folder)
             if self.keeper.is_done(cell.run_id):
                 return None
             if self.stop.requested:
-                return ""
+                return Ended(0, "", told=True)
             logger.info("%s: started %s", name_of(cell), cell.run_id)
             began = time.monotonic()
             ended = self.launcher.run(cell, worker, self.stop, watch)
-            if "is being trained by another process" not in ended.reason:
+            if not ended.busy:
                 break
         seconds = time.monotonic() - began
         if ended.interrupted and not self.keeper.is_done(cell.run_id):
             self._interruptions[cell.run_id] += not ended.told
             if self._interruptions[cell.run_id] < MOST_INTERRUPTIONS:
                 logger.info("%s: interrupted after %.0f s; it can go on", name_of(cell), seconds)
-                return ""
+                return replace(ended, reason="")
         reason = ended.reason
         if not reason and not is_finished(folder):
             reason = f"it ended with exit code 0, but {folder} has no run.json and metrics.json"
@@ -194,7 +198,7 @@ class Runner:
             reason = f"{folder / 'metrics.json'} has no finite mAP"
         if reason:
             logger.warning("%s: FAILED after %.0f s: %s; log: %s", name_of(cell), seconds, reason, self._log(cell))
-            return reason
+            return replace(ended, reason=reason)
         score = read_score(folder, "mAP") or 0.0
         logger.info("%s: done after %.0f s, mAP %.1f %%", name_of(cell), seconds, 100 * score)
         self._publish(cell.run_id)

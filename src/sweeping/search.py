@@ -12,7 +12,7 @@ from typing import Any
 import optuna
 from optuna.trial import Trial
 
-from src.errors import HorizonError
+from src.errors import DivergedError, HorizonError
 from src.reporting.sweep_file import DimensionConfig
 from src.sweeping.keeping import cell_from
 from src.sweeping.plan import Cell, Identify, cells_of, join_overrides, split_machine
@@ -114,18 +114,18 @@ class Search(Runner):
         machine = split_machine(join_overrides(self.sweep.overrides, self._common))[1]
         *sources, cell = [replace(cell_from(content), machine=machine) for content in attrs["cells"]]
         for source in sources:
-            reason = self.train(source, worker)
-            if reason is not None:
-                self._fail(trial, reason and f"{source.run_id}, which it starts from, failed: {reason}")
+            ended = self.train(source, worker)
+            if ended is not None:
+                self._fail(trial, ended.reason and f"{source.run_id}, which it starts from, failed: {ended.reason}")
         watch = _Watch(self.study, trial, self.outputs / cell.run_id, self.sweep.objective)
-        reason = self.train(cell, worker, watch)
+        ended = self.train(cell, worker, watch)
         watch()  # what came since the last look: later trials are compared with all of it
         if watch.pruned and not self.keeper.is_done(cell.run_id):
             self.study.note(trial, "value", watch.last)
             logger.info("%s: pruned, val/%s %.4f", name_of(cell), self.sweep.objective, watch.last)
             raise optuna.TrialPruned
-        if reason is not None:
-            self._fail(trial, reason, answer="diverged" in reason)
+        if ended is not None:
+            self._fail(trial, ended.reason, answer=ended.code == DivergedError.exit_code)
         value = read_score(self.outputs / cell.run_id, self.sweep.objective)
         if value is None:
             self._fail(trial, f"metrics.json has no finite {self.sweep.objective}", answer=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import re
 import socket
 import time
 import warnings
@@ -23,16 +22,20 @@ import optuna
 from optuna.storages import RDBStorage
 from optuna.trial import FrozenTrial, Trial, TrialState
 from sqlalchemy import text
-from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
 from src.errors import ConfigError
+from src.sweeping.address import for_optuna, masked, without_secrets
 
 FORMAT = 1
 HEARTBEAT_S = 60
 GRACE_S = 300
 """A worker of another machine that has not been heard of for so long is dead."""
 CONNECT_S = 15
+DATABASE_FAULTS = (
+    SQLAlchemyError, optuna.exceptions.StorageInternalError, ImportError, RuntimeError, ValueError, LookupError,
+)  # fmt: skip
+"""What SQLAlchemy, Optuna and a driver raise over an address or a database."""
 
 
 class CellEndedError(Exception):
@@ -83,44 +86,22 @@ def file_lock(path: Path) -> Iterator[Hold]:
         file.close()
 
 
-def default_storage(outputs: Path) -> str:
-    """The SQLite database that studies of one machine share; its path is as relative as `outputs`."""
-    return f"sqlite:///{outputs / 'sweeps' / 'sweeps.db'}"
-
-
-def masked(url: str) -> str:
-    """A database's address without its password, whatever it looks like."""
-    url = re.sub(r"(://[^/@]*?:)[^@]*(?=@)", r"\1***", url)
-    return re.sub(r"(?i)((?:password|passwd|sslpassword)=)[^&\s]*", r"\1***", url)
-
-
 @contextmanager
 def database_errors(url: str) -> Iterator[None]:
     """Turn what a database and its driver raise into one line with the masked address. Raises ConfigError."""
     remedy = "check storage=..., and that the server runs; finished runs are kept, the same command goes on"
     try:
         yield
-    except (SQLAlchemyError, optuna.exceptions.StorageInternalError, ImportError, RuntimeError, ValueError) as error:
+    except DATABASE_FAULTS as error:
         if not isinstance(error, SQLAlchemyError) and isinstance(error.__cause__, SQLAlchemyError):
             error = error.__cause__
         said = str(getattr(error, "orig", None) or error).strip().splitlines() or [type(error).__name__]
-        said = " ".join(line.strip() for line in said[:2])
-        secret = _password(url)
-        if secret:
-            said = said.replace(secret, "***")
+        said = without_secrets(" ".join(line.strip() for line in said[:2]), url)
         if isinstance(error, ImportError):
             remedy = 'a PostgreSQL server needs `pip install "horizon3d[postgres]"`'
         raise ConfigError(
             f"storage={masked(url)}: the database of the sweep cannot be used ({said}); {remedy}"
         ) from error
-
-
-def _password(url: str) -> str | None:
-    try:
-        password = make_url(url).password
-    except (SQLAlchemyError, ValueError):
-        return None
-    return str(password) if password else None
 
 
 class SweepStudy:
@@ -295,7 +276,9 @@ def _open_storage(url: str) -> RDBStorage:
         arguments = {"connect_args": {"connect_timeout": CONNECT_S}, "pool_pre_ping": True}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        return RDBStorage(url, engine_kwargs=arguments, heartbeat_interval=HEARTBEAT_S, grace_period=GRACE_S)
+        return RDBStorage(
+            for_optuna(url), engine_kwargs=arguments, heartbeat_interval=HEARTBEAT_S, grace_period=GRACE_S
+        )
 
 
 def _attempt(trial: FrozenTrial) -> Attempt:

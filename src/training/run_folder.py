@@ -12,7 +12,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from src.errors import CheckpointError, ConfigError, DataError
+from src.errors import BusyError, CheckpointError, ConfigError, DataError
 from src.training.checkpoints import read_checkpoint
 
 logger = logging.getLogger(__name__)
@@ -68,7 +68,7 @@ class RunFolder:
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise ConfigError(f"{self.path} is being trained by another process; wait for it or end it") from error
+            raise BusyError(f"{self.path} is being trained by another process; wait for it or end it") from error
 
     def _release(self) -> None:
         self._lock.close()

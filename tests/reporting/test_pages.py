@@ -130,7 +130,9 @@ def test_other_data_is_refused(both_phases, write_run, report):
 def test_everything_of_a_scale_is_written(both_phases, report, tmp_path, make_record, exported):
     record = make_record({"4.8 m": {"mAP": 20.3}}, seeds=1)
     write_record(record_path(tmp_path / "reports", "epsilon", "mini"), record)
-    write_record(record_path(tmp_path / "reports", "other", "debug"), make_record({"x": {}}, scale="debug"))
+    write_record(
+        record_path(tmp_path / "reports", "other", "debug"), make_record({"x": {}}, scale="debug", name="other")
+    )
     report("phase1")
     reports = tmp_path / "reports"
     assert {path.name for path in reports.iterdir()} >= {"phase1_mini.md", "phase2_mini.md", "results", "tables"}
@@ -181,6 +183,8 @@ def test_rows_of_sweeps_do_not_flood_the_pages(both_phases, write_run, tmp_path,
     write_run("c0", ["model.kggi.initialization=random"], 0, 0.2)  # a row that has a name on the page
     write_run("d0", ["model.ocsf.num_layers=4"], 0, 0.1)  # of no sweep
     record = make_record({"0.8 m": {}, "4.8 m": {}, "random": {}}, seeds=1)
+    record.rows["4.8 m"] = {2: record.rows["4.8 m"][0]}
+    record.runs[record.rows["4.8 m"][2]].seed = 2
     write_record(record_path(tmp_path / "reports", "epsilon", "mini"), record)
     text = report("phase1")
     summary = rows(text, "| experiment | mAP | NDS | car AP |")

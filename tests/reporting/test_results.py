@@ -116,6 +116,13 @@ def test_broken_records_of_runs_are_named(write_run, reports, content):
 
 
 SCORES = [
+    (lambda m: m.update(mAP=1.5), "mAP must be from 0 to 1, but is 1.5"),
+    (lambda m: m.update(NDS=-0.1), "NDS must be from 0 to 1, but is -0.1"),
+    (lambda m: m["classes"]["car"].update(AP=30), r"classes\.car\.AP must be from 0 to 1"),
+    (lambda m: m["speeds"]["25+"].update(mAP_present=2.0), r"speeds\.25\+\.mAP_present must be from 0 to 1"),
+    (lambda m: m.update(mAVE=-2e6), r"mAVE must be from -1e\+06 to 1e\+06"),
+    (lambda m: m.update(mAVE=int("9" * 400)), r"mAVE must be at most 1e\+15 in size, but is 9+"),
+    (lambda m: m["classes"]["truck"].update(AVE=1e308), r"classes\.truck\.AVE must be at most 1e\+15"),
     (lambda m: m["classes"]["car"].update(AP="0.3"), r"classes\.car\.AP must be float or int, but is '0\.3'"),
     (lambda m: m["ranges"]["0-25"].clear(), r"ranges\.0-25\.mAP is missing"),
     (lambda m: m["ranges"]["0-25"].update(classes=None), r"ranges\.0-25\.classes must be dict"),
@@ -170,6 +177,12 @@ def test_and_with_its_result(published, change, message):
         (lambda c: c.update(latency={"ms": {}, "memory_gb": 1.0}), r"latency\.fps is missing"),
         (lambda c: c.update(latency=7), "latency must be dict or null, but is 7"),
         (lambda c: c.update(model=None), "model must be str"),
+        (lambda c: c.update(run_id="horizon3d-phase1-mini-b"), "run_id must be horizon3d-phase1-mini-a, as the file"),
+        (lambda c: c.update(parameters=int("9" * 400)), r"parameters must be at most 1e\+15"),
+        (
+            lambda c: c.update(latency={"ms": {}, "fps": 1.0, "memory_gb": 1.0, "spread_ms": {"total": "x"}}),
+            r"latency\.spread_ms\.total must be float or int",
+        ),
     ],
 )
 def test_a_result_that_is_not_one_is_named(published, change, message):
@@ -188,6 +201,26 @@ def test_truncated_and_foreign_files_are_named_and_the_rest_is_read(published, w
     assert {path.name.split("-")[-1]: str(error).removeprefix(f"{path}: ")[:20] for path, error in broken.items()} == {
         "a.json": "not readable as JSON", "bytes.json": "not readable as JSON", "list.json": "must hold an object,"
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("depth", [100_000, 940])  # the second is read, but hardly walked through
+def test_deep_json_is_named(published, reports, depth):
+    content = published.read_text()
+    published.write_text(content.replace('"data": ', f'"data": {"[" * depth}{"]" * depth}, "x": ', 1))
+    with pytest.raises(DataError, match=r"mini-a\.json: .*delete it and run python -m src\.report"):
+        read_result(published)
+    assert read_results(reports)[1].keys() == {published}
+
+
+def test_a_share_of_all_may_be_a_rounding_above_one(published):
+    damage(published, lambda c: c["metrics"].update(mAP=1.0000000000000002))
+    assert read_result(published).metrics["mAP"] == 1.0000000000000002
+
+
+def test_losses_too_large_to_draw_are_left_out(write_run, reports):
+    folder = write_run("a", [], 0, 0.3)
+    (folder / "metrics.csv").write_text("step,loss/total\n1,1e300\n2,5.0\n")
+    assert read_result(publish_result(folder, reports)).curves == {"loss/total": [[2, 5.0]]}
 
 
 def test_a_run_without_its_configuration_is_named(write_run, reports):

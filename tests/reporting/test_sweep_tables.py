@@ -61,7 +61,7 @@ def test_means_spreads_and_differences_by_hand(make_record, results_of):
     assert "mAP, %: paper" in table.to_markdown() and "mAVE, m/s: paper" not in table.to_markdown()
 
 
-def test_the_smaller_error_is_bold_and_a_tie_is_not(make_record, results_of):
+def test_the_smaller_error_is_bold_and_a_tie_of_all_is_not(make_record, results_of):
     record = make_record({"a": {}, "b": {}}, seeds=1, columns=("mAVE",))
     (table,) = sweep_tables(record, results_of({"a0": 0.2, "b0": 0.3}))
     assert [row.cells[0].best for row in table.rows] == [False, True]  # 0.8 and 0.7
@@ -101,11 +101,12 @@ def test_one_seed_has_no_spread_and_says_so(make_record, results_of):
 def test_the_caption_names_what_was_run(make_record, results_of):
     results = results_of(THREE)
     results[f"{PREFIX}b2"].commit = "fedcba9876543210+"
-    results[f"{PREFIX}b1"].phase, results[f"{PREFIX}b1"].epochs = "phase2", 4
+    for seed in range(3):
+        results[f"{PREFIX}b{seed}"].phase, results[f"{PREFIX}b{seed}"].epochs = "phase2", 1
     results[f"{PREFIX}a0"].latency = {"processor": "Fast CPU", "threads": 1, "ms": {}}
     (table,) = sweep_tables(make_record({"a": {}, "b": {}}), results)
     assert table.caption == (
-        "Data: synthetic highway world, split val; scale mini; phase1: 6 epochs; phase2: 4 epochs; seeds 0, 1, 2: "
+        "Data: synthetic highway world, split val; scale mini; phase1: 6 epochs; phase2: 1 epoch; seeds 0, 1, 2: "
         "mean ± standard deviation; code 0123456789, fedcba9876+; cpu, 1 process of 2 threads; latency on Fast CPU, "
         "1 thread."
     )
@@ -130,6 +131,86 @@ def test_rows_without_numbers_say_why(make_record, results_of):
     assert [row.state for row in table.rows] == ["failed", "failed", "running", "waiting", "failed"]
     assert not any(cell.best for row in table.rows for cell in row.cells)  # no row is whole
     assert "Bold is the best of the rows whose seeds have all finished." in table.caption
+
+
+def test_numbers_of_an_earlier_training_are_marked_and_do_not_count(make_record, results_of):
+    states = {
+        "b0": {"state": "failed", "reason": "loss is nan", "log": "logs/b0.txt"},
+        "c0": {"state": "running"}, "d0": {"state": "waiting"},
+    }  # fmt: skip
+    record = make_record(dict.fromkeys("abcd", {}), seeds=1, columns=("mAP",), states=states)
+    (table,) = sweep_tables(record, results_of({"a0": 0.1, "b0": 0.2, "c0": 0.3, "d0": 0.4}))
+    assert [row.state for row in table.rows] == ["done", "failed", "running", "waiting"]
+    assert [row.done for row in table.rows] == [1, 0, 0, 0]
+    assert [row.note for row in table.rows] == [
+        "", "failed again: loss is nan (logs/b0.txt); the number is of an earlier training",
+        "running; the number is of an earlier training", "waiting; the number is of an earlier training",
+    ]  # fmt: skip
+    text = cells_of(table.to_markdown())
+    assert text["d"][:2] == [" 40.0 (n = 1) ", " 0 of 1 "] and "**" not in table.to_markdown()
+
+
+def test_a_result_of_another_seed_is_refused_by_name(make_record, results_of):
+    results = results_of({"a0": 0.1, "a1": 0.2})
+    results[f"{PREFIX}a1"].seed = 7
+    with pytest.raises(DataError, match=f"{PREFIX}a1 stands for seed 1, but its result is of seed 7"):
+        sweep_tables(make_record({"a": {}}, seeds=2), results)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"overrides": ["model.x=2"]}, {"config": {"seed": 1, "x": 2}}, {"phase": "phase2"}, {"model": "other"}],
+)
+def test_a_row_never_mixes_configurations(make_record, results_of, changes):
+    results = results_of({"a0": 0.1}) | results_of({"a1": 0.2}, **changes)
+    with pytest.raises(DataError, match=f"row a: .*{PREFIX}a0 and {PREFIX}a1 differ in more than their seed"):
+        sweep_tables(make_record({"a": {}}, seeds=2), results)
+
+
+def test_a_setting_that_was_typed_though_it_is_the_default_is_the_same(make_record, results_of):
+    results = results_of({"a0": 0.1}, config={"seed": 0, "x": 1})
+    results |= results_of({"a1": 0.2}, config={"seed": 1, "x": 1}, overrides=["x=1"])
+    assert sweep_tables(make_record({"a": {}}, seeds=2), results)[0].rows[0].done == 2
+
+
+def test_verdicts_are_about_the_digits_shown(make_record, results_of):
+    paper = {"a": {"mAP": 18.0}, "b": {"mAP": 18.04}, "c": {"mAP": 10.0}}
+    record = make_record(paper, seeds=1, columns=("mAP",), baseline="b")
+    (table,) = sweep_tables(record, results_of({"a0": 0.20001, "b0": 0.20003, "c0": 0.1}))
+    assert table.text[1] == (
+        "mAP: 2 of the paper's 3 orderings of two rows hold here in the mean, 1 ties at the digits shown."
+    )
+    assert table.text[2].startswith("mAP, a against b: paper -0.04, here +0.0, no difference at the digits shown; ")
+    assert [row.cells[0].best for row in table.rows] == [True, True, False]  # a tie as shown
+    assert "-0.0 " not in table.to_markdown()
+
+
+def test_the_one_ordering_may_be_a_tie(make_record, results_of):
+    record = make_record({"a": {"mAP": 18.0}, "b": {"mAP": 19.0}}, seeds=1, columns=("mAP",))
+    (table,) = sweep_tables(record, results_of({"a0": 0.2, "b0": 0.20004}))
+    assert table.text[1] == ("mAP: the paper's one ordering of two rows ties at the digits shown in the mean.")
+    assert [row.cells[0].best for row in table.rows] == [False, False]
+
+
+def timed(result, total, spread, **load):
+    """The result with a latency of this total and range of the middle half."""
+    result.latency = {"ms": {"total": total}, "spread_ms": {"total": spread}, "processor": "CPU", "threads": 1} | load
+    result.metrics |= {"latency.total": total, "latency.fps": 1e3 / total}
+
+
+def test_a_latency_of_one_run_shows_the_spread_of_its_frames(make_record, results_of):
+    record = make_record({"a": {}, "b": {}}, seeds=1, columns=("latency.total", "latency.fps"))
+    results = results_of({"a0": 0.1, "b0": 0.1})
+    timed(results[f"{PREFIX}a0"], 250.0, 20.0)
+    timed(results[f"{PREFIX}b0"], 200.0, 40.0, load=3.0, cores=4)
+    (table,) = sweep_tables(record, results)
+    text = cells_of(table.to_markdown())
+    assert text["a"][:2] == [" 250.0 ± 10.0 ", " 4.00 ± 0.16 "] and text["b"][0] == " **200.0 ± 20.0** "
+    assert "half the range of the middle half of its frames" in table.caption
+    assert "latency measured on a busy machine" in table.caption
+    timed(results[f"{PREFIX}b0"], 225.0, 40.0, load=1.0, cores=4)  # 25 apart, within 10 + 20
+    (table,) = sweep_tables(record, results)
+    assert not any(cell.best for row in table.rows for cell in row.cells) and "busy" not in table.caption
 
 
 def test_a_failed_single_run_stands_as_failed(make_record, results_of):
@@ -339,7 +420,7 @@ def test_every_sweep_has_tables_before_and_after_it_ran(name, scale, make_result
     sweep = load_sweep(name).at_scale(scale)
     rows = {row.label: {seed: f"{place}-{seed}" for seed in (0, 1)} for place, row in enumerate(sweep.rows)}
     runs = {
-        run_id: RunState(run_id=run_id, overrides=[], seed=seed, label=label)
+        run_id: RunState(run_id=run_id, overrides=[], seed=seed, label=label, state="done")
         for label, of in rows.items() for seed, run_id in of.items()
     }  # fmt: skip
     record = SweepRecord(

@@ -15,7 +15,7 @@ def record_of(**states):
     for name, state in states.items():
         run_id = f"m-{name.replace('_', '-mini-')}"
         runs[run_id] = RunState(run_id=run_id, overrides=[], seed=0, label="a", state=state, started=NOW - 20.0)
-    sweep = SweepConfig(title="t", question="q", rows=[RowConfig(label="a")])
+    sweep = SweepConfig(name="a", title="t", question="q", rows=[RowConfig(label="a")])
     return SweepRecord(sweep=sweep, scale="mini", command="", seeds=[0], rows={}, runs=runs, study="", storage="")
 
 

@@ -9,12 +9,13 @@ from pathlib import Path
 
 from src.errors import HorizonError
 from src.reporting.sweep_file import DimensionConfig, RowConfig, SweepConfig
+from src.sweeping.address import default_storage
 from src.sweeping.keeping import Keeper
 from src.sweeping.launcher import Launcher
 from src.sweeping.plan import make_plan
 from src.sweeping.runner import Runner
 from src.sweeping.search import Search
-from src.sweeping.study import SweepStudy, default_storage
+from src.sweeping.study import SweepStudy
 from tests.sweeping.fake_train import identify
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -52,7 +52,7 @@ def main(overrides):
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
-        print(f"ConfigError: {folder} is being trained by another process; wait for it or end it", file=sys.stderr)
+        print(f"BusyError: {folder} is being trained by another process; wait for it or end it", file=sys.stderr)
         sys.exit(3)
     if (folder / "run.json").exists():
         print("shown again")

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from src.sweeping.launcher import Launcher, Stop, explain
+from src.sweeping.launcher import Launcher, Stop, explain, quoted
 from src.sweeping.plan import Cell
 
 
@@ -81,6 +81,13 @@ def test_the_log_is_continued_and_only_the_last_start_explains(tmp_path):
     assert run("pass").reason == ""
     assert "first" in launcher.log_of("x").read_text() and launcher.log_of("x").read_text().count("====") == 3
     assert "could not be started" in launcher.run_command(["/no/such"], "x", 0, Stop()).reason
+
+
+@pytest.mark.parametrize("label", ["a\\b", "end\\", 'quo"te', 'both\\"', "\\\\", "it's, a=b {c} [d]"])
+def test_hydra_reads_a_label_as_it_is(label):
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    assert OverridesParser.create().parse_override(f"row={quoted(label)}").value() == label
 
 
 def test_weights_and_biases_is_told_sweep_and_row(tmp_path):

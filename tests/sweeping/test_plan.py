@@ -3,7 +3,8 @@
 import pytest
 
 from src.errors import ConfigError
-from src.sweeping.plan import join_overrides, make_plan, split_machine
+from src.reporting.sweep_record import suffix_of
+from src.sweeping.plan import changes_of, join_overrides, make_plan, split_machine
 from tests.sweeping.fake_sweep import make_sweep
 from tests.sweeping.fake_train import identify
 
@@ -38,7 +39,7 @@ def test_order_is_seed_by_seed_and_first_what_others_start_from():
     assert first.overrides == ["phase=phase1", "model.x=2", "seed=3"] and first.needs is None
     assert second.overrides == ["model.x=2", "phase=phase2", "seed=3"] or second.needs == first.run_id
     assert plan.rows["b"] == plan.rows["b again"] and plan.labels(second.run_id) == ["b", "b again"]
-    assert plan.study == "fake-debug"
+    assert plan.changes == ["model.x=2"] and plan.study == f"fake-debug{suffix_of(plan.changes)}"
 
 
 def test_a_run_that_no_row_shows_says_what_it_is_for():
@@ -64,3 +65,29 @@ def test_a_sweep_is_of_one_scale():
     sweep.rows[1].scales = ["paper"]
     plan = make_plan(sweep, [], [0], identify)
     assert list(plan.rows) == ["a"] and [row.label for row in plan.sweep.paper_rows] == ["b"]
+
+
+def test_what_a_command_line_changes_makes_another_experiment():
+    sweep = make_sweep({"a": ["model.x=1"]}, overrides=["phase=phase1"])
+    places = ["scale=debug", "seed=3", "paths.outputs=/o", "trainer=cpu", "logger=wandb", "data.num_workers=2"]
+    assert make_plan(sweep, places, [0], identify).study == "fake-debug"
+    assert changes_of(sweep, [*places, "phase=phase1"]) == []  # as the file says
+    assert changes_of(sweep, ["phase=phase1", "optim.lr=1", "data=synthetic", "optim.lr=2"]) == [
+        "data=synthetic",
+        "optim.lr=2",
+    ]
+    names = {
+        make_plan(sweep, [*places, *more], [0], identify).study
+        for more in ([], ["optim.lr=1"], ["optim.lr=2"], ["optim.lr=2", "model.z=1"], ["model.z=1", "optim.lr=2"])
+    }
+    assert len(names) == 4 and all(name.startswith("fake-debug") for name in names)
+
+
+def test_a_phase_other_than_the_files_is_refused():
+    with pytest.raises(ConfigError, match="phase=phase2 contradicts phase=phase1 of sweeps/fake.yaml, overrides"):
+        make_plan(make_sweep({"a": []}, overrides=["phase=phase1"]), ["phase=phase2"], [0], identify)
+    rows = {"a": ["phase=phase2"], "b": ["phase=phase1"]}
+    with pytest.raises(ConfigError, match="phase=phase2 contradicts phase=phase1 of sweeps/fake.yaml, row 'b'"):
+        make_plan(make_sweep(rows), ["phase=phase2"], [0], identify)
+    plan = make_plan(make_sweep({"a": ["model.x=1"]}), ["phase=phase2"], [0], identify)  # the file says none
+    assert plan.changes == ["phase=phase2"]

@@ -14,6 +14,7 @@ import pytest
 
 from src.errors import ConfigError
 from src.reporting.sweep_record import read_record, record_path, write_record
+from src.sweeping.launcher import Ended
 from tests.sweeping.fake_sweep import ROOT, make_runner, make_sweep
 from tests.sweeping.fake_train import identify
 
@@ -140,6 +141,56 @@ def test_rows_and_seeds_extend_a_sweep_and_earlier_seeds_stay(tmp_path):
     assert changed.seeds == [0] and len(changed.runs) == 3
 
 
+def test_another_command_line_is_another_sweep_beside_the_first(tmp_path):
+    sweep = make_sweep({"a": ["model.x=1"]})
+    plain = make_runner(tmp_path, sweep).run()
+    runner = make_runner(tmp_path, sweep, common=["optim.lr=0.01"])
+    changed = runner.run()
+    assert changed.changes == ["optim.lr=0.01"] and changed.rows != plain.rows and changed.study == runner.study.name
+    assert record_of(tmp_path) == plain  # not replaced
+    assert read_record(runner.keeper.path) == changed and runner.keeper.path.stem == changed.stem != plain.stem
+    assert make_runner(tmp_path, sweep).run().seeds == [0] and changed.study != plain.study
+
+
+def test_an_earlier_seed_of_another_definition_leaves_the_table(tmp_path):
+    make_runner(tmp_path, make_sweep({"a": ["model.x=1"], "b": ["model.x=2"]}), seeds=(0,)).run()
+    record = make_runner(tmp_path, make_sweep({"a": ["model.x=1"], "b": ["model.x=3"]}), seeds=(1,)).run()
+    assert sorted(record.rows["a"]) == [0, 1] and sorted(record.rows["b"]) == [1]
+
+
+def test_a_source_of_an_earlier_seed_is_looked_at_again(tmp_path):
+    sweep = make_sweep({"two": ["phase=phase2"]})
+    record = make_runner(tmp_path, sweep, seeds=(0,)).run()
+    source = record.runs[record.runs[record.rows["two"][0]].needs]
+    source.state, source.worker = "running", "a host:1"
+    write_record(record_path(tmp_path / "reports", "fake", "debug"), record)
+    again = make_runner(tmp_path, sweep, seeds=(1,)).run()
+    assert again.runs[source.run_id].state == "done" and again.runs[source.run_id].worker is None
+
+
+def test_words_of_a_failure_decide_nothing(tmp_path):
+    """A setting's error that quotes what a busy folder or a diverged run would say is a failure like others."""
+    folder = tmp_path / "outputs" / fault(tmp_path, ["model.x=1", "seed=0"], "3")
+    code = f"print('ConfigError: {folder} is being trained by another process; it diverged'); raise SystemExit(3)"
+    runner = make_runner(tmp_path, make_sweep({"a": ["model.x=1"]}))
+    runner.launcher.command = [sys.executable, "-c", code]
+    (run,) = runner.run().runs.values()
+    assert run.state == "failed" and "is being trained by another process" in run.reason
+
+
+def test_a_busy_folder_is_waited_for_even_when_it_is_free_at_the_next_look(tmp_path):
+    runner = make_runner(tmp_path, make_sweep({"a": ["model.x=1"]}))
+    own, starts = runner.launcher.run, []
+
+    def run(*arguments):
+        starts.append(1)
+        busy = Ended(3, "BusyError: the folder is being trained by another process (exit code 3)", told=False)
+        return busy if len(starts) == 1 else own(*arguments)
+
+    runner.launcher.run = run
+    assert runner.run().count("done") == 1 and len(starts) == 2
+
+
 def test_a_run_that_someone_else_trains_is_waited_for(tmp_path):
     rows = {"a": ["model.x=1"]}
     outputs = tmp_path / "outputs"
@@ -171,7 +222,7 @@ def test_several_runners_at_once_train_every_cell_once(tmp_path):
 @pytest.mark.slow
 def test_two_workers_killed_at_random_times_finish_every_row_once(tmp_path):
     rng = random.Random(5)
-    what = {"rows": TWELVE, "common": ["fake.seconds=0.4"]}
+    what = {"rows": TWELVE, "sweep": {"overrides": ["fake.seconds=0.4"]}}
     runners = [start(tmp_path, **what) for _ in range(2)]
     for kill in range(5):
         before = trained(tmp_path, "begin").total()
@@ -189,7 +240,7 @@ def test_two_workers_killed_at_random_times_finish_every_row_once(tmp_path):
 
 @pytest.mark.slow
 def test_children_of_a_killed_runner_end_and_the_same_command_goes_on_at_once(tmp_path):
-    what = {"rows": {"a": ["model.x=1"]}, "common": ["fake.seconds=30"]}
+    what = {"rows": {"a": ["model.x=1"]}, "sweep": {"overrides": ["fake.seconds=30"]}}
     runner = start(tmp_path, **what)
     wait_for(lambda: trained(tmp_path, "begin"))
     pid = int((tmp_path / "outputs" / "trained.txt").read_text().split()[-1])
@@ -209,7 +260,7 @@ def test_children_of_a_killed_runner_end_and_the_same_command_goes_on_at_once(tm
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_sweep_lets_runs_write_checkpoints_and_goes_on(tmp_path, number):
     what = {"rows": {"a": ["model.x=1"], "b": ["model.x=2"]}, "workers": 2}
-    runner = start(tmp_path, **what, common=["fake.seconds=30"])
+    runner = start(tmp_path, **what, sweep={"overrides": ["fake.seconds=30"]})
     wait_for(lambda: trained(tmp_path, "begin").total() == 2)
     runner.send_signal(number)
     assert "stopping" in finish(runner, expect=6)

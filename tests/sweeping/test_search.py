@@ -47,9 +47,13 @@ def test_choices_are_repeatable(tmp_path):
 
 @pytest.mark.slow
 def test_trials_that_promise_little_are_pruned(tmp_path):
-    search(tmp_path, 5, {"fake.score": {"low": 0.8, "high": 0.9}}, ["fake.epochs=4", "fake.seconds=0.1"]).run()
+    search(
+        tmp_path, 5, {"fake.score": {"low": 0.8, "high": 0.9}}, overrides=["fake.epochs=4", "fake.seconds=0.1"]
+    ).run()
     # The same study must not see another space; widen it behind its back to have a bad trial for certain.
-    runner = search(tmp_path, 6, {"fake.score": {"low": 0.8, "high": 0.9}}, ["fake.epochs=4", "fake.seconds=6"])
+    runner = search(
+        tmp_path, 6, {"fake.score": {"low": 0.8, "high": 0.9}}, overrides=["fake.epochs=4", "fake.seconds=6"]
+    )
     runner.sweep.space["fake.score"].low, runner.sweep.space["fake.score"].high = 0.1, 0.2
     record = runner.run()
     assert record.count("done") == 5 and record.count("pruned") == 1
@@ -67,6 +71,15 @@ def test_an_objective_that_is_no_number_is_a_failed_trial_and_not_tried_again(tm
     begun = trained(tmp_path, "begin").total()
     search(tmp_path, 2, space).run()
     assert trained(tmp_path, "begin").total() == begun == 1
+
+
+@pytest.mark.parametrize(("code", "again"), [("5", False), ("4", True)])
+def test_only_the_exit_code_of_a_diverged_run_is_an_answer(tmp_path, code, again):
+    space = {"model.x": {"choices": [1, 1]}}
+    fault(tmp_path, ["model.x=1", "seed=0"], code)  # what it prints is that it diverged, both times
+    assert search(tmp_path, 1, space, workers=1).run().count("failed") == 1
+    search(tmp_path, 1, space, workers=1).run()
+    assert trained(tmp_path, "begin").total() == 1 + again
 
 
 def test_a_database_that_is_away_for_a_moment_ends_no_run(tmp_path):
@@ -88,7 +101,7 @@ def test_a_database_that_is_away_for_a_moment_ends_no_run(tmp_path):
 
 @pytest.mark.slow
 def test_a_killed_search_goes_on_with_the_same_values(tmp_path):
-    what = {"space": SPACE, "sweep": {"objective": "NDS", "trials": 2}, "common": ["fake.seconds=1"]}
+    what = {"space": SPACE, "sweep": {"objective": "NDS", "trials": 2, "overrides": ["fake.seconds=1"]}}
     runner = start(tmp_path, **what)
     wait_for(lambda: trained(tmp_path, "begin"))
     (first,) = trained(tmp_path, "begin")

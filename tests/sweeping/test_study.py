@@ -14,7 +14,8 @@ import pytest
 from optuna.trial import TrialState
 
 from src.errors import ConfigError
-from src.sweeping.study import CellEndedError, SweepStudy, default_storage, masked
+from src.sweeping.address import default_storage
+from src.sweeping.study import CellEndedError, SweepStudy
 from tests.sweeping.fake_sweep import ROOT, make_runner, make_sweep
 
 ROWS = {"format": 1, "kind": "rows"}
@@ -29,16 +30,6 @@ def take(study, work, **more):
     with study.lock() as hold:
         study.clear_dead()
         study.take(hold, work, attrs={"run_id": "a"}, params={}, **more)
-
-
-def test_passwords_are_masked():
-    assert masked("postgresql+psycopg://me:s3cr:et@host:5/db") == "postgresql+psycopg://me:***@host:5/db"
-    assert (
-        masked("storage=postgresql://me@host/db?password=s3cret&x=1")
-        == "storage=postgresql://me@host/db?password=***&x=1"
-    )
-    assert masked("sqlite:////a/b@c.db") == "sqlite:////a/b@c.db"
-    assert masked("model.x=1") == "model.x=1"
 
 
 @pytest.mark.parametrize(
@@ -224,7 +215,13 @@ def test_several_runners_share_a_study_on_a_server(tmp_path, server):
 
     url, stop = server
     what = {"folder": str(tmp_path), "rows": {f"{i}": [f"model.x={i}"] for i in range(8)}, "storage": url, "workers": 2}
-    command = [sys.executable, "-m", "tests.sweeping.fake_sweep", json.dumps(what | {"common": ["fake.seconds=0.3"]})]
+    what["sweep"] = {"overrides": ["fake.seconds=0.3"]}
+    command = [
+        sys.executable,
+        "-m",
+        "tests.sweeping.fake_sweep",
+        json.dumps(what | {"sweep": {"overrides": ["fake.seconds=0.3"]}}),
+    ]
     runners = [subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) for _ in range(2)]
     trained = tmp_path / "outputs" / "trained.txt"
     deadline = time.monotonic() + 60
@@ -242,7 +239,7 @@ def test_several_runners_share_a_study_on_a_server(tmp_path, server):
     assert len(ends) == len(set(ends)) == 8
     assert "s3cret" not in (tmp_path / "reports" / "sweeps" / "fake_debug.json").read_text()
 
-    runner = make_runner(tmp_path, make_sweep({"late": ["model.x=99"]}), storage=url, common=["fake.seconds=0"])
+    runner = make_runner(tmp_path, make_sweep({"late": ["model.x=99"]}), storage=url)
     stop()
     with pytest.raises(ConfigError, match=r"me:\*\*\*@127.0.0.1") as caught:
         runner.run()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import threading
 import time
 from collections.abc import Iterable
@@ -18,6 +19,7 @@ from src.reporting.sweep_table import SweepTable
 from src.reporting.sweep_tables import sweep_tables
 from src.reporting.time_left import seconds_left
 
+logger = logging.getLogger(__name__)
 STALLED_S = 120.0
 """A runner whose runs write neither log nor numbers for this long has probably ended without a word."""
 SCALES = ("paper", "mini", "debug")
@@ -38,7 +40,7 @@ class Sweep:
     @property
     def key(self) -> str:
         """Its part of an address: the record's file name."""
-        return f"{self.record.name}_{self.record.scale}"
+        return self.record.stem
 
     @property
     def state(self) -> str:
@@ -185,7 +187,7 @@ class BoardReader:
         self, stamps: dict[Path, Stamp], names: list[str], unfinished: dict[str, float | None],
         folders: RunFolders, now: float,
     ) -> Board:  # fmt: skip
-        records, results, broken = [], {}, {}
+        records, results, broken = {}, {}, {}
         for path, stamp in stamps.items():
             content = self._cached(path, stamp)
             if isinstance(content, DataError):
@@ -194,12 +196,22 @@ class BoardReader:
                     str(content).replace(f"{path}: ", "").replace(f"{self.reports}/", "")
                 )
             elif isinstance(content, SweepRecord):
-                records.append(content)
+                records[path] = content
             else:
                 results[content.run_id] = content
         self._files = {path: content for path, content in self._files.items() if path in stamps}
+        sweeps = []
+        for path, record in records.items():
+            try:
+                sweep = self._sweep(record, results, folders, now)
+                _ = sweep.state, sweep.left_s, [settings_of(run.overrides) for run in record.runs.values()]
+            except Exception as error:  # whatever a record holds, the others are shown
+                logger.exception("%s cannot be shown", path)
+                broken[str(path.relative_to(self.reports))] = f"{type(error).__name__}: {error}"
+            else:
+                sweeps.append(sweep)
         runs = {run_id: Run(run_id=run_id, state="done", result=result) for run_id, result in results.items()}
-        for record in records:
+        for record in (sweep.record for sweep in sweeps):
             for run_id, planned in record.runs.items():
                 run = runs.setdefault(run_id, Run(run_id=run_id, state=planned.state))
                 run.planned = run.planned or planned
@@ -208,12 +220,11 @@ class BoardReader:
             labels += [(planned.label, run_id) for run_id, planned in record.runs.items() if run_id not in rowed]
             for label, run_id in labels:
                 if run_id in runs:
-                    runs[run_id].rows.append((f"{record.name}_{record.scale}", label))
+                    runs[run_id].rows.append((record.stem, label))
         for name in names:
             alive = now - (unfinished.get(name) or 0.0) < ALIVE_S
             state = "running" if name in unfinished and alive else "stopped" if name in unfinished else "done"
             runs.setdefault(name, Run(run_id=name, state=state)).has_folder = True
-        sweeps = [self._sweep(record, results, folders, now) for record in records]
         return Board(
             sweeps=sweeps, runs=runs, broken=broken, folders=folders, has_reports=self.reports.is_dir(), now=now
         )  # fmt: skip
@@ -239,6 +250,9 @@ class BoardReader:
             content = read_record(path) if path.parent.name == "sweeps" else read_result(path)
         except DataError as error:
             content = error
+        except Exception as error:  # whatever a file holds, the others are shown
+            logger.exception("%s cannot be read", path)
+            content = DataError(f"{path}: not readable ({type(error).__name__}: {error}); delete it")
         self._files[path] = (stamp, content)
         return content
 

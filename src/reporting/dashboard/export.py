@@ -61,7 +61,7 @@ def _data_address(picture: Picture) -> str | None:
     try:
         with Image.open(picture.path) as image:
             image = image.convert("RGB")
-    except (OSError, ValueError, SyntaxError):
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return None
     image.thumbnail((PICTURE_WIDTH, 4 * PICTURE_WIDTH))
     stream = io.BytesIO()

@@ -11,7 +11,7 @@ from src.reporting.dashboard.charts import Bars, Series, category_chart, line_ch
 from src.reporting.metric_names import RANGES, SPEEDS, Metric, find_metric
 from src.reporting.results import RunResult
 from src.reporting.sweep_file import PlotConfig
-from src.reporting.sweep_table import PAPER, format_here, format_paper
+from src.reporting.sweep_table import PAPER, format_here, format_paper, rounded
 from src.reporting.tables import mean_and_spread
 from src.structures.taxonomy import CLASSES
 
@@ -242,12 +242,15 @@ def headline(sweep: Sweep) -> str:
         return ""
     metric, rows = table.columns[0], [(row, row.cells[0]) for row in table.rows]
     best = max if metric.higher_is_better else min
-    here = [(cell.mean, row.label, format_here(cell, metric, row.done)) for row, cell in rows if cell.mean is not None]
+    here = [(rounded(cell.mean, metric), row, cell) for row, cell in rows if cell.mean is not None]
+    here = [found for found in here if found[1].state == "done"] or here
     paper = [(cell.paper, row.label) for row, cell in rows if cell.paper is not None and row.state != PAPER]
     if not here:
         return ""
-    _, label, text = best(here)
-    line = f"Best {metric.title} here: {label}, {text}"
+    top = best(value for value, _, _ in here)
+    tied = [(row, cell) for value, row, cell in here if value == top]
+    line = f"Best {metric.title} here: {' and '.join(row.label for row, _ in tied)}, "
+    line += format_here(tied[0][1], metric, tied[0][0].done) if len(tied) == 1 else f"{top:.{metric.digits}f}"
     if paper:
         value, label = best(paper)
         line += f". In the paper: {label}, {format_paper(value, metric)}"

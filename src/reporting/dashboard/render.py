@@ -8,11 +8,13 @@ from __future__ import annotations
 import base64
 import functools
 import hashlib
+import logging
 import re
 import shlex
 import time
+import urllib.parse
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +58,11 @@ class MetricRow:
     verdict: str  # `better`, `worse` or nothing
 
 
+logger = logging.getLogger(__name__)
+MACHINE_PATH = re.compile(r"""(?<![\w.])/(?:(?:home|Users)/[^\s/'"]+|root|tmp)((?:/[^\s/'"<>()\[\],:;]+)+)/?""")
+"""An absolute path below a home or a temporary folder, and what of it does not name the machine's user."""
+
+
 class Renderer:
     """Renders pages with the addresses of one kind of dashboard.
 
@@ -68,6 +75,7 @@ class Renderer:
         self.environment = _environment()
         self.environment.globals.update(address=address, live=live, summary=SUMMARY)
         self.environment.filters["src"] = source
+        self.environment.filters["local"] = (lambda text: text) if live else shortened_paths
 
     def document(self, board: Board, pages: list[Page], mark: str = "") -> str:
         """The whole HTML document around one page, or around all of them."""
@@ -76,17 +84,61 @@ class Renderer:
             if self.live
             else "Exported from the results: complete in itself, opens without a network."
         )
-        return self.environment.get_template("page.html").render(
-            board=board, pages=pages, mark=mark, note=note, style=Markup(asset("style.css")),
+        return self._without_broken(board, lambda shown: self._content(
+            "page.html", board=shown, pages=pages, mark=mark, note=note, style=Markup(asset("style.css")),
             script=Markup(asset("script.js")), policy=content_policy(self.live),
-        )  # fmt: skip
+        ))  # fmt: skip
 
     def overview(self, board: Board) -> Page:
-        """All sweeps and all runs."""
-        return Page(id="overview", title="Experiments", content=self._content("overview.html", board=board))
+        """All sweeps and all runs; one that cannot be shown is listed as broken."""
+        content = self._without_broken(board, lambda shown: self._content("overview.html", board=shown))
+        return Page(id="overview", title="Experiments", content=content)
 
     def sweep(self, board: Board, sweep: Sweep) -> Page:
-        """One sweep: tables, figures, runs, failures."""
+        """One sweep: tables, figures, runs, failures; or why it cannot be shown."""
+        return self._guarded(f"sweep-{sweep.key}", sweep.key, lambda: self._sweep(board, sweep))
+
+    def run(self, board: Board, run: Run, against: Run | None = None) -> Page:
+        """One run, alone beside its baseline's numbers, or held against another one; or why it cannot be shown."""
+        return self._guarded(f"run-{run.run_id}", run.run_id, lambda: self._run(board, run, against))
+
+    def compare(self, board: Board) -> Page:
+        """Where the exported file puts two runs side by side; or why it cannot be shown."""
+        return self._guarded("compare", "Two runs side by side", lambda: self._compare(board))
+
+    def _guarded(self, page_id: str, title: str, draw: Callable[[], Page]) -> Page:
+        """The page, or one with the message of whatever a record or a result makes fail: others are still shown."""
+        try:
+            return draw()
+        except Exception as error:
+            logger.exception("page %s cannot be shown", page_id)
+            return Page(id=page_id, title=title, content=self._content("broken.html", title=title, fault=fault(error)))
+
+    def _without_broken(self, board: Board, draw: Callable[[Board], Markup]) -> Markup:
+        """What shows the whole board; without sweeps and runs that make it fail, which are among the broken."""
+        try:
+            return draw(board)
+        except Exception:
+            logger.exception("the board cannot be shown whole")
+        broken, sweeps, runs = dict(board.broken), [], {}
+
+        def is_sound(name: str, **alone: Any) -> bool:
+            try:
+                draw(replace(board, **({"sweeps": [], "runs": {}} | alone)))
+            except Exception as error:
+                broken[name] = fault(error)
+                return False
+            return True
+
+        for sweep in board.sweeps:
+            if is_sound(f"sweeps/{sweep.key}.json", sweeps=[sweep]):
+                sweeps.append(sweep)
+        for run_id, run in board.runs.items():
+            if is_sound(run_id, runs={run_id: run}):
+                runs[run_id] = run
+        return draw(replace(board, sweeps=sweeps, runs=runs, broken=broken))
+
+    def _sweep(self, board: Board, sweep: Sweep) -> Page:
         record = sweep.record
         states = record.runs
         failed = [
@@ -106,10 +158,10 @@ class Renderer:
             "sweep.html", board=board, sweep=sweep, failed=failed, runs=listed, study=study_command(record.storage),
             tables=[table_view(table) for table in sweep.tables], figures=sweep_figures(board, sweep),
         )  # fmt: skip
-        return Page(id=f"sweep-{sweep.key}", title=f"{record.sweep.title}, {record.scale}", content=content)
+        title = ", ".join([record.sweep.title, record.scale, *record.changes])
+        return Page(id=f"sweep-{sweep.key}", title=title, content=content)
 
-    def run(self, board: Board, run: Run, against: Run | None = None) -> Page:
-        """One run, alone beside its baseline's numbers, or held against another one."""
+    def _run(self, board: Board, run: Run, against: Run | None) -> Page:
         baseline = board.baseline_of(run)
         other, other_name = (against, run_name(against)) if against else baseline or (None, "")
         config = flat_config(run.result.config if run.result else board.folders.config(run.run_id))
@@ -134,13 +186,22 @@ class Renderer:
         )  # fmt: skip
         return Page(id=f"run-{run.run_id}", title=run_name(run), content=content)
 
-    def compare(self, board: Board) -> Page:
-        """Where the exported file puts two runs side by side."""
+    def _compare(self, board: Board) -> Page:
         runs = sorted((run for run in board.runs.values() if run.result), key=run_name)
         return Page(id="compare", title="Two runs side by side", content=self._content("compare.html", runs=runs))
 
     def _content(self, template: str, **values: Any) -> Markup:
         return Markup(self.environment.get_template(template).render(**values))
+
+
+def fault(error: Exception) -> str:
+    """What went wrong, in a line."""
+    return f"{type(error).__name__}: {error}"
+
+
+def shortened_paths(text: str) -> str:
+    """Absolute paths below home and temporary folders by their last two parts at most."""
+    return MACHINE_PATH.sub(lambda found: ".../" + "/".join(found[1].split("/")[1:][-2:]), text)
 
 
 @functools.cache
@@ -186,7 +247,8 @@ def study_command(storage: str) -> str | None:
     """What shows a study in Optuna's own dashboard, over a copy; None where it is not a file of this machine."""
     if not storage.startswith("sqlite:///"):
         return None
-    path, copy = storage.removeprefix("sqlite:///").removeprefix(f"{Path.cwd()}/"), "/tmp/study_copy.db"
+    path = urllib.parse.unquote(storage.removeprefix("sqlite:///")).removeprefix(f"{Path.cwd()}/")
+    copy = "/tmp/study_copy.db"
     backup = "from sqlite3 import connect; from sys import argv; connect(argv[1]).backup(connect(argv[2]))"
     return (
         f'python -c "{backup}" {shlex.quote(path)} {copy}\n'
@@ -247,7 +309,7 @@ def number(value: float | None, metric: Metric) -> str:
 
 def signed(value: float, digits: int) -> str:
     """With its sign, a true minus."""
-    return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
+    return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def _other_runs(board: Board, run: Run) -> list[Run]:

@@ -41,7 +41,9 @@ def test_state_of_a_sweep(states, silent_s, expected):
 
 def test_a_search_is_not_done_while_trials_are_to_come():
     sweep = state_of([])
-    search = SweepConfig(title="t", question="q", space={"optim.lr": DimensionConfig(low=0.0, high=1.0)}, trials=7)
+    search = SweepConfig(
+        name="t", title="t", question="q", space={"optim.lr": DimensionConfig(low=0.0, high=1.0)}, trials=7
+    )
     sweep.record.sweep, sweep.record.trials = search, 6
     assert sweep.state == "running" and sweep.left_s == pytest.approx(60.0) and sweep.record.planned == 7
     sweep.record.trials = 7
@@ -117,6 +119,34 @@ def test_results_of_different_data_have_no_table_but_a_reason(world):
     path.write_text(json.dumps(content))
     sweep = read(world).sweep("epsilon_mini")
     assert sweep.tables == [] and "never mixes" in sweep.problem
+
+
+def test_a_record_that_breaks_the_reading_is_listed_and_the_rest_is_there(world, monkeypatch):
+    broken = epsilon("mini")
+    broken.sweep.name = "other"
+    write_record(record_path(world.reports, "other", "mini"), broken)
+    original = board_module.sweep_tables
+
+    def tables(record, results):
+        if record.name == "other":
+            raise AttributeError("no such thing")
+        return original(record, results)
+
+    monkeypatch.setattr(board_module, "sweep_tables", tables)
+    board = read(world)
+    assert [sweep.key for sweep in board.sweeps] == ["epsilon_mini"]
+    assert board.broken["sweeps/other_mini.json"] == "AttributeError: no such thing"
+    assert {key for run in board.runs.values() for key, _ in run.rows} == {"epsilon_mini"}
+
+
+def test_a_file_that_breaks_its_reader_is_listed(world, monkeypatch):
+    def read_any(path):
+        raise KeyError(path.name)
+
+    monkeypatch.setattr(board_module, "read_result", read_any)
+    board = read(world)
+    assert "not readable (KeyError" in board.broken[f"results/{world.run_id(0, 0)}.json"]
+    assert [sweep.key for sweep in board.sweeps] == ["epsilon_mini"]
 
 
 def test_only_what_changed_is_read_again(world, monkeypatch):

@@ -9,8 +9,10 @@ from experiments import World
 from PIL import Image
 
 from src.reporting.dashboard import export as export_module
+from src.reporting.dashboard import render as render_module
 from src.reporting.dashboard.board import BoardReader
 from src.reporting.dashboard.export import embed_pictures, export_dashboard
+from src.reporting.dashboard.render import shortened_paths
 
 RUN = World.run_id(0, 0)
 
@@ -83,3 +85,42 @@ def test_an_older_file_survives_a_full_disk(world, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space left"):
         export_dashboard(world.reports, world.outputs, path)
     assert path.read_text() == "older" and list(tmp_path.glob(".*")) == []
+
+
+def test_a_page_that_cannot_be_drawn_says_so_and_the_others_are_there(world, tmp_path, monkeypatch):
+    def run_figures(board, runs, original=render_module.run_figures):
+        if any(run.run_id == RUN for run in runs.values()):
+            raise OverflowError("too large")
+        return original(board, runs)
+
+    monkeypatch.setattr(render_module, "run_figures", run_figures)
+    path = tmp_path / "dashboard.html"
+    export_dashboard(world.reports, world.outputs, path)
+    pages = dict(re.findall(r'<section class="page" id="([^"]*)".*?>(.*?)</section>', path.read_text(), re.DOTALL))
+    assert "This cannot be shown: OverflowError: too large" in pages[f"run-{RUN}"]
+    assert "By distance" in pages[f"run-{World.run_id(2, 1)}"] and "table12_epsilon" in pages["sweep-epsilon_mini"]
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ('File "/home/alice/code/src/train.py", line 5', 'File ".../src/train.py", line 5'),
+        ("no /tmp/x, /root/a/b/c.ckpt: gone", "no .../x, .../b/c.ckpt: gone"),
+        ("file:///Users/bob/d/e/", "file://.../d/e"),
+        ("(/home/bob/last.ckpt)", "(.../last.ckpt)"),
+        ("1/tmp/2 and data/home/x and /opt/a/b/c, 3 m/s", "1/tmp/2 and data/home/x and /opt/a/b/c, 3 m/s"),
+    ],
+)
+def test_paths_of_the_machine_are_shortened(text, shown):
+    assert shortened_paths(text) == shown
+
+
+def test_logs_and_reasons_of_the_file_say_nothing_of_the_machine(world, tmp_path):
+    log = world.outputs / "sweeps" / "epsilon_mini" / "failed.log"
+    log.write_text("Traceback in /home/alice/venv/lib/torch/nn.py\n")
+    record = world.reports / "sweeps" / "epsilon_mini.json"
+    record.write_text(record.read_text().replace("loss/total is <nan>", "no file /root/alice/deep/down/x.pcd"))
+    path = tmp_path / "dashboard.html"
+    export_dashboard(world.reports, world.outputs, path)
+    text = path.read_text()
+    assert "alice" not in text and ".../torch/nn.py" in text and "no file .../down/x.pcd" in text

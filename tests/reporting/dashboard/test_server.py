@@ -6,7 +6,10 @@ import urllib.request
 from urllib.parse import quote, urlsplit
 
 import pytest
-from experiments import World, serve
+from experiments import World, epsilon, serve
+
+from src.reporting.dashboard import render as render_module
+from src.reporting.sweep_record import record_path, write_record
 
 
 def get(address, **headers):
@@ -87,6 +90,34 @@ def test_the_mark_moves_when_something_changed(world):
         path = world.reports / "results" / f"{RUN}.json"
         path.write_text(path.read_text().replace('"seed": 0', '"seed": 5'))
         assert get(f"{base}/mark")[1] != mark
+
+
+def test_one_broken_sweep_leaves_the_other_pages(world, monkeypatch, caplog):
+    """Whatever fails, wherever: the overview lists it, its page says it, every other page is as it was."""
+    other = epsilon("mini")
+    other.sweep.name = "other"
+    write_record(record_path(world.reports, "other", "mini"), other)
+    original = render_module.headline
+
+    def headline(sweep):
+        if sweep.record.name == "epsilon":
+            raise ZeroDivisionError("no <rows>")
+        return original(sweep)
+
+    def sweep_figures(board, sweep, original=render_module.sweep_figures):
+        headline(sweep)
+        return original(board, sweep)
+
+    monkeypatch.setattr(render_module, "headline", headline)
+    monkeypatch.setattr(render_module, "sweep_figures", sweep_figures)
+    for base in serve(world):
+        status, text, _ = get(base)
+        assert status == 200 and b"/sweep/other_mini" in text and RUN.encode() in text
+        assert b"sweeps/epsilon_mini.json" in text and b"ZeroDivisionError: no &lt;rows&gt;" in text
+        status, text, _ = get(f"{base}/sweep/epsilon_mini")
+        assert status == 200 and b"This cannot be shown: ZeroDivisionError" in text
+        assert b"cannot be shown" not in get(f"{base}/sweep/other_mini")[1] + get(f"{base}/run/{RUN}")[1]
+    assert "no <rows>" in caplog.text
 
 
 def test_without_run_folders_pages_say_what_is_missing(world):
