@@ -48,10 +48,6 @@ NAMES_OF_COMPARISON = {
         "model.dptf.bev_path.velocity_compensation=false",
         "model.dptf.gaussian_path.velocity_compensation=false",
     ): "phase 2, no velocity compensation",
-    ("phase2", "model.dptf.gaussian_path=null"): "phase 2, BEV path only",
-    ("phase2", "model.dptf.bev_path=null"): "phase 2, Gaussian path only",
-    ("phase2", "model.dptf.gaussian_path.self_attention=null"): "phase 2, no self-attention",
-    ("phase2", "model.dptf.max_age_s=0.55"): "phase 2, 0.5 s of memory",
 }
 """By phase and sorted settings, in the order of the page; phase 1 that went on stands after phase 1."""
 
