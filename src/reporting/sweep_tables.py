@@ -138,7 +138,7 @@ def _row_table(record: SweepRecord, results: dict[str, RunResult], config: Table
     complete = all(row.state == "done" for row in trained)
     table.caption = describe_runs(record, results, complete)
     table.caption += describe_differences(table.baselines, any(map(table.has_paper, range(len(columns)))))
-    table.caption += describe_latency(shown)
+    table.caption += describe_latency(columns, shown, results.values())
     table.text = findings(columns, trained, next(iter(results.values()), None), complete)
     return table
 
@@ -164,7 +164,8 @@ def _search_table(record: SweepRecord, results: dict[str, RunResult], config: Ta
     rows = [row for row, _ in scored]
     _mark_best(rows, columns)
     table = SweepTable(config.name, record.scale, config.title, "", columns, rows, is_search=True)
-    table.caption = describe_runs(record, results, complete=True) + describe_latency(rows)
+    table.caption = describe_runs(record, results, complete=True)
+    table.caption += describe_latency(columns, rows, results.values())
     best = next(((r.label, r.overrides, v) for r, v in scored[:1] if r.state == "done" and v is not None), None)
     table.text = describe_search([row.state for row in rows], record.sweep.trials, objective, best)
     return table

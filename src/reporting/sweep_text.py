@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from collections.abc import Iterable
 
 from src.reporting.metric_names import Metric
 from src.reporting.orderings import LEAST_SEEDS, Ordering, describe_test, find_orderings, paired_gains
@@ -32,18 +33,13 @@ def describe_runs(record: SweepRecord, results: dict[str, RunResult], complete: 
             parts.append(f"{phase}: {_listed(sorted(epochs))} epoch{'' if epochs == {1} else 's'}")
     spread = "mean ± standard deviation" if len(seeds) > 1 else "one seed, so no spread"
     parts.append(f"seed{'s' if len(seeds) > 1 else ''} {_listed(seeds)}: {spread}")
-    code, devices, places, busy = set(), set(), set(), False
+    code, devices = set(), set()
     for result in results.values():
         code.add(result.commit[:10] + ("+" if result.commit.endswith("+") else ""))
         threads = f"{_counted(result.processes, 'process')} of {_counted(result.threads, 'thread')}"
         devices.add(f"{result.device}, {threads}")
-        if result.latency is not None:
-            at = result.latency.get("processor") or result.latency.get("device") or "an unnamed device"
-            places.add(f"{at}, {_counted(result.latency.get('threads', 1), 'thread')}")
-            busy = busy or is_busy(result.latency.get("load"), result.latency.get("cores"))
-    for words, found in (("code ", code), ("", devices), ("latency on ", places)):
+    for words, found in (("code ", code), ("", devices)):
         parts += [words + _listed(sorted(found))] if found else []
-    parts += ["latency measured on a busy machine, so rows may differ by what else ran"] if busy else []
     text = "; ".join(parts) + "."
     return text + ("" if complete else " Bold is the best of the rows whose seeds have all finished.")
 
@@ -56,13 +52,27 @@ def describe_differences(baselines: list[str], has_paper: bool) -> str:
     return f" Differences are to {' or '.join(baselines)}, seed by seed{brackets}."
 
 
-def describe_latency(rows: list[SweepRow]) -> str:
-    """What stands after ± where one run's latency has no deviation over seeds, to stand after `describe_runs`."""
-    if all(cell.frames is None for row in rows for cell in row.cells):
+def describe_latency(columns: list[Metric], rows: list[SweepRow], results: Iterable[RunResult]) -> str:
+    """Where a table's latencies were measured and what stands after their ±; empty for a table without any.
+
+    Stands after `describe_runs`.
+    """
+    timed = [result.latency for result in results if result.latency is not None]
+    if not timed or not any(column.name.startswith("latency.") for column in columns):
         return ""
+    places = {
+        f"{latency.get('processor') or latency.get('device') or 'an unnamed device'}, "
+        f"{_counted(latency.get('threads', 1), 'thread')}"
+        for latency in timed
+    }
+    text = f" Latency on {_listed(sorted(places))}"
+    if any(is_busy(latency.get("load"), latency.get("cores")) for latency in timed):
+        text += ", measured on a busy machine, so rows may differ by what else ran"
+    if all(cell.frames is None for row in rows for cell in row.cells):
+        return f"{text}."
     return (
-        " After ± of a latency that one run has stands half the range of the middle half of its frames; none is bold "
-        "where the best and the next are no further apart than these."
+        f"{text}; after ± of a latency that one run has stands half the range of the middle half of its frames, and "
+        "none is bold where the best and the next are no further apart than these."
     )
 
 

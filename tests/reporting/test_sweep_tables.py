@@ -107,9 +107,10 @@ def test_the_caption_names_what_was_run(make_record, results_of):
     (table,) = sweep_tables(make_record({"a": {}, "b": {}}), results)
     assert table.caption == (
         "Data: synthetic highway world, split val; scale mini; phase1: 6 epochs; phase2: 1 epoch; seeds 0, 1, 2: "
-        "mean ± standard deviation; code 0123456789, fedcba9876+; cpu, 1 process of 2 threads; latency on Fast CPU, "
-        "1 thread."
+        "mean ± standard deviation; code 0123456789, fedcba9876+; cpu, 1 process of 2 threads."
     )
+    (table,) = sweep_tables(make_record({"a": {}, "b": {}}, columns=("mAP", "latency.total")), results)
+    assert table.caption.endswith("2 threads. Latency on Fast CPU, 1 thread.")
 
 
 def test_rows_without_numbers_say_why(make_record, results_of):
@@ -207,7 +208,7 @@ def test_a_latency_of_one_run_shows_the_spread_of_its_frames(make_record, result
     text = cells_of(table.to_markdown())
     assert text["a"][:2] == [" 250.0 ± 10.0 ", " 4.00 ± 0.16 "] and text["b"][0] == " **200.0 ± 20.0** "
     assert "half the range of the middle half of its frames" in table.caption
-    assert "latency measured on a busy machine" in table.caption
+    assert "Latency on CPU, 1 thread, measured on a busy machine" in table.caption
     timed(results[f"{PREFIX}b0"], 225.0, 40.0, load=1.0, cores=4)  # 25 apart, within 10 + 20
     (table,) = sweep_tables(record, results)
     assert not any(cell.best for row in table.rows for cell in row.cells) and "busy" not in table.caption

@@ -111,7 +111,7 @@ def search_figures(sweep: Sweep) -> list[Markup]:
 
 
 def latency_figures(sweep: Sweep, results: dict[str, list[RunResult]]) -> list[Markup]:
-    """NDS over milliseconds per frame, one point for each row that was timed."""
+    """NDS over milliseconds per frame, one point for each row that was timed, where at least two were."""
     accuracy, latency = find_metric(ACCURACY, sweep.key), find_metric(LATENCY, sweep.key)
     points = []
     for style, (label, runs) in enumerate(results.items()):
@@ -128,7 +128,7 @@ def latency_figures(sweep: Sweep, results: dict[str, list[RunResult]]) -> list[M
                     joined=False,
                 )
             )
-    if not points:
+    if len(points) < 2:
         return []
     return [line_chart(f"{ACCURACY} over latency", points, "milliseconds per frame", f"{ACCURACY}, %")]
 
