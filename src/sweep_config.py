@@ -33,7 +33,7 @@ from src.sweeping.address import check_address, masked
 
 SWEEPS = CONF.parent / "sweeps"
 SCALES = sorted(path.stem for path in (CONF / "scale").glob("*.yaml"))
-OWN_KEYS = ("sweep", "seeds", "workers", "storage", "dry_run")
+OWN_KEYS = ("sweep", "seeds", "workers", "storage", "dry_run", "trials")
 MOST_SEEDS = 1000
 FILE_PARTS = (SweepConfig, RowConfig, TableConfig, PlotConfig, PaperRowConfig, DimensionConfig)
 
@@ -47,11 +47,16 @@ class SweepCommand:
     workers: int
     storage: str | None
     dry_run: bool
+    trials: int | None
 
     def __post_init__(self) -> None:
         for name in ("seeds", "workers"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1, but got {getattr(self, name)}")
+        if self.trials is not None:
+            if self.sweep is None or not self.sweep.is_search:
+                raise ConfigError(f"trials={self.trials} is for searches; a sweep of rows trains each of them")
+            self.sweep = dataclasses.replace(self.sweep, trials=self.trials)
         if self.seeds > MOST_SEEDS:
             raise ConfigError(f"seeds must be at most {MOST_SEEDS}, but got {self.seeds}; seed=... says the first one")
 

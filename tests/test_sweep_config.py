@@ -116,3 +116,13 @@ def test_a_files_name_is_the_sweeps(sweeps):
     (sweeps / "b d.yaml").write_text(GOOD)
     with pytest.raises(ConfigError, match="name 'b d' must be of letters"):
         load_sweep("b d")
+
+
+def test_trials_of_a_search_are_chosen_on_the_command_line():
+    command, _ = compose_sweep(["+sweep=tune", "trials=3"])
+    assert command.sweep.trials == 3
+    assert compose_sweep(["+sweep=tune"])[0].sweep.trials > 3
+    with pytest.raises(ConfigError, match="trials=3 is for searches"):
+        compose_sweep(["+sweep=epsilon", "trials=3"])
+    with pytest.raises(ConfigError, match="trials must be at least 1"):
+        compose_sweep(["+sweep=tune", "trials=0"])
