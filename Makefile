@@ -49,6 +49,6 @@ PYTEST := OMP_NUM_THREADS=1 $(PYTHON) -m pytest -n auto --dist loadfile
 test: $(STAMP) ## run every test
 	$(PYTEST) $(ARGS)
 
-check: $(STAMP) ## lint and the fast tests, under a minute
+check: $(STAMP) ## lint and the fast tests, some minutes
 	$(PYTHON) -m ruff check .
 	$(PYTEST) -q -m "not slow and not gpu" $(ARGS)
