@@ -6,7 +6,7 @@ import hashlib
 import json
 from typing import Any
 
-from src.overrides import OUTSIDE_IDENTITY, is_of, without_keys
+from src.overrides import OUTSIDE_IDENTITY, digest_of, is_of, without_keys
 
 
 def digest_of_changes(overrides: list[str]) -> str:
@@ -15,8 +15,8 @@ def digest_of_changes(overrides: list[str]) -> str:
     What only says where from, where to and on what machine does not count.
     """
     besides = ("checkpoint", "predictions", "out", "scene", "paths", "trainer", "logger", "data.num_workers")
-    changes = sorted(change for change in overrides if not is_of(change, besides))
-    return f"-{hashlib.sha256(json.dumps(changes).encode()).hexdigest()[:8]}" if changes else ""
+    changes = [change for change in overrides if not is_of(change, besides)]
+    return f"-{digest_of(changes)}" if changes else ""
 
 
 def run_identity(tree: dict[str, Any], source: str | None = None) -> str:
