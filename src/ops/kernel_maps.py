@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ class KernelMap:
 
     Offsets run in C order over the kernel axes, as in a torch weight [Cout, Cin, k...]. `mirrored` marks a map whose
     transpose is itself with the offsets reversed (submanifold); `identity` one in which output i sees input i only.
+    `cache` holds what was derived from the map.
     """
 
     inputs: Tensor  # [pairs] int32, input row
@@ -29,31 +31,36 @@ class KernelMap:
     num_outputs: int
     mirrored: bool = False
     identity: bool = False
-    _lazy: dict[str, tuple[Tensor, ...]] = field(default_factory=dict, repr=False)
+    cache: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @property
     def num_offsets(self) -> int:
         """Number of kernel offsets K."""
         return len(self.counts)
 
+    @property
+    def centre(self) -> int | None:
+        """The offset that joins every row with itself, None for a map that is not submanifold."""
+        return self.num_offsets // 2 if self.mirrored else None
+
     def ends(self) -> Tensor:  # [K] int32
         """End of each offset's block of pairs."""
-        if "ends" not in self._lazy:
+        if "ends" not in self.cache:
             ends = list(itertools.accumulate(self.counts))
-            self._lazy["ends"] = (torch.tensor(ends, dtype=torch.int32, device=self.inputs.device),)
-        return self._lazy["ends"][0]
+            self.cache["ends"] = torch.tensor(ends, dtype=torch.int32, device=self.inputs.device)
+        return self.cache["ends"]
 
     def bags_by_output(self) -> tuple[Tensor, Tensor]:
         """Pairs ordered by output row [pairs] int32 and the first pair of each row [num_outputs + 1] int32."""
-        if "by_output" not in self._lazy:
-            self._lazy["by_output"] = bags(self.outputs, self.num_outputs)
-        return self._lazy["by_output"]
+        if "by_output" not in self.cache:
+            self.cache["by_output"] = bags(self.outputs, self.num_outputs)
+        return self.cache["by_output"]
 
     def bags_by_input(self) -> tuple[Tensor, Tensor]:
         """Pairs ordered by input row [pairs] int32 and the first pair of each row [num_inputs + 1] int32."""
-        if "by_input" not in self._lazy:
-            self._lazy["by_input"] = bags(self.inputs, self.num_inputs)
-        return self._lazy["by_input"]
+        if "by_input" not in self.cache:
+            self.cache["by_input"] = bags(self.inputs, self.num_inputs)
+        return self.cache["by_input"]
 
 
 def submanifold_map(sites: Sites, kernel_size: Size) -> KernelMap:

@@ -10,6 +10,7 @@ from torch.autograd.function import FunctionCtx
 from src.ops.backend import implementation, register
 from src.ops.bags import bag_sum
 from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
+from src.ops.pair_tiles import pair_tiles, scratch
 from src.ops.sites import Sites, union
 
 __all__ = [
@@ -71,7 +72,7 @@ def sparse_conv_reference(
 
 
 class _SparseConv(torch.autograd.Function):
-    """Gather by input -> grouped product -> sum by output, and the transposed way back."""
+    """Gather by input -> one product per offset -> sum by output, and the transposed way back."""
 
     @staticmethod
     def forward(
@@ -84,7 +85,11 @@ class _SparseConv(torch.autograd.Function):
         weight = weight.contiguous()  # the grouped product takes plain row- or column-major matrices only
         ctx.save_for_backward(features, weight)
         ctx.kernel_map = kernel_map
-        out = _gather_multiply_sum(features, weight, kernel_map.inputs, kernel_map, kernel_map.bags_by_output())
+        if _is_grouped(features):
+            picks, bags = kernel_map.inputs, kernel_map.bags_by_output()
+            out = _gather_multiply_sum(features, weight, picks, kernel_map, bags)
+        else:
+            out, _ = _tiled(features, weight, kernel_map, backward=False)
         return out if bias is None else out.add_(bias)
 
     @staticmethod
@@ -92,20 +97,76 @@ class _SparseConv(torch.autograd.Function):
         features, weight = ctx.saved_tensors
         maps: KernelMap = ctx.kernel_map
         grad = grad.contiguous()
-        grad_features = grad_weight = grad_bias = None
-        if ctx.needs_input_grad[0]:
-            if maps.mirrored:
+        need_features, need_weight, need_bias, _ = ctx.needs_input_grad
+        grad_features = grad_weight = None
+        if not _is_grouped(features):
+            if need_features or need_weight:
+                others = features if need_weight else None
+                grad_features, grad_weight = _tiled(grad, weight, maps, backward=True, others=others)
+        else:
+            if need_features and maps.mirrored:
                 # The transposed map is the map itself with reversed offsets, whose bags exist already.
                 back = weight.flip(0).transpose(1, 2)
                 grad_features = _gather_multiply_sum(grad, back, maps.inputs, maps, maps.bags_by_output())
-            else:
+            elif need_features:
                 back = weight.transpose(1, 2)
                 grad_features = _gather_multiply_sum(grad, back, maps.outputs, maps, maps.bags_by_input())
-        if ctx.needs_input_grad[1]:
-            grad_weight = _weight_gradient(features, grad, maps)
-        if ctx.needs_input_grad[2]:
-            grad_bias = grad.sum(0)
-        return grad_features, grad_weight, grad_bias, None
+            if need_weight:
+                grad_weight = _weight_gradient(features, grad, maps)
+        return grad_features, grad_weight, grad.sum(0) if need_bias else None, None
+
+
+def _is_grouped(rows: Tensor) -> bool:
+    """Whether all offsets go into one kernel launch over all pairs, as on a GPU, or tile by tile through a cache."""
+    return rows.device.type != "cpu" and rows.dtype in GROUPED_DTYPES
+
+
+def _tiled(
+    rows: Tensor,  # [n, Ca] features, or backward the gradient of the output
+    weight: Tensor,  # [K, Cin, Cout]
+    kernel_map: KernelMap,
+    backward: bool,
+    others: Tensor | None = None,  # [m, Cin] the features, if backward is to make the gradient of the weight
+) -> tuple[Tensor, Tensor | None]:  # [m, Cb], [K, Cin, Cout]
+    """Convolution, or both its gradients, with every temporary in reused memory of a cache's size.
+
+    Backward, a tile's gathered gradients serve the features and the weight.
+    """
+    num = kernel_map.num_inputs if backward else kernel_map.num_outputs
+    matrices = (weight.transpose(1, 2) if backward else weight).unbind(0)
+    width_in, width = matrices[0].shape
+    # Sums over tiles in float32 at least: half precision would swallow the last ones.
+    full = torch.promote_types(weight.dtype, torch.float32)
+    grad_weight = None if others is None else torch.zeros_like(weight, dtype=full)
+    gradients = () if grad_weight is None else grad_weight.unbind(0)
+    centre = kernel_map.centre
+    if centre is None:
+        out = rows.new_empty(num, width)
+    else:
+        out = torch.mm(rows, matrices[centre])
+        if others is not None:
+            gradients[centre].add_(torch.mm(others.t(), rows))
+    if backward and kernel_map.mirrored:  # the tiles are those of the way forward
+        matrices, gradients = matrices[::-1], gradients[::-1]
+    cut = pair_tiles(kernel_map, backward, width_in + width, rows.dtype)
+    gathered_rows = scratch("gathered", cut.most_pairs, width_in, rows.dtype)
+    products = scratch("products", cut.most_pairs, width, rows.dtype)
+    for tile in cut.tiles:
+        gathered = torch.index_select(rows, 0, tile.gathered, out=gathered_rows[: len(tile.gathered)])
+        for offset, first, last in tile.spans:
+            torch.mm(gathered[first:last], matrices[offset], out=products[first:last])
+        sums = bag_sum(products, tile.order, tile.starts)
+        block = out[tile.first : tile.last]
+        if centre is None:
+            block.copy_(sums)
+        else:
+            block.add_(sums)
+        if others is not None:
+            partners = torch.index_select(others, 0, tile.summed, out=products[: len(tile.summed)])
+            for offset, first, last in tile.spans:
+                product = torch.mm(partners[first:last].t(), gathered[first:last])  # addmm_ is slow in bfloat16
+                gradients[offset].add_(product)
+    return out, None if grad_weight is None else grad_weight.to(weight.dtype)
 
 
 def _gather_multiply_sum(
@@ -118,17 +179,9 @@ def _gather_multiply_sum(
     if len(picks) == 0:
         return rows.new_zeros(len(bags[1]) - 1, weight.shape[2])
     width = weight.shape[2]
-    if rows.dtype in GROUPED_DTYPES:
-        # Rows of a grouped product must be multiples of 16 bytes.
-        rows, weight = _padded(rows, 1), _padded(_padded(weight, 1), 2)
-        products = F.grouped_mm(F.embedding(picks, rows), weight, offs=kernel_map.ends())
-    else:
-        products = rows.new_empty(len(picks), width)
-        gathered = F.embedding(picks, rows)
-        for block, matrix, out in zip(
-            gathered.split(kernel_map.counts), weight, products.split(kernel_map.counts), strict=True
-        ):
-            torch.mm(block, matrix, out=out)
+    # Rows of a grouped product must be multiples of 16 bytes.
+    rows, weight = _padded(rows, 1), _padded(_padded(weight, 1), 2)
+    products = F.grouped_mm(F.embedding(picks, rows), weight, offs=kernel_map.ends())
     order, starts = bags
     out = bag_sum(products, order, starts)
     return out if out.shape[1] == width else out[:, :width].contiguous()
@@ -142,13 +195,9 @@ def _weight_gradient(
     c_in, c_out = features.shape[1], grad.shape[1]
     if len(kernel_map.inputs) == 0:
         return features.new_zeros(kernel_map.num_offsets, c_in, c_out)
-    if features.dtype in GROUPED_DTYPES:
-        left = F.embedding(kernel_map.inputs, _padded(features, 1))
-        right = F.embedding(kernel_map.outputs, _padded(grad, 1))
-        return F.grouped_mm(left.t(), right, offs=kernel_map.ends())[:, :c_in, :c_out]
-    left, right = F.embedding(kernel_map.inputs, features), F.embedding(kernel_map.outputs, grad)
-    blocks = zip(left.split(kernel_map.counts), right.split(kernel_map.counts), strict=True)
-    return torch.stack([a.t() @ b for a, b in blocks])
+    left = F.embedding(kernel_map.inputs, _padded(features, 1))
+    right = F.embedding(kernel_map.outputs, _padded(grad, 1))
+    return F.grouped_mm(left.t(), right, offs=kernel_map.ends())[:, :c_in, :c_out]
 
 
 def _padded(x: Tensor, axis: int) -> Tensor:
