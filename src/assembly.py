@@ -70,8 +70,8 @@ def save_submission(path: Path, tokens: list[str], table: DetectionTable, config
         path.unlink(missing_ok=True)  # of an earlier command, whose boxes these are not
         logger.warning("no box reached the score threshold, so there is no valid submission to write")
         return False
-    dptf = getattr(config.model, "dptf", None)  # the benchmark's rules are about how far back a detector looks
-    memory = "no memory" if dptf is None else f"memory of up to {dptf.max_age_s:g} s"
+    max_age_s = config.model.memory_max_age_s  # the benchmark's rules are about how far back a detector looks
+    memory = "no memory" if max_age_s is None else f"memory of up to {max_age_s:g} s"
     meta = {
         "use_camera": config.model.uses_images,
         "use_radar": True,

@@ -147,6 +147,9 @@ class BenchmarkSuite(Enum):
     """What `python -m src.benchmark` measures."""
 
     model = "model"
+    ops = "ops"
+    scaling = "scaling"
+    training = "training"
     latency = "latency"
     metric = "metric"
     reader = "reader"
@@ -235,7 +238,8 @@ def _compose(overrides: list[str]) -> DictConfig:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             tree = compose("config", overrides=overrides)
         if not tree.phase.temporal:
-            tree.model.dptf = None  # in code: a later at_scale file would revive a part that a phase file sets to null
+            # In code: a later at_scale file would revive a part that a phase file sets to null.
+            tree.model[OmegaConf.get_type(tree.model).temporal_part] = None
         return tree
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(hydra_message(error)) from error
@@ -262,9 +266,9 @@ def build_config(tree: DictConfig) -> Config:
 def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     """A configuration as a checkpoint stores it, with the keys named in `overrides` replaced.
 
-    A group choice (`data=truckscenes`) replaces that whole group, at the checkpoint's scale and phase.
-    Raises CheckpointError when the stored tree does not fit this version of the code, ConfigError for another scale or
-    phase and for a key below a part that the checkpoint does not have.
+    A group choice (`data=truckscenes`) replaces that whole group, at the checkpoint's scale and phase; `model=` only
+    says whose keys may follow. Raises CheckpointError when the stored tree does not fit this version of the code,
+    ConfigError for another model, scale or phase and for a key below a part that the checkpoint does not have.
     """
     model, phase = (
         stored[key].get("name") if isinstance(stored.get(key), dict) else None for key in ("model", "phase")
@@ -275,10 +279,13 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
         raise CheckpointError(f"the checkpoint is of phase {phase!r}; this version knows {PHASES}")
     scale = stored.get("scale")
     changes = {change.key_or_group: change for change in OverridesParser.create().parse_overrides(overrides)}
-    for key, own in {"scale": scale, "phase": phase, "phase.temporal": stored["phase"].get("temporal")}.items():
+    fixed = {"scale": scale, "model": model, "phase": phase, "phase.temporal": stored["phase"].get("temporal")}
+    for key, own in fixed.items():
         if key in changes and changes[key].value() != own:
             raise ConfigError(f"{key}={changes[key].value()}: the checkpoint is of {key}={own}; leave {key}= out")
-    tree, fresh = OmegaConf.create(stored), _compose([f"scale={scale}", f"phase={phase}", *overrides])
+    own = [f"{key}={fixed[key]}" for key in ("scale", "model", "phase")]
+    tree, fresh = OmegaConf.create(stored), _compose([*own, *overrides])
+    changes.pop("model", None)  # only says whose keys may follow: the checkpoint's own values stay
     for key in sorted(changes, key=lambda key: key.count(".")):  # a part before what lies in it
         part = key.rpartition(".")[0]
         if part and OmegaConf.select(tree, part) is None:

@@ -28,12 +28,12 @@ from src.training.run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
 
-MAY_BE_NEW = re.compile(r"dptf\.|ocsf\.encoder\.layers\.\d+\.temporal_attention\.")
+MAY_BE_NEW = re.compile(r"(dptf|temporal)\.|ocsf\.encoder\.layers\.\d+\.temporal_attention\.")
 """Parameters that a later phase adds; every other one must come from the checkpoint."""
 OF_THIS_RUN = ("phase", "resume")
 """Overrides that never concern the run whose weights are taken."""
 OF_THE_LATER_PHASE = (
-    *("model.dptf", "data.groups_per_scene", "data.lane_sets", "data.silent_frames"),
+    *("model.dptf", "model.temporal", "data.groups_per_scene", "data.lane_sets", "data.silent_frames"),
     *(f"model.loss.cell_{term}_weight" for term in ("focal", "dice", "lovasz", "velocity")),
 )
 """Nor do these, where that run is of the phase before."""
@@ -85,7 +85,7 @@ def find_source(config: Config, overrides: list[str], compose: Compose = compose
     others = OF_THIS_RUN
     if name != config.phase.name:
         others += OF_THE_LATER_PHASE
-        if not config.model.loss.gaussian_velocity_in_phase1:
+        if not getattr(config.model.loss, "gaussian_velocity_in_phase1", False):
             others += WEIGHTS_OF_GAUSSIAN_VELOCITY
     kept = [override for override in overrides if not is_of(override, others)]
     wanted = [f"phase={name}", *kept]
@@ -170,7 +170,7 @@ def differing_settings(old: dict[str, Any], new: dict[str, Any]) -> dict[str, tu
     return {
         key: (before[key], after[key])
         for key in before.keys() & after.keys()
-        if before[key] != after[key] and not key.startswith(("model.loss.", "model.dptf"))
+        if before[key] != after[key] and not key.startswith(("model.loss.", "model.dptf", "model.temporal"))
     }
 
 

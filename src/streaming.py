@@ -17,6 +17,8 @@ from src.data.sensors import Camera, RadarSweep, frame_from_sensors
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.detector import Detector
+from src.models.inference import prepare_for_inference
+from src.models.static_parts import compile_static_parts, replay_image_encoder
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CAMERAS
@@ -45,35 +47,69 @@ class StreamingDetector:
         grid: BEVGrid,
         settings: ReaderSettings,
         device: torch.device | str = "cpu",
-        bf16: bool = False,
+        bf16: bool | None = None,
+        plain: bool = False,
+        compiled: bool = False,
+        cuda_graph: bool = False,
     ) -> None:
+        """`model` is a trained one, of which a copy is prepared for inference, or that of another detector.
+
+        `bf16` None is float32, or what the model is prepared for. `plain` runs the model as it was trained: slower,
+        the same boxes up to rounding. `compiled` compiles the parts of fixed shape, which takes a minute at the first
+        frames and pays on a GPU; `cuda_graph` runs the image encoder as one CUDA graph, on a CPU it changes nothing.
+
+        Raises ConfigError for a device that is not there or switches that do not go together, ValueError for a model
+        that is prepared for another precision.
+        """
         self.device = torch.device(device)
         if self.device.type == "cuda" and not torch.cuda.is_available():
             raise ConfigError(f"device={device}: torch sees no GPU on this machine; use device=cpu")
-        self.model = model.to(self.device).eval()
+        if plain and (compiled or cuda_graph):
+            raise ConfigError("plain=True runs the model as trained; compiled and cuda_graph need it prepared")
+        prepared = model.prepared_bf16
+        if bf16 is None:
+            bf16 = bool(prepared)
+        if prepared is not None and prepared != bf16:
+            raise ValueError(f"the model is prepared for bf16={prepared}, but bf16={bf16} was asked for")
+        model = model.to(self.device).eval()
+        if prepared is None and not plain:
+            model = prepare_for_inference(model, bf16)
+            if cuda_graph:
+                replay_image_encoder(model)
+            if compiled:
+                compile_static_parts(model)
+        self.model = model
         self.grid = grid
         self.settings = settings
         self.bf16 = bf16
         self.memory: Any = None
 
     @classmethod
-    def load(cls, checkpoint: Path | str, device: torch.device | str = "cpu") -> Self:
-        """Rebuild a checkpoint's own model from the configuration in it.
+    def load(cls, checkpoint: Path | str, device: torch.device | str = "cpu", **switches: bool) -> Self:
+        """Rebuild a checkpoint's own model from the configuration in it; `switches` as for the constructor.
 
         Raises CheckpointError when the file is missing, damaged or not of this project.
         """
         path = Path(checkpoint)
         content = read_checkpoint(path)
-        return cls.restore(restore_config(content["horizon3d"]["config"], []), content, path, device)
+        return cls.restore(restore_config(content["horizon3d"]["config"], []), content, path, device, **switches)
 
     @classmethod
-    def restore(cls, config: Config, checkpoint: dict[str, Any], path: Path, device: torch.device | str) -> Self:
+    def restore(
+        cls,
+        config: Config,
+        checkpoint: dict[str, Any],
+        path: Path,
+        device: torch.device | str,
+        **switches: bool,
+    ) -> Self:
         """The detector of a checkpoint that has been read already; `path` is for messages."""
         # Every weight comes from the checkpoint; the file that training began from may not be on this machine.
         model = build_model(replace(config, backbone=replace(config.backbone, weights=None)))
         load_model_weights(model, checkpoint, path)
         settings = config.data.reader_settings(config.image_size_px)
-        return cls(model, config.grid.build(), settings, device, bf16=config.precision == Precision.bf16.value)
+        bf16 = config.precision == Precision.bf16.value
+        return cls(model, config.grid.build(), settings, device, bf16, **switches)
 
     def reset(self) -> None:
         """Forget everything: the next frame begins a new recording."""

@@ -181,7 +181,7 @@ def draw_pictures(
         {name: values["mAP"] for name, values in scores["ranges"].items()},
         folder.run_id,
     )
-    length = config.model.dptf.num_frames + 1 if config.phase.temporal and config.model.dptf is not None else 1
+    length = config.model.memory_frames + 1 if config.phase.temporal else 1
     clips = datamodule.validation_clips(config.trainer.num_pictures, length)
     draw_frames(module.model, clips, config.grid.build(), folder.pictures)
 

@@ -1,17 +1,16 @@
-"""`python -m src.benchmark suite=model|latency`: every part of a step or a frame is measured, with a full memory."""
+"""`python -m src.benchmark`: every suite runs at debug scale and leaves a page that says what was measured on what."""
 
 import json
-import os
-import types
 
 import pytest
 import torch
-from untrained import write_checkpoint
 
 from src import benchmark
-from src.benchmark import benchmark_latency, main, timed_parts
-from src.errors import CheckpointError, ConfigError
-from src.reporting.metric_names import METRICS
+from src.benchmark import main
+from src.benchmarking import convolutions, machine, model, ops, scaling, training
+from src.benchmarking.scenes import Highway
+from src.config import compose_config
+from src.errors import ConfigError, DataError
 
 
 @pytest.fixture(scope="module")
@@ -19,148 +18,134 @@ def outputs(tmp_path_factory):
     return tmp_path_factory.mktemp("outputs")
 
 
-def measured(outputs, tmp_path, *own):
-    main(["suite=model", "scale=debug", f"paths.outputs={outputs}", f"out={tmp_path}", "trainer=cpu", *own])
-    return json.loads((tmp_path / "model_debug.json").read_text())["result"]
+@pytest.fixture(autouse=True)
+def in_a_hurry(monkeypatch):
+    """Few rounds and a small roofline; what is measured stays the same."""
+    monkeypatch.setattr(machine, "GEMM_SIZE", {"cpu": 128, "cuda": 128})
+    monkeypatch.setattr(machine, "COPY_BYTES", {"cpu": 2**20, "cuda": 2**20})
+    for module in (model, ops, scaling, convolutions):
+        monkeypatch.setattr(module, "ROUNDS", 1)
+    monkeypatch.setattr(training, "WARM_UP_STEPS", 1)
+    monkeypatch.setattr(training, "MEASURED_STEPS", 3)
 
 
-def test_the_memory_is_full_and_measured(outputs, tmp_path):
-    result = measured(outputs, tmp_path, "phase=phase2", "model.dptf.bev_path.memory_threshold=0")
-    parts = ("radar_encoder", "image_encoder", "kggi", "ocsf", "head")
-    wanted = [f"{part} forward" for part in parts] + [f"dptf {part}" for part in ("recall", "aggregate", "remember")]
-    assert set(wanted) <= set(result["seconds"])
+def measured(name, outputs, folder, *own):
+    """Run one suite; its JSON result, after a look at the page."""
+    main([*own, "scale=debug", f"paths.outputs={outputs}", f"out={folder}", "trainer=cpu"])
+    page = json.loads((folder / f"{name}.json").read_text())
+    assert page["machine"]["threads"] == torch.get_num_threads() and page["machine"]["processor"]
+    text = (folder / f"{name}.md").read_text()
+    assert f"`python -m src.benchmark {' '.join(own)} scale=debug" in text and "processor: " in text
+    for key, rows in page["result"].items():
+        if isinstance(rows, list) and key != "notes":
+            assert f"## {key}" in text and rows
+    return page["result"]
+
+
+def column(rows, key, name):
+    return {row[key]: row.get(name) for row in rows}
+
+
+@pytest.mark.slow
+def test_model_with_a_full_memory(outputs, tmp_path):
+    own = ["suite=model", "phase=phase2", "model.dptf.bev_path.memory_threshold=0"]
+    result = measured("model_horizon3d_phase2_debug", outputs, tmp_path, *own)
+    milliseconds = column(result["time by part"], "part", "forward ms")
+    inner = {f"ocsf: {part}" for part in ("gaussian encoder", "splat", "gated fusion")}
+    inner |= {f"dptf: {part}" for part in ("recall", "aggregate", "remember")}
+    parts = {"radar_encoder", "image_encoder", "kggi", "ocsf", "dptf", "head", "head: decode"} | inner
+    assert parts < set(milliseconds) and all(value > 0 for value in milliseconds.values())
+    both = column(result["time by part"], "part", "f+b ms")
+    assert both["ocsf"] > 0 and both["head: decode"] is None  # boxes are no part of a training step
+    work = column(result["work by part"], "part", "forward GFLOP")
+    counted = sum(value for part, value in work.items() if part in parts - inner)
+    assert counted == pytest.approx(work["whole: frame to boxes, step to gradients"], rel=1e-6)
+    inside = sum(work[part] for part in inner if part.startswith("ocsf"))
+    assert inside == pytest.approx(work["ocsf"], rel=1e-6)
     assert result["state"]["remembered_cells"] > 1000 and result["state"]["gaussians_history"] == 16  # 2 frames of 8
-    assert "| dptf aggregate |" in (tmp_path / "model_debug.md").read_text()
-
-
-def test_a_model_of_single_frames_has_no_memory_to_measure(outputs, tmp_path):
-    result = measured(outputs, tmp_path, "phase=phase1")
-    assert not [name for name in result["seconds"] if name.startswith("dptf")] and result["seconds"]["kggi forward"] > 0
-
-
-# ---------------------------------------------------------------- latency
-
-ALL_PARTS = {"image_encoder", "radar_encoder", "kggi", "ocsf", "gaussian_encoder", "detection_head", "total"}
-
-
-def latency_of(outputs, folder, monkeypatch, *own):
-    monkeypatch.setattr(benchmark, "MEASURED_FRAMES", 4)
-    path = write_checkpoint(folder / "some.ckpt", f"paths.outputs={outputs}", "trainer=cpu", *own)
-    main(["suite=latency", f"checkpoint={path}", f"out={folder}", f"paths.outputs={outputs}", "trainer=cpu"])
-    return json.loads((folder / "latency.json").read_text())
+    assert result["batch_size"] == 1
 
 
 @pytest.mark.parametrize(
-    ("own", "parts"),
-    [
-        (["phase=phase2"], ALL_PARTS | {"dptf"}),
-        (["phase=phase1"], ALL_PARTS),
-        (["phase=phase1", "model.kggi=null", "model.ocsf=null"], {"radar_encoder", "detection_head", "total"}),
-    ],
-    ids=["with memory", "single frames", "radar only"],
+    ("own", "absent"), [(["phase=phase1"], "dptf"), (["model.kggi=null", "model.ocsf=null"], "image_encoder")]
 )
-def test_latency_of_the_parts_makes_up_that_of_a_frame(outputs, tmp_path, monkeypatch, capsys, own, parts):
-    result = latency_of(outputs, tmp_path, monkeypatch, *own)
-    milliseconds = result["ms"]
-    assert set(milliseconds) == set(result["spread_ms"]) == parts
-    assert {f"latency.{part}" for part in parts} <= METRICS.keys()
-    total, encoder = milliseconds.pop("total"), milliseconds.pop("gaussian_encoder", 0.0)
-    assert all(0 < value < total for value in milliseconds.values()) and encoder <= milliseconds.get("ocsf", 0.0)
-    assert 0.5 * total < sum(milliseconds.values()) < 1.25 * total  # medians of each; what is between parts is little
-    assert result["fps"] == pytest.approx(1e3 / total) and 0.1 < result["memory_gb"] < 64
-    assert (result["format"], result["frames"], result["device"]) == (1, 4, "cpu")
-    assert result["threads"] == torch.get_num_threads() and result["precision"] == "32-true"
-    assert result["processor"] and result["commit"] and result["load"] >= 0 and result["cores"] == os.cpu_count()
-    printed = capsys.readouterr().out
-    assert f"| total | {total:.1f} |" in printed and "latency.json" in printed
-    assert {path.name for path in tmp_path.iterdir()} == {"some.ckpt", "latency.json"}
+def test_parts_that_a_model_lacks_are_left_out(outputs, tmp_path, own, absent):
+    result = measured("model_horizon3d_phase1_debug", outputs, tmp_path, "suite=model", *own, "data.batch_size=2")
+    parts = column(result["time by part"], "part", "forward ms")
+    assert not [part for part in parts if part.startswith(absent)] and parts["radar_encoder"] > 0
+    assert result["batch_size"] == 2
 
 
-class FakeData:
-    """Validation scenes of these lengths."""
-
-    def __init__(self, lengths):
-        self.lengths, self.index, self.config = lengths, None, types.SimpleNamespace(split="val")
-
-    def stream(self):
-        return (FakeFrame(number) for length in self.lengths for number in range(length))
-
-
-class FakeFrame:
-    def __init__(self, number):
-        self.number, self.starts = number, [number == 0]
-
-    def to(self, device):
-        return self
+@pytest.mark.slow
+def test_model_of_the_dense_peer(outputs, tmp_path):
+    own = ["suite=model", "model=dense_bev", "phase=phase2"]
+    result = measured("model_dense_bev_phase2_debug", outputs, tmp_path, *own)
+    parts = column(result["time by part"], "part", "f+b ms")
+    assert {"image_encoder", "radar_encoder", "view_transform", "fuser", "temporal", "decoder", "head"} < set(parts)
+    assert result["state"]["remembered_frames"] == 2
 
 
-class FakeDetector:
-    """Notes how many frames it remembers when a frame comes."""
-
-    def __init__(self, depth):
-        self.device, self.model, self.depth = torch.device("cpu"), torch.nn.Module(), depth
-        self.seen, self.remembered = [], 0
-
-    def run(self, frame):
-        self.remembered = 0 if frame.number == 0 else min(self.remembered + 1, self.depth)
-        self.seen.append(self.remembered)
-
-
-@pytest.mark.parametrize(("lengths", "depth", "wanted"), [((6, 6), 3, 3), ((3, 2), 8, 2), ((4,), 0, 0), ((1,), 2, 0)])
-def test_frames_count_once_the_memory_is_as_full_as_it_gets(monkeypatch, lengths, depth, wanted):
-    """Which frames are measured is seen by a clock that each frame pushes on by what is remembered."""
-    data, detector = FakeData(lengths), FakeDetector(depth)
-    monkeypatch.setattr(benchmark, "split_samples", lambda index, split: None)
-    monkeypatch.setattr(benchmark, "scenes_of", lambda index, samples: [range(length) for length in lengths])
-    ticks = {"now": 0.0}
-
-    def run(frame, run=detector.run):
-        run(frame)
-        ticks["now"] += 1.0 + detector.remembered
-
-    detector.run = run
-    monkeypatch.setattr(benchmark, "clock", lambda device: lambda: ticks["now"])
-    result = benchmark_latency(detector, data, depth)
-    assert result["frames"] == 20 and result["ms"]["total"] == pytest.approx(1e3 * (1 + wanted))
-    assert result["spread_ms"]["total"] == 0.0
-    assert len(detector.seen) >= 25  # the first ones warm up
+@pytest.mark.parametrize("phase", ["phase1", "phase2"])
+def test_training(outputs, tmp_path, phase):
+    result = measured(f"training_horizon3d_{phase}_debug", outputs, tmp_path, "suite=training", f"phase={phase}")
+    rows = column(result["training step"], "batches", "frames/s")
+    assert list(rows) == ["with loader", "loaded"] and min(rows.values()) > 0
+    for row in result["training step"]:
+        stages = ("wait", "forward", "loss", "backward", "optimiser", "bookkeeping")
+        assert all(row[f"{stage} ms"] >= 0 for stage in stages)
+        # Medians of three steps each: their sum is near the median of the sum.
+        assert sum(row[f"{stage} ms"] for stage in stages) == pytest.approx(row["step ms"], rel=0.8)
 
 
-@pytest.mark.parametrize(("load", "warned"), [(1.9, False), (2.1, True)])
-def test_a_busy_machine_is_warned_of(tmp_path, monkeypatch, capsys, load, warned):
-    monkeypatch.setattr(benchmark, "read_checkpoint", lambda path: {"horizon3d": {"config": None}})
-    config = types.SimpleNamespace(model=types.SimpleNamespace(), precision="32-true", trainer=None)
-    monkeypatch.setattr(benchmark, "restore_config", lambda config_, overrides: config)
-    monkeypatch.setattr(benchmark, "chosen_device", lambda config: torch.device("cpu"))
-    monkeypatch.setattr(benchmark.StreamingDetector, "restore", lambda *_: FakeDetector(0))
-    monkeypatch.setattr(benchmark, "data_root", lambda config, write: None)
-    monkeypatch.setattr(benchmark, "build_datamodule", lambda config, root: FakeData((6, 6)))
-    monkeypatch.setattr(benchmark, "split_samples", lambda index, split: None)
-    monkeypatch.setattr(benchmark, "scenes_of", lambda index, samples: [range(6), range(6)])
-    monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0))
-    monkeypatch.setattr("os.cpu_count", lambda: 4)
-    benchmark.report_latency(types.SimpleNamespace(checkpoint="x", out=str(tmp_path)), [])
-    content = json.loads((tmp_path / "latency.json").read_text())
-    assert (content["load"], content["cores"]) == (load, 4)
-    assert ("warning: the load was" in capsys.readouterr().out) == warned
+def test_ops(outputs, tmp_path, monkeypatch):
+    monkeypatch.setattr(convolutions, "memory_of", lambda *_: (1.0, 2.0))  # its own test runs processes
+    monkeypatch.setattr(convolutions, "DENSE_LIMIT_FLOPS", 1e9)
+    result = measured("ops_debug", outputs, tmp_path, "suite=ops")
+    layers = result["sparse convolution"]
+    assert {row["mode"] for row in layers} == {"forward", "f+b"} and all(row["% of floor"] > 0 for row in layers)
+    assert any(row.get("x faster than dense") for row in layers)
+    assert any("x faster than dense" not in row for row in layers)  # too large
+    for row in [*layers, *result["radar backbone"]]:
+        assert row.get("spconv differs by", 0.0) < 1e-5
+    assert {row["mode"] for row in result["splat"]} == {"forward", "f+b"}
+    others = {row["operation"] for row in result["other operations"]}
+    assert {"segment sum", "bilinear sampling", "image attention", "farthest points", "box raster", "voxels"} == others
 
 
-def test_timed_parts_add_up_calls_and_leave_the_model_as_it_was():
-    model = torch.nn.Module()
-    model.first, model.second = torch.nn.Linear(2, 2), None
-    before = dict(vars(model.first))
-    timings = {}
-    parts = {"both": ("first.forward", "first.extra_repr"), "absent": ("second.forward", "third.forward")}
-    with pytest.raises(ZeroDivisionError), timed_parts(model, parts, timings, torch.device("cpu")):
-        model.first(torch.zeros(1, 2))
-        model.first.extra_repr()
-        1 / 0  # noqa: B018
-    assert list(timings) == ["both"] and len(timings["both"]) == 2 and vars(model.first) == before
+@pytest.mark.slow
+def test_scaling(outputs, tmp_path, monkeypatch):
+    small = scaling.Sizes(Highway(100, 10, 5, 150.0), 2, (37.5, 75.0, 150.0))
+    monkeypatch.setattr(scaling, "SIZES", {"debug": small})
+    monkeypatch.setattr(scaling, "NOMINAL_M", 75.0)
+    monkeypatch.setattr(scaling, "MEMORY_FRAMES", (0, 2))
+    monkeypatch.setattr(scaling, "FACTORS", {name: (0.5, 1.0) for name in scaling.FACTORS})
+    own = ["suite=scaling", "phase=phase2", "grid.cells=[192,192]"]
+    result = measured("scaling_debug", outputs, tmp_path, *own)
+    assert (tmp_path / "scaling_debug.png").read_bytes()[:4] == b"\x89PNG"
+    assert result["picture"] == "scaling_debug.png"
+    sweeps = [row["sweep"] for row in result["growth"]]
+    assert sweeps == [
+        "range, equal density", "range, fixed scene", "objects", "radar points", "gaussians", "memory frames"
+    ]  # fmt: skip
+    for name in sweeps:
+        assert {row["model"] for row in result[name]} == {"horizon3d", "dense_bev"}
+    remembered = {(row["memory frames"], row["model"]): row["remembered MiB"] for row in result["memory frames"]}
+    assert remembered[0, "horizon3d"] == remembered[0, "dense_bev"] == 0.0
+    channels = compose_config(["scale=debug", "model=dense_bev"])[0].model.fused_channels
+    assert remembered[2, "dense_bev"] == pytest.approx(2 * 192 * 192 * channels * 2 / 2**20, rel=1e-3)  # bfloat16
+    fixed = [row["radar points"] for row in result["range, fixed scene"]]
+    dense = [row["radar points"] for row in result["range, equal density"]]
+    assert len(set(fixed)) == 1 and dense == sorted(dense) and dense[0] < dense[-1]
 
 
-def test_latency_needs_a_checkpoint(tmp_path):
-    with pytest.raises(ConfigError, match="checkpoint=PATH"):
-        main(["suite=latency", f"out={tmp_path}"])
-    with pytest.raises(CheckpointError, match="does not exist"):
-        main(["suite=latency", f"checkpoint={tmp_path / 'no.ckpt'}", f"out={tmp_path}"])
-    assert not list(tmp_path.iterdir())
+def test_a_disagreement_of_the_metric_is_an_error_after_the_page(tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark, "compare_with_devkit", lambda **_: {"agrees": False, "max_difference": 0.5})
+    with pytest.raises(DataError, match="disagree"):
+        main(["suite=metric", f"out={tmp_path}"])
+    assert "max_difference 0.5" in (tmp_path / "metric.md").read_text()
+
+
+def test_a_folder_that_cannot_be_written_is_told_first(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="out"):
+        main(["suite=model", f"out={tmp_path / 'file'}"])

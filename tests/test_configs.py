@@ -43,6 +43,18 @@ def test_phase_2_composes_at_every_scale(scale):
 
 
 @pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("phase", ["phase1", "phase2"])
+def test_the_dense_peer_composes_at_every_scale(scale, phase):
+    """At the same range and cell; phase 1 drops what its settings name as temporal."""
+    config, tree = compose_config([f"scale={scale}", "data.root=x", "model=dense_bev", f"phase={phase}"])
+    model = config.model
+    assert model.name == tree["model"]["name"] == "dense_bev" and config.grid.cells == [384, 384]
+    assert (model.temporal is None) == (tree["model"]["temporal"] is None) == (phase == "phase1")
+    assert (model.memory_frames > 0) == (model.memory_max_age_s == 6.0) == (phase == "phase2")
+    assert model.view_transform.num_depth_bins in (16, 80) and model.view_transform.depth_range == (1.0, 160.0)
+
+
+@pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize(
     ("overrides", "off"),
     [
@@ -205,6 +217,11 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["seed=${nothing}"], "nothing"),
         (["seed=4294967296"], "seed.*4294967296"),
         (["model.name=other"], "model.name.*horizon3d"),
+        (["model=dense_bev", "model.kggi=null"], "kggi"),
+        (["model=dense_bev", "model.fused_channels=8"], "model.fused_channels=8.*at least 16"),
+        (["model=dense_bev", "model.loss.depth_weight=-1"], "model.loss.depth_weight=-1"),
+        (["model=dense_bev", "model.view_transform.image_stride_px=0"], "image_stride_px=0"),
+        (["model=dense_bev", "phase=phase2", "model.temporal.num_frames=0"], "num_frames=0.*model.temporal=null"),
         (["phase=phase2", "phase.name=phase1"], "phase.name=phase1.*phase=\\.\\.\\."),
         (["phase.velocity_code_weight=-1"], "velocity_code_weight"),
         (["optim.final_lr_ratio=-1"], "final_lr_ratio"),
@@ -255,6 +272,17 @@ def test_a_stored_phase_2_comes_back_with_its_memory():
     _, single = compose_config(["scale=debug"])
     with pytest.raises(ConfigError, match="model.dptf.max_age_s: the checkpoint has no model.dptf"):
         restore_config(single, ["model.dptf.max_age_s=0.55"])
+
+
+def test_a_stored_dense_peer_comes_back_as_such():
+    """Also where the command line says nothing of the model, whose default is another."""
+    _, tree = compose_config(["scale=debug", "phase=phase2", "model=dense_bev", "model.temporal.num_frames=3"])
+    for named in ([], ["model=dense_bev"]):  # commands compose their line by itself, and then need to be told
+        config = restore_config(tree, [*named, "model.temporal.max_age_s=0.55", "data.root=/elsewhere"])
+        assert config.model.name == "dense_bev" and config.model.temporal.num_frames == 3
+        assert config.model.memory_max_age_s == 0.55 and config.data.root == "/elsewhere"
+    with pytest.raises(ConfigError, match="model=horizon3d: the checkpoint is of model=dense_bev"):
+        restore_config(tree, ["model=horizon3d"])
 
 
 def test_a_stored_configuration_comes_back_with_the_command_lines_changes():

@@ -12,6 +12,8 @@ from src.reporting.sweep_tables import sweep_tables
 from src.sweep_config import sweep_files
 
 ROOT = Path(__file__).resolve().parent.parent
+PARTS_OF_SOME = ("kggi", "ocsf", "gaussian_encoder", "dptf", "view_transform", "temporal_fusion")
+"""Of Table 15: not every model has each of them."""
 pytestmark = pytest.mark.slow
 
 
@@ -47,6 +49,7 @@ def test_a_sweep_ends_with_complete_tables(name, folder):
         assert trained
         for place, column in enumerate(table.columns):
             shown = [row.cells[place].mean for row in trained]
-            in_paper_only = column.name in ("latency.view_transform", "latency.temporal_fusion")
             present_here = column.name.startswith(("speeds.", "classes."))  # the debug world lacks most of them
-            assert in_paper_only or present_here or None not in shown, (table.name, column.name)
+            own = column.name.removeprefix("latency.") in PARTS_OF_SOME
+            complete = any(value is not None for value in shown) if own else None not in shown
+            assert present_here or complete, (table.name, column.name)

@@ -234,8 +234,14 @@ def test_bf16_runs_in_autocast(tmp_path):
     path = write_checkpoint(tmp_path / "bf16.ckpt", "phase=phase2", "precision=bf16-mixed")
     detector = StreamingDetector.load(path)
     frame = make_frame(detector, 0.0)
-    assert detector.bf16 and torch.isfinite(detector.step(frame).centers).all()
-    assert not same(alone(detector, frame), StreamingDetector.load(path).step(frame))  # alone: in full precision
+    boxes = detector.step(frame)
+    assert detector.bf16 and torch.isfinite(boxes.centers).all()
+    assert same(alone(detector, frame), boxes)  # a second vehicle's detector takes the precision over
+    plain = StreamingDetector.load(path, plain=True)
+    full = StreamingDetector(plain.model, plain.grid, plain.settings, bf16=False)
+    assert not same(full.step(frame), boxes)
+    with pytest.raises(ValueError, match="prepared for bf16=True, but bf16=False"):
+        StreamingDetector(detector.model, detector.grid, detector.settings, bf16=False)
 
 
 def test_the_example_of_the_readme_runs(checkpoints, tmp_path, monkeypatch, capsys):

@@ -131,6 +131,23 @@ def test_numbers_of_all_methods_are_those_reported():
     assert found == wanted
 
 
+def test_the_dense_peer_is_trained_as_the_method_it_stands_for():
+    """Same phase, data, backbone and head settings as the row it is compared with; only the model differs."""
+    sweep = load_sweep(OTHER_METHODS)
+    (row,) = [row for row in sweep.rows if row.label == "BEVFusion"]
+    (ours,) = [row for row in sweep.rows if row.label == sweep.baseline]
+    for scale in SCALES:
+        peer, own = (build_config(tree_of(scale, overrides_of(sweep, one))) for one in (row, ours))
+        assert (peer.model.name, own.model.name) == ("dense_bev", "horizon3d")
+        for part in ("data", "backbone", "phase", "optim", "grid", "precision", "seed"):
+            assert getattr(peer, part) == getattr(own, part), (scale, part)
+        for name in ("nms", "score_threshold", "max_boxes", "attributes"):
+            assert getattr(peer.model.head, name) == getattr(own.model.head, name)
+        for name in ("heatmap_weight", "box_weight", "depth_weight"):
+            assert getattr(peer.model.loss, name) == getattr(own.model.loss, name)
+        assert peer.model.memory_max_age_s == own.model.memory_max_age_s and peer.model.memory_frames > 0
+
+
 def test_tables_show_every_number_of_the_paper_that_a_file_has():
     for name in QUESTIONS:
         sweep = load_sweep(name)
@@ -191,8 +208,8 @@ def test_tables_have_names_of_their_own():
 def test_a_row_for_one_scale_is_the_papers_alone_at_others():
     sweep = load_sweep(OTHER_METHODS)
     small, full = sweep.at_scale("mini"), sweep.at_scale("paper")
-    assert [row.label for row in small.rows] == ["Horizon3D"] and len(full.rows) == 2
-    assert small.paper_rows[0].label == "Horizon3D, V2-99" and small.paper_rows[0].paper == full.rows[1].paper
+    assert [row.label for row in small.rows] == ["Horizon3D", "BEVFusion"] and len(full.rows) == 3
+    assert small.paper_rows[0].label == "Horizon3D, V2-99" and small.paper_rows[0].paper == full.rows[2].paper
     assert full == sweep and small.baseline == "Horizon3D"
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import lightning as L
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, default_collate
 
 from src.data.augment import AugmentationConfig
 from src.data.cache import load_index
@@ -29,6 +29,7 @@ from src.data.clips import (
     whole_scenes,
 )
 from src.data.evaluation import evaluation_set
+from src.data.parcel import Parcel
 from src.data.reader import FrameReader, OnBadFile, ReaderSettings
 from src.data.schema import DatasetIndex
 from src.data.splits import split_samples
@@ -144,7 +145,7 @@ class FrameLoader(DataLoader):
             for batch in super().__iter__():
                 if isinstance(batch, HorizonError):
                     raise batch
-                yield batch
+                yield batch.unpack() if isinstance(batch, Parcel) else batch
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing: the place in an epoch follows from the trainer's step. Lightning warns of a loader without this."""
@@ -308,7 +309,7 @@ class DetectionDataModule(L.LightningDataModule):
             FrameDataset(self.reader, augmentation, self.seed, self.config.silent_frames),
             batch_sampler=sampler,
             num_workers=workers,
-            collate_fn=collate,
+            collate_fn=collate_in_worker if workers else collate,
             pin_memory=torch.cuda.is_available(),
             persistent_workers=workers > 0,
             prefetch_factor=4 if workers else None,
@@ -325,11 +326,15 @@ def collate(frames: list[FrameBatch | HorizonError]) -> FrameBatch | HorizonErro
     for frame in frames:
         if isinstance(frame, HorizonError):
             return frame
+    if len(frames) == 1:
+        return frames[0]
     values: dict[str, Any] = {}
     for field in fields(FrameBatch):
         parts = [getattr(frame, field.name) for frame in frames]
         if isinstance(parts[0], torch.Tensor):
-            values[field.name] = torch.cat(parts)
+            # torch's own collate writes a worker's stack into shared memory at once.
+            stack = field.name == "images"
+            values[field.name] = default_collate([part[0] for part in parts]) if stack else torch.cat(parts)
         elif isinstance(parts[0], list):
             values[field.name] = [item for part in parts for item in part]
     values["radar_batch"] = torch.repeat_interleave(
@@ -339,6 +344,12 @@ def collate(frames: list[FrameBatch | HorizonError]) -> FrameBatch | HorizonErro
         name: sum(frame.skipped.get(name, 0) for frame in frames) for frame in frames for name in frame.skipped
     }
     return FrameBatch(**values)
+
+
+def collate_in_worker(frames: list[FrameBatch | HorizonError]) -> Parcel | HorizonError:
+    """As `collate`, packed for the way to the training process."""
+    batch = collate(frames)
+    return batch if isinstance(batch, HorizonError) else Parcel.pack(batch)
 
 
 def _evenly_spread(samples: np.ndarray, count: int) -> np.ndarray:

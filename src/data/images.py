@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from src.data.jpeg import REDUCTIONS, decode_fast
 from src.errors import ConfigError, DataError
 from src.geometry.camera import image_transform
 
@@ -57,14 +58,45 @@ def width_fit(
 
 
 def read_image(
-    path: Path,
+    path: str | os.PathLike[str],
     source_px: tuple[int, int],  # (height, width) as the tables state it
     crop: ImageCrop,
-) -> Array:  # [3, H, W] uint8 RGB
+) -> Array:  # [3, H, W] uint8 RGB, not to be written to
     """Read, resample and augment one image. Greyscale and CMYK become RGB.
 
     Raises DataError naming the file when it is missing, no image, truncated, a bomb or of another size.
     """
+    return resample(decode(path, source_px, reduction_for(source_px, crop)), crop, source_px)
+
+
+def reduction_for(
+    source_px: tuple[int, int],  # (height, width)
+    crop: ImageCrop,
+) -> int:
+    """1/8, 1/4 or 1/2 is what is decoded where that still has more pixels than needed: half the time of a frame."""
+    needed = [math.ceil(side * crop.resize) for side in source_px]
+    return next((r for r in REDUCTIONS if all(s // n >= r for s, n in zip(source_px, needed, strict=True))), 1)
+
+
+def decode(
+    path: str | os.PathLike[str],
+    source_px: tuple[int, int],  # (height, width) as the tables state it
+    reduction: int,  # one of REDUCTIONS
+) -> Image.Image:  # RGB
+    """The whole image at 1/`reduction` of its size, by the fastest decoder at hand; raises DataError as `read_image`.
+
+    Whichever it is, the pixels are the same (`src.data.jpeg`).
+    """
+    image = decode_fast(path, source_px, reduction) if source_px[0] * source_px[1] <= MAX_PIXELS else None
+    return image if image is not None else decode_by_pillow(path, source_px, reduction)
+
+
+def decode_by_pillow(
+    path: str | os.PathLike[str],
+    source_px: tuple[int, int],  # (height, width) as the tables state it
+    reduction: int,  # one of REDUCTIONS
+) -> Image.Image:  # RGB
+    """As `decode`, and what says what is wrong with a file."""
     try:
         # Only JPEG: other decoders of Pillow start programs or unpack without bounds.
         with Image.open(path, formats=("JPEG",)) as image:
@@ -74,9 +106,9 @@ def read_image(
                 raise DataError(f"{path}: the tables say {stated} pixels, the file has {width} x {height}")
             if width * height > MAX_PIXELS:
                 raise DataError(f"{path}: {width} x {height} pixels are more than any camera gives ({MAX_PIXELS})")
-            # Decode at 1/2, 1/4 or 1/8 where that still has more pixels than needed: half the time of a frame.
-            image.draft(image.mode, (math.ceil(width * crop.resize), math.ceil(height * crop.resize)))
-            return resample(image.convert("RGB"), crop, (height, width))
+            image.draft(image.mode, (max(1, width // reduction), max(1, height // reduction)))
+            image.load()
+            return image if image.mode == "RGB" else image.convert("RGB")
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such file") from error
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
@@ -87,7 +119,7 @@ def resample(
     image: Image.Image,  # RGB, perhaps decoded at a power of two below the source size
     crop: ImageCrop,
     source_px: tuple[int, int],  # (height, width)
-) -> Array:  # [3, H, W] uint8
+) -> Array:  # [3, H, W] uint8, not to be written to
     """Cut the source rectangle behind the crop and resize it in one step; what lies outside stays black."""
     height, width = crop.size_px
     reduction = round(source_px[1] / image.width)  # exactly that; an odd last row or column is half padding
@@ -96,16 +128,30 @@ def resample(
     x0, y0 = max(0, -left), max(0, -top)
     x1 = min(width, math.floor(crop.resize * source_px[1] - left + 1e-6))
     y1 = min(height, math.floor(crop.resize * source_px[0] - top + 1e-6))
-    canvas = Image.new("RGB", (width, height))
+    canvas = None
     if x1 > x0 and y1 > y0:
         box = tuple(
             min(max(0.0, edge / crop.resize), limit) / reduction
             for edge, limit in zip((x0 + left, y0 + top, x1 + left, y1 + top), 2 * source_px[::-1], strict=True)
         )
-        canvas.paste(image.resize((x1 - x0, y1 - y0), Image.Resampling.BILINEAR, box=box), (x0, y0))
+        canvas = image.resize((x1 - x0, y1 - y0), Image.Resampling.BILINEAR, box=box)
+    if canvas is None or canvas.size != (width, height):
+        part, canvas = canvas, Image.new("RGB", (width, height))
+        if part is not None:
+            canvas.paste(part, (x0, y0))
+    canvas = turn(canvas, crop)
+    planes = b"".join(canvas.tobytes("raw", band) for band in "RGB")
+    return np.frombuffer(planes, np.uint8).reshape(3, height, width)
+
+
+def turn(
+    canvas: Image.Image,
+    crop: ImageCrop,
+) -> Image.Image:
+    """The part of the augmentation that comes after the crop: mirror, then rotate about the centre."""
     if crop.flip:
         canvas = canvas.transpose(Image.Transpose.FLIP_LEFT_RIGHT)
     if crop.rotation_rad:
         # Pillow turns counter-clockwise on the screen, our angle runs from x to y, which points down.
         canvas = canvas.rotate(-math.degrees(crop.rotation_rad), Image.Resampling.BILINEAR)
-    return np.ascontiguousarray(np.asarray(canvas).transpose(2, 0, 1))
+    return canvas

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import os
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -18,46 +20,80 @@ _KINDS = {(kind, size): f"<{kind.lower()}{size}" for kind in "IU" for size in (1
 _KINDS |= {("F", 4): "<f4", ("F", 8): "<f8"}
 
 
+@dataclass(frozen=True)
+class _Layout:
+    """What a header says of the data behind it."""
+
+    fields: tuple[str, ...]
+    dtype: np.dtype  # of one point
+    count: int  # points
+    encoding: str
+    start: int  # byte at which the data begin
+    plain: bool  # nothing but RADAR_FIELDS as float32 in their order: the data are the array
+
+
 def read_radar_points(
-    path: Path,
+    path: str | os.PathLike[str],
 ) -> Array:  # [n, 7] float32 in the order of RADAR_FIELDS, sensor frame
     """Positions (m), relative radial velocity vectors (m/s) and RCS of one radar sweep; a file may hold no point.
 
-    Fields are taken by name, in any order, from `binary` or `ascii` data. Raises DataError naming the file, what was
-    expected and what was found.
+    Fields are taken by name, in any order, from `binary` or `ascii` data; usual files are one read-only view of their
+    bytes. Raises DataError naming the file, what was expected and what was found.
     """
     try:
-        content = path.read_bytes()
+        with open(path, "rb", buffering=0) as file:
+            content = file.readall()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    header, start = _header(path, content)
-    names, kinds = _columns(path, header)
-    count = _count(path, header)
-    missing = [name for name in RADAR_FIELDS if name not in names]
-    if missing:
-        raise DataError(f"{path}: a radar file has the fields {list(RADAR_FIELDS)}, but {missing} are not in {names}")
-    encoding = header.get("DATA", [""])[0]
-    if encoding == "binary":
-        dtype = np.dtype(list(zip(names, kinds, strict=True)))
-        expected = start + count * dtype.itemsize
-        if len(content) != expected:
-            raise DataError(f"{path}: {count} points end at byte {expected}, but the file has {len(content)} bytes")
-        if names == list(RADAR_FIELDS) and set(kinds) == {"<f4"}:
-            points = np.frombuffer(content, "<f4", offset=start).reshape(count, len(RADAR_FIELDS))
-        else:
-            table = np.frombuffer(content, dtype, count, start)
-            points = np.stack([table[name] for name in RADAR_FIELDS], axis=1).astype(np.float32)
-    elif encoding == "ascii":
-        points = _ascii_points(path, content[start:], names, count)
-    else:
-        raise DataError(f"{path}: DATA must be binary or ascii for a radar file, but got {encoding!r}")
+    try:
+        layout = _layout(content)
+        points = _points(content, layout)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error.__cause__
     if not np.isfinite(points).all():
         row = int(np.argmin(np.isfinite(points).all(axis=1)))
         raise DataError(f"{path}: point {row} is not finite: {points[row].tolist()}")
     return points
 
 
-def _header(path: Path, content: bytes) -> tuple[dict[str, list[str]], int]:
+def _points(content: bytes, layout: _Layout) -> Array:  # [n, 7] float32
+    if layout.encoding == "ascii":
+        return _ascii_points(content[layout.start :], layout.fields, layout.count)
+    expected = layout.start + layout.count * layout.dtype.itemsize
+    if len(content) != expected:
+        raise DataError(f"{layout.count} points end at byte {expected}, but the file has {len(content)} bytes")
+    if layout.plain:
+        return np.frombuffer(content, "<f4", offset=layout.start).reshape(layout.count, len(RADAR_FIELDS))
+    table = np.frombuffer(content, layout.dtype, layout.count, layout.start)
+    return np.stack([table[name] for name in RADAR_FIELDS], axis=1).astype(np.float32)
+
+
+def _layout(content: bytes) -> _Layout:
+    """The header's meaning; files differ in little but their number of points, so most headers were met before."""
+    data = content.find(b"\nDATA ", 0, MAX_HEADER_BYTES)
+    end = content.find(b"\n", data + 1, MAX_HEADER_BYTES) + 1 if data >= 0 else 0
+    return _known_layout(content[:end]) if end else _parse_layout(content)
+
+
+def _parse_layout(content: bytes) -> _Layout:
+    header, start = _header(content)
+    names, kinds = _columns(header)
+    count = _count(header)
+    missing = [name for name in RADAR_FIELDS if name not in names]
+    if missing:
+        raise DataError(f"a radar file has the fields {list(RADAR_FIELDS)}, but {missing} are not in {names}")
+    encoding = header.get("DATA", [""])[0]
+    if encoding not in ("binary", "ascii"):
+        raise DataError(f"DATA must be binary or ascii for a radar file, but got {encoding!r}")
+    dtype = np.dtype(list(zip(names, kinds, strict=True)))
+    plain = names == list(RADAR_FIELDS) and set(kinds) == {"<f4"}
+    return _Layout(tuple(names), dtype, count, encoding, start, plain)
+
+
+_known_layout = lru_cache(maxsize=2048)(_parse_layout)  # about a kilobyte each
+
+
+def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
     """Header entries, and the byte at which the data begin."""
     entries: dict[str, list[str]] = {}
     at = 0
@@ -71,42 +107,42 @@ def _header(path: Path, content: bytes) -> tuple[dict[str, list[str]], int]:
             entries[words[0]] = words[1:]
             if words[0] == "DATA":
                 return entries, at
-    raise DataError(f"{path}: not a PCD file: no DATA line in the first {min(len(content), MAX_HEADER_BYTES)} bytes")
+    raise DataError(f"not a PCD file: no DATA line in the first {min(len(content), MAX_HEADER_BYTES)} bytes")
 
 
-def _columns(path: Path, header: dict[str, list[str]]) -> tuple[list[str], list[str]]:
+def _columns(header: dict[str, list[str]]) -> tuple[list[str], list[str]]:
     names, sizes, types = (header.get(key, []) for key in ("FIELDS", "SIZE", "TYPE"))
     counts = header.get("COUNT", ["1"] * len(names))
     if not names or len(set(names)) != len(names) or not len(names) == len(sizes) == len(types) == len(counts):
         lines = f"{names}, {sizes}, {types}, {counts}"
-        raise DataError(f"{path}: FIELDS, SIZE, TYPE and COUNT must have one entry per field, but got {lines}")
+        raise DataError(f"FIELDS, SIZE, TYPE and COUNT must have one entry per field, but got {lines}")
     if set(counts) != {"1"}:
-        raise DataError(f"{path}: every field must have COUNT 1, but got {counts}")
+        raise DataError(f"every field must have COUNT 1, but got {counts}")
     kinds = [_KINDS.get((kind, int(size) if size.isdigit() else 0)) for kind, size in zip(types, sizes, strict=True)]
     if None in kinds:
         at = kinds.index(None)
-        raise DataError(f"{path}: field {names[at]} has TYPE {types[at]} SIZE {sizes[at]}, which is not supported")
+        raise DataError(f"field {names[at]} has TYPE {types[at]} SIZE {sizes[at]}, which is not supported")
     return names, kinds
 
 
-def _count(path: Path, header: dict[str, list[str]]) -> int:
+def _count(header: dict[str, list[str]]) -> int:
     numbers = {}
     for key in ("WIDTH", "HEIGHT", "POINTS"):
         words = header.get(key, [])
         if len(words) != 1 or not words[0].isdigit():
-            raise DataError(f"{path}: {key} must be one whole number, but got {words}")
+            raise DataError(f"{key} must be one whole number, but got {words}")
         numbers[key] = int(words[0])
     if numbers["POINTS"] > MAX_POINTS or numbers["WIDTH"] * numbers["HEIGHT"] != numbers["POINTS"]:
-        raise DataError(f"{path}: WIDTH x HEIGHT must equal POINTS, at most {MAX_POINTS}, but got {numbers}")
+        raise DataError(f"WIDTH x HEIGHT must equal POINTS, at most {MAX_POINTS}, but got {numbers}")
     return numbers["POINTS"]
 
 
-def _ascii_points(path: Path, text: bytes, names: list[str], count: int) -> Array:
+def _ascii_points(text: bytes, names: tuple[str, ...], count: int) -> Array:
     words = text.split()
     if len(words) != count * len(names):
-        raise DataError(f"{path}: {count} points of {len(names)} fields expected, but {len(words)} numbers found")
+        raise DataError(f"{count} points of {len(names)} fields expected, but {len(words)} numbers found")
     try:
         table = np.array(words, dtype=np.float64).reshape(count, len(names))
     except ValueError as error:
-        raise DataError(f"{path}: not a number in the data ({error})") from error
+        raise DataError(f"not a number in the data ({error})") from error
     return table[:, [names.index(name) for name in RADAR_FIELDS]].astype(np.float32)

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -59,7 +58,8 @@ class FrameReader:
     def __init__(self, index: DatasetIndex, settings: ReaderSettings) -> None:
         self.index = index
         self.settings = settings
-        self._root = Path(os.path.realpath(index.root))
+        self._root = os.path.realpath(index.root)
+        self._folders: dict[str, str] = {}  # where the folders of files lead to
         self._reported: set[str] = set()
 
     def read(
@@ -133,7 +133,7 @@ class FrameReader:
         linear = aug_from_ego[:3, :3]
         compensated[:, :3] = compensated[:, :3] @ linear.T + aug_from_ego[:3, 3]
         compensated[:, 4:6] = compensated[:, 4:6] @ linear[:2, :2].T
-        return compensated.astype(np.float32)
+        return compensated.astype(np.float32, order="C")
 
     # ---------------------------------------------------------------- cameras
 
@@ -152,8 +152,15 @@ class FrameReader:
         valid = np.zeros(len(CAMERAS), bool)
         pix_from_aug = np.tile(np.eye(4), (len(CAMERAS), 1, 1))
         ida = augmentation.image if augmentation is not None else None
+        rows = index.key_data[sample, [CHANNELS.index(channel) for channel in CAMERAS]]
+        poses, calibrations = index.data_poses[rows], index.data_calibrations[rows]
+        global_from_cam = (
+            pose_matrix(index.pose_rotations[poses], index.pose_translations[poses])
+            @ index.ego_from_sensor[calibrations]
+        )
+        cam_from_aug = invert_rigid(global_from_cam) @ global_from_ego @ np.linalg.inv(aug_from_ego)
         for view, channel in enumerate(CAMERAS):
-            row = int(index.key_data[sample, CHANNELS.index(channel)])
+            row = int(rows[view])
             if row < 0:
                 _count(skipped, f"{channel} (not recorded)")
                 continue
@@ -167,14 +174,8 @@ class FrameReader:
             image = self._guarded(sample, channel, row, read, skipped)
             if image is not None:
                 images[view], valid[view] = image, True
-            pose = index.data_poses[row]
-            global_from_cam = (
-                pose_matrix(index.pose_rotations[pose], index.pose_translations[pose])
-                @ index.ego_from_sensor[index.data_calibrations[row]]
-            )
-            cam_from_aug = invert_rigid(global_from_cam) @ global_from_ego @ np.linalg.inv(aug_from_ego)
             pix_from_aug[view] = pixels_from_points(
-                index.intrinsics[index.data_calibrations[row]], cam_from_aug, crop.matrix()
+                index.intrinsics[calibrations[view]], cam_from_aug[view], crop.matrix()
             )
         return {
             "images": torch.from_numpy(images[None]),
@@ -208,7 +209,7 @@ class FrameReader:
     # ---------------------------------------------------------------- files
 
     def _guarded(
-        self, sample: int, channel: str, row: int, read: Callable[[Path], T], skipped: dict[str, int]
+        self, sample: int, channel: str, row: int, read: Callable[[str], T], skipped: dict[str, int]
     ) -> T | None:
         """Read a sensor file; when it cannot be, raise or count and return None, as `on_bad_file` says."""
         name = self.index.filename(row)
@@ -224,11 +225,20 @@ class FrameReader:
                 _log.warning("skipped: %s", error)
             return None
 
-    def _inside(self, name: str) -> Path:
-        """The file's path, refused when a symbolic link leads out of the data set."""
-        path = Path(os.path.realpath(self._root / name))
-        if not path.is_relative_to(self._root):
-            raise DataError(f"{self._root / name}: leads to {path}, which is outside the dataset folder")
+    def _inside(self, name: str) -> str:
+        """The file's path, refused when a symbolic link leads out of the data set.
+
+        A folder is followed once: sixty files of a frame lie in a dozen folders.
+        """
+        folder, _, file = name.rpartition("/")
+        if folder not in self._folders:
+            self._folders[folder] = os.path.realpath(os.path.join(self._root, folder))
+        path = f"{self._folders[folder]}/{file}"
+        if os.path.islink(path):
+            path = os.path.realpath(path)
+        if not path.startswith(f"{self._root}/"):
+            stated = os.path.join(self._root, name)
+            raise DataError(f"{stated}: leads to {path}, which is outside the dataset folder")
         return path
 
 
@@ -270,25 +280,44 @@ def compensate_clouds(
     v_r = vrel . r_hat + v_s . r_hat, zero for whatever stands still.
     """
     sensor_velocity = velocity + np.cross(rate, ego_from_sensor[:, :3, 3])
-    points = np.concatenate(clouds).astype(np.float64)
-    sweep = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
-    distance = np.linalg.norm(points[:, :3], axis=1)
-    near = (np.abs(points[:, :2]) < settings.min_distance_m).all(axis=1) | (distance < 1e-6)
-    points, sweep, distance = points[~near], sweep[~near], distance[~near]
-
-    def rotate(matrices: Array, vectors: Array) -> Array:  # [S, 3, 3], [P, 3] -> [P, 3]
-        return np.einsum("pij,pj->pi", matrices[sweep], vectors)
-
-    direction = points[:, :3] / distance[:, None]  # sensor frame
-    direction_ego = rotate(ego_from_sensor[:, :3, :3], direction)
-    speed = (points[:, 3:6] * direction).sum(axis=1) + (sensor_velocity[sweep] * direction_ego).sum(axis=1)
     key_from_sensor = key_from_sweep @ ego_from_sensor
-    position = rotate(key_from_sensor[:, :3, :3], points[:, :3]) + key_from_sensor[sweep, :3, 3]
-    ground_velocity = speed[:, None] * rotate(key_from_sweep[:, :3, :3], direction_ego)
-    lag = elapsed_s[sweep]
+    counts = [len(cloud) for cloud in clouds]
+
+    def rows(values: Array, *shape: int) -> Array:  # [S, ...] -> [..., P]
+        """A sweep's numbers once for each of its points, as rows: whole rows are what numpy is fast on."""
+        return np.repeat(values.reshape(len(counts), -1).T, counts, axis=1).reshape(*shape, -1)
+
+    # [3, P] each
+    place, relative, (rcs,) = np.split(np.concatenate(clouds).T.astype(np.float64, order="C"), (3, 6))
+    distance = np.sqrt(_dot(place, place))
+    near = (np.abs(place[:2]) < settings.min_distance_m).all(axis=0) | (distance < 1e-6)
+    distance[near] = 1.0  # left out at the end; until then no division by zero
+    direction = place / distance  # sensor frame
+    direction_ego = _rotate(rows(ego_from_sensor[:, :3, :3], 3, 3), direction)
+    speed = _dot(relative, direction) + _dot(rows(sensor_velocity, 3), direction_ego)
+    position = _rotate(rows(key_from_sensor[:, :3, :3], 3, 3), place) + rows(key_from_sensor[:, :3, 3], 3)
+    ground_velocity = speed * _rotate(rows(key_from_sweep[:, :2, :3], 2, 3), direction_ego)
+    lag = rows(elapsed_s)
     if settings.propagate_points:
-        position[:, :2] += ground_velocity[:, :2] * lag[:, None]
-    return np.concatenate([position, points[:, 6:7], ground_velocity[:, :2], lag[:, None]], axis=1)
+        position[:2] += ground_velocity * lag
+    points = np.stack([*position, rcs, *ground_velocity, lag])
+    return (points[:, ~near] if near.any() else points).T
+
+
+def _dot(
+    a: Array,  # [3, P]
+    b: Array,  # [3, P]
+) -> Array:  # [P]
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _rotate(
+    matrices: Array,  # [n, 3, P]
+    vectors: Array,  # [3, P]
+) -> Array:  # [n, P]
+    """A matrix of its own for every point."""
+    # The order of the sum is that of numpy's einsum on x86, to the last bit.
+    return matrices[:, 0] * vectors[0] + matrices[:, 2] * vectors[2] + matrices[:, 1] * vectors[1]
 
 
 def ego_motion(

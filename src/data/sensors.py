@@ -130,7 +130,7 @@ def _radar_points(
         rate=np.stack(rates),
         elapsed_s=np.array(ages),
         settings=settings,
-    ).astype(np.float32)
+    ).astype(np.float32, order="C")
 
 
 def _driven(

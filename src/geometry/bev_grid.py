@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from src.errors import ConfigError
+from src.geometry.constants import constant
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class BEVGrid:
         xy: Tensor,  # [..., 2] metres
     ) -> Tensor:  # [..., 2] (x, y) in cells, continuous, measured from the grid's lower corner
         """Grid coordinates g = (xy - lower corner) / cell; cell (row, col) spans [col, col+1) x [row, row+1)."""
-        return (xy - xy.new_tensor([self.x_min_m, self.y_min_m])) / self.cell_m
+        return (xy - constant((self.x_min_m, self.y_min_m), xy.dtype, xy.device)) / self.cell_m
 
     def cell_of(
         self,
@@ -89,5 +90,5 @@ class BEVGrid:
         dtype: torch.dtype = torch.float32,
     ) -> Tensor:  # [..., 2] (x, y) metres
         """Centre of each cell."""
-        lower = torch.tensor([self.x_min_m, self.y_min_m], dtype=dtype, device=cells.device)
+        lower = constant((self.x_min_m, self.y_min_m), dtype, cells.device)
         return lower + (cells.flip(-1).to(dtype) + 0.5) * self.cell_m

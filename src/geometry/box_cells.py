@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import constant
 
 # Closed rectangles: a cell centre on the edge counts, whatever the rounding of its coordinates says.
 EDGE_TOLERANCE_M = 1e-6
@@ -21,7 +22,7 @@ def window_cells(
     Returns (window, row, col) [pairs] int64, ordered by window and row-major within, and the number of cells of each
     window [n] int64. Windows outside the grid and NaN windows have no cells that any sensible test would keep.
     """
-    limit = torch.tensor([grid.cols, grid.rows], device=centres.device)
+    limit = constant((grid.cols, grid.rows), torch.int64, centres.device)
     low = torch.maximum((centres - half_extents).ceil(), torch.zeros_like(centres)).minimum(limit).long()  # [n, 2]
     high = torch.maximum((centres + half_extents).floor(), -torch.ones_like(centres)).minimum(limit - 1).long()
     widths, heights = (high - low + 1).clamp(min=0).unbind(1)

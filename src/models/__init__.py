@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.image import ImageEncoderConfig
-from src.models.detector import Detector
+from src.models.dense_bev.model import DenseBEV, DenseBEVConfig
+from src.models.detector import Detector, ModelConfig
 from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
 
-MODEL_CONFIGS: dict[str, type[Any]] = {"horizon3d": Horizon3DConfig}
-MODELS: dict[type[Any], type[Detector]] = {Horizon3DConfig: Horizon3D}
+MODEL_CONFIGS: dict[str, type[ModelConfig]] = {"horizon3d": Horizon3DConfig, "dense_bev": DenseBEVConfig}
+MODELS: dict[type[ModelConfig], type[Detector]] = {Horizon3DConfig: Horizon3D, DenseBEVConfig: DenseBEV}
 
 
 def build_model(
-    config: Any,  # an instance of one of MODEL_CONFIGS
+    config: ModelConfig,  # an instance of one of MODEL_CONFIGS
     grid: BEVGrid,
     backbone: ImageEncoderConfig | None,
     velocity_code_weight: float,

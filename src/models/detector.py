@@ -3,13 +3,33 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import torch
 from torch import Tensor, nn
 
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
+
+
+class ModelConfig(Protocol):
+    """What commands ask of every model's settings, whatever else these hold."""
+
+    name: str
+    temporal_part: ClassVar[str]
+    """The key of all that is temporal; phase 1 sets it to null."""
+
+    @property
+    def uses_images(self) -> bool:
+        """Whether images are read and encoded."""
+
+    @property
+    def memory_frames(self) -> int:
+        """How many past key frames are remembered at most; 0 for single frames."""
+
+    @property
+    def memory_max_age_s(self) -> float | None:
+        """How far back the memory may lie; None for single frames."""
 
 
 class TemporalMemory(Protocol):
@@ -31,6 +51,9 @@ class TemporalMemory(Protocol):
 
 class Detector(nn.Module, ABC):
     """One frame in, boxes out. State between frames never lives on the module; the output is the model's own type."""
+
+    prepared_bf16: bool | None = None
+    """Whether `prepare_for_inference` made this copy for bfloat16 or for float32; None: as trained."""
 
     @property
     def image_backbone(self) -> nn.Module | None:

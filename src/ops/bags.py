@@ -65,6 +65,33 @@ class _SegmentSum(torch.autograd.Function):
         return F.embedding(rows, grad.contiguous()), None, None
 
 
+def exchange_rows(
+    values: Tensor,  # [n, C]
+    there: Tensor,  # [m] int64, the row of `values` that each result takes, -1 for zeros; none twice
+    back: Tensor,  # [n] int64, the inverse: the result that takes each row, -1 for none
+) -> Tensor:  # [m, C]
+    """Rows in other places. Differentiable; the way back is a gather as well, so nothing is added up."""
+    return _ExchangeRows.apply(values, there, back)
+
+
+class _ExchangeRows(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: FunctionCtx, values: Tensor, there: Tensor, back: Tensor) -> Tensor:
+        ctx.save_for_backward(back)
+        return _take(values, there)
+
+    @staticmethod
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None, None]:
+        (back,) = ctx.saved_tensors
+        return _take(grad, back), None, None
+
+
+def _take(values: Tensor, rows: Tensor) -> Tensor:
+    if len(values) == 0:
+        return values.new_zeros(len(rows), values.shape[1])
+    return values.index_select(0, rows.clamp(min=0)).masked_fill_((rows < 0)[:, None], 0.0)
+
+
 def best_rows(
     scores: Tensor,  # [M]
     sample: Tensor,  # [M] int64

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import constant
 from src.ops.backend import implementation, register
 from src.ops.bags import weighted_bag
 from src.ops.sites import Sites
@@ -101,7 +102,7 @@ def deform_attend_images_reference(
     batch_size, queries, views, _, _ = pixels.shape
     heads = weights.shape[2]
     dtype = torch.promote_types(pixels.dtype, torch.float32)
-    size = pixels.new_tensor(image_size_px[::-1], dtype=dtype)
+    size = constant(tuple(image_size_px[::-1]), dtype, pixels.device)
     unit = pixels.to(dtype) / size  # [B, Q, N, P, 2], the image is [0, 1) x [0, 1)
     weights = weights.to(dtype)
     # Half a cell beyond the edge still mixes with the border cells.

@@ -5,10 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from src.ops.backend import implementation, register
+
 
 @torch.no_grad()
 def farthest_points(
-    points: Tensor,  # [B, G, 2] m
+    points: Tensor,  # [B, G, 2] m, finite where valid
     valid: Tensor,  # [B, G] bool
     start: Tensor,  # [B] int64, first pick of each sample; of no meaning where a sample has no valid point
     count: int,
@@ -23,6 +25,13 @@ def farthest_points(
             f"points {list(points.shape)}, valid {list(valid.shape)} and start {list(start.shape)} must be [B, G, 2], "
             "[B, G] and [B]"
         )
+    return implementation("farthest_points")(points, valid, start, count)
+
+
+@register("farthest_points", "reference")
+def farthest_points_reference(points: Tensor, valid: Tensor, start: Tensor, count: int) -> Tensor:
+    """Plain torch form: one round of the loop a pick, all samples at once."""
+    b, g = valid.shape
     picks = start.new_full((b, count), -1)
     if g == 0:
         return picks

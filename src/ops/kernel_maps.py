@@ -21,7 +21,7 @@ class KernelMap:
 
     Offsets run in C order over the kernel axes, as in a torch weight [Cout, Cin, k...]. `mirrored` marks a map whose
     transpose is itself with the offsets reversed (submanifold); `identity` one in which output i sees input i only.
-    `cache` holds what was derived from the map.
+    Within the block of an offset the inputs ascend, and so do the outputs. `cache` holds what was derived from the map.
     """
 
     inputs: Tensor  # [pairs] int32, input row
@@ -89,6 +89,31 @@ def strided_map(sites: Sites, kernel_size: Size, stride: Size, padding: Size) ->
     if key not in sites.cache:
         sites.cache[key] = _build_strided(sites, kernel, strides, pads)
     return sites.cache[key]
+
+
+def stacked_map(
+    sites: Sites,
+    kernel_size: Size,
+    parts: list[Tensor],  # [n_p] int64 each: rows of `sites` that a part has features for, ascending
+) -> KernelMap:
+    """Map from several parts of a set of sites, stacked row below row, to all of the sites.
+
+    Kernel offsets run through the parts one after the other: convolving the stack with the weights of every part equals
+    a submanifold convolution of the parts side by side as channels, zero where a part has no site, without the zeros.
+    """
+    base = submanifold_map(sites, kernel_size)
+    ends = torch.tensor(list(itertools.accumulate(base.counts)), device=sites.device)
+    inputs, outputs, counts, first = [], [], [], 0
+    for rows in parts:
+        place = torch.full((len(sites),), -1, dtype=torch.int32, device=sites.device)
+        place[rows] = torch.arange(first, first + len(rows), dtype=torch.int32, device=sites.device)
+        seen = place.index_select(0, base.inputs)
+        kept = (seen >= 0).nonzero().squeeze(1)
+        inputs.append(seen.index_select(0, kept))
+        outputs.append(base.outputs.index_select(0, kept))
+        counts.append(torch.searchsorted(kept, ends).diff(prepend=ends.new_zeros(1)))
+        first += len(rows)
+    return KernelMap(torch.cat(inputs), torch.cat(outputs), tuple(torch.cat(counts).tolist()), first, len(sites))
 
 
 def temporal_map(sites: Sites, kernel_size: Size, stride: Size, padding: Size) -> tuple[KernelMap, Sites]:

@@ -38,10 +38,7 @@ def nms_rotated(
 ) -> Tensor:  # [kept] int64, by descending score
     """Greedy suppression: a box goes if its IoU with a better kept one exceeds the threshold; ties keep their order."""
     order = torch.argsort(scores, descending=True, stable=True)
-    ranked = boxes.detach().index_select(0, order).double()
-    better, worse = _touching(ranked, ranked).triu(1).nonzero(as_tuple=True)
-    conflict = _pair_iou(ranked, ranked, better, worse) > iou_threshold
-    return order[_greedy(better[conflict], worse[conflict], len(order))]
+    return _suppress(boxes.index_select(0, order), order, None, iou_threshold)
 
 
 def nms_circle(
@@ -51,9 +48,87 @@ def nms_circle(
 ) -> Tensor:  # [kept] int64, by descending score
     """Greedy suppression: a detection goes if a better kept one lies within `radius_m` metres (not squared)."""
     order = torch.argsort(scores, descending=True, stable=True)
-    ranked = centers.detach().index_select(0, order).double()
-    better, worse = (_squared_distance(ranked, ranked) <= radius_m**2).triu(1).nonzero(as_tuple=True)
-    return order[_greedy(better, worse, len(order))]
+    return _suppress(F.pad(centers, (0, 3)).index_select(0, order), order, radius_m, 0.0)
+
+
+def _suppress(ranked: Tensor, order: Tensor, radius_m: float | None, iou_threshold: float) -> Tensor:
+    better, worse = conflicting_pairs(ranked, [len(order)], [radius_m], iou_threshold)
+    kept = greedy_survivors(better.tolist(), worse.tolist(), len(order))
+    return order[torch.tensor(kept, dtype=torch.int64, device=order.device)]
+
+
+@torch.no_grad()
+def conflicting_pairs(
+    boxes: Tensor,  # [n, 5] (x, y, length, width, yaw), block after block, best first within each
+    counts: list[int],  # boxes of each block
+    radii_m: list[float | None],  # of each block: the distance of a conflict; None: by overlap
+    iou_threshold: float,
+) -> tuple[Tensor, Tensor]:  # [pairs] int64 better row, ascending within its block, and [pairs] int64 worse row
+    """Pairs of one block of which at most one detection may stay: too near, or an IoU above the threshold.
+
+    A GPU is waited for three times, however many blocks there are. Computed in float64.
+    """
+    boxes = boxes.detach().double()
+    by_distance, by_overlap, start = [], [], 0
+    for count, radius in zip(counts, radii_m, strict=True):
+        if count > 1 and radius is not None:
+            by_distance.append((start, count, radius**2))
+        elif count > 1:
+            by_overlap.append((start, count, None))
+        start += count
+    near, meeting = (_near_pairs(boxes, blocks) for blocks in (by_distance, by_overlap))
+    overlapping = (_pair_iou(boxes, boxes, *meeting) > iou_threshold).nonzero().squeeze(1)
+    better, worse = (torch.cat([first, second[overlapping]]) for first, second in zip(near, meeting, strict=True))
+    return better, worse
+
+
+Block = tuple[int, int, float | None]
+"""First row, number of rows, and the squared radius in m^2 or None for circumscribed circles that meet."""
+
+
+def _near_pairs(
+    boxes: Tensor,  # [n, 5] float64
+    blocks: list[Block],  # all with a radius or all without
+) -> tuple[Tensor, Tensor]:  # [pairs] int64 better row, [pairs] int64 worse row
+    """Pairs of rows of one block that are near each other."""
+    at_once = _blocks_at_once(len(blocks), boxes.device)
+    table = torch.cat([boxes[:, :2], 0.5 * boxes[:, 2:4].norm(dim=1, keepdim=True)], dim=1)
+    better = worse = torch.zeros(0, dtype=torch.int64, device=boxes.device)
+    for first in range(0, len(blocks), at_once):
+        starts, sizes, squares = zip(*blocks[first : first + at_once], strict=True)
+        starts, sizes = torch.tensor([starts, sizes], device=boxes.device)
+        place = torch.arange(max(size for _, size, _ in blocks[first : first + at_once]), device=boxes.device)
+        present = place < sizes[:, None]
+        x, y, half = F.embedding(torch.where(present, starts[:, None] + place, 0), table).unbind(2)  # [S, K] each
+        squared = (x[:, :, None] - x[:, None]).square() + (y[:, :, None] - y[:, None]).square()
+        if squares[0] is None:
+            reach = (half[:, :, None] + half[:, None]).square()
+        else:
+            reach = boxes.new_tensor(squares)[:, None, None]
+        near = (squared <= reach) & present[:, :, None] & present[:, None]
+        block, row, column = near.triu(1).nonzero(as_tuple=True)
+        better = torch.cat([better, starts[block] + row])
+        worse = torch.cat([worse, starts[block] + column])
+    return better, worse
+
+
+def _blocks_at_once(count: int, device: torch.device) -> int:
+    """Blocks are padded to the largest, which costs a CPU time; on a GPU each look at a result costs more."""
+    return 1 if device.type == "cpu" else max(count, 1)
+
+
+def greedy_survivors(
+    better: list[int],  # [pairs], ascending among the rows that conflict with one another
+    worse: list[int],  # [pairs], each above its partner
+    num: int,
+) -> list[int]:
+    """Rows that survive when every kept row removes the later ones it is in conflict with."""
+    dropped = [False] * num
+    # In the order of `better`, so that a row's own fate is settled before it removes others.
+    for first, second in zip(better, worse, strict=True):
+        if not dropped[first]:
+            dropped[second] = True
+    return [row for row, gone in enumerate(dropped) if not gone]
 
 
 def maxpool_peaks(
@@ -70,21 +145,6 @@ def maxpool_peaks(
     picks = maps.inputs.index_select(0, order)
     scores = scores.detach()
     return scores == F.embedding_bag(picks, scores, starts[:-1], mode="max")
-
-
-def _greedy(
-    better: Tensor,  # [pairs] int64, ascending
-    worse: Tensor,  # [pairs] int64, each above its partner
-    num: int,
-) -> Tensor:  # [kept] int64
-    """Rows that survive when every kept row removes the later ones it is in conflict with."""
-    dropped = [False] * num
-    # In the order of `better`, so that a row's own fate is settled before it removes others.
-    for first, second in zip(better.tolist(), worse.tolist(), strict=True):
-        if not dropped[first]:
-            dropped[second] = True
-    kept = [row for row, gone in enumerate(dropped) if not gone]
-    return torch.tensor(kept, dtype=torch.int64, device=better.device)
 
 
 def _squared_distance(a: Tensor, b: Tensor) -> Tensor:  # [n, m]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 from dataclasses import dataclass
@@ -65,41 +66,33 @@ def pair_tiles(
 
 
 def _cut(kernel_map: KernelMap, backward: bool, rows: int, num: int) -> PairTiles:
-    gathered, summed, counts = kernel_map.inputs, kernel_map.outputs, list(kernel_map.counts)
-    if kernel_map.centre is not None:
-        before, own = sum(counts[: kernel_map.centre]), counts[kernel_map.centre]
-        gathered, summed = (torch.cat([x[:before], x[before + own :]]) for x in (gathered, summed))
-        counts[kernel_map.centre] = 0
+    gathered, summed = kernel_map.inputs, kernel_map.outputs
     if backward:
         gathered, summed = summed, gathered
-    num_tiles, num_offsets = -(-num // rows), len(counts)
-    offset = torch.repeat_interleave(torch.arange(num_offsets, dtype=torch.int32), torch.tensor(counts))
-    # Stable sorts of int32 are radix sorts, five percent of one convolution.
-    block, into_tiles = torch.sort(torch.div(summed, rows, rounding_mode="floor") * num_offsets + offset, stable=True)
-    gathered, summed = gathered.index_select(0, into_tiles), summed.index_select(0, into_tiles)
-    by_row, order = torch.sort(summed, stable=True)
-    order = order.to(torch.int32)
-    starts = torch.searchsorted(by_row, torch.arange(num + 1, dtype=torch.int32), out_int32=True)
-    edges = torch.searchsorted(block, torch.arange(num_tiles * num_offsets + 1, dtype=torch.int32)).tolist()
+    # Both columns ascend within the block of an offset, so a tile's share of a block is a slice of it.
+    edges = torch.arange(-(-num // rows) + 1, dtype=torch.int32).mul_(rows).clamp_(max=num)
+    offsets, blocks = [], []
+    for offset, (sources, targets) in enumerate(
+        zip(gathered.split(kernel_map.counts), summed.split(kernel_map.counts), strict=True)
+    ):
+        if offset != kernel_map.centre and len(targets):
+            offsets.append(offset)
+            blocks.append((sources, targets, torch.searchsorted(targets, edges).tolist()))
     tiles = []
-    for number in range(num_tiles):
-        first, last = number * rows, min((number + 1) * rows, num)
-        ends = edges[number * num_offsets : (number + 1) * num_offsets + 1]
-        begin, end = ends[0], ends[-1]
-        spans = tuple(
-            (k, ends[k] - begin, ends[k + 1] - begin) for k in range(num_offsets) if ends[k] < ends[k + 1]
-        )
-        tiles.append(
-            Tile(
-                first,
-                last,
-                gathered[begin:end],
-                summed[begin:end],
-                spans,
-                order[begin:end] - begin,
-                starts[first : last + 1] - begin,
-            )
-        )
+    for number, (first, last) in enumerate(itertools.pairwise(edges.tolist())):
+        parts, spans, place = [], [], 0
+        for offset, (sources, targets, cuts) in zip(offsets, blocks, strict=True):
+            low, high = cuts[number], cuts[number + 1]
+            if low < high:
+                parts.append((sources[low:high], targets[low:high]))
+                spans.append((offset, place, place := place + high - low))
+        if parts:
+            sources, targets = (torch.cat(column) for column in zip(*parts, strict=True))
+        else:
+            sources = targets = gathered[:0]
+        by_row, order = torch.sort(targets, stable=True)  # a radix sort, as these are int32
+        starts = torch.searchsorted(by_row, torch.arange(first, last + 1, dtype=torch.int32), out_int32=True)
+        tiles.append(Tile(first, last, sources, targets, tuple(spans), order.to(torch.int32), starts))
     return PairTiles(tuple(tiles), max((len(tile.gathered) for tile in tiles), default=0))
 
 

@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from src.geometry.constants import constant
+
 # Empty cells kept behind the last cell of every spatial axis. A key moved by up to HALO cells along any axis, in either
 # direction, lands in such a gap and never on a cell of the next row, so look-ups need no bounds test.
 HALO = 2
@@ -124,7 +126,7 @@ class Sites:
         indices: Tensor,  # [q, 1 + d] int64, may lie outside the grid
     ) -> Tensor:  # [q] int64
         """Row of each cell among the sites, -1 where it is absent or outside the grid."""
-        upper = torch.tensor(self.shape, device=indices.device)
+        upper = constant(self.shape, torch.int64, indices.device)
         inside = ((indices >= 0) & (indices < upper)).all(1)
         if len(self) == 0:
             return torch.full_like(inside, -1, dtype=torch.int64)
@@ -133,7 +135,7 @@ class Sites:
         return torch.where(inside & (self.keys[rows] == wanted), rows, -1)
 
     def _keys_of(self, indices: Tensor) -> Tensor:
-        return (indices.long() * torch.tensor(self.strides, device=indices.device)).sum(1)
+        return (indices.long() * constant(self.strides, torch.int64, indices.device)).sum(1)
 
 
 def union(a: Sites, b: Sites) -> tuple[Sites, Tensor, Tensor]:
@@ -162,7 +164,7 @@ def _checked_empty(indices: Tensor, shape: tuple[int, ...]) -> Sites:
     sites = Sites(tuple(int(size) for size in shape), indices.new_empty(0, dtype=torch.int64))
     if math.prod(size + HALO for size in sites.shape) >= 2**63:
         raise ValueError(f"shape={sites.shape}: too many cells for 64-bit keys")
-    outside = (indices < 0) | (indices >= torch.tensor(sites.shape, device=indices.device))
+    outside = (indices < 0) | (indices >= constant(sites.shape, torch.int64, indices.device))
     if bool(outside.any()):
         first = indices[outside.any(1)][0].tolist()
         raise ValueError(f"indices: cell {first} lies outside shape {sites.shape}; drop such cells first")

@@ -111,8 +111,11 @@ def splat_gaussians(
 
 
 @dataclass(eq=False)
-class _Pairs:
-    """(Gaussian, cell) pairs in the order of the cells, and the way back to the order of the Gaussians."""
+class Pairs:
+    """(Gaussian, cell) pairs in the order of the cells, and the way back to the order of the Gaussians.
+
+    By Gaussian, the pairs of one Gaussian stand in the order of their cells.
+    """
 
     gaussian: Tensor  # [pairs] int64
     cell: Tensor  # [pairs] int64, row in the support, ascending
@@ -125,7 +128,7 @@ class _Pairs:
 
 
 @torch.no_grad()
-def _gaussian_cells(
+def gaussian_cells(
     means: Tensor,
     scales: Tensor,
     directions: Tensor,
@@ -133,7 +136,7 @@ def _gaussian_cells(
     grid: BEVGrid,
     batch_size: int,
     support_sigmas: float,
-) -> tuple[_Pairs, Tensor]:
+) -> tuple[Pairs, Tensor]:
     """All pairs with q <= support_sigmas^2, and the linear keys [n] of the cells they reach."""
     squares, turned = scales.square(), directions.square()
     variances = torch.stack([(turned * squares).sum(1), (turned.flip(1) * squares).sum(1)], 1)  # Sigma_xx, Sigma_yy
@@ -151,7 +154,7 @@ def _gaussian_cells(
     q = along.square() + across.square()
     near = (q <= support_sigmas**2).nonzero().squeeze(1)
 
-    gaussian = gaussian.index_select(0, near)
+    gaussian = gaussian.index_select(0, near)  # ascending
     linear = (batch.index_select(0, gaussian) * grid.rows + row.index_select(0, near)) * grid.cols
     linear = linear + col.index_select(0, near)
     num_cells = batch_size * grid.rows * grid.cols
@@ -160,9 +163,9 @@ def _gaussian_cells(
     by_gaussian = torch.empty_like(order)
     in_turn = torch.arange(len(order), device=order.device)
     by_gaussian[order] = in_turn
-    counts = torch.bincount(gaussian, minlength=len(means))
+    owners = torch.arange(len(means) + 1, device=gaussian.device)
     near = near.index_select(0, order)
-    pairs = _Pairs(
+    pairs = Pairs(
         gaussian=gaussian.index_select(0, order),
         cell=cell,
         delta=torch.stack([delta_x.index_select(0, near), delta_y.index_select(0, near)], 1),
@@ -170,7 +173,7 @@ def _gaussian_cells(
         in_turn=in_turn,
         cell_starts=F.pad(sizes.cumsum(0), (1, 0)),
         by_gaussian=by_gaussian,
-        gaussian_starts=F.pad(counts.cumsum(0), (1, 0)),
+        gaussian_starts=torch.searchsorted(gaussian, owners),
     )
     return pairs, support.long()
 
@@ -183,7 +186,7 @@ class _LogFree(torch.autograd.Function):
         ctx: FunctionCtx,
         q: Tensor,
         opacity_logits: Tensor,
-        pairs: _Pairs,
+        pairs: Pairs,
         smooth_cap: bool,
     ) -> Tensor:
         surprise = F.softplus(-opacity_logits).index_select(0, pairs.gaussian) + 0.5 * q  # -log a
@@ -198,7 +201,7 @@ class _LogFree(torch.autograd.Function):
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
         surprise, opacity_logits = ctx.saved_tensors
-        pairs: _Pairs = ctx.pairs
+        pairs: Pairs = ctx.pairs
         slope = grad.index_select(0, pairs.cell) / torch.expm1(surprise)  # d log(1 - a) / d(-log a) = a / (1 - a)
         if not ctx.smooth_cap:
             slope = torch.where(surprise > -math.log1p(-CAP), slope, 0.0)
@@ -215,7 +218,7 @@ class _Distance(torch.autograd.Function):
         means: Tensor,
         scales: Tensor,
         directions: Tensor,
-        pairs: _Pairs,
+        pairs: Pairs,
     ) -> Tensor:
         ctx.save_for_backward(scales, directions)
         ctx.pairs = pairs
@@ -224,7 +227,7 @@ class _Distance(torch.autograd.Function):
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
         scales, directions = ctx.saved_tensors
-        pairs: _Pairs = ctx.pairs
+        pairs: Pairs = ctx.pairs
         cosine, sine, size_x, size_y = torch.cat([directions, scales], 1).index_select(0, pairs.gaussian).unbind(1)
         delta_x, delta_y = pairs.delta.unbind(1)
         along, across = cosine * delta_x + sine * delta_y, cosine * delta_y - sine * delta_x
@@ -264,10 +267,10 @@ def splat_reference(
     smooth_cap: bool,
 ) -> Splat:
     """Plain torch form over ragged (Gaussian, cell) pairs; arguments as `splat_gaussians`."""
-    pairs, support = _gaussian_cells(means, scales, directions, batch, grid, batch_size, support_sigmas)
+    pairs, support = gaussian_cells(means, scales, directions, batch, grid, batch_size, support_sigmas)
     q = _Distance.apply(means, scales, directions, pairs)
     log_free = _LogFree.apply(q, opacity_logits, pairs, smooth_cap)
-    occupied_rows, num_cut = _occupied(log_free.detach(), support, threshold, max_cells, grid.rows * grid.cols)
+    occupied_rows, num_cut = occupied_cells(log_free.detach(), support, threshold, max_cells, grid.rows * grid.cols)
 
     # Pairs of the occupied cells, and their order by Gaussian.
     place = torch.full_like(support, -1)
@@ -294,7 +297,7 @@ def splat_reference(
     )
 
 
-def _occupied(
+def occupied_cells(
     log_free: Tensor,  # [n]
     support: Tensor,  # [n]
     threshold: float,
@@ -308,9 +311,8 @@ def _occupied(
     sample = torch.div(support.index_select(0, rows), cells_per_sample, rounding_mode="floor")
     by_occupancy = torch.argsort(log_free.index_select(0, rows), stable=True)
     by_sample = by_occupancy[torch.argsort(sample[by_occupancy], stable=True)]  # best first within each sample
-    counts = torch.bincount(sample)
-    first = (counts.cumsum(0) - counts).index_select(0, sample[by_sample])
-    best = torch.arange(len(rows), device=rows.device) - first < max_cells
+    owner = sample[by_sample]
+    best = torch.arange(len(rows), device=rows.device) - torch.searchsorted(owner, owner) < max_cells
     kept = rows[by_sample[best]].sort().values
     return kept, len(rows) - len(kept)
 
@@ -329,6 +331,6 @@ def _nearest_cell(
     return torch.where(peak == none, -1, peak)
 
 
-def _gaussian_sum(values: Tensor, pairs: _Pairs) -> Tensor:
+def _gaussian_sum(values: Tensor, pairs: Pairs) -> Tensor:
     """Sums of pair values [pairs, C] per Gaussian [G, C]."""
     return bag_sum(values, pairs.by_gaussian, pairs.gaussian_starts)

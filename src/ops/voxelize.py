@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from src.geometry.constants import constant
 from src.ops.bags import segment_mean
 from src.ops.sites import Sites
 
@@ -34,9 +35,11 @@ def voxelize(
         )
     if len(lower_m) != ndim or len(voxel_size_m) != ndim:
         raise ValueError(f"lower_m={lower_m}, voxel_size_m={voxel_size_m}: expected {ndim} values each, as in {shape}")
-    place = coordinates.double() - coordinates.new_tensor(lower_m, dtype=torch.float64)
-    cells = (place / coordinates.new_tensor(voxel_size_m, dtype=torch.float64)).floor().flip(1)  # [P, d] (z, y, x)
-    limit = torch.tensor(shape, device=cells.device)
+    place = coordinates.double() - constant(tuple(lower_m), torch.float64, coordinates.device)
+    cells = (
+        (place / constant(tuple(voxel_size_m), torch.float64, coordinates.device)).floor().flip(1)
+    )  # [P, d] (z, y, x)
+    limit = constant(tuple(shape), torch.int64, cells.device)
     inside = ((cells >= 0) & (cells < limit)).all(1).nonzero().squeeze(1)
     indices = torch.cat([batch[:, None].index_select(0, inside), cells.index_select(0, inside).long()], 1)
     sites, rows = Sites.unique(indices, (batch_size, *shape))

@@ -3,11 +3,20 @@ import io
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.JpegImagePlugin import JpegImageFile
 
-from src.data.images import read_image, width_fit
+from src.data import jpeg as jpeg_module
+from src.data.images import ImageCrop, read_image, width_fit
 from src.errors import ConfigError, DataError
 
 SIZE = (60, 120)  # network input, height and width
+
+
+@pytest.fixture(params=[True, False], ids=["best decoder", "Pillow"])
+def decoders(request, monkeypatch):
+    """The decoder at hand, and Pillow alone."""
+    if not request.param:
+        monkeypatch.setattr(jpeg_module, "_checked_decoder", lambda: None)
 
 
 def save(path, image, **options):
@@ -83,7 +92,7 @@ def jpeg(height, width):
     ],
     ids=["empty", "text", "truncated", "size"],
 )
-def test_bad_files(tmp_path, content, words):
+def test_bad_files(decoders, tmp_path, content, words):
     path = tmp_path / "bad.jpg"
     path.write_bytes(content)
     with pytest.raises(DataError, match=words) as error:
@@ -104,10 +113,46 @@ def test_bombs_are_refused_before_decoding(tmp_path, side, monkeypatch):
     content[at : at + 4] = side.to_bytes(2, "big") * 2
     path = tmp_path / "bomb.jpg"
     path.write_bytes(bytes(content))
-    monkeypatch.setattr(Image.Image, "convert", lambda *_: pytest.fail("decoded"))
+    monkeypatch.setattr(JpegImageFile, "load", lambda *_: pytest.fail("decoded"))
     for stated in ((100, 240), (side, side)):
         with pytest.raises(DataError, match="bomb.jpg"):
             read_image(path, stated, width_fit(stated, SIZE))
+
+
+def straightforward(path, source_px, crop):
+    """Step after step on the whole canvas, each with a copy."""
+    image = Image.open(path)
+    image.draft("RGB", [int(np.ceil(side * crop.resize)) for side in source_px[::-1]])
+    image = image.convert("RGB")
+    reduction = round(source_px[1] / image.width)
+    (height, width), (left, top) = crop.size_px, crop.offset_px
+    x0, y0 = max(0, -left), max(0, -top)
+    x1 = min(width, int(np.floor(crop.resize * source_px[1] - left + 1e-6)))
+    y1 = min(height, int(np.floor(crop.resize * source_px[0] - top + 1e-6)))
+    canvas = Image.new("RGB", (width, height))
+    if x1 > x0 and y1 > y0:
+        corners = np.array([x0 + left, y0 + top, x1 + left, y1 + top]) / crop.resize
+        box = np.clip(corners, 0, [*source_px[::-1], *source_px[::-1]]) / reduction
+        canvas.paste(image.resize((x1 - x0, y1 - y0), Image.Resampling.BILINEAR, box=box.tolist()), (x0, y0))
+    if crop.flip:
+        canvas = canvas.transpose(Image.Transpose.FLIP_LEFT_RIGHT)
+    if crop.rotation_rad:
+        canvas = canvas.rotate(-np.degrees(crop.rotation_rad), Image.Resampling.BILINEAR)
+    return np.asarray(canvas).transpose(2, 0, 1)
+
+
+@pytest.mark.parametrize("source", [(114, 240), (228, 480), (301, 633), (943, 1980)])
+def test_pixels_are_those_of_the_straightforward_way(decoders, tmp_path, source):
+    """To the last bit: padded above and beside, cropped, mirrored, turned, and all of it outside."""
+    values = np.random.default_rng(1).integers(0, 255, (*source, 3)).astype(np.uint8)
+    path = save(tmp_path / "a.jpg", Image.fromarray(values))
+    crops = [
+        width_fit(source, size_px, *change)
+        for size_px in ((96, 320), (64, 160), (150, 160))
+        for change in ((), (0.11, 0.3), (-0.06, 0.8, True), (0.02, 0.5, False, 0.09), (-0.05, 0.5, True, -0.05))
+    ]
+    for crop in (*crops, ImageCrop(0.5, (5000, 0), SIZE)):
+        np.testing.assert_array_equal(read_image(path, source, crop), straightforward(path, source, crop))
 
 
 def test_missing_file(tmp_path):

@@ -79,6 +79,30 @@ def test_bad_files_name_file_and_fault(file, content, words):
     assert str(file) in str(error.value)
 
 
+def test_a_header_met_before_serves_other_files_of_the_same_kind_only(tmp_path):
+    """Files of one and the same header, of another number of points, of other fields, and damaged ones, in turns."""
+    order = " ".join(RADAR_FIELDS[::-1])
+    files = {
+        "a": (pcd_bytes(POINTS), POINTS),
+        "b": (pcd_bytes(POINTS + 1), POINTS + 1),
+        "c": (pcd_bytes(POINTS[:4]), POINTS[:4]),
+        "d": (pcd_bytes(POINTS[:, ::-1], fields=order), POINTS),
+        "e": (pcd_bytes(POINTS).replace(b"VERSION", b"# first\nDATA_OF = truck\nVERSION"), POINTS),
+        "f": (pcd_bytes(POINTS).replace(b"DATA binary", b"  DATA\tbinary"), POINTS),
+        "short": (pcd_bytes(POINTS)[:-4], "9 points end at byte"),
+        "long": (pcd_bytes(POINTS) + b"DATA", "9 points end at byte"),
+        "fields": (pcd_bytes(POINTS, fields="x y z vrel_x vrel_y vrel_z snr"), "'rcs'"),
+    }
+    for name in 2 * [*files]:
+        content, expected = files[name]
+        (tmp_path / name).write_bytes(content)
+        if isinstance(expected, str):
+            with pytest.raises(DataError, match=f"{tmp_path / name}: .*{expected}"):
+                read_radar_points(str(tmp_path / name))
+        else:
+            np.testing.assert_array_equal(read_radar_points(str(tmp_path / name)), expected)
+
+
 def test_missing_file(file):
     with pytest.raises(DataError, match="No such file"):
         read_radar_points(file)

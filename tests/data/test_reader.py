@@ -12,7 +12,7 @@ from tiny_set import BLOB, START_S, STATIC, TARGET_VELOCITY, VERSION, ego_pose, 
 from src.data.augment import AugmentationConfig, BevAugmentationConfig, ImageAugmentationConfig
 from src.data.cache import load_index
 from src.data.pcd import read_radar_points
-from src.data.reader import FrameReader, OnBadFile, compensate_sweeps, ego_motion
+from src.data.reader import FrameReader, OnBadFile, compensate_clouds, compensate_sweeps, ego_motion
 from src.errors import DataError
 from src.geometry.camera import project
 from src.geometry.transforms import invert_rigid, quaternion_to_matrix, rigid
@@ -81,6 +81,36 @@ def test_moved_points_meet_the_target(data_set):
         _, target = split_points(data_set.reader(propagate_points=moved, image_size_px=None).read(1, None))
         spread[moved] = np.ptp(target[:10, :2], axis=0).max()
     assert spread[False] > 4 and spread[True] < 0.6 * spread[False]
+
+
+@pytest.mark.parametrize("propagate_points", [False, True])
+def test_compensation_is_that_of_one_point_after_the_other(propagate_points):
+    rng = np.random.default_rng(0)
+    turns = quaternion_to_matrix(rng.normal(size=(2, 4, 4)))
+    mounts = rigid(turns[0], rng.normal(size=(4, 3)))
+    key_from_sweep = rigid(turns[1], rng.normal(scale=5, size=(4, 3)))
+    velocity, rate, elapsed_s = rng.normal(size=(4, 3)) * 20, rng.normal(size=(4, 3)), rng.uniform(0, 0.5, 4)
+    clouds = [rng.normal(scale=4, size=(n, 7)).astype(np.float32) for n in (5, 0, 40, 1)]
+    clouds[2][3, :3] = 0
+    settings = reader_settings(propagate_points=propagate_points, min_distance_m=2.0)
+    found = compensate_clouds(clouds, mounts, key_from_sweep, velocity, rate, elapsed_s, settings)
+    expected = []
+    for cloud, mount_, motion, v, w, lag in zip(clouds, mounts, key_from_sweep, velocity, rate, elapsed_s, strict=True):
+        for point in cloud.astype(np.float64):
+            if (np.abs(point[:2]) < 2.0).all():
+                continue
+            ray = point[:3] / np.linalg.norm(point[:3])
+            ray_ego = mount_[:3, :3] @ ray
+            speed = point[3:6] @ ray + (v + np.cross(w, mount_[:3, 3])) @ ray_ego
+            ground = speed * (motion[:3, :3] @ ray_ego)[:2]
+            place = apply(motion @ mount_, point[:3])
+            place[:2] += ground * lag if propagate_points else 0
+            expected.append([*place, point[6], *ground, lag])
+    assert found.dtype == np.float64 and 20 < len(expected) < 45
+    np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11)
+    nothing = compensate_clouds(clouds[1:2], *(a[1:2] for a in (mounts, key_from_sweep, velocity, rate)), np.zeros(1),
+                                settings)  # fmt: skip
+    assert nothing.shape == (0, 7)
 
 
 def test_near_points_are_dropped(data_set, broken_files):
@@ -237,6 +267,19 @@ def test_link_out_of_the_data_set_is_refused(broken_files, tmp_path_factory):
     radar.symlink_to(outside)
     with pytest.raises(DataError, match="outside the dataset folder"):
         broken_files.reader().read(1, None)
+
+
+def test_links_within_the_data_set_are_followed_and_folders_that_lead_out_are_not(broken_files, tmp_path_factory):
+    radar, _ = radar_path(broken_files)
+    expected = broken_files.reader().read(1, None).radar_points
+    radar.rename(broken_files.root / "kept.pcd")
+    radar.symlink_to(broken_files.root / "kept.pcd")
+    assert torch.equal(broken_files.reader().read(1, None).radar_points, expected)
+    outside = tmp_path_factory.mktemp("outside") / "radar"
+    radar.parent.rename(outside)
+    radar.parent.symlink_to(outside)
+    with pytest.raises(DataError, match=f"{radar.parent.name}.*outside the dataset folder"):
+        broken_files.reader().read(0, None)
 
 
 def test_sensors_that_were_not_recorded_are_masked(broken_files):

@@ -1,7 +1,7 @@
 import torch
 
 from src.ops import segment_mean, segment_sum
-from src.ops.bags import bag_sum, bags, best_rows, row_products, weighted_bag
+from src.ops.bags import bag_sum, bags, best_rows, exchange_rows, row_products, weighted_bag
 
 
 def test_bags_keep_the_order_of_their_pairs():
@@ -51,3 +51,16 @@ def test_best_rows_by_hand():
     scores, sample = torch.tensor([0.1, 0.9, 0.5, 0.5, 0.7]), torch.tensor([0, 0, 0, 2, 2])
     assert best_rows(scores, sample, 3, 2).tolist() == [[1, 2], [-1, -1], [4, 3]]
     assert best_rows(scores[:0], sample[:0], 2, 2).tolist() == [[-1, -1], [-1, -1]]
+
+
+def test_exchanged_rows_and_their_gradient():
+    values = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
+    there, back = torch.tensor([2, -1, 0, -1, 3]), torch.tensor([2, -1, 0, 4])
+    found = exchange_rows(values, there, back)
+    zeros = torch.zeros(3, dtype=torch.float64)
+    torch.testing.assert_close(found, torch.stack([values[2], zeros, values[0], zeros, values[3]]))
+    assert torch.autograd.gradcheck(lambda x: exchange_rows(x, there, back), values)
+    empty = torch.zeros(0, 3, requires_grad=True)
+    none = exchange_rows(empty, torch.tensor([-1, -1]), torch.zeros(0, dtype=torch.int64))
+    none.sum().backward()
+    assert none.tolist() == [[0.0] * 3] * 2 and empty.grad.shape == (0, 3)

@@ -8,7 +8,8 @@ import torch
 import torch.nn.functional as F
 
 from src.ops import Sites, neighbour_sum, sparse_conv, strided_map, submanifold_map, temporal_map
-from src.ops.kernel_maps import KernelMap
+from src.ops.kernel_maps import KernelMap, stacked_map
+from src.ops.pair_tiles import pair_tiles
 
 GOLDEN = np.load(Path(__file__).parents[1] / "golden" / "sparse_conv" / "cases.npz")
 CASES = json.loads(str(GOLDEN["meta_json"]))
@@ -122,6 +123,53 @@ def test_neighbour_sum_is_the_convolution_with_unit_weights(mode):
     features = torch.randn(60, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     unit = torch.eye(5, dtype=torch.float64).expand(27, 5, 5)
     assert torch.allclose(neighbour_sum(features, kernel_map), sparse_conv(features, unit, kernel_map), atol=1e-12)
+
+
+@pytest.mark.parametrize("kernel", [1, 3])
+def test_stacked_parts_equal_the_parts_side_by_side(kernel):
+    sites = random_sites((2, 6, 7), 40)
+    generator = torch.Generator().manual_seed(2)
+    parts = [torch.randperm(40, generator=generator)[:count].sort().values for count in (25, 0, 18)]
+    features = [torch.randn(len(rows), 4, dtype=torch.float64, generator=generator) for rows in parts]
+    weights = [torch.randn(kernel**2, 4, 5, dtype=torch.float64, generator=generator) for _ in parts]
+    wide = torch.cat(
+        [torch.zeros(40, 4).double().index_copy(0, r, x) for r, x in zip(parts, features, strict=True)], dim=1
+    )
+    expected = sparse_conv(wide, torch.cat(weights, dim=1), submanifold_map(sites, kernel))
+    found = sparse_conv(torch.cat(features), torch.cat(weights), stacked_map(sites, kernel, parts))
+    torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal"])
+def test_tiles_change_nothing(mode, monkeypatch):
+    """One tile, and tiles so small that most offsets are missing in each: the same values and gradients."""
+    results = []
+    for least, budget in ((256, 1 << 24), (2, 64)):
+        monkeypatch.setattr("src.ops.pair_tiles.LEAST_ROWS", least)
+        monkeypatch.setattr("src.ops.pair_tiles.TILE_BYTES", budget)
+        sites = random_sites((2, 5, 6, 7), 70)
+        if mode == "submanifold":
+            kernel_map = submanifold_map(sites, 3)
+        else:
+            kernel_map, _ = (strided_map if mode == "strided" else temporal_map)(sites, 3, (2, 1, 1), 1)
+        torch.manual_seed(0)
+        x, w = torch.randn(70, 3).double().requires_grad_(), torch.randn(27, 3, 4).double().requires_grad_()
+        out = sparse_conv(x, w, kernel_map)
+        (out * torch.randn(out.shape, dtype=torch.float64)).sum().backward()
+        results.append((out.detach(), x.grad, w.grad))
+        assert (len(pair_tiles(kernel_map, False, 7, torch.float64).tiles) > 10) == (budget == 64)
+    torch.testing.assert_close(results[0], results[1])
+
+
+def test_training_after_inference_in_the_same_process():
+    """Memory reused between calls must not be bound to inference mode."""
+    kernel_map = submanifold_map(random_sites((1, 9, 9), 30), 3)
+    x, w = torch.randn(30, 3), torch.randn(9, 3, 700, requires_grad=True)
+    with torch.inference_mode():
+        expected = sparse_conv(x, w, kernel_map)
+    out = sparse_conv(x, w, kernel_map)
+    out.sum().backward()
+    assert torch.equal(out, expected) and w.grad.isfinite().all()
 
 
 def test_order_of_the_given_cells_does_not_matter():

@@ -70,14 +70,19 @@ class ImageEncoderConfig:
 
 
 class FPN(nn.Module):
-    """Feature pyramid at strides 8, 16 and 32: 1x1 laterals, nearest upsampling, 3x3 output convolutions, no norm."""
+    """Feature pyramid at strides 8, 16 and 32: 1x1 laterals, nearest upsampling, 3x3 output convolutions, no norm.
 
-    strides = (8, 16, 32)
+    Of `strides` fewer, ascending, may be asked for; what no wanted level needs is not built.
+    """
 
-    def __init__(self, in_channels: list[int], channels: int) -> None:
+    offered = (8, 16, 32)
+
+    def __init__(self, in_channels: list[int], channels: int, strides: tuple[int, ...] = offered) -> None:
         super().__init__()
-        self.laterals = nn.ModuleList(nn.Conv2d(width, channels, 1) for width in in_channels[1:])
-        self.outputs = nn.ModuleList(nn.Conv2d(channels, channels, 3, padding=1) for _ in in_channels[1:])
+        self.strides = strides
+        self.first_stage = 1 + self.offered.index(strides[0])
+        self.laterals = nn.ModuleList(nn.Conv2d(width, channels, 1) for width in in_channels[self.first_stage :])
+        self.outputs = nn.ModuleList(nn.Conv2d(channels, channels, 3, padding=1) for _ in strides)
         for conv in (*self.laterals, *self.outputs):
             nn.init.xavier_uniform_(conv.weight)
             nn.init.zeros_(conv.bias)
@@ -85,20 +90,24 @@ class FPN(nn.Module):
     def forward(
         self,
         stages: list[Tensor],  # four of [M, C_l, H_l, W_l] at strides 4, 8, 16, 32
-    ) -> list[Tensor]:  # three of [M, channels, H_l, W_l]
-        maps = [lateral(stage) for lateral, stage in zip(self.laterals, stages[1:], strict=True)]
+    ) -> list[Tensor]:  # of each wanted stride [M, channels, H_l, W_l]
+        maps = [lateral(stage) for lateral, stage in zip(self.laterals, stages[self.first_stage :], strict=True)]
         for level in reversed(range(len(maps) - 1)):
             maps[level] = maps[level] + F.interpolate(maps[level + 1], size=maps[level].shape[-2:], mode="nearest")
-        return [conv(x) for conv, x in zip(self.outputs, maps, strict=True)]
+        wanted = [
+            x for x, stride in zip(maps, self.offered[self.first_stage - 1 :], strict=True) if stride in self.strides
+        ]
+        return [conv(x) for conv, x in zip(self.outputs, wanted, strict=True)]
 
 
 class SecondFPN16(nn.Module):
     """A single map at stride 16: every stage is resampled to it by one (transposed) convolution, then concatenated."""
 
-    strides = (16,)
+    offered = (16,)
 
-    def __init__(self, in_channels: list[int], channels: int) -> None:
+    def __init__(self, in_channels: list[int], channels: int, strides: tuple[int, ...] = offered) -> None:
         super().__init__()
+        self.strides = strides
         part = channels // 4
         at_4, at_8, at_16, at_32 = in_channels
         resample = (
@@ -123,19 +132,25 @@ class ImageEncoder(nn.Module):
     """Backbone and neck over all cameras of all samples (spec section 3).
 
     Feature row r of a level with stride s covers pixel rows r * s to (r + 1) * s of the input image, whether or not
-    padding is trimmed. `strides` and `channels` describe the output; `lr_multiplier` is meant for the parameters of
-    `backbone`. Loads `config.weights` when given: raises CheckpointError for a file that does not fit.
+    padding is trimmed. `strides` and `channels` describe the output, all levels of the neck unless fewer are asked for;
+    `lr_multiplier` is meant for the parameters of `backbone`. Loads `config.weights` when given: raises CheckpointError
+    for a file that does not fit, and ConfigError for a stride that the neck does not offer.
     """
 
-    def __init__(self, config: ImageEncoderConfig) -> None:
+    def __init__(self, config: ImageEncoderConfig, strides: tuple[int, ...] | None = None) -> None:
         super().__init__()
         self.image_size_px = tuple(config.image_size_px)
         self.trim_padding = config.trim_padding
         self.lr_multiplier = config.lr_multiplier
         self.backbone = build_backbone(config)
         neck = FPN if config.neck is NeckName.fpn else SecondFPN16
-        self.neck = neck(self.backbone.out_channels, config.neck_channels)
-        self.channels, self.strides = config.neck_channels, neck.strides
+        self.channels, self.strides = config.neck_channels, neck.offered if strides is None else strides
+        if not set(self.strides) <= set(neck.offered):
+            raise ConfigError(
+                f"backbone.neck={config.neck.value}: gives levels of stride {list(neck.offered)} px, but the model "
+                f"asks for {list(self.strides)}; choose another neck, or another stride in the model"
+            )
+        self.neck = neck(self.backbone.out_channels, config.neck_channels, self.strides)
         self.reads_bgr = config.name is BackboneName.vovnet99
         mean, std = (CAFFE_MEAN, CAFFE_STD) if self.reads_bgr else (IMAGENET_MEAN, IMAGENET_STD)
         self.register_buffer("mean", torch.tensor(mean).view(3, 1, 1), persistent=False)

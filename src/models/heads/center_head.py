@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -14,6 +15,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import penalty_reduced_focal
 from src.losses.normalizers import full_precision, mean_over_ranks
 from src.losses.regression import masked_l1
+from src.models.dense_layers import AllCells, DenseConvNormReLU
 from src.models.heads.decode import (
     AttributeSource,
     Suppression,
@@ -23,15 +25,14 @@ from src.models.heads.decode import (
     rule_attributes,
     suppress,
     top_candidates,
-    within_limits,
 )
 from src.models.sparse_layers import ConvNormReLU, RowNorm, SubmanifoldConv
 from src.ops.nms import maxpool_peaks
+from src.ops.row_mlp import row_mlp
 from src.structures.boxes import Boxes3D
 from src.structures.sparse_bev import SparseBEV
 from src.structures.taxonomy import ATTRIBUTES, CLASSES, MAX_BOXES_PER_SAMPLE
 from src.targets.heatmap import CODE_SIZE, GROUP_OF_CLASS, HEAD_GROUPS, HeadTargets, head_targets
-from src.targets.supervision import join_boxes
 
 # Probability 0.1 for every cell at the start, so that the focal loss is not drowned by background.
 HEATMAP_BIAS = -2.19
@@ -86,7 +87,6 @@ class Branches(nn.Module):
 
     def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
         super().__init__()
-        self.channels = channels
         self.hidden = nn.Linear(channels, len(widths) * channels, bias=False)
         self.norm = RowNorm(len(widths) * channels)
         self.outputs = nn.ModuleList(nn.Linear(channels, width) for width in widths)
@@ -96,19 +96,69 @@ class Branches(nn.Module):
         x: Tensor,  # [n, C]
     ) -> Tensor:  # [n, sum of widths] float32
         """Outputs of all branches side by side."""
-        hidden = F.relu(self.norm(self.hidden(x))).split(self.channels, dim=1)
-        return full_precision(torch.cat([out(part) for out, part in zip(self.outputs, hidden, strict=True)], dim=1))
+        return evaluate_branches([self], x)
+
+
+def evaluate_branches(
+    parts: Sequence[Branches],
+    x: Tensor,  # [n, C]
+) -> Tensor:  # [n, sum of all widths] float32
+    """Outputs of several sets of branches side by side, as one network of two layers.
+
+    A batch norm behind a linear layer is a linear layer once its statistics are known, and those of every hidden
+    channel follow from mean and covariance of the input: no hidden layer is ever stored, normalised or read again.
+    """
+    with torch.autocast(x.device.type, enabled=False):
+        weight = torch.cat([part.hidden.weight for part in parts])  # [H, C]
+        mean, variance = _hidden_statistics(parts, x, weight)
+        scale = torch.cat([part.norm.weight for part in parts]) * (variance + parts[0].norm.eps).rsqrt()
+        shift = torch.cat([part.norm.bias for part in parts]) - mean * scale
+        outputs = [output for part in parts for output in part.outputs]
+        out_weight, out_bias = torch.block_diag(*(out.weight for out in outputs)), torch.cat([o.bias for o in outputs])
+    return full_precision(row_mlp(x, (weight * scale[:, None]).t(), shift, out_weight.t(), out_bias))
+
+
+def _hidden_statistics(
+    parts: Sequence[Branches],
+    x: Tensor,  # [n, C]
+    weight: Tensor,  # [H, C]
+) -> tuple[Tensor, Tensor]:  # [H], [H]
+    """Mean and variance that the norms divide by: the batch's in training, where the running ones learn from them."""
+    if not parts[0].training or len(x) < 2:
+        return torch.cat([p.norm.running_mean for p in parts]), torch.cat([p.norm.running_var for p in parts])
+    x = full_precision(x)
+    centre = x.mean(0)
+    x = x - centre
+    covariance = x.t() @ x / len(x)  # [C, C]
+    mean, variance = weight @ centre, (weight @ covariance * weight).sum(1).clamp(min=0)
+    with torch.no_grad():
+        widths = [len(part.norm.running_mean) for part in parts]
+        unbiased = variance * (len(x) / (len(x) - 1))
+        for part, its_mean, its_variance in zip(parts, mean.split(widths), unbiased.split(widths), strict=True):
+            part.norm.running_mean.lerp_(its_mean, part.norm.momentum)
+            part.norm.running_var.lerp_(its_variance, part.norm.momentum)
+            part.norm.num_batches_tracked.add_(1)
+    return mean, variance
 
 
 class CenterHead(nn.Module):
-    """CenterPoint head on sparse cells (VoxelNeXt's nuScenes head, seven groups); 0.86 M parameters at C = 128."""
+    """CenterPoint head on sparse cells (VoxelNeXt's nuScenes head, seven groups); 0.86 M parameters at C = 128.
 
-    def __init__(self, config: HeadConfig, channels: int, grid: BEVGrid, velocity_code_weight: float) -> None:
+    With `dense` it reads a whole map [B, C, rows, cols] and every cell is a site; all behind the shared convolution is
+    the same.
+    """
+
+    def __init__(
+        self, config: HeadConfig, channels: int, grid: BEVGrid, velocity_code_weight: float, dense: bool = False
+    ) -> None:
         super().__init__()
         self.config, self.grid = config, grid
         self.learned = config.attributes is AttributeSource.learned
         self.code_weights = (1.0,) * (CODE_SIZE - 2) + (velocity_code_weight,) * 2
-        self.shared = ConvNormReLU(SubmanifoldConv(channels, channels, 3, 2, bias=True), eps=1e-5, momentum=0.1)
+        if dense:
+            self.shared = nn.Sequential(DenseConvNormReLU(channels, channels, 3, bias=True), AllCells())
+        else:
+            self.shared = ConvNormReLU(SubmanifoldConv(channels, channels, 3, 2, bias=True), eps=1e-5, momentum=0.1)
         self.heatmaps = nn.ModuleList(Branches(channels, (len(group),)) for group in HEAD_GROUPS)
         for branches in self.heatmaps:
             nn.init.constant_(branches.outputs[0].bias, HEATMAP_BIAS)
@@ -117,10 +167,17 @@ class CenterHead(nn.Module):
         in_group_order = [CLASSES.index(name) for group in HEAD_GROUPS for name in group]
         self.class_columns = [in_group_order.index(label) for label in range(len(CLASSES))]
 
-    def forward(self, bev: SparseBEV) -> HeadOutput:
+    def forward(
+        self,
+        bev: SparseBEV | Tensor,  # a tensor [B, C, rows, cols] where the head is dense
+    ) -> HeadOutput:
         """Heat maps of all cells; box codes only where training needs them everywhere."""
         bev = self.shared(bev)
-        logits = torch.cat([branches(bev.features) for branches in self.heatmaps], dim=1)[:, self.class_columns]
+        if isinstance(self.heatmaps[0], Branches):
+            logits = evaluate_branches(list(self.heatmaps), bev.features)
+        else:  # prepared for inference
+            logits = self.heatmaps[0](bev.features)
+        logits = logits[:, self.class_columns]
         codes = None
         if self.training and self.config.train_regression is TrainRegression.all:
             codes = torch.stack([branches(bev.features) for branches in self.regressions], dim=1)
@@ -139,18 +196,27 @@ class CenterHead(nn.Module):
         """
         if output.codes is not None:
             return output.codes[rows, groups]
+        order = groups.argsort(stable=True)
+        counts = torch.bincount(groups, minlength=len(HEAD_GROUPS)).tolist()
+        return self._regress_by_group(output, rows[order], counts)[order.argsort()]
+
+    def _regress_by_group(
+        self,
+        output: HeadOutput,
+        rows: Tensor,  # [n] int64, cells, group after group
+        counts: list[int],  # of each group
+    ) -> Tensor:  # [n, CODE_SIZE (+ 11)]
         features = output.bev.features
         step = max(1, len(features) // SAMPLED_CELLS)
         spread = features[::step] if self.training else features[:0]
-        order, codes = [], []
-        for number, branches in enumerate(self.regressions):
-            mine = (groups == number).nonzero().squeeze(1)
-            chosen = torch.cat([features[rows[mine]], spread])
+        codes = []
+        for branches, mine in zip(self.regressions, rows.split(counts), strict=True):
+            chosen = torch.cat([features[mine], spread])
             if not torch.is_autocast_enabled(chosen.device.type):
                 chosen = chosen.to(branches.hidden.weight.dtype)
-            codes.append(branches(chosen)[: len(mine)])
-            order.append(mine)
-        return torch.cat(codes)[torch.cat(order).argsort()]
+            if len(chosen) or self.training or len(rows) == 0:  # otherwise a group without cells costs nothing
+                codes.append(branches(chosen)[: len(mine)])
+        return torch.cat(codes)
 
     def targets(self, output: HeadOutput, boxes: list[Boxes3D]) -> HeadTargets:
         """What the head should predict on its cells, with the counts of objects that cannot be met."""
@@ -195,22 +261,20 @@ class CenterHead(nn.Module):
         scores = output.logits.sigmoid()
         if self.config.nms is Suppression.maxpool:
             scores = scores * maxpool_peaks(scores, output.bev.sites)
-        cell_counts = output.bev.sites.batch_counts().tolist()
-        found: list[list[Boxes3D]] = [[] for _ in cell_counts]
-        for number, group in enumerate(HEAD_GROUPS):
-            labels = torch.tensor([CLASSES.index(name) for name in group], device=scores.device)
-            best = top_candidates(scores[:, labels], labels, cell_counts, self.config.score_threshold)
-            codes = self.regress(output, best.rows, torch.full_like(best.rows, number))
-            cells = output.bev.indices[best.rows, 1:]
-            boxes = boxes_from_codes(cells, codes[:, :CODE_SIZE], best.labels, best.scores, self.grid)
-            if self.learned:
-                boxes.attributes = learned_attributes(codes[:, CODE_SIZE:], best.labels)
-            else:
-                boxes.attributes = rule_attributes(boxes)
-            places = torch.arange(len(boxes), device=scores.device).split(best.counts)
-            for sample, rows in enumerate(places):
-                found[sample].append(suppress(boxes[rows], number, self.config.nms))
-        return [within_limits(join_boxes(parts), self.config.max_boxes) for parts in found]
+        cells = output.bev.indices
+        best = top_candidates(scores, cells[:, 0], output.bev.batch_size, self.config.score_threshold)
+        counts = [sum(of_samples) for of_samples in best.counts]
+        if output.codes is None:
+            codes = self._regress_by_group(output, best.rows, counts)
+        else:
+            groups = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts)).to(best.rows.device)
+            codes = output.codes[best.rows, groups]
+        boxes = boxes_from_codes(cells[best.rows, 1:], codes[:, :CODE_SIZE], best.labels, best.scores, self.grid)
+        if self.learned:
+            boxes.attributes = learned_attributes(codes[:, CODE_SIZE:], best.labels)
+        else:
+            boxes.attributes = rule_attributes(boxes)
+        return suppress(boxes, best.counts, self.config.nms, self.config.max_boxes)
 
 
 def _attribute_loss(logits: Tensor, targets: HeadTargets) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from enum import Enum
 
@@ -9,10 +10,11 @@ import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.ops.nms import nms_circle, nms_rotated
+from src.geometry.constants import constant
+from src.ops.nms import conflicting_pairs, greedy_survivors
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import ATTRIBUTES, CLASS_ATTRIBUTE_PREFIX, CLASS_RANGE_M, CLASSES
-from src.targets.heatmap import HEAD_GROUPS
+from src.targets.heatmap import GROUP_OF_CLASS, HEAD_GROUPS
 
 MAX_CANDIDATES_PER_GROUP = 500
 """Best (cell, class) scores of a group; the public limit of 1000 before NMS lies above it and never binds."""
@@ -22,12 +24,35 @@ ROTATED_IOU = 0.2
 MOVING_MPS = 0.2
 OVERHEAD_M = 3.5
 
+GROUP_COLUMNS = tuple(CLASSES.index(name) for group in HEAD_GROUPS for name in group)
+"""Classes in the order of the groups."""
+COLUMN_GROUPS = tuple(GROUP_OF_CLASS[label] for label in GROUP_COLUMNS)
+RANGES_M = tuple(CLASS_RANGE_M[name] for name in CLASSES)
+
 CIRCLE_GROUPS = tuple(
     number for number, group in enumerate(HEAD_GROUPS) if {"barrier", "pedestrian", "traffic_sign"} & set(group)
 )
 """Groups of small or static objects, suppressed by centre distance in the per-group table."""
 CIRCLE_RADII_M = (2.0, 3.46, 3.16, 1.0, 0.92, 0.4, 1.0)
 """Distances of circle NMS per group; the vehicles' are the roots of CenterPoint's squared ones."""
+
+
+def _attribute_of_classes(pedestrian: str, cycle: str, **vehicles: str) -> tuple[int, ...]:
+    """Attribute of every class, `vehicle` being that of all vehicles without their own; -1 for classes without."""
+    chosen = {"pedestrian.": pedestrian, "cycle.": cycle, "traffic_sign.": "pole_mounted"}
+    table = []
+    for name in CLASSES:
+        prefix = CLASS_ATTRIBUTE_PREFIX[name]
+        if prefix is None:
+            table.append(-1)
+        else:
+            word = vehicles.get(name, vehicles["vehicle"]) if prefix == "vehicle." else chosen[prefix]
+            table.append(ATTRIBUTES.index(prefix + word))
+    return tuple(table)
+
+
+MOVING_ATTRIBUTES = _attribute_of_classes("moving", "with_rider", vehicle="moving")
+STILL_ATTRIBUTES = _attribute_of_classes("standing", "without_rider", vehicle="parked", bus="stopped")
 
 
 class Suppression(Enum):
@@ -48,34 +73,47 @@ class AttributeSource(Enum):
 
 @dataclass
 class Candidates:
-    """The best (cell, class) pairs of one group, sample after sample, best first within each."""
+    """The best (cell, class) pairs, group after group and sample after sample, best first within each."""
 
     rows: Tensor  # [n] int64, row of the cell in the map
     labels: Tensor  # [n] int64, index into taxonomy.CLASSES
     scores: Tensor  # [n]
-    counts: list[int]  # B, candidates of each sample
+    counts: list[list[int]]  # of each group: candidates of each sample
 
 
 def top_candidates(
-    scores: Tensor,  # [M, c] of the classes of one group
-    labels: Tensor,  # [c] int64, index of each column in taxonomy.CLASSES
-    cell_counts: list[int],  # B, cells of each sample in the map
+    scores: Tensor,  # [M, 12] columns as taxonomy.CLASSES
+    samples: Tensor,  # [M] int64, sample of each cell, ascending
+    batch_size: int,
     threshold: float,
     limit: int = MAX_CANDIDATES_PER_GROUP,
 ) -> Candidates:
-    """Per sample the `limit` best scores above the threshold, in descending order."""
-    rows, columns, kept, counts, first = [], [], [], [], 0
-    for part in scores.split(cell_counts):
-        flat = part.flatten()
-        passing = (flat > threshold).nonzero().squeeze(1)
-        order = flat[passing].argsort(descending=True, stable=True)[:limit]
-        passing = passing[order]
-        rows.append(first + torch.div(passing, scores.shape[1], rounding_mode="floor"))
-        columns.append(passing % scores.shape[1])
-        kept.append(flat[passing])
-        counts.append(len(passing))
-        first += len(part)
-    return Candidates(torch.cat(rows), labels[torch.cat(columns)], torch.cat(kept), counts)
+    """Per group and sample the `limit` best scores above the threshold, in descending order, ties by cell and class.
+
+    A GPU is waited for once.
+    """
+    columns, groups = constant((GROUP_COLUMNS, COLUMN_GROUPS), torch.int64, scores.device)  # [12] each, by group
+    passing = scores.index_select(1, columns) > threshold
+    if batch_size == 1:
+        by_column = passing.sum(0)[None]  # [B, 12]
+    else:
+        by_column = columns.new_zeros(batch_size, len(columns)).index_add(0, samples, passing.long())
+    found = columns.new_zeros(len(HEAD_GROUPS), batch_size).index_add(0, groups, by_column.t()).tolist()
+
+    places = torch.nonzero_static(passing.flatten(), size=sum(map(sum, found))).squeeze(1)
+    rows = torch.div(places, len(columns), rounding_mode="floor")
+    column = places - rows * len(columns)
+    labels = columns[column]
+    best = scores[rows, labels]
+    order = best.argsort(descending=True, stable=True)
+    block = groups[column] * batch_size + samples[rows]
+    order = order[block[order].argsort(stable=True)]
+    counts = [[min(count, limit) for count in of_samples] for of_samples in found]
+    if counts != found:
+        starts = itertools.accumulate(itertools.chain([0], *found))
+        kept = [torch.arange(first, first + count) for first, count in zip(starts, sum(counts, []), strict=False)]
+        order = order[torch.cat(kept).to(order.device)]
+    return Candidates(rows[order], labels[order], best[order], counts)
 
 
 def boxes_from_codes(
@@ -86,7 +124,7 @@ def boxes_from_codes(
     grid: BEVGrid,
 ) -> Boxes3D:
     """Invert the box code: x = (col + dx) * cell + x_min, sizes = exp(clamp(., -5, 5)), yaw = atan2(sin, cos)."""
-    lower = codes.new_tensor([grid.x_min_m, grid.y_min_m])
+    lower = constant((grid.x_min_m, grid.y_min_m), codes.dtype, codes.device)
     xy = (cells.flip(1).to(codes.dtype) + codes[:, :2]) * grid.cell_m + lower
     return Boxes3D(
         centers=torch.cat([xy, codes[:, 2:3]], dim=1),
@@ -100,60 +138,61 @@ def boxes_from_codes(
 
 
 def suppress(
-    boxes: Boxes3D,  # one sample and group, best first
-    group: int,
+    boxes: Boxes3D,  # group after group and sample after sample, best first within each
+    counts: list[list[int]],  # of each group: boxes of each sample
     method: Suppression,
-) -> Boxes3D:
-    """Thin out overlapping boxes, whatever their classes, and keep the best MAX_BOXES_PER_GROUP.
-
-    `maxpool` has thinned the cells before and only applies the limit.
-    """
-    if method is Suppression.per_group:
-        method = Suppression.circle if group in CIRCLE_GROUPS else Suppression.rotated
-    if method is Suppression.rotated:
-        boxes = boxes[nms_rotated(boxes.bev(), boxes.scores, ROTATED_IOU)]
-    elif method is Suppression.circle:
-        boxes = boxes[nms_circle(boxes.centers[:, :2], boxes.scores, CIRCLE_RADII_M[group])]
-    return boxes[torch.arange(min(len(boxes), MAX_BOXES_PER_GROUP), device=boxes.labels.device)]
-
-
-def within_limits(
-    boxes: Boxes3D,  # one sample, ego frame
     max_boxes: int,
-) -> Boxes3D:
-    """Drop boxes beyond their class's evaluation range (xy distance to the ego origin); keep the best, best first."""
-    ranges = boxes.centers.new_tensor([CLASS_RANGE_M[name] for name in CLASSES])
-    boxes = boxes[boxes.centers[:, :2].norm(dim=1) < ranges[boxes.labels]]
-    return boxes[boxes.scores.argsort(descending=True, stable=True)[:max_boxes]]
+) -> list[Boxes3D]:  # one of each sample, best first
+    """Thin out overlapping boxes of a group, whatever their classes, and keep the best MAX_BOXES_PER_GROUP of them.
+
+    Then drop those beyond their class's evaluation range (xy distance to the ego origin) and keep the `max_boxes` best
+    of a sample. `maxpool` has thinned the cells before and only applies the limits.
+    """
+    blocks = sum(counts, [])
+    better = worse = boxes.labels[:0]
+    if method is not Suppression.maxpool:
+        circle = range(len(counts)) if method is Suppression.circle else ()
+        circle = CIRCLE_GROUPS if method is Suppression.per_group else circle
+        radii = [CIRCLE_RADII_M[group] if group in circle else None for group in range(len(counts)) for _ in counts[0]]
+        better, worse = conflicting_pairs(boxes.bev(), blocks, radii, ROTATED_IOU)
+    ranges = constant(RANGES_M, boxes.centers.dtype, boxes.centers.device)
+    near = boxes.centers[:, :2].norm(dim=1) < ranges[boxes.labels]
+
+    # One transfer of all that the choice depends on, since a GPU is waited for; float64 holds every value of it.
+    parts = (better, worse, near, boxes.scores)
+    values = torch.cat([part.double() for part in parts]).cpu().split([len(part) for part in parts])
+    better, worse = values[0].long().tolist(), values[1].long().tolist()
+    near, scores = values[2].bool().tolist(), values[3].tolist()
+    survivors = iter(greedy_survivors(better, worse, len(boxes)))
+    row, chosen = next(survivors, None), [[] for _ in counts[0]]
+    for block, end in enumerate(itertools.accumulate(blocks)):
+        mine = []
+        while row is not None and row < end:
+            mine.append(row)
+            row = next(survivors, None)
+        chosen[block % len(chosen)] += [row for row in mine[:MAX_BOXES_PER_GROUP] if near[row]]
+    best = [sorted(rows, key=lambda row: -scores[row])[:max_boxes] for rows in chosen]  # stable: ties by group
+    return [boxes[torch.tensor(rows, dtype=torch.int64, device=boxes.labels.device)] for rows in best]
 
 
 def rule_attributes(
     boxes: Boxes3D,
 ) -> Tensor:  # [K] int64, -1 for none
     """Attributes from the speed (table of section 7); signs are overhanging where their lower edge is above 3.5 m."""
-    moving = _attribute_table("moving", "moving", "with_rider", "pole_mounted")
-    still = _attribute_table("parked", "standing", "without_rider", "pole_mounted")
-    still[CLASSES.index("bus")] = ATTRIBUTES.index("vehicle.stopped")
     labels = boxes.labels
-    chosen = torch.where(
-        boxes.velocities.norm(dim=1) > MOVING_MPS, labels.new_tensor(moving)[labels], labels.new_tensor(still)[labels]
-    )
+    moving, still = constant((MOVING_ATTRIBUTES, STILL_ATTRIBUTES), labels.dtype, labels.device)
+    chosen = torch.where(boxes.velocities.norm(dim=1) > MOVING_MPS, moving[labels], still[labels])
     overhead = (labels == CLASSES.index("traffic_sign")) & (boxes.centers[:, 2] - 0.5 * boxes.sizes[:, 2] > OVERHEAD_M)
     return torch.where(overhead, ATTRIBUTES.index("traffic_sign.overhanging"), chosen)
-
-
-def _attribute_table(vehicle: str, pedestrian: str, cycle: str, sign: str) -> list[int]:
-    """Attribute of every class, given the one of each family; -1 for classes without."""
-    chosen = {"vehicle.": vehicle, "pedestrian.": pedestrian, "cycle.": cycle, "traffic_sign.": sign}
-    prefixes = [CLASS_ATTRIBUTE_PREFIX[name] for name in CLASSES]
-    return [-1 if prefix is None else ATTRIBUTES.index(prefix + chosen[prefix]) for prefix in prefixes]
 
 
 def allowed_attributes(device: torch.device) -> Tensor:  # [12, 11] bool
     """Which attributes each class can carry."""
     prefixes = [CLASS_ATTRIBUTE_PREFIX[name] for name in CLASSES]
-    table = [[prefix is not None and attribute.startswith(prefix) for attribute in ATTRIBUTES] for prefix in prefixes]
-    return torch.tensor(table, device=device)
+    table = tuple(
+        tuple(prefix is not None and attribute.startswith(prefix) for attribute in ATTRIBUTES) for prefix in prefixes
+    )
+    return constant(table, torch.bool, device)
 
 
 def learned_attributes(

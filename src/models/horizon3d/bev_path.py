@@ -12,6 +12,7 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
+from src.models.memory import motions
 from src.models.sparse_layers import ConvNormReLU, RowNorm, SparseKernel, SubmanifoldConv
 from src.ops.bags import best_rows, segment_mean
 from src.ops.sites import Sites
@@ -90,7 +91,8 @@ class BEVPath(nn.Module):
         super().__init__()
         self.config, self.grid = config, grid
         self.occupancy = _cell_head(channels, 1)
-        self.velocity = _cell_head(channels, 2)
+        # None once the other predicts both (`prepare_for_inference`).
+        self.velocity: nn.ModuleList | None = _cell_head(channels, 2)
         nn.init.constant_(self.occupancy[1].bias, OCCUPANCY_BIAS)
         self.time = TimeEmbedding(TIME_CHANNELS)
         self.convs, self.norms = nn.ModuleList(), nn.ModuleList()
@@ -109,11 +111,14 @@ class BEVPath(nn.Module):
 
     def predict(self, fused: SparseBEV) -> CellPrediction:
         """Occupancy and velocity of every cell of F_fuse."""
-        values = []
-        for conv, output in (self.occupancy, self.velocity):
-            hidden = conv(fused).features
-            with torch.autocast(hidden.device.type, enabled=False):
-                values.append(output(hidden.float()))
+        values: list[Tensor] = []
+        for head in (self.occupancy, self.velocity):
+            if head is not None:
+                hidden = head[0](fused).features
+                with torch.autocast(hidden.device.type, enabled=False):
+                    values.append(head[1](hidden.float()))
+        if self.velocity is None:
+            values = list(values[0].split([1, 2], dim=1))
         return CellPrediction(values[0].squeeze(1), VELOCITY_UNIT_MPS * values[1])
 
     @torch.no_grad()
@@ -142,25 +147,26 @@ class BEVPath(nn.Module):
 
         x' = A_t T (x + u dt), always from the original frame, so positions are quantised once.
         """
-        parts: list[tuple[Tensor, ...]] = []
-        for age, frame in enumerate(memory.frames):
-            past = frame.cells
-            if past is None:
-                continue
-            motion = frame.motion(batch, max_age_s)
-            matrix, elapsed = motion.aug_from_past[past.rows], motion.elapsed_s[past.rows]
-            xy = past.xy
-            if self.config.velocity_compensation:
-                xy = xy + past.velocities * elapsed[:, None]
-            xy = _move(matrix, xy)
-            keep = motion.usable[past.rows] & self.grid.contains(xy)
-            slot = torch.full_like(past.rows, self.config.num_frames - 1 - age)
-            indices = torch.cat([past.rows[:, None], slot[:, None], self.grid.cell_of(xy)], dim=1)
-            parts.append((indices, xy, _rotate(matrix, past.velocities), elapsed, past.features, keep))
-        if not parts:
+        ages = [age for age, frame in enumerate(memory.frames) if frame.cells is not None]
+        if not ages:
             return None
-        *values, keep = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
-        kept = keep.nonzero().squeeze(1)  # once for all frames: a GPU waits for it
+        # All frames at once: the work is small, its operations are many.
+        motion = motions([memory.frames[age] for age in ages], batch, max_age_s)
+        cells = [memory.frames[age].cells for age in ages]
+        slots = [
+            torch.full_like(past.rows, self.config.num_frames - 1 - age) for age, past in zip(ages, cells, strict=True)
+        ]
+        way = torch.cat([number * len(batch) + past.rows for number, past in enumerate(cells)])  # [n] row in [T * B]
+        matrix, elapsed = motion.aug_from_past.flatten(0, 1)[way], motion.elapsed_s.flatten()[way]
+        xy, velocities, features, rows = (
+            torch.cat([getattr(past, name) for past in cells]) for name in ("xy", "velocities", "features", "rows")
+        )
+        if self.config.velocity_compensation:
+            xy = xy + velocities * elapsed[:, None]
+        xy = _move(matrix, xy)
+        kept = (motion.usable.flatten()[way] & self.grid.contains(xy)).nonzero().squeeze(1)
+        indices = torch.cat([rows[:, None], torch.cat(slots)[:, None], self.grid.cell_of(xy)], dim=1)
+        values = (indices, xy, _rotate(matrix, velocities), elapsed, features)
         return WarpedCells(*(value[kept] for value in values))
 
     def aggregate(self, fused: SparseBEV, warped: WarpedCells | None) -> SparseBEV:
@@ -170,13 +176,15 @@ class BEVPath(nn.Module):
         cell = fused.indices
         now = torch.full_like(cell[:, :1], self.config.num_frames)
         indices = torch.cat([cell[:, :1], now, cell[:, 1:]], dim=1)
-        elapsed, features = torch.zeros_like(cell[:, 0], dtype=torch.float32), fused.features
+        # Every slot of a sample has one age, 0 where nobody reads it: embedded once and looked up.
+        ages, features = self.time.mlp[0].bias.new_zeros(b * self.num_slots), fused.features
         if warped is not None:
+            ages[warped.indices[:, 0] * self.num_slots + warped.indices[:, 1]] = warped.elapsed_s
             indices = torch.cat([warped.indices, indices])
-            elapsed = torch.cat([warped.elapsed_s, elapsed])
             features = torch.cat([warped.features.to(features.dtype), features])
         sites, owners = Sites.unique(indices, shape)
-        features = torch.cat([features, self.time(elapsed).to(features.dtype)], dim=1)
+        times = F.embedding(indices[:, 0] * self.num_slots + indices[:, 1], self.time(ages))
+        features = torch.cat([features, times.to(features.dtype)], dim=1)
         x = SparseMap(sites, segment_mean(features, owners, len(sites)))
         for number, (conv, norm) in enumerate(zip(self.convs, self.norms, strict=True)):
             x = conv(x)

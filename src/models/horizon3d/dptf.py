@@ -45,6 +45,7 @@ class DPTFConfig:
 class Recollection:
     """The memory as it looks in the current frame."""
 
+    past: Memory  # less what is not in the frame's past (`Memory.before`)
     history: GaussianSet | None  # None: nothing remembered, or the path is off
     warped: WarpedCells | None
 
@@ -73,13 +74,12 @@ class DPTF(nn.Module):
     def recall(self, memory: Memory | None, batch: FrameBatch) -> Recollection:
         """Bring the memory to the batch's time and frame."""
         history = warped = None
-        if memory is not None:
-            memory = memory.before(batch)
-            if self.gaussian_path is not None:
-                history = self.gaussian_path.recall(memory, batch, self.config.max_age_s)
-            if self.bev_path is not None:
-                warped = self.bev_path.recall(memory, batch, self.config.max_age_s)
-        return Recollection(history, warped)
+        memory = Memory(()) if memory is None else memory.before(batch)
+        if self.gaussian_path is not None:
+            history = self.gaussian_path.recall(memory, batch, self.config.max_age_s)
+        if self.bev_path is not None:
+            warped = self.bev_path.recall(memory, batch, self.config.max_age_s)
+        return Recollection(memory, history, warped)
 
     def aggregate(self, fused: SparseBEV, recollection: Recollection) -> DPTFOutput:
         """F_fuse and the remembered cells into F_out."""
@@ -91,13 +91,13 @@ class DPTF(nn.Module):
 
     def remember(
         self,
-        memory: Memory | None,
+        past: Memory,  # of the batch, see `Recollection`
         batch: FrameBatch,
         fused: SparseBEV,
         output: DPTFOutput,
         ocsf: OCSFOutput | None,  # None for radar only, which has no Gaussians
     ) -> Memory:
-        """The memory with the current frame added, less what is not in its past (`Memory.before`)."""
+        """The memory with the current frame added."""
         cells = gaussians = None
         if self.bev_path is not None:
             cells = self.bev_path.store(fused, output.cells, batch)
@@ -111,5 +111,4 @@ class DPTF(nn.Module):
             gaussians,
         )
         paths = (self.config.bev_path, self.config.gaussian_path)
-        past = memory.before(batch) if memory is not None else Memory(())
         return past.push(frame, *(path.num_frames if path is not None else 0 for path in paths))

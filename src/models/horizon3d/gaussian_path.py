@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, fields, replace
 from enum import Enum
 
 import torch
@@ -11,8 +12,9 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.horizon3d.memory import Memory
+from src.models.horizon3d.memory import Memory, MemoryFrame
 from src.models.horizon3d.time_embedding import TimeEmbedding
+from src.models.memory import motions
 from src.ops.farthest_point import farthest_points
 from src.structures.batch import FrameBatch
 from src.structures.gaussians import GaussianSet, Source
@@ -69,37 +71,61 @@ class GaussianPath(nn.Module):
 
     def __init__(self, config: GaussianPathConfig, channels: int, grid: BEVGrid) -> None:
         super().__init__()
-        self.config, self.grid = config, grid
+        self.config, self.channels, self.grid = config, channels, grid
         self.time = TimeEmbedding(channels)
         self.register_buffer("centre_m", torch.tensor(grid.centre_m), persistent=False)
+        self.fixed_capacity = False  # always K_hist places, padding where less is remembered: shapes that never change
 
     def recall(self, memory: Memory, batch: FrameBatch, max_age_s: float) -> GaussianSet | None:
-        """History Gaussians in the batch's augmented frame, newest first; None when nothing is remembered.
+        """History Gaussians in the batch's augmented frame, newest first; None when nothing is remembered, unless the
+        capacity is fixed.
 
         m' = A_t T (m + v dt); what is too old, not in the past or outside the grid is padding.
         """
-        parts = []
-        for frame in memory.frames:
-            past = frame.gaussians
-            if past is None:
-                continue
-            motion = frame.motion(batch, max_age_s)
-            elapsed = motion.elapsed_s[:, None].expand_as(past.valid)
-            if self.config.velocity_compensation:
-                past = replace(past, means=past.means + past.velocities * elapsed[..., None])
-            moved = past.transform(motion.aug_from_past)
-            valid = moved.valid & motion.usable[:, None] & self.grid.contains(moved.means)
-            parts.append(
-                replace(
-                    moved,
-                    means=torch.where(valid[..., None], moved.means, self.centre_m),
-                    features=past.features + self.time(elapsed),
-                    sources=torch.full_like(past.sources, int(Source.HISTORY)),
-                    elapsed_s=elapsed,
-                    valid=valid,
-                )
-            )
+        frames = [frame for frame in memory.frames if frame.gaussians is not None]
+        parts = [self._moved(frames, batch, max_age_s)] if frames else []
+        missing = self.config.num_history_gaussians - sum(map(len, parts))
+        if self.fixed_capacity and missing > 0:
+            parts.append(self._padding(len(batch), missing))
         return GaussianSet.concatenate(parts) if parts else None
+
+    def _moved(self, frames: list[MemoryFrame], batch: FrameBatch, max_age_s: float) -> GaussianSet:
+        """The Gaussians of T frames at once: the work is small, its operations are many."""
+        motion = motions(frames, batch, max_age_s)
+        sets = [frame.gaussians for frame in frames]
+        past = GaussianSet(
+            **{field.name: torch.cat([getattr(one, field.name) for one in sets]) for field in fields(GaussianSet)}
+        )  # [T * B, n]
+        elapsed = motion.elapsed_s.flatten()[:, None].expand_as(past.valid)
+        if self.config.velocity_compensation:
+            past = replace(past, means=past.means + past.velocities * elapsed[..., None])
+        moved = past.transform(motion.aug_from_past.flatten(0, 1))
+        valid = moved.valid & motion.usable.flatten()[:, None] & self.grid.contains(moved.means)
+        moved = replace(
+            moved,
+            means=torch.where(valid[..., None], moved.means, self.centre_m),
+            features=past.features + self.time(elapsed),
+            sources=torch.full_like(past.sources, int(Source.HISTORY)),
+            elapsed_s=elapsed,
+            valid=valid,
+        )
+        # Sample by sample, newest first.
+        return moved.map(lambda value: value.unflatten(0, (len(frames), -1)).transpose(0, 1).flatten(1, 2))
+
+    def _padding(self, batch_size: int, count: int) -> GaussianSet:
+        ones = self.centre_m.new_ones(batch_size, count, 2)
+        zeros = self.centre_m.new_zeros(batch_size, count)
+        return GaussianSet(
+            means=self.centre_m.expand_as(ones),
+            scales=ones,
+            directions=ones * math.sqrt(0.5),
+            opacity_logits=zeros,
+            velocities=torch.zeros_like(ones),
+            features=self.centre_m.new_zeros(batch_size, count, self.channels),
+            sources=zeros.new_full(zeros.shape, int(Source.HISTORY), dtype=torch.int64),
+            elapsed_s=zeros,
+            valid=zeros.bool(),
+        )
 
     @torch.no_grad()
     def store(

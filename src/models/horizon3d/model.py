@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -33,6 +33,8 @@ CHANNEL_MULTIPLE = 4 * NUM_HEADS
 @dataclass(kw_only=True)
 class Horizon3DConfig:
     """Settings of the model (`model`). Raises ConfigError for parts that do not go together."""
+
+    temporal_part: ClassVar[str] = "dptf"
 
     name: str
     channels: int  # C, width of BEV cells and Gaussians
@@ -70,6 +72,16 @@ class Horizon3DConfig:
     def uses_images(self) -> bool:
         """Whether images are read and encoded."""
         return self.ocsf is not None
+
+    @property
+    def memory_frames(self) -> int:
+        """How many past key frames are remembered at most; 0 for single frames."""
+        return self.dptf.num_frames if self.dptf is not None else 0
+
+    @property
+    def memory_max_age_s(self) -> float | None:
+        """How far back the memory may lie; None for single frames."""
+        return self.dptf.max_age_s if self.dptf is not None else None
 
     @property
     def temporal_heads(self) -> int | None:
@@ -144,7 +156,7 @@ class Horizon3D(Detector):
             return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, None, self.head(fused)), None
         dptf = self.dptf.aggregate(fused, recollection)
         output = Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, dptf, self.head(dptf.bev))
-        return output, self.dptf.remember(memory, batch, fused, dptf, ocsf)
+        return output, self.dptf.remember(recollection.past, batch, fused, dptf, ocsf)
 
     def restore_memory(self, state: list[dict[str, Any]]) -> Memory:
         """The memory that `Memory.state` described."""

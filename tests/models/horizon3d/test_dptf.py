@@ -39,7 +39,8 @@ def make_parts(make_dptf):
             )
             ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, gaussians.valid, zeros.long()), fused)
             predicted = CellPrediction(torch.ones(b), torch.zeros(b, 2)) if dptf.bev_path is not None else None
-            return dptf.remember(memory, batch, fused, DPTFOutput(None, None, predicted, fused), ocsf)
+            past = dptf.recall(memory, batch).past
+            return dptf.remember(past, batch, fused, DPTFOutput(None, None, predicted, fused), ocsf)
 
         return dptf, remember
 

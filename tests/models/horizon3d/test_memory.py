@@ -6,7 +6,8 @@ import pytest
 import torch
 from moving import UTM, bare_frame, bda, pose, tensors_of
 
-from src.models.horizon3d.memory import Memory, MemoryFrame, StoredCells, rigid_inverse
+from src.models.horizon3d.memory import Memory, MemoryFrame, StoredCells
+from src.models.memory import rigid_inverse
 from src.structures.gaussians import GaussianSet
 
 DIM = 3

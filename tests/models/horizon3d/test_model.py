@@ -1,5 +1,6 @@
 """The whole single-frame model: one forward and backward, empty inputs, sample isolation, sizes."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -259,10 +260,10 @@ def test_no_state_stays_on_the_module(make_model, make_batch):
 def test_impossible_combinations_are_refused(make_config, make_batch, make_model, grid):
     config = make_config()
     for part in ("kggi", "ocsf"):
-        values = {name: getattr(config, name) for name in Horizon3DConfig.__dataclass_fields__} | {part: None}
+        values = {field.name: getattr(config, field.name) for field in fields(config)} | {part: None}
         with pytest.raises(ConfigError, match=f"model.{part}=null"):
             Horizon3DConfig(**values)
-    values = {name: getattr(config, name) for name in Horizon3DConfig.__dataclass_fields__} | {"channels": 20}
+    values = {field.name: getattr(config, field.name) for field in fields(config)} | {"channels": 20}
     with pytest.raises(ConfigError, match="model.channels=20"):
         Horizon3DConfig(**values)
     with pytest.raises(ConfigError, match="backbone=null"):

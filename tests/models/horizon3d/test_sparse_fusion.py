@@ -49,3 +49,34 @@ def test_empty_branches(cells):
     out = fusion(make_map(cells[0]), make_map(cells[1]))
     out.features.sum().backward()
     assert out.features.isfinite().all() and len(out) == len(cells[0]) + len(cells[1])
+
+
+@pytest.mark.parametrize("kernel", [1, 3])
+def test_equals_the_branches_side_by_side(kernel):
+    """The literal form: zeros where a branch has no site, every layer on all cells; values and all gradients."""
+    torch.manual_seed(0)
+    fusion = SparseFusion(8, kernel).double().train()
+    cells = torch.randperm(2 * 20 * 20, generator=torch.Generator().manual_seed(1))
+    maps = []
+    for part in (cells[:150], cells[100:300]):
+        sites = Sites.from_linear(part.sort().values, SHAPE)
+        maps.append(SparseBEV(sites, torch.randn(len(sites), 8, dtype=torch.float64, requires_grad=True)))
+    gaussian, radar = (
+        part.with_features(norm(part.features))
+        for part, norm in zip(maps, (fusion.norm_gaussian, fusion.norm_radar), strict=True)
+    )
+    gaussian, radar = gaussian.union(radar)
+    joined = gaussian.with_features(torch.cat([gaussian.features, radar.features], dim=1))
+    gates = torch.cat([fusion.gate_gaussian(joined).features, fusion.gate_radar(joined).features], dim=1).sigmoid()
+    gated = joined.with_features(gates * joined.features)
+    x = fusion.conv1(gated)
+    x = fusion.conv2(x.with_features(torch.relu(fusion.norm1(x.features))))
+    expected = torch.relu(fusion.norm2(x.features) + fusion.shortcut(gated).features)
+
+    leaves = [part.features for part in maps] + list(fusion.parameters())
+    found = fusion(*maps)
+    assert torch.equal(found.indices, joined.indices)
+    torch.testing.assert_close(found.features, expected)
+    weight = torch.randn(expected.shape, dtype=torch.float64)
+    wanted = torch.autograd.grad((expected * weight).sum(), leaves)
+    torch.testing.assert_close(torch.autograd.grad((found.features * weight).sum(), leaves), wanted)

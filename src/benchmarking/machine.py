@@ -1,0 +1,90 @@
+"""What the numbers were measured on, and what that machine can do at most."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from src.benchmarking.timing import interleaved, median_spread
+from src.reporting.sweep_text import is_busy
+
+# Square products large enough to reach the highest rate, small enough for seconds on two cores.
+GEMM_SIZE = {"cpu": 2048, "cuda": 8192}
+# Far beyond every cache, so that a copy moves memory.
+COPY_BYTES = {"cpu": 256 * 2**20, "cuda": 2 * 2**30}
+ROUNDS = 7
+
+
+def describe_machine() -> dict[str, Any]:
+    """Processor, threads, versions and how busy it was when the measurement began."""
+    return {
+        "processor": processor(),
+        "cores": os.cpu_count() or 1,
+        "threads": torch.get_num_threads(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "memory_gib": memory_gib(),
+        "system": platform.system(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "load": round(os.getloadavg()[0], 2),
+    }
+
+
+def busy_warning(machine: dict[str, Any]) -> str | None:
+    """What to say of numbers that were taken beside other work; None on a quiet machine."""
+    if not is_busy(machine["load"], machine["cores"]):
+        return None
+    return (
+        f"warning: the load was {machine['load']:.1f} on {machine['cores']} cores when this began: the machine is "
+        "busy, so times are too long; ratios of what was measured in turns still tell; measure again when nothing "
+        "else runs"
+    )
+
+
+def processor() -> str:
+    """Name of the CPU where the system tells it."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def memory_gib() -> float | None:
+    """Memory of the machine where the system tells it."""
+    try:
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+    except (AttributeError, ValueError, OSError):
+        return None
+
+
+def measure_roofline(device: torch.device) -> dict[str, float]:
+    """Measured ceilings: GFLOP/s of matrix products by type and GB/s of a copy (bytes read plus bytes written).
+
+    With torch's number of threads. `bf16` is absent where the processor has no arithmetic of its own for it, which
+    the rate tells: below that of fp32 nobody would choose it.
+    """
+    size, kind = GEMM_SIZE[device.type], device.type
+    rates: dict[str, float] = {}
+    products: dict[str, Callable[[], Tensor]] = {}
+    for name, dtype in (("fp32", torch.float32), ("bf16", torch.bfloat16)):
+        a, b = (torch.randn(size, size, device=device).to(dtype) for _ in range(2))
+        products[name] = lambda a=a, b=b: a @ b
+    for name, seconds in interleaved(products, device, ROUNDS).items():
+        rates[f"{name}_gflops"] = 2 * size**3 / median_spread(seconds)[0] / 1e9
+    if rates["bf16_gflops"] < rates["fp32_gflops"]:
+        del rates["bf16_gflops"]
+    source = torch.ones(COPY_BYTES[kind] // 4, device=device)
+    target = torch.empty_like(source)
+    seconds = interleaved({"copy": lambda: target.copy_(source)}, device, ROUNDS)["copy"]
+    return rates | {"copy_gbps": 2 * COPY_BYTES[kind] / median_spread(seconds)[0] / 1e9}
+
+
+def gemm_rate(roofline: dict[str, float], precision: str) -> float:
+    """GFLOP/s that work in a precision (`32-true`, `bf16-mixed`) could reach."""
+    wanted = "bf16_gflops" if precision == "bf16-mixed" else "fp32_gflops"
+    return roofline.get(wanted, roofline["fp32_gflops"])

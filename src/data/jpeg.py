@@ -1,0 +1,95 @@
+"""A faster decoder for JPEG files, used where it is installed and gives Pillow's pixels to the last bit.
+
+`pip install horizon3d[fast]` brings simplejpeg. Training and evaluation cannot differ by it: the first use in a process
+compares both decoders at every scale, and one that differs, fails or is not there leaves the work to Pillow.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+from functools import cache
+from types import ModuleType
+
+import numpy as np
+from PIL import Image
+
+REDUCTIONS = (8, 4, 2, 1)
+"""Scales at which a decoder gives a smaller image for less work: 1/8, 1/4, 1/2 and 1."""
+LEAST_PX = 16
+"""Below, several scales give the same size and the one that a decoder takes is not known."""
+
+_log = logging.getLogger(__name__)
+
+
+def decode_fast(
+    path: str | os.PathLike[str],
+    source_px: tuple[int, int],  # (height, width) as the tables state it
+    reduction: int,  # one of REDUCTIONS
+) -> Image.Image | None:
+    """The image that Pillow's `draft` and `load` give, for resizing only, or None where Pillow must read it itself.
+
+    None stands for: no faster decoder, a file that is not there or damaged, another size, and anything but colour in
+    the usual encoding. Pillow then finds the same fault and names it.
+    """
+    decoder = _checked_decoder()
+    if decoder is None or min(source_px) < LEAST_PX:
+        return None
+    try:
+        with open(path, "rb", buffering=0) as file:
+            content = file.readall()
+    except OSError:
+        return None
+    return _decode(decoder, content, source_px, reduction)
+
+
+def decoder_name() -> str:
+    """What decodes the files of this process, with its version."""
+    decoder = _checked_decoder()
+    return f"Pillow {Image.__version__}" if decoder is None else f"simplejpeg {decoder.__version__}"
+
+
+@cache
+def _checked_decoder() -> ModuleType | None:
+    try:
+        import simplejpeg
+    except ImportError:
+        return None
+    rng = np.random.default_rng(0)
+    ramp = np.linspace(0, 200, 83)[:, None, None] * np.linspace(0, 1, 118)[:, None]
+    picture = Image.fromarray((ramp + rng.uniform(0, 55, (83, 118, 3))).astype(np.uint8))
+    for subsampling in ("4:2:0", "4:2:2", "4:4:4"):
+        buffer = io.BytesIO()
+        picture.save(buffer, "JPEG", quality=85, subsampling=subsampling)
+        for reduction in REDUCTIONS:
+            expected = Image.open(buffer)
+            expected.draft("RGB", (118 // reduction, 83 // reduction))
+            expected.load()
+            found = _decode(simplejpeg, buffer.getvalue(), (83, 118), reduction)
+            if found is None or found.tobytes() != expected.tobytes():
+                _log.warning("simplejpeg %s gives other pixels than Pillow: not used", simplejpeg.__version__)
+                return None
+    return simplejpeg
+
+
+def _decode(
+    decoder: ModuleType,
+    content: bytes,
+    source_px: tuple[int, int],  # (height, width)
+    reduction: int,
+) -> Image.Image | None:
+    wanted = [-(-side // reduction) for side in source_px]
+    try:
+        height, width, colours, _ = decoder.decode_jpeg_header(content)
+        if (height, width) != tuple(source_px) or colours != "YCbCr":
+            return None
+        scale = {"min_height": wanted[0], "min_width": wanted[1], "min_factor": reduction}
+        pixels = decoder.decode_jpeg(content, "RGBX", **scale)  # [H, W, 4], as Pillow lays out its own images
+        if list(pixels.shape[:2]) != wanted:
+            return None
+        # What Image.frombuffer does without a copy for RGBX; as RGB it resizes three of the four bytes.
+        memory = Image.core.map_buffer(pixels, (wanted[1], wanted[0]), "raw", 0, ("RGB", 0, 1))
+        return Image.new("RGB", (1, 1))._new(memory)
+    except Exception:  # whatever is wrong with a file, Pillow says it in the words that callers know
+        return None

@@ -1,0 +1,113 @@
+"""The dense BEV trunk: fusion of the two maps, residual stages, and a neck back to full resolution (spec 13)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.resnet import BasicBlock
+from src.models.dense_layers import DenseConvNormReLU
+
+MIN_CHANNELS = 16
+"""Least width of what a strided stage reads: below it the backward pass of a strided 1x1 convolution with channels last
+writes beyond its memory on CPUs (oneDNN in torch 2.13; the process dies or computes nonsense)."""
+
+
+@dataclass(kw_only=True)
+class BEVDecoderConfig:
+    """Settings of the decoder (`model.decoder`). Raises ConfigError for lists that do not fit together."""
+
+    stage_channels: list[int]  # width of every stage
+    stage_strides: list[int]  # of its first block
+    blocks_per_stage: int  # basic residual blocks
+
+    def __post_init__(self) -> None:
+        if not self.stage_channels or len(self.stage_channels) != len(self.stage_strides):
+            raise ConfigError(
+                f"model.decoder.stage_channels={self.stage_channels} and model.decoder.stage_strides="
+                f"{self.stage_strides}: must be of the same length, one value a stage"
+            )
+        for name, least in (("stage_channels", MIN_CHANNELS), ("stage_strides", 1)):
+            if min(getattr(self, name)) < least:
+                raise ConfigError(f"model.decoder.{name}={getattr(self, name)}: each must be at least {least}")
+        if self.blocks_per_stage < 1:
+            raise ConfigError(f"model.decoder.blocks_per_stage={self.blocks_per_stage}: must be at least 1")
+
+
+class ConvFuser(nn.Module):
+    """Camera and radar map side by side through one 3x3 convolution."""
+
+    def __init__(self, in_channels: int, channels: int) -> None:
+        super().__init__()
+        self.conv = DenseConvNormReLU(in_channels, channels, 3)
+
+    def forward(
+        self,
+        camera: Tensor,  # [B, C_camera, rows, cols]
+        radar: Tensor,  # [B, C_radar, rows, cols]
+    ) -> Tensor:  # [B, C, rows, cols]
+        if torch.is_autocast_enabled(camera.device.type):  # before they are joined: half the bytes
+            half = torch.get_autocast_dtype(camera.device.type)
+            camera, radar = camera.to(half), radar.to(half)
+        return self.conv(torch.cat([camera, radar], dim=1))
+
+
+class BEVDecoder(nn.Module):
+    """Residual stages at ever coarser strides; the first and the last are joined and brought back to every cell.
+
+    Structure of the public BEVFusion decoder, with one more link: the fused map itself joins at full resolution, where
+    radar is sharpest.
+    """
+
+    def __init__(self, config: BEVDecoderConfig, in_channels: int, channels: int, grid: BEVGrid) -> None:
+        super().__init__()
+        coarsest = math.prod(config.stage_strides)
+        if any(cells % coarsest for cells in grid.cells):
+            raise ConfigError(
+                f"grid.cells={list(grid.cells)}: each must be a multiple of {coarsest}, the product of "
+                f"model.decoder.stage_strides={config.stage_strides}"
+            )
+        widths = [in_channels, *config.stage_channels]
+        self.stages = nn.ModuleList(
+            nn.Sequential(
+                BasicBlock(widths[stage], width, stride),
+                *(BasicBlock(width, width, 1) for _ in range(config.blocks_per_stage - 1)),
+            )
+            for stage, (width, stride) in enumerate(zip(widths[1:], config.stage_strides, strict=True))
+        )
+        joined = widths[1] + (widths[-1] if len(config.stage_channels) > 1 else 0)
+        self.join = nn.Sequential(DenseConvNormReLU(joined, channels, 1), DenseConvNormReLU(channels, channels, 3))
+        self.lateral = nn.Conv2d(in_channels, channels, 1)
+        self.output = DenseConvNormReLU(channels, channels, 3)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        nn.init.zeros_(self.lateral.bias)
+
+    def forward(
+        self,
+        fused: Tensor,  # [B, C_fused, rows, cols]
+    ) -> Tensor:  # [B, C, rows, cols]
+        outputs, x = [], fused
+        for stage in self.stages:
+            x = stage(x)
+            outputs.append(x)
+        finest = outputs[0]
+        if len(outputs) > 1:
+            finest = torch.cat([finest, _resized(x, finest.shape[-2:])], dim=1)
+        return self.output(self.lateral(fused) + _resized(self.join(finest), fused.shape[-2:]))
+
+
+def _resized(
+    x: Tensor,  # [B, C, h, w]
+    size: torch.Size,
+) -> Tensor:  # [B, C, *size]
+    if x.shape[-2:] == size:
+        return x
+    return F.interpolate(x, size=size, mode="bilinear", align_corners=False)

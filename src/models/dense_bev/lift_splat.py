@@ -1,0 +1,137 @@
+"""Lift-splat: pixels spread along their rays by a predicted depth, summed into BEV cells (specification 13)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.resnet import BasicBlock
+from src.models.dense_layers import DenseConvNormReLU, map_of_rows, rows_of_map
+from src.ops.bags import weighted_bag
+from src.targets.depth import lid_centres
+
+
+@dataclass(kw_only=True)
+class LiftSplatConfig:
+    """Settings of the view transform (`model.view_transform`). Raises ConfigError for values that cannot work."""
+
+    image_stride_px: int  # level of the image encoder that is lifted
+    hidden_channels: int  # of the depth network
+    context_channels: int  # width of what is lifted, and of the map
+    num_depth_bins: int  # D, linearly increasing widths
+    depth_range_m: list[float]  # [nearest, farthest] along the optical axis
+    z_range_m: list[float]  # [low, high): lifted points outside are dropped
+
+    def __post_init__(self) -> None:
+        for name in ("image_stride_px", "hidden_channels", "context_channels", "num_depth_bins"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"model.view_transform.{name}={getattr(self, name)}: must be at least 1")
+        low_high = self.depth_range_m
+        if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
+            raise ConfigError(
+                f"model.view_transform.depth_range_m={low_high}: must be [near, far] in metres with 0 < near < far"
+            )
+        if len(self.z_range_m) != 2 or not self.z_range_m[0] < self.z_range_m[1]:
+            raise ConfigError(
+                f"model.view_transform.z_range_m={self.z_range_m}: must be [low, high] in metres with low < high"
+            )
+
+    @property
+    def depth_range(self) -> tuple[float, float]:
+        """(nearest, farthest) in metres."""
+        return self.depth_range_m[0], self.depth_range_m[1]
+
+
+@dataclass
+class LiftedViews:
+    """The camera map and the depths it was made with."""
+
+    bev: Tensor  # [B, C, rows, cols] float32, channels last
+    depth_logits: Tensor  # [B, N, D, h, w], softmax over D gives the depth distribution
+    num_lifted: int  # (pixel, bin) pairs that met a cell, of all samples
+
+
+class LiftSplat(nn.Module):
+    """Depth distribution times context features of every pixel, pooled into cells as one weighted bag.
+
+    The frustum tensor [N, D, C, h, w] of the published formulation is never made: a cell is the sum over its
+    (pixel, bin) pairs, weights the probabilities, values the rows of the pixels.
+    """
+
+    def __init__(self, config: LiftSplatConfig, in_channels: int, grid: BEVGrid) -> None:
+        super().__init__()
+        self.config, self.grid = config, grid
+        hidden = config.hidden_channels
+        self.trunk = nn.Sequential(DenseConvNormReLU(in_channels, hidden, 3), BasicBlock(hidden, hidden, 1))
+        self.depth = nn.Conv2d(hidden, config.num_depth_bins, 1)
+        self.context = nn.Conv2d(hidden, config.context_channels, 1)
+        centres = lid_centres(config.depth_range, config.num_depth_bins)
+        self.register_buffer("depth_centres_m", centres, persistent=False)
+
+    def forward(
+        self,
+        level: Tensor,  # [B, N, C_I, h, w] image features
+        pix_from_aug: Tensor,  # [B, N, 4, 4]: (x, y, z, 1) in aug metres -> (u*d, v*d, d, 1)
+        valid: Tensor,  # [B, N] bool, False where the camera is missing
+        image_size_px: tuple[int, int],  # (H, W) of the network input
+    ) -> LiftedViews:
+        """Pool all views of every sample; a missing view contributes nothing."""
+        b, n, _, h, w = level.shape
+        hidden = self.trunk(level.flatten(0, 1))
+        depth, context = self.depth(hidden), self.context(hidden)
+        with torch.autocast(level.device.type, enabled=False):  # sums of many terms, weighted by probabilities
+            probabilities = rows_of_map(depth.float()).softmax(1)  # [B*N*h*w, D]
+            pairs, cells, by_pixel = self.pair(self.lift(pix_from_aug, valid, image_size_px, (h, w)), valid)
+            weights = probabilities.flatten().index_select(0, pairs)
+            pixels = torch.div(pairs, self.config.num_depth_bins, rounding_mode="floor")
+            shape = (b, self.grid.rows, self.grid.cols)
+            values = rows_of_map(context.float())
+            pooled = weighted_bag(values, weights, pixels, cells, torch.Size(shape).numel(), by_pixel)
+        return LiftedViews(map_of_rows(pooled, shape), depth.unflatten(0, (b, n)), len(pairs))
+
+    @torch.no_grad()
+    def lift(
+        self,
+        pix_from_aug: Tensor,  # [B, N, 4, 4]
+        valid: Tensor,  # [B, N] bool
+        image_size_px: tuple[int, int],  # (H, W)
+        level_size: tuple[int, int],  # (h, w)
+    ) -> Tensor:  # [B, N, h, w, D, 3] aug metres, float32
+        """Points at the pixel centres and the bins' mean depths."""
+        (height, width), (h, w), device = image_size_px, level_size, pix_from_aug.device
+        v, u = torch.meshgrid(
+            (torch.arange(h, device=device) + 0.5) * (height / h),
+            (torch.arange(w, device=device) + 0.5) * (width / w),
+            indexing="ij",
+        )
+        # A missing view may carry any matrix; its points are never used, but must not stop the inversion.
+        matrix = torch.where(valid[..., None, None], pix_from_aug, torch.eye(4, device=device))
+        aug_from_pix = torch.linalg.inv_ex(matrix.double())[0].float()[:, :, None, None]  # [B, N, 1, 1, 4, 4]
+        # Not a matrix product: a GPU may round its factors to fewer digits.
+        rays = sum(aug_from_pix[..., :3, i] * part[..., None] for i, part in enumerate((u, v, torch.ones_like(u))))
+        return rays[..., None, :] * self.depth_centres_m[:, None] + aug_from_pix[..., None, :3, 3]
+
+    @torch.no_grad()
+    def pair(
+        self,
+        points: Tensor,  # [B, N, h, w, D, 3] aug metres
+        valid: Tensor,  # [B, N] bool
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [pairs] int64 each
+        """(pixel, bin) pairs that meet a cell as pixel * D + bin, in the order of cells; the linear key of each one's
+        cell, ascending; and where in this order the pairs lie when they are taken pixel by pixel.
+        """
+        low, high = self.config.z_range_m
+        inside = self.grid.contains(points[..., :2]) & (points[..., 2] >= low) & (points[..., 2] < high)
+        inside &= valid[:, :, None, None, None]
+        met = inside.flatten().nonzero().squeeze(1)  # a GPU waits here
+        cell = self.grid.cell_of(points.view(-1, 3).index_select(0, met)[:, :2])
+        sample = torch.div(met, points[0].numel() // 3, rounding_mode="floor")
+        keys = (sample * self.grid.rows + cell[:, 0]) * self.grid.cols + cell[:, 1]
+        keys, order = torch.sort(keys, stable=True)
+        by_pixel = torch.empty_like(order)
+        by_pixel[order] = torch.arange(len(order), device=order.device)
+        return met[order], keys, by_pixel

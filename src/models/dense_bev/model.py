@@ -1,0 +1,196 @@
+"""Dense peer: radar-camera fusion on a whole BEV map, in the way of BEVFusion (specification 13)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.losses.classification import depth_cross_entropy
+from src.losses.normalizers import mean_over_ranks
+from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
+from src.models.dense_bev.bev_decoder import MIN_CHANNELS, BEVDecoder, BEVDecoderConfig, ConvFuser
+from src.models.dense_bev.lift_splat import LiftedViews, LiftSplat, LiftSplatConfig
+from src.models.dense_bev.pillars import PillarConfig, PillarEncoder
+from src.models.dense_bev.temporal import MapMemory, Recollection, TemporalConfig, TemporalFusion
+from src.models.detector import Detector
+from src.models.heads.center_head import CenterHead, HeadConfig, HeadOutput
+from src.structures.batch import FrameBatch
+from src.structures.boxes import Boxes3D
+from src.targets.depth import paint_depth
+from src.targets.projection import view_boxes
+from src.targets.supervision import supervised_boxes
+
+
+@dataclass(kw_only=True)
+class LossConfig:
+    """Weights of the terms (`model.loss`); null switches a term off, uncomputed."""
+
+    heatmap_weight: float | None
+    box_weight: float | None
+    depth_weight: float | None
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None and value < 0:
+                raise ConfigError(f"model.loss.{field.name}={value}: must not be negative; null switches a term off")
+
+
+@dataclass(kw_only=True)
+class DenseBEVConfig:
+    """Settings of the model (`model`). Raises ConfigError for parts that do not go together."""
+
+    temporal_part: ClassVar[str] = "temporal"
+
+    name: str
+    channels: int  # C, width of the map that the head reads
+    fused_channels: int  # width of the fused map, which is also what is remembered
+    radar_encoder: PillarConfig
+    view_transform: LiftSplatConfig
+    decoder: BEVDecoderConfig
+    temporal: TemporalConfig | None  # null: single frames, phase 1
+    head: HeadConfig
+    loss: LossConfig
+
+    def __post_init__(self) -> None:
+        for name, least in (("channels", 1), ("fused_channels", MIN_CHANNELS)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"model.{name}={getattr(self, name)}: must be at least {least}")
+
+    @property
+    def uses_images(self) -> bool:
+        """Always: without cameras there is nothing to fuse."""
+        return True
+
+    @property
+    def memory_frames(self) -> int:
+        """How many past key frames are remembered at most; 0 for single frames."""
+        return self.temporal.num_frames if self.temporal is not None else 0
+
+    @property
+    def memory_max_age_s(self) -> float | None:
+        """How far back the memory may lie; None for single frames."""
+        return self.temporal.max_age_s if self.temporal is not None else None
+
+
+@dataclass
+class DenseBEVOutput:
+    """One frame through the model."""
+
+    views: LiftedViews
+    radar_bev: Tensor  # [B, C_radar, rows, cols]
+    fused_bev: Tensor  # [B, C_fused, rows, cols]
+    recollection: Recollection | None  # None in phase 1
+    head: HeadOutput
+
+
+class DenseBEV(Detector):
+    """BEVFusion-style detector: lift-splat and pillars onto one dense map, a convolutional decoder, a dense head.
+
+    Raises ConfigError when parts, grid and backbone do not fit.
+    """
+
+    def __init__(
+        self,
+        config: DenseBEVConfig,
+        grid: BEVGrid,
+        backbone: ImageEncoderConfig | None,
+        velocity_code_weight: float,
+    ) -> None:
+        super().__init__()
+        if backbone is None:
+            raise ConfigError("backbone=null: model=dense_bev fuses radar with images; choose a backbone")
+        self.config, self.grid = config, grid
+        self.image_encoder = ImageEncoder(backbone, strides=(config.view_transform.image_stride_px,))
+        self.radar_encoder = PillarEncoder(config.radar_encoder, grid)
+        self.view_transform = LiftSplat(config.view_transform, self.image_encoder.channels, grid)
+        both = config.view_transform.context_channels + config.radar_encoder.channels
+        self.fuser = ConvFuser(both, config.fused_channels)
+        self.temporal = (
+            TemporalFusion(config.temporal, config.fused_channels, grid) if config.temporal is not None else None
+        )
+        self.decoder = BEVDecoder(config.decoder, config.fused_channels, config.channels, grid)
+        self.head = CenterHead(config.head, config.channels, grid, velocity_code_weight, dense=True)
+        self.to(memory_format=torch.channels_last)
+
+    @property
+    def image_backbone(self) -> nn.Module:
+        """Backbone without its neck."""
+        return self.image_encoder.backbone
+
+    def forward(self, batch: FrameBatch, memory: MapMemory | None = None) -> tuple[DenseBEVOutput, MapMemory | None]:
+        """Detect in the frames of B lanes, given what is remembered of them; the new memory is detached.
+
+        Raises ValueError when images are absent, or when the memory is of another number of lanes.
+        """
+        if batch.images is None or batch.image_valid is None or batch.pix_from_aug is None:
+            raise ValueError("FrameBatch.images is None, but this model uses images; read them with the frames")
+        if memory is not None and memory.frames and memory.batch_size != len(batch):
+            raise ValueError(f"the memory holds {memory.batch_size} lanes, but the batch {len(batch)} frames")
+        recollection = self.temporal.recall(memory, batch) if self.temporal is not None else None
+        (level,) = self.image_encoder(batch.images)
+        views = self.view_transform(level, batch.pix_from_aug, batch.image_valid, self.image_encoder.image_size_px)
+        radar_bev = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
+        current = fused = self.fuser(views.bev, radar_bev)
+        if self.temporal is not None:
+            current, memory = self.temporal.aggregate(fused, recollection), self.temporal.remember(memory, batch, fused)
+        output = DenseBEVOutput(views, radar_bev, fused, recollection, self.head(self.decoder(current)))
+        return output, memory if self.temporal is not None else None
+
+    def restore_memory(self, state: list[dict[str, Any]]) -> MapMemory:
+        """The memory that `MapMemory.state` described."""
+        return MapMemory.from_state(state)
+
+    def loss(self, output: DenseBEVOutput, batch: FrameBatch) -> dict[str, Tensor]:
+        """Weighted terms `heatmap`, `box` and `depth`, and their sum `total`; ValueError without annotations."""
+        if batch.boxes is None:
+            raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
+        weights = self.config.loss
+        with torch.autocast(batch.device.type, enabled=False):
+            terms = self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
+            if weights.depth_weight is not None:
+                terms["depth"] = weights.depth_weight * self._depth_loss(output.views.depth_logits, batch)
+        zero = torch.zeros((), device=batch.device)
+        return terms | {"total": sum(terms.values(), zero)}
+
+    def _depth_loss(
+        self,
+        logits: Tensor,  # [B, N, D, h, w]
+        batch: FrameBatch,
+    ) -> Tensor:  # []
+        """Cross-entropy at the pixels of annotated boxes, as Horizon3D's camera branch (specification 4.3)."""
+        settings, size = self.config.view_transform, self.image_encoder.image_size_px
+        joined, sample = supervised_boxes(batch.boxes, self.grid)
+        seen = view_boxes(joined, sample, batch.pix_from_aug, batch.image_valid, size)
+        logits = logits.flatten(0, 1)
+        bins = (settings.depth_range, settings.num_depth_bins)
+        target = paint_depth(seen, len(logits), size, *bins, settings.image_stride_px)
+        return depth_cross_entropy(logits, target) / mean_over_ranks((target >= 0).sum())
+
+    def decode(self, output: DenseBEVOutput) -> list[Boxes3D]:
+        """Boxes of each frame, best first."""
+        return self.head.decode(output.head)
+
+    @torch.no_grad()
+    def diagnostics(self, output: DenseBEVOutput) -> dict[str, Tensor]:
+        """Pillars and lifted pairs per frame, how sure depth is, past maps in use; after a loss the head's objects."""
+        frames = len(output.radar_bev)
+        probabilities = output.views.depth_logits.float().softmax(2)  # [B, N, D, h, w]
+        values: dict[str, Tensor | float] = {
+            "pillars": output.radar_bev.any(dim=1).sum() / frames,
+            "lifted_pairs": output.views.num_lifted / frames,
+            "depth_confidence": probabilities.amax(2).mean(),
+        }
+        if output.recollection is not None:
+            values["remembered_frames"] = output.recollection.usable.sum() / frames
+        targets = output.head.targets
+        if targets is not None:
+            values["objects"] = len(targets.rows) / frames
+            values["shared_objects"] = targets.num_shared / frames
+        device = output.radar_bev.device
+        return {name: torch.as_tensor(value, dtype=torch.float32, device=device) for name, value in values.items()}

@@ -1,0 +1,98 @@
+"""Radar points to a dense BEV map: pillars of one cell, encoded point by point (PointPillars; specification 13)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.sparse_voxel import POINT_SCALES
+from src.models.dense_layers import map_of_rows
+from src.models.sparse_layers import RowNorm
+from src.ops.bags import segment_mean
+
+EXTRA_FEATURES = 6
+"""From the cell's centre (x, y), from the mean of the pillar's points (x, y, z), log of their number."""
+
+
+@dataclass(kw_only=True)
+class PillarConfig:
+    """Settings of the radar encoder (`model.radar_encoder`). Raises ConfigError for values that cannot work."""
+
+    channels: int  # width of the map; the layers before the last are half as wide and see their pillar's maximum
+    num_layers: int  # of the point network
+
+    def __post_init__(self) -> None:
+        if self.channels < 2 or self.channels % 2:
+            raise ConfigError(f"model.radar_encoder.channels={self.channels}: must be a positive even number")
+        if self.num_layers < 1:
+            raise ConfigError(f"model.radar_encoder.num_layers={self.num_layers}: must be at least 1")
+
+
+class PillarEncoder(nn.Module):
+    """Radar points to a map of `config.channels` over the whole grid, zero where no point fell.
+
+    Runs in float32 whatever autocast says: it is small, and its inputs are positions.
+    """
+
+    def __init__(self, config: PillarConfig, grid: BEVGrid) -> None:
+        super().__init__()
+        self.grid = grid
+        self.register_buffer("point_scales", torch.tensor(POINT_SCALES), persistent=False)
+        self.layers, self.norms = nn.ModuleList(), nn.ModuleList()
+        inputs = len(POINT_SCALES) + EXTRA_FEATURES
+        for number in range(config.num_layers):
+            width = config.channels if number == config.num_layers - 1 else config.channels // 2
+            self.layers.append(nn.Linear(inputs, width, bias=False))
+            self.norms.append(RowNorm(width))
+            inputs = config.channels
+
+    def forward(
+        self,
+        radar_points: Tensor,  # [P, 7] x, y, z (m, aug frame), rcs (dB), vx, vy (m/s), dt (s)
+        radar_batch: Tensor,  # [P] int64 sample of each point
+        batch_size: int,
+    ) -> Tensor:  # [B, C, rows, cols] float32, channels last
+        """The map; points outside the grid or its height band are left out."""
+        with torch.autocast(radar_points.device.type, enabled=False):
+            features, cells, rows = self.describe(radar_points.float(), radar_batch)
+            for layer, norm in zip(self.layers, self.norms, strict=True):
+                points = F.relu(norm(layer(features)))
+                pillars = _maximum(points, rows, len(cells))  # [V, width]
+                features = torch.cat([points, F.embedding(rows, pillars)], dim=1)
+            shape = (batch_size, self.grid.rows, self.grid.cols)
+            whole = pillars.new_zeros(torch.Size(shape).numel(), pillars.shape[1])
+            return map_of_rows(whole.index_copy(0, cells, pillars), shape)
+
+    def describe(
+        self,
+        points: Tensor,  # [P, 7]
+        batch: Tensor,  # [P] int64
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [n, 13], [V] int64, [n] int64
+        """Features of the points inside, linear keys of the pillars they form, and the pillar of each point."""
+        low, high = self.grid.z_range_m
+        inside = self.grid.contains(points[:, :2]) & (points[:, 2] >= low) & (points[:, 2] < high)
+        kept = inside.nonzero().squeeze(1)
+        points, batch = points[kept], batch[kept]
+        cell = self.grid.cell_of(points[:, :2])
+        keys = (batch * self.grid.rows + cell[:, 0]) * self.grid.cols + cell[:, 1]
+        cells, rows = torch.unique(keys, return_inverse=True)
+        from_centre = (points[:, :2] - self.grid.centre_of(cell)) / self.grid.cell_m
+        mean = F.embedding(rows, segment_mean(points[:, :3], rows, len(cells)))
+        from_mean = (points[:, :3] - mean) / points.new_tensor([self.grid.cell_m, self.grid.cell_m, POINT_SCALES[2]])
+        count = torch.bincount(rows, minlength=len(cells)).to(points.dtype).log()[rows]
+        return torch.cat([points / self.point_scales, from_centre, from_mean, count[:, None]], dim=1), cells, rows
+
+
+def _maximum(
+    values: Tensor,  # [n, C], none negative
+    rows: Tensor,  # [n] int64
+    num_rows: int,
+) -> Tensor:  # [num_rows, C]
+    """Maximum of the values that share a row."""
+    index = rows[:, None].expand_as(values)
+    return values.new_zeros(num_rows, values.shape[1]).scatter_reduce(0, index, values, "amax")

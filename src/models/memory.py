@@ -1,0 +1,146 @@
+"""The past of a detector's lanes: when and where each remembered frame was made, and its way to the present (6)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, Self, TypeVar
+
+import torch
+from torch import Tensor
+
+from src.structures.batch import MAX_EGO_SPEED_MPS, FrameBatch
+
+
+@dataclass
+class Motion:
+    """How each lane got from a stored frame to the current one."""
+
+    aug_from_past: Tensor  # [B, 4, 4] float32, A_t T_{t-k -> t}
+    elapsed_s: Tensor  # [B] float32, dt_k; 0 where not usable
+    usable: Tensor  # [B] bool
+
+
+@dataclass
+class RememberedFrame:
+    """Time and place of one remembered key frame of each of B lanes; models add what they remember of it."""
+
+    timestamps_s: Tensor  # [B] float64
+    global_from_ego: Tensor  # [B, 4, 4] float64
+    present: Tensor  # [B] bool, False for a lane whose clip began later
+
+    def motion(self, batch: FrameBatch, max_age_s: float) -> Motion:
+        """From this frame to the batch's, composed in float64.
+
+        Not usable: an absent lane, a frame that is not in the past or older than `max_age_s`, a pose that jumped.
+        """
+        ego_from_past, elapsed, driven = self._way_to(batch)
+        usable = self.present & driven & (elapsed <= max_age_s)
+        matrix = batch.aug_from_ego.double() @ ego_from_past
+        # What is not usable must not carry NaN or huge numbers into arithmetic that is masked afterwards.
+        matrix = torch.where(usable[..., None, None], matrix, torch.eye(4, dtype=matrix.dtype, device=matrix.device))
+        return Motion(matrix.float(), torch.where(usable, elapsed, 0.0).float(), usable)
+
+    def jumped(self, batch: FrameBatch) -> Tensor:  # [B] bool
+        """Lanes whose pose jumped between this frame and the batch's, which is later."""
+        _, elapsed, driven = self._way_to(batch)
+        return self.present & (elapsed > 0) & ~driven
+
+    def _way_to(self, batch: FrameBatch) -> tuple[Tensor, Tensor, Tensor]:
+        """[B, 4, 4] and [B] s from here to the batch, float64, and whether a vehicle can drive it in that time [B]."""
+        ego_from_past = rigid_inverse(batch.global_from_ego) @ self.global_from_ego
+        elapsed = batch.timestamps_s - self.timestamps_s
+        distance = ego_from_past[..., :3, 3].norm(dim=-1)
+        return ego_from_past, elapsed, (elapsed > 0) & (distance <= MAX_EGO_SPEED_MPS * elapsed)
+
+    def select(
+        self,
+        rows: Tensor,  # [B'] int64, distinct where kept
+        keep: Tensor,  # [B'] bool
+    ) -> Self:
+        """The lanes at `rows`, those without `keep` forgotten; a model's frame selects what it added."""
+        return replace(
+            self,
+            timestamps_s=self.timestamps_s[rows],
+            global_from_ego=self.global_from_ego[rows],
+            present=self.present[rows] & keep,
+        )
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same frame on another device; a model's frame moves what it added."""
+        return replace(
+            self,
+            timestamps_s=self.timestamps_s.to(device),
+            global_from_ego=self.global_from_ego.to(device),
+            present=self.present.to(device),
+        )
+
+
+Frame = TypeVar("Frame", bound=RememberedFrame)
+
+
+def motions(frames: Sequence[RememberedFrame], batch: FrameBatch, max_age_s: float) -> Motion:
+    """`RememberedFrame.motion` of T frames at once, each tensor with a leading axis [T]."""
+    names = ("timestamps_s", "global_from_ego", "present")
+    stacked = RememberedFrame(*(torch.stack([getattr(frame, name) for frame in frames]) for name in names))
+    return stacked.motion(batch, max_age_s)
+
+
+@dataclass(frozen=True)
+class FrameMemory(Generic[Frame]):
+    """The last key frames of each of B lanes, newest first. A value: what changes it makes a new one."""
+
+    frames: tuple[Frame, ...]
+
+    @property
+    def batch_size(self) -> int:
+        """B, 0 for an empty memory."""
+        return len(self.frames[0].present) if self.frames else 0
+
+    def before(self, batch: FrameBatch) -> Self:
+        """What of the memory is in the past of the batch, lane by lane; the rest is forgotten for good.
+
+        Gone are frames that are not older than the batch's, and, where the pose jumped since a lane's last frame, all
+        that lies before the jump. Only neighbouring frames tell: over several seconds the same jump could pass for a
+        drive.
+        """
+        if not self.frames:
+            return self
+        steady = ~self.frames[0].jumped(batch)
+        return self._shared(
+            replace(frame, present=frame.present & steady & (frame.timestamps_s < batch.timestamps_s))
+            for frame in self.frames
+        )
+
+    def select(
+        self,
+        rows: Tensor,  # [B'] int64, row of each new lane in this memory, distinct where kept
+        keep: Tensor,  # [B'] bool, False: the lane starts anew
+    ) -> Self:
+        """Memory for a batch whose lanes come from these rows; frames that no lane has any more are dropped."""
+        return self._shared(frame.select(rows, keep) for frame in self.frames)
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same memory on another device."""
+        return type(self)(tuple(frame.to(device) for frame in self.frames))
+
+    @classmethod
+    def _shared(cls, frames: Iterable[Frame]) -> Self:
+        """A memory without the frames that no lane has any more, so that they take no place of others."""
+        frames = tuple(frames)
+        if not frames:
+            return cls(())
+        kept = torch.stack([frame.present.any() for frame in frames]).tolist()  # one look, since a GPU waits for it
+        return cls(tuple(frame for frame, wanted in zip(frames, kept, strict=True) if wanted))
+
+
+def rigid_inverse(
+    dst_from_src: Tensor,  # [..., 4, 4] rotation and translation
+) -> Tensor:  # [..., 4, 4]
+    """Inverse of rigid transforms, without a general solve."""
+    rotation = dst_from_src[..., :3, :3].transpose(-1, -2)
+    inverse = torch.zeros_like(dst_from_src)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3] = -(rotation @ dst_from_src[..., :3, 3:]).squeeze(-1)
+    inverse[..., 3, 3] = 1.0
+    return inverse

@@ -1,0 +1,66 @@
+"""Compile every kernel for a GPU that need not be there, and print their names; run by test_without_a_gpu.py.
+
+The operations run up to their launches on tensors of the CPU, which fill nothing: only shapes and types matter.
+"""
+
+import sys
+
+import torch
+from triton.backends.compiler import GPUTarget
+from triton.runtime import driver
+from triton.runtime.jit import JITFunction
+
+from src.geometry.bev_grid import BEVGrid
+from src.ops import Sites, submanifold_map
+from src.ops.kernels import farthest_point_triton, sparse_conv_triton, splat_triton
+
+
+class Target:
+    """What the compiler asks of a driver: an Nvidia GPU of the compute capability given on the command line."""
+
+    def get_current_target(self):
+        return GPUTarget("cuda", int(sys.argv[1]), 32)
+
+    def get_current_device(self):
+        return 0
+
+    def get_current_stream(self, device=None):
+        return 0
+
+
+def compile_only(launch):
+    def run(self, *arguments, grid, warmup, **options):
+        kernel = launch(self, *arguments, grid=grid, warmup=True, **options)
+        assert kernel.asm["cubin"]
+        print(self.__name__)
+
+    return run
+
+
+def main():
+    driver.set_active(Target())
+    JITFunction.run = compile_only(JITFunction.run)
+    for module in (farthest_point_triton, sparse_conv_triton, splat_triton):
+        module.runs_kernels = lambda tensor: True
+    valid = torch.ones(2, 700, dtype=torch.bool)
+    farthest_point_triton.farthest_points_triton(torch.zeros(2, 700, 2), valid, torch.zeros(2).long(), 20)
+
+    kernel_map = submanifold_map(Sites.from_linear(torch.arange(80), (1, 8, 10)), 3)
+    for dtype, c_in, c_out in ((torch.float32, 5, 16), (torch.bfloat16, 96, 128)):
+        features, weight = torch.zeros(80, c_in, dtype=dtype), torch.zeros(9, c_in, c_out, dtype=dtype)
+        inputs = [features.requires_grad_(), weight.requires_grad_()]
+        out = sparse_conv_triton.sparse_conv_triton(*inputs, kernel_map, torch.zeros(c_out, dtype=dtype))
+        torch.autograd.grad(out, inputs, torch.zeros_like(out))
+
+    # Nothing fills log_free, so the occupied cells are given.
+    splat_triton.occupied_cells = lambda log_free, support, *choice: (torch.arange(len(support)), 0)
+    grid = BEVGrid(cells=(8, 10), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
+    direction = torch.tensor([[1.0, 0.0]])
+    gaussian = (torch.zeros(1, 2), torch.ones(1, 2), direction, torch.zeros(1), torch.zeros(1, 128))
+    inputs = [x.requires_grad_() for x in gaussian]
+    out = splat_triton.splat_triton(*inputs, torch.zeros(1).long(), grid, 1, 0.1, 99, 3.0, False)
+    torch.autograd.grad(out.log_free.sum() + out.features.sum(), inputs)
+
+
+if __name__ == "__main__":
+    main()
