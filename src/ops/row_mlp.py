@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-CPU_ROWS = 256
+CPU_ROWS = 1024
 GPU_ROWS = 1 << 18
 """Rows at a time: on a CPU their hidden layer stays in the cache, on a GPU it bounds the memory."""
 
