@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
+
+from src.errors import ConfigError
+
+VARIABLE = "HORIZON3D_ALLOCATOR"
+TUNED, DEFAULT = "tuned", "default"
 
 # Parameters of glibc's mallopt and the largest value it takes.
 M_TRIM_THRESHOLD = -1
@@ -12,13 +18,17 @@ LARGEST = 2**31 - 1
 
 
 def tune_cpu_allocator() -> bool:
-    """Let glibc keep large freed blocks for reuse; True if the switch took, False where there is no glibc.
+    """Let glibc keep large freed blocks for reuse; True if the switch took, False without glibc or if unwanted.
 
     By default glibc asks the kernel for every large tensor anew, and each fresh page faults on first touch: gathering
     37 MiB costs 24.7 ms into fresh memory and 3.2 ms into reused memory. The price is that the process gives memory
-    back late, if at all. Entry points call this once before any work; results do not change.
+    back late, if at all. Entry points call this once before any work; results do not change. The environment variable
+    HORIZON3D_ALLOCATOR=default leaves glibc as it is. Raises ConfigError for another value of it.
     """
-    if not sys.platform.startswith("linux"):
+    choice = os.environ.get(VARIABLE, TUNED)
+    if choice not in (TUNED, DEFAULT):
+        raise ConfigError(f"{VARIABLE}={choice}: must be {TUNED} or {DEFAULT}")
+    if choice == DEFAULT or not sys.platform.startswith("linux"):
         return False
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -2,6 +2,7 @@ import sys
 
 import pytest
 
+from src.errors import ConfigError
 from src.ops import tune_cpu_allocator
 
 
@@ -13,3 +14,11 @@ def test_switch_can_be_set_twice():
 def test_other_platforms_are_left_alone(monkeypatch):
     monkeypatch.setattr(sys, "platform", "darwin")
     assert tune_cpu_allocator() is False
+
+
+def test_the_variable_leaves_it_alone_or_is_refused(monkeypatch):
+    monkeypatch.setenv("HORIZON3D_ALLOCATOR", "default")
+    assert tune_cpu_allocator() is False
+    monkeypatch.setenv("HORIZON3D_ALLOCATOR", "jemalloc")
+    with pytest.raises(ConfigError, match="HORIZON3D_ALLOCATOR=jemalloc: must be tuned or default"):
+        tune_cpu_allocator()
