@@ -12,7 +12,7 @@ SCALE_ARG := $(if $(SCALE),scale=$(SCALE))
 INIT_ARG := $(if $(CHECKPOINT),'phase.init_from="$(CHECKPOINT)"')
 $(if $(filter 1 2,$(PHASE)),,$(error PHASE=$(PHASE): must be 1 or 2))
 
-.PHONY: help install world train sweep report dashboard benchmark test check
+.PHONY: help install world train sweep report dashboard benchmark performance test check
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -42,6 +42,18 @@ dashboard: $(STAMP) ## sweeps and runs in the browser, on this machine [ARGS="po
 
 benchmark: $(STAMP) ## time and memory of every part [ARGS="suite=metric"]
 	$(PYTHON) -m src.benchmark $(SCALE_ARG) $(ARGS)
+
+# The pages of reports/performance; on a GPU they get names of their own.
+FULL_SIZE := scale=paper data=synthetic_full
+PRECISION := precision=32-true
+performance: $(STAMP) ## all pages of reports/performance, half an hour of a quiet machine [on a GPU: PRECISION=precision=bf16-mixed]
+	for suite in "suite=ops $(FULL_SIZE)" "suite=scaling phase=phase2 $(FULL_SIZE)" \
+	    "suite=model phase=phase1 $(FULL_SIZE)" "suite=model phase=phase1 model=dense_bev $(FULL_SIZE)" \
+	    "suite=model phase=phase2 model.dptf.bev_path.memory_threshold=0 $(FULL_SIZE)" \
+	    "suite=model phase=phase2 model=dense_bev $(FULL_SIZE)" \
+	    "suite=training" "suite=training model=dense_bev" "suite=reader $(FULL_SIZE)" "suite=reader" "suite=metric"; do \
+	    $(PYTHON) -m src.benchmark $$suite $(PRECISION) out=reports/performance $(ARGS) || exit 1; \
+	done
 
 # One thread per process: small operators gain nothing from a second one, and side by side they slow each other down.
 PYTEST := OMP_NUM_THREADS=1 $(PYTHON) -m pytest -n auto --dist loadfile

@@ -24,7 +24,7 @@ from src.benchmarking.machine import busy_warning, describe_machine
 from src.benchmarking.model import benchmark_model
 from src.benchmarking.ops import benchmark_ops
 from src.benchmarking.reader import benchmark_reader
-from src.benchmarking.report import markdown, page_of, write_page
+from src.benchmarking.report import markdown, page_name, page_of, write_page
 from src.benchmarking.scaling import benchmark_scaling
 from src.benchmarking.training import benchmark_training
 from src.command import run_command
@@ -85,15 +85,6 @@ def report_latency(config: Config, overrides: list[str]) -> None:
     print(markdown(page))
     if config.out:
         print(f"written: {Path(config.out) / 'latency.json'}")
-
-
-def page_name(config: Config) -> str:
-    """Name of a suite's files: with model and phase where one is measured, with the scale where there is one."""
-    if config.suite is BenchmarkSuite.metric:
-        return config.suite.value
-    of_one_model = config.suite in (BenchmarkSuite.model, BenchmarkSuite.training)
-    which = [config.model.name, config.phase.name] if of_one_model else []
-    return "_".join([config.suite.value, *which, config.scale])
 
 
 if __name__ == "__main__":

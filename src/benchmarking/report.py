@@ -6,12 +6,24 @@ from pathlib import Path
 from typing import Any
 
 from src.benchmarking.machine import busy_warning
+from src.benchmarking.timing import chosen_device
+from src.config import BenchmarkSuite, Config
 from src.training.run_folder import current_commit, write_json
 
 
 def page_of(suite: str, overrides: list[str], machine: dict[str, Any], result: dict[str, Any]) -> dict[str, Any]:
     """Everything a page tells, as it stands in the JSON file."""
     return {"suite": suite, "overrides": overrides, "commit": current_commit(), "machine": machine, "result": result}
+
+
+def page_name(config: Config) -> str:
+    """Name of a suite's files: with model and phase where one is measured, with the scale, and with `gpu` on one."""
+    if config.suite is BenchmarkSuite.metric:
+        return config.suite.value
+    of_one_model = config.suite in (BenchmarkSuite.model, BenchmarkSuite.training)
+    which = [config.model.name, config.phase.name] if of_one_model else []
+    device = ["gpu"] if config.suite is not BenchmarkSuite.reader and chosen_device(config).type == "cuda" else []
+    return "_".join([config.suite.value, *which, config.scale, *device])
 
 
 def write_page(folder: Path, name: str, page: dict[str, Any]) -> None:

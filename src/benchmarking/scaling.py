@@ -16,6 +16,7 @@ import torch
 from src.benchmarking.figure import draw_scaling
 from src.benchmarking.model import CANDIDATES, KEY_FRAME_S, Case, expect_trained_scores
 from src.benchmarking.parts import is_within, parts_of, tensors_in
+from src.benchmarking.report import page_name
 from src.benchmarking.scenes import Highway, highway_frame, highway_points
 from src.benchmarking.timing import added_bytes, chosen_device, in_turns, median_spread, timed_parts
 from src.config import Config, compose_config
@@ -86,7 +87,7 @@ def benchmark_scaling(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
         "growth": growth_rows(measured),
     }
     if config.out:
-        name = f"scaling_{config.scale}.png"
+        name = f"{page_name(config)}.png"
         draw_scaling(
             Path(config.out) / name, measured, f"Cost of a frame without its image encoder, scale {config.scale}"
         )
