@@ -189,6 +189,8 @@ def measure_splat(gaussians: Gaussians, grid: BEVGrid, subset: int, device: torc
         whole = splat_gaussians(**gaussians, batch=batch, grid=grid, batch_size=1, **options)
     occupied = whole.occupied.linear()
     factor = number / min(subset, number)
+    areas = math.pi * (options["support_sigmas"] / grid.cell_m) ** 2 * gaussians["scales"].detach().prod(1)
+    pairs = round(float(areas.sum()))  # (Gaussian, cell), less those that the edge of the grid cuts off
 
     def dense() -> tuple[Tensor, Tensor]:
         return dense_splat(few, occupied, grid, options["support_sigmas"])
@@ -206,7 +208,7 @@ def measure_splat(gaussians: Gaussians, grid: BEVGrid, subset: int, device: torc
             row["dense added MiB"] *= factor
         row |= {"ms": 1e3 * middle["ours"], "± ms": 1e3 * median_spread(seconds["ours"])[1]}
         row |= {"dense ms": 1e3 * factor * middle["dense"]}
-        rows.append(row | {"gaussians": number, "cells reached": len(whole.support), "occupied": len(occupied)})
+        rows.append(row | {"gaussians": number, "pairs": pairs, "cells": len(whole.support), "occupied": len(occupied)})
     return rows
 
 

@@ -18,6 +18,8 @@ from torch import nn
 from src.config import Accelerator, Config
 from src.training.processes import check_devices
 
+PATIENCE = 4.0  # a first call that takes so many times what a candidate may take is its only one
+
 
 def chosen_device(config: Config) -> torch.device:
     """A GPU where there is one and `trainer.accelerator` does not say otherwise."""
@@ -71,12 +73,19 @@ def in_turns(
     rounds: int,
     budget_s: float,  # of each candidate
 ) -> dict[str, list[float]]:
-    """As `interleaved`, with fewer rounds for what is slow; a call that takes the whole budget is made once only."""
+    """As `interleaved`, with fewer rounds for what is slow.
+
+    The first call of each tells how slow it is and does not count, unless it alone takes several times the budget.
+    """
     first = {name: values[0] for name, values in interleaved(candidates, device, 1, warm_up=0).items()}
-    quick = {name: function for name, function in candidates.items() if first[name] < budget_s}
-    seconds: dict[str, list[float]] = {name: [] if name in quick else [first[name]] for name in candidates}
+    endless = [name for name in candidates if first[name] > PATIENCE * budget_s]
+    seconds: dict[str, list[float]] = {name: [first[name]] if name in endless else [] for name in candidates}
     for number in range(rounds):
-        due = {name: function for name, function in quick.items() if number < max(1, budget_s // first[name])}
+        due = {
+            name: function
+            for name, function in candidates.items()
+            if name not in endless and number < max(1, budget_s // max(first[name], 1e-9))
+        }
         for name, values in interleaved(due, device, 1, warm_up=0).items():
             seconds[name] += values
     return seconds

@@ -87,7 +87,7 @@ class ConvNormReLU(nn.Module):
 
     def forward(self, x: SparseMap) -> SparseMap:
         y = self.conv(x)
-        return y.with_features(F.relu(self.norm(y.features)))
+        return y.with_features(F.relu(self.norm(y.features), inplace=True))
 
 
 class ResidualBlock(nn.Module):
@@ -102,5 +102,5 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: SparseMap) -> SparseMap:
         y = self.conv1(x)
-        y = self.conv2(y.with_features(F.relu(self.bn1(y.features))))
-        return x.with_features(F.relu(self.bn2(y.features) + x.features))
+        y = self.conv2(y.with_features(F.relu(self.bn1(y.features), inplace=True)))
+        return x.with_features(F.relu(self.bn2(y.features).add_(x.features), inplace=True))

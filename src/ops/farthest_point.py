@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,7 +31,15 @@ def farthest_points(
 
 @register("farthest_points", "reference")
 def farthest_points_reference(points: Tensor, valid: Tensor, start: Tensor, count: int) -> Tensor:
-    """Plain torch form: one round of the loop a pick, all samples at once."""
+    """One round of a loop a pick: of numpy on a CPU, which takes a tenth of torch's time, else of torch."""
+    if points.device.type != "cpu":
+        return pick_on_device(points, valid, start, count)
+    picks = [_pick(*sample, count) for sample in zip(points.numpy(), valid.numpy(), start.tolist(), strict=True)]
+    return torch.from_numpy(np.array(picks, dtype=np.int64).reshape(len(picks), count))
+
+
+def pick_on_device(points: Tensor, valid: Tensor, start: Tensor, count: int) -> Tensor:
+    """All samples at once, without waiting for a GPU."""
     b, g = valid.shape
     picks = start.new_full((b, count), -1)
     if g == 0:
@@ -44,4 +53,25 @@ def farthest_points_reference(points: Tensor, valid: Tensor, start: Tensor, coun
         gap = torch.where(gap >= 0, torch.minimum(gap, squared), gap)
         gap[samples, pick] = -1.0
         pick = gap.argmax(dim=1)
+    return picks
+
+
+def _pick(points: np.ndarray, valid: np.ndarray, pick: int, count: int) -> np.ndarray:
+    """The picks [count] of one sample of points [G, 2]."""
+    picks = np.full(count, -1)
+    x, y = np.where(valid, points[:, 0], 0), np.where(valid, points[:, 1], 0)
+    gap = np.where(valid, np.inf, -1).astype(points.dtype)  # as above; the least of -1 and a distance is -1
+    across, along = np.empty_like(x), np.empty_like(y)
+    for step in range(min(count, len(points))):
+        if gap[pick] < 0:
+            break
+        picks[step] = pick
+        np.subtract(x, x[pick], out=across)
+        np.subtract(y, y[pick], out=along)
+        across *= across
+        along *= along
+        across += along
+        np.minimum(gap, across, out=gap)
+        gap[pick] = -1
+        pick = int(gap.argmax())
     return picks

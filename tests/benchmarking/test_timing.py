@@ -40,7 +40,7 @@ def test_candidates_take_turns_and_warm_up(ticking):
 
 
 def test_what_is_slow_has_fewer_rounds(ticking):
-    calls = {"quick": 0, "slow": 0, "endless": 0}
+    calls = {"quick": 0, "slow": 0, "slower": 0, "endless": 0}
 
     def candidate(name, seconds):
         def run():
@@ -49,10 +49,11 @@ def test_what_is_slow_has_fewer_rounds(ticking):
 
         return run
 
-    made = {"quick": candidate("quick", 0.1), "slow": candidate("slow", 2.0), "endless": candidate("endless", 50.0)}
+    made = {"quick": candidate("quick", 0.1), "slow": candidate("slow", 2.0)}
+    made |= {"slower": candidate("slower", 10.0), "endless": candidate("endless", 50.0)}
     seconds = in_turns(made, CPU, rounds=6, budget_s=5.0)
-    assert calls == {"quick": 7, "slow": 3, "endless": 1}  # the first call of each tells how slow it is
-    assert [len(values) for values in seconds.values()] == [6, 2, 1]
+    assert calls == {"quick": 7, "slow": 3, "slower": 2, "endless": 1}  # the first call of each tells how slow it is
+    assert [len(values) for values in seconds.values()] == [6, 2, 1, 1]
 
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="the peak of a process is told by Linux only")

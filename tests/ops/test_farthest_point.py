@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from src.ops.farthest_point import farthest_points
+from src.ops.farthest_point import farthest_points, pick_on_device
 
 
 def oracle(points, valid, start, count):
@@ -84,3 +84,13 @@ def test_nothing_to_pick_from(b, g):
 def test_wrong_shapes_are_named():
     with pytest.raises(ValueError, match=r"points \[1, 4, 3\]"):
         farthest_points(torch.zeros(1, 4, 3), torch.ones(1, 4, dtype=torch.bool), torch.zeros(1).long(), 2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_loop_for_other_devices_picks_the_same(seed):
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.randint(0, 12, (3, 40, 2), generator=generator).float()  # a lattice: many ties
+    valid = torch.rand(3, 40, generator=generator) < torch.tensor([[0.9], [0.2], [0.0]])
+    points[~valid] = torch.nan
+    start = valid.int().argmax(dim=1)
+    assert torch.equal(pick_on_device(points, valid, start, 20), farthest_points(points, valid, start, 20))

@@ -18,7 +18,7 @@ C = 8
 def head_of(dense, train_regression=TrainRegression.all, nms=Suppression.per_group):
     config = HeadConfig(
         nms=nms,
-        score_threshold=0.1,
+        score_threshold=0.005,
         max_boxes=500,
         attributes=AttributeSource.rule,
         train_regression=train_regression,
@@ -79,6 +79,13 @@ def test_outputs_losses_gradients_and_boxes_are_the_sparse_heads(train_regressio
             assert (a is None) == (b is None) and (a is None or torch.allclose(a.float(), b.float(), atol=1e-3))
 
 
+def test_an_untrained_map_is_nearly_empty():
+    """Or the focal loss of a hundred thousand free cells would drown the rest."""
+    with torch.no_grad():
+        scores = head_of(True).eval()(torch.zeros(1, C, 24, 32)).logits.sigmoid()
+    assert 0.005 < float(scores.mean()) < 0.02
+
+
 def test_every_object_has_its_own_cell():
     """Unlike on sparse sites nothing is too far from a cell."""
     head, boxes = head_of(True), [boxes_of(12, 5)]
@@ -97,7 +104,7 @@ def test_local_maxima_suppress_on_whole_maps():
         output = head(x)
         (boxes,) = head.decode(output)
         scores = output.logits.sigmoid().t().view(12, 24, 32)
-        peaks = (scores == torch.nn.functional.max_pool2d(scores, 3, 1, 1)) & (scores > 0.1)
+        peaks = (scores == torch.nn.functional.max_pool2d(scores, 3, 1, 1)) & (scores > 0.005)
     assert 0 < len(boxes) <= int(peaks.sum())
 
 
