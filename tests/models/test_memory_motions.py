@@ -1,14 +1,9 @@
 """Motion of several remembered frames at once."""
 
-import sys
-from pathlib import Path
-
 import torch
+from moving import UTM, bare_frame, bda, pose
 
-sys.path.insert(0, str(Path(__file__).parent / "horizon3d"))
-from moving import UTM, bare_frame, bda, pose  # noqa: E402
-
-from src.models.memory import RememberedFrame, motions  # noqa: E402
+from src.models.memory import RememberedFrame, motions
 
 
 def test_frames_together_move_as_each_alone_to_the_last_bit():

@@ -1,9 +1,10 @@
 """Random frames, a driving vehicle and a model of a few thousand parameters."""
 
-import math
 from dataclasses import replace
 
+import moving
 import torch
+from surroundings import AXES, camera_matrices, random_boxes
 
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.image import ImageEncoderConfig, NeckName
@@ -16,69 +17,14 @@ from src.models.dense_bev.temporal import TemporalConfig
 from src.models.heads.center_head import HeadConfig, TrainRegression
 from src.models.heads.decode import AttributeSource, Suppression
 from src.structures.batch import FrameBatch
-from src.structures.boxes import Boxes3D
 
 SIZE = (64, 96)  # image height, width
 GRID = BEVGrid(cells=(48, 64), cell_m=0.8, centre_m=(2.0, -1.0), z_range_m=(-3.0, 5.0))
-UTM = (7e5, 5.3e6)
 
 
-def pose(x=0.0, y=0.0, yaw=0.0, origin=UTM):
-    """global_from_ego [4, 4] float64 of a vehicle at (x, y) from `origin`, heading `yaw`."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:2, :2] = torch.tensor([[c, -s], [s, c]])
-    matrix[:2, 3] = torch.tensor([origin[0] + x, origin[1] + y], dtype=torch.float64)
-    return matrix
-
-
-def bda(rotation=0.0, scale=1.0, flip_x=False, flip_y=False):
-    """aug_from_ego [4, 4] float32 as A = S R F (specification 9)."""
-    c, s = scale * math.cos(rotation), scale * math.sin(rotation)
-    a, b = -1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0
-    return torch.tensor([[c * a, -s * b, 0, 0], [s * a, c * b, 0, 0], [0, 0, scale, 0], [0, 0, 0, 1]])
-
-
-def bare_frame(time_s, poses, augs=None):
-    """B frames at one time (or B times), one pose and one augmentation a lane, nothing seen."""
-    b = len(poses)
-    return FrameBatch(
-        tokens=[f"lane{i}" for i in range(b)],
-        timestamps_s=torch.as_tensor(time_s, dtype=torch.float64).expand(b).clone(),
-        global_from_ego=torch.stack(list(poses)),
-        aug_from_ego=torch.stack(list(augs)) if augs is not None else torch.eye(4).repeat(b, 1, 1),
-        radar_points=torch.zeros(0, 7),
-        radar_batch=torch.zeros(0, dtype=torch.int64),
-    )
-
-
-def camera_matrices():
-    """Four cameras 2 m up, looking ahead, right, back, left, 90 degrees wide: [4, 4, 4] pixels from the aug frame."""
-    height, width = SIZE
-    matrices = []
-    for degrees in (0.0, -90.0, 180.0, 90.0):
-        yaw = math.radians(degrees)
-        forward, right = (math.cos(yaw), math.sin(yaw), 0.0), (math.sin(yaw), -math.cos(yaw), 0.0)
-        rotation = torch.tensor([right, (0.0, 0.0, -1.0), forward])
-        intrinsics = torch.tensor([[width / 2, 0.0, width / 2], [0.0, width / 2, height / 2], [0.0, 0.0, 1.0]])
-        matrix = torch.eye(4)
-        matrix[:3, :3] = intrinsics @ rotation
-        matrix[:3, 3] = intrinsics @ (rotation @ torch.tensor([0.0, 0.0, -2.0]))
-        matrices.append(matrix)
-    return torch.stack(matrices)
-
-
-def random_boxes(count, generator):
-    spread, corner = torch.tensor([40.0, 30.0, 1.0]), torch.tensor([-18.0, -16.0, 0.0])
-    return Boxes3D(
-        centers=torch.rand(count, 3, generator=generator) * spread + corner,
-        sizes=torch.tensor([4.5, 1.9, 1.6]).expand(count, 3) * (0.5 + torch.rand(count, 1, generator=generator)),
-        yaws=torch.rand(count, generator=generator) * 6.0,
-        velocities=torch.randn(count, 2, generator=generator) * 5.0,
-        labels=torch.arange(count) % 12,
-        attributes=torch.full((count,), -1),
-        num_points=torch.full((count,), 5),
-    )
+def pose(x=0.0, y=0.0, yaw=0.0):
+    """global_from_ego [4, 4] far from the origin of the global frame."""
+    return moving.pose(x, y, yaw, origin=moving.UTM)
 
 
 def make_batch(points=(150, 120), boxes=(6, 4), seed=0):
@@ -99,7 +45,7 @@ def make_batch(points=(150, 120), boxes=(6, 4), seed=0):
         radar_batch=torch.repeat_interleave(torch.arange(b), torch.tensor(points)),
         images=torch.randint(0, 256, (b, 4, 3, *SIZE), generator=generator, dtype=torch.uint8),
         image_valid=torch.ones(b, 4, dtype=torch.bool),
-        pix_from_aug=camera_matrices().repeat(b, 1, 1, 1),
+        pix_from_aug=camera_matrices(SIZE, AXES).repeat(b, 1, 1, 1),
         boxes=[random_boxes(count, generator) for count in boxes],
     )
 
@@ -112,7 +58,7 @@ def drive(step, **changes):
         batch,
         timestamps_s=torch.tensor([100.0 + 0.5 * step, 7.0 + 0.5 * step], dtype=torch.float64)[:b],
         global_from_ego=torch.stack([pose(5.0 * step, 0.0, 0.02 * step), pose(10.0 * step, 1.0, 0.3)])[:b],
-        aug_from_ego=torch.stack([bda(0.1, 1.02), bda(-0.2, 0.97, flip_y=True)])[:b],
+        aug_from_ego=torch.stack([moving.bda(0.1, 1.02), moving.bda(-0.2, 0.97, flip_y=True)])[:b],
         lanes=torch.arange(b),
         starts=torch.full((b,), step == 0),
     )

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from dense_frames import GRID, bare_frame, bda, dense_model, drive, memory_config, pose
+from dense_frames import GRID, dense_model, drive, memory_config, pose
+from moving import bare_frame, bda
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid

@@ -4,7 +4,8 @@ import itertools
 
 import pytest
 import torch
-from dense_frames import GRID, SIZE, camera_matrices, lift_config
+from dense_frames import GRID, SIZE, lift_config
+from surroundings import AXES, camera_matrices
 
 from src.errors import ConfigError
 from src.models.dense_bev.lift_splat import LiftSplat
@@ -47,7 +48,7 @@ def test_it_is_the_published_frustum_pooled(missing):
     """Values and gradients, through depth and through context; the cameras are tilted a little against the grid."""
     module = make_module(num_depth_bins=6, z_range_m=[-1.0, 3.0])
     generator = torch.Generator().manual_seed(1)
-    matrices = camera_matrices()[:2].repeat(2, 1, 1, 1)
+    matrices = camera_matrices(SIZE, AXES)[:2].repeat(2, 1, 1, 1)
     tilt = 0.05 * torch.randn(matrices.shape, generator=generator)
     matrices[:, :, :3] += tilt[:, :, :3]
     valid = torch.ones(2, 2, dtype=torch.bool)
@@ -85,7 +86,7 @@ def test_a_pixel_lands_where_its_depth_says():
         module.context.bias[:] = torch.arange(12.0) + 1
     level = torch.randn(1, 4, CHANNELS, 4, 7)  # 7 columns, so that one looks straight ahead
     valid = torch.tensor([[True, False, False, False]])
-    bev = module(level, camera_matrices()[None], valid, SIZE).bev[0]
+    bev = module(level, camera_matrices(SIZE, AXES)[None], valid, SIZE).bev[0]
     row, col = GRID.cell_of(torch.tensor([float(centres[wanted]), 0.0])).tolist()
     torch.testing.assert_close(bev[:, row, col], 4.0 * (torch.arange(12.0) + 1))  # the column's four pixels
     columns = {int(c) for c in (bev > 1e-6).any(dim=0).nonzero()[:, 1]}
@@ -94,7 +95,7 @@ def test_a_pixel_lands_where_its_depth_says():
 
 def test_views_of_other_samples_and_missing_views_stay_out():
     module = make_module().eval()
-    level, matrices = torch.randn(2, 4, CHANNELS, 4, 6), camera_matrices().repeat(2, 1, 1, 1)
+    level, matrices = torch.randn(2, 4, CHANNELS, 4, 6), camera_matrices(SIZE, AXES).repeat(2, 1, 1, 1)
     valid = torch.ones(2, 4, dtype=torch.bool)
     both = module(level, matrices, valid, SIZE).bev
     for sample in range(2):
@@ -114,9 +115,9 @@ def test_views_of_other_samples_and_missing_views_stay_out():
 def test_autocast_changes_neither_geometry_nor_types():
     module = make_module().eval()
     level, valid = torch.randn(1, 4, CHANNELS, 4, 6), torch.ones(1, 4, dtype=torch.bool)
-    plain = module(level, camera_matrices()[None], valid, SIZE)
+    plain = module(level, camera_matrices(SIZE, AXES)[None], valid, SIZE)
     with torch.autocast("cpu", torch.bfloat16):
-        half = module(level, camera_matrices()[None], valid, SIZE)
+        half = module(level, camera_matrices(SIZE, AXES)[None], valid, SIZE)
     assert half.bev.dtype == torch.float32 and half.num_lifted == plain.num_lifted
     assert torch.equal(half.bev.any(dim=1), plain.bev.any(dim=1))
     torch.testing.assert_close(half.bev, plain.bev, rtol=0.1, atol=0.05)

@@ -1,9 +1,8 @@
 """A model of a few thousand parameters and random frames to feed it."""
 
-import math
-
 import pytest
 import torch
+from surroundings import DIAGONALS, camera_matrices, random_boxes
 
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.image import ImageEncoderConfig, NeckName
@@ -20,7 +19,6 @@ from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom
 from src.models.horizon3d.views import CameraViews
 from src.structures.batch import FrameBatch
-from src.structures.boxes import Boxes3D
 from src.targets.depth import DepthTarget
 
 SIZE = (64, 96)  # image height, width
@@ -29,37 +27,6 @@ SIZE = (64, 96)  # image height, width
 @pytest.fixture
 def grid():
     return BEVGrid(cells=(48, 64), cell_m=0.8, centre_m=(2.0, -1.0), z_range_m=(-3.0, 5.0))
-
-
-def camera_matrices(size=SIZE):
-    """Four cameras 2 m up, looking along the diagonals, 90 degrees wide: [4, 4, 4] pixels from the aug frame."""
-    height, width = size
-    matrices = []
-    for degrees in (45.0, -45.0, -135.0, 135.0):
-        yaw = math.radians(degrees)
-        forward, right = (math.cos(yaw), math.sin(yaw), 0.0), (math.sin(yaw), -math.cos(yaw), 0.0)
-        rotation = torch.tensor([right, (0.0, 0.0, -1.0), forward])
-        focal = width / 2
-        intrinsics = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
-        matrix = torch.eye(4)
-        matrix[:3, :3] = intrinsics @ rotation
-        matrix[:3, 3] = intrinsics @ (rotation @ torch.tensor([0.0, 0.0, -2.0]))
-        matrices.append(matrix)
-    return torch.stack(matrices)
-
-
-def random_boxes(count, generator):
-    spread, corner = torch.tensor([40.0, 30.0, 1.0]), torch.tensor([-18.0, -16.0, 0.0])
-    centers = torch.rand(count, 3, generator=generator) * spread + corner
-    return Boxes3D(
-        centers=centers,
-        sizes=torch.tensor([4.5, 1.9, 1.6]).expand(count, 3) * (0.5 + torch.rand(count, 1, generator=generator)),
-        yaws=torch.rand(count, generator=generator) * 6.0,
-        velocities=torch.randn(count, 2, generator=generator) * 5.0,
-        labels=torch.arange(count) % 12,
-        attributes=torch.full((count,), -1),
-        num_points=torch.full((count,), 5),
-    )
 
 
 @pytest.fixture
@@ -85,7 +52,7 @@ def make_batch():
             radar_batch=torch.cat(owners),
             images=torch.randint(0, 256, (b, 4, 3, *SIZE), generator=generator, dtype=torch.uint8) if images else None,
             image_valid=torch.ones(b, 4, dtype=torch.bool) if images else None,
-            pix_from_aug=camera_matrices().repeat(b, 1, 1, 1) if images else None,
+            pix_from_aug=camera_matrices(SIZE, DIAGONALS).repeat(b, 1, 1, 1) if images else None,
             boxes=[random_boxes(count, generator) for count in boxes],
         )
 
@@ -98,7 +65,9 @@ def make_views():
 
     def build(b=1, strides=(8, 16, 32), channels=16):
         levels = [torch.randn(b, 4, channels, SIZE[0] // stride, SIZE[1] // stride) for stride in strides]
-        return CameraViews(levels, camera_matrices().repeat(b, 1, 1, 1), torch.ones(b, 4, dtype=torch.bool), SIZE)
+        return CameraViews(
+            levels, camera_matrices(SIZE, DIAGONALS).repeat(b, 1, 1, 1), torch.ones(b, 4, dtype=torch.bool), SIZE
+        )
 
     return build
 
