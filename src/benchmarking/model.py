@@ -136,17 +136,19 @@ def fill_memory(case: Case, frames: int) -> Case:
     return case
 
 
-def expect_trained_scores(case: Case) -> None:
+def expect_trained_scores(case: Case) -> Any:
     """Set the score threshold of the prepared model so that decoding has the work that it has in a trained one.
 
     Fresh weights give every cell about the threshold of the configuration, and boxes would be made of half of them.
+    Returns the memory after the frame that told the scores.
     """
     with torch.no_grad(), case.precision():
-        output, _ = case.prepared(case.batch, case.memory)
+        output, memory = case.prepared(case.batch, case.memory)
     scores = output.head.logits.float().sigmoid().flatten()
     if len(scores) > CANDIDATES:
         head = case.prepared.head
         head.config = replace(head.config, score_threshold=float(scores.topk(CANDIDATES).values[-1]))
+    return memory
 
 
 def measure_parts(

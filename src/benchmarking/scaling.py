@@ -194,12 +194,10 @@ def make_case(config: Config, point: Point, device: torch.device) -> Case:
     batch = highway_frame(highway_points(point.road), tuple(config.backbone.image_size_px)).to(device)
     case = Case(model, prepared, batch, None, device, bf16)
     cache_images(case)
+    memory = expect_trained_scores(case)
     if settings.memory_frames:
-        with torch.no_grad(), case.precision():
-            _, memory = prepared(batch, None)
         case.memory = aged(memory, settings)
         case.batch = replace(batch, timestamps_s=batch.timestamps_s + KEY_FRAME_S)
-    expect_trained_scores(case)
     return case
 
 
