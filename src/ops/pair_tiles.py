@@ -70,7 +70,8 @@ def _cut(kernel_map: KernelMap, backward: bool, rows: int, num: int) -> PairTile
     if backward:
         gathered, summed = summed, gathered
     # Both columns ascend within the block of an offset, so a tile's share of a block is a slice of it.
-    edges = torch.arange(-(-num // rows) + 1, dtype=torch.int32).mul_(rows).clamp_(max=num)
+    device = summed.device
+    edges = torch.arange(-(-num // rows) + 1, dtype=torch.int32, device=device).mul_(rows).clamp_(max=num)
     offsets, blocks = [], []
     for offset, (sources, targets) in enumerate(
         zip(gathered.split(kernel_map.counts), summed.split(kernel_map.counts), strict=True)
@@ -91,7 +92,8 @@ def _cut(kernel_map: KernelMap, backward: bool, rows: int, num: int) -> PairTile
         else:
             sources = targets = gathered[:0]
         by_row, order = torch.sort(targets, stable=True)  # a radix sort, as these are int32
-        starts = torch.searchsorted(by_row, torch.arange(first, last + 1, dtype=torch.int32), out_int32=True)
+        wanted = torch.arange(first, last + 1, dtype=torch.int32, device=device)
+        starts = torch.searchsorted(by_row, wanted, out_int32=True)
         tiles.append(Tile(first, last, sources, targets, tuple(spans), order.to(torch.int32), starts))
     return PairTiles(tuple(tiles), max((len(tile.gathered) for tile in tiles), default=0))
 
@@ -100,7 +102,7 @@ class _Scratch(threading.local):
     """Memory that every convolution of a thread uses again: fresh memory costs a page fault for every 4 KiB."""
 
     def __init__(self) -> None:
-        self.blocks: dict[str, Tensor] = {}
+        self.blocks: dict[tuple[str, torch.device], Tensor] = {}
 
 
 _scratch = _Scratch()
@@ -111,11 +113,12 @@ def scratch(
     rows: int,
     columns: int,
     dtype: torch.dtype,
+    device: torch.device,
 ) -> Tensor:  # [rows, columns]
-    """Memory on the CPU with arbitrary content; the same name gives the same memory again."""
+    """Memory with arbitrary content; the same name gives the same memory again."""
     size = rows * columns * dtype.itemsize
-    block = _scratch.blocks.get(name)
+    block = _scratch.blocks.get((name, device))
     if block is None or len(block) < size:
         with torch.inference_mode(False):  # or training could not use it after an evaluation
-            block = _scratch.blocks[name] = torch.empty(size, dtype=torch.uint8)
+            block = _scratch.blocks[name, device] = torch.empty(size, dtype=torch.uint8, device=device)
     return block[:size].view(dtype).view(rows, columns)

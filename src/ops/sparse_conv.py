@@ -149,8 +149,8 @@ def _tiled(
     if backward and kernel_map.mirrored:  # the tiles are those of the way forward
         matrices, gradients = matrices[::-1], gradients[::-1]
     cut = pair_tiles(kernel_map, backward, width_in + width, rows.dtype)
-    gathered_rows = scratch("gathered", cut.most_pairs, width_in, rows.dtype)
-    products = scratch("products", cut.most_pairs, width, rows.dtype)
+    gathered_rows = scratch("gathered", cut.most_pairs, width_in, rows.dtype, rows.device)
+    products = scratch("products", cut.most_pairs, width, rows.dtype, rows.device)
     for tile in cut.tiles:
         gathered = torch.index_select(rows, 0, tile.gathered, out=gathered_rows[: len(tile.gathered)])
         for offset, first, last in tile.spans:

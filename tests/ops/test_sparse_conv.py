@@ -1,5 +1,6 @@
 import itertools
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -159,6 +160,30 @@ def test_tiles_change_nothing(mode, monkeypatch):
         results.append((out.detach(), x.grad, w.grad))
         assert (len(pair_tiles(kernel_map, False, 7, torch.float64).tiles) > 10) == (budget == 64)
     torch.testing.assert_close(results[0], results[1])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal", "empty"])
+def test_one_launch_for_all_offsets_gives_the_same(mode, dtype, monkeypatch):
+    """The form of a GPU without Triton, on a CPU."""
+    sites = random_sites((2, 5, 6, 7), 0 if mode == "empty" else 70)
+    if mode in ("submanifold", "empty"):
+        kernel_map = submanifold_map(sites, 3)
+    else:
+        kernel_map, _ = (strided_map if mode == "strided" else temporal_map)(sites, 3, (2, 1, 1), 1)
+    results = []
+    for grouped in (False, True):
+        monkeypatch.setattr(sys.modules[sparse_conv.__module__], "_is_grouped", lambda rows, grouped=grouped: grouped)
+        torch.manual_seed(0)
+        x = torch.randn(len(sites), 3).to(dtype).requires_grad_()
+        w, b = torch.randn(27, 3, 5).to(dtype).requires_grad_(), torch.randn(5).to(dtype).requires_grad_()
+        out = sparse_conv(x, w, kernel_map, b)
+        (out * torch.randn(out.shape).to(dtype)).sum().backward()
+        results.append((out.detach().float(), x.grad.float(), w.grad.float(), b.grad.float()))
+    tolerance = 1e-5 if dtype == torch.float32 else 0.05
+    for tiled, grouped in zip(*results, strict=True):
+        scale = tiled.abs().max().item() if tiled.numel() else 1.0
+        torch.testing.assert_close(grouped, tiled, rtol=0, atol=tolerance * max(scale, 1.0))
 
 
 def test_training_after_inference_in_the_same_process():
