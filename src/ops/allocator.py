@@ -1,4 +1,4 @@
-"""One process-wide switch of the CPU allocator, worth a factor of two on sparse convolutions."""
+"""One process-wide switch of the CPU allocator: large freed blocks are kept for reuse."""
 
 from __future__ import annotations
 
