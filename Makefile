@@ -12,7 +12,7 @@ SCALE_ARG := $(if $(SCALE),scale=$(SCALE))
 INIT_ARG := $(if $(CHECKPOINT),'phase.init_from="$(CHECKPOINT)"')
 $(if $(filter 1 2,$(PHASE)),,$(error PHASE=$(PHASE): must be 1 or 2))
 
-.PHONY: help install world train sweep report dashboard benchmark performance test check
+.PHONY: help install world train sweep report dashboard benchmark performance test test-faults check
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -58,9 +58,12 @@ performance: $(STAMP) ## all pages of reports/performance, half an hour of a qui
 # One thread per process: small operators gain nothing from a second one, and side by side they slow each other down.
 PYTEST := OMP_NUM_THREADS=1 $(PYTHON) -m pytest -n auto --dist loadfile
 
-test: $(STAMP) ## run every test
-	$(PYTEST) $(ARGS)
+test: $(STAMP) ## run every test but the fault suite
+	$(PYTEST) -m "not faults" $(ARGS)
+
+test-faults: $(STAMP) ## kill, starve and corrupt running commands, half an hour [ARGS="-k kills"]
+	$(PYTEST) -m faults $(ARGS)
 
 check: $(STAMP) ## lint and the fast tests, some minutes
 	$(PYTHON) -m ruff check .
-	$(PYTEST) -q -m "not slow and not gpu" $(ARGS)
+	$(PYTEST) -q -m "not slow and not gpu and not faults" $(ARGS)
