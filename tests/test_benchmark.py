@@ -7,7 +7,7 @@ import torch
 
 from src import benchmark
 from src.benchmark import main
-from src.benchmarking import convolutions, machine, model, ops, scaling, training
+from src.benchmarking import convolutions, machine, model, plain_peers, scaling, training
 from src.benchmarking.scenes import Highway
 from src.config import compose_config
 from src.errors import ConfigError, DataError
@@ -23,7 +23,7 @@ def in_a_hurry(monkeypatch):
     """Few rounds and a small roofline; what is measured stays the same."""
     monkeypatch.setattr(machine, "GEMM_SIZE", {"cpu": 128, "cuda": 128})
     monkeypatch.setattr(machine, "COPY_BYTES", {"cpu": 2**20, "cuda": 2**20})
-    for module in (model, ops, scaling, convolutions):
+    for module in (model, plain_peers, scaling, convolutions):
         monkeypatch.setattr(module, "ROUNDS", 1)
     monkeypatch.setattr(training, "WARM_UP_STEPS", 1)
     monkeypatch.setattr(training, "MEASURED_STEPS", 3)
@@ -95,6 +95,7 @@ def test_training(outputs, tmp_path, phase):
         assert all(row[f"{stage} ms"] >= 0 for stage in stages)
         # Medians of three steps each: their sum is near the median of the sum.
         assert sum(row[f"{stage} ms"] for stage in stages) == pytest.approx(row["step ms"], rel=0.8)
+    assert "_SparseConvBackward" in column(result["operations of a step"], "operation", "ms")
 
 
 def test_ops(outputs, tmp_path, monkeypatch):
@@ -108,6 +109,9 @@ def test_ops(outputs, tmp_path, monkeypatch):
     for row in [*layers, *result["radar backbone"]]:
         assert row.get("spconv differs by", 0.0) < 1e-5
     assert {row["mode"] for row in result["splat"]} == {"forward", "f+b"}
+    backward = column(result["operations of the backbone, f+b"], "operation", "ms")
+    assert "_SparseConvBackward" in backward
+    assert "_SparseConvBackward" not in column(result["operations of the backbone, forward"], "operation", "ms")
     others = {row["operation"] for row in result["other operations"]}
     assert {"segment sum", "bilinear sampling", "image attention", "farthest points", "box raster", "voxels"} == others
 

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.benchmarking.counting import counted_work
+from src.benchmarking.operations import operation_table
 from src.benchmarking.spconv_peer import (
     SpconvEncoder,
     build_layer,
@@ -24,7 +25,7 @@ from src.benchmarking.spconv_peer import (
     torch_threads,
     uncached,
 )
-from src.benchmarking.timing import in_turns, median_spread
+from src.benchmarking.timing import in_turns, median_spread, with_gradient, without_gradient
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.sparse_voxel import RadarEncoder, RadarEncoderConfig
 from src.models.horizon3d.bev_path import TemporalConv
@@ -273,8 +274,8 @@ def _backbone_rows(
     if "spconv" in functions and threads == 1:
         with torch.no_grad():
             agreement["spconv differs by"] = largest_difference([functions["ours"]()], [functions["spconv"]()])
-    forward = {kind: _without_gradient(function) for kind, function in functions.items()}
-    both = {kind: _with_gradient(function) for kind, function in functions.items()}
+    forward = {kind: without_gradient(function) for kind, function in functions.items()}
+    both = {kind: with_gradient(function) for kind, function in functions.items()}
     rows = []
     for mode, candidates in (("forward", forward), ("f+b", both)):
         with counted_work() as work:
@@ -291,20 +292,18 @@ def _backbone_rows(
     return rows
 
 
-def _without_gradient(function: Callable[[], Tensor]) -> Callable[[], Tensor]:
-    def call() -> Tensor:
-        with torch.no_grad():
-            return function()
+def backbone_operations(backbone: Backbone, points: Tensor) -> dict[str, list[dict[str, Any]]]:
+    """Where the time of our backbone goes, by mode, as `operation_table` has it."""
+    encoder = backbone.build().to(points.device)
+    owners = torch.zeros(len(points), dtype=torch.int64, device=points.device)
 
-    return call
+    def run() -> Tensor:
+        return encoder(points, owners, 1).features
 
-
-def _with_gradient(function: Callable[[], Tensor]) -> Callable[[], None]:
-    def call() -> None:
-        output = function()
-        output.backward(torch.ones_like(output))
-
-    return call
+    return {
+        f"operations of the backbone, {mode}": operation_table(wrap(run), points.device)
+        for mode, wrap in (("forward", without_gradient), ("f+b", with_gradient))
+    }
 
 
 def memory_of(
@@ -330,7 +329,7 @@ def _run_alone(backbone: Backbone, points: Tensor, kind: str, backward: bool, th
         twin = SpconvEncoder(load_spconv(torch.device("cpu")), encoder).train()
         run = lambda: twin(voxels)[1]  # noqa: E731
     before = _status_mib("VmRSS")
-    (_with_gradient if backward else _without_gradient)(run)()
+    (with_gradient if backward else without_gradient)(run)()
     return before, _status_mib("VmHWM")
 
 

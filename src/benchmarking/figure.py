@@ -1,4 +1,4 @@
-"""The picture of suite=scaling: time and memory over what grows, and the parts that make up the time."""
+"""Pictures of two suites: scaling, time and memory over what grows; soak, what is held over thousands of frames."""
 
 from __future__ import annotations
 
@@ -98,3 +98,48 @@ def _label(axes: Axes, name: str, rows: Rows) -> None:
     axes.tick_params(axis="x", labelsize=8)
     if not rows:
         axes.text(0.5, 0.5, "nothing measured", transform=axes.transAxes, ha="center", color=MUTED)
+
+
+SOAK_PANELS = {
+    "memory, MiB": ("RSS MiB", "heap MiB", "workers MiB", "CUDA MiB", "CUDA reserved MiB", "remembered MiB"),
+    "ms a frame": ("ms",),
+    "Python's, thousands": ("objects", "tensors"),
+    "handles": ("descriptors", "threads"),
+}
+"""By row of the picture the columns of the curves that it shows."""
+
+
+def draw_soak(path: Path, curves: dict[str, Rows], title: str) -> None:
+    """What was held and how long a frame took over the frames passed: a column for each pass, one scale in a row."""
+    size, gap = (430, 190), (80, 92)
+    canvas = Canvas(SHEET_PX, 56 + len(SOAK_PANELS) * (size[1] + gap[1]))
+    canvas.text(12, 10, title, 20, bold=True)
+    for row, (what, quantities) in enumerate(SOAK_PANELS.items()):
+        factor = 1e-3 if "thousands" in what else 1.0
+        top = 116 + row * (size[1] + gap[1])
+        panels = []
+        for column, (name, rows) in enumerate(curves.items()):
+            axes = canvas.axes(LEFT_PX + column * (size[0] + gap[0]), top, *size)
+            style_axes(axes, f"{name}: {what}")
+            for index, quantity in enumerate(quantities):
+                places = [point["frames"] for point in rows if quantity in point]
+                values = [factor * point[quantity] for point in rows if quantity in point]
+                style = {"color": LINE_COLOURS[index], "marker": MARKERS[index], "linewidth": 1.6, "markersize": 4}
+                if values:
+                    axes.plot(places, values, label=quantity.removesuffix(" MiB"), **style)
+                    last = values[-1]
+                    shown = f"{last:,.0f}" if last >= 10 or last == int(last) else f"{last:.2g}"
+                    beside = {"textcoords": "offset points", "va": "center", "fontsize": 8, "color": INK}
+                    axes.annotate(shown, (places[-1], last), (6, 0), annotation_clip=False, **beside)
+            axes.set_xlabel("frames", color="#495057", fontsize=9)
+            axes.set_xlim(0, None)
+            panels.append(axes)
+        highest = max(axes.dataLim.ymax for axes in panels)
+        for axes in panels:
+            axes.set_ylim(0, 1.12 * highest)
+        keys: dict[str, Any] = {}
+        for axes in panels:
+            keys |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        if len(quantities) > 1:
+            canvas.legend(LEFT_PX, top - 52, list(keys.values()))
+    canvas.save(path, photographs=False)

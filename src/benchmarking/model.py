@@ -14,6 +14,8 @@ from torch import Tensor
 from src.assembly import build_datamodule, build_model, data_root
 from src.benchmarking.counting import counted_work, distinct_bytes
 from src.benchmarking.machine import gemm_rate, measure_roofline
+from src.benchmarking.operations import NOTE as OPERATIONS_NOTE
+from src.benchmarking.operations import operation_table
 from src.benchmarking.parts import Call, derive, is_within, parts_of, record_calls, tensors_in
 from src.benchmarking.timing import added_bytes, chosen_device, interleaved, median_spread, peak_bytes
 from src.config import Config
@@ -88,9 +90,12 @@ def benchmark_model(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
             "measured product rate and bytes over the measured copy rate, bytes being inputs, outputs and weights once "
             f"({BACKWARD_PASSES} times with backward). Traffic is what all operations read and write without fusion "
             "and cache. Added memory is the most that a call takes beyond its inputs and weights.",
+            OPERATIONS_NOTE,
         ]
         + ([] if device.type == "cuda" else [gpu_note(config)]),
         **tables,
+        "operations of a frame": operation_table(case.infer, device),
+        "operations of forward, loss and backward": operation_table(case.step, device),
         "roofline": roofline,
         "device": str(device),
         "batch_size": len(case.batch),

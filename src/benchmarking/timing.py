@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from src.config import Accelerator, Config
 from src.training.processes import check_devices
@@ -89,6 +89,28 @@ def in_turns(
         for name, values in interleaved(due, device, 1, warm_up=0).items():
             seconds[name] += values
     return seconds
+
+
+def without_gradient(function: Callable[[], Any]) -> Callable[[], Any]:
+    """The function as inference calls it."""
+
+    def call() -> Any:
+        with torch.no_grad():
+            return function()
+
+    return call
+
+
+def with_gradient(function: Callable[[], Any]) -> Callable[[], None]:
+    """The function and, from gradients of one, its backward pass."""
+
+    def call() -> None:
+        result = function()
+        outputs = [result] if isinstance(result, Tensor) else [x for x in result if isinstance(x, Tensor)]
+        outputs = [x for x in outputs if x.requires_grad]
+        torch.autograd.backward(outputs, [torch.ones_like(x) for x in outputs])
+
+    return call
 
 
 @contextmanager

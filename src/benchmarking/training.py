@@ -12,6 +12,8 @@ from typing import Any
 import torch
 
 from src.assembly import build_datamodule, build_module, data_root
+from src.benchmarking.operations import NOTE as OPERATIONS_NOTE
+from src.benchmarking.operations import operation_table
 from src.benchmarking.timing import chosen_device, clock, median_spread, peak_bytes, timed_parts
 from src.config import Config
 from src.data.datamodule import DetectionDataModule
@@ -21,6 +23,7 @@ from src.training.optim import CyclicSchedule, build_optimizer
 
 WARM_UP_STEPS = 5  # first calls choose algorithms, fill the allocator and the loader's queue
 MEASURED_STEPS = 40  # enough for quartiles of a step whose work follows the scene
+PROFILED_STEPS = 2  # one to warm up
 
 
 def benchmark_training(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
@@ -55,13 +58,22 @@ def benchmark_training(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
             }
             | {f"{stage} ms": 1e3 * statistics.median(values) for stage, values in stages.items()}
         )
+    optimizer, schedule = build_optimizer(
+        module.model, module.optim, PROFILED_STEPS, module.model.image_backbone, module.backbone_lr_multiplier
+    )
+    last = batches[-1].to(device)
+    operations = operation_table(
+        lambda: timed_step(module, last, optimizer, schedule, device, config.precision == "bf16-mixed"), device
+    )
     return {
         "notes": [
             f"{MEASURED_STEPS} steps of {config.data.batch_size} frames after {WARM_UP_STEPS}, {config.phase.name}, "
             f"scale {config.scale}, {config.precision}, {config.data.num_workers} loader workers, fresh weights. "
-            "Medians, after ± the range of the middle half; frames/s counts the whole time."
+            "Medians, after ± the range of the middle half; frames/s counts the whole time.",
+            OPERATIONS_NOTE,
         ],
         "training step": rows,
+        "operations of a step": operations,
         "device": str(device),
         "batch_size": config.data.batch_size,
         "parameters": sum(p.numel() for p in module.model.parameters()),
