@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.dense_layers import DenseConvNormReLU
-from src.models.memory import FrameMemory, RememberedFrame
+from src.models.memory import FrameMemory, Motion, RememberedFrame
 from src.structures.batch import FrameBatch
 
 STORED = torch.bfloat16
@@ -77,10 +78,11 @@ class MapMemory(FrameMemory[MapFrame]):
 
 @dataclass
 class Recollection:
-    """Past maps as they look in the current augmented frame, newest first; zero where nothing is known."""
+    """Past maps and their way to the current augmented frame, newest first; not yet moved there."""
 
-    maps: list[Tensor]  # of [B, C, rows, cols], as many as frames are remembered
-    usable: Tensor  # [frames, B] bool
+    frames: tuple[MapFrame, ...]  # as many as are remembered
+    motions: list[Motion]
+    usable: Tensor  # [frames of the configuration, B] bool
 
 
 class TemporalFusion(nn.Module):
@@ -101,15 +103,20 @@ class TemporalFusion(nn.Module):
 
     @torch.no_grad()
     def recall(self, memory: MapMemory | None, batch: FrameBatch) -> Recollection:
-        """Bring every remembered map to the batch's time and augmented frame."""
-        frames = memory.before(batch).frames if memory is not None else ()
-        maps, usable = [], torch.zeros(self.config.num_frames, len(batch), dtype=torch.bool, device=batch.device)
-        for age, frame in enumerate(frames[: self.config.num_frames]):
-            motion = frame.motion(batch, self.config.max_age_s)
+        """Find every remembered map's way to the batch's time and augmented frame."""
+        frames = memory.before(batch).frames[: self.config.num_frames] if memory is not None else ()
+        motions = [frame.motion(batch, self.config.max_age_s) for frame in frames]
+        usable = torch.zeros(self.config.num_frames, len(batch), dtype=torch.bool, device=batch.device)
+        for age, motion in enumerate(motions):
             usable[age] = motion.usable
-            maps.append(self.align(frame, motion.aug_from_past, motion.usable))
-        return Recollection(maps, usable)
+        return Recollection(frames, motions, usable)
 
+    def maps(self, recollection: Recollection) -> Iterator[Tensor]:  # of [B, C, rows, cols] float32
+        """Past maps as they look in the current augmented frame, newest first; zero where nothing is known."""
+        for frame, motion in zip(recollection.frames, recollection.motions, strict=True):
+            yield self.align(frame, motion.aug_from_past, motion.usable)
+
+    @torch.no_grad()
     def align(
         self,
         frame: MapFrame,
@@ -133,11 +140,16 @@ class TemporalFusion(nn.Module):
         fused: Tensor,  # [B, C, rows, cols]
         recollection: Recollection,
     ) -> Tensor:  # [B, C, rows, cols]
-        """The current map, changed by what is remembered."""
-        missing = self.config.num_frames - len(recollection.maps)
-        stack = [fused, *(past.to(fused.dtype) for past in recollection.maps)]
-        stack += [torch.zeros_like(fused)] * missing
-        return fused + self.norm(self.refine(self.reduce(torch.cat(stack, dim=1))))
+        """The current map, changed by what is remembered.
+
+        `reduce` of all maps side by side is the sum of its slices of the single maps: no stack of them is ever held,
+        and a map that is not remembered, zero, costs nothing.
+        """
+        current, *slices = self.reduce.conv.weight.split(self.channels, dim=1)
+        total = F.conv2d(fused, current, self.reduce.conv.bias)
+        for past, weight in zip(self.maps(recollection), slices, strict=False):  # younger clips remember fewer
+            total = total + F.conv2d(past.to(fused.dtype), weight)
+        return fused + self.norm(self.refine(F.relu(self.reduce.norm(total))))
 
     @torch.no_grad()
     def remember(

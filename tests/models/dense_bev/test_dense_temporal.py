@@ -8,6 +8,7 @@ import pytest
 import torch
 from dense_frames import GRID, dense_model, drive, memory_config, pose
 from moving import bare_frame, bda
+from torch import nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
@@ -56,7 +57,7 @@ def test_a_standing_world_looks_the_same_from_memory(then, now):
     batch = bare_frame([0.5, 3.5], [pose(9.0, 2.0, 0.25), pose(1.0, -1.0, -1.8)], [now, now])
     memory = fusion.remember(None, past, map_of(past))
     with torch.autocast("cpu", torch.bfloat16):
-        found = fusion.recall(memory, batch).maps[0]
+        found = next(fusion.maps(fusion.recall(memory, batch)))
     near = slice(28, 68)  # what both frames cover
     wanted = map_of(batch)
     torch.testing.assert_close(found[..., near, near], wanted[..., near, near], rtol=0, atol=0.02)  # bfloat16, bilinear
@@ -68,7 +69,7 @@ def test_whole_cells_move_without_loss():
     fusion = make_fusion(channels=1)
     first = torch.arange(96.0 * 96).view(1, 1, 96, 96) % 128  # exact in bfloat16
     memory = fusion.remember(None, bare_frame(0.0, [pose()]), first)
-    found = fusion.recall(memory, bare_frame(0.5, [pose(8.0)])).maps[0]
+    found = next(fusion.maps(fusion.recall(memory, bare_frame(0.5, [pose(8.0)]))))
     torch.testing.assert_close(found[..., 1:-1, :86], first[..., 1:-1, 10:], rtol=0, atol=2e-2)
     assert not found[..., 87:].any()
 
@@ -81,7 +82,8 @@ def test_what_is_not_a_usable_past_is_zero_and_only_in_its_lane(elapsed_s, metre
     batch = bare_frame([10.0 + elapsed_s, 10.5], [pose(metres), pose(5.0)])
     recalled = fusion.recall(memory, batch)
     assert recalled.usable[0].tolist() == [False, True]
-    assert not recalled.maps[0][0].any() and recalled.maps[0][1].any()
+    (found,) = fusion.maps(recalled)
+    assert not found[0].any() and found[1].any()
 
 
 def test_the_newest_frames_stay_and_lanes_come_and_go():
@@ -95,9 +97,26 @@ def test_the_newest_frames_stay_and_lanes_come_and_go():
     swapped = memory.select(torch.tensor([1, 0]), torch.tensor([True, False]))
     assert [frame.present.tolist() for frame in swapped.frames] == [[True, False]] * 2
     recalled = fusion.recall(swapped, bare_frame(2.0, [pose(3.0, 1.0), pose(3.0)]))
-    centre = [past[:, 0, 48, 48].tolist() for past in recalled.maps]
+    centre = [past[:, 0, 48, 48].tolist() for past in fusion.maps(recalled)]
     assert centre == [[40.0, 0.0], [30.0, 0.0]]
     assert memory.select(torch.tensor([0, 1]), torch.tensor([False, False])).frames == ()
+
+
+def test_aggregation_is_the_convolution_of_all_maps_side_by_side():
+    torch.manual_seed(3)
+    fusion = make_fusion(num_frames=3).train()
+    nn.init.ones_(fusion.norm.weight)
+    memory = None
+    for step in range(2):  # of three that there is room for
+        frame = bare_frame(0.5 * step, [pose(4.0 * step), pose(step, 1.0)])
+        memory = fusion.remember(memory, frame, torch.randn(2, 2, 96, 96))
+    recollection = fusion.recall(memory, bare_frame(1.0, [pose(8.0), pose(2.0, 1.0)]))
+    fused = torch.randn(2, 2, 96, 96)
+    past = list(fusion.maps(recollection))
+    stack = torch.cat([fused, *past, torch.zeros_like(fused)], dim=1)
+    wanted = fused + fusion.norm(fusion.refine(fusion.reduce(stack)))
+    torch.testing.assert_close(fusion.aggregate(fused, recollection), wanted, rtol=1e-5, atol=1e-5)
+    assert len(past) == 2 and (wanted - fused).abs().max() > 0.5
 
 
 def test_memory_survives_a_checkpoint():
@@ -109,7 +128,8 @@ def test_memory_survives_a_checkpoint():
     buffer.seek(0)
     again = MapMemory.from_state(torch.load(buffer, weights_only=True))
     batch = bare_frame(0.5, [pose(4.0)])
-    assert torch.equal(fusion.recall(again, batch).maps[0], fusion.recall(memory, batch).maps[0])
+    maps = [next(fusion.maps(fusion.recall(each, batch))) for each in (again, memory)]
+    assert torch.equal(*maps)
 
 
 def test_remembering_keeps_no_graph_and_no_alias():
