@@ -1,4 +1,4 @@
-"""One frame at a time with memory: what each kind of frame may remember, bounded size, and the README's example."""
+"""One frame at a time with memory: what each kind of frame may remember, bounded size, and the example of the guide."""
 
 import re
 from dataclasses import fields, replace
@@ -16,7 +16,7 @@ from src.streaming import StreamingDetector
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CAMERAS, RADARS
 
-README = Path(__file__).resolve().parent.parent / "README.md"
+GUIDE = Path(__file__).resolve().parent.parent / "docs" / "streaming.md"
 
 
 @pytest.fixture(scope="module")
@@ -244,12 +244,12 @@ def test_bf16_runs_in_autocast(tmp_path):
         StreamingDetector(detector.model, detector.grid, detector.settings, bf16=False)
 
 
-def test_the_example_of_the_readme_runs(checkpoints, tmp_path, monkeypatch, capsys):
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), flags=re.DOTALL)
+def test_the_example_of_the_guide_runs(checkpoints, tmp_path, monkeypatch, capsys):
+    blocks = re.findall(r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), flags=re.DOTALL)
     (example,) = [block for block in blocks if "StreamingDetector" in block]
     assert len(example.splitlines()) <= 30
     (tmp_path / "model.ckpt").write_bytes(checkpoints["phase2"].read_bytes())
     monkeypatch.chdir(tmp_path)
-    exec(compile(example, "README.md", "exec"), {})
+    exec(compile(example, str(GUIDE), "exec"), {})
     printed = capsys.readouterr().out
     assert re.search(r"car|truck|bus|pedestrian|traffic_sign", printed) and " m/s" in printed

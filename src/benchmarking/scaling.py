@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from src.benchmarking.counting import counted_work
 from src.benchmarking.figure import draw_scaling
 from src.benchmarking.model import CANDIDATES, KEY_FRAME_S, Case, expect_trained_scores
 from src.benchmarking.parts import is_within, parts_of, tensors_in
@@ -153,7 +154,9 @@ def measure_sweep(
             row = {name: int(x), "model": model, "ms": 1e3 * middle, "± ms": 1e3 * spread}
             row["added MiB"] = None if added is None else added / 2**20
             row["remembered MiB"] = sum(x.nbytes for x in tensors_in(case.memory)) / 2**20
-            row["radar points"] = len(case.batch.radar_points)
+            with counted_work() as work:
+                case.infer()
+            row |= {"GFLOP": work.flops / 1e9, "radar points": len(case.batch.radar_points)}
             rows.append(row | {f"{part} ms": 1e3 * statistics.median(values) for part, values in parts[model].items()})
         del cases
     return rows
@@ -287,9 +290,10 @@ def growth_rows(measured: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any
             row[f"{model} time x"] = own[-1]["ms"] / first["ms"]
             if first["added MiB"] is not None:
                 row[f"{model} memory x"] = held_mib(own[-1]) / max(held_mib(first), 1e-9)
-        last = [point["ms"] for point in points if point[name] == row["to"]]
-        begin = [point["ms"] for point in points if point[name] == row["from"]]
-        row |= {"dense / ours at from": begin[1] / begin[0], "dense / ours at to": last[1] / last[0]}
+        for place in ("from", "to"):
+            ours, dense = (point for point in points if point[name] == row[place])  # as they were measured
+            row[f"dense / ours at {place}"] = dense["ms"] / ours["ms"]
+            row[f"GFLOP dense / ours at {place}"] = dense["GFLOP"] / ours["GFLOP"]
         rows.append(row)
     return rows
 

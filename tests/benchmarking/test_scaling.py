@@ -12,7 +12,10 @@ ROAD = Highway(background=400, num_vehicles=20, points_per_vehicle=10, reach_m=1
 
 
 def row(sweep, x, model, milliseconds, added, remembered):
-    return {sweep: x, "model": model, "ms": milliseconds, "added MiB": added, "remembered MiB": remembered}
+    work = 2.0 * milliseconds if model == "horizon3d" else 3.0 * milliseconds
+    return {sweep: x, "model": model, "ms": milliseconds, "added MiB": added, "remembered MiB": remembered} | {
+        "GFLOP": work
+    }
 
 
 def test_growth_is_from_the_nominal_range_and_else_from_the_first_point():
@@ -33,6 +36,7 @@ def test_growth_is_from_the_nominal_range_and_else_from_the_first_point():
     assert (first["horizon3d time x"], first["dense_bev time x"]) == (1.2, 16.0)
     assert (first["horizon3d memory x"], first["dense_bev memory x"]) == (1.2, 16.0)
     assert (first["dense / ours at from"], first["dense / ours at to"]) == (5.0, 800.0 / 12.0)
+    assert first["GFLOP dense / ours at from"] == 1.5 * first["dense / ours at from"]
     assert (second["from"], second["horizon3d time x"], second["dense_bev time x"]) == (0, 1.5, 1.0)
     assert "horizon3d memory x" not in second  # not known there
 
