@@ -114,7 +114,7 @@ def deform_attend_images_reference(
     unit = torch.where(seen.unsqueeze(4), unit, -1.0)
     used = seen.any(3).permute(0, 2, 1)  # [B, N, Q]
     counts = used.sum(2).flatten().tolist()
-    chosen = (used.flatten().nonzero().squeeze(1) % queries).split(counts)
+    chosen = (torch.nonzero_static(used.flatten(), size=sum(counts)).squeeze(1) % queries).split(counts)
 
     # One image at a time; unbind, because the gradient of an index would fill the whole tensor for every image.
     images = zip(*(level.to(dtype).flatten(0, 1).unbind(0) for level in values), strict=True)

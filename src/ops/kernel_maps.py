@@ -175,8 +175,8 @@ def _build_strided(
         targets = targets.unsqueeze(-2) + coarse * out.strides[axis + 1]
         valid = valid.unsqueeze(-2) & fits
     num = len(sites)
-    hits = valid.reshape(-1).nonzero().squeeze(1)
     counts = valid.flatten(0, -2).sum(1).tolist()
+    hits = torch.nonzero_static(valid.reshape(-1), size=sum(counts)).squeeze(1)
     out.keys, outputs = torch.unique(targets.reshape(-1).index_select(0, hits), return_inverse=True)
     inputs = torch.remainder(hits, max(num, 1)).to(torch.int32)
     return KernelMap(inputs, outputs.to(torch.int32), tuple(counts), num, len(out)), out
@@ -228,10 +228,11 @@ def _search(
 
 def _pairs(found: Tensor, where: Tensor) -> tuple[Tensor, Tensor, list[int]]:
     """(input rows, output rows, counts) of the taps that met a site, block by block."""
-    hits = found.reshape(-1).nonzero().squeeze(1)
+    counts = found.sum(1).tolist()
+    hits = torch.nonzero_static(found.reshape(-1), size=sum(counts)).squeeze(1)  # a GPU is waited for once, not twice
     outputs = torch.remainder(hits, max(found.shape[1], 1))
     inputs = where.reshape(-1).index_select(0, hits)
-    return inputs.to(torch.int32), outputs.to(torch.int32), found.sum(1).tolist()
+    return inputs.to(torch.int32), outputs.to(torch.int32), counts
 
 
 def _output_shape(
