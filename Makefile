@@ -6,21 +6,24 @@ SWEEP ?=
 ARGS ?=
 ACTIVE := $(or $(VIRTUAL_ENV),$(CONDA_PREFIX))
 PYTHON := $(if $(ACTIVE),python,.venv/bin/python)
-# The stamp remembers an install: it is redone when pyproject.toml changes. It lives inside the environment it describes.
+# The stamp remembers an install: it is redone when pyproject.toml or constraints.txt changes. It lives inside the
+# environment it describes.
 STAMP := $(if $(ACTIVE),$(ACTIVE),.venv)/.horizon3d-installed
 SCALE_ARG := $(if $(SCALE),scale=$(SCALE))
 INIT_ARG := $(if $(CHECKPOINT),'phase.init_from="$(CHECKPOINT)"')
 $(if $(filter 1 2,$(PHASE)),,$(error PHASE=$(PHASE): must be 1 or 2))
 
-.PHONY: help install world train sweep report dashboard benchmark performance test test-faults check
+.PHONY: help install world train sweep report dashboard benchmark performance test test-faults audit check
 .DEFAULT_GOAL := help
 
 help: ## show this list
-	@awk -F':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-$(STAMP): pyproject.toml
+# An active environment keeps the versions it has, so that a torch of one's choice stays.
+PINNED := $(if $(ACTIVE),,--constraint constraints.txt)
+$(STAMP): pyproject.toml constraints.txt
 	$(if $(ACTIVE),,test -x .venv/bin/python || python3 -m venv .venv)
-	$(PYTHON) -m pip install --quiet --editable ".[test,oracle]"
+	$(PYTHON) -m pip install --quiet $(PINNED) --editable ".[test,oracle]"
 	@touch $@
 
 install: $(STAMP) ## create .venv (unless an environment is active) and install the project
@@ -63,6 +66,12 @@ test: $(STAMP) ## run every test but the fault suite
 
 test-faults: $(STAMP) ## kill, starve and corrupt running commands, half an hour [ARGS="-k kills"]
 	$(PYTEST) -m faults $(ARGS)
+
+# In an environment of its own, so that it changes nothing of what it looks at. What cannot be looked up is a failure.
+AUDITOR := $(dir $(STAMP)).audit
+audit: $(STAMP) ## look the versions of constraints.txt up among known vulnerabilities, over the network
+	test -x $(AUDITOR)/bin/pip-audit || { $(PYTHON) -m venv $(AUDITOR) && $(AUDITOR)/bin/pip install --quiet pip-audit; }
+	$(AUDITOR)/bin/pip-audit --strict --requirement constraints.txt --no-deps --disable-pip $(ARGS)
 
 check: $(STAMP) ## lint and the fast tests, some minutes
 	$(PYTHON) -m ruff check .

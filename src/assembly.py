@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from src.config import Config
+from src.config import Config, OnNonfinite
 from src.data.datamodule import DetectionDataModule
 from src.data.world.write import ensure_world, world_digest
 from src.errors import ConfigError
@@ -92,4 +92,5 @@ def build_module(config: Config, tree: dict[str, Any], datamodule: DetectionData
         evaluation_set=datamodule.evaluation_set(),
         seed=config.seed,
         config=tree,
+        skip_nonfinite=config.trainer.on_nonfinite is OnNonfinite.skip,
     )

@@ -9,6 +9,7 @@ suite=scaling   cost against range, objects, radar points, Gaussians and memory,
 suite=training  frames per second of the phase's training step, with its loader and without
 suite=latency   a frame of the trained model checkpoint=PATH, part by part, with full memory in phase 2, over the frames
                 that it was validated on; into DIR/latency.json, where DIR is the run's folder if tables are to show it
+suite=soak      memory, time and handles over thousands of streamed frames, in inference and in training (phase=phase2)
 suite=metric    our metric against the official evaluator on one val-sized problem
 suite=reader    frames per second of the reader on one core
 """
@@ -26,6 +27,7 @@ from src.benchmarking.ops import benchmark_ops
 from src.benchmarking.reader import benchmark_reader
 from src.benchmarking.report import markdown, page_name, page_of, write_page
 from src.benchmarking.scaling import benchmark_scaling
+from src.benchmarking.soak import benchmark_soak
 from src.benchmarking.training import benchmark_training
 from src.command import run_command
 from src.config import BenchmarkSuite, Config, compose_config
@@ -42,6 +44,7 @@ SUITES: dict[BenchmarkSuite, Callable[[Config, dict[str, Any]], dict[str, Any]]]
     BenchmarkSuite.ops: benchmark_ops,
     BenchmarkSuite.scaling: benchmark_scaling,
     BenchmarkSuite.training: benchmark_training,
+    BenchmarkSuite.soak: benchmark_soak,
     BenchmarkSuite.metric: lambda config, tree: compare_with_devkit(**VAL_SIZED, seed=config.seed),
     BenchmarkSuite.reader: lambda config, tree: benchmark_reader(config),
 }

@@ -26,6 +26,8 @@ from src.errors import CheckpointError, ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models import MODEL_CONFIGS
 from src.models.backbones.image import ImageEncoderConfig
+from src.overrides import fault_of_tree, key_of
+from src.sweeping.address import masked
 from src.training.optim import OptimConfig
 from src.training.run_folder import Resume
 from src.training.wandb import WandbConfig
@@ -33,6 +35,7 @@ from src.training.wandb import WandbConfig
 CONF = Path(__file__).resolve().parent.parent / "conf"
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir())
 PHASES = sorted(path.stem for path in (CONF / "phase").glob("*.yaml"))
+SCALES = sorted(path.stem for path in (CONF / "scale").glob("*.yaml"))
 
 # Lines of Hydra's messages that tell a user nothing, or to do what is refused here (`+key`).
 HYDRA_INTERNALS = (
@@ -93,9 +96,16 @@ class Accelerator(Enum):
     gpu = "gpu"
 
 
+class OnNonfinite(Enum):
+    """What happens at a step whose loss or gradients are not finite; either way a dump of it is left."""
+
+    stop = "stop"  # the training ends there and says why
+    skip = "skip"  # weights and optimiser stay as they were, the step is counted; too many in a row end the training
+
+
 @dataclass(kw_only=True)
 class TrainerConfig:
-    """Where a run computes and how often it reports."""
+    """Where a run computes, how often it reports, and what it does when something goes wrong with its numbers."""
 
     accelerator: Accelerator
     devices: int  # processes on each machine
@@ -103,6 +113,8 @@ class TrainerConfig:
     log_every_steps: int
     checkpoint_every_steps: int | None  # null: after every epoch
     num_pictures: int  # validation frames drawn at the end
+    on_nonfinite: OnNonfinite
+    deterministic: bool  # refuse operations whose result differs from run to run, of which a GPU has some
 
     def __post_init__(self) -> None:
         least_of = {"devices": 1, "num_nodes": 1, "log_every_steps": 1, "checkpoint_every_steps": 1, "num_pictures": 0}
@@ -151,6 +163,7 @@ class BenchmarkSuite(Enum):
     scaling = "scaling"
     training = "training"
     latency = "latency"
+    soak = "soak"
     metric = "metric"
     reader = "reader"
 
@@ -232,6 +245,7 @@ def _compose(overrides: list[str]) -> DictConfig:
             raise ConfigError(f"{override}: options are written key=value, without dashes")
         if override.startswith("~"):
             raise ConfigError(f"{override}: keys cannot be removed; a part is switched off with {override[1:]}=null")
+        _refuse_hidden(override)
         if override.startswith("phase.name="):
             raise ConfigError(f"{override}: runs are told apart by this name; choose a phase with phase=...")
     try:
@@ -241,13 +255,28 @@ def _compose(overrides: list[str]) -> DictConfig:
             # In code: a later at_scale file would revive a part that a phase file sets to null.
             tree.model[OmegaConf.get_type(tree.model).temporal_part] = None
         return tree
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, OverflowError) as error:  # the last: beyond every float
         raise ConfigError(hydra_message(error)) from error
     except (ValueError, AssertionError) as error:  # Hydra's own words for these name neither the key nor the remedy
         raise ConfigError(
             f"{' '.join(overrides)}: a choice of conf/ ({', '.join(GROUPS)}) needs one of its names, and a key below a "
             f"part that is null needs the part first, as in logger=wandb logger.wandb.project=... ({error})"
         ) from error
+
+
+def _refuse_hidden(override: str) -> None:
+    """Raises ConfigError for what brings in more than it shows, or shows what should stay hidden.
+
+    The file of a sweep may come from somebody else, and what is composed is written into config.yaml, logs and pages.
+    """
+    name = key_of(override)
+    if "${" in override:
+        raise ConfigError(f"{name}: must not refer to something else with ${{; the shell fills in $VARIABLES")
+    if name.partition("/")[0].partition(".")[0] == "hydra":
+        raise ConfigError(f"{name}: settings of Hydra itself are none of a run's")
+    if masked(override) != override:
+        name = name if masked(name) == name and "@" not in name else "the command line"
+        raise ConfigError(f"{name}: holds what looks like a password, which would be written down with the run")
 
 
 def build_config(tree: DictConfig) -> Config:
@@ -267,17 +296,23 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     """A configuration as a checkpoint stores it, with the keys named in `overrides` replaced.
 
     A group choice (`data=truckscenes`) replaces that whole group, at the checkpoint's scale and phase; `model=` only
-    says whose keys may follow. Raises CheckpointError when the stored tree does not fit this version of the code,
-    ConfigError for another model, scale or phase and for a key below a part that the checkpoint does not have.
+    says whose keys may follow. A key of `trainer` that is younger than the checkpoint has today's value.
+    Raises CheckpointError when the stored tree does not fit this version of the code, ConfigError for another model,
+    scale or phase and for a key below a part that the checkpoint does not have.
     """
+    fault = fault_of_tree(stored)
+    if fault is not None:
+        raise CheckpointError(f"the checkpoint's configuration is not one of plain values: {fault}")
     model, phase = (
         stored[key].get("name") if isinstance(stored.get(key), dict) else None for key in ("model", "phase")
     )
-    if model not in MODEL_CONFIGS:
-        raise CheckpointError(f"the checkpoint is of model {model!r}; this version knows {sorted(MODEL_CONFIGS)}")
+    if not isinstance(model, str) or model not in MODEL_CONFIGS:
+        raise CheckpointError(f"the checkpoint is of model {model!r:.80}; this version knows {sorted(MODEL_CONFIGS)}")
     if phase not in PHASES:
-        raise CheckpointError(f"the checkpoint is of phase {phase!r}; this version knows {PHASES}")
+        raise CheckpointError(f"the checkpoint is of phase {phase!r:.80}; this version knows {PHASES}")
     scale = stored.get("scale")
+    if scale not in SCALES:
+        raise CheckpointError(f"the checkpoint is of scale {scale!r:.80}; this version knows {SCALES}")
     changes = {change.key_or_group: change for change in OverridesParser.create().parse_overrides(overrides)}
     fixed = {"scale": scale, "model": model, "phase": phase, "phase.temporal": stored["phase"].get("temporal")}
     for key, own in fixed.items():
@@ -294,8 +329,8 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     schema = OmegaConf.structured(Config)
     try:
         schema.model = OmegaConf.structured(MODEL_CONFIGS[model])
-        return build_config(OmegaConf.merge(schema, tree))
-    except (OmegaConfBaseException, ConfigError) as error:
+        return build_config(OmegaConf.merge(schema, {"trainer": fresh.trainer}, tree))
+    except (OmegaConfBaseException, ConfigError, OverflowError) as error:  # the last: a whole number beyond every float
         raise CheckpointError(f"the checkpoint's configuration does not fit this code: {error}") from None
 
 

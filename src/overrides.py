@@ -8,6 +8,8 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
+MAX_LEVELS = 30
+"""Of a stored configuration, whose readers follow each level with a call of their own; a run's has six."""
 OUTSIDE_IDENTITY = (
     "paths",
     "logger",
@@ -57,3 +59,33 @@ def without_keys(tree: dict[str, Any], keys: Iterable[str]) -> dict[str, Any]:
         if isinstance(node, dict):
             node.pop(leaf, None)
     return tree
+
+
+def fault_of_tree(tree: Any) -> str | None:
+    """What a configuration that somebody else stored holds besides plain values, with its place; None for a sound one.
+
+    `${` would be filled in when the tree is read, with environment variables too. A part that stands in two places is
+    walked through twice by whoever reads it, so that a few nested ones are more than a machine can hold.
+    """
+    seen: set[int] = set()
+    parts: list[tuple[str, Any]] = [("", tree)]
+    while parts:
+        where, part = parts.pop()
+        if isinstance(part, str):
+            if "${" in part:
+                return f"{where} is {part!r:.80}, which refers to something else"
+        elif isinstance(part, dict | list):
+            if where.count(".") >= MAX_LEVELS:
+                return f"{where:.80} has more than {MAX_LEVELS} levels"
+            if id(part) in seen:
+                return f"{where} stands in two places"
+            seen.add(id(part))
+            items = part.items() if isinstance(part, dict) else enumerate(part)
+            for name, value in items:
+                if isinstance(part, dict) and not isinstance(name, str):
+                    return f"a key of {where or 'it'} is {name!r:.80}, which is not a text"
+                parts.append((f"{where}.{name}" if where else str(name), value))
+                parts.append((f"the key {where}.{name}", str(name)))
+        elif not isinstance(part, (bool, int, float, type(None))):
+            return f"{where} is a {type(part).__name__}"
+    return None

@@ -24,6 +24,7 @@ from src.streaming import StreamingDetector
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
+from src.structures.passed_over import PassedOver
 from src.training.checkpoints import read_checkpoint
 from src.training.identity import digest_of_changes
 from src.training.processes import check_devices
@@ -68,7 +69,7 @@ def main(overrides: list[str]) -> None:
     print(f"{len(tokens)} frames, {sum(len(boxes) for boxes, _ in found.values())} boxes, written into {out}: ", end="")
     print(", ".join(["submission.json"] * written + ["scene.gif", "strip.png"] * bool(film)))
     if skipped:
-        print(f"sensor files passed over: {skipped}")
+        print(f"sensor files passed over: {skipped.text()}")
     if command.scene is not None:
         print(
             f"submission.json holds {command.scene} only; an evaluation wants all {len(split)} samples of the split "
@@ -94,18 +95,17 @@ def chosen_device(config: Config) -> str:
 
 def predict(
     detector: StreamingDetector, frames: Iterable[FrameBatch], film: Film | None
-) -> tuple[dict[str, Prediction], dict[str, int]]:
+) -> tuple[dict[str, Prediction], PassedOver]:
     """What is detected in each frame by token, and the sensor files passed over; the first scene goes into the film."""
     found: dict[str, Prediction] = {}
-    skipped: dict[str, int] = {}
+    skipped = PassedOver()
     scenes = 0
     with tempfile.TemporaryDirectory() as folder:
         for frame in frames:
             scenes += bool(frame.starts[0])
             boxes, output = detector.run(frame)
             found[frame.tokens[0]] = boxes.to("cpu"), frame.global_from_ego[0].numpy()
-            for channel, count in frame.skipped.items():
-                skipped[channel] = skipped.get(channel, 0) + count
+            skipped.add(frame)
             if film is not None and scenes == 1 and not film.full:
                 picture = Path(folder) / "frame.png"
                 title = f"Frame {len(film) + 1}, sample {frame.tokens[0][:12]}"

@@ -46,7 +46,7 @@ class StreamingDetector:
         model: Detector,
         grid: BEVGrid,
         settings: ReaderSettings,
-        device: torch.device | str = "cpu",
+        device: torch.device | str | None = None,
         bf16: bool | None = None,
         plain: bool = False,
         compiled: bool = False,
@@ -54,31 +54,35 @@ class StreamingDetector:
     ) -> None:
         """`model` is a trained one, of which a copy is prepared for inference, or that of another detector.
 
-        `bf16` None is float32, or what the model is prepared for. `plain` runs the model as it was trained: slower,
-        the same boxes up to rounding. `compiled` compiles the parts of fixed shape, which takes a minute at the first
-        frames and pays on a GPU; `cuda_graph` runs the image encoder as one CUDA graph, on a CPU it changes nothing.
+        `device` None is where the model is. `bf16` None is float32, or what the model is prepared for. `plain` runs the
+        model itself, in evaluation mode and as it was trained: slower, the same boxes up to rounding. `compiled`
+        compiles the parts of fixed shape, which takes a minute at the first frames and pays on a GPU; `cuda_graph` runs
+        the image encoder as one CUDA graph, on a CPU it changes nothing.
 
         Raises ConfigError for a device that is not there or switches that do not go together, ValueError for a model
         that is prepared for another precision.
         """
-        self.device = torch.device(device)
+        self.device = next(model.parameters()).device if device is None else torch.device(device)
         if self.device.type == "cuda" and not torch.cuda.is_available():
             raise ConfigError(f"device={device}: torch sees no GPU on this machine; use device=cpu")
         if plain and (compiled or cuda_graph):
             raise ConfigError("plain=True runs the model as trained; compiled and cuda_graph need it prepared")
         prepared = model.prepared_bf16
+        if prepared is not None and (plain or compiled or cuda_graph):
+            raise ConfigError(
+                "plain, compiled and cuda_graph are for a trained model; that of another detector runs as it does there"
+            )
         if bf16 is None:
             bf16 = bool(prepared)
         if prepared is not None and prepared != bf16:
             raise ValueError(f"the model is prepared for bf16={prepared}, but bf16={bf16} was asked for")
-        model = model.to(self.device).eval()
         if prepared is None and not plain:
             model = prepare_for_inference(model, bf16)
             if cuda_graph:
                 replay_image_encoder(model)
             if compiled:
                 compile_static_parts(model)
-        self.model = model
+        self.model = model.to(self.device).eval()
         self.grid = grid
         self.settings = settings
         self.bf16 = bf16

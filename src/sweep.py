@@ -26,7 +26,7 @@ from src.reporting.sweep_file import DimensionConfig
 from src.reporting.sweep_record import SweepRecord
 from src.reporting.sweep_tables import write_sweep_tables
 from src.sweep_config import SweepCommand, compose_sweep
-from src.sweeping.address import default_storage, masked
+from src.sweeping.address import default_storage, hide_in_process_list, masked
 from src.sweeping.keeping import Keeper
 from src.sweeping.latency import measure_latencies
 from src.sweeping.launcher import Launcher
@@ -45,6 +45,8 @@ logger = logging.getLogger(__name__)
 
 def main(overrides: list[str]) -> None:
     """Plan the sweep, train what is missing, write its tables. Raises HorizonError when a run has failed."""
+    for override in overrides:
+        hide_in_process_list(override)
     command, common = compose_sweep(overrides)
     sweep = command.sweep
     identify = Identifier()

@@ -18,9 +18,10 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from src.config import CONF, GROUPS, Config, hydra_message
+from src.config import CONF, GROUPS, SCALES, Config, hydra_message
 from src.errors import ConfigError
 from src.overrides import key_of
+from src.reporting.plain_yaml import check_plain_yaml
 from src.reporting.sweep_file import (
     DimensionConfig,
     PaperRowConfig,
@@ -32,7 +33,6 @@ from src.reporting.sweep_file import (
 from src.sweeping.address import check_address, masked
 
 SWEEPS = CONF.parent / "sweeps"
-SCALES = sorted(path.stem for path in (CONF / "scale").glob("*.yaml"))
 OWN_KEYS = ("sweep", "seeds", "workers", "storage", "dry_run", "trials")
 MOST_SEEDS = 1000
 FILE_PARTS = (SweepConfig, RowConfig, TableConfig, PlotConfig, PaperRowConfig, DimensionConfig)
@@ -116,6 +116,7 @@ def load_sweep(name: str) -> SweepConfig:
         hint = f"did you mean {near[0]}? " if near else ""
         raise ConfigError(f"sweep={name}: there is no sweeps/{name}.yaml; {hint}there are {', '.join(files)}")
     try:
+        check_plain_yaml(files[name].read_text(encoding="utf-8"))
         stated = OmegaConf.load(files[name])
         _refuse_interpolation(OmegaConf.to_container(stated, resolve=False))
         content = OmegaConf.merge(OmegaConf.structured(SweepConfig), stated, {"name": name})
@@ -128,7 +129,7 @@ def load_sweep(name: str) -> SweepConfig:
         key = getattr(error, "full_key", None)
         where = f"sweeps/{name}.yaml" + (f", {key}" if key else "")
         raise ConfigError(f"{where}: {hydra_message(error, known)}") from error
-    except (YAMLError, ValueError, OSError) as error:
+    except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, OSError) as error:
         raise ConfigError(f"sweeps/{name}.yaml: {' '.join(str(error).split())}") from error
     for row in [*stated.get("rows", []), *stated.get("paper_rows", [])]:
         if isinstance(row.label, bool):

@@ -7,7 +7,6 @@ import platform
 import resource
 import sys
 import time
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from src.handoff import Source, find_source, hand_over, read_source, train_sourc
 from src.metrics.report import format_scores
 from src.ops.allocator import tune_cpu_allocator
 from src.pictures.curves import draw_curves, draw_scores
+from src.structures.passed_over import SHOWN_NAMES, PassedOver
 from src.training.detection import DetectionModule, gather_by_rank
 from src.training.fit import build_loggers, build_trainer, fit
 from src.training.identity import run_identity
@@ -123,7 +123,8 @@ def run(
     training_started = time.monotonic()
     fit(trainer, module, datamodule, resume_from)
     seconds = time.monotonic() - training_started
-    skipped = sum(map(Counter, gather_by_rank(module.skipped)), Counter())
+    skipped = PassedOver()
+    skipped.restore(gather_by_rank(module.skipped.state()))
     end_processes()
     if not is_main_process():
         return
@@ -147,7 +148,9 @@ def run(
         "resumed": resume_from is not None,
         "seconds": {"fit": round(seconds, 1), "all": round(time.monotonic() - started, 1)},
         "peak_memory_mib": peak_memory_mib(),
-        "skipped_files": dict(skipped),
+        "skipped_files": dict(skipped.channels),
+        "skipped_names": skipped.names(),
+        "skipped_steps": module.guard.skipped_steps,
         "device": str(module.device),
         "processes": config.trainer.num_processes,
         "threads": torch.get_num_threads(),
@@ -158,7 +161,9 @@ def run(
             "numpy": np.__version__,
         },
     }
-    write_json(folder.record, record)
+    folder.finish(record)
+    if skipped:
+        logger.warning("sensor files passed over: %s", skipped.text())
     logger.info("finished in %.0f s", record["seconds"]["all"])
     print_result(folder, record, scores)
     for tracked in [own for own in loggers if isinstance(own, WandbRun)]:
@@ -202,6 +207,7 @@ def make_trainer(config: Config, folder: RunFolder, loggers: list[Logger]) -> L.
         log_every_steps=config.trainer.log_every_steps,
         ema_decay=config.optim.ema_decay,
         loggers=loggers,
+        deterministic=config.trainer.deterministic,
     )
 
 
@@ -240,7 +246,9 @@ def print_result(folder: RunFolder, record: dict[str, Any], scores: dict[str, An
         f"parameters, {record['seconds']['all']:.0f} s, {record['peak_memory_mib']['process']} MiB"
     )
     if record["skipped_files"]:
-        print(f"sensor files passed over: {record['skipped_files']}")
+        names = record.get("skipped_names", [])  # older records have none
+        shown = f": {', '.join(names[:SHOWN_NAMES])}{' ...' if len(names) > SHOWN_NAMES else ''}" if names else ""
+        print(f"sensor files passed over: {record['skipped_files']}{shown} (names in run.json)")
     print(f"run folder: {folder.path}  (metrics.json, metrics.csv, config.yaml, log.txt, pictures/, submission.json)")
 
 

@@ -9,7 +9,7 @@ SRC = Path(__file__).resolve().parent.parent / "src"
 FILES = sorted(path for path in SRC.rglob("*.py"))
 ENTRY = {
     "train", "evaluate", "world", "report", "benchmark", "predict", "export", "streaming", "assembly", "command",
-    "config", "handoff", "sweep", "sweep_config", "dashboard",
+    "config", "handoff", "sweep", "sweep_config", "dashboard", "replay",
 }  # fmt: skip
 
 # Suites of the benchmark: they may import what an entry point may, and only entry points import them.

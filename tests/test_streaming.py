@@ -179,6 +179,28 @@ def test_two_vehicles_can_share_a_model(phase2):
         second.step(make_frame(phase2, 0.5 * k, seed=100 + k))
 
 
+def test_a_trained_model_is_left_as_it_is(checkpoints):
+    """A detector made in the middle of a training must not stop its batch norms and dropout."""
+    plain = StreamingDetector.load(checkpoints["phase1"], plain=True)
+    model = plain.model.train()
+    model.image_encoder.eval()  # frozen, as some trainings have it
+    modes = [module.training for module in model.modules()]
+    detector = StreamingDetector(model, plain.grid, plain.settings)
+    assert [module.training for module in model.modules()] == modes and not detector.model.training
+    assert len(detector.step(make_frame(detector, 0.0))) > 0
+
+
+def test_a_shared_model_stays_on_its_device_and_as_it_was_prepared(phase2):
+    parts = (phase2.grid, phase2.settings)
+    for switch in ("plain", "compiled", "cuda_graph"):
+        with pytest.raises(ConfigError, match="that of another detector"):
+            StreamingDetector(phase2.model, *parts, **{switch: True})
+    elsewhere = phase2.model.to("meta")
+    second = StreamingDetector(elsewhere, *parts)
+    assert second.model is elsewhere and second.device.type == "meta"
+    assert all(parameter.is_meta for parameter in elsewhere.parameters())
+
+
 def test_what_is_not_one_plain_frame_is_refused_and_costs_no_memory(phase2):
     good = make_frame(phase2, 0.0)
     wrong = {

@@ -103,7 +103,8 @@ def _label(axes: Axes, name: str, rows: Rows) -> None:
 SOAK_PANELS = {
     "memory, MiB": ("RSS MiB", "heap MiB", "workers MiB", "CUDA MiB", "CUDA reserved MiB", "remembered MiB"),
     "ms a frame": ("ms",),
-    "Python's, thousands": ("objects", "tensors"),
+    "live tensors": ("tensors",),
+    "Python objects": ("objects",),
     "handles": ("descriptors", "threads"),
 }
 """By row of the picture the columns of the curves that it shows."""
@@ -111,32 +112,34 @@ SOAK_PANELS = {
 
 def draw_soak(path: Path, curves: dict[str, Rows], title: str) -> None:
     """What was held and how long a frame took over the frames passed: a column for each pass, one scale in a row."""
-    size, gap = (430, 190), (80, 92)
-    canvas = Canvas(SHEET_PX, 56 + len(SOAK_PANELS) * (size[1] + gap[1]))
+    size, gap, first = (400, 170), (112, 96), 112
+    canvas = Canvas(SHEET_PX, first + len(SOAK_PANELS) * (size[1] + gap[1]) - 36)
     canvas.text(12, 10, title, 20, bold=True)
-    for row, (what, quantities) in enumerate(SOAK_PANELS.items()):
-        factor = 1e-3 if "thousands" in what else 1.0
-        top = 116 + row * (size[1] + gap[1])
+    known = {quantity for rows in curves.values() for point in rows for quantity in point}
+    shown = {what: own for what, names in SOAK_PANELS.items() if (own := [name for name in names if name in known])}
+    for row, (what, quantities) in enumerate(shown.items()):
+        top = first + row * (size[1] + gap[1])
         panels = []
         for column, (name, rows) in enumerate(curves.items()):
             axes = canvas.axes(LEFT_PX + column * (size[0] + gap[0]), top, *size)
             style_axes(axes, f"{name}: {what}")
             for index, quantity in enumerate(quantities):
                 places = [point["frames"] for point in rows if quantity in point]
-                values = [factor * point[quantity] for point in rows if quantity in point]
+                values = [point[quantity] for point in rows if quantity in point]
                 style = {"color": LINE_COLOURS[index], "marker": MARKERS[index], "linewidth": 1.6, "markersize": 4}
                 if values:
                     axes.plot(places, values, label=quantity.removesuffix(" MiB"), **style)
                     last = values[-1]
-                    shown = f"{last:,.0f}" if last >= 10 or last == int(last) else f"{last:.2g}"
+                    text = f"{last:,.0f}" if last >= 10 or last == int(last) else f"{last:.2g}"
                     beside = {"textcoords": "offset points", "va": "center", "fontsize": 8, "color": INK}
-                    axes.annotate(shown, (places[-1], last), (6, 0), annotation_clip=False, **beside)
+                    axes.annotate(text, (places[-1], last), (6, 0), annotation_clip=False, **beside)
             axes.set_xlabel("frames", color="#495057", fontsize=9)
             axes.set_xlim(0, None)
             panels.append(axes)
-        highest = max(axes.dataLim.ymax for axes in panels)
+        highest = max(max(line.get_ydata()) for axes in panels for line in axes.lines) or 1.0
         for axes in panels:
             axes.set_ylim(0, 1.12 * highest)
+            axes.yaxis.set_major_formatter("{x:,.0f}")
         keys: dict[str, Any] = {}
         for axes in panels:
             keys |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}

@@ -71,6 +71,8 @@ def benchmark_latency(
 ) -> dict[str, Any]:
     """Median milliseconds of a frame and of its parts, from the frame on the device to its boxes; reading is not in it.
 
+    The clocks of the parts run meanwhile, and on a GPU each of them waits for it.
+
     The spread is the range of the middle half. Frames count once the memory is full, or as full as scenes are long.
     `load` is how many processes wanted a core over the minute before, of `cores`.
     `memory_gb` is the largest that torch held on a GPU, or the process with its libraries on a CPU, in 1e9 bytes.

@@ -20,7 +20,7 @@ def page_name(config: Config) -> str:
     """Name of a suite's files: with model and phase where one is measured, with the scale, and with `gpu` on one."""
     if config.suite is BenchmarkSuite.metric:
         return config.suite.value
-    of_one_model = config.suite in (BenchmarkSuite.model, BenchmarkSuite.training)
+    of_one_model = config.suite in (BenchmarkSuite.model, BenchmarkSuite.training, BenchmarkSuite.soak)
     which = [config.model.name, config.phase.name] if of_one_model else []
     device = ["gpu"] if config.suite is not BenchmarkSuite.reader and chosen_device(config).type == "cuda" else []
     return "_".join([config.suite.value, *which, config.scale, *device])

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from src.config import Accelerator, Config
+from src.ops.pair_tiles import release_scratch
 from src.training.processes import check_devices
 
 PATIENCE = 4.0  # a first call that takes so many times what a candidate may take is its only one
@@ -171,9 +172,10 @@ def added_bytes(function: Callable[[], Any], device: torch.device) -> int | None
     """The most that a call takes beyond what was held before it; None where the system does not tell.
 
     On a GPU what torch allocates; on a CPU pages of the process (Linux), after the allocator has given back what it
-    kept of earlier calls.
+    kept of earlier calls. Memory that convolutions use again is part of the call.
     """
     gc.collect()
+    release_scratch()
     if device.type == "cuda":
         torch.cuda.synchronize()
         torch.cuda.reset_peak_memory_stats()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from dataclasses import dataclass
@@ -9,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from src.data.jpeg import REDUCTIONS, decode_fast
+from src.data.files import read_whole
+from src.data.jpeg import MAX_FILE_BYTES, REDUCTIONS, damage_of, decode_fast
 from src.errors import ConfigError, DataError
 from src.geometry.camera import image_transform
 
@@ -64,7 +66,8 @@ def read_image(
 ) -> Array:  # [3, H, W] uint8 RGB, not to be written to
     """Read, resample and augment one image. Greyscale and CMYK become RGB.
 
-    Raises DataError naming the file when it is missing, no image, truncated, a bomb or of another size.
+    Raises DataError naming the file when it is missing, no image, truncated, a bomb, of another size, or with a block
+    of zeros in it. JPEG has no checksum: a few bytes changed in the middle give an image of which a part is wrong.
     """
     return resample(decode(path, source_px, reduction_for(source_px, crop)), crop, source_px)
 
@@ -97,9 +100,13 @@ def decode_by_pillow(
     reduction: int,  # one of REDUCTIONS
 ) -> Image.Image:  # RGB
     """As `decode`, and what says what is wrong with a file."""
+    content = read_whole(path, MAX_FILE_BYTES)
+    damage = damage_of(content)
+    if damage:
+        raise DataError(f"{path}: not a readable image ({damage})")
     try:
         # Only JPEG: other decoders of Pillow start programs or unpack without bounds.
-        with Image.open(path, formats=("JPEG",)) as image:
+        with Image.open(io.BytesIO(content), formats=("JPEG",)) as image:
             width, height = image.size
             if (height, width) != tuple(source_px):
                 stated = f"{source_px[1]} x {source_px[0]}"
@@ -109,10 +116,12 @@ def decode_by_pillow(
             image.draft(image.mode, (max(1, width // reduction), max(1, height // reduction)))
             image.load()
             return image if image.mode == "RGB" else image.convert("RGB")
-    except FileNotFoundError as error:
-        raise DataError(f"{path}: no such file") from error
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
-        raise DataError(f"{path}: not a readable image ({error})") from error
+    except (DataError, MemoryError):
+        raise
+    except Exception as error:  # Pillow promises no set of them: damaged metadata fails in its parsers in many ways
+        # Its message may hold an address in memory: the same fault always reads the same.
+        reason = "no JPEG file" if isinstance(error, UnidentifiedImageError) else str(error)
+        raise DataError(f"{path}: not a readable image ({reason})") from error
 
 
 def resample(

@@ -15,10 +15,20 @@ from types import ModuleType
 import numpy as np
 from PIL import Image
 
+from src.data.files import read_whole
+from src.errors import DataError
+
 REDUCTIONS = (8, 4, 2, 1)
 """Scales at which a decoder gives a smaller image for less work: 1/8, 1/4, 1/2 and 1."""
 LEAST_PX = 16
 """Below, several scales give the same size and the one that a decoder takes is not known."""
+
+MAX_FILE_BYTES = 2**28
+"""Four bytes a pixel of the largest image; a longer file is no camera's."""
+MAX_SCANS = 100
+"""Progressive files have about ten. Each scan is a walk over all pixels, so a small file with many is a bomb."""
+HOLE_BYTES = 512
+"""A sector of a disk: zeros of this length among compressed data are a block that was never written."""
 
 _log = logging.getLogger(__name__)
 
@@ -31,17 +41,51 @@ def decode_fast(
     """The image that Pillow's `draft` and `load` give, for resizing only, or None where Pillow must read it itself.
 
     None stands for: no faster decoder, a file that is not there or damaged, another size, and anything but colour in
-    the usual encoding. Pillow then finds the same fault and names it.
+    the usual encoding. Pillow then finds the same fault and names it, or overlooks it.
     """
     decoder = _checked_decoder()
     if decoder is None or min(source_px) < LEAST_PX:
         return None
     try:
-        with open(path, "rb", buffering=0) as file:
-            content = file.readall()
-    except OSError:
+        content = read_whole(path, MAX_FILE_BYTES)
+    except DataError:
         return None
-    return _decode(decoder, content, source_px, reduction)
+    return None if damage_of(content) else _decode(decoder, content, source_px, reduction)
+
+
+def damage_of(content: bytes) -> str | None:
+    """What is wrong with a JPEG file though decoders accept it, or None.
+
+    A hole (a block of zeros) decodes without an error, and whatever comes after it in the image is wrong.
+    """
+    start, first_symbols = _head(content)
+    if start < 0:
+        return None  # no JPEG file, or none with image data: a decoder says so
+    scans = content.count(b"\xff\xda", start)
+    if scans > MAX_SCANS:
+        return f"at most {MAX_SCANS} scans are expected, but it has {scans}"
+    if first_symbols and not any(first_symbols):
+        return None  # tables made for an image of hardly more than one colour, where zeros may be many equal pixels
+    end = content.find(b"\xff\xd9", start)  # what comes after the image is not looked at
+    hole = content.find(bytes(HOLE_BYTES), start, end if end >= 0 else len(content))
+    return f"{HOLE_BYTES} bytes from byte {hole} are zero, a block of the file that was lost" if hole >= 0 else None
+
+
+def _head(content: bytes) -> tuple[int, list[int]]:
+    """Byte at which the image data begin, -1 without any, and what the code of zeros means in each Huffman table."""
+    at, first_symbols = 2, []
+    while at + 4 <= len(content) and content[at] == 0xFF:
+        marker = content[at + 1]
+        if marker == 0xDA:
+            return at, first_symbols
+        end = at + 1 if marker == 0xFF else at + 2 + int.from_bytes(content[at + 2 : at + 4], "big")
+        if marker == 0xC4:
+            table = at + 4
+            while table + 17 < min(end, len(content)):
+                first_symbols.append(content[table + 17])
+                table += 17 + sum(content[table + 1 : table + 17])
+        at = end
+    return -1, first_symbols
 
 
 def decoder_name() -> str:

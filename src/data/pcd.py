@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from src.data.files import read_whole
 from src.errors import DataError
 
 Array = np.ndarray
@@ -15,9 +16,14 @@ Array = np.ndarray
 RADAR_FIELDS = ("x", "y", "z", "vrel_x", "vrel_y", "vrel_z", "rcs")
 MAX_POINTS = 1_000_000
 """More than any sensor gives in one sweep; a larger number is a damaged header."""
+MAX_VALUES = 8 * MAX_POINTS
+"""Points times fields; what a file may take in memory follows from it."""
+MAX_FILE_BYTES = 2**27
 MAX_HEADER_BYTES = 4096
-_KINDS = {(kind, size): f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)}
-_KINDS |= {("F", 4): "<f4", ("F", 8): "<f8"}
+LARGEST = np.array([1e4, 1e4, 1e4, 1e3, 1e3, 1e3, 1e3], np.float32)
+"""Of each of RADAR_FIELDS in size, in m, m/s and dB: hundreds of times what a radar gives, so beyond it is damage."""
+_KINDS = {(kind, size): f"<{kind.lower()}{size}" for kind in "IU" for size in "1248"}
+_KINDS |= {("F", "4"): "<f4", ("F", "8"): "<f8"}
 
 
 @dataclass(frozen=True)
@@ -40,19 +46,18 @@ def read_radar_points(
     Fields are taken by name, in any order, from `binary` or `ascii` data; usual files are one read-only view of their
     bytes. Raises DataError naming the file, what was expected and what was found.
     """
-    try:
-        with open(path, "rb", buffering=0) as file:
-            content = file.readall()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    content = read_whole(path, MAX_FILE_BYTES)
     try:
         layout = _layout(content)
         points = _points(content, layout)
     except DataError as error:
         raise DataError(f"{path}: {error}") from error.__cause__
-    if not np.isfinite(points).all():
-        row = int(np.argmin(np.isfinite(points).all(axis=1)))
-        raise DataError(f"{path}: point {row} is not finite: {points[row].tolist()}")
+    possible = np.abs(points) <= LARGEST  # False for NaN too
+    if not possible.all():
+        row = int(np.argmin(possible.all(axis=1)))
+        finite = np.isfinite(points[row]).all()
+        fault = f"is beyond {LARGEST.tolist()}, more than any radar gives" if finite else "is not finite"
+        raise DataError(f"{path}: point {row} {fault}: {points[row].tolist()}")
     return points
 
 
@@ -65,7 +70,7 @@ def _points(content: bytes, layout: _Layout) -> Array:  # [n, 7] float32
     if layout.plain:
         return np.frombuffer(content, "<f4", offset=layout.start).reshape(layout.count, len(RADAR_FIELDS))
     table = np.frombuffer(content, layout.dtype, layout.count, layout.start)
-    return np.stack([table[name] for name in RADAR_FIELDS], axis=1).astype(np.float32)
+    return _as_float32(np.stack([table[name] for name in RADAR_FIELDS], axis=1))
 
 
 def _layout(content: bytes) -> _Layout:
@@ -85,6 +90,8 @@ def _parse_layout(content: bytes) -> _Layout:
     encoding = header.get("DATA", [""])[0]
     if encoding not in ("binary", "ascii"):
         raise DataError(f"DATA must be binary or ascii for a radar file, but got {encoding!r}")
+    if count * len(names) > MAX_VALUES:
+        raise DataError(f"at most {MAX_VALUES} numbers are expected, but got {count} points of {len(names)} fields")
     dtype = np.dtype(list(zip(names, kinds, strict=True)))
     plain = names == list(RADAR_FIELDS) and set(kinds) == {"<f4"}
     return _Layout(tuple(names), dtype, count, encoding, start, plain)
@@ -98,7 +105,7 @@ def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
     entries: dict[str, list[str]] = {}
     at = 0
     while at < min(len(content), MAX_HEADER_BYTES):
-        end = content.find(b"\n", at)
+        end = content.find(b"\n", at, MAX_HEADER_BYTES)
         if end < 0:
             break
         words = content[at:end].decode("ascii", "replace").split()
@@ -118,7 +125,7 @@ def _columns(header: dict[str, list[str]]) -> tuple[list[str], list[str]]:
         raise DataError(f"FIELDS, SIZE, TYPE and COUNT must have one entry per field, but got {lines}")
     if set(counts) != {"1"}:
         raise DataError(f"every field must have COUNT 1, but got {counts}")
-    kinds = [_KINDS.get((kind, int(size) if size.isdigit() else 0)) for kind, size in zip(types, sizes, strict=True)]
+    kinds = [_KINDS.get((kind, size)) for kind, size in zip(types, sizes, strict=True)]
     if None in kinds:
         at = kinds.index(None)
         raise DataError(f"field {names[at]} has TYPE {types[at]} SIZE {sizes[at]}, which is not supported")
@@ -129,7 +136,7 @@ def _count(header: dict[str, list[str]]) -> int:
     numbers = {}
     for key in ("WIDTH", "HEIGHT", "POINTS"):
         words = header.get(key, [])
-        if len(words) != 1 or not words[0].isdigit():
+        if len(words) != 1 or not words[0].isdigit() or len(words[0]) > 18:
             raise DataError(f"{key} must be one whole number, but got {words}")
         numbers[key] = int(words[0])
     if numbers["POINTS"] > MAX_POINTS or numbers["WIDTH"] * numbers["HEIGHT"] != numbers["POINTS"]:
@@ -138,11 +145,20 @@ def _count(header: dict[str, list[str]]) -> int:
 
 
 def _ascii_points(text: bytes, names: tuple[str, ...], count: int) -> Array:
-    words = text.split()
-    if len(words) != count * len(names):
-        raise DataError(f"{count} points of {len(names)} fields expected, but {len(words)} numbers found")
+    expected = count * len(names)
+    words = text.split(maxsplit=expected)  # and what is left over as one more
+    if len(words) != expected:
+        found = f"only {len(words)} numbers" if len(words) < expected else "more numbers"
+        raise DataError(f"{count} points of {len(names)} fields expected, but {found} found")
     try:
         table = np.array(words, dtype=np.float64).reshape(count, len(names))
     except ValueError as error:
         raise DataError(f"not a number in the data ({error})") from error
-    return table[:, [names.index(name) for name in RADAR_FIELDS]].astype(np.float32)
+    return _as_float32(table[:, [names.index(name) for name in RADAR_FIELDS]])
+
+
+def _as_float32(
+    values: Array,  # [n, 7] numbers of any type
+) -> Array:  # [n, 7] float32, infinite beyond its range
+    with np.errstate(over="ignore", invalid="ignore"):
+        return values.astype(np.float32)

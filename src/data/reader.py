@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
 from typing import TypeVar
@@ -38,6 +38,17 @@ class OnBadFile(Enum):
 
     error = "error"
     skip = "skip"  # counted; a radar file gives no points, an image a masked camera
+
+
+@dataclass
+class _Skipped:
+    """What a frame does without."""
+
+    channels: dict[str, int] = field(default_factory=dict)
+    files: list[str] = field(default_factory=list)
+
+    def count(self, channel: str) -> None:
+        self.channels[channel] = self.channels.get(channel, 0) + 1
 
 
 @dataclass(frozen=True)
@@ -85,7 +96,7 @@ class FrameReader:
             aug_from_ego = draw_bev_transform(bev, frame_generator(seed, epoch, clip))
         pose = index.frame_poses[sample]
         global_from_ego = pose_matrix(index.pose_rotations[pose], index.pose_translations[pose])
-        skipped: dict[str, int] = {}
+        skipped = _Skipped()
         points = self._radar_points(sample, global_from_ego, aug_from_ego, skipped)
         batch = {
             "tokens": [token],
@@ -94,13 +105,12 @@ class FrameReader:
             "aug_from_ego": torch.from_numpy(aug_from_ego[None].astype(np.float32)),
             "radar_points": torch.from_numpy(points),
             "radar_batch": torch.zeros(len(points), dtype=torch.int64),
-            "skipped": skipped,
         }
         if self.settings.image_size_px is not None:
             batch |= self._images(sample, global_from_ego, aug_from_ego, augmentation, rng, skipped)
         if index.annotated:
             batch["boxes"] = [self._boxes(sample, global_from_ego).transform(torch.from_numpy(aug_from_ego))]
-        return FrameBatch(**batch)
+        return FrameBatch(**batch, skipped=skipped.channels, bad_files=skipped.files)
 
     # ---------------------------------------------------------------- radar
 
@@ -109,14 +119,14 @@ class FrameReader:
         sample: int,
         global_from_ego: Array,  # [4, 4]
         aug_from_ego: Array,  # [4, 4]
-        skipped: dict[str, int],
+        skipped: _Skipped,
     ) -> Array:  # [P, 7] float32, see RADAR_POINT_FIELDS
         """All sweeps, moved to ego(t) and compensated for the ego motion by the full mount (spec section 1.3)."""
         rows, clouds = [], []
         for channel in RADARS:
             row = int(self.index.key_data[sample, CHANNELS.index(channel)])
             if row < 0:
-                _count(skipped, f"{channel} (not recorded)")
+                skipped.count(f"{channel} (not recorded)")
             for _ in range(self.settings.num_sweeps):
                 if row < 0:
                     break
@@ -144,7 +154,7 @@ class FrameReader:
         aug_from_ego: Array,  # [4, 4]
         augmentation: AugmentationConfig | None,
         rng: np.random.Generator,
-        skipped: dict[str, int],
+        skipped: _Skipped,
     ) -> dict[str, torch.Tensor]:
         """Images at network size and P_n by each camera's own pose; a missing camera stays black and masked."""
         index, settings = self.index, self.settings
@@ -162,7 +172,7 @@ class FrameReader:
         for view, channel in enumerate(CAMERAS):
             row = int(rows[view])
             if row < 0:
-                _count(skipped, f"{channel} (not recorded)")
+                skipped.count(f"{channel} (not recorded)")
                 continue
             source_px = tuple(int(n) for n in index.data_sizes[row])
             crop = (
@@ -208,9 +218,7 @@ class FrameReader:
 
     # ---------------------------------------------------------------- files
 
-    def _guarded(
-        self, sample: int, channel: str, row: int, read: Callable[[str], T], skipped: dict[str, int]
-    ) -> T | None:
+    def _guarded(self, sample: int, channel: str, row: int, read: Callable[[str], T], skipped: _Skipped) -> T | None:
         """Read a sensor file; when it cannot be, raise or count and return None, as `on_bad_file` says."""
         name = self.index.filename(row)
         try:
@@ -219,7 +227,8 @@ class FrameReader:
             if self.settings.on_bad_file is OnBadFile.error:
                 remedy = "restore the file, or count and pass over such files with data.on_bad_file=skip"
                 raise DataError(f"{error} (sample {self.index.sample_tokens[sample]}); {remedy}") from error
-            _count(skipped, channel)
+            skipped.count(channel)
+            skipped.files.append(name)
             if name not in self._reported:
                 self._reported.add(name)
                 _log.warning("skipped: %s", error)
@@ -351,7 +360,3 @@ def ego_motion(
             f"{speed[at]:.0f} m/s; a truck stays below {MAX_EGO_SPEED_MPS:.0f}, so the pose table is damaged there"
         )
     return velocity, rate
-
-
-def _count(skipped: dict[str, int], name: str) -> None:
-    skipped[name] = skipped.get(name, 0) + 1

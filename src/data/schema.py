@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from src.data.tables import Table
+from src.data.tables import LARGEST, MAX_DESCRIPTION, Table
 from src.errors import DataError
 from src.geometry.transforms import pose_matrix
 from src.structures.taxonomy import (
@@ -46,6 +46,10 @@ OPTIONAL_TABLES = ("weather_annotation",)  # came with v1.1
 LABEL_IGNORED, LABEL_RACK = -1, -2
 MAX_SPEED_INTERVAL_S = 1.5
 """Devkit rule: neighbours further apart give no velocity; twice that when both neighbours exist."""
+MAX_BOX_SIZE_M = 1000.0
+MAX_BOX_SPEED_MPS = 1000.0
+MAX_POINTS_OF_BOX = 100_000_000
+"""Beyond these a number is damage: the box is left out, its velocity unknown, the table refused."""
 
 _log = logging.getLogger(__name__)
 
@@ -99,7 +103,7 @@ class DatasetIndex:
 
     def filename(self, data_row: int) -> str:
         """Path of a sensor file relative to the root."""
-        return self.data_filenames[data_row].decode()
+        return self.data_filenames[data_row].decode(errors="replace")  # from a damaged cache: no such file, then
 
     def samples_of(self, scene_names: set[str]) -> Array:  # [n] int64
         """Rows of the samples whose scene is named, in table order."""
@@ -172,7 +176,7 @@ def _scene_columns(scenes: Table, samples: Table) -> dict[str, Array]:
         samples.fail(int(order[at + 1]), "timestamp", int(times[order[at]]), f"another time than sample {other!r}")
     return {
         "scene_names": np.array(names),
-        "scene_descriptions": np.array(scenes.values("description")),
+        "scene_descriptions": np.array(scenes.values("description", most=MAX_DESCRIPTION)),
         "sample_tokens": np.array(samples.tokens),
         "sample_scenes": scene_rows.astype(np.int32),
         "sample_times_us": times,
@@ -302,14 +306,15 @@ def _box_columns(folder: Path, samples: Table, annotated: bool, parts: dict[str,
     centers = table.vectors("translation", 3, finite=False)
     sizes = table.vectors("size", 3, finite=False)
     attribute_ids = _box_attributes(table, attributes, labels >= 0)
-    points = table.integers("num_lidar_pts") + table.integers("num_radar_pts")
+    points = _box_points(table)
     velocities = _box_velocities(table, instance_rows, 1e-6 * parts["sample_times_us"][sample_rows], centers)
     rotations = table.quaternions("rotation")
 
-    sound = np.isfinite(centers).all(axis=1) & np.isfinite(sizes).all(axis=1) & (sizes > 0).all(axis=1)
+    sound = _is_place(centers) & ((sizes > 0) & (sizes <= MAX_BOX_SIZE_M)).all(axis=1)
     if not sound.all():
         _log.warning(
-            "%s: %d annotations without a finite centre or a positive size are left out (first: %s)",
+            "%s: %d annotations without a centre on Earth or a size above 0 and below a kilometre are left out "
+            "(first: %s)",
             table.path, int((~sound).sum()), table.tokens[int(np.argmin(sound))],
         )  # fmt: skip
     kept = np.flatnonzero((labels != LABEL_IGNORED) & sound)
@@ -318,6 +323,23 @@ def _box_columns(folder: Path, samples: Table, annotated: bool, parts: dict[str,
     columns = {"labels": labels, "centers": centers, "sizes": sizes, "rotations": rotations}
     columns |= {"velocities": velocities, "attributes": attribute_ids, "points": points.astype(np.int32)}
     parts |= {f"box_{name}": column[kept] for name, column in columns.items()}
+
+
+def _is_place(
+    centers: Array,  # [n, 3] m
+) -> Array:  # [n] bool
+    return (np.abs(centers) <= LARGEST).all(axis=1)  # False for NaN too
+
+
+def _box_points(table: Table) -> Array:  # [n] int64
+    """Lidar and radar returns; -1 stands for unknown."""
+    total = np.zeros(len(table), np.int64)
+    for field in ("num_lidar_pts", "num_radar_pts"):
+        counts = table.integers(field)
+        expected = f"a number of points, at most {MAX_POINTS_OF_BOX}"
+        table.check((counts >= -1) & (counts <= MAX_POINTS_OF_BOX), field, counts, expected)
+        total += counts
+    return total
 
 
 def _category_labels(categories: Table) -> Array:  # [n] int8
@@ -366,6 +388,7 @@ def _box_velocities(
     elapsed = times_s[last] - times_s[first]
     limit = MAX_SPEED_INTERVAL_S * np.where((first != rows) & (last != rows), 2, 1)
     unknown = (elapsed <= 0) | (elapsed > limit)
-    velocities = (centers[last] - centers[first]) / np.where(unknown, 1.0, elapsed)[:, None]
-    velocities[unknown] = np.nan
+    known = np.where(_is_place(centers)[:, None], centers, np.nan)
+    velocities = (known[last] - known[first]) / np.where(unknown, 1.0, elapsed)[:, None]
+    velocities[unknown | (np.abs(velocities) > MAX_BOX_SPEED_MPS).any(axis=1)] = np.nan
     return velocities

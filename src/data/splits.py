@@ -50,7 +50,7 @@ def _read_splits(index: DatasetIndex) -> tuple[dict[str, list[str]], Path]:
 def _checked(path: Path) -> dict[str, list[str]]:
     try:
         splits = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: not readable as JSON ({error}); restore or delete it") from None
     good = isinstance(splits, dict) and all(
         isinstance(names, list) and all(isinstance(name, str) for name in names) for names in splits.values()

@@ -9,9 +9,20 @@ from typing import Any
 
 import numpy as np
 
+from src.data.files import read_whole
 from src.errors import DataError
 
 Array = np.ndarray
+
+MAX_TEXT = 255
+"""Characters of a token, a name or a path: arrays of them take the length of the longest for each record."""
+MAX_DESCRIPTION = 10_000
+MAX_TABLE_BYTES = 2**36
+"""64 GiB; the largest real table has a few."""
+LARGEST = 1e8
+"""Of any number in size, mostly metres: beyond every place on Earth in every map projection."""
+LAST_TIME_US = 10**16
+"""Three hundred years after 1970."""
 
 _REMEDY = "restore the file from the data set's archive, or write the synthetic world again"
 
@@ -41,11 +52,8 @@ class Table:
 
     def fail(self, row: int, field: str, value: object, expected: str) -> None:
         """Raise a DataError about one value of one record."""
-        token = self.records[row].get("token", "")
-        text = repr(value)
-        text = text if len(text) <= 120 else text[:117] + "..."
-        where = f"{self.path}: {self.name} {token!r} (record {row})"
-        raise DataError(f"{where}: {field}={text}, expected {expected}; {_REMEDY}")
+        where = f"{self.path}: {self.name} {_short(self.records[row].get('token', ''))} (record {row})"
+        raise DataError(f"{where}: {field}={_short(value)}, expected {expected}; {_REMEDY}")
 
     def check(self, good: Array, field: str, values: Sequence[object] | Array, expected: str) -> None:
         """Raise about the first record for which `good` [n] is False."""
@@ -54,20 +62,23 @@ class Table:
             value = values[row]
             self.fail(row, field, value.tolist() if isinstance(value, np.ndarray | np.generic) else value, expected)
 
-    def values(self, field: str, kind: type = str) -> list[Any]:
-        """One field of every record, all of type `kind`."""
+    def values(self, field: str, kind: type = str, most: int = MAX_TEXT) -> list[Any]:
+        """One field of every record, all of type `kind`; a text of at most `most` characters that UTF-8 can write."""
         try:
             column = [record[field] for record in self.records]
         except KeyError:
             row = next(row for row, record in enumerate(self.records) if field not in record)
-            token = self.records[row].get("token", "")
+            token = _short(self.records[row].get("token", ""))
             raise DataError(
-                f"{self.path}: {self.name} {token!r} (record {row}) has no field '{field}', "
-                f"but only {sorted(self.records[row])}; {_REMEDY}"
+                f"{self.path}: {self.name} {token} (record {row}) has no field '{field}', "
+                f"but only {_short(sorted(self.records[row]))}; {_REMEDY}"
             ) from None
         if any(type(value) is not kind for value in column):
             row = next(row for row, value in enumerate(column) if type(value) is not kind)
             self.fail(row, field, column[row], f"a value of type {kind.__name__}")
+        if kind is str and not _is_plain(column, most):
+            row = next(row for row, value in enumerate(column) if not _is_plain([value], most))
+            self.fail(row, field, column[row], f"a text of at most {most} characters, without NUL and lone surrogates")
         return column
 
     def integers(self, field: str) -> Array:  # [n] int64
@@ -83,11 +94,12 @@ class Table:
     def times(self) -> Array:  # [n] int64, microseconds
         """The time stamps."""
         stamps = self.integers("timestamp")
-        self.check(stamps > 0, "timestamp", stamps, "microseconds since 1970, above 0")
+        possible = (stamps > 0) & (stamps < LAST_TIME_US)
+        self.check(possible, "timestamp", stamps, f"microseconds since 1970, above 0 and below {LAST_TIME_US}")
         return stamps
 
     def vectors(self, field: str, width: int, finite: bool = True) -> Array:  # [n, width] float64
-        """A list of `width` numbers per record; NaN and infinity are refused unless `finite` is False."""
+        """A list of `width` numbers per record; unless `finite` is False none is NaN or beyond LARGEST in size."""
         return self._numbers(self.values(field, list), field, (width,), finite=finite)
 
     def quaternions(self, field: str) -> Array:  # [n, 4] float64 (w, x, y, z), unit length
@@ -122,7 +134,7 @@ class Table:
     def _numbers(
         self, column: list[Any], field: str, shape: tuple[int, ...], first_row: int = 0, finite: bool = True
     ) -> Array:
-        """Numbers of one shape per record, float64."""
+        """Numbers of one shape per record, float64, of at most LARGEST in size unless `finite` is False."""
         try:
             raw = np.array(column) if column else np.zeros((0, *shape))
         except ValueError:  # ragged
@@ -131,11 +143,26 @@ class Table:
             row = _first(column, lambda value: not _is_numeric(value, shape))
             self.fail(first_row + row, field, column[row], f"{'x'.join(map(str, shape))} numbers")
         result = raw.astype(np.float64)
-        good = np.isfinite(result).all(axis=tuple(range(1, result.ndim)))
+        good = (np.abs(result) <= LARGEST).all(axis=tuple(range(1, result.ndim)))  # False for NaN too
         if finite and not good.all():
             row = int(np.argmin(good))
-            self.fail(first_row + row, field, column[row], "finite numbers")
+            self.fail(first_row + row, field, column[row], f"finite numbers of at most {LARGEST:g} in size")
         return result
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 120 else text[:117] + "..."
+
+
+def _is_plain(texts: list[str], most: int) -> bool:
+    """Whether arrays and files can hold these: numpy drops a NUL at the end, UTF-8 has no lone surrogates."""
+    try:
+        whole = "".join(texts)
+        whole.encode()
+    except UnicodeEncodeError:
+        return False
+    return "\0" not in whole and max(map(len, texts), default=0) <= most
 
 
 def _first(column: list[Any], bad: Callable[[Any], bool]) -> int:
@@ -151,17 +178,17 @@ def _is_numeric(value: object, shape: tuple[int, ...]) -> bool:
 
 
 def _read_list(path: Path) -> list[dict[str, Any]]:
+    if not path.exists():
+        raise DataError(f"{path}: this table is missing; {_REMEDY}")
     try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise DataError(f"{path}: this table is missing; {_REMEDY}") from None
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_whole(path, MAX_TABLE_BYTES).decode("utf-8")
+    except UnicodeDecodeError as error:
         raise DataError(f"{path}: cannot be read as UTF-8 text ({error}); {_REMEDY}") from None
     try:
         records = json.loads(text)
     except json.JSONDecodeError as error:
         raise DataError(f"{path}: line {error.lineno}, column {error.colno}: {error.msg}; {_REMEDY}") from None
-    except (RecursionError, ValueError) as error:
+    except (RecursionError, ValueError) as error:  # nested too deeply; a number of too many digits
         raise DataError(f"{path}: not a table ({error}); {_REMEDY}") from None
     if not isinstance(records, list):
         raise DataError(f"{path}: expected a list of records, but got {type(records).__name__}; {_REMEDY}")

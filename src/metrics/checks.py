@@ -12,12 +12,19 @@ from src.structures.taxonomy import ATTRIBUTES, CLASSES, MAX_BOXES_PER_SAMPLE
 
 Array = np.ndarray
 
+LARGEST = 1e9
+"""Of any number in size: beyond it, squares and differences lose their meaning long before they overflow."""
+SMALLEST_ROTATION = 1e-100
+"""Of a quaternion's largest entry: the square of a smaller one is 0, and so is its length."""
+_FINITE = f"finite, at most {LARGEST:g} in size"
+
 
 def check_predictions(table: DetectionTable, tokens: Sequence[str]) -> None:
     """Refuse predictions that the official evaluator refuses, or would score with no meaning.
 
-    Refused: indices outside the samples, classes or attributes; numbers that are not finite (only a velocity may be
-    NaN); sizes that are not positive; a rotation of all zeros; negative scores; more than 500 boxes of one sample.
+    Refused: indices outside the samples, classes or attributes; numbers that are not finite or beyond LARGEST (only a
+    velocity may be NaN); sizes that are not positive; a rotation of all zeros; negative scores; more than 500 boxes of
+    one sample.
 
     Raises DataError naming the sample, the box (counted within the table) and the value.
     """
@@ -25,11 +32,11 @@ def check_predictions(table: DetectionTable, tokens: Sequence[str]) -> None:
         "samples": (_within(table.samples, 0, len(tokens)), f"0..{len(tokens) - 1}"),
         "labels": (_within(table.labels, 0, len(CLASSES)), f"0..{len(CLASSES) - 1}"),
         "attributes": (_within(table.attributes, -1, len(ATTRIBUTES)), f"-1..{len(ATTRIBUTES) - 1}"),
-        "centers": (np.isfinite(table.centers), "finite"),
-        "sizes": (np.isfinite(table.sizes) & (table.sizes > 0), "finite and positive"),
-        "rotations": (np.isfinite(np.where(_all_zero(table.rotations), np.nan, table.rotations)), "finite, not all 0"),
-        "velocities": (~np.isinf(table.velocities), "finite or NaN"),
-        "scores": (np.isfinite(table.scores) & (table.scores >= 0), "finite and at least 0"),
+        "centers": (np.abs(table.centers) <= LARGEST, _FINITE),
+        "sizes": ((table.sizes > 0) & (table.sizes <= LARGEST), f"positive and {_FINITE}"),
+        "rotations": (_are_rotations(table.rotations), f"{_FINITE}, not all 0"),
+        "velocities": (~(np.abs(table.velocities) > LARGEST), f"{_FINITE}, or NaN"),
+        "scores": ((table.scores >= 0) & (table.scores <= LARGEST), f"at least 0 and {_FINITE}"),
     }
     for name, (right, expected) in valid.items():
         if right.all():
@@ -55,8 +62,9 @@ def _within(
     return (values >= low) & (values < high)
 
 
-def _all_zero(
+def _are_rotations(
     rotations: Array,  # [n, 4]
-) -> Array:  # [n, 1] bool
-    w, x, y, z = rotations.T
-    return ((w == 0) & (x == 0) & (y == 0) & (z == 0))[:, None]
+) -> Array:  # [n, 4] bool
+    possible = np.abs(rotations) <= LARGEST  # False for NaN too
+    length = np.abs(np.where(possible, rotations, 0.0)).max(axis=1, initial=0.0)
+    return possible & (length >= SMALLEST_ROTATION)[:, None]

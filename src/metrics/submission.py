@@ -15,7 +15,7 @@ import numpy as np
 
 from src.errors import DataError
 from src.geometry.transforms import matrix_to_quaternion
-from src.metrics.checks import check_predictions
+from src.metrics.checks import LARGEST, SMALLEST_ROTATION, check_predictions
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
 from src.structures.taxonomy import ATTRIBUTES, CLASSES, MAX_BOXES_PER_SAMPLE
@@ -36,10 +36,10 @@ def load_submission(path: Path | str, tokens: Sequence[str]) -> DetectionTable:
 
     Refused are all files that the official evaluator refuses, and some that it accepts by oversight, because their
     score would mean something else than their author believes or depend on what happens to match: numbers written as
-    strings, infinities, negative or missing scores, sizes that are not positive, a rotation of all zeros, and a
-    `sample_token` that differs from the sample the box is listed under. A velocity may be NaN or null (unknown);
-    scores above 1, attributes of another class and unknown extra fields are accepted, and a `num_pts` of 0 drops
-    the box, as officially.
+    strings, infinities and numbers beyond 1e9, negative or missing scores, sizes that are not positive, a rotation of
+    all zeros, and a `sample_token` that differs from the sample the box is listed under. A velocity may be NaN or null
+    (unknown); scores above 1, attributes of another class and unknown extra fields are accepted, and a `num_pts` of 0
+    drops the box, as officially.
 
     Raises DataError naming file, sample, box index and field, with what was found and what was expected.
     """
@@ -157,10 +157,10 @@ def _fault_of(token: str, box: object) -> str | None:
         for value in values:
             unknown = name == "velocity" and (value is None or _is_nan(value))
             if not unknown and not _is_finite(value):
-                return f"'{name}' must hold finite numbers, but got {_short(value)}"
+                return f"'{name}' must hold finite numbers of at most {LARGEST:g} in size, but got {_short(value)}"
     if min(box["size"]) <= 0:
         return f"'size' must be positive, but got {_short(box['size'])}"
-    if not any(box["rotation"]):
+    if max(map(abs, box["rotation"])) < SMALLEST_ROTATION:
         return f"'rotation' must be a quaternion (w, x, y, z), but got {_short(box['rotation'])}"
     for name, known in (("detection_name", _LABELS), ("attribute_name", _ATTRIBUTES)):
         if not isinstance(box[name], str) or box[name] not in known:
@@ -176,10 +176,7 @@ def _fault_of(token: str, box: object) -> str | None:
 def _is_finite(value: object) -> bool:
     if type(value) not in _NUMBERS:
         return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # an integer beyond every float
-        return False
+    return abs(value) <= LARGEST  # False for NaN; exact for integers beyond every float
 
 
 def _is_nan(value: object) -> bool:

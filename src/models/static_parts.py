@@ -41,7 +41,8 @@ class _Capture:
 class GraphReplay(nn.Module):
     """Runs a network as one CUDA graph for each shape of its input, without its launches; on a CPU as it is.
 
-    What it returns is a copy, so results of earlier calls stay what they are.
+    What it returns is a copy, so results of earlier calls stay what they are. One thread at a time may call it: all
+    calls share the graph's input.
     """
 
     def __init__(self, network: nn.Module) -> None:

@@ -132,7 +132,7 @@ def deform_attend_images_reference(
             total = total + (sampled.view(heads, -1, *sampled.shape[2:]) * level_share).sum(3)  # [heads, c, q]
         # The queries of one image are distinct, so the sum does not depend on the order of the additions.
         out.index_add_(0, rows + image // views * queries, total.flatten(0, 1).t())
-    return out.view(batch_size, queries, -1).to(values[0].dtype)
+    return out.view(batch_size, queries, values[0].shape[2]).to(values[0].dtype)
 
 
 def _corners(

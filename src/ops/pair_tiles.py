@@ -122,3 +122,8 @@ def scratch(
         with torch.inference_mode(False):  # or training could not use it after an evaluation
             block = _scratch.blocks[name, device] = torch.empty(size, dtype=torch.uint8, device=device)
     return block[:size].view(dtype).view(rows, columns)
+
+
+def release_scratch() -> None:
+    """Give the calling thread's reused memory back; the next convolution takes it anew."""
+    _scratch.blocks.clear()

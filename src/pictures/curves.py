@@ -20,6 +20,8 @@ Series = dict[str, tuple[Array, Array]]  # name -> epochs [E], values [E]
 LINE_COLOURS = ("#0072B2", "#D55E00", "#00846B", "#8C2D7E", "#E6A000", "#3DA5D9", "#6B3E1E", "#E7298A", "#4B3BB5")
 LINE_DASHES = ("-", (0, (5, 1.6)), (0, (1.4, 1.4)))
 HEIGHT_PX = 520
+MAX_EPOCHS, LARGEST = 1e6, 1e15
+"""A row or a value beyond them is damage and left out."""
 
 
 def read_metrics(
@@ -31,8 +33,11 @@ def read_metrics(
     Raises DataError when the file has no `epoch` column or holds something else than numbers.
     """
     path = Path(path)
-    with path.open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    try:
+        with path.open(newline="") as stream:
+            rows = list(csv.DictReader(stream))
+    except (OSError, ValueError, csv.Error) as error:
+        raise DataError(f"{path}: not a readable CSV log ({type(error).__name__}: {error})") from error
     if not rows or "epoch" not in rows[0]:
         raise DataError(f"{path}: must be a CSV log with a column `epoch` and at least one row")
     values: dict[str, dict[int, list[float]]] = {}
@@ -41,10 +46,10 @@ def read_metrics(
             numbers = {name: float(text) for name, text in row.items() if name and text}
         except (TypeError, ValueError) as error:
             raise DataError(f"{path}, line {number}: every cell must be a number or blank ({error})") from error
-        if not np.isfinite(epoch := numbers.pop("epoch", np.nan)):
+        if not 0 <= (epoch := numbers.pop("epoch", np.nan)) < MAX_EPOCHS:
             continue
         for name, value in numbers.items():
-            if name != "step" and np.isfinite(value):
+            if name != "step" and abs(value) <= LARGEST:
                 values.setdefault(name, {}).setdefault(int(epoch), []).append(value)
     series = {
         name: (np.array(sorted(by_epoch)), np.array([np.mean(by_epoch[epoch]) for epoch in sorted(by_epoch)]))

@@ -11,6 +11,7 @@ import yaml
 from src.overrides import key_of
 from src.reporting.escaping import as_code
 from src.reporting.metric_names import SPEEDS
+from src.reporting.plain_yaml import load_plain_yaml
 from src.reporting.results import RunResult
 from src.reporting.tables import (
     BY_RANGE,
@@ -110,7 +111,7 @@ def _is_default(key: str, override: str, defaults: dict[str, Any]) -> bool:
             return False
         value = value[name]
     try:
-        said = yaml.safe_load(override.partition("=")[2])
+        said = load_plain_yaml(override.partition("=")[2])
     except yaml.YAMLError:
         return False
     if isinstance(value, dict):  # a part is chosen by its name

@@ -17,9 +17,11 @@ import yaml
 from src.errors import DataError
 from src.overrides import OUTSIDE_IDENTITY, is_of, key_of, without_keys
 from src.reporting.metric_names import METRICS
+from src.reporting.plain_yaml import load_plain_yaml
 from src.reporting.writing import write_whole
 
 FORMAT = 1
+RUN_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 MAX_POINTS = 200
 """Of a learning curve."""
 
@@ -121,6 +123,13 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
     Raises DataError naming file and key of a run folder that is not as a run leaves it, OSError naming the result for
     a disk that does not take it: the older one stays.
     """
+    try:
+        return _publish(run_folder, reports)
+    except RecursionError as error:
+        raise DataError(f"{run_folder}: a file of this run is nested too deeply; give the run's command again") from error
+
+
+def _publish(run_folder: Path, reports: Path) -> Path:
     remedy = "delete run.json and metrics.json there and give the run's command again"
     record, scores = _Json(run_folder / "run.json", remedy), _Json(run_folder / "metrics.json", remedy)
     config = _read_config(run_folder / "config.yaml")
@@ -142,6 +151,8 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
     }
     lines = (f"{json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
     text = "{\n" + ",\n".join(lines) + "\n}\n"  # a line per key: compact, and a change is seen where it is
+    if not RUN_ID.fullmatch(fields["run_id"]):
+        raise record.refusal(("run_id",), f"must be the name of a folder, but is {fields['run_id']!r:.80}")
     path = result_path(reports, fields["run_id"])
     if not path.is_file() or path.read_bytes() != text.encode():
         write_whole(path, text)
@@ -207,6 +218,8 @@ class _Json:
         try:
             text = path.read_text(encoding="utf-8")
             self.content = json.loads(text)
+            if "\\ud" in text or "\\uD" in text:  # half a pair, which no page can hold, is a UnicodeEncodeError
+                json.dumps(self.content, ensure_ascii=False).encode()
         except (OSError, ValueError) as error:
             raise DataError(f"{path}: not readable as JSON ({error}); {remedy}") from error
         except RecursionError as error:
@@ -341,9 +354,10 @@ def _is_point(point: Any) -> bool:
 
 def _read_config(path: Path) -> dict[str, Any]:
     try:
-        content = yaml.load(path.read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        content = load_plain_yaml(path.read_text())
         if not all(isinstance(content[part]["name"], str) for part in ("model", "phase")):
             raise TypeError("model.name and phase.name must be words")
+        json.dumps(content, allow_nan=False)  # a result holds it: no dates, and no number that is not finite
     except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError) as error:
         what = " ".join(str(error).split())
         raise DataError(f"{path}: not a run's configuration ({type(error).__name__}: {what})") from error

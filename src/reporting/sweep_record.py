@@ -107,7 +107,8 @@ def read_record(path: Path) -> SweepRecord:
     """Raises DataError naming the file for anything that is not a record of this format."""
     remedy = "delete it and give the sweep's command again: finished runs are found and not trained anew"
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
+        json.dumps(content, ensure_ascii=False).encode()  # half of a surrogate pair is nothing a page can hold
         if not isinstance(content, dict):
             raise TypeError(f"must hold an object, but holds a {type(content).__name__}")
         found = content.pop("format", None)

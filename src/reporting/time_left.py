@@ -26,7 +26,9 @@ def seconds_left(
     running = [run for run in record.runs.values() if run.state == "running"]
     waiting = [run for run in record.runs.values() if run.state == "waiting"]
     work = sum(means.get(_phase(run), overall) for run in waiting) + overall * record.unchosen
-    work += sum(max(0.0, means.get(_phase(run), overall) - (now - (run.started or now))) for run in running)
+    for run in running:
+        elapsed = max(0.0, now - (run.started or now))  # a clock that was set back says less than nothing
+        work += max(0.0, means.get(_phase(run), overall) - elapsed)
     return work / max(workers, len(running), 1)
 
 

@@ -38,6 +38,7 @@ class FrameBatch:
     lanes: Tensor | None = None  # [B] int64, unique: the stream of frames that each row is the next of; None: unordered
     starts: Tensor | None = None  # [B] bool, the row begins a clip: memory of its lane ends here; given with `lanes`
     skipped: dict[str, int] = field(default_factory=dict)  # unreadable files passed over, by channel
+    bad_files: list[str] = field(default_factory=list)  # which these were, relative to the data set's root
 
     def __post_init__(self) -> None:
         b = len(self.tokens)

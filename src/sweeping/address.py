@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import re
 from pathlib import Path
 from urllib.parse import unquote
@@ -12,7 +13,7 @@ from src.errors import ConfigError
 
 # Both take too much rather than too little: a password that holds the character that should end it stays hidden.
 IN_AUTHORITY = re.compile(r"(://[^:]*:)(.*)(?=@)", re.DOTALL)
-AS_OPTION = re.compile(r"""((?:password|passwd|pwd)=)('.*'|".*"|[^&]*)""", re.DOTALL | re.IGNORECASE)
+AS_OPTION = re.compile(r"""((?:password|passwd|pwd|api_?key|secret|token)=)('.*'|".*"|[^&]*)""", re.DOTALL | re.IGNORECASE)
 
 
 def default_storage(outputs: Path) -> str:
@@ -28,10 +29,40 @@ def masked(text: str) -> str:
 
 def without_secrets(text: str, url: str) -> str:
     """What a database or its driver says of an address, without the address's passwords."""
-    hidden = {found[2].strip("'\"") for form in (IN_AUTHORITY, AS_OPTION) for found in form.finditer(url)}
+    hidden = _secrets(url)
     for secret in sorted(hidden | {unquote(secret) for secret in hidden}, key=len, reverse=True):
-        text = text.replace(secret, "***") if secret else text
+        text = text.replace(secret, "***")
     return masked(text)
+
+
+def hide_in_process_list(url: str) -> None:
+    """Overwrite an address's passwords in this process's command line, which every user of the machine can read.
+
+    What the shell, make or a job's script show of it stays, and so does the moment before this is called: a password
+    in ~/.pgpass or PGPASSWORD is never shown. Does nothing where the system does not say where the line lies (only
+    Linux does).
+    """
+    try:
+        # Fields 48 and 49 of proc(5); the name in parentheses, the second, may hold blanks.
+        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+        begin, shown = int(fields[45]), Path("/proc/self/cmdline").read_bytes()
+        if not begin or int(fields[46]) - begin != len(shown):
+            return
+    except (OSError, ValueError, IndexError):
+        return
+    if ctypes.string_at(begin, len(shown)) != shown:
+        return
+    for secret in (secret.encode() for secret in _secrets(url)):
+        place = shown.find(secret)
+        while place >= 0:
+            ctypes.memset(begin + place, ord("*"), len(secret))
+            place = shown.find(secret, place + len(secret))
+
+
+def _secrets(url: str) -> set[str]:
+    """The passwords of an address, as they stand there."""
+    found = {match[2].strip("'\"") for form in (IN_AUTHORITY, AS_OPTION) for match in form.finditer(url)}
+    return found - {""}
 
 
 def check_address(url: str) -> None:

@@ -10,8 +10,10 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
+from typing import TypeVar
 
 from optuna.trial import Trial
 
@@ -22,14 +24,19 @@ from src.sweeping.launcher import Ended, Launcher, Stop
 from src.sweeping.plan import Cell, Plan
 from src.sweeping.progress import progress_line
 from src.sweeping.runs import is_busy, is_finished, read_score
-from src.sweeping.study import Attempt, CellEndedError, SweepStudy
+from src.sweeping.study import Attempt, CellEndedError, DatabaseError, SweepStudy
 
 logger = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
 
 IDLE_S = 1.0
 """Between two looks of a worker that has nothing to do."""
 PROGRESS_EVERY_S = 60.0
 RECORD_EVERY_S = 20.0
+AWAY_S = 900.0
+"""How long a running sweep waits for its database; runs that train go on meanwhile. At the start it waits for none."""
+AWAY_RETRY_S = 5.0
 IMPATIENT_AFTER_S = 2.0
 """A second Ctrl-C this long after the first ends everything at once; launchers repeat a signal within milliseconds."""
 MOST_INTERRUPTIONS = 3
@@ -81,8 +88,8 @@ class Runner:
                         self._show(record)
             if self._broken:
                 raise self._broken[0]
-            self.publish_done()
-            return self.keeper.write()
+            self._patiently(self.publish_done)
+            return self._patiently(self.keeper.write)
 
     def publish_done(self, strictly: bool = False) -> None:
         """Put the results of finished runs, whoever trained them, where tables find them.
@@ -111,11 +118,27 @@ class Runner:
 
     def _work(self, worker: int) -> None:
         try:
-            while not self.stop.requested and self._step(worker):
+            while not self.stop.requested and self._patiently(partial(self._step, worker)):
                 pass
         except BaseException as error:
             self._broken.append(error)
             self.stop.requested = True
+
+    def _patiently(self, action: Callable[[], Result]) -> Result:
+        """What needs the database, again and again while it is away. Raises DatabaseError when it stays away."""
+        since = None
+        while True:
+            try:
+                return action()
+            except DatabaseError as error:
+                now = time.monotonic()
+                if self.stop.requested or (since is not None and now - since > AWAY_S):
+                    raise
+                if since is None:
+                    since = now
+                    logger.warning("%s; trying again for %.0f minutes", error, AWAY_S / 60)
+            time.sleep(AWAY_RETRY_S)
+            self.study.reconnect()
 
     def _step(self, worker: int) -> bool:
         """Take and train one cell, or wait a little. False when nothing is left for anyone."""

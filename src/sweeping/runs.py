@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import fcntl
 import json
-import math
 from pathlib import Path
 from typing import Any
+
+LARGEST = 1e9
+"""Of a score or of seconds: a number beyond it, or one that is not finite, is damage."""
 
 
 def is_finished(folder: Path) -> bool:
@@ -24,10 +26,10 @@ def read_score(folder: Path, metric: str) -> float | None:
     """One number of metrics.json by its dotted name, None where it is not there or not finite."""
     try:
         value = _find(json.loads((folder / "metrics.json").read_text()), metric)
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if number and math.isfinite(value) else None
+    return float(value) if number and abs(value) <= LARGEST else None
 
 
 def _find(node: Any, name: str) -> Any:
@@ -45,9 +47,10 @@ def _find(node: Any, name: str) -> Any:
 def read_seconds(folder: Path) -> float | None:
     """How long the run took, None where it does not say."""
     try:
-        return float(json.loads((folder / "run.json").read_text())["seconds"]["all"])
-    except (OSError, ValueError, KeyError, TypeError):
+        seconds = float(json.loads((folder / "run.json").read_text())["seconds"]["all"])
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
+    return seconds if 0 <= seconds <= LARGEST else None
 
 
 def is_busy(folder: Path) -> bool:
@@ -69,7 +72,9 @@ def read_validations(folder: Path, metric: str) -> dict[int, float]:
         with (folder / "metrics.csv").open(newline="") as file:
             for row in csv.DictReader(file):
                 if row.get(f"val/{metric}") and row.get("epoch"):
-                    values[int(row["epoch"])] = float(row[f"val/{metric}"])
+                    value = float(row[f"val/{metric}"])
+                    if abs(value) <= LARGEST:
+                        values[int(row["epoch"])] = value
     except (OSError, ValueError, csv.Error):
         return values  # a line is being written; the next look sees it whole
     return values

@@ -34,8 +34,14 @@ GRACE_S = 300
 CONNECT_S = 15
 DATABASE_FAULTS = (
     SQLAlchemyError, optuna.exceptions.StorageInternalError, ImportError, RuntimeError, ValueError, LookupError,
+    UnboundLocalError,
 )  # fmt: skip
-"""What SQLAlchemy, Optuna and a driver raise over an address or a database."""
+"""What SQLAlchemy, Optuna and a driver raise over an address or a database; the last one where it is away at the end
+of a trial, which Optuna does not expect."""
+
+
+class DatabaseError(ConfigError):
+    """The database of a sweep cannot be used, which may pass."""
 
 
 class CellEndedError(Exception):
@@ -88,18 +94,22 @@ def file_lock(path: Path) -> Iterator[Hold]:
 
 @contextmanager
 def database_errors(url: str) -> Iterator[None]:
-    """Turn what a database and its driver raise into one line with the masked address. Raises ConfigError."""
+    """Turn what a database and its driver raise into one line with the masked address. Raises DatabaseError."""
     remedy = "check storage=..., and that the server runs; finished runs are kept, the same command goes on"
     try:
         yield
     except DATABASE_FAULTS as error:
-        if not isinstance(error, SQLAlchemyError) and isinstance(error.__cause__, SQLAlchemyError):
-            error = error.__cause__
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, SQLAlchemyError):
+            cause = cause.__cause__ or cause.__context__
+        if cause is None and isinstance(error, UnboundLocalError):
+            raise
+        error = cause or error
         said = str(getattr(error, "orig", None) or error).strip().splitlines() or [type(error).__name__]
         said = without_secrets(" ".join(line.strip() for line in said[:2]), url)
         if isinstance(error, ImportError):
             remedy = 'a PostgreSQL server needs `pip install "horizon3d[postgres]"`'
-        raise ConfigError(
+        raise DatabaseError(
             f"storage={masked(url)}: the database of the sweep cannot be used ({said}); {remedy}"
         ) from error
 
@@ -114,6 +124,7 @@ class SweepStudy:
         self.name, self.url = name, url
         self.folder = outputs / "sweeps" / name
         self._this_machine = _machine()
+        self._lost: set[int] = set()  # trials of this process whose end the database did not take
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         with file_lock(outputs / "sweeps" / ".lock"), database_errors(url):  # two creators at once would collide
             self._storage = _open_storage(url)
@@ -149,7 +160,8 @@ class SweepStudy:
         """Free what dead workers had; the lock is held. Returns what was theirs.
 
         Dead is a worker of this machine whose process is gone, one of another that has not been heard of for
-        `GRACE_S`, and one that took a trial and left no name. A trial that waits is nobody's: see the module.
+        `GRACE_S`, and one that took a trial and left no name. A trial that waits is nobody's: see the module. So is
+        one of this process that ended while the database was away.
         """
         with database_errors(self.url), warnings.catch_warnings():
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
@@ -171,7 +183,7 @@ class SweepStudy:
 
     def _is_gone(self, trial: FrozenTrial) -> bool:
         worker = trial.user_attrs.get("worker")
-        if worker is None:
+        if worker is None or trial._trial_id in self._lost:
             return True
         if worker["machine"] == self._this_machine:
             return _born(worker["pid"]) != worker["born"]
@@ -210,10 +222,12 @@ class SweepStudy:
             "pid": os.getpid(),
             "born": _born(os.getpid()),
         }
+        taken: list[int] = []
         ended: list[bool] = []
         defects: list[BaseException] = []  # kept apart from what the database raises
 
         def objective(trial: Trial) -> float:
+            taken.append(trial._trial_id)
             try:
                 for key, value in (attrs or {}).items():
                     if key not in trial.user_attrs:
@@ -233,18 +247,27 @@ class SweepStudy:
             finally:
                 ended.append(True)
 
-        with database_errors(self.url):
-            study = self._load(sampler, pruner)
-            if params is not None:
-                study.enqueue_trial(params, user_attrs=attrs)
-            try:
-                study.optimize(objective, n_trials=1, catch=(CellEndedError,))
-            except (AssertionError, optuna.exceptions.UpdateFinishedTrialError):
-                # Another worker took this one for dead, as after a suspended machine; what the run left stays.
-                if not ended:
-                    raise
+        try:
+            with database_errors(self.url):
+                study = self._load(sampler, pruner)
+                if params is not None:
+                    study.enqueue_trial(params, user_attrs=attrs)
+                try:
+                    study.optimize(objective, n_trials=1, catch=(CellEndedError,))
+                except (AssertionError, optuna.exceptions.UpdateFinishedTrialError):
+                    # Another worker took this one for dead, as after a suspended machine; what the run left stays.
+                    if not ended:
+                        raise
+        except DatabaseError:
+            self._lost.update(taken)
+            if not defects:
+                raise
         if defects:
             raise defects[0]
+
+    def reconnect(self) -> None:
+        """Let go of the connections that are open: they may lead to a database that is no longer there."""
+        self._storage.engine.dispose()
 
     def note(self, trial: Trial, key: str, value: Any) -> None:
         """Keep something with a trial, unless it was ended from outside."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
+import logging
+from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -19,7 +20,19 @@ from src.models.detector import Detector
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable, EvaluationSet
+from src.structures.passed_over import PassedOver
+from src.training.nonfinite import (
+    MAX_IN_A_ROW,
+    StepGuard,
+    describe_gradients,
+    finite_everywhere,
+    gradient_norm,
+    step_seed,
+    write_dump,
+)
 from src.training.optim import OptimConfig, build_optimizer
+
+logger = logging.getLogger(__name__)
 
 
 class DetectionModule(L.LightningModule):
@@ -27,6 +40,9 @@ class DetectionModule(L.LightningModule):
 
     `config` is the run's resolved configuration as plain values; it travels in the checkpoint, so that a checkpoint
     alone tells how to rebuild its model. After a validation `scores` and `detections` are the same on every process.
+
+    A step whose loss or gradients are not finite leaves a dump in the run's folder and ends the training with
+    DivergedError on all ranks; with `skip_nonfinite` it is passed over instead, as if it had not been made.
     """
 
     def __init__(
@@ -37,6 +53,7 @@ class DetectionModule(L.LightningModule):
         evaluation_set: EvaluationSet,
         seed: int,
         config: dict[str, Any],
+        skip_nonfinite: bool = False,
     ) -> None:
         super().__init__()
         self.model = model
@@ -49,7 +66,9 @@ class DetectionModule(L.LightningModule):
         self.scores: DetectionScores | None = None
         self.detections: DetectionTable | None = None
         self.scored_step = -1
-        self.skipped: dict[str, int] = {}
+        self.skipped = PassedOver()
+        self.guard = StepGuard(skip_nonfinite)
+        self._step: tuple[FrameBatch, dict[str, Tensor], dict[str, Tensor]] | None = None  # batch, terms, diagnostics
 
     def run(self, batch: FrameBatch) -> Any:
         """The model's own output for a batch, in training and validation."""
@@ -58,22 +77,24 @@ class DetectionModule(L.LightningModule):
 
     # ---------------------------------------------------------------- training
 
+    def on_train_start(self) -> None:
+        """Look up what a step changes of the model; it lies on its device by now."""
+        self.guard.watch(self.model)
+
     def on_train_batch_start(self, batch: FrameBatch, batch_idx: int) -> None:
         """Seed the step by its number, so that a resumed run draws what the uninterrupted one would have drawn."""
-        text = f"{self.seed}/{self.trainer.global_step}/{self.trainer.global_rank}"
-        torch.manual_seed(int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little"))
+        torch.manual_seed(step_seed(self.seed, self.trainer.global_step, self.trainer.global_rank))
+        self.guard.begin()
 
     def training_step(self, batch: FrameBatch, batch_idx: int) -> Tensor:
-        """Forward and loss of one batch; every term is logged under its own name."""
+        """Forward and loss of one batch; `configure_gradient_clipping` looks at the terms and gradients together."""
         output = self.run(batch)
         terms = self.model.loss(output, batch)
-        self._check_finite(terms, batch)
-        self._count_skipped(batch)
-        for name, value in terms.items():
-            self._mean(f"loss/{name}").update(value.detach(), len(batch))
-            self.log(f"step/{name}", value.detach(), batch_size=len(batch), prog_bar=True)
-        for name, value in self.model.diagnostics(output).items():
-            self._mean(f"state/{name}").update(value)
+        self.skipped.add(batch)
+        values = {name: value.detach() for name, value in terms.items()}
+        for name, value in values.items():  # also where not finite: each reader of the log leaves such cells out
+            self.log(f"step/{name}", value, batch_size=len(batch), prog_bar=True)
+        self._step = (batch, values, self.model.diagnostics(output))
         return terms["total"]
 
     def _mean(self, name: str) -> MeanMetric:
@@ -82,28 +103,95 @@ class DetectionModule(L.LightningModule):
             self.loss_means[key] = MeanMetric().to(self.device)
         return self.loss_means[key]
 
-    def _check_finite(self, terms: dict[str, Tensor], batch: FrameBatch) -> None:
-        if not torch.isfinite(terms["total"]):
-            bad = {name: float(value.detach()) for name, value in terms.items() if not torch.isfinite(value)}
-            raise DivergedError(
-                f"step {self.trainer.global_step}: loss terms {bad} are not finite for samples {batch.tokens}; "
-                "the last checkpoint, if there is one yet, holds the weights before; try a smaller optim.lr or "
-                "optim.peak_lr_ratio"
-            )
-
-    def _count_skipped(self, batch: FrameBatch) -> None:
-        for channel, count in batch.skipped.items():
-            self.skipped[channel] = self.skipped.get(channel, 0) + count
-
     def configure_gradient_clipping(
         self,
         optimizer: torch.optim.Optimizer,
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clip the global norm (Table 10) and log what it was."""
-        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.optim.clip_norm)
+        """Clip the global norm (Table 10) and take the step into the means of its epoch, or refuse it.
+
+        Raises DivergedError as `_refuse` does.
+        """
+        (batch, terms, diagnostics), self._step = self._step, None
+        norm = gradient_norm(self.model)
+        if not finite_everywhere(terms["total"], norm):
+            self._refuse(batch, terms)
+            return
+        self.guard.in_a_row = 0
+        nn.utils.clip_grads_with_norm_(self.model.parameters(), self.optim.clip_norm, norm)
+        for name, value in terms.items():
+            self._mean(f"loss/{name}").update(value, len(batch))
+        for name, value in diagnostics.items():
+            self._mean(f"state/{name}").update(value)
         self._mean("state/gradient_norm").update(norm)
+
+    def _refuse(self, batch: FrameBatch, terms: dict[str, Tensor]) -> None:
+        """Take back what the step did, keep it for a replay, and go on without it where that is wanted.
+
+        The weights have not changed yet; gradients are dropped, so that the optimiser does nothing. All ranks come here
+        together. Raises DivergedError on all of them, with the same words, or when too many steps were passed over.
+        """
+        bad = {name: float(value) for name, value in terms.items() if not torch.isfinite(value)}
+        ranks = gather_by_rank({"bad": bad, "total": float(terms["total"]), "tokens": batch.tokens})
+        guilty = [rank for rank, own in enumerate(ranks) if own["bad"]]
+        # Gradients are means over the ranks by now: where every loss is finite, none can be told from the others.
+        told = guilty or range(len(ranks))
+        if guilty:
+            found = "; ".join(f"loss terms {ranks[rank]['bad']} of rank {rank} are not finite" for rank in guilty)
+        else:
+            totals = ", ".join(f"{own['total']:.4g}" for own in ranks)
+            found = f"the loss ({totals}) is finite, but {describe_gradients(self.model)}"
+        samples = "; ".join(f"rank {rank}: {', '.join(ranks[rank]['tokens'])}" for rank in told)
+        trainer = self.trainer
+        text = f"step {trainer.global_step}, epoch {trainer.current_epoch}: {found}; samples of {samples}"
+
+        self.guard.restore()
+        if self.guard.in_a_row == 0:  # the next ones in a row have the same weights
+            path = self._dump(batch, text) if trainer.global_rank in told else None
+            kept = [path for path in gather_by_rank(path and str(path)) if path]
+            text += f"; run it again with: python -m src.replay checkpoint={kept[0]}" if kept else ""
+        self.forget_step(batch)
+        self.guard.in_a_row += 1
+        if not self.guard.skip:
+            raise DivergedError(
+                f"{text}\nThe last checkpoint, if there is one yet, holds earlier weights. Look for broken data, try a "
+                "smaller optim.lr or optim.peak_lr_ratio, or pass over such steps with trainer.on_nonfinite=skip"
+            )
+        if self.guard.in_a_row > MAX_IN_A_ROW:
+            raise DivergedError(
+                f"{text}\nMore than {MAX_IN_A_ROW} steps in a row were like this, so it is not one bad batch: the dump "
+                "of the first of them tells more"
+            )
+        self.guard.skipped_steps += 1
+        if trainer.is_global_zero:
+            logger.warning("passed over (%d so far): %s", self.guard.skipped_steps, text)
+        for parameter in self.model.parameters():
+            parameter.grad = None
+
+    def _dump(self, batch: FrameBatch, found: str) -> Path | None:
+        """Write what `src.replay` needs; see `write_dump`."""
+        step, rank = self.trainer.global_step, self.trainer.global_rank
+        return write_dump(
+            Path(self.trainer.default_root_dir),
+            self.model,
+            self.config,
+            batch,
+            global_step=step,
+            epoch=self.trainer.current_epoch,
+            rank=rank,
+            world_size=self.trainer.world_size,
+            seed=step_seed(self.seed, step, rank),
+            memories=self.memories_before_step(),
+            found=found,
+        )
+
+    def memories_before_step(self) -> list[dict[str, Any]]:
+        """What the model remembered before the step, as in `rank_state`; nothing for single frames."""
+        return []
+
+    def forget_step(self, batch: FrameBatch) -> None:
+        """Drop what a step that counts for nothing has left to be remembered."""
 
     def on_train_epoch_end(self) -> None:
         """Log the epoch's means over all ranks and frames."""
@@ -133,7 +221,7 @@ class DetectionModule(L.LightningModule):
 
     def validation_step(self, batch: FrameBatch, batch_idx: int) -> None:
         """Detect, bring the boxes to the global frame, hand them to the metric."""
-        self._count_skipped(batch)
+        self.skipped.add(batch)
         for token, boxes, global_from_ego in zip(
             batch.tokens, self.detect(batch), batch.global_from_ego.cpu().numpy(), strict=True
         ):
@@ -171,6 +259,11 @@ class DetectionModule(L.LightningModule):
         A checkpoint from the end of an epoch has nothing to go on with.
         """
         states = checkpoint["horizon3d"].get("ranks", [])
+        same = len(states) == self.trainer.world_size
+        mine = states[self.trainer.global_rank :][:1] if same else states if self.trainer.global_rank == 0 else []
+        self.skipped.restore(state["skipped"] for state in mine if "skipped" in state)
+        if states and "nonfinite" in states[0]:
+            self.guard.restore_counts(states[0]["nonfinite"])
         if len(states) == self.trainer.world_size:
             self.restore_rank(states[self.trainer.global_rank])
         elif self.trainer.global_rank == 0:
@@ -179,7 +272,12 @@ class DetectionModule(L.LightningModule):
     def rank_state(self) -> dict[str, Any]:
         """This rank's part of an unfinished epoch, as plain values and tensors on the CPU."""
         sums = {name: [float(mean.mean_value), float(mean.weight)] for name, mean in self.loss_means.items()}
-        return {"means": {name: values for name, values in sums.items() if values[1] > 0}}
+        state: dict[str, Any] = {"means": {name: values for name, values in sums.items() if values[1] > 0}}
+        if self.guard.skipped_steps:
+            state["nonfinite"] = self.guard.state()
+        if self.skipped:
+            state["skipped"] = self.skipped.state()
+        return state
 
     def restore_rank(self, state: dict[str, Any]) -> None:
         """Go on from what `rank_state` gave."""

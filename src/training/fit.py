@@ -13,7 +13,7 @@ from lightning.pytorch.strategies import Strategy
 
 from src.data.datamodule import DetectionDataModule, dead_workers_named
 from src.errors import InterruptedRunError
-from src.training.checkpoints import AtomicCheckpointIO, load_model_weights, read_checkpoint
+from src.training.checkpoints import BEST, LAST, AtomicCheckpointIO, load_model_weights, read_checkpoint
 from src.training.detection import DetectionModule
 from src.training.interruption import Interruption
 from src.training.metrics_csv import MetricsCSV
@@ -54,17 +54,21 @@ def build_trainer(
     checkpoint_every_steps: int | None = None,
     strategy: Strategy | str = "auto",
     num_nodes: int = 1,
+    deterministic: bool = False,
 ) -> L.Trainer:
     """A Trainer that keeps `last.ckpt` of every epoch and `best.ckpt` by validation mAP in the run's folder.
 
-    With `checkpoint_every_steps`, `last.ckpt` is written inside epochs too. `devices` counts those of one node.
+    The last but one stays as `previous.ckpt`. With `checkpoint_every_steps`, `last.ckpt` is written inside epochs too.
+    `devices` counts those of one node.
     """
     # Checkpoint names carry no metric: an unquoted `=` in a path cannot be typed after checkpoint=.
     fixed_name = {"dirpath": folder.checkpoints, "auto_insert_metric_name": False, "enable_version_counter": False}
+    best, last = Path(BEST).stem, Path(LAST).stem
+    interruption = Interruption(folder.checkpoints / LAST, checkpoint_every_steps)
     callbacks: list[L.Callback] = [
-        ModelCheckpoint(filename="best", monitor="val/mAP", mode="max", save_top_k=1, **fixed_name),
-        ModelCheckpoint(filename="last", save_top_k=1, save_on_train_epoch_end=True, **fixed_name),
-        Interruption(folder.checkpoints / "last.ckpt", checkpoint_every_steps),
+        ModelCheckpoint(filename=best, monitor="val/mAP", mode="max", save_top_k=1, **fixed_name),
+        ModelCheckpoint(filename=last, save_top_k=1, save_on_train_epoch_end=True, **fixed_name),
+        interruption,
         LossProgressBar(refresh_rate=10),
     ]
     if ema_decay is not None:
@@ -80,8 +84,9 @@ def build_trainer(
         strategy=strategy,
         logger=loggers,
         callbacks=callbacks,
-        plugins=[AtomicCheckpointIO()],
+        plugins=[AtomicCheckpointIO(folder.check_held, hurried=lambda: interruption.requested)],
         log_every_n_steps=log_every_steps,
+        deterministic=deterministic,
         num_sanity_val_steps=0,
         use_distributed_sampler=False,  # Lightning's pads validation, so samples would count twice
         default_root_dir=folder.path,

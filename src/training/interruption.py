@@ -14,6 +14,7 @@ import lightning as L
 from lightning.pytorch.trainer.states import TrainerFn
 
 from src.errors import InterruptedRunError
+from src.training.metrics_csv import MetricsCSV
 
 IMPATIENT_AFTER_S = 2.0
 """A second Ctrl-C this long after the first ends the run at once. Launchers repeat a signal within milliseconds."""
@@ -104,7 +105,12 @@ class Interruption(L.Callback):
         self.requested = self._agreed(trainer)
 
     def on_save_checkpoint(self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
-        """State the loops' progress in a way from which Lightning goes on exactly here."""
+        """State the loops' progress in a way from which Lightning goes on exactly here; first the log is made safe."""
+        for own in trainer.loggers:
+            if isinstance(own, MetricsCSV):
+                if not self._saving and not trainer.validating:
+                    self._log_epoch(trainer, own)
+                own.sync()
         if not self._saving:
             return
         loops = checkpoint["loops"]["fit_loop"]
@@ -124,6 +130,12 @@ class Interruption(L.Callback):
             loops["epoch_loop.state_dict"]["_batches_that_stepped"] -= 1
 
     # ---------------------------------------------------------------- parts
+
+    def _log_epoch(self, trainer: L.Trainer, log: MetricsCSV) -> None:
+        """Write the epoch's row before the checkpoint of its end, behind which a run goes on; Lightning does after."""
+        metrics = trainer._logger_connector.metrics["log"]
+        step = trainer.fit_loop.epoch_loop._batches_that_stepped - 1
+        log.log_metrics(metrics | {"epoch": trainer.current_epoch}, step)
 
     def _agreed(self, trainer: L.Trainer) -> bool:
         return trainer.strategy.reduce_boolean_decision(self.requested, all=False)

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import csv
+import logging
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from lightning.pytorch.loggers.logger import Logger, rank_zero_experiment
 from lightning.pytorch.utilities import rank_zero_only
 
+logger = logging.getLogger(__name__)
+
 
 class MetricsCSV(Logger):
     """A Lightning logger over one CSV file.
 
     Lightning's own deletes the file of an earlier start; this one keeps the rows of the `resume_step` steps (counted
-    from 0) that the checkpoint has behind it, so the file of an interrupted run equals that of an uninterrupted one.
+    from 0) that the checkpoint has behind it, so the file of an interrupted run equals that of an uninterrupted one. A
+    row that comes again, because what it tells of was done again, takes the place of the first.
+
+    Rows that a full or vanished disk refuses end no training: they are written with the first that it takes.
     """
 
     def __init__(self, path: Path, resume_step: int) -> None:
@@ -24,13 +31,30 @@ class MetricsCSV(Logger):
         self._rows: list[dict[str, str]] = []
         self._columns: list[str] = ["step", "epoch"]
         self._rewrite = True
+        self._refused = False
         if path.is_file():
-            with path.open(newline="") as file:
+            self._read(resume_step)
+
+    def _read(self, resume_step: int) -> None:
+        """The rows to go on from; where the file is damaged, those before that place, and the log says so."""
+        try:
+            with self._path.open(newline="") as file:
                 for row in csv.DictReader(file):
-                    if row.get("step", "").isdigit() and int(row["step"]) < resume_step:
+                    step = row.get("step") or ""
+                    if step.isascii() and step.isdigit() and int(step) < resume_step:
                         self._add({key: value for key, value in row.items() if key and value})
+        except (OSError, ValueError, csv.Error) as error:
+            kept = f"going on from the {len(self._rows)} rows before"
+            logger.warning("%s: damaged (%s: %s); %s", self._path, type(error).__name__, error, kept)
 
     def _add(self, row: dict[str, str]) -> None:
+        for number in range(len(self._rows) - 1, -1, -1):
+            earlier = self._rows[number]
+            if earlier["step"] != row.get("step"):
+                break
+            if earlier.keys() == row.keys():
+                self._rows[number], self._rewrite = row, True
+                return
         new = [key for key in row if key not in self._columns]
         self._columns += sorted(new)
         self._rewrite = self._rewrite or bool(new)
@@ -70,7 +94,27 @@ class MetricsCSV(Logger):
         self._add(row)
         self._write()
 
+    def sync(self) -> None:
+        """Put the rows onto the disk: no checkpoint shall outlive a power failure without the rows before it."""
+        with suppress(OSError), self._path.open("rb") as file:
+            os.fsync(file.fileno())
+
+    @rank_zero_only
+    def finalize(self, status: str) -> None:
+        """At the end, write what the disk has refused so far. Raises OSError when it still does."""
+        if status == "success" and self._refused:
+            self._write_rows()
+
     def _write(self) -> None:
+        try:
+            self._write_rows()
+            self._refused = False
+        except OSError as error:
+            if not self._refused:
+                logger.warning("%s could not be written (%s); its rows are kept for later", self._path, error.strerror)
+            self._refused = self._rewrite = True
+
+    def _write_rows(self) -> None:
         """Append the newest row; write the whole file anew when a column was added."""
         if not self._rewrite:
             with self._path.open("a", newline="") as file:

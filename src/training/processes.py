@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from types import FrameType
 from typing import Any, TypeVar
@@ -47,6 +47,9 @@ DECISION_TIMEOUT = timedelta(hours=12)
 """How long the others wait for the main process, which may be writing a data set."""
 GRACE_S = 20.0
 """What the other processes get to end by themselves once one has failed."""
+QUIET_S = 10.0
+"""How long a process that lost another says nothing: first the user shall read why that one ended, and its rank."""
+_SETTLE_S = 0.5  # processes that end this close together end for one reason, which is that of the lowest rank
 _LOST_PEER = ("gloo/", "NCCL", "TCPStore", "closed by peer", "reset by peer")
 _SET_PDEATHSIG = 1  # of Linux' prctl: a signal to the child when the thread that started it dies
 # Looked up here: between fork and exec, a lock that another thread of the parent held would never be free again.
@@ -134,9 +137,9 @@ def _number_started() -> int | None:
 def launch(module: str, overrides: Sequence[str], devices: int) -> None:
     """Run `python -m module overrides` once per device of this machine and wait for all.
 
-    When one process fails, the others get some seconds to end by themselves and are then killed. SIGTERM and Ctrl-C are
-    passed on as SIGTERM, a later second Ctrl-C kills. Raises SystemExit with the exit code of the process that failed,
-    1 if it was killed.
+    When one process fails, the log says which and how; the others get some seconds to end by themselves and are then
+    killed. SIGTERM and Ctrl-C are passed on as SIGTERM, a later second Ctrl-C kills. Raises SystemExit with the exit
+    code of the process that failed, 1 if it was killed.
     """
     ranks: list[subprocess.Popen] = []
     stops: list[float] = []
@@ -172,23 +175,40 @@ def launch(module: str, overrides: Sequence[str], devices: int) -> None:
 
 def _wait_for_all(ranks: list[subprocess.Popen], stops: list[float]) -> int:
     """Wait until all have ended, not for ever once one has failed; the exit code that tells most."""
-    deadline = None
-    while None in [process.poll() for process in ranks]:
-        failed = [rank for rank, process in enumerate(ranks) if process.returncode]
-        if failed and deadline is None:
-            deadline = time.monotonic() + GRACE_S
-            code = ranks[failed[0]].returncode
-            how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
-            logger.warning("process %d of %d %s; ending the others", failed[0], len(ranks), how)
-        if deadline is not None and time.monotonic() > deadline:
-            _signal_all(ranks, signal.SIGKILL)
+    while (states := [process.poll() for process in ranks]).count(None) and not any(states):
         time.sleep(0.1)
+    interrupted = InterruptedRunError.exit_code
+    if any(states):
+        time.sleep(_SETTLE_S)
+        failed, code = next((rank, code) for rank, process in enumerate(ranks) if (code := process.poll()))
+        if code != interrupted and not stops:
+            logger.warning("process %d of %d %s; ending the others", failed, len(ranks), _how_it_ended(code))
+        _end_within(GRACE_S, ranks)
     codes = [process.returncode for process in ranks]
     told = [code for code in codes if code in (ConfigError.exit_code, DataError.exit_code, DivergedError.exit_code)]
-    interrupted = InterruptedRunError.exit_code
     if not any(codes) or told:
         return told[0] if told else 0
     return interrupted if interrupted in codes or stops else 1
+
+
+def _how_it_ended(code: int) -> str:
+    if code >= 0:
+        return f"ended with exit code {code}"
+    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+    return f"was killed by {name}" + (", as the system does when memory is short" if -code == signal.SIGKILL else "")
+
+
+def _end_within(seconds: float, ranks: list[subprocess.Popen]) -> None:
+    """Wait for the processes that are left, and kill those that have not ended by then."""
+    deadline = time.monotonic() + seconds
+    while None in [process.poll() for process in ranks] and time.monotonic() < deadline:
+        time.sleep(0.1)
+    left = [rank for rank, process in enumerate(ranks) if process.poll() is None]
+    for rank in left:
+        logger.warning("process %d of %d did not end within %.0f s; killing it", rank, len(ranks), seconds)
+        ranks[rank].kill()
+    for rank in left:
+        ranks[rank].wait()
 
 
 def _signal_all(ranks: list[subprocess.Popen], number: int) -> None:
@@ -216,7 +236,7 @@ def process_group(accelerator: str, devices: int, num_nodes: int = 1) -> Iterato
     """Connect the processes for the time within; nothing happens for a single one.
 
     Only the main process logs below warnings. Raises HorizonError instead of torch's errors when another process was
-    lost or did not come in time.
+    lost or did not come in time, some seconds after it noticed: the reason is that process's to tell.
     """
     if devices * num_nodes == 1:
         yield
@@ -243,12 +263,21 @@ def process_group(accelerator: str, devices: int, num_nodes: int = 1) -> Iterato
         if not any(word in str(error) for word in _LOST_PEER):
             raise
         reason = str(error).splitlines()[0]
+        late = "timed out" in reason.lower() or "timeout" in reason.lower()
+        if not late:  # otherwise nobody else has anything to say
+            _keep_quiet()
+        what = "hangs or is cut off" if late else "ended, its message says why"
         raise HorizonError(
-            f"another process of this run ended or hangs, its message says why ({reason}); the same command goes on "
-            "from the last checkpoint"
+            f"another process of this run {what} ({reason}); the same command goes on from the last checkpoint"
         ) from error
     finally:
         end_processes()
+
+
+def _keep_quiet() -> None:
+    """Give the process that failed the time to say why; whoever ends this one meanwhile need not wait."""
+    with suppress(KeyboardInterrupt):
+        time.sleep(QUIET_S)
 
 
 def end_processes() -> None:

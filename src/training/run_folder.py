@@ -8,12 +8,14 @@ import logging
 import os
 import subprocess
 import time
+from contextlib import suppress
 from enum import Enum
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from src.errors import BusyError, CheckpointError, ConfigError, DataError
-from src.training.checkpoints import read_checkpoint
+from src.training.checkpoints import BEST, LAST, PREVIOUS, read_checkpoint, sync_folder
 
 logger = logging.getLogger(__name__)
 
@@ -49,6 +51,8 @@ class RunFolder:
     def open(self, resume: Resume) -> None:
         """Make the folder ready to train in, or leave a finished one as it is; see `finished`.
 
+        What a killed process was writing is removed.
+
         Raises ConfigError when the run exists and `resume` is `never`, when another process trains it at this
         moment, or when the folder cannot be written.
         """
@@ -56,12 +60,45 @@ class RunFolder:
             raise ConfigError(f"{self.path} exists and resume=never; use resume=auto to go on or resume=restart")
         if self.path.exists() and resume is Resume.restart:
             self._acquire()
-            aside = self.path.with_name(f"{self.run_id}.before-{time.strftime('%Y%m%d-%H%M%S')}")
+            aside = self._aside()
             self.path.rename(aside)
             self._release()
             logger.info("moved the old run to %s", aside)
         make_writable(self.checkpoints, "paths.outputs")
         self._acquire()
+        self._tidy()
+
+    def finish(self, record: dict[str, Any]) -> None:
+        """Write run.json, by which the run counts as finished; checkpoints that only a resumption needs go."""
+        write_json(self.record, record)
+        self._tidy()
+
+    def check_held(self) -> None:
+        """Whether this is the folder that was opened.
+
+        Raises FileNotFoundError while it is away, and CheckpointError when another process has made it anew.
+        """
+        status = os.stat(self.path)  # raises while the disk is away
+        with suppress(FileNotFoundError):
+            status = os.stat(self.path / ".lock")
+            if self._lock is not None and status.st_ino != os.fstat(self._lock.fileno()).st_ino:
+                raise CheckpointError(
+                    f"{self.path} was deleted and made anew by another process, which trains there now; this one ends"
+                )
+
+    def _aside(self) -> Path:
+        """A free name for the old folder: a clock that was set back, or is slow, gives the same time twice."""
+        name = self.path.with_name(f"{self.run_id}.before-{time.strftime('%Y%m%d-%H%M%S')}")
+        names = (name if number == 1 else name.with_name(f"{name.name}-{number}") for number in count(1))
+        return next(free for free in names if not free.exists())
+
+    def _tidy(self) -> None:
+        for folder in (self.path, self.checkpoints):
+            for pattern in ("*.tmp", ".*.part", ".probe-*"):
+                for left_over in folder.glob(pattern):
+                    left_over.unlink(missing_ok=True)
+        if self.finished:
+            (self.checkpoints / PREVIOUS).unlink(missing_ok=True)
 
     def _acquire(self) -> None:
         self._lock = open(self.path / ".lock", "w")
@@ -75,19 +112,23 @@ class RunFolder:
         self._lock = None
 
     def newest_checkpoint(self) -> Path | None:
-        """The checkpoint an unfinished run goes on from: the last one, or the best where the last is damaged.
+        """The checkpoint an unfinished run goes on from: the last one, or where it is damaged the next older whole one.
 
         Raises CheckpointError when there are some and none can be read: training would silently start anew.
         """
         damage: list[str] = []
-        for path in (self.checkpoints / "last.ckpt", self.checkpoints / "best.ckpt"):
-            if path.is_file():
-                try:
-                    read_checkpoint(path)
-                    return path
-                except CheckpointError as error:
-                    logger.warning("%s", error)
-                    damage.append(str(error))
+        for name in (LAST, PREVIOUS, BEST):
+            path = self.checkpoints / name
+            if not path.is_file():
+                continue
+            try:
+                read_checkpoint(path)
+            except CheckpointError as error:
+                damage.append(str(error))
+                continue
+            if damage:
+                logger.warning("%s; going on from %s instead", "; ".join(damage), path)
+            return path
         if damage:
             raise CheckpointError(f"{'; '.join(damage)}; resume=restart moves the run aside and trains anew")
         return None
@@ -98,7 +139,7 @@ class RunFolder:
         for path in (self.record, self.metrics_json):
             try:
                 content = json.loads(path.read_text())
-            except (OSError, ValueError) as error:
+            except (OSError, ValueError, RecursionError) as error:
                 raise DataError(f"{path} is not readable ({error}); delete it to have it made again") from error
             if not isinstance(content, dict):
                 raise DataError(f"{path} must hold an object, but holds a {type(content).__name__}; delete it")
@@ -118,10 +159,15 @@ def make_writable(folder: Path, key: str) -> None:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a JSON file that is never seen half-written."""
+    """Write a JSON file that is never seen half-written, after a power failure neither."""
     temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    with temporary.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
     os.replace(temporary, path)
+    sync_folder(path.parent)
 
 
 def current_commit() -> str:

@@ -26,6 +26,7 @@ class TemporalModule(DetectionModule):
         super().__init__(*arguments, **named)
         # Sets of lanes take turns (`data.lane_sets`): the lanes [B] int64 of each set's last batch, and their memory.
         self.memories: list[tuple[Tensor, TemporalMemory]] = []
+        self._before_step: list[tuple[Tensor, TemporalMemory]] = []
 
     def run(self, batch: FrameBatch) -> Any:
         """The model's output for the next frames of the batch's lanes; they are remembered.
@@ -57,6 +58,20 @@ class TemporalModule(DetectionModule):
     def forget(self) -> None:
         """Drop the memory of all lanes."""
         self.memories.clear()
+        self._before_step.clear()
+
+    def forget_step(self, batch: FrameBatch) -> None:
+        """Let the lanes of a step that counts for nothing begin anew: what they remember may not be finite."""
+        self.memories = [entry for entry in self.memories if not _common(batch.lanes, entry[0]).any()]
+
+    def memories_before_step(self) -> list[dict[str, Any]]:
+        """As in `rank_state`, of the time before the running step."""
+        return _plain(self._before_step)
+
+    def on_train_batch_start(self, batch: FrameBatch, batch_idx: int) -> None:
+        """As the base; a step that has to be replayed needs the memory that it began with."""
+        super().on_train_batch_start(batch, batch_idx)
+        self._before_step = list(self.memories)
 
     def on_fit_start(self) -> None:
         """Bring a restored memory to the device: a checkpoint is read before the module is moved there."""
@@ -83,8 +98,7 @@ class TemporalModule(DetectionModule):
 
     def rank_state(self) -> dict[str, Any]:
         """As the base, with `memories`: a list of {lanes: list[int], frames: `TemporalMemory.state`}."""
-        memories = [{"lanes": lanes.tolist(), "frames": memory.to("cpu").state()} for lanes, memory in self.memories]
-        return super().rank_state() | {"memories": memories}
+        return super().rank_state() | {"memories": _plain(self.memories)}
 
     def restore_rank(self, state: dict[str, Any]) -> None:
         """As the base, with the memory of this rank's lanes."""
@@ -102,6 +116,10 @@ class TemporalModule(DetectionModule):
                 len(states),
                 self.trainer.world_size,
             )
+
+
+def _plain(memories: list[tuple[Tensor, TemporalMemory]]) -> list[dict[str, Any]]:
+    return [{"lanes": lanes.tolist(), "frames": memory.to("cpu").state()} for lanes, memory in memories]
 
 
 def _common(

@@ -7,6 +7,7 @@ import torch
 
 from src.benchmarking import timing
 from src.benchmarking.timing import added_bytes, in_turns, interleaved, median_spread, timed_parts
+from src.ops.pair_tiles import scratch
 
 CPU = torch.device("cpu")
 
@@ -70,6 +71,17 @@ def test_added_memory_is_that_of_the_call():
         pytest.skip("the system does not let a process begin its peak anew")
     assert 60 * 2**20 < added < 96 * 2**20
     assert added_bytes(lambda: None, CPU) < 8 * 2**20  # the peak of the call before is forgotten
+
+
+def test_memory_that_is_used_again_counts_for_every_call():
+    def call():
+        return scratch("of a test", 32 * 2**20, 1, torch.uint8, CPU).fill_(1)[0, 0]
+
+    call()
+    added = [added_bytes(call, CPU) for _ in range(2)]
+    if None in added:
+        pytest.skip("the system does not let a process begin its peak anew")
+    assert 30 * 2**20 < min(added) and max(added) < 60 * 2**20
 
 
 def test_timed_parts_add_up_calls_and_leave_the_model_as_it_was():

@@ -46,6 +46,39 @@ def test_broken_cache_is_built_again(broken_tables, tmp_path, caplog, damage):
     assert "broken" not in caplog.text
 
 
+@pytest.mark.parametrize(
+    "name, change",
+    [
+        ("frame_poses", lambda column: column + 10**6),
+        ("key_data", lambda column: column.astype(float)),
+        ("pose_times_us", lambda column: column.byteswap().view(column.dtype.newbyteorder())),
+        ("box_sizes", lambda column: -column),
+        ("box_centers", lambda column: column * np.nan),
+        ("box_starts", lambda column: column[::-1]),
+        ("data_times_us", lambda column: column[:-1]),
+        ("ego_from_sensor", lambda column: column * 1e30),
+    ],
+)
+def test_a_cache_that_a_stranger_wrote_is_built_again(broken_tables, tmp_path, caplog, name, change):
+    """Whole to every checksum, with columns that do not fit each other."""
+    whole = load_index(broken_tables.root, VERSION, tmp_path / "cache")
+    (file,) = (tmp_path / "cache").glob("*.npz")
+    with np.load(file) as arrays:
+        columns = dict(arrays)
+    np.savez(file, **(columns | {name: change(columns[name])}))
+    again = load_index(broken_tables.root, VERSION, tmp_path / "cache")
+    assert "broken" in caplog.text and name in caplog.text
+    np.testing.assert_array_equal(getattr(again, name), getattr(whole, name))
+
+
+def test_a_cache_of_zeros_beyond_all_memory_is_built_again(broken_tables, tmp_path, caplog):
+    load_index(broken_tables.root, VERSION, tmp_path / "cache")
+    (file,) = (tmp_path / "cache").glob("*.npz")
+    np.savez_compressed(file, annotated=np.array(True), box_labels=np.zeros(30_000_000, np.int8))
+    assert len(load_index(broken_tables.root, VERSION, tmp_path / "cache")) == 6
+    assert "larger than the file" in caplog.text
+
+
 def test_cache_that_cannot_be_written_is_done_without(broken_tables, tmp_path, caplog, monkeypatch):
     monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
     with caplog.at_level(logging.WARNING):
@@ -64,7 +97,12 @@ def test_own_split_file_wins(data_set):
 def test_bad_split_files(broken_tables):
     index = load_index(broken_tables.root, VERSION, None)
     path = broken_tables.root / "splits.json"
-    for text, words in (("{", "JSON"), ('["train"]', "scene names"), ('{"train": ["no-such-scene"]}', "none of its 1")):
+    for text, words in (
+        ("{", "JSON"),
+        ("[" * 100_000, "JSON"),
+        ('["train"]', "scene names"),
+        ('{"train": ["no-such-scene"]}', "none of its 1"),
+    ):
         path.write_text(text)
         with pytest.raises(DataError, match=words):
             split_samples(index, "train")

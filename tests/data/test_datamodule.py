@@ -123,13 +123,15 @@ def test_faults_of_workers_keep_their_message(broken_files, num_workers, quick_e
     assert name in text and "no DATA line" in text and "Traceback" not in text and "\n" not in text
 
 
-def test_skipped_files_are_counted_in_the_batch(broken_files):
+@pytest.mark.parametrize("num_workers", [0, 1])
+def test_skipped_files_are_counted_and_named_in_the_batch(broken_files, num_workers, quick_end):
     index = load_index(broken_files.root, VERSION, None)
-    for row in index.key_data[3:5, 4]:
-        (broken_files.root / index.filename(row)).unlink()
-    data = module(broken_files, on_bad_file=OnBadFile.skip, batch_size=3)
+    names = [index.filename(row) for row in index.key_data[3:5, 4]]
+    for name in names:
+        (broken_files.root / name).unlink()
+    data = module(broken_files, on_bad_file=OnBadFile.skip, batch_size=3, num_workers=num_workers)
     (batch,) = data.val_dataloader()
-    assert batch.skipped == {RADARS[0]: 2} and len(batch) == 3
+    assert batch.skipped == {RADARS[0]: 2} and len(batch) == 3 and batch.bad_files == names
 
 
 def test_worker_that_dies_is_a_data_error(data_set, quick_end):

@@ -248,13 +248,15 @@ def test_bad_files_stop_or_are_counted(broken_files, caplog):
     radar, token = radar_path(broken_files)
     radar.write_bytes(radar.read_bytes()[:-5])
     index = load_index(broken_files.root, VERSION, None)
-    (broken_files.root / index.filename(index.key_data[1, 2])).unlink()
+    camera = broken_files.root / index.filename(index.key_data[1, 2])
+    camera.unlink()
     with pytest.raises(DataError, match=f"{radar.name}.*{token}.*data.on_bad_file=skip"):
         broken_files.reader().read(1, None)
     reader = broken_files.reader(on_bad_file=OnBadFile.skip)
     for _ in range(2):
         frame = reader.read(1, None)
         assert frame.skipped == {RADARS[0]: 1, CAMERAS[2]: 1}
+        assert frame.bad_files == [str(path.relative_to(broken_files.root)) for path in (radar, camera)]
         assert frame.image_valid.tolist() == [[True, True, False, True]] and not frame.images[0, 2].any()
         assert len(frame.radar_points) == (60 - 1) * 21
     assert caplog.text.count(radar.name) == 1  # told once
@@ -288,7 +290,7 @@ def test_sensors_that_were_not_recorded_are_masked(broken_files):
     broken_files.table("sample_data").write_text(json.dumps(records))
     frame = broken_files.reader().read(1, None)
     assert frame.image_valid.tolist() == [[True, False, True, True]]
-    assert frame.skipped == {f"{name} (not recorded)": 1 for name in gone}
+    assert frame.skipped == {f"{name} (not recorded)": 1 for name in gone} and frame.bad_files == []
     assert torch.linalg.inv(frame.pix_from_aug).isfinite().all()
 
 

@@ -89,6 +89,17 @@ def case(table, row, change, *words, name):
         case("sample_data", 30, {"prev": token("sample_data", "CAMERA_LEFT_FRONT", int(START_S * 1e6) + 19_000)},
              "same channel", name="file-chain-of-another"),
         case("scene", 1, {"name": "scene-train-0"}, "of its own", name="same-scene-name"),
+        case("scene", 1, {"name": "x" * 256}, "at most 255 characters", name="long-name"),
+        case("scene", 1, {"description": "x" * 10_001}, "at most 10000 characters", name="long-description"),
+        case("scene", 1, {"name": "\ud800"}, "'\\ud800'", "surrogates", name="half-a-character"),
+        case("sample_data", 0, {"filename": "\ud800.jpg"}, "surrogates", name="half-a-character-of-a-path"),
+        case("sample", 1, {"token": "a\0"}, "without NUL", name="nul"),
+        case("sample", 1, {"timestamp": 10**16}, "below 10000000000000000", name="time-of-the-far-future"),
+        case("ego_pose", 0, {"translation": [1e300, 0, 0]}, "1e+300", "at most 1e+08", name="far-away"),
+        case("ego_pose", 0, {"translation": [10**400, 0, 0]}, "3 numbers", name="beyond-floats"),
+        case("sample_annotation", 0, {"num_radar_pts": 2**40}, "a number of points", name="more-points-than-int32"),
+        case("sample_annotation", 0, {"num_lidar_pts": 2**62}, "a number of points", name="more-points-than-int64"),
+        case("sample_annotation", 0, {"num_lidar_pts": -7}, "a number of points", name="negative-points"),
     ],
 )  # fmt: skip
 def test_bad_values_are_named(broken_tables, table, row, change, words):
@@ -103,8 +114,14 @@ def test_bad_values_are_named(broken_tables, table, row, change, words):
 
 @pytest.mark.parametrize(
     "change",
-    [{"size": [1.0, 0.0, 1.0]}, {"size": [1.0, -2.0, 1.0]}, {"translation": [float("nan"), 0, 0]}],
-    ids=["zero-size", "negative-size", "nan-centre"],
+    [
+        {"size": [1.0, 0.0, 1.0]},
+        {"size": [1.0, -2.0, 1.0]},
+        {"translation": [float("nan"), 0, 0]},
+        {"size": [1.0, 1e30, 1.0]},
+        {"translation": [1e300, 0, 0]},
+    ],
+    ids=["zero-size", "negative-size", "nan-centre", "huge-size", "far-centre"],
 )
 def test_boxes_that_cannot_be_are_left_out_and_counted(broken_tables, caplog, change):
     record = broken_tables.edit("sample_annotation", 0, **change)
@@ -112,6 +129,21 @@ def test_boxes_that_cannot_be_are_left_out_and_counted(broken_tables, caplog, ch
     assert np.diff(index.box_starts).tolist() == [1, 2, 1, 2, 2, 1]
     assert "1 annotations" in caplog.text and record["token"] in caplog.text
     assert np.isfinite(index.box_centers).all() and (index.box_sizes > 0).all()
+
+
+def test_a_box_that_jumps_has_no_velocity_and_spoils_none(broken_tables):
+    """The car's three boxes: beyond the Earth in the middle, then a thousand kilometres further within a second."""
+    cars = [row for row, record in enumerate(broken_tables.records("sample_annotation"))
+            if record["size"] == [1.9, 4.6, 1.6]][:3]  # fmt: skip
+    where = broken_tables.records("sample_annotation")[cars[1]]["translation"]
+    broken_tables.edit("sample_annotation", cars[1], translation=[1e300, 0.0, 0.0])
+    first = build(broken_tables)
+    assert np.isnan(first.box_velocities[first.box_starts[0]]).all()  # towards the one that is left out
+    broken_tables.edit("sample_annotation", cars[1], translation=[where[0] + 1e6, *where[1:]])
+    again = build(broken_tables)
+    assert np.isnan(again.box_velocities[again.box_starts[0]]).all()
+    assert len(again.box_labels) == len(first.box_labels) + 1
+    np.testing.assert_array_equal(again.box_velocities[again.box_starts[2]], first.box_velocities[first.box_starts[2]])
 
 
 def test_sweeps_of_another_scene_are_not_linked(broken_tables):

@@ -201,12 +201,15 @@ def test_nothing_at_all():
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
-        ("scores", np.nan, "scores must be finite and at least 0, but got nan"),
-        ("scores", -0.1, "scores must be finite and at least 0"),
+        ("scores", np.nan, "scores must be at least 0 and finite, .*, but got nan"),
+        ("scores", -0.1, "scores must be at least 0 and finite"),
         ("centers", np.inf, "centers must be finite"),
-        ("sizes", 0.0, "sizes must be finite and positive"),
-        ("rotations", 0.0, "rotations must be finite, not all 0"),
-        ("velocities", np.inf, "velocities must be finite or NaN"),
+        ("centers", 1e10, "centers must be finite, at most 1e.09 in size, but got"),
+        ("sizes", 0.0, "sizes must be positive and finite"),
+        ("rotations", 0.0, "rotations must be finite, .*, not all 0"),
+        ("rotations", 1e-200, "rotations must be finite, .*, not all 0"),  # their squares are 0
+        ("velocities", np.inf, "velocities must be finite, .*, or NaN"),
+        ("velocities", -1e10, "velocities must be finite, .*, or NaN"),
         ("labels", 12, "labels must be 0..11"),
         ("attributes", 11, r"attributes must be -1..10"),
         ("samples", 1, r"samples must be 0..0, but got 1"),

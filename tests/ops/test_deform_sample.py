@@ -149,6 +149,12 @@ def test_invisible_points_count_for_nothing():
     assert not deform_attend_images(values, pixels, (16, 24), weights, visible & False).any()
 
 
+@pytest.mark.parametrize(("batch", "queries"), [(1, 0), (0, 5)])
+def test_image_attention_of_nothing(batch, queries):
+    values, pixels, weights = pyramid(batch, queries)
+    assert deform_attend_images(values, pixels, (16, 24), weights).shape == (batch, queries, 6)
+
+
 def test_wrong_shapes_are_named():
     values, sites, points, batch = scene()
     with pytest.raises(ValueError, match="expected as many rows"):

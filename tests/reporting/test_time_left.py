@@ -35,3 +35,9 @@ def test_each_phase_takes_what_its_finished_runs_took():
 )
 def test_durations(seconds, expected):
     assert duration(seconds) == expected
+
+
+def test_a_clock_that_was_set_back_adds_nothing():
+    record = record_of(phase1_0="done", phase1_1="running")
+    assert seconds_left(record, {"m-phase1-mini-0": 100.0}, 1, NOW - 86_400.0) == pytest.approx(100.0)
+    assert seconds_left(record, {"m-phase1-mini-0": 100.0}, 1, NOW + 86_400.0) == 0.0

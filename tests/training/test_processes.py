@@ -161,6 +161,33 @@ def test_the_exit_code_is_that_of_the_cause_and_nobody_is_left_waiting(code, exp
     assert time.monotonic() - started < 20
 
 
+@pytest.mark.parametrize(
+    ("code", "told"),
+    [
+        ("sys.exit(0)", []),
+        ("sys.exit(6)", []),  # stopped from outside is no failure
+        ("sys.exit(4 if rank else 0)", ["process 1 of 2 ended with exit code 4; ending the others"]),
+        (
+            "os.kill(os.getpid(), signal.SIGKILL) if rank else time.sleep(60)",
+            [
+                "process 1 of 2 was killed by SIGKILL, as the system does when memory is short; ending the others",
+                "process 0 of 2 did not end within 1 s; killing it",
+            ],
+        ),
+        (
+            "time.sleep(60) if rank else os.kill(os.getpid(), signal.SIGSEGV)",
+            [
+                "process 0 of 2 was killed by SIGSEGV; ending the others",
+                "process 1 of 2 did not end within 1 s; killing it",
+            ],
+        ),
+    ],
+)
+def test_the_launcher_says_which_process_failed_and_how(code, told, command, caplog):
+    command(code)
+    assert [record.message for record in caplog.records if record.levelname == "WARNING"] == told
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_to_the_launching_process_reaches_all_as_sigterm(number, command, tmp_path):
     def once_both_wait():
@@ -205,6 +232,42 @@ def test_the_main_process_decides_for_all_and_what_it_refuses_ends_all(command, 
     assert {(tmp_path / f"answer{rank}").read_text() for rank in (0, 1)} == {"{'resume_from': None, 'step': 7}"}
     assert not (tmp_path / "went on").exists()
     assert capfd.readouterr().err.count("ConfigError: such a folder is taken") == 1
+
+
+MEET = """
+import torch
+from src.command import run_command
+from src.errors import DataError
+from src.training import processes
+
+def main(overrides):
+    with processes.process_group('cpu', 2):
+        for turn in range(1000):
+            torch.distributed.all_reduce(torch.ones(1))
+            if turn == 3 and rank == 1:
+                {fault}
+
+run_command(main)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "code", "cause"),
+    [
+        ("raise DataError('such a file')", 4, "DataError: such a file"),
+        ("os.kill(os.getpid(), signal.SIGKILL)", 1, "process 1 of 2 was killed by SIGKILL"),
+    ],
+)
+def test_what_ended_a_process_is_read_before_what_the_others_say(fault, code, cause, command, monkeypatch, capfd):
+    """`tests/faults/test_ranks.py` does it to real training."""
+    monkeypatch.setattr(processes, "GRACE_S", 30.0)
+    # The launcher's lines come in between those of the processes.
+    monkeypatch.setattr(processes.logger, "warning", lambda text, *values: os.write(2, (text % values).encode()))
+    assert command(MEET.format(fault=fault)) == code
+    text = capfd.readouterr().err
+    assert -1 < text.find(cause) < text.find("another process of this run ended, its message says why"), text
+    assert "Traceback" not in text, text
 
 
 # ---------------------------------------------------------------- the commands as people type them

@@ -15,7 +15,7 @@ import torch.multiprocessing as mp
 from toys import STEPS, ToyData, toy_module
 
 from src.errors import InterruptedRunError
-from src.training.checkpoints import read_checkpoint
+from src.training.checkpoints import AtomicCheckpointIO, read_checkpoint
 from src.training.fit import build_loggers, build_trainer, fit
 from src.training.interruption import Interruption
 from src.training.processes import build_strategy, is_main_process, process_group
@@ -164,6 +164,47 @@ def test_only_the_results_were_missing(run, validate_every, ema):
     expected, _ = run("run", **options)
     found, module = run("run", **options)
     assert module.seen == [] and found == expected
+
+
+def killed_at_save(monkeypatch, number, after):
+    """Make the process end at one of its writes of a checkpoint, before or after it."""
+    write, saves = AtomicCheckpointIO._write, []
+
+    def write_until(self, checkpoint, target):
+        saves.append(target.name)
+        if len(saves) != number:
+            return write(self, checkpoint, target)
+        if after:
+            write(self, checkpoint, target)
+        raise Killed
+
+    monkeypatch.setattr(AtomicCheckpointIO, "_write", write_until)
+    return saves
+
+
+@STOPPED_OFTEN
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", [(), ("last.ckpt",), ("last.ckpt", "previous.ckpt")])
+def test_killed_around_every_write(run, monkeypatch, tmp_path, lost):
+    """The next start finds the newest file, or where that is torn the one before, or where both are the best."""
+    expected, _ = run("whole")
+    with monkeypatch.context() as patched:
+        saves = killed_at_save(patched, 0, False)
+        run("counted")
+    assert saves == ["last.ckpt", "best.ckpt", "last.ckpt"] + 2 * ["last.ckpt"] * 2
+    for number in range(1, len(saves) + 1):
+        for after in (False, True):
+            name = f"killed at {number} {after}"
+            with monkeypatch.context() as patched, pytest.raises(Killed):
+                killed_at_save(patched, number, after)
+                run(name)
+            checkpoints = tmp_path / name / "checkpoints"
+            torn = [checkpoints / file for file in lost if (checkpoints / file).is_file()]
+            if len(torn) < len(list(checkpoints.glob("*.ckpt"))):  # with none left, the run does not go on unasked
+                for path in torn:
+                    path.write_bytes(path.read_bytes()[:1000])
+            found, _ = run(name)
+            assert found == expected, name
 
 
 def test_the_earlier_handlers_come_back(run):

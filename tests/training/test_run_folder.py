@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import pytest
 
@@ -83,3 +84,74 @@ def test_json_with_nan_is_refused_rather_than_written(tmp_path):
     with pytest.raises(ValueError):
         write_json(tmp_path / "x.json", {"mAP": float("nan")})
     assert not (tmp_path / "x.json").exists()
+
+
+def write_checkpoint(folder, name):
+    AtomicCheckpointIO().save_checkpoint({"state_dict": {}, "horizon3d": {"config": {}}}, folder.checkpoints / name)
+
+
+def test_a_damaged_last_checkpoint_gives_way_to_the_one_before(tmp_path, caplog):
+    folder = RunFolder(tmp_path, "run")
+    folder.open(Resume.auto)
+    for name in ("last.ckpt", "previous.ckpt", "best.ckpt"):
+        write_checkpoint(folder, name)
+    assert folder.newest_checkpoint().name == "last.ckpt" and not caplog.records
+    (folder.checkpoints / "last.ckpt").write_bytes(b"")
+    assert folder.newest_checkpoint().name == "previous.ckpt"
+    (told,) = [record.getMessage() for record in caplog.records]
+    assert "last.ckpt is truncated" in told and f"going on from {folder.checkpoints / 'previous.ckpt'} instead" in told
+
+
+def test_what_a_killed_process_was_writing_goes_and_so_does_what_only_resuming_needs(tmp_path):
+    folder = RunFolder(tmp_path, "run")
+    folder.open(Resume.auto)
+    for name in ("last.ckpt", "previous.ckpt", "best.ckpt"):
+        write_checkpoint(folder, name)
+    for name in (
+        "last.ckpt.tmp",
+        "previous.ckpt.tmp",
+        ".probe-77",
+        "../.submission.json.77.part",
+        "../metrics.csv.tmp",
+    ):
+        (folder.checkpoints / name).write_bytes(b"half")
+    folder._release()
+    again = RunFolder(tmp_path, "run")
+    again.open(Resume.auto)
+    assert {path.name for path in folder.checkpoints.iterdir()} == {"last.ckpt", "previous.ckpt", "best.ckpt"}
+    assert {path.name for path in folder.path.iterdir()} == {"checkpoints", ".lock"}
+    write_json(again.metrics_json, {"mAP": 0.5})
+    again.finish({"commit": "abc"})
+    assert again.finished and {path.name for path in folder.checkpoints.iterdir()} == {"last.ckpt", "best.ckpt"}
+
+
+def test_a_clock_that_says_the_same_time_again_costs_no_old_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr("src.training.run_folder.time.strftime", lambda form: "19700101-000000")
+    for number in range(4):
+        folder = RunFolder(tmp_path, "run")
+        folder.open(Resume.restart)
+        folder.log.write_text(str(number))
+        folder._release()
+    assert {path.name: (path / "log.txt").read_text() for path in tmp_path.iterdir()} == {
+        "run.before-19700101-000000": "0",
+        "run.before-19700101-000000-2": "1",
+        "run.before-19700101-000000-3": "2",
+        "run": "3",
+    }
+
+
+def test_a_folder_that_was_deleted_and_made_anew_is_another(tmp_path):
+    folder = RunFolder(tmp_path, "run")
+    folder.open(Resume.auto)
+    folder.check_held()
+    folder.path.rename(tmp_path / "elsewhere")
+    with pytest.raises(FileNotFoundError):
+        folder.check_held()
+    other = RunFolder(tmp_path, "run")
+    other.open(Resume.auto)
+    other.check_held()
+    with pytest.raises(CheckpointError, match="made anew by another process"):
+        folder.check_held()
+    shutil.rmtree(folder.path)
+    (tmp_path / "elsewhere").rename(folder.path)
+    folder.check_held()

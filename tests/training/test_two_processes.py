@@ -1,9 +1,12 @@
 """Two processes train and score as one with the same batch does (CPU, gloo)."""
 
 import copy
+import csv
 import importlib.util
 import os
+import signal
 import socket
+import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,13 +17,20 @@ import pytest
 import torch
 import torch.multiprocessing as mp
 from torch.utils.data import DataLoader
+from toys import STEPS as TOY_STEPS
+from toys import Positions, toy_batch, toy_module
 
 from src.data.datamodule import collate, in_lane
-from src.metrics.detection import score_detections
+from src.errors import InterruptedRunError
+from src.metrics.benchmark import random_problem
+from src.metrics.detection import DetectionMetric, score_detections
 from src.models.horizon3d.kggi import Initialization
 from src.structures.detections import DetectionTable, EvaluationSet
+from src.training.detection import DetectionModule
+from src.training.fit import build_loggers, build_trainer, fit
 from src.training.optim import OptimConfig
-from src.training.processes import SharedBuffers, build_strategy, process_group
+from src.training.processes import SharedBuffers, build_strategy, is_main_process, process_group
+from src.training.run_folder import Resume, RunFolder
 from src.training.temporal import TemporalModule
 
 LANES, STEPS = 4, 3
@@ -32,6 +42,7 @@ COLUMNS = tuple(DetectionTable.__dataclass_fields__)
 def _of_the_models_tests():
     """The small model and its frames are described beside the model's own tests."""
     path = Path(__file__).parents[1] / "models" / "horizon3d" / "conftest.py"
+    sys.path.append(str(path.parents[1]))  # of what it imports, when this file is tested alone
     spec = importlib.util.spec_from_file_location("horizon3d_conftest", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -75,13 +86,18 @@ class Module(TemporalModule):
         return torch.optim.SGD(self.model.parameters(), lr=1e-3)
 
 
-def work_as(rank, world_size, port, work):
-    """Train three steps and validate, as rank `rank` of `world_size`; the result goes to a file."""
+def become(rank, world_size, port):
+    """Tell this process who it is, as a launcher does."""
     torch.set_num_threads(1)
     if world_size > 1:
         who = {"LOCAL_RANK": rank, "RANK": rank, "WORLD_SIZE": world_size}
         who |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
         os.environ.update({name: str(value) for name, value in who.items()})
+
+
+def work_as(rank, world_size, port, work):
+    """Train three steps and validate, as rank `rank` of `world_size`; the result goes to a file."""
+    become(rank, world_size, port)
     optim = OptimConfig(
         lr=1e-3, weight_decay=0.0, clip_norm=35.0, peak_lr_ratio=1.0, final_lr_ratio=1.0, rise_fraction=0.5,
         betas=[0.9, 0.99], cycled_beta1=None, ema_decay=None,
@@ -117,11 +133,17 @@ def in_one_process(work):
 
 
 def in_two_processes(work):
-    """Both ranks with a deadline; their results."""
+    """Both ranks' results."""
+    spawn_two(work_as, work)
+    return [torch.load(work.folder / f"2-{rank}.pt", weights_only=True) for rank in range(2)]
+
+
+def spawn_two(function, *arguments):
+    """`function` of rank, number of ranks, port and `arguments` in two processes, with a deadline."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    context = mp.spawn(work_as, (2, port, work), nprocs=2, join=False)
+    context = mp.spawn(function, (2, port, *arguments), nprocs=2, join=False)
     deadline = time.monotonic() + DEADLINE_S
     try:
         while not context.join(timeout=1.0):
@@ -130,7 +152,6 @@ def in_two_processes(work):
         for process in context.processes:
             if process.is_alive():
                 process.kill()
-    return [torch.load(work.folder / f"2-{rank}.pt", weights_only=True) for rank in range(2)]
 
 
 @pytest.fixture
@@ -237,3 +258,120 @@ def test_two_processes_score_as_one_does_their_checkpoint(work):
         found = score_detections(truth, table_of(result["detections"])).as_dict()
         for (name, value), (same_name, same) in zip(numbers(expected), numbers(found), strict=True):
             assert name == same_name and same == (None if value is None else pytest.approx(value, abs=1e-6)), name
+
+
+# ---------------------------------------------------------------- going on with another number of processes
+
+STOP_AT = TOY_STEPS + 1  # in the middle of the second epoch
+PROBLEM = 7, 20, 40, 3  # samples, which two ranks share as five and two; annotations, boxes, seed
+
+
+class Single(DetectionModule):
+    """Trains on single frames, stops where told to, and validates with boxes that are given."""
+
+    stop_at = None
+
+    def training_step(self, batch, batch_idx):
+        if self.trainer.global_step == self.stop_at:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return super().training_step(batch, batch_idx)
+
+    def validation_step(self, batch, batch_idx):
+        evaluation_set, boxes = random_problem(*PROBLEM)
+        sample = int(batch.tokens[0].split()[1])
+        self.metric.update([evaluation_set.tokens[sample]], boxes[boxes.samples == sample])
+
+
+class Shared:
+    """This rank's part of the four lanes of (epoch, step)."""
+
+    def __init__(self, lanes):
+        self.lanes = lanes
+
+    def __getitem__(self, key):
+        epoch, step = key
+        return collate([toy_batch([lane], [False], number=1000 * lane + 10 * epoch + step) for lane in self.lanes])
+
+
+class SharedData(L.LightningDataModule):
+    """The same batches however many ranks share them; validation in unequal parts."""
+
+    def train_dataloader(self):
+        lanes = (FIRST_RANK, SECOND_RANK)[self.trainer.global_rank] if self.trainer.world_size > 1 else range(LANES)
+        return DataLoader(Shared(lanes), batch_size=None, sampler=Positions(self.trainer, []))
+
+    def val_dataloader(self):
+        samples = range(PROBLEM[0])
+        if self.trainer.world_size > 1:
+            samples = (samples[:5], samples[5:])[self.trainer.global_rank]
+        return DataLoader([toy_batch([0], [True], sample) for sample in samples], batch_size=None)
+
+
+def train_single(path, world_size, stop_at=None):
+    """Train three epochs in a folder, from its newest checkpoint where there is one."""
+    folder = RunFolder(path.parent, path.name)
+    if is_main_process():
+        folder.open(Resume.auto)
+    resume_from = folder.newest_checkpoint()
+    module = toy_module(Single)
+    module.model.dropout.p = 0.0  # its draws are a rank's own
+    module.metric, module.stop_at = DetectionMetric(random_problem(*PROBLEM)[0]), stop_at
+    trainer = build_trainer(
+        folder, epochs=3, validate_every=1, precision="32-true", accelerator="cpu", devices=world_size,
+        log_every_steps=1, ema_decay=None, strategy=build_strategy("cpu", world_size),
+        loggers=build_loggers(folder, resume_from, None) if is_main_process() else [],
+    )  # fmt: skip
+    trainer.progress_bar_callback.disable()
+    try:
+        fit(trainer, module, SharedData(), resume_from)
+    except InterruptedRunError:
+        assert stop_at is not None and trainer.global_step == stop_at + 1
+    finally:
+        if is_main_process():
+            folder._release()
+    return module.scores and module.scores.as_dict()
+
+
+def go_on_as(rank, world_size, port, folder):
+    """As one of two: finish what one process began, and begin what one process will finish."""
+    become(rank, world_size, port)
+    with process_group("cpu", world_size):
+        scores = train_single(folder / "one, then two", world_size)
+        train_single(folder / "two, then one", world_size, stop_at=STOP_AT)
+    torch.save(scores, folder / f"scores {rank}.pt")
+
+
+def epochs_of(path):
+    """The log's rows of epochs: their means and scores by name."""
+    with open(path / "metrics.csv", newline="") as file:
+        rows = [{name: float(value) for name, value in row.items() if value} for row in csv.DictReader(file)]
+    return [row for row in rows if "loss/total" in row or "val/mAP" in row]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Checkpoint directory")
+def test_a_run_goes_on_with_another_number_of_processes(tmp_path):
+    """From one to two and from two to one in the middle of an epoch: its means are those of one process all along."""
+    scores = train_single(tmp_path / "one", 1)
+    train_single(tmp_path / "one, then two", 1, stop_at=STOP_AT)
+    spawn_two(go_on_as, tmp_path)
+    assert scores == score_detections(*random_problem(*PROBLEM)).as_dict()
+    assert train_single(tmp_path / "two, then one", 1) == scores
+    assert 0.02 < scores["mAP"] < 0.98
+    for rank in range(2):
+        assert torch.load(tmp_path / f"scores {rank}.pt", weights_only=True) == scores  # to the last digit
+
+    expected = epochs_of(tmp_path / "one")
+    assert len(expected) >= 3 and {"loss/total", "loss/near", "state/gradient_norm"} <= set(expected[1])
+    for name in ("one, then two", "two, then one"):
+        found = epochs_of(tmp_path / name)
+        assert len(found) == len(expected)
+        for row, same in zip(found, expected, strict=True):
+            assert set(row) == set(same)
+            for key, value in same.items():
+                if key.startswith("state/") and row["epoch"] == STOP_AT // TOY_STEPS:
+                    continue  # means over ranks: in the epoch of the change, steps of two ranks count twice
+                exact = key.startswith("val/") or key in ("epoch", "step")
+                # The spread of a batch is a rank's own; everything else is a sum over frames.
+                tolerance = 0.0 if exact else 1e-5
+                assert key == "state/spread" or row[key] == pytest.approx(value, rel=tolerance, abs=0.0), (name, key)

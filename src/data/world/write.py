@@ -82,7 +82,7 @@ def write_world(config: WorldConfig, root: Path, progress: bool = True) -> Path:
 def _read_stored(root: Path) -> dict[str, object]:
     try:
         stored = json.loads((root / CONFIG_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(
             f"{root}: not a complete synthetic world ({CONFIG_FILE}: {error}); remove the folder or choose another"
         ) from error

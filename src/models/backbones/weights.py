@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import pickle
+import io
 import re
+import zipfile
 from enum import Enum
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from src.errors import CheckpointError
 WRAPPERS = ("state_dict", "model")
 PREFIXES = ("img_backbone.", "backbone.bottom_up.")  # FCOS3D, DD3D
 LISTED_KEYS = 5
+LARGEST = 1e9
+"""Of a weight or a variance in size; those of published files stay far below."""
 
 
 class BackboneName(Enum):
@@ -59,6 +62,12 @@ def load_backbone_weights(module: nn.Module, path: str | Path, name: BackboneNam
             f"backbone.weights={path}: {_listed(wrong)} differ in shape from {name.value}; "
             "use a file made for this backbone"
         )
+    damaged = [key for key, value in expected.items() if value.is_floating_point() and not _is_sound(found[key])]
+    if damaged:
+        raise CheckpointError(
+            f"backbone.weights={path}: {_listed(damaged)} must hold finite numbers of at most {LARGEST:g} in size; "
+            "the file is damaged: download it again"
+        )
     module.load_state_dict(found)
 
 
@@ -67,8 +76,10 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise CheckpointError(f"backbone.weights={path}: no such file; download it first or set backbone.weights=null")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError) as error:
+        content = torch.load(_checked_file(path), map_location="cpu", weights_only=True)
+    except MemoryError:
+        raise
+    except Exception as error:  # a damaged pickle fails in many ways, all of them harmless
         raise CheckpointError(
             f"backbone.weights={path}: expected a torch file with tensors only, but reading it failed "
             f"({type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'no reason given'}); "
@@ -89,6 +100,27 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
     if others:
         raise CheckpointError(f"backbone.weights={path}: expected tensors only, but {_listed(others)} are none")
     return content
+
+
+def _is_sound(value: Tensor) -> bool:
+    plain = value.is_floating_point() and value.layout is torch.strided
+    return plain and bool((value.abs() <= LARGEST).all())  # NaN is not
+
+
+def _checked_file(path: Path) -> Path | io.BytesIO:
+    """What to load from. Raises ValueError for an archive with damage that torch reads over, or larger than its file.
+
+    A file of the older format is read as a whole: torch would ask a file for as many bytes as a damaged length says.
+    """
+    if not zipfile.is_zipfile(path):
+        return io.BytesIO(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        if sum(member.file_size for member in archive.infolist()) > path.stat().st_size:
+            raise ValueError("its parts are larger than the file")
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise ValueError(f"the checksum of {damaged} in it is wrong")
+    return path
 
 
 def _rename(key: str, name: BackboneName) -> str:

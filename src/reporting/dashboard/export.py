@@ -17,6 +17,8 @@ PICTURE_BUDGET = 8_000_000
 """Bytes of embedded pictures; those of every run's first frame come first, then of the second, and so on."""
 PICTURE_WIDTH = 960
 JPEG_QUALITY = 72
+MAX_PIXELS = 64_000_000
+"""Of a picture that is decoded; those of runs have a hundredth of it."""
 
 
 def export_dashboard(reports: Path, outputs: Path | None, path: Path) -> None:
@@ -58,10 +60,12 @@ def embed_pictures(board: Board, budget: int = PICTURE_BUDGET) -> dict[tuple[str
 
 def _data_address(picture: Picture) -> str | None:
     """A smaller JPEG of the picture; None where it cannot be decoded."""
+    if picture.width * picture.height > MAX_PIXELS:
+        return None
     try:
-        with Image.open(picture.path) as image:
+        with Image.open(picture.path, formats=("PNG",)) as image:
             image = image.convert("RGB")
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except Exception:  # Pillow's parsers of damaged files fail in many ways
         return None
     image.thumbnail((PICTURE_WIDTH, 4 * PICTURE_WIDTH))
     stream = io.BytesIO()

@@ -1,6 +1,7 @@
 """What lies in the run folders of paths.outputs: pictures, logs, learning curves so far. Reads, never writes.
 
-Names that come from an address are looked up among what a folder lists, never joined to a path unseen.
+Names that come from an address are looked up among what a folder lists, never joined to a path unseen, and a link that
+leads out of its folder is as good as no file.
 """
 
 from __future__ import annotations
@@ -17,9 +18,12 @@ from typing import Any
 
 import yaml
 
+from src.reporting.plain_yaml import load_plain_yaml
 from src.reporting.results import thinned, without_places
 
 TAIL_BYTES = 24_000
+CONFIG_BYTES = 1_000_000
+"""A larger config.yaml is not a run's."""
 ALIVE_S = 300.0
 """A run folder without a result counts as running as long as something was written in it this recently."""
 
@@ -81,7 +85,8 @@ class RunFolders:
             return []
         found = []
         for path in (folder / "pictures").glob("*.png"):
-            size = _png_size(path) if _NAME.fullmatch(path.name) and path.resolve().is_relative_to(folder) else None
+            inside = _NAME.fullmatch(path.name) and path.is_file() and path.resolve().is_relative_to(folder)
+            size = _png_size(path) if inside else None
             if size is not None:
                 found.append(Picture(run_id=run_id, name=path.name, path=path, width=size[0], height=size[1]))
         return sorted(found, key=lambda picture: picture.order)
@@ -111,16 +116,16 @@ class RunFolders:
 
     def curves(self, run_id: str) -> Curves:
         """Losses and scores so far, from metrics.csv: steps and values, as thinned as those of a result."""
-        folder = self.find(run_id)
-        return read_curves(folder / "metrics.csv") if folder is not None else {}
+        path = self._file_of(run_id, "metrics.csv")
+        return read_curves(path) if path is not None else {}
 
     def config(self, run_id: str) -> dict[str, Any]:
         """The configuration of a run that has no result yet, without what concerns the machine; empty if unreadable."""
-        folder = self.find(run_id)
-        if folder is None:
+        path = self._file_of(run_id, "config.yaml")
+        if path is None or path.stat().st_size > CONFIG_BYTES:
             return {}
         try:
-            tree = yaml.load((folder / "config.yaml").read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+            tree = load_plain_yaml(path.read_text())
         except (OSError, ValueError, yaml.YAMLError):
             return {}
         return without_places(tree) if isinstance(tree, dict) else {}
@@ -149,7 +154,15 @@ class RunFolders:
         if self.outputs is None:
             return None
         path = (self.outputs / relative).resolve()
-        return path if path.is_relative_to(self.outputs) and path.suffix in (".txt", ".log") else None
+        if not path.is_relative_to(self.outputs) or path.suffix not in (".txt", ".log"):
+            return None
+        return path if path.is_file() or not path.exists() else None  # reading a pipe would wait for ever
+
+    def _file_of(self, run_id: str, name: str) -> Path | None:
+        """A file of a run's folder, where it is one and lies in there."""
+        folder = self.find(run_id)
+        path = (folder / name).resolve() if folder is not None else None
+        return path if path is not None and path.is_file() and path.is_relative_to(folder) else None
 
     def _entries(self) -> Iterator[os.DirEntry]:
         if self.outputs is None:

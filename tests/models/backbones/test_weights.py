@@ -1,3 +1,4 @@
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -87,3 +88,40 @@ class Intruder:
 
 def test_code_in_a_file_is_never_run(path: Path) -> None:
     assert "tensors only" in refused(path, {"conv1.weight": Intruder()})
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("-inf"), 1e30])
+def test_weights_that_cannot_be_are_refused(path: Path, value: float) -> None:
+    content = tiny().state_dict()
+    content["bn1.running_var"][1] = value
+    assert "1 (bn1.running_var)" in refused(path, content) and "download it again" in refused(path, content)
+
+
+def test_tensors_of_other_kinds_are_refused(path: Path) -> None:
+    content = tiny().state_dict()
+    for other in (content["bn1.weight"].to(torch.complex64), content["bn1.weight"].to_sparse(), torch.ones(4).bool()):
+        assert "bn1.weight" in refused(path, content | {"bn1.weight": other})
+
+
+def test_a_flipped_bit_is_found_by_the_checksum(path: Path) -> None:
+    torch.save(tiny().state_dict(), path)
+    content = bytearray(path.read_bytes())
+    at = content.index(tiny().state_dict()["bn1.weight"].numpy().tobytes())
+    content[at + 2] ^= 1  # 1.0 becomes 1.0078, which torch reads without a word
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match="checksum of .* is wrong"):
+        load_backbone_weights(tiny(), path, BackboneName.resnet50)
+
+
+def test_an_archive_larger_than_its_file_is_refused(path: Path) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", bytes(50_000_000))
+    with pytest.raises(CheckpointError, match="larger than the file"):
+        load_backbone_weights(tiny(), path, BackboneName.resnet50)
+
+
+def test_the_older_format_is_read_too(path: Path) -> None:
+    source, target = tiny(), tiny()
+    torch.save(source.state_dict(), path, _use_new_zipfile_serialization=False)
+    load_backbone_weights(target, path, BackboneName.resnet50)
+    assert torch.equal(target.conv1.weight, source.conv1.weight)

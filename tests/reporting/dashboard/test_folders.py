@@ -1,5 +1,7 @@
 """Run folders: what is found, and that nothing outside is."""
 
+import os
+
 import pytest
 
 from src.reporting.dashboard.folders import RunFolders, read_curves
@@ -80,3 +82,46 @@ def test_configuration_of_an_unfinished_run_says_nothing_of_the_machine(world, f
     for text in ("model: [", "just words", ""):
         (world.outputs / run / "config.yaml").write_text(text)
         assert folders.config(run) == {}
+
+
+def test_files_of_a_run_that_lead_out_are_as_good_as_none(world, folders):
+    """A run folder from somebody else may name any file of this machine as its own."""
+    run, outside = world.run_id(0, 0), world.outputs.parent
+    folder = world.outputs / run
+    (outside / "secret.yaml").write_text("password: s3cret\n")
+    (outside / "secret.csv").write_text("step,loss/s3cret\n1,2\n")
+    (outside / "log.txt").write_text("s3cret\n")
+    for name, target in (("config.yaml", "secret.yaml"), ("metrics.csv", "secret.csv"), ("log.txt", "log.txt")):
+        (folder / name).unlink()
+        (folder / name).symlink_to(outside / target)
+    assert folders.config(run) == {} and folders.curves(run) == {} and folders.log_tail(f"{run}/log.txt") is None
+    (folder / "pictures").rename(outside / "moved")
+    (folder / "pictures").symlink_to(outside / "moved")
+    assert folders.pictures(run) == [] and folders.picture(run, "frame_0_abc.png") is None
+
+
+def test_a_pipe_is_not_waited_for(world, folders):
+    run = world.run_id(0, 0)
+    folder = world.outputs / run
+    for name in ("metrics.csv", "log.txt"):
+        (folder / name).unlink()
+        os.mkfifo(folder / name)
+    os.mkfifo(folder / "pictures" / "frame_7_pipe.png")
+    assert folders.curves(run) == {} and folders.log_tail(f"{run}/log.txt") is None
+    assert len(folders.pictures(run)) == 2
+    (folder / "config.yaml").unlink()
+    os.mkfifo(folder / "config.yaml")
+    assert run not in folders.names() and folders.config(run) == {}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a: &a [x, x]\n" + "".join(f"k{n}: &k{n} [*{f'k{n - 1}' if n else 'a'}, *a]\n" for n in range(60)),
+     "a: " + "[" * 200_000 + "]" * 200_000, "a: !!python/object/apply:os.mkdir [executed]", "x: " + "y" * 2_000_000],
+    ids=["aliases", "depth", "code", "size"],
+)  # fmt: skip
+def test_a_configuration_that_is_none_is_empty(world, folders, monkeypatch, text):
+    monkeypatch.chdir(world.outputs)
+    (world.outputs / world.run_id(0, 0) / "config.yaml").write_text(text)
+    assert folders.config(world.run_id(0, 0)) == {}
+    assert not (world.outputs / "executed").exists()

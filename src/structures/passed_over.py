@@ -1,0 +1,54 @@
+"""Sensor files that were not read, counted over many frames and told at the end."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import Any
+
+from src.structures.batch import FrameBatch
+
+MAX_NAMES, SHOWN_NAMES = 1000, 10
+"""Names kept in a record, and of these on a line; the counts are of all."""
+
+
+class PassedOver:
+    """How often a sensor's file was passed over, by channel, and which files these were."""
+
+    def __init__(self) -> None:
+        self.channels: Counter[str] = Counter()
+        self.files: Counter[str] = Counter()  # relative to the data set's root
+
+    def __bool__(self) -> bool:
+        return bool(self.channels)
+
+    def add(self, batch: FrameBatch) -> None:
+        """Count what a batch had to do without."""
+        self.channels.update(batch.skipped)
+        self.files.update(batch.bad_files)
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self.channels.clear()
+        self.files.clear()
+
+    def state(self) -> dict[str, dict[str, int]]:
+        """As plain values."""
+        return {"channels": dict(self.channels), "files": dict(self.files)}
+
+    def restore(self, states: Iterable[dict[str, Any]]) -> None:
+        """Add what `state` gave, on this rank before or on several."""
+        for state in states:
+            self.channels.update(state["channels"])
+            self.files.update(state["files"])
+
+    def names(self) -> list[str]:
+        """Up to MAX_NAMES files, in the order of their names."""
+        return sorted(self.files)[:MAX_NAMES]
+
+    def text(self) -> str:
+        """All of it on one line."""
+        counts = ", ".join(f"{count} of {channel}" for channel, count in sorted(self.channels.items()))
+        names, more = sorted(self.files)[:SHOWN_NAMES], len(self.files) - SHOWN_NAMES
+        listed = f": {', '.join(names)}{f' and {more} more' if more > 0 else ''}" if names else ""
+        return f"{counts} ({len(self.files)} unreadable files{listed})"

@@ -1,0 +1,152 @@
+"""The database of a sweep is lost, broken or slow in time while cells train; what they leave is not lost."""
+
+import logging
+import sqlite3
+import threading
+import time
+from collections import Counter
+
+import pytest
+
+from src.errors import ConfigError
+from src.reporting.sweep_record import read_record, record_path
+from src.sweeping import runner as runner_module
+from src.sweeping.study import GRACE_S
+from tests.sweeping.fake_sweep import ROOT, make_runner, make_sweep
+
+ROWS = {"a": ["model.x=1"], "b": ["model.x=2"], "c": ["model.x=3"]}
+
+
+@pytest.fixture(autouse=True)
+def at_the_root(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(runner_module, "AWAY_RETRY_S", 0.2)
+
+
+def sweep_of(seconds, rows=ROWS):
+    return make_sweep(rows, overrides=[f"fake.seconds={seconds}"])
+
+
+def lines(folder, what):
+    path = folder / "outputs" / "trained.txt"
+    found = path.read_text().splitlines() if path.exists() else []
+    return Counter(line.split()[1] for line in found if line.startswith(what))
+
+
+def wait_for(condition, timeout=60):
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def beside(action):
+    """Do something in another thread while the sweep runs in this one, where its signals are."""
+    failures = []
+
+    def run():
+        try:
+            action()
+        except BaseException as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread, failures
+
+
+def database(folder):
+    return folder / "outputs" / "sweeps" / "sweeps.db"
+
+
+def away(folder, began, until):
+    """Overwrite the database once a cell has begun, and bring the old content back when `until` is true."""
+
+    def act():
+        wait_for(lambda: lines(folder, "begin").total() >= began)
+        content = database(folder).read_bytes()
+        database(folder).write_bytes(b"no database " * 1000)
+        wait_for(until)
+        database(folder).write_bytes(content)
+
+    return act
+
+
+@pytest.mark.slow
+def test_a_database_that_comes_back_costs_no_cell(tmp_path, caplog):
+    """It is garbage while the first cell ends, so its end cannot be noted."""
+    runner = make_runner(tmp_path, sweep_of(0.4))
+    thread, failures = beside(away(tmp_path, 1, lambda: "trying again" in caplog.text))
+    with caplog.at_level(logging.WARNING):
+        record = runner.run()
+    thread.join()
+    assert not failures and "trying again for 15 minutes" in caplog.text
+    assert record.count("done") == 3
+    assert set(lines(tmp_path, "begin").values()) == {1} and lines(tmp_path, "begin").total() == 3
+
+
+@pytest.mark.slow
+def test_a_cell_that_failed_meanwhile_is_free_again(tmp_path, caplog):
+    """Nobody else would free it: the process that had it lives."""
+    runner = make_runner(tmp_path, sweep_of(0.3, {"a": ["model.x=1"]}))
+    (cell,) = runner.plan.cells.values()
+    fault = tmp_path / "outputs" / "faults" / cell.run_id
+    fault.parent.mkdir(parents=True)
+    fault.write_text("1")
+    thread, failures = beside(away(tmp_path, 1, lambda: "trying again" in caplog.text))
+    record = runner.run()
+    thread.join()
+    assert not failures
+    assert record.count("done") == 1 and lines(tmp_path, "begin").total() == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", ["garbage", "deleted"])
+def test_a_database_that_is_lost_ends_the_sweep_and_no_finished_cell(tmp_path, monkeypatch, loss):
+    monkeypatch.setattr(runner_module, "AWAY_S", 1.0)
+
+    def lose():
+        wait_for(lambda: lines(tmp_path, "begin").total() >= 2)
+        if loss == "garbage":
+            database(tmp_path).write_bytes(b"no database " * 1000)
+        else:
+            database(tmp_path).unlink()
+
+    thread, failures = beside(lose)
+    with pytest.raises(ConfigError, match="the database of the sweep cannot be used") as caught:
+        make_runner(tmp_path, sweep_of(0.6)).run()
+    thread.join()
+    assert not failures and "\n" not in str(caught.value) and caught.value.exit_code == 3
+    ended = lines(tmp_path, "end")
+    assert ended
+
+    database(tmp_path).unlink(missing_ok=True)  # what the message advises
+    record = make_runner(tmp_path, sweep_of(0.0)).run()
+    assert record.count("done") == 3
+    assert all(lines(tmp_path, "end")[name] == 1 for name in ended)  # none of them was trained again
+    stored = read_record(record_path(tmp_path / "reports", "fake", "debug"))
+    assert stored.count("done") == 3
+
+
+@pytest.mark.slow
+def test_a_clock_that_jumps_ahead_makes_no_cell_train_twice(tmp_path):
+    """The heartbeat of a cell that trains looks old; a second runner must not train beside it."""
+    second = []
+
+    def jump():
+        wait_for(lambda: lines(tmp_path, "begin").total() == 1)
+        with sqlite3.connect(database(tmp_path), timeout=30) as connection:
+            past = f"-{10 * GRACE_S} seconds"
+            wait_for(lambda: connection.execute("SELECT count(*) FROM trial_heartbeats").fetchone()[0] == 1)
+            connection.execute("UPDATE trial_heartbeats SET heartbeat = datetime('now', ?)", (past,))
+            connection.execute("UPDATE trials SET datetime_start = datetime('now', ?)", (past,))
+        runner = make_runner(tmp_path, sweep_of(2.0, {"a": ["model.x=1"]}))
+        with runner.study.lock():
+            second.append([attempt.run_id for attempt in runner.study.clear_dead()])
+        second.append(runner._step(1))
+
+    thread, failures = beside(jump)
+    record = make_runner(tmp_path, sweep_of(2.0, {"a": ["model.x=1"]})).run()
+    thread.join()
+    assert not failures and len(second) == 2
+    assert lines(tmp_path, "begin").total() == 1 and record.count("done") == 1
