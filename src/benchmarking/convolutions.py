@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -35,6 +36,8 @@ from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, tempora
 from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv
 from src.structures.sparse_bev import SparseMap
+
+logger = logging.getLogger(__name__)
 
 ROUNDS = 7
 LAYER_BUDGET_S, BACKBONE_BUDGET_S = 4.0, 20.0  # of each candidate; what takes longer has fewer rounds
@@ -106,6 +109,7 @@ def measure_layers(layers: list[Layer], device: torch.device, rates: dict[int, f
     spconv = load_spconv(device)
     rows = []
     for layer in layers:
+        logger.info("%s", layer.name)
         layer.kernel.to(device)
         for threads, rate in rates.items():
             with torch_threads(threads):
@@ -244,6 +248,7 @@ def measure_backbone(
     encoder.local_means = None  # spconv has no counterpart, and it is not part of the backbone
     rows = []
     for number, (name, points) in enumerate(scenes.items()):
+        logger.info("backbone, %s", name)
         points = points.to(device)
         with torch.no_grad():
             voxels = encoder.voxelise(points, torch.zeros(len(points), dtype=torch.int64, device=device), 1)

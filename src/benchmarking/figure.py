@@ -73,6 +73,9 @@ def _paint_parts(axes: Axes, name: str, rows: Rows) -> None:
         style = {"color": LINE_COLOURS[index % len(LINE_COLOURS)], "marker": MARKERS[index % len(MARKERS)]}
         axes.plot(places, values, label=part.removesuffix(" ms"), linewidth=1.6, markersize=4, **style)
     _log_where_wide(axes, [value for line in axes.lines for value in line.get_ydata()])
+    axes.set_ylim(
+        top=6.0 * axes.get_ylim()[1] if axes.get_yscale() == "log" else 1.5 * axes.get_ylim()[1]
+    )  # the legend
     axes.legend(loc="upper left", fontsize=7, frameon=False, labelcolor=INK, ncols=2, columnspacing=0.8)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -23,6 +24,8 @@ from src.models.detector import Detector
 from src.models.inference import prepare_for_inference
 from src.structures.batch import FrameBatch
 from src.training.checkpoints import load_model_weights, read_checkpoint
+
+logger = logging.getLogger(__name__)
 
 ROUNDS = 5  # all parts in turns; a round of the full size takes ten seconds on two cores
 KEY_FRAME_S = 0.5
@@ -244,6 +247,7 @@ def measure_mode(case: Case, calls: dict[str, list[Call]], backward: bool) -> di
         }
         case.model.zero_grad(set_to_none=True)
     for number in range(1 + ROUNDS):
+        logger.info("%s, round %d of %d", "f+b" if backward else "forward", number, ROUNDS)
         for name in calls:
             seconds = interleaved({name: prepared(name)}, case.device, 1, warm_up=0)[name]
             case.model.zero_grad(set_to_none=True)

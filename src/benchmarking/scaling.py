@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import logging
 import math
 import statistics
 from collections.abc import Callable
@@ -24,6 +25,8 @@ from src.config import Config, compose_config
 from src.geometry.bev_grid import BEVGrid
 from src.models import build_model
 from src.models.inference import prepare_for_inference
+
+logger = logging.getLogger(__name__)
 
 OURS, DENSE = "horizon3d", "dense_bev"
 ROUNDS, BUDGET_S = 5, 8.0  # of each model at each point; whole maps of 600 m are measured once
@@ -143,7 +146,8 @@ def measure_sweep(
 ) -> list[dict[str, Any]]:
     """A row for each point and model."""
     rows = []
-    for point in points:
+    for number, point in enumerate(points, 1):
+        logger.info("%s: point %d of %d", name, number, len(points))
         cases = {model: make_case(config, point, device) for model, config in configs.items()}
         counts = {model: number_of_gaussians(config, point) for model, config in configs.items()}
         x = counts[OURS] if name == "gaussians" else point.x
