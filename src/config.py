@@ -271,7 +271,7 @@ def _refuse_hidden(override: str) -> None:
     """
     name = key_of(override)
     if "${" in override:
-        raise ConfigError(f"{name}: must not refer to something else with ${{; the shell fills in $VARIABLES")
+        raise ConfigError(f"{masked(override)}: must not refer to something else; the shell fills in $VARIABLES")
     if name.partition("/")[0].partition(".")[0] == "hydra":
         raise ConfigError(f"{name}: settings of Hydra itself are none of a run's")
     if masked(override) != override:

@@ -24,13 +24,15 @@ def read_whole(
         raise DataError(f"{path}: no such file") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise DataError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
-    with open(handle, "rb", buffering=0) as file:
-        try:
-            status = os.fstat(handle)
-            if not stat.S_ISREG(status.st_mode):
-                raise DataError(f"{path}: must be a file, but is a folder, a pipe or a device")
-            if status.st_size > most_bytes:
-                raise DataError(f"{path}: at most {most_bytes} bytes are expected, but it has {status.st_size}")
+    try:
+        status = os.fstat(handle)
+        if not stat.S_ISREG(status.st_mode):
+            raise DataError(f"{path}: must be a file, but is a folder, a pipe or a device")
+        if status.st_size > most_bytes:
+            raise DataError(f"{path}: at most {most_bytes} bytes are expected, but it has {status.st_size}")
+        with open(handle, "rb", buffering=0, closefd=False) as file:
             return file.readall()
-        except OSError as error:
-            raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+    finally:
+        os.close(handle)

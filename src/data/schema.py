@@ -103,7 +103,8 @@ class DatasetIndex:
 
     def filename(self, data_row: int) -> str:
         """Path of a sensor file relative to the root."""
-        return self.data_filenames[data_row].decode(errors="replace")  # from a damaged cache: no such file, then
+        # What no table gives comes from a damaged cache, and there is no file of that name then.
+        return self.data_filenames[data_row].decode(errors="replace").replace("\0", "\ufffd")
 
     def samples_of(self, scene_names: set[str]) -> Array:  # [n] int64
         """Rows of the samples whose scene is named, in table order."""

@@ -126,7 +126,9 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
     try:
         return _publish(run_folder, reports)
     except RecursionError as error:
-        raise DataError(f"{run_folder}: a file of this run is nested too deeply; give the run's command again") from error
+        raise DataError(
+            f"{run_folder}: a file of this run is nested too deeply; give the run's command again"
+        ) from error
 
 
 def _publish(run_folder: Path, reports: Path) -> Path:

@@ -21,6 +21,8 @@ from src.reporting.sweep_file import SweepConfig
 from src.reporting.writing import write_whole
 
 FORMAT = 1
+LAST_MOMENT = 1e11
+"""Seconds since 1970, three thousand years on; a calendar goes no further than three times that."""
 STATES = ("waiting", "running", "done", "failed", "pruned")
 
 
@@ -141,6 +143,11 @@ def _check(record: SweepRecord, stem: str) -> None:
     """Raises ValueError for parts that do not fit each other."""
     if record.stem != stem:
         raise ValueError(f"it is the record of {record.stem}, whose file is {record.stem}.json")
+    moments = {f"runs.{run_id}.{name}": getattr(run, name)
+               for run_id, run in record.runs.items() for name in ("started", "ended")}  # fmt: skip
+    for name, moment in (moments | {"updated": record.updated}).items():
+        if moment is not None and not 0 <= moment <= LAST_MOMENT:
+            raise ValueError(f"{name} is {moment!r:.80}, must be seconds from 0 to {LAST_MOMENT:g}")
     for run_id, run in record.runs.items():
         if run.run_id != run_id:
             raise ValueError(f"runs.{run_id}.run_id is {run.run_id!r}, must be {run_id!r}")

@@ -13,7 +13,9 @@ from src.errors import ConfigError
 
 # Both take too much rather than too little: a password that holds the character that should end it stays hidden.
 IN_AUTHORITY = re.compile(r"(://[^:]*:)(.*)(?=@)", re.DOTALL)
-AS_OPTION = re.compile(r"""((?:password|passwd|pwd|api_?key|secret|token)=)('.*'|".*"|[^&]*)""", re.DOTALL | re.IGNORECASE)
+AS_OPTION = re.compile(
+    r"""((?:password|passwd|pwd|api_?key|secret|token)=)('.*'|".*"|[^&]*)""", re.DOTALL | re.IGNORECASE
+)
 
 
 def default_storage(outputs: Path) -> str:

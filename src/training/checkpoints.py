@@ -40,7 +40,17 @@ _COMMENT_LENGTH = struct.pack("<H", _COMMENT_BYTES)
 _END = b"PK\5\6" + bytes(18)
 """The last record of an archive: its signature first, the length of a comment last."""
 _PIECE_BYTES = 2**20
-_BROKEN = (RuntimeError, EOFError, OSError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError, struct.error)
+_BROKEN = (
+    RuntimeError,
+    EOFError,
+    OSError,
+    LookupError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    struct.error,
+)
 """How torch fails at a damaged pickle of plain values."""
 
 

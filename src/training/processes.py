@@ -252,6 +252,7 @@ def process_group(accelerator: str, devices: int, num_nodes: int = 1) -> Iterato
     try:
         dist.init_process_group(
             backend,
+            store=_meeting_place(cluster),
             rank=cluster.global_rank(),
             world_size=cluster.world_size(),
             timeout=STEP_TIMEOUT,
@@ -272,6 +273,18 @@ def process_group(accelerator: str, devices: int, num_nodes: int = 1) -> Iterato
         ) from error
     finally:
         end_processes()
+
+
+def _meeting_place(cluster: ClusterEnvironment) -> dist.Store:
+    """Where the processes leave their addresses for each other, apart from those of an earlier attempt.
+
+    torchrun keeps one store for all its restarts, and there the addresses of ended processes would still stand. Agents
+    of several nodes count restarts each for themselves, so there the count cannot tell attempts apart.
+    """
+    where = next(dist.rendezvous("env://", cluster.global_rank(), cluster.world_size(), timeout=STEP_TIMEOUT))
+    one_agent = os.environ.get("GROUP_WORLD_SIZE", "1") == "1"
+    attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") if one_agent else "0"
+    return dist.PrefixStore(f"attempt {attempt}", where[0])
 
 
 def _keep_quiet() -> None:

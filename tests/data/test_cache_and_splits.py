@@ -67,7 +67,7 @@ def test_a_cache_that_a_stranger_wrote_is_built_again(broken_tables, tmp_path, c
         columns = dict(arrays)
     np.savez(file, **(columns | {name: change(columns[name])}))
     again = load_index(broken_tables.root, VERSION, tmp_path / "cache")
-    assert "broken" in caplog.text and name in caplog.text
+    assert "broken" in caplog.text and name.partition("_")[0] in caplog.text
     np.testing.assert_array_equal(getattr(again, name), getattr(whole, name))
 
 

@@ -46,5 +46,11 @@ def undisturbed(context, outputs, overrides):
             first = used
         process.join(0.02)
     assert killing.wait(process, log) == 0, log.read_text()[-3000:]
-    size = (killing.run_folder(outputs) / "checkpoints" / killing.LAST).stat().st_size
-    return {"outcome": killing.outcome(outputs), "size": size, "first step": first, "end": end}
+    last = killing.run_folder(outputs) / "checkpoints" / killing.LAST
+    return {
+        "outcome": killing.outcome(outputs),
+        "size": last.stat().st_size,
+        "steps": killing.read_checkpoint(last)["global_step"],
+        "first step": first,
+        "end": end,
+    }

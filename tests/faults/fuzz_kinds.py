@@ -9,7 +9,9 @@ import json
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,7 @@ from src.data.reader import FrameReader, OnBadFile  # noqa: E402
 from src.data.schema import CHANNELS, TABLES, DatasetIndex, build_index  # noqa: E402
 from src.data.splits import split_samples  # noqa: E402
 from src.data.world.write import _read_stored  # noqa: E402
+from src.errors import CheckpointError, DataError, HorizonError  # noqa: E402
 from src.metrics.submission import load_submission  # noqa: E402
 from src.models.backbones.weights import BackboneName, load_backbone_weights  # noqa: E402
 from src.pictures.curves import read_metrics  # noqa: E402
@@ -168,8 +171,6 @@ def check_index(index: DatasetIndex) -> None:
 
 def use_index(index: DatasetIndex) -> None:
     """Annotations and one frame without files, as a training would read them."""
-    from src.errors import DataError
-
     check_index(index)
     try:
         truth = evaluation_set(index, "val").ground_truth
@@ -237,8 +238,9 @@ def read_cache(path: Path, number: int) -> None:
     index = load_index(tiny_root(), VERSION, path.parent)
     check_index(index)
     assert index.root == tiny_root() and len(index) == 6
-    frame = FrameReader(index, reader_settings(on_bad_file=OnBadFile.skip, num_sweeps=2)).read(0, None)
-    assert torch.isfinite(frame.radar_points).all()
+    with suppress(DataError):  # poses that move too fast, and the like: another fault than those of files
+        frame = FrameReader(index, reader_settings(on_bad_file=OnBadFile.skip, num_sweeps=2)).read(0, None)
+        assert torch.isfinite(frame.radar_points).all()
 
 
 # -------------------------------------------------------------------- checkpoints
@@ -308,8 +310,6 @@ def compose_once() -> None:
 
 def restore(path: Path, number: int) -> None:
     """The configuration of a checkpoint, here as the JSON that stands for its plain values."""
-    from src.errors import CheckpointError, HorizonError
-
     try:
         stored = json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
@@ -381,8 +381,6 @@ def write_run(folder: Path) -> None:
 
 def read_run(path: Path, number: int) -> None:
     """As the report, the sweep runner, the dashboard, a resumed training and the pictures read a run's folder."""
-    from src.errors import HorizonError
-
     folder, outputs = path.parent, path.parents[1]
     for name in ("mAP", "NDS", "classes.car.AP", "ranges.50-100.mAP"):
         score = read_score(folder, name)
@@ -455,7 +453,8 @@ def read_sweep_record(path: Path, number: int) -> None:
     record = read_record(path)
     assert record.stem == path.stem and 0 <= record.planned < 1e9
     check_text(dataclasses.asdict(record))
-    assert all(run.started is None or np.isfinite(run.started) for run in record.runs.values())
+    for moment in (record.updated, *(run.started for run in record.runs.values())):
+        assert moment is None or time.localtime(moment)
 
 
 def sweep_examples() -> list[bytes]:

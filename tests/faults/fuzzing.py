@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import json
 import logging
 import mmap
@@ -74,6 +75,9 @@ def run_cases(kind: Kind, seed: int, cases: range, folder: Path, strangers: list
             os.close(report)
             try:
                 _read_all(kind, seed, range(at, cases.stop), folder, strangers, shared, told)
+            except BaseException:  # of the fuzzing itself
+                reached = int.from_bytes(shared[:8], "little")
+                _tell(told, kind, seed, reached, "no file was made", traceback.format_exc()[-800:])
             finally:
                 os._exit(0)
         os.close(told)
@@ -98,6 +102,7 @@ def _read_all(
 ) -> None:
     """In the child: every case, with the case at hand in shared memory and faults as lines of a pipe."""
     logging.disable(logging.CRITICAL)
+    faulthandler.disable()  # pytest's; a death is told with its case instead
     warnings.simplefilter("error", RuntimeWarning)  # numpy's overflows: a number that cannot be, on its way
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * resource.getpagesize() + MEMORY_BYTES

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import torch
 
+from src.errors import CheckpointError
 from src.training.checkpoints import LAST, PREVIOUS, read_checkpoint
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -231,6 +232,8 @@ def digest(value):
 def damage(path, rng):
     """What a power failure leaves of a file that was never synced; says what was done."""
     data = bytearray(path.read_bytes())
+    if len(data) < 100:
+        return "torn already"
     what = rng.choice(("truncated", "truncated", "empty", "page of zeros", "bit flipped"))
     if what == "truncated":
         data = data[: rng.randrange(len(data))]
@@ -273,7 +276,8 @@ class Chain:
             size = self.reference["size"]
             fault = InWrite(number, self.rng.choice((1, 1, 2, 3)), point, self.rng.randrange(1, size))
         else:
-            until = self.rng.uniform(self.reference["first step"], self.reference["end"])
+            first, end = self.reference["first step"], self.reference["end"]
+            until = self.rng.uniform(first, first + (end - first) * self._left())
         process = start(self.context, self.overrides, self.log, fault)
         if not inside:
             strike_at(process, until, number)
@@ -286,19 +290,32 @@ class Chain:
         self._power_failure(number)
         return True
 
+    def _left(self):
+        """Share of the training that the next start has before it."""
+        for path in self.outputs.glob(f"horizon3d-phase*/checkpoints/{LAST}"):
+            try:
+                return 1.0 - 0.8 * read_checkpoint(path)["global_step"] / self.reference["steps"]
+            except CheckpointError:
+                return 1.0
+        return 1.0
+
     def _power_failure(self, number):
         folders = list(self.outputs.glob("horizon3d-phase*"))
         if not folders:
             return
         checkpoints = folders[0] / "checkpoints"
-        if number == signal.SIGKILL and self.rng.random() < 0.2 and (checkpoints / PREVIOUS).is_file():
-            what = damage(checkpoints / LAST, self.rng)
+        last, previous = checkpoints / LAST, checkpoints / PREVIOUS
+        two = previous.is_file() and not previous.samefile(last)  # not two names of one file that was synced long ago
+        if number == signal.SIGKILL and self.rng.random() < 0.2 and two:
+            what = damage(last, self.rng)
             self.kills[-1] = (f"{number.name} and power", f"{self.kills[-1][1]}, last checkpoint {what}")
         if self.rng.random() < 0.3:
             jump_clock(folders[0], self.rng)
 
     def finish(self):
-        """Let it end; what it ended with."""
+        """Let it end, if it has not; what it ended with."""
+        if list(self.outputs.glob("horizon3d-phase*/run.json")):
+            return outcome(self.outputs)
         process = start(self.context, self.overrides, self.log)
         assert wait(process, self.log) == 0, self.log.read_text()[-3000:]
         return outcome(self.outputs)

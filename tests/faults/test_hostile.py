@@ -317,7 +317,7 @@ def test_a_stored_configuration_is_values_and_nothing_else(tree, secret, key, va
 
 def test_a_stored_configuration_that_unfolds_without_end_is_refused(tree):
     part = ["x"]
-    for _ in range(60):
+    for _ in range(20):
         part = [part, part]
     stored = dict(tree) | {"out": part}
     with pytest.raises(CheckpointError, match="stands in two places"):

@@ -270,6 +270,32 @@ def test_what_ended_a_process_is_read_before_what_the_others_say(fault, code, ca
     assert "Traceback" not in text, text
 
 
+MEET_AGAIN = """
+import torch
+from src.training import processes
+
+os.environ |= {
+    'TORCHELASTIC_RUN_ID': 'none', 'TORCHELASTIC_USE_AGENT_STORE': 'True', 'MASTER_PORT': os.environ['AGENT_PORT'],
+}
+for attempt in range(8):  # which of two connects to the other is a matter of their ports
+    os.environ['TORCHELASTIC_RESTART_COUNT'] = str(attempt)
+    time.sleep(0.5 * rank)  # the other must not find the address of the attempt before meanwhile
+    with processes.process_group('cpu', 2):
+        torch.distributed.all_reduce(torch.ones(1))
+        processes.decided_by_main(lambda: None)
+open(f'met again {rank}', 'w')
+"""
+
+
+@pytest.mark.slow
+def test_processes_that_torchrun_starts_again_find_each_other(command, tmp_path, monkeypatch):
+    """The agent's store outlives its processes."""
+    agent = torch.distributed.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
+    monkeypatch.setenv("AGENT_PORT", str(agent.port))
+    assert command(MEET_AGAIN) == 0
+    assert len(list(tmp_path.glob("met again *"))) == 2
+
+
 # ---------------------------------------------------------------- the commands as people type them
 
 EPOCHS = 8
