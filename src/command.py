@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import logging
+import os
+import select
 import shutil
 import signal
 import sys
@@ -41,6 +43,8 @@ def run_command(main: Callable[[list[str]], None]) -> None:
         print("\nInterrupted; the same command goes on from a checkpoint where it writes any.", file=sys.stderr)
         sys.exit(InterruptedRunError.exit_code)
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and _reader_has_gone():
+            sys.exit(128 + signal.SIGPIPE)  # what a shell says of a command whose output `head` has had enough of
         if interruptions:  # it struck inside a library's compiled code, which made another error of it
             what = f"Interrupted ({error}); the same command goes on from a checkpoint where it writes any."
             print(f"\n{what}", file=sys.stderr)
@@ -67,6 +71,16 @@ def _listen() -> list[int]:
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # a shell's background job, or one rank of several
         signal.signal(signal.SIGINT, interrupt)
     return came
+
+
+def _reader_has_gone() -> bool:
+    """Whether nobody reads what is printed any more; then nothing more is."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)  # whatever is asked for, a broken pipe is told
+    if not any(event & select.POLLERR for _, event in poll.poll(0)):
+        return False
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains at its end
+    return True
 
 
 def _machine_fault(error: Exception) -> tuple[str, int] | None:
