@@ -91,7 +91,8 @@ def _machine_fault(error: Exception) -> tuple[str, int] | None:
         free = shutil.disk_usage(place).free // 2**20
         what = f"{error.filename or 'A file'} could not be written or read: {error.strerror}"
         return f"{what}; {free} MiB are free in {place}; make room or choose another folder", ConfigError.exit_code
-    if "allocate memory" in str(error) or "out of memory" in str(error):  # torch's words on CPU and on GPU
+    words = str(error)  # of torch on a CPU and on a GPU; of numpy and Python in an error of its own
+    if isinstance(error, MemoryError) or "allocate memory" in words or "out of memory" in words:
         remedy = "lower data.batch_size or data.num_workers, or choose a smaller scale or backbone"
         return f"Out of memory: {error}; {remedy}", 1
     return None

@@ -123,8 +123,8 @@ class DetectionModule(L.LightningModule):
         for name, value in terms.items():
             self._mean(f"loss/{name}").update(value, len(batch))
         for name, value in diagnostics.items():
-            self._mean(f"state/{name}").update(value)
-        self._mean("state/gradient_norm").update(norm)
+            self._mean(f"state/{name}").update(value, len(batch))
+        self._mean("state/gradient_norm").update(norm, len(batch))
 
     def _refuse(self, batch: FrameBatch, terms: dict[str, Tensor]) -> None:
         """Take back what the step did, keep it for a replay, and go on without it where that is wanted.
