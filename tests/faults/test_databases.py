@@ -15,6 +15,7 @@ from src.sweeping.study import GRACE_S
 from tests.sweeping.fake_sweep import ROOT, make_runner, make_sweep
 
 ROWS = {"a": ["model.x=1"], "b": ["model.x=2"], "c": ["model.x=3"]}
+pytestmark = pytest.mark.faults
 
 
 @pytest.fixture(autouse=True)
@@ -72,7 +73,6 @@ def away(folder, began, until):
     return act
 
 
-@pytest.mark.slow
 def test_a_database_that_comes_back_costs_no_cell(tmp_path, caplog):
     """It is garbage while the first cell ends, so its end cannot be noted."""
     runner = make_runner(tmp_path, sweep_of(0.4))
@@ -85,7 +85,6 @@ def test_a_database_that_comes_back_costs_no_cell(tmp_path, caplog):
     assert set(lines(tmp_path, "begin").values()) == {1} and lines(tmp_path, "begin").total() == 3
 
 
-@pytest.mark.slow
 def test_a_cell_that_failed_meanwhile_is_free_again(tmp_path, caplog):
     """Nobody else would free it: the process that had it lives."""
     runner = make_runner(tmp_path, sweep_of(0.3, {"a": ["model.x=1"]}))
@@ -103,7 +102,6 @@ def test_a_cell_that_failed_meanwhile_is_free_again(tmp_path, caplog):
     assert record.count("done") == 1 and lines(tmp_path, "begin").total() == 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["garbage", "deleted"])
 def test_a_database_that_is_lost_ends_the_sweep_and_no_finished_cell(tmp_path, monkeypatch, loss):
     monkeypatch.setattr(runner_module, "AWAY_S", 1.0)
@@ -131,7 +129,6 @@ def test_a_database_that_is_lost_ends_the_sweep_and_no_finished_cell(tmp_path, m
     assert stored.count("done") == 3
 
 
-@pytest.mark.slow
 def test_a_clock_that_jumps_ahead_makes_no_cell_train_twice(tmp_path):
     """The heartbeat of a cell that trains looks old; a second runner must not train beside it."""
     second = []

@@ -6,14 +6,12 @@ import logging
 import math
 import os
 import re
-import socket
-import time
 
 import pytest
 import torch
-import torch.multiprocessing as mp
 from torch import nn
 from toys import STEPS, ToyData, toy_batch, toy_module
+from two_ranks import spawn_two
 
 from src.errors import CheckpointError, DivergedError, InterruptedRunError
 from src.training import nonfinite
@@ -301,18 +299,7 @@ def as_rank(rank, port, path, fault, skip):
 @pytest.mark.parametrize(("fault", "skip"), [("point", False), ("gradient", False), ("constant", True)])
 def test_ranks_agree(tmp_path, fault, skip):
     """What one of two ranks meets, both stop at with the same words, or both pass over; nobody waits for the other."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    context = mp.spawn(as_rank, (port, tmp_path, fault, skip), nprocs=2, join=False)
-    deadline = time.monotonic() + 300.0
-    try:
-        while not context.join(timeout=1.0):
-            assert time.monotonic() < deadline, "the two processes hang"
-    finally:
-        for process in context.processes:
-            if process.is_alive():
-                process.kill()
+    spawn_two(as_rank, tmp_path, fault, skip)
     first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2))
     assert first["told"] == second["told"] and same(first["weights"], second["weights"])
     folder = tmp_path / "run"

@@ -3,7 +3,6 @@
 import hashlib
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -11,8 +10,8 @@ from pathlib import Path
 
 import pytest
 import torch
-import torch.multiprocessing as mp
 from toys import STEPS, ToyData, toy_module
+from two_ranks import spawn_two
 
 from src.errors import InterruptedRunError
 from src.training.checkpoints import AtomicCheckpointIO, read_checkpoint
@@ -263,18 +262,7 @@ def stopped_on_two(rank, port, folder):
 
 @pytest.mark.slow
 def test_a_signal_to_one_rank_stops_all(tmp_path):
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    context = mp.spawn(stopped_on_two, (port, tmp_path), nprocs=2, join=False)
-    deadline = time.monotonic() + 300.0
-    try:
-        while not context.join(timeout=1.0):
-            assert time.monotonic() < deadline, "the two processes hang"
-    finally:
-        for process in context.processes:
-            if process.is_alive():
-                process.kill()
+    spawn_two(stopped_on_two, tmp_path)
     assert (tmp_path / "done 0").exists() and (tmp_path / "done 1").exists()
 
 

@@ -5,9 +5,7 @@ import csv
 import importlib.util
 import os
 import signal
-import socket
 import sys
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,10 +13,10 @@ import lightning as L
 import numpy as np
 import pytest
 import torch
-import torch.multiprocessing as mp
 from torch.utils.data import DataLoader
 from toys import STEPS as TOY_STEPS
 from toys import Positions, toy_batch, toy_module
+from two_ranks import spawn_two
 
 from src.data.datamodule import collate, in_lane
 from src.errors import InterruptedRunError
@@ -35,7 +33,6 @@ from src.training.temporal import TemporalModule
 
 LANES, STEPS = 4, 3
 FIRST_RANK, SECOND_RANK = (0, 1), (2, 3)
-DEADLINE_S = 300.0
 COLUMNS = tuple(DetectionTable.__dataclass_fields__)
 
 
@@ -95,7 +92,7 @@ def become(rank, world_size, port):
         os.environ.update({name: str(value) for name, value in who.items()})
 
 
-def work_as(rank, world_size, port, work):
+def work_as(rank, port, world_size, work):
     """Train three steps and validate, as rank `rank` of `world_size`; the result goes to a file."""
     become(rank, world_size, port)
     optim = OptimConfig(
@@ -128,30 +125,14 @@ def work_as(rank, world_size, port, work):
 
 
 def in_one_process(work):
-    work_as(0, 1, 0, work)
+    work_as(0, 0, 1, work)
     return torch.load(work.folder / "1-0.pt", weights_only=True)
 
 
 def in_two_processes(work):
     """Both ranks' results."""
-    spawn_two(work_as, work)
+    spawn_two(work_as, 2, work)
     return [torch.load(work.folder / f"2-{rank}.pt", weights_only=True) for rank in range(2)]
-
-
-def spawn_two(function, *arguments):
-    """`function` of rank, number of ranks, port and `arguments` in two processes, with a deadline."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    context = mp.spawn(function, (2, port, *arguments), nprocs=2, join=False)
-    deadline = time.monotonic() + DEADLINE_S
-    try:
-        while not context.join(timeout=1.0):
-            assert time.monotonic() < deadline, "the two processes hang"
-    finally:
-        for process in context.processes:
-            if process.is_alive():
-                process.kill()
 
 
 @pytest.fixture
@@ -332,7 +313,7 @@ def train_single(path, world_size, stop_at=None):
     return module.scores and module.scores.as_dict()
 
 
-def go_on_as(rank, world_size, port, folder):
+def go_on_as(rank, port, world_size, folder):
     """As one of two: finish what one process began, and begin what one process will finish."""
     become(rank, world_size, port)
     with process_group("cpu", world_size):
@@ -354,7 +335,7 @@ def test_a_run_goes_on_with_another_number_of_processes(tmp_path):
     """From one to two and from two to one in the middle of an epoch: its means are those of one process all along."""
     scores = train_single(tmp_path / "one", 1)
     train_single(tmp_path / "one, then two", 1, stop_at=STOP_AT)
-    spawn_two(go_on_as, tmp_path)
+    spawn_two(go_on_as, 2, tmp_path)
     assert scores == score_detections(*random_problem(*PROBLEM)).as_dict()
     assert train_single(tmp_path / "two, then one", 1) == scores
     assert 0.02 < scores["mAP"] < 0.98
