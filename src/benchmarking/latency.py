@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from src.assembly import build_datamodule, data_root
-from src.benchmarking.machine import describe_machine, processor
+from src.benchmarking.machine import busy_cores, describe_machine, processor
 from src.benchmarking.report import page_of
 from src.benchmarking.timing import chosen_device, clock, peak_bytes, timed_parts
 from src.config import Config, restore_config
@@ -77,7 +77,7 @@ def benchmark_latency(
     `load` is how many processes wanted a core over the minute before, of `cores`.
     `memory_gb` is the largest that torch held on a GPU, or the process with its libraries on a CPU, in 1e9 bytes.
     """
-    device, now, load = detector.device, clock(detector.device), os.getloadavg()[0]
+    device, now, load = detector.device, clock(detector.device), busy_cores()
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
     scenes = scenes_of(datamodule.index, split_samples(datamodule.index, datamodule.config.split))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ GEMM_SIZE = {"cpu": 2048, "cuda": 8192}
 # Far beyond every cache, so that a copy moves memory.
 COPY_BYTES = {"cpu": 256 * 2**20, "cuda": 2 * 2**30}
 ROUNDS = 7
+BUSY_WINDOW_S = 1.0  # a hundred ticks of each core
 
 
 def describe_machine() -> dict[str, Any]:
@@ -32,7 +34,7 @@ def describe_machine() -> dict[str, Any]:
         "system": platform.system(),
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "load": round(os.getloadavg()[0], 2),
+        "load": round(busy_cores(), 2),
     }
 
 
@@ -41,10 +43,34 @@ def busy_warning(machine: dict[str, Any]) -> str | None:
     if not is_busy(machine["load"], machine["cores"]):
         return None
     return (
-        f"warning: the load was {machine['load']:.1f} on {machine['cores']} cores when this began: the machine is "
+        f"warning: {machine['load']:.1f} of {machine['cores']} cores were at work when this began: the machine is "
         "busy, so times are too long; ratios of what was measured in turns still tell; measure again when nothing "
         "else runs"
     )
+
+
+def busy_cores() -> float:
+    """How many cores were at work during one second in which this process waits.
+
+    Where the system does not count that (Linux does), its load, which still holds what ended a minute ago.
+    """
+    before = _core_seconds()
+    if before is None:
+        return os.getloadavg()[0]
+    time.sleep(BUSY_WINDOW_S)
+    worked, whole = (after - earlier for after, earlier in zip(_core_seconds() or before, before, strict=True))
+    return (os.cpu_count() or 1) * worked / whole if whole else 0.0
+
+
+def _core_seconds() -> tuple[int, int] | None:
+    """Ticks of all cores at work, and of all in all (/proc/stat)."""
+    try:
+        line = Path("/proc/stat").read_text().split("\n", 1)[0]
+    except OSError:
+        return None
+    user, nice, system, idle, waiting, *interrupts = map(int, line.split()[1:9])  # what comes after is in these already
+    worked = user + nice + system + sum(interrupts)
+    return worked, worked + idle + waiting
 
 
 def processor() -> str:

@@ -1,8 +1,12 @@
 """Pages: tables of rows, numbers, and a warning where the machine was busy."""
 
 import json
+from pathlib import Path
 
-from src.benchmarking.machine import busy_warning, describe_machine, gemm_rate
+import pytest
+
+from src.benchmarking import machine
+from src.benchmarking.machine import busy_cores, busy_warning, describe_machine, gemm_rate
 from src.benchmarking.report import markdown, number, page_of, table, write_page
 
 MACHINE = {"processor": "abacus", "cores": 4, "threads": 2, "gpu": None, "load": 0.4}
@@ -34,7 +38,7 @@ def test_numbers():
 def test_a_busy_machine_is_told():
     assert busy_warning(MACHINE | {"load": 2.0}) is None  # half of it is not
     warning = busy_warning(MACHINE | {"load": 2.1})
-    assert "the load was 2.1 on 4 cores" in warning
+    assert "2.1 of 4 cores were at work" in warning
     page = page_of("ops", [], MACHINE | {"load": 2.1}, {})
     assert f"**{warning}**" in markdown(page)
 
@@ -42,6 +46,15 @@ def test_a_busy_machine_is_told():
 def test_the_machine_says_what_it_is():
     described = describe_machine()
     assert described["processor"] and described["cores"] >= 1 and described["load"] >= 0
+
+
+def test_busy_cores_are_those_at_work_now(monkeypatch):
+    """Ticks of user, nice, system, idle, iowait, irq, softirq, steal, guest: 150 of 200 were work, on two cores."""
+    lines = iter(["cpu  100 10 20 900 30 1 2 3 50 0\ncpu0 9", "cpu  170 20 50 930 50 11 12 23 90 0\ncpu0 9"])
+    monkeypatch.setattr(Path, "read_text", lambda path: next(lines))
+    monkeypatch.setattr(machine, "BUSY_WINDOW_S", 0.0)
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    assert busy_cores() == pytest.approx(2 * 150 / 200)
 
 
 def test_work_in_bfloat16_is_held_against_its_own_rate():
