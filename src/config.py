@@ -296,7 +296,8 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     """A configuration as a checkpoint stores it, with the keys named in `overrides` replaced.
 
     A group choice (`data=truckscenes`) replaces that whole group, at the checkpoint's scale and phase; `model=` only
-    says whose keys may follow. A key of `trainer` that is younger than the checkpoint has today's value.
+    says whose keys may follow. A key of `trainer` that is younger than the checkpoint has today's value. `paths` are
+    the command's own: where it reads and writes is not for a file to say, least of all for a stranger's.
     Raises CheckpointError when the stored tree does not fit this version of the code, ConfigError for another model,
     scale or phase and for a key below a part that the checkpoint does not have.
     """
@@ -320,6 +321,7 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
             raise ConfigError(f"{key}={changes[key].value()}: the checkpoint is of {key}={own}; leave {key}= out")
     own = [f"{key}={fixed[key]}" for key in ("scale", "model", "phase")]
     tree, fresh = OmegaConf.create(stored), _compose([*own, *overrides])
+    tree.paths = fresh.paths
     changes.pop("model", None)  # only says whose keys may follow: the checkpoint's own values stay
     for key in sorted(changes, key=lambda key: key.count(".")):  # a part before what lies in it
         part = key.rpartition(".")[0]

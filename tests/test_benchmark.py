@@ -103,7 +103,7 @@ def test_ops(outputs, tmp_path, monkeypatch):
     monkeypatch.setattr(convolutions, "DENSE_LIMIT_FLOPS", 1e9)
     result = measured("ops_debug", outputs, tmp_path, "suite=ops")
     layers = result["sparse convolution"]
-    assert {row["mode"] for row in layers} == {"forward", "f+b"} and all(row["% of floor"] > 0 for row in layers)
+    assert {row["mode"] for row in layers} == {"forward", "f+b"} and all(row["% of products"] > 0 for row in layers)
     assert any(row.get("x faster than dense") for row in layers)
     assert any("x faster than dense" not in row for row in layers)  # too large
     for row in [*layers, *result["radar backbone"]]:

@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.benchmarking.counting import counted_work
+from src.benchmarking.machine import Product
 from src.benchmarking.operations import operation_table
 from src.benchmarking.spconv_peer import (
     SpconvEncoder,
@@ -104,21 +105,21 @@ def layers_of(
     return layers
 
 
-def measure_layers(layers: list[Layer], device: torch.device, rates: dict[int, float]) -> list[dict[str, Any]]:
-    """Rows of all layers at every number of threads in `rates` (GFLOP/s by threads)."""
-    spconv = load_spconv(device)
+def measure_layers(layers: list[Layer], device: torch.device, threads: list[int]) -> list[dict[str, Any]]:
+    """Rows of all layers at every number of threads."""
+    spconv, product = load_spconv(device), Product(device)
     rows = []
     for layer in layers:
         logger.info("%s", layer.name)
         layer.kernel.to(device)
-        for threads, rate in rates.items():
-            with torch_threads(threads):
-                rows += measure_layer(layer, spconv, device, rate, threads)
+        for number in threads:
+            with torch_threads(number):
+                rows += measure_layer(layer, spconv, device, product, number)
     return rows
 
 
 def measure_layer(
-    layer: Layer, spconv: ModuleType | None, device: torch.device, rate: float, threads: int
+    layer: Layer, spconv: ModuleType | None, device: torch.device, product: Product, threads: int
 ) -> list[dict[str, Any]]:
     """Forward, and forward with both gradients; kernel maps of all are made before, ours timed by themselves."""
     kernel_map, out_sites = layer.map(layer.sites)
@@ -165,25 +166,27 @@ def measure_layer(
     forward["map"] = lambda: layer.map(Sites(layer.sites.shape, layer.sites.keys))
     rows = []
     for mode, candidates, times in (("forward", forward, 1), ("f+b", both, 3)):
-        seconds = in_turns(candidates, device, ROUNDS, LAYER_BUDGET_S)
+        seconds = in_turns(candidates | {"product": product}, device, ROUNDS, LAYER_BUDGET_S)
         sizes = {"sites": len(layer.sites), "outputs": len(out_sites), "pairs": len(kernel_map.inputs)}
         row = {"layer": layer.name, "mode": mode, "threads": threads}
-        row |= ratio_columns(seconds, times * flops / rate / 1e9)
+        row |= ratio_columns(seconds, times * flops, product)
         if mode == "forward":
             row["map ms"] = 1e3 * median_spread(seconds["map"])[0]
         rows.append(row | agreement | sizes)
     return rows
 
 
-def ratio_columns(seconds: dict[str, list[float]], floor_s: float) -> dict[str, Any]:
-    """How many times faster ours is than its peers, its share of the floor, then times."""
+def ratio_columns(seconds: dict[str, list[float]], flops: float, product: Product) -> dict[str, Any]:
+    """How many times faster ours is than its peers, its share of the product's rate beside it, then times."""
     middle = {name: median_spread(values)[0] for name, values in seconds.items()}
     row: dict[str, Any] = {
         f"x faster than {name}": middle[name] / middle["ours"] for name in ("dense", "spconv") if name in middle
     }
-    row |= {"% of floor": 100 * floor_s / middle["ours"], "ms": 1e3 * middle["ours"]}
+    rate = product.flops / middle["product"]
+    row |= {"% of products": 100 * flops / middle["ours"] / rate, "ms": 1e3 * middle["ours"]}
     row["± ms"] = 1e3 * median_spread(seconds["ours"])[1]
-    return row | {f"{name} ms": 1e3 * middle[name] for name in ("dense", "spconv") if name in middle}
+    row |= {f"{name} ms": 1e3 * middle[name] for name in ("dense", "spconv") if name in middle}
+    return row | {"products GFLOP/s": rate / 1e9}
 
 
 def spconv_difference(
@@ -240,10 +243,10 @@ def measure_backbone(
     backbone: Backbone,
     scenes: dict[str, Tensor],  # by name the radar points [P, 7] of one frame
     device: torch.device,
-    rates: dict[int, float],  # GFLOP/s by threads
+    threads: list[int],
 ) -> list[dict[str, Any]]:
     """Rows by scene, mode and threads; kernel maps are made anew every time, batch norm uses the batch."""
-    spconv = load_spconv(device)
+    spconv, product = load_spconv(device), Product(device)
     encoder = backbone.build().to(device)
     encoder.local_means = None  # spconv has no counterpart, and it is not part of the backbone
     rows = []
@@ -256,11 +259,11 @@ def measure_backbone(
         if spconv is not None:
             twin = SpconvEncoder(spconv, encoder).to(device).train()
             functions["spconv"] = lambda v=voxels, twin=twin: twin(v)[1]
-        for threads, rate in rates.items():
-            with torch_threads(threads):
+        for count in threads:
+            with torch_threads(count):
                 # A process each, so only of the first scene and with all threads.
-                with_memory = device.type == "cpu" and number == 0 and threads == max(rates)
-                rows += _backbone_rows(name, backbone, points, voxels, functions, device, rate, threads, with_memory)
+                with_memory = device.type == "cpu" and number == 0 and count == max(threads)
+                rows += _backbone_rows(name, backbone, points, voxels, functions, device, product, count, with_memory)
     return rows
 
 
@@ -271,7 +274,7 @@ def _backbone_rows(
     voxels: SparseMap,
     functions: dict[str, Callable[[], Tensor]],
     device: torch.device,
-    rate: float,
+    product: Product,
     threads: int,
     with_memory: bool,
 ) -> list[dict[str, Any]]:
@@ -285,8 +288,8 @@ def _backbone_rows(
     for mode, candidates in (("forward", forward), ("f+b", both)):
         with counted_work() as work:
             candidates["ours"]()
-        seconds = in_turns(candidates, device, ROUNDS, BACKBONE_BUDGET_S)
-        row = {"scene": name, "mode": mode, "threads": threads} | ratio_columns(seconds, work.flops / rate / 1e9)
+        seconds = in_turns(candidates | {"product": product}, device, ROUNDS, BACKBONE_BUDGET_S)
+        row = {"scene": name, "mode": mode, "threads": threads} | ratio_columns(seconds, work.flops, product)
         row |= {"GFLOP": work.flops / 1e9}
         if with_memory:
             for kind in functions:

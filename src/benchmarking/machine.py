@@ -5,21 +5,20 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from src.benchmarking.timing import interleaved, median_spread
+from src.benchmarking.timing import interleaved
 from src.reporting.sweep_text import is_busy
 
 # Square products large enough to reach the highest rate, small enough for seconds on two cores.
 GEMM_SIZE = {"cpu": 2048, "cuda": 8192}
 # Far beyond every cache, so that a copy moves memory.
 COPY_BYTES = {"cpu": 256 * 2**20, "cuda": 2 * 2**30}
-ROUNDS = 7
+ROUNDS = 15
 BUSY_WINDOW_S = 1.0  # a hundred ticks of each core
 
 
@@ -91,23 +90,31 @@ def memory_gib() -> float | None:
 def measure_roofline(device: torch.device) -> dict[str, float]:
     """Measured ceilings: GFLOP/s of matrix products by type and GB/s of a copy (bytes read plus bytes written).
 
-    With torch's number of threads. `bf16` is absent where the processor has no arithmetic of its own for it, which
-    the rate tells: below that of fp32 nobody would choose it.
+    With torch's number of threads, each the fastest of some rounds. `bf16` is absent where the processor has no
+    arithmetic of its own for it, which the rate tells: below that of fp32 nobody would choose it.
     """
-    size, kind = GEMM_SIZE[device.type], device.type
-    rates: dict[str, float] = {}
-    products: dict[str, Callable[[], Tensor]] = {}
-    for name, dtype in (("fp32", torch.float32), ("bf16", torch.bfloat16)):
-        a, b = (torch.randn(size, size, device=device).to(dtype) for _ in range(2))
-        products[name] = lambda a=a, b=b: a @ b
-    for name, seconds in interleaved(products, device, ROUNDS).items():
-        rates[f"{name}_gflops"] = 2 * size**3 / median_spread(seconds)[0] / 1e9
+    products = {name: Product(device, dtype) for name, dtype in (("fp32", torch.float32), ("bf16", torch.bfloat16))}
+    timed = interleaved(products, device, ROUNDS)
+    rates = {f"{name}_gflops": product.flops / min(timed[name]) / 1e9 for name, product in products.items()}
     if rates["bf16_gflops"] < rates["fp32_gflops"]:
         del rates["bf16_gflops"]
-    source = torch.ones(COPY_BYTES[kind] // 4, device=device)
+    size = COPY_BYTES[device.type]
+    source = torch.ones(size // 4, device=device)
     target = torch.empty_like(source)
     seconds = interleaved({"copy": lambda: target.copy_(source)}, device, ROUNDS)["copy"]
-    return rates | {"copy_gbps": 2 * COPY_BYTES[kind] / median_spread(seconds)[0] / 1e9}
+    return rates | {"copy_gbps": 2 * size / min(seconds) / 1e9}
+
+
+class Product:
+    """A matrix product large enough to reach the machine's rate; a call makes it, `flops` of arithmetic."""
+
+    def __init__(self, device: torch.device, dtype: torch.dtype = torch.float32) -> None:
+        size = GEMM_SIZE[device.type]
+        self._a, self._b = (torch.randn(size, size, device=device).to(dtype) for _ in range(2))
+        self.flops = 2 * size**3
+
+    def __call__(self) -> Tensor:
+        return self._a @ self._b
 
 
 def gemm_rate(roofline: dict[str, float], precision: str) -> float:

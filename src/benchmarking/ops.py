@@ -16,11 +16,11 @@ from src.benchmarking.convolutions import (
     measure_layers,
     remembered_sites,
 )
-from src.benchmarking.machine import gemm_rate, measure_roofline
+from src.benchmarking.machine import measure_roofline
 from src.benchmarking.operations import NOTE as OPERATIONS_NOTE
 from src.benchmarking.plain_peers import SIZES, made_up_gaussians, measure_rest, measure_splat
 from src.benchmarking.scenes import Highway, highway_points
-from src.benchmarking.spconv_peer import load_spconv, torch_threads
+from src.benchmarking.spconv_peer import load_spconv
 from src.benchmarking.timing import chosen_device
 from src.config import Config
 from src.geometry.bev_grid import BEVGrid
@@ -35,11 +35,6 @@ def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     device, sizes, grid = chosen_device(config), SIZES[config.scale], config.grid.build()
     every = torch.get_num_threads()
     threads = sorted({1, every}) if device.type == "cpu" else [every]
-    rates, roofline = {}, {}
-    for number in threads:
-        with torch_threads(number):
-            roofline = measure_roofline(device)
-            rates[number] = gemm_rate(roofline, "32-true")
     points = highway_points(Highway(sizes.background, NUM_VEHICLES, sizes.points_per_vehicle, 150.0)).to(device)
     backbone = Backbone(config.model.radar_encoder, grid, config.model.channels, config.seed)
     encoder = backbone.build().to(device)
@@ -54,8 +49,9 @@ def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     return {
         "notes": [
             f"Scale {config.scale}, float32 on {device}; everything but the convolutions on {every} threads. A row's "
-            "candidates take turns in one run. Ratios above 1: ours is faster. % of floor: the products' share of the "
-            "rate of a large matrix product, measured just before. ± is the range of the middle half.",
+            "candidates take turns in one run. Ratios above 1: ours is faster. % of products: the arithmetic's rate "
+            "as a share of that of one large matrix product, which takes its turns too. ± is the range of the middle "
+            "half.",
             "Dense convolution: scatter to the whole grid, torch's convolution, gather; left blank where it does not "
             "fit. Kernel maps are cached on the sites by all (made once for all layers of a stage): `map ms` is ours. "
             "The backbone makes its maps anew.",
@@ -65,13 +61,12 @@ def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
             OPERATIONS_NOTE,
         ]
         + ([] if device.type == "cuda" else [gpu_note(config)]),
-        "sparse convolution": measure_layers(layers, device, rates),
-        "radar backbone": measure_backbone(backbone, scenes, device, rates),
+        "sparse convolution": measure_layers(layers, device, threads),
+        "radar backbone": measure_backbone(backbone, scenes, device, threads),
         **backbone_operations(backbone, points),
         "splat": measure_splat(gaussians, grid, sizes.splat_subset, device),
         "other operations": measure_rest(config, sizes, grid, points, bev, device),
-        "products, GFLOP/s by threads": {str(number): rate for number, rate in rates.items()},
-        "roofline": roofline,
+        "roofline": measure_roofline(device),
     }
 
 

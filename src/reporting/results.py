@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ import yaml
 
 from src.errors import DataError
 from src.overrides import OUTSIDE_IDENTITY, is_of, key_of, without_keys
+from src.reporting.json_object import LARGEST, NONE, NUMBER, JsonObject
 from src.reporting.metric_names import METRICS
 from src.reporting.plain_yaml import load_plain_yaml
 from src.reporting.writing import write_whole
@@ -30,19 +30,10 @@ NOT_A_SETTING = ("seed", "scale", "phase")
 ELSEWHERE = re.compile(r"""["']*(/|~|\$|\.\./|file:|[A-Za-z]:[\\/])""")
 """How a value begins that names a place on one machine."""
 
-SHARES = ("AP", "mAP", "NDS", "mAP_present")
-"""Numbers from 0 to 1, by the last part of their names."""
-LARGEST_SCORE, LARGEST = 1e6, 1e15
-"""Of any other number in a table, and of any number in a result: beyond it is damage, not a measurement."""
-SUSPICIOUS = re.compile(r"[\s\[,:]-?(\d{16}|\d[\d.]*[eE]\+?\d\d)|NaN|Infinity")
-"""How a number beyond LARGEST looks in JSON; NaN and Infinity are not JSON, though Python reads them."""
-
 KEPT_OF_A_CLASS = ("AP", "AVE", "num_gt")
 """Within a range or a speed class; the run's metrics.json has the rest."""
 
 Point = TypeVar("Point")
-NUMBER = (float, int)
-NONE = type(None)
 RECORD = {
     "run_id": (str,), "scale": (str,), "seed": (int,), "overrides": (list,), "data": (dict,), "commit": (str,),
     "versions": (dict,), "device": (str,), "processes": (int,), "threads": (int,), "initialized_from": (str, NONE),
@@ -133,10 +124,10 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
 
 def _publish(run_folder: Path, reports: Path) -> Path:
     remedy = "delete run.json and metrics.json there and give the run's command again"
-    record, scores = _Json(run_folder / "run.json", remedy), _Json(run_folder / "metrics.json", remedy)
+    record, scores = JsonObject(run_folder / "run.json", remedy), JsonObject(run_folder / "metrics.json", remedy)
     config = _read_config(run_folder / "config.yaml")
     latency_path = run_folder / "latency.json"
-    latency = _Json(latency_path, "delete it and measure again") if latency_path.is_file() else None
+    latency = JsonObject(latency_path, "delete it and measure again") if latency_path.is_file() else None
     fields = _record(record)
     overrides = [_without_place(o) for o in fields["overrides"] if not is_of(o, OUTSIDE_IDENTITY)]
     _metrics(scores, latency)
@@ -163,14 +154,14 @@ def _publish(run_folder: Path, reports: Path) -> Path:
 
 def read_result(path: Path) -> RunResult:
     """Read one result. Raises DataError naming file, key, what was expected and found, and the remedy."""
-    file = _Json(path, "delete it and run python -m src.report, which writes it anew from the run's folder")
+    file = JsonObject(path, "delete it and run python -m src.report, which writes it anew from the run's folder")
     try:
         return _result(file)
     except RecursionError as error:  # just not too deep to be read, but too deep to be walked through
         raise file.too_deep() from error
 
 
-def _result(file: _Json) -> RunResult:
+def _result(file: JsonObject) -> RunResult:
     found = file.content.get("format")
     if found != FORMAT or type(found) is not int:
         raise file.refusal(("format",), f"must be {FORMAT}, the one that this version reads, but is {found!r:.80}")
@@ -210,68 +201,7 @@ def read_results(reports: Path, scale: str | None = None) -> tuple[dict[str, Run
     return results, broken
 
 
-class _Json:
-    """A JSON object of a file; whatever it lacks is named with the file and what to do."""
-
-    def __init__(self, path: Path, remedy: str, content: Any = None, prefix: tuple[str, ...] = ()) -> None:
-        self.path, self.remedy, self.content, self.prefix = path, remedy, content, prefix
-        if content is not None:
-            return
-        try:
-            text = path.read_text(encoding="utf-8")
-            self.content = json.loads(text)
-            if "\\ud" in text or "\\uD" in text:  # half a pair, which no page can hold, is a UnicodeEncodeError
-                json.dumps(self.content, ensure_ascii=False).encode()
-        except (OSError, ValueError) as error:
-            raise DataError(f"{path}: not readable as JSON ({error}); {remedy}") from error
-        except RecursionError as error:
-            raise self.too_deep() from error
-        if not isinstance(self.content, dict):
-            raise DataError(f"{path}: must hold an object, but holds a {type(self.content).__name__}; {remedy}")
-        if SUSPICIOUS.search(text):
-            for names, value in _leaves(self.content):
-                if isinstance(value, float) and not math.isfinite(value):
-                    raise self.refusal(names, f"must be a finite number, but is {value}")
-                if isinstance(value, NUMBER) and abs(value) > LARGEST and names[0] != "config":
-                    raise self.refusal(names, f"must be at most {LARGEST:g} in size, but is {value!r:.80}")
-
-    def below(self, name: str) -> _Json:
-        """The object at one name, checked as this one is."""
-        return _Json(self.path, self.remedy, self.get(name, dict), (*self.prefix, name))
-
-    def get(self, names: str | Sequence[str], *kinds: type) -> Any:
-        """The value at one name, or under several names one inside the other; its type is exactly one of `kinds`."""
-        names = (names,) if isinstance(names, str) else names
-        value: Any = self.content
-        for depth, name in enumerate(names):
-            if not isinstance(value, dict) or name not in value:
-                raise self.refusal(names[: depth + 1], "is missing")
-            value = value[name]
-        if type(value) not in kinds:
-            expected = " or ".join("null" if kind is NONE else kind.__name__ for kind in kinds)
-            raise self.refusal(names, f"must be {expected}, but is {value!r:.80}")
-        return value
-
-    def score(self, names: str | Sequence[str], *kinds: type) -> Any:
-        """A number as by `get`, within what a number of this name can be."""
-        names = (names,) if isinstance(names, str) else names
-        value = self.get(names, *NUMBER, *kinds)
-        share = names[-1] in SHARES
-        low, high = (0.0, 1.0) if share else (-LARGEST_SCORE, LARGEST_SCORE)
-        if value is not None and not low - 1e-9 <= value <= high + 1e-9:  # a mean of ones may be 1.0000000000000002
-            raise self.refusal(names, f"must be from {low:g} to {high:g}, but is {value!r:.80}")
-        return value
-
-    def too_deep(self) -> DataError:
-        """What is wrong with a file of too many brackets."""
-        return DataError(f"{self.path}: not readable as JSON (nested too deeply); {self.remedy}")
-
-    def refusal(self, names: Sequence[str], fault: str) -> DataError:
-        """What is wrong at `names`."""
-        return DataError(f"{self.path}: {'.'.join((*self.prefix, *names))} {fault}; {self.remedy}")
-
-
-def _record(file: _Json) -> dict[str, Any]:
+def _record(file: JsonObject) -> dict[str, Any]:
     fields = {name: file.get(name, *kinds) for name, kinds in RECORD.items()}
     for names, kinds in INSIDE_RECORD.items():
         file.get(names, *kinds)
@@ -281,7 +211,7 @@ def _record(file: _Json) -> dict[str, Any]:
     return fields
 
 
-def _metrics(scores: _Json, latency: _Json | None) -> dict[str, float | None]:
+def _metrics(scores: JsonObject, latency: JsonObject | None) -> dict[str, float | None]:
     """See RunResult.metrics."""
     values: dict[str, float | None] = {}
     for name in ("mAP", "NDS", "mAVE"):
@@ -340,14 +270,6 @@ def _has(content: Any, path: Sequence[str]) -> bool:
             return False
         content = content[name]
     return True
-
-
-def _leaves(content: Any, names: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    if isinstance(content, (dict, list)):
-        for name, value in content.items() if isinstance(content, dict) else enumerate(content):
-            yield from _leaves(value, (*names, str(name)))
-    else:
-        yield names, content
 
 
 def _is_point(point: Any) -> bool:

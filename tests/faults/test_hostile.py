@@ -315,6 +315,13 @@ def test_a_stored_configuration_is_values_and_nothing_else(tree, secret, key, va
     assert SECRET not in str(caught.value)
 
 
+def test_a_stored_configuration_says_no_place_to_write_to(tree, tmp_path):
+    own = dict(tree) | {"paths": {"outputs": str(tmp_path / "home"), "reports": str(tmp_path / "etc")}}
+    paths = restore_config(own, []).paths
+    assert (paths.outputs, paths.reports) == ("outputs", "reports")
+    assert restore_config(own, ["paths.outputs=mine"]).paths.outputs == "mine"
+
+
 def test_a_stored_configuration_that_unfolds_without_end_is_refused(tree):
     part = ["x"]
     for _ in range(20):
