@@ -146,7 +146,7 @@ def joined(
     before: FrameBatch | None = None
     for frame in frames:
         if before is not None and bool(frame.starts[0]):
-            onward = before.global_from_ego @ step @ rigid_inverse(frame.global_from_ego)
+            onward = made_rigid(before.global_from_ego @ step @ rigid_inverse(frame.global_from_ego))
             later_s = before.timestamps_s + step_s - frame.timestamps_s
         moved = replace(
             frame,
@@ -159,6 +159,16 @@ def joined(
             step_s = moved.timestamps_s - before.timestamps_s
         before = moved
         yield moved
+
+
+def made_rigid(
+    matrix: Tensor,  # [1, 4, 4] rigid but for rounding
+) -> Tensor:  # [1, 4, 4]
+    """With the nearest rotation: what one joint adds in rounding, the next would multiply, without end."""
+    left, _, right = torch.linalg.svd(matrix[:, :3, :3])
+    rigid = matrix.clone()
+    rigid[:, :3, :3] = left @ right
+    return rigid
 
 
 def soak_training(

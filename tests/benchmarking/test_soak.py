@@ -1,5 +1,6 @@
 """suite=soak: slopes by hand, leaks that are planted and found, clips that make one drive, and the command itself."""
 
+import itertools
 import json
 import os
 import sys
@@ -146,6 +147,14 @@ def test_clips_make_one_drive_without_a_jump():
         assert bool(past.motion(now, 8.0).usable) and len(FrameMemory((past,)).before(now).frames) == 1
     jump = RememberedFrame(first[-1].timestamps_s, first[-1].global_from_ego, torch.ones(1, dtype=torch.bool))
     assert not bool(jump.motion(replace(second[0]), 8.0).usable)  # without joining
+
+
+def test_a_drive_over_many_clips_stays_rigid():
+    clip = [frame("a", 0.5 * n, pose(6e5 + 5.0 * n, 0.3 + 0.1 * n), n == 0) for n in range(3)]
+    *_, last = joined(itertools.chain.from_iterable(itertools.repeat(clip, 200)))
+    rotation = last.global_from_ego[0, :3, :3]
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-9, rtol=0)
+    assert torch.isfinite(last.global_from_ego).all()
 
 
 def test_soak_needs_a_memory():
