@@ -49,12 +49,13 @@ benchmark: $(STAMP) ## time and memory of every part [ARGS="suite=metric"]
 # The pages of reports/performance; on a GPU they get names of their own.
 FULL_SIZE := scale=paper data=synthetic_full
 PRECISION := precision=32-true
-performance: $(STAMP) ## all pages of reports/performance, an hour of a quiet machine [on a GPU: PRECISION=precision=bf16-mixed]
+performance: $(STAMP) ## all pages of reports/performance, an hour and a half of a quiet machine [on a GPU: PRECISION=precision=bf16-mixed]
 	for suite in "suite=ops $(FULL_SIZE)" "suite=scaling phase=phase2 $(FULL_SIZE)" \
 	    "suite=model phase=phase1 $(FULL_SIZE)" "suite=model phase=phase1 model=dense_bev $(FULL_SIZE)" \
 	    "suite=model phase=phase2 model.dptf.bev_path.memory_threshold=0 $(FULL_SIZE)" \
 	    "suite=model phase=phase2 model=dense_bev $(FULL_SIZE)" \
-	    "suite=training" "suite=training model=dense_bev" "suite=reader $(FULL_SIZE)" "suite=reader" "suite=metric"; do \
+	    "suite=training" "suite=training model=dense_bev" "suite=reader $(FULL_SIZE)" "suite=reader" "suite=metric" \
+	    "suite=soak phase=phase2"; do \
 	    $(PYTHON) -m src.benchmark $$suite $(PRECISION) out=reports/performance $(ARGS) || exit 1; \
 	done
 
