@@ -68,12 +68,19 @@ def benchmark_soak(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
         curves[name] = soak_inference(detector, datamodule, frames, one_drive=name == DRIVE)
         del detector
     curves[TRAINING] = soak_training(config, tree, datamodule, frames, device)
+    epoch = epoch_frames(config, datamodule)
+    validated = epoch * config.phase.validate_every  # frames before the first validation
+    enough = validated + 2 * epoch <= curves[TRAINING][-1]["frames"]
+    growth = [growth_row(name, curves[name]) for name in (DRIVE, CLIPS)]
+    growth.append(growth_row(TRAINING, curves[TRAINING], epoch, validated if enough else 0))
     result = {
         "notes": [
             f"{config.model.name}, {config.phase.name}, scale {config.scale}, {config.precision} on {device}, "
             + (f"weights of {Path(config.checkpoint).name}. " if config.checkpoint else "fresh weights. ")
-            + f"Growth is the median slope between all points (Theil-Sen) behind the first {SETTLED:.0%} of a pass. "
-            "`last / second quarter` compares the median times of a frame, from one frame to the next with reading.",
+            + f"Growth is the median slope between all points (Theil-Sen) behind the first {SETTLED:.0%} of a pass; in "
+            "training between points at the same place of two epochs, behind the first validation (which starts its "
+            "own loader) where two epochs follow it. `last / second quarter` compares the median times of a frame, from one frame to the next with "
+            "reading.",
             f"{DRIVE}: validation clips joined end to end, time and pose go on, so the memory is never empty. "
             f"{CLIPS}: each clip starts anew, as in validation. {TRAINING}: the run that this configuration would "
             f"train, batches of {config.data.batch_size} from its loader, with trainer, logs, validations and "
@@ -84,7 +91,7 @@ def benchmark_soak(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
             "tensors and objects: those of Python's garbage collector, which runs as it always does.",
         ],
         "picture": None,
-        "growth": [growth_row(name, rows) for name, rows in curves.items()],
+        "growth": growth,
     }
     if config.out:
         name = f"{page_name(config)}.png"
@@ -178,7 +185,7 @@ def soak_training(
     torch.manual_seed(config.seed)
     module = build_module(config, tree, datamodule)
     load_weights(config, module.model)
-    epochs = math.ceil(frames / (len(datamodule.train_dataloader()) * config.data.batch_size))
+    epochs = math.ceil(frames / epoch_frames(config, datamodule))
     curve = Curve(frames, device, lambda: [memory for _, memory in module.memories])
 
     def watched(name: str, path: str, method: Callable[..., Any]) -> Callable[..., Any]:
@@ -211,6 +218,11 @@ def soak_training(
         with replaced_methods(module, hooks, watched):
             fit(trainer, module, datamodule, None)
     return curve.rows
+
+
+def epoch_frames(config: Config, datamodule: DetectionDataModule) -> int:
+    """Frames of a training epoch."""
+    return len(datamodule.train_dataloader()) * config.data.batch_size
 
 
 # ---------------------------------------------------------------- what is looked at
@@ -323,26 +335,43 @@ def number_in(folder: str) -> int | None:
 # ---------------------------------------------------------------- what it comes to
 
 
-def growth_row(name: str, rows: list[Row]) -> Row:
-    """How much everything grows in a thousand frames once it has settled, and the times of two quarters."""
-    frames = [row["frames"] for row in rows]
-    settled = [row for row in rows if row["frames"] > SETTLED * frames[-1]]
-    second = [row["ms"] for row in settled if row["frames"] <= 0.5 * frames[-1]]
-    last = [row["ms"] for row in rows if row["frames"] > 0.75 * frames[-1]]
-    places = [row["frames"] for row in settled]
+def growth_row(
+    name: str,
+    rows: list[Row],
+    period: int = 1,  # frames after which the work is the same again
+    settled_after: int = 0,  # frames, where that is more than SETTLED of all
+) -> Row:
+    """How much everything grows in a thousand frames once it has settled, and the times of two quarters.
+
+    Within a training epoch the clips' memories fill, so only points at the same place of two epochs tell of growth.
+    """
+    last_frame = rows[-1]["frames"]
+    settled = [row for row in rows if row["frames"] > max(SETTLED * last_frame, settled_after)]
+    second = [row["ms"] for row in rows if SETTLED * last_frame < row["frames"] <= 0.5 * last_frame]
+    last = [row["ms"] for row in rows if row["frames"] > 0.75 * last_frame]
+    pairs = [
+        (before, after)
+        for before, after in itertools.combinations(settled, 2)
+        if is_multiple(after["frames"] - before["frames"], period, last_frame / len(rows))
+    ]
     growth = {
-        f"{quantity} / 1000 frames": 1e3 * robust_slope(places, [row[quantity] for row in settled])
-        for quantity in settled[-1]
-        if quantity not in ("frames", "ms", "± ms") and all(quantity in row for row in settled)
+        f"{quantity} / 1000 frames": 1e3 * robust_slope(pairs, quantity)
+        for quantity in rows[-1]
+        if pairs and quantity not in ("frames", "ms", "± ms") and all(quantity in row for row in settled)
     }
     ratio = {"last / second quarter": statistics.median(last) / statistics.median(second)}
-    return {"pass": name, "frames": frames[-1]} | ratio | growth
+    return {"pass": name, "frames": last_frame} | ratio | growth
+
+
+def is_multiple(frames: int, period: int, spacing: float) -> bool:
+    """Whether a distance is a whole number of periods, as nearly as points of this spacing can tell."""
+    off = frames % period
+    return frames >= period and min(off, period - off) < 0.5 * spacing
 
 
 def robust_slope(
-    x: list[float],  # ascending
-    y: list[float],
+    pairs: list[tuple[Row, Row]],  # the earlier first
+    quantity: str,
 ) -> float:
-    """Median of the slopes between all pairs of points (Theil 1950, Sen 1968): up to 29 % of outliers do not matter."""
-    pairs = itertools.combinations(zip(x, y, strict=True), 2)
-    return statistics.median((y1 - y0) / (x1 - x0) for (x0, y0), (x1, y1) in pairs)
+    """Median of the slopes between pairs of points (Theil 1950, Sen 1968): up to 29 % of outliers do not matter."""
+    return statistics.median((b[quantity] - a[quantity]) / (b["frames"] - a["frames"]) for a, b in pairs)

@@ -22,11 +22,23 @@ ON_LINUX = sys.platform.startswith("linux")
 
 
 def test_a_slope_is_that_of_most_points():
-    x = list(range(0, 1000, 100))
-    y = [7.0 + 0.02 * place for place in x]
-    assert robust_slope(x, y) == pytest.approx(0.02)
-    y[3], y[8] = 1e6, -1e6  # a burst of other work
-    assert robust_slope(x, y) == pytest.approx(0.02)
+    rows = [{"frames": place, "MiB": 7.0 + 0.02 * place} for place in range(0, 1000, 100)]
+    pairs = list(itertools.combinations(rows, 2))
+    assert robust_slope(pairs, "MiB") == pytest.approx(0.02)
+    rows[3]["MiB"], rows[8]["MiB"] = 1e6, -1e6  # a burst of other work
+    assert robust_slope(pairs, "MiB") == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("leak", [0.0, 3.0])
+def test_growth_in_training_is_that_from_epoch_to_epoch(leak):
+    """Four epochs of 240 frames: memory fills in each, a loader starts after two; the leak is what an epoch adds."""
+    rows = [
+        {"frames": n, "ms": 1.0, "± ms": 0.0, "MiB": (n - 1) % 240 + leak * ((n - 1) // 240) + 50.0 * (n > 480)}
+        for n in range(30, 961, 30)
+    ]
+    assert growth_row("training", rows, 240, 480)["MiB / 1000 frames"] == pytest.approx(1e3 * leak / 240)
+    assert growth_row("training", rows)["MiB / 1000 frames"] > 50.0  # what does not tell
+    assert "MiB / 1000 frames" not in growth_row("training", rows[:16], 240, 240)  # one epoch tells nothing
 
 
 def test_growth_is_that_behind_the_first_quarter():
