@@ -79,8 +79,8 @@ def benchmark_soak(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
             + (f"weights of {Path(config.checkpoint).name}. " if config.checkpoint else "fresh weights. ")
             + f"Growth is the median slope between all points (Theil-Sen) behind the first {SETTLED:.0%} of a pass; in "
             "training between points at the same place of two epochs, behind the first validation (which starts its "
-            "own loader) where two epochs follow it. `last / second quarter` compares the median times of a frame, from one frame to the next with "
-            "reading.",
+            "own loader) where two epochs follow it. `last / second quarter` compares the median times of a frame, "
+            "from one frame to the next with reading.",
             f"{DRIVE}: validation clips joined end to end, time and pose go on, so the memory is never empty. "
             f"{CLIPS}: each clip starts anew, as in validation. {TRAINING}: the run that this configuration would "
             f"train, batches of {config.data.batch_size} from its loader, with trainer, logs, validations and "
