@@ -7,7 +7,7 @@ import torch
 
 from src import benchmark
 from src.benchmark import main
-from src.benchmarking import convolutions, machine, model, plain_peers, scaling, training
+from src.benchmarking import convolutions, machine, model, operations, plain_peers, scaling, training
 from src.benchmarking.scenes import Highway
 from src.config import compose_config
 from src.errors import ConfigError, DataError
@@ -20,11 +20,12 @@ def outputs(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def in_a_hurry(monkeypatch):
-    """Few rounds and a small roofline; what is measured stays the same."""
+    """Few rounds and a small roofline; what is measured stays the same. All operations are rows, not the longest."""
     monkeypatch.setattr(machine, "GEMM_SIZE", {"cpu": 128, "cuda": 128})
     monkeypatch.setattr(machine, "COPY_BYTES", {"cpu": 2**20, "cuda": 2**20})
     for module in (model, plain_peers, scaling, convolutions):
         monkeypatch.setattr(module, "ROUNDS", 1)
+    monkeypatch.setattr(operations, "NUM_ROWS", 1000)
     monkeypatch.setattr(training, "WARM_UP_STEPS", 1)
     monkeypatch.setattr(training, "MEASURED_STEPS", 3)
 

@@ -118,7 +118,7 @@ def changed_value(rng: random.Random, document: Any, others: tuple[Any, ...] = O
         top = [place for place in places if place[0] is document]
         places = top if rng.random() < 0.3 else places
         if not places or rng.random() < 0.02:
-            document = rng.choice([*NUMBERS, *TEXTS, *others])
+            document = copy.deepcopy(rng.choice([*NUMBERS, *TEXTS, *others]))
             return f"all of it is {document!r:.40}", document
         container, key = rng.choice(places)
         deed = rng.random()
@@ -136,7 +136,8 @@ def changed_value(rng: random.Random, document: Any, others: tuple[Any, ...] = O
             value = container.pop(key)
             key = rng.choice(["", "x" * 3000, "\ud800", f"{key} "])
         else:
-            value = rng.choice([*NUMBERS, *rng.sample(TEXTS, 8), *rng.sample(others, 4)])
+            # A copy: a later change may put a list of ours into itself.
+            value = copy.deepcopy(rng.choice([*NUMBERS, *rng.sample(TEXTS, 8), *rng.sample(others, 4)]))
         container[key] = value
         said.append(f"{key!r:.40} is {value!r:.40}")
     return ", ".join(said), document
