@@ -7,21 +7,12 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
+from tests.running import ROOT, command
+
 pytestmark = pytest.mark.slow
-
-
-def command(module, *overrides, expect=0, timeout=480):
-    result = subprocess.run(
-        [sys.executable, "-m", f"src.{module}", *overrides],
-        cwd=ROOT, capture_output=True, text=True, timeout=timeout,
-    )  # fmt: skip
-    assert result.returncode == expect, result.stdout[-3000:] + result.stderr[-3000:]
-    return result
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,6 @@
 """The dense peer by the commands that people type, at debug scale: phase 1, phase 2, evaluation, streaming."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -12,17 +9,9 @@ from src.assembly import build_datamodule
 from src.config import restore_config
 from src.streaming import StreamingDetector
 from src.training.checkpoints import read_checkpoint
+from tests.running import command
 
-ROOT = Path(__file__).resolve().parent.parent
 pytestmark = pytest.mark.slow
-
-
-def command(module, *overrides):
-    result = subprocess.run(
-        [sys.executable, "-m", f"src.{module}", *overrides], cwd=ROOT, capture_output=True, text=True, timeout=480
-    )
-    assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
-    return result
 
 
 @pytest.fixture(scope="module")

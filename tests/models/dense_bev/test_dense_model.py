@@ -15,22 +15,10 @@ from src.models.backbones.image import NeckName
 from src.models.dense_bev.bev_decoder import BEVDecoder, BEVDecoderConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig, LossConfig
 from src.structures.boxes import Boxes3D
+from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
 
 STEPS = 140
 TERMS = {"heatmap", "box", "depth", "total"}
-
-
-def train_step(model, batch):
-    output = model(batch)[0]
-    terms = model.loss(output, batch)
-    model.zero_grad()
-    terms["total"].backward()
-    return output, terms
-
-
-def gradients_are_finite(model):
-    """Every parameter has a gradient, zero where its part had nothing to do: DDP waits for each of them."""
-    return all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
 
 
 def test_shapes_named_terms_and_one_entry_per_sample():
@@ -51,15 +39,7 @@ def test_shapes_named_terms_and_one_entry_per_sample():
 @pytest.mark.parametrize("changes", [{}, {"image_stride_px": 8}, {"neck": NeckName.secondfpn16}])
 def test_every_parameter_learns(changes):
     model, batch = dense_model(**changes), make_batch(boxes=(12, 12))  # every class, hence every branch of the head
-    optimizer = torch.optim.SGD(model.parameters(), lr=1e-3)
-    moved = set()
-    for _ in range(2):
-        train_step(model, batch)
-        moved |= {name for name, p in model.named_parameters() if p.grad is not None and p.grad.any()}
-        optimizer.step()
-    still = {name for name, _ in model.named_parameters()} - moved
-    # An L1 term pulls a bias by +-1 per object, which an even number of objects can cancel exactly.
-    assert [name for name in sorted(still) if not (name.startswith("head.regressions") and name.endswith("bias"))] == []
+    assert parameters_that_stay(model, batch, lr=1e-3) == []
 
 
 @pytest.mark.parametrize(

@@ -15,22 +15,10 @@ from src.models.horizon3d.kggi import Initialization
 from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, RefineFrom
 from src.structures.boxes import Boxes3D
+from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
 
 CONF = Path(__file__).parents[3] / "conf"
 ALL_TERMS = {"heatmap", "box", "keypoint", "depth", "radar_objectness", "occupancy_focal", "occupancy_dice", "total"}
-
-
-def train_step(model, batch):
-    output = model(batch)[0]
-    terms = model.loss(output, batch)
-    model.zero_grad()
-    terms["total"].backward()
-    return output, terms
-
-
-def gradients_are_finite(model):
-    """Every parameter has a gradient, zero where its part had nothing to do: DDP waits for each of them."""
-    return all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
 
 
 def test_named_terms_add_up_and_decode_gives_one_entry_per_sample(make_model, make_batch):
@@ -46,15 +34,7 @@ def test_named_terms_add_up_and_decode_gives_one_entry_per_sample(make_model, ma
 @pytest.mark.parametrize("changes", [{}, {"initialization": Initialization.random}, {"radar_only": True}])
 def test_every_parameter_learns_within_two_steps(make_model, make_batch, changes):
     model, batch = make_model(**changes), make_batch(boxes=(12, 12))  # every class, hence every branch of the head
-    optimizer = torch.optim.SGD(model.parameters(), lr=1e-2)
-    moved = set()
-    for _ in range(2):
-        train_step(model, batch)
-        moved |= {name for name, p in model.named_parameters() if p.grad is not None and p.grad.any()}
-        optimizer.step()
-    still = {name for name, _ in model.named_parameters()} - moved
-    # An L1 term pulls a bias by +-1 per object, which an even number of objects can cancel exactly.
-    assert [name for name in sorted(still) if not (name.startswith("head.regressions") and name.endswith("bias"))] == []
+    assert parameters_that_stay(model, batch, lr=1e-2) == []
 
 
 @pytest.mark.parametrize(
