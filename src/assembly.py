@@ -9,14 +9,14 @@ from typing import Any
 
 from src.config import Config, OnNonfinite
 from src.data.datamodule import DetectionDataModule
-from src.data.world.write import ensure_world, world_digest
 from src.errors import ConfigError
 from src.metrics.submission import write_submission
 from src.models import build_model as build_model_of
 from src.models.detector import Detector
 from src.structures.detections import DetectionTable
-from src.training.detection import DetectionModule
-from src.training.temporal import TemporalModule
+from src.training.module import DetectionModule
+from src.training.temporal_module import TemporalModule
+from src.world.write import ensure_world, world_digest
 
 logger = logging.getLogger(__name__)
 
@@ -54,6 +54,7 @@ def build_datamodule(config: Config, root: Path) -> DetectionDataModule:
         seed=config.seed,
         cache=Path(config.paths.outputs) / "cache",
         temporal=config.phase.temporal,
+        name="synthetic highway" if config.data.world is not None else None,
     )
 
 

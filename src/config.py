@@ -26,11 +26,13 @@ from src.errors import CheckpointError, ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models import MODEL_CONFIGS
 from src.models.backbones.image import ImageEncoderConfig
-from src.overrides import fault_of_tree, key_of
-from src.sweeping.address import masked
+from src.reliability.passwords import masked
+from src.reliability.untrusted import fault_of_tree
+from src.training.identity import key_of
 from src.training.optim import OptimConfig
 from src.training.run_folder import Resume
 from src.training.wandb import WandbConfig
+from src.world.world_config import WorldConfig
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir())
@@ -63,6 +65,13 @@ class GridConfig:
     def build(self) -> BEVGrid:
         """The checked grid."""
         return BEVGrid(tuple(self.cells), self.cell_m, tuple(self.centre_m), tuple(self.z_range_m))
+
+
+@dataclass(kw_only=True)
+class RunDataConfig(DataConfig):
+    """The data of a run, and where they come from."""
+
+    world: WorldConfig | None  # the synthetic highway to write on first use; null = recorded data
 
 
 @dataclass(kw_only=True)
@@ -175,7 +184,7 @@ class Config:
     grid: GridConfig
     model: Any  # the chosen model's own dataclass, see MODEL_CONFIGS
     backbone: ImageEncoderConfig
-    data: DataConfig
+    data: RunDataConfig
     phase: PhaseConfig
     trainer: TrainerConfig
     logger: LoggerConfig

@@ -6,18 +6,18 @@ import logging
 from pathlib import Path
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
-from src.command import run_command
 from src.config import Config, compose_config, restore_config
 from src.errors import ConfigError, DataError
 from src.metrics.detection import score_detections
-from src.metrics.report import format_scores
+from src.metrics.score_text import format_scores
 from src.metrics.scores import DetectionScores
 from src.metrics.submission import load_submission
-from src.ops.allocator import tune_cpu_allocator
-from src.training.checkpoints import load_model_weights, read_checkpoint
+from src.reliability.allocator import tune_cpu_allocator
+from src.reliability.checkpoints import load_model_weights, read_checkpoint
+from src.reliability.command import run_command
+from src.reliability.processes import check_devices
 from src.training.fit import build_evaluation_trainer
 from src.training.identity import digest_of_changes
-from src.training.processes import check_devices
 from src.training.run_folder import make_writable, write_json
 
 logger = logging.getLogger(__name__)

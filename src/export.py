@@ -9,13 +9,13 @@ from pathlib import Path
 import torch
 
 from src.assembly import build_model
-from src.command import run_command
 from src.config import compose_config, restore_config
 from src.errors import ConfigError
 from src.models.backbones.image import ImageEncoder
-from src.models.inference import prepare_for_inference
+from src.models.deploy.inference import prepare_for_inference
+from src.reliability.checkpoints import load_model_weights, read_checkpoint
+from src.reliability.command import run_command
 from src.structures.taxonomy import CAMERAS
-from src.training.checkpoints import load_model_weights, read_checkpoint
 from src.training.run_folder import make_writable
 
 EXAMPLE_FRAMES = 2

@@ -12,22 +12,22 @@ import torch
 from tqdm import tqdm
 
 from src.assembly import build_datamodule, data_root, save_submission
-from src.command import run_command
 from src.config import Config, compose_config, restore_config
 from src.data.splits import split_samples
 from src.errors import ConfigError
 from src.metrics.submission import to_global
-from src.ops.allocator import tune_cpu_allocator
 from src.pictures.film import Film
 from src.pictures.frame import draw_frame
+from src.reliability.allocator import tune_cpu_allocator
+from src.reliability.checkpoints import read_checkpoint
+from src.reliability.command import run_command
+from src.reliability.processes import check_devices
 from src.streaming import StreamingDetector
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
-from src.structures.passed_over import PassedOver
-from src.training.checkpoints import read_checkpoint
+from src.structures.skipped import PassedOver
 from src.training.identity import digest_of_changes
-from src.training.processes import check_devices
 from src.training.run_folder import make_writable
 from src.training.snapshots import SHOWN_SCORE, scene_of, views_of
 

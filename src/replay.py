@@ -27,16 +27,16 @@ import torch
 from torch import Tensor, nn
 
 from src.assembly import build_model
-from src.command import run_command
 from src.config import Config, Precision, compose_config, restore_config
 from src.errors import ConfigError, DivergedError
 from src.predict import chosen_device
+from src.reliability.checkpoints import load_model_weights
+from src.reliability.command import run_command
+from src.reliability.nonfinite import describe_gradients, gradient_norm, read_dump
 from src.structures.batch import RADAR_POINT_FIELDS, FrameBatch
 from src.structures.detections import DetectionTable, EvaluationSet
-from src.training.checkpoints import load_model_weights
-from src.training.detection import DetectionModule
-from src.training.nonfinite import describe_gradients, gradient_norm, read_dump
-from src.training.temporal import TemporalModule
+from src.training.module import DetectionModule
+from src.training.temporal_module import TemporalModule
 
 MAX_SHOWN = 8
 

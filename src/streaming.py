@@ -16,13 +16,13 @@ from src.data.reader import ReaderSettings
 from src.data.sensors import Camera, RadarSweep, frame_from_sensors
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.models.deploy.inference import prepare_for_inference
+from src.models.deploy.static_parts import compile_static_parts, replay_image_encoder
 from src.models.detector import Detector
-from src.models.inference import prepare_for_inference
-from src.models.static_parts import compile_static_parts, replay_image_encoder
+from src.reliability.checkpoints import load_model_weights, read_checkpoint
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CAMERAS
-from src.training.checkpoints import load_model_weights, read_checkpoint
 
 
 class StreamingDetector:

@@ -17,19 +17,14 @@ import yaml
 from lightning.pytorch.loggers.logger import Logger
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
-from src.command import run_command
-from src.config import Config, compose_config
+from src.config import PHASES, Config, compose_config
 from src.data.datamodule import DetectionDataModule
 from src.errors import DataError
-from src.handoff import Source, find_source, hand_over, read_source, train_source
-from src.metrics.report import format_scores
-from src.ops.allocator import tune_cpu_allocator
-from src.pictures.curves import draw_curves, draw_scores
-from src.structures.passed_over import SHOWN_NAMES, PassedOver
-from src.training.detection import DetectionModule, gather_by_rank
-from src.training.fit import build_loggers, build_trainer, fit
-from src.training.identity import run_identity
-from src.training.processes import (
+from src.metrics.score_text import format_scores
+from src.pictures.learning_curves import draw_curves, draw_scores
+from src.reliability.allocator import tune_cpu_allocator
+from src.reliability.command import run_command
+from src.reliability.processes import (
     build_strategy,
     check_devices,
     created_externally,
@@ -39,6 +34,11 @@ from src.training.processes import (
     launch,
     process_group,
 )
+from src.structures.skipped import SHOWN_NAMES, PassedOver
+from src.training.fit import build_loggers, build_trainer, fit
+from src.training.handoff import Source, find_source, hand_over, read_source, train_source
+from src.training.identity import run_identity
+from src.training.module import DetectionModule, gather_by_rank
 from src.training.run_folder import Resume, RunFolder, current_commit, write_json
 from src.training.snapshots import draw_frames
 from src.training.wandb import WandbRun
@@ -52,7 +52,7 @@ def main(overrides: list[str]) -> None:
     config, tree = compose_config(overrides)
     where = (config.trainer.accelerator.value, config.trainer.devices, config.trainer.num_nodes)
     check_devices(*where)
-    source = find_source(config, overrides)
+    source = find_source(config, overrides, compose_config, PHASES)
     folder = RunFolder(Path(config.paths.outputs), run_identity(tree, source.identity if source is not None else None))
     if config.trainer.num_processes > 1 and not created_externally():
         ensure_source(config, folder, source, processes_exist=False)

@@ -5,7 +5,7 @@ import pytest
 from src.assembly import build_datamodule, data_root
 from src.config import compose_config
 from src.errors import ConfigError, DataError
-from src.training.processes import check_devices
+from src.reliability.processes import check_devices
 
 
 def test_evaluation_never_writes_a_world_into_a_mistyped_folder(tmp_path):

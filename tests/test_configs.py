@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from src.command import run_command
 from src.config import CONF, compose_config, restore_config
 from src.errors import CheckpointError, ConfigError
+from src.reliability.command import run_command
 
 SCALES = sorted(p.stem for p in (CONF / "scale").glob("*.yaml"))
 

@@ -4,11 +4,11 @@ import json
 
 import pytest
 import torch
-from untrained import write_checkpoint
 
 from src import export
 from src.errors import CheckpointError, ConfigError
 from src.streaming import StreamingDetector
+from tests.untrained import write_checkpoint
 
 
 def test_the_file_gives_the_features_of_the_detector(tmp_path, capsys):

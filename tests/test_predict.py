@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from untrained import write_checkpoint
 
 from src import evaluate, predict
 from src.errors import CheckpointError, ConfigError, DataError
 from src.streaming import StreamingDetector
+from tests.untrained import write_checkpoint
 
 ROOT = Path(__file__).resolve().parent.parent
 FRAMES = 3  # of a scene

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from untrained import write_checkpoint
 
 from src.data.datamodule import collate
 from src.data.sensors import Camera, RadarSweep
@@ -15,6 +14,7 @@ from src.errors import CheckpointError, ConfigError
 from src.streaming import StreamingDetector
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CAMERAS, RADARS
+from tests.untrained import write_checkpoint
 
 GUIDE = Path(__file__).resolve().parent.parent / "docs" / "streaming.md"
 

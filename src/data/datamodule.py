@@ -28,12 +28,11 @@ from src.data.clips import (
     streamed_groups,
     whole_scenes,
 )
-from src.data.evaluation import evaluation_set
-from src.data.parcel import Parcel
+from src.data.evaluation_set import evaluation_set
+from src.data.packed_batch import Parcel
 from src.data.reader import FrameReader, OnBadFile, ReaderSettings
 from src.data.schema import DatasetIndex
 from src.data.splits import split_samples
-from src.data.world.config import WorldConfig
 from src.errors import ConfigError, DataError, HorizonError
 from src.structures.batch import FrameBatch
 from src.structures.detections import EvaluationSet
@@ -60,7 +59,6 @@ class DataConfig:
     on_bad_file: OnBadFile
     test_resize_offset: float  # added to the image scale without augmentation
     augmentation: AugmentationConfig | None
-    world: WorldConfig | None  # the synthetic highway to write on first use; null = recorded data
 
     def __post_init__(self) -> None:
         least_values = {
@@ -187,9 +185,11 @@ class DetectionDataModule(L.LightningDataModule):
         cache: Path,
         *,
         temporal: bool,
+        name: str | None = None,  # of the data set in results; None: its folder's
     ) -> None:
         super().__init__()
         self.config, self.root, self.seed, self.temporal = config, root, seed, temporal
+        self.name = name or root.name
         self.settings = config.reader_settings(image_size_px)
         self.index: DatasetIndex = load_index(root, config.version, cache)
         self.reader = FrameReader(self.index, self.settings)
@@ -201,7 +201,7 @@ class DetectionDataModule(L.LightningDataModule):
     def identity(self) -> dict[str, Any]:
         """What data these are, without machine paths."""
         return {
-            "name": "synthetic highway" if self.config.world is not None else self.root.name,
+            "name": self.name,
             "version": self.config.version,
             "train_split": self.config.train_split,
             "split": self.config.split,

@@ -1,11 +1,10 @@
 """Maths on plain tensors: each file is one operation with its torch reference; these names are the public ones."""
 
-from src.ops.allocator import tune_cpu_allocator
-from src.ops.bags import segment_mean, segment_sum
 from src.ops.deform_sample import deform_attend_bev, deform_attend_images, sample_sparse_bev
 from src.ops.farthest_point import farthest_points
 from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
 from src.ops.nms import maxpool_peaks, nms_circle, nms_rotated, rotated_iou
+from src.ops.segment_reduce import segment_mean, segment_sum
 from src.ops.sites import Sites, union
 from src.ops.sparse_conv import neighbour_sum, sparse_conv
 from src.ops.splat import Splat, log1mexp, splat_gaussians
@@ -32,7 +31,6 @@ __all__ = [
     "strided_map",
     "submanifold_map",
     "temporal_map",
-    "tune_cpu_allocator",
     "union",
     "voxelize",
 ]

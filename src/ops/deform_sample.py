@@ -9,7 +9,7 @@ from torch import Tensor
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
 from src.ops.backend import implementation, register
-from src.ops.bags import weighted_bag
+from src.ops.segment_reduce import weighted_bag
 from src.ops.sites import Sites
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.ops.bags import bags
+from src.ops.segment_reduce import bags
 from src.ops.sites import HALO, Sites
 
 Size = int | tuple[int, ...]

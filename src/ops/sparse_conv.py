@@ -8,10 +8,10 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
 from src.ops.backend import implementation, register
-from src.ops.bags import bag_sum
 from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
-from src.ops.pair_tiles import pair_tiles, scratch
+from src.ops.segment_reduce import bag_sum
 from src.ops.sites import Sites, union
+from src.ops.tiled_rulebook import pair_tiles, scratch
 
 __all__ = [
     "KernelMap",

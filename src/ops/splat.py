@@ -13,7 +13,7 @@ from torch.autograd.function import FunctionCtx
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import window_cells
 from src.ops.backend import implementation, register
-from src.ops.bags import bag_sum, weighted_bag
+from src.ops.segment_reduce import bag_sum, weighted_bag
 from src.ops.sites import Sites
 
 # A contribution is at most 1 - CAP, so that the logarithm of the free probability stays finite.

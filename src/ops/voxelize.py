@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.constants import constant
-from src.ops.bags import segment_mean
+from src.ops.segment_reduce import segment_mean
 from src.ops.sites import Sites
 
 

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 
 from src.pictures.canvas import SHEET_PX, Canvas
 from src.pictures.contents import INK, MUTED
-from src.pictures.curves import LINE_COLOURS, style_axes
+from src.pictures.learning_curves import LINE_COLOURS, style_axes
 
 HEIGHT_PX = 360
 """Of one panel with its title and labels."""

@@ -13,11 +13,11 @@ from lightning.pytorch.strategies import Strategy
 
 from src.data.datamodule import DetectionDataModule, dead_workers_named
 from src.errors import InterruptedRunError
-from src.training.checkpoints import BEST, LAST, AtomicCheckpointIO, load_model_weights, read_checkpoint
-from src.training.detection import DetectionModule
-from src.training.interruption import Interruption
-from src.training.metrics_csv import MetricsCSV
-from src.training.processes import SharedBuffers
+from src.reliability.checkpoints import BEST, LAST, AtomicCheckpointIO, load_model_weights, read_checkpoint
+from src.reliability.interruption import Interruption
+from src.reliability.metrics_csv import MetricsCSV
+from src.reliability.processes import SharedBuffers
+from src.training.module import DetectionModule
 from src.training.run_folder import RunFolder
 from src.training.wandb import WandbConfig, start_wandb
 

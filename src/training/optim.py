@@ -10,7 +10,7 @@ from torch import nn
 from torch.optim.lr_scheduler import LRScheduler
 
 from src.errors import ConfigError
-from src.models.sparse_layers import SparseKernel
+from src.models.layers.sparse import SparseKernel
 
 
 @dataclass(kw_only=True)

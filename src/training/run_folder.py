@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from src.errors import BusyError, CheckpointError, ConfigError, DataError
-from src.training.checkpoints import BEST, LAST, PREVIOUS, read_checkpoint, sync_folder
+from src.reliability.checkpoints import BEST, LAST, PREVIOUS, read_checkpoint, sync_folder
 
 logger = logging.getLogger(__name__)
 

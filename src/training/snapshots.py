@@ -18,7 +18,7 @@ from src.pictures.bev import BevScene
 from src.pictures.cameras import CameraViews
 from src.pictures.contents import PictureBoxes, PictureGaussians, PictureGrid, PictureMemory
 from src.pictures.frame import draw_frame
-from src.pictures.memory import MemoryScene, draw_memory
+from src.pictures.memory_picture import MemoryScene, draw_memory
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.gaussians import GaussianSet

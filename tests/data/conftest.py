@@ -6,7 +6,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from tiny_set import VERSION, DataSet, write_data_set
+
+from tests.data.tiny_set import VERSION, DataSet, write_data_set
 
 
 @pytest.fixture(scope="session")

@@ -4,12 +4,12 @@ import os
 
 import numpy as np
 import pytest
-from tiny_set import VERSION
 
 from src.data import cache
 from src.data.cache import load_index
 from src.data.splits import OFFICIAL_LISTS, split_samples
 from src.errors import DataError
+from tests.data.tiny_set import VERSION
 
 
 def test_second_start_reads_the_cache(broken_tables, tmp_path, monkeypatch):

@@ -11,7 +11,6 @@ import lightning as L
 import numpy as np
 import pytest
 import torch
-from tiny_set import START_S, VERSION, DataSet, Writer, token
 
 from src.data.augment import AugmentationConfig, BevAugmentationConfig, ImageAugmentationConfig
 from src.data.cache import load_index
@@ -20,6 +19,7 @@ from src.data.datamodule import DataConfig, DetectionDataModule, collate, dead_w
 from src.data.reader import OnBadFile
 from src.errors import ConfigError, DataError, HorizonError
 from src.structures.taxonomy import RADARS
+from tests.data.tiny_set import START_S, VERSION, DataSet, Writer, token
 
 BEV = BevAugmentationConfig(scale=[0.95, 1.05], rotation_rad=0.4, flip_probability=0.5)
 
@@ -29,7 +29,7 @@ def config(**changes):
         root=None, version=VERSION, train_split="train", split="val", batch_size=2, groups_per_scene=2, lane_sets=1,
         silent_frames=0.0, num_workers=0, num_sweeps=2, min_distance_m=1.0, propagate_points=False,
         on_bad_file=OnBadFile.error, test_resize_offset=0.0,
-        augmentation=AugmentationConfig(image=None, bev=BEV), world=None,
+        augmentation=AugmentationConfig(image=None, bev=BEV),
     )  # fmt: skip
     return DataConfig(**(values | changes))
 

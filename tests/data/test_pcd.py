@@ -2,10 +2,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_set import pcd_bytes
 
 from src.data.pcd import RADAR_FIELDS, read_radar_points
 from src.errors import DataError
+from tests.data.tiny_set import pcd_bytes
 
 POINTS = np.random.default_rng(0).normal(size=(9, 7)).astype(np.float32)
 REAL = Path(__file__).resolve().parents[3] / "shared/real/truckscenes_radar"

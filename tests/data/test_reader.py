@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_set import BLOB, START_S, STATIC, TARGET_VELOCITY, VERSION, ego_pose, mount, pcd_bytes, reader_settings
 
 from src.data.augment import AugmentationConfig, BevAugmentationConfig, ImageAugmentationConfig
 from src.data.cache import load_index
@@ -17,6 +16,17 @@ from src.errors import DataError
 from src.geometry.camera import project
 from src.geometry.transforms import invert_rigid, quaternion_to_matrix, rigid
 from src.structures.taxonomy import CAMERAS, CLASSES, RADARS
+from tests.data.tiny_set import (
+    BLOB,
+    START_S,
+    STATIC,
+    TARGET_VELOCITY,
+    VERSION,
+    ego_pose,
+    mount,
+    pcd_bytes,
+    reader_settings,
+)
 
 REAL = Path(__file__).resolve().parents[3] / "shared/real/truckscenes_radar"
 AUGMENTATION = AugmentationConfig(

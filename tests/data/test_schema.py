@@ -5,10 +5,10 @@ import shutil
 
 import numpy as np
 import pytest
-from tiny_set import START_S, TARGET_VELOCITY, VERSION, token
 
 from src.data.schema import CHANNELS, build_index
 from src.errors import DataError
+from tests.data.tiny_set import START_S, TARGET_VELOCITY, VERSION, token
 
 
 def build(data_set):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tiny_set import INTRINSICS, VERSION, ego_pose, mount, reader_settings
 
 from src.data.cache import load_index
 from src.data.pcd import read_radar_points
@@ -15,6 +14,7 @@ from src.data.schema import CHANNELS
 from src.data.sensors import Camera, RadarSweep, frame_from_sensors
 from src.errors import DataError
 from src.structures.taxonomy import CAMERAS, RADARS
+from tests.data.tiny_set import INTRINSICS, VERSION, ego_pose, mount, reader_settings
 
 SAMPLE = 1
 

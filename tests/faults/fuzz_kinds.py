@@ -7,7 +7,6 @@ import functools
 import io
 import json
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -18,41 +17,38 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from fuzzing import Kind
-from mutations import archive, changed_csv, changed_json, changed_yaml, damaged, either
 from PIL import Image, ImageDraw
 from torch import nn
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
-
-from tiny_set import VERSION, pcd_bytes, reader_settings, write_data_set  # noqa: E402
-
-import src.config  # noqa: E402
-import src.sweep_config  # noqa: E402
-from src.config import compose_config, restore_config  # noqa: E402
-from src.data import jpeg  # noqa: E402
-from src.data.cache import load_index  # noqa: E402
-from src.data.evaluation import evaluation_set  # noqa: E402
-from src.data.images import read_image, width_fit  # noqa: E402
-from src.data.pcd import RADAR_FIELDS, read_radar_points  # noqa: E402
-from src.data.reader import FrameReader, OnBadFile  # noqa: E402
-from src.data.schema import CHANNELS, TABLES, DatasetIndex, build_index  # noqa: E402
-from src.data.splits import split_samples  # noqa: E402
-from src.data.world.write import _read_stored  # noqa: E402
-from src.errors import CheckpointError, DataError, HorizonError  # noqa: E402
-from src.metrics.submission import load_submission  # noqa: E402
-from src.models.backbones.weights import BackboneName, load_backbone_weights  # noqa: E402
-from src.pictures.curves import read_metrics  # noqa: E402
-from src.reporting.dashboard.export import _data_address  # noqa: E402
-from src.reporting.dashboard.folders import Picture, RunFolders  # noqa: E402
-from src.reporting.results import publish_result, read_result  # noqa: E402
-from src.reporting.sweep_file import RowConfig, SweepConfig, TableConfig  # noqa: E402
-from src.reporting.sweep_record import RunState, SweepRecord, read_record, write_record  # noqa: E402
-from src.sweep_config import load_sweep  # noqa: E402
-from src.sweeping.runs import read_score, read_seconds, read_validations  # noqa: E402
-from src.training.checkpoints import load_model_weights, read_checkpoint  # noqa: E402
-from src.training.metrics_csv import MetricsCSV  # noqa: E402
-from src.training.run_folder import RunFolder  # noqa: E402
+import src.config
+import src.sweep.compose
+from src.config import compose_config, restore_config
+from src.dashboard.folders import Picture, RunFolders
+from src.dashboard.single_file import _data_address
+from src.data import jpeg
+from src.data.cache import load_index
+from src.data.evaluation_set import evaluation_set
+from src.data.images import read_image, width_fit
+from src.data.pcd import RADAR_FIELDS, read_radar_points
+from src.data.reader import FrameReader, OnBadFile
+from src.data.schema import CHANNELS, TABLES, DatasetIndex, build_index
+from src.data.splits import split_samples
+from src.errors import CheckpointError, DataError, HorizonError
+from src.metrics.submission import load_submission
+from src.models.backbones.weights import BackboneName, load_backbone_weights
+from src.pictures.learning_curves import read_metrics
+from src.reliability.checkpoints import load_model_weights, read_checkpoint
+from src.reliability.metrics_csv import MetricsCSV
+from src.report.results import publish_result, read_result
+from src.report.sweep_file import RowConfig, SweepConfig, TableConfig
+from src.report.sweep_record import RunState, SweepRecord, read_record, write_record
+from src.sweep.compose import load_sweep
+from src.sweep.run_status import read_score, read_seconds, read_validations
+from src.training.run_folder import RunFolder
+from src.world.write import _read_stored
+from tests.data.tiny_set import VERSION, pcd_bytes, reader_settings, write_data_set
+from tests.faults.fuzzing import Kind
+from tests.faults.mutations import archive, changed_csv, changed_json, changed_yaml, damaged, either
 
 Array = np.ndarray
 
@@ -463,7 +459,7 @@ def sweep_examples() -> list[bytes]:
 
 
 def use_sweeps_of(folder: Path) -> None:
-    src.sweep_config.SWEEPS = folder
+    src.sweep.compose.SWEEPS = folder
 
 
 def read_sweep_file(path: Path, number: int) -> None:

@@ -17,9 +17,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mutations import Mutate
-
 from src.errors import HorizonError
+from tests.faults.mutations import Mutate
 
 MEMORY_BYTES = 600 * 2**20
 """What reading one small damaged file may take beside what the process has."""

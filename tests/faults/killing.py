@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from src.errors import CheckpointError
-from src.training.checkpoints import LAST, PREVIOUS, read_checkpoint
+from src.reliability.checkpoints import LAST, PREVIOUS, read_checkpoint
 
 ROOT = Path(__file__).resolve().parents[2]
 GRACE_S = 60.0
@@ -54,9 +54,9 @@ def start(context, overrides, log, fault=None, prepare=None):
 
 def run_train(overrides, log, fault, prepare):
     """In the new process: its session, its output, its fault, then the command."""
-    from src.command import run_command
+    from src.reliability.command import run_command
+    from src.reliability.processes import die_with_parent
     from src.train import main
-    from src.training.processes import die_with_parent
 
     die_with_parent(signal.SIGKILL)
     os.setsid()
@@ -75,7 +75,7 @@ def run_train(overrides, log, fault, prepare):
 
 def arm(fault):
     """Let this process strike itself inside a write of a checkpoint."""
-    from src.training import checkpoints as module
+    from src.reliability import checkpoints as module
 
     state = {"saves": 0, "inside": False, "bytes": 0}
 
@@ -124,14 +124,14 @@ def arm(fault):
 
 def brisk():
     """In the new process: look often whether a disk is back."""
-    from src.training import checkpoints
+    from src.reliability import checkpoints
 
     checkpoints.RETRY_EVERY_S = 0.1
 
 
 def impatient():
     """In the new process: do not wait long for a disk."""
-    from src.training import checkpoints
+    from src.reliability import checkpoints
 
     checkpoints.RETRY_EVERY_S, checkpoints.WAIT_S = 0.1, 1.0
 

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mutations import cut, empty
 
 from src.assembly import build_datamodule, data_root
 from src.config import compose_config
@@ -20,6 +19,7 @@ from src.data.clips import shuffled_frames
 from src.data.schema import CHANNELS, DatasetIndex
 from src.data.splits import split_samples
 from src.structures.taxonomy import CAMERAS, RADARS
+from tests.faults.mutations import cut, empty
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = (

@@ -9,10 +9,10 @@ from collections import Counter
 import pytest
 
 from src.errors import ConfigError
-from src.reporting.sweep_record import read_record, record_path
-from src.sweeping import runner as runner_module
-from src.sweeping.study import GRACE_S
-from tests.sweeping.fake_sweep import ROOT, make_runner, make_sweep
+from src.report.sweep_record import read_record, record_path
+from src.sweep import runner as runner_module
+from src.sweep.sweep_study import GRACE_S
+from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep
 
 ROWS = {"a": ["model.x=1"], "b": ["model.x=2"], "c": ["model.x=3"]}
 pytestmark = pytest.mark.faults

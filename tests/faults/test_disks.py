@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from src.training.checkpoints import LAST, read_checkpoint
+from src.reliability.checkpoints import LAST, read_checkpoint
 from tests.faults import killing
 
 OF_SIZE = 64 * 2**20

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from fuzz_kinds import kinds, strangers
-from fuzzing import Kind, damaged_file, run_cases
-from mutations import damaged
+
+from tests.faults.fuzz_kinds import kinds, strangers
+from tests.faults.fuzzing import Kind, damaged_file, run_cases
+from tests.faults.mutations import damaged
 
 KINDS = {kind.name: kind for kind in kinds()}
 STRANGERS = strangers(list(KINDS.values()))

@@ -19,13 +19,13 @@ from src.data import cache
 from src.errors import CheckpointError, ConfigError, DataError
 from src.metrics.submission import load_submission
 from src.models.backbones.weights import BackboneName, load_backbone_weights
-from src.overrides import fault_of_tree
-from src.reporting import plain_yaml
-from src.reporting.results import publish_result, read_result
-from src.reporting.sweep_record import read_record
+from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
+from src.reliability.untrusted import fault_of_tree
+from src.report import plain_yaml
+from src.report.results import publish_result, read_result
+from src.report.sweep_record import read_record
 from src.streaming import StreamingDetector
-from src.sweep_config import load_sweep
-from src.training.checkpoints import AtomicCheckpointIO, read_checkpoint
+from src.sweep.compose import load_sweep
 
 SRC = Path(train.__file__).parent
 SECRET = "wk-5ecret-0123456789"
@@ -373,7 +373,7 @@ def test_an_override_brings_in_nothing_but_values(secret, override):
 )
 def test_a_sweep_file_brings_in_nothing_but_values(tmp_path, monkeypatch, secret, content):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("src.sweep_config.SWEEPS", tmp_path)
+    monkeypatch.setattr("src.sweep.compose.SWEEPS", tmp_path)
     (tmp_path / "bad.yaml").write_text(content)
     with pytest.raises(ConfigError, match="sweeps/bad.yaml") as caught:
         load_sweep("bad")
@@ -451,8 +451,7 @@ def yaml_quoted(text):
 @pytest.fixture
 def world_of_runs(tmp_path, monkeypatch):
     """The folder of a finished run, as the dashboard's tests make it up."""
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parent.parent / "reporting" / "dashboard"))
-    from experiments import write_run
+    from tests.dashboard.experiments import write_run
 
     folder = write_run(tmp_path / "outputs", "horizon3d-phase1-mini-0000000a", 0, 0.4, 4.8)
     assert publish_result(folder, tmp_path / "reports").is_file()

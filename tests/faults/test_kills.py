@@ -5,7 +5,7 @@ from collections import Counter
 
 import pytest
 
-from src.training.checkpoints import LAST, PREVIOUS, read_checkpoint
+from src.reliability.checkpoints import LAST, PREVIOUS, read_checkpoint
 from tests.faults.killing import GRACE_S, Chain, InWrite, rows, run_folder, start, wait
 
 KILLS = 200

@@ -19,9 +19,9 @@ from src.config import OnNonfinite, compose_config, restore_config
 from src.data.datamodule import collate, in_lane
 from src.errors import CheckpointError, ConfigError, DivergedError
 from src.models.horizon3d.model import Horizon3D
-from src.training.checkpoints import read_checkpoint
-from src.training.detection import DetectionModule
-from src.training.nonfinite import step_seed, write_dump
+from src.reliability.checkpoints import read_checkpoint
+from src.reliability.nonfinite import step_seed, write_dump
+from src.training.module import DetectionModule
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = (

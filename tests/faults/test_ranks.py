@@ -17,9 +17,9 @@ from pathlib import Path
 
 import pytest
 
-from src.training import processes
-from src.training.checkpoints import read_checkpoint
-from src.training.processes import launch
+from src.reliability import processes
+from src.reliability.checkpoints import read_checkpoint
+from src.reliability.processes import launch
 
 pytestmark = [
     pytest.mark.faults,
@@ -38,9 +38,9 @@ from datetime import timedelta
 from pathlib import Path
 import torch
 from src import train
-from src.command import run_command
-from src.training import processes
-from src.training.temporal import TemporalModule
+from src.reliability.command import run_command
+from src.reliability import processes
+from src.training.temporal_module import TemporalModule
 
 def kill(module): os.kill(os.getpid(), signal.SIGKILL)
 def hang(module): os.kill(os.getpid(), signal.SIGSTOP)
@@ -137,7 +137,7 @@ def faulty(place, monkeypatch, capfd):
     for name, value in environment(place).items():
         monkeypatch.setenv(name, value)
     monkeypatch.chdir(ROOT)
-    logger = logging.getLogger("src.training.processes")
+    logger = logging.getLogger("src.reliability.processes")
     handler = LauncherLines()
 
     def run(fault, rank, module="faulty_train", **settings):

@@ -6,7 +6,7 @@ import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
 
-from src.metrics.benchmark import random_problem
+from src.benchmark.suite_metric import random_problem
 from src.metrics.detection import DetectionMetric, score_detections
 from src.structures.detections import DetectionTable
 

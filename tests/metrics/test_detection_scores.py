@@ -8,7 +8,7 @@ import pytest
 
 from src.errors import DataError
 from src.metrics.detection import SCENE_TAGS, TAGS_WITHOUT_SCORE, score_detections
-from src.metrics.report import format_scores
+from src.metrics.score_text import format_scores
 from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERRORS
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import ATTRIBUTES, CLASSES

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from src.metrics.benchmark import random_problem
+from src.benchmark.suite_metric import random_problem
 from src.metrics.detection import score_detections
 from src.metrics.filtering import speed_classes
-from src.metrics.report import format_scores
+from src.metrics.score_text import format_scores
 from src.metrics.scores import DISTANCE_THRESHOLDS_M
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import ATTRIBUTES, CLASSES

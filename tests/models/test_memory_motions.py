@@ -1,9 +1,9 @@
 """Motion of several remembered frames at once."""
 
 import torch
-from moving import UTM, bare_frame, bda, pose
 
 from src.models.memory import RememberedFrame, motions
+from tests.models.moving import UTM, bare_frame, bda, pose
 
 
 def test_frames_together_move_as_each_alone_to_the_last_bit():

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 
 from src.ops import Sites, neighbour_sum, sparse_conv, strided_map, submanifold_map, temporal_map
 from src.ops.kernel_maps import KernelMap, stacked_map
-from src.ops.pair_tiles import pair_tiles
+from src.ops.tiled_rulebook import pair_tiles
 
 GOLDEN = np.load(Path(__file__).parents[1] / "golden" / "sparse_conv" / "cases.npz")
 CASES = json.loads(str(GOLDEN["meta_json"]))
@@ -146,8 +146,8 @@ def test_tiles_change_nothing(mode, monkeypatch):
     """One tile, and tiles so small that most offsets are missing in each: the same values and gradients."""
     results = []
     for least, budget in ((256, 1 << 24), (2, 64)):
-        monkeypatch.setattr("src.ops.pair_tiles.LEAST_ROWS", least)
-        monkeypatch.setattr("src.ops.pair_tiles.TILE_BYTES", budget)
+        monkeypatch.setattr("src.ops.tiled_rulebook.LEAST_ROWS", least)
+        monkeypatch.setattr("src.ops.tiled_rulebook.TILE_BYTES", budget)
         sites = random_sites((2, 5, 6, 7), 70)
         if mode == "submanifold":
             kernel_map = submanifold_map(sites, 3)

@@ -10,7 +10,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from src.pictures.contents import PictureBoxes, PictureGaussians, PictureGrid, PictureMemory
-from src.pictures.memory import (
+from src.pictures.memory_picture import (
     CAPTION_PX,
     CLOSE_PX,
     GAP_PX,

@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from src.errors import ConfigError
-from src.models.sparse_layers import SubmanifoldConv
+from src.models.layers.sparse import SubmanifoldConv
 from src.training.optim import CyclicSchedule, OptimConfig, cycle_value, parameter_groups
 
 

@@ -10,16 +10,16 @@ from pathlib import Path
 
 import pytest
 import torch
-from toys import STEPS, ToyData, toy_module
-from two_ranks import spawn_two
 
 from src.errors import InterruptedRunError
-from src.training.checkpoints import AtomicCheckpointIO, read_checkpoint
+from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
+from src.reliability.interruption import Interruption
+from src.reliability.processes import build_strategy, is_main_process, process_group
 from src.training.fit import build_loggers, build_trainer, fit
-from src.training.interruption import Interruption
-from src.training.processes import build_strategy, is_main_process, process_group
 from src.training.run_folder import Resume, RunFolder
-from src.training.temporal import TemporalModule
+from src.training.temporal_module import TemporalModule
+from tests.training.toys import STEPS, ToyData, toy_module
+from tests.training.two_ranks import spawn_two
 
 EPOCHS = 3
 

@@ -4,7 +4,7 @@ import shutil
 import pytest
 
 from src.errors import CheckpointError, ConfigError, DataError
-from src.training.checkpoints import AtomicCheckpointIO
+from src.reliability.checkpoints import AtomicCheckpointIO
 from src.training.run_folder import Resume, RunFolder, make_writable, write_json
 
 

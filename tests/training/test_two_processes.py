@@ -5,7 +5,6 @@ import csv
 import importlib.util
 import os
 import signal
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,22 +13,22 @@ import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader
-from toys import STEPS as TOY_STEPS
-from toys import Positions, toy_batch, toy_module
-from two_ranks import spawn_two
 
+from src.benchmark.suite_metric import random_problem
 from src.data.datamodule import collate, in_lane
 from src.errors import InterruptedRunError
-from src.metrics.benchmark import random_problem
 from src.metrics.detection import DetectionMetric, score_detections
 from src.models.horizon3d.kggi import Initialization
+from src.reliability.processes import SharedBuffers, build_strategy, is_main_process, process_group
 from src.structures.detections import DetectionTable, EvaluationSet
-from src.training.detection import DetectionModule
 from src.training.fit import build_loggers, build_trainer, fit
+from src.training.module import DetectionModule
 from src.training.optim import OptimConfig
-from src.training.processes import SharedBuffers, build_strategy, is_main_process, process_group
 from src.training.run_folder import Resume, RunFolder
-from src.training.temporal import TemporalModule
+from src.training.temporal_module import TemporalModule
+from tests.training.toys import STEPS as TOY_STEPS
+from tests.training.toys import Positions, toy_batch, toy_module
+from tests.training.two_ranks import spawn_two
 
 LANES, STEPS = 4, 3
 FIRST_RANK, SECOND_RANK = (0, 1), (2, 3)
@@ -39,7 +38,6 @@ COLUMNS = tuple(DetectionTable.__dataclass_fields__)
 def _of_the_models_tests():
     """The small model and its frames are described beside the model's own tests."""
     path = Path(__file__).parents[1] / "models" / "horizon3d" / "conftest.py"
-    sys.path.append(str(path.parents[1]))  # of what it imports, when this file is tested alone
     spec = importlib.util.spec_from_file_location("horizon3d_conftest", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

@@ -13,7 +13,7 @@ from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.training.optim import OptimConfig
-from src.training.temporal import TemporalModule
+from src.training.temporal_module import TemporalModule
 
 STEPS = 3  # of one epoch
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
-from src.ops.bags import segment_sum
 from src.ops.kernel_maps import submanifold_map
+from src.ops.segment_reduce import segment_sum
 from src.ops.sparse_conv import neighbour_sum
 from src.structures.sparse_bev import SparseBEV
 

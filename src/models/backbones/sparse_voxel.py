@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.local_means import LocalMeans
-from src.models.sparse_layers import ConvNormReLU, ResidualBlock, SparseConv, SubmanifoldConv
-from src.ops.bags import segment_sum
+from src.models.layers.sparse import ConvNormReLU, ResidualBlock, SparseConv, SubmanifoldConv
+from src.ops.segment_reduce import segment_sum
 from src.ops.sites import Sites
 from src.ops.voxelize import voxelize
 from src.structures.sparse_bev import SparseBEV, SparseMap

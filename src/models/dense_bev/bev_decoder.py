@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.resnet import BasicBlock
-from src.models.dense_layers import DenseConvNormReLU
+from src.models.layers.dense import DenseConvNormReLU
 
 MIN_CHANNELS = 16
 """Least width of what a strided stage reads: below it the backward pass of a strided 1x1 convolution with channels last

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.resnet import BasicBlock
-from src.models.dense_layers import DenseConvNormReLU, map_of_rows, rows_of_map
-from src.ops.bags import weighted_bag
+from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
+from src.ops.segment_reduce import weighted_bag
 from src.targets.depth import lid_centres
 
 

@@ -16,7 +16,7 @@ from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.dense_bev.bev_decoder import MIN_CHANNELS, BEVDecoder, BEVDecoderConfig, ConvFuser
 from src.models.dense_bev.lift_splat import LiftedViews, LiftSplat, LiftSplatConfig
 from src.models.dense_bev.pillars import PillarConfig, PillarEncoder
-from src.models.dense_bev.temporal import MapMemory, Recollection, TemporalConfig, TemporalFusion
+from src.models.dense_bev.temporal_fusion import MapMemory, Recollection, TemporalConfig, TemporalFusion
 from src.models.detector import Detector
 from src.models.heads.center_head import CenterHead, HeadConfig, HeadOutput
 from src.structures.batch import FrameBatch

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.sparse_voxel import POINT_SCALES
-from src.models.dense_layers import map_of_rows
-from src.models.sparse_layers import RowNorm
-from src.ops.bags import segment_mean
+from src.models.layers.dense import map_of_rows
+from src.models.layers.sparse import RowNorm
+from src.ops.segment_reduce import segment_mean
 
 EXTRA_FEATURES = 6
 """From the cell's centre (x, y), from the mean of the pillar's points (x, y, z), log of their number."""

@@ -15,7 +15,6 @@ from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import penalty_reduced_focal
 from src.losses.normalizers import full_precision, mean_over_ranks
 from src.losses.regression import masked_l1
-from src.models.dense_layers import AllCells, DenseConvNormReLU
 from src.models.heads.decode import (
     AttributeSource,
     Suppression,
@@ -26,9 +25,10 @@ from src.models.heads.decode import (
     suppress,
     top_candidates,
 )
-from src.models.sparse_layers import ConvNormReLU, RowNorm, SubmanifoldConv
+from src.models.layers.dense import AllCells, DenseConvNormReLU
+from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv
+from src.ops.checkpointed_mlp import row_mlp
 from src.ops.nms import maxpool_peaks
-from src.ops.row_mlp import row_mlp
 from src.structures.boxes import Boxes3D
 from src.structures.sparse_bev import SparseBEV
 from src.structures.taxonomy import ATTRIBUTES, CLASSES, MAX_BOXES_PER_SAMPLE

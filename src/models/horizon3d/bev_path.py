@@ -10,11 +10,11 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.horizon3d.memory import Memory, StoredCells
+from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
+from src.models.layers.sparse import ConvNormReLU, RowNorm, SparseKernel, SubmanifoldConv
 from src.models.memory import motions
-from src.models.sparse_layers import ConvNormReLU, RowNorm, SparseKernel, SubmanifoldConv
-from src.ops.bags import best_rows, segment_mean
+from src.ops.segment_reduce import best_rows, segment_mean
 from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv, strided_map, temporal_map
 from src.structures.batch import FrameBatch

@@ -10,8 +10,8 @@ from torch import nn
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.bev_path import BEVPath, BEVPathConfig, CellPrediction, WarpedCells
+from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.gaussian_path import GaussianPath, GaussianPathConfig
-from src.models.horizon3d.memory import Memory, MemoryFrame
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.structures.batch import FrameBatch
 from src.structures.gaussians import GaussianSet

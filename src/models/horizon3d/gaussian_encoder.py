@@ -18,8 +18,8 @@ from src.models.horizon3d.cross_attention import (
 )
 from src.models.horizon3d.temporal_attention import TemporalSelfAttention
 from src.models.horizon3d.views import CameraViews
-from src.models.sparse_layers import SubmanifoldConv
-from src.ops.bags import segment_mean
+from src.models.layers.sparse import SubmanifoldConv
+from src.ops.segment_reduce import segment_mean
 from src.ops.sites import Sites
 from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV

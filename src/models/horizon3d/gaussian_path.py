@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.horizon3d.memory import Memory, MemoryFrame
+from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.memory import motions
 from src.ops.farthest_point import farthest_points

@@ -14,7 +14,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.heads.keypoint_head import KEYPOINT_BIAS, CameraKeypointHead, CameraMaps, keypoint_scores
 from src.models.horizon3d.gaussian_encoder import RAW_ATTRIBUTES, GaussianBounds
 from src.models.horizon3d.views import CameraViews
-from src.ops.bags import best_rows
+from src.ops.segment_reduce import best_rows
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV
 from src.targets.depth import DepthTarget, check_depth_target, lid_centres

@@ -16,9 +16,9 @@ from src.models.detector import Detector
 from src.models.heads.center_head import CenterHead, HeadConfig, HeadOutput
 from src.models.horizon3d.cross_attention import NUM_HEADS
 from src.models.horizon3d.dptf import DPTF, DPTFConfig, DPTFOutput
+from src.models.horizon3d.dptf_memory import Memory
 from src.models.horizon3d.kggi import KGGI, KGGIConfig, KGGIOutput
 from src.models.horizon3d.loss import LossConfig, cell_losses, gaussian_velocity_loss, kggi_losses, ocsf_losses
-from src.models.horizon3d.memory import Memory
 from src.models.horizon3d.ocsf import OCSF, OCSFConfig, OCSFOutput
 from src.models.horizon3d.views import CameraViews
 from src.structures.batch import FrameBatch

@@ -6,9 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.models.sparse_layers import RowNorm, SubmanifoldConv
-from src.ops.bags import exchange_rows
+from src.models.layers.sparse import RowNorm, SubmanifoldConv
 from src.ops.kernel_maps import stacked_map
+from src.ops.segment_reduce import exchange_rows
 from src.ops.sites import union
 from src.ops.sparse_conv import sparse_conv
 from src.structures.sparse_bev import SparseBEV

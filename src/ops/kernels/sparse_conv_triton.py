@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
 from src.ops.backend import REFERENCE, TRITON, implementation, interpreted, register, runs_kernels
-from src.ops.bags import bag_sum
 from src.ops.kernel_maps import KernelMap
+from src.ops.segment_reduce import bag_sum
 
 DTYPES = (torch.float32, torch.float16, torch.bfloat16)
 # Output rows a program computes, and pairs it multiplies at a time for the gradient of the weights.

@@ -2,9 +2,7 @@
 
 from dataclasses import replace
 
-import moving
 import torch
-from surroundings import AXES, camera_matrices, random_boxes
 
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.image import ImageEncoderConfig, NeckName
@@ -13,10 +11,12 @@ from src.models.dense_bev.bev_decoder import BEVDecoderConfig
 from src.models.dense_bev.lift_splat import LiftSplatConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig, LossConfig
 from src.models.dense_bev.pillars import PillarConfig
-from src.models.dense_bev.temporal import TemporalConfig
+from src.models.dense_bev.temporal_fusion import TemporalConfig
 from src.models.heads.center_head import HeadConfig, TrainRegression
 from src.models.heads.decode import AttributeSource, Suppression
 from src.structures.batch import FrameBatch
+from tests.models import moving
+from tests.models.surroundings import AXES, camera_matrices, random_boxes
 
 SIZE = (64, 96)  # image height, width
 GRID = BEVGrid(cells=(48, 64), cell_m=0.8, centre_m=(2.0, -1.0), z_range_m=(-3.0, 5.0))

@@ -4,7 +4,6 @@ from dataclasses import fields
 
 import pytest
 import torch
-from dense_frames import GRID, backbone, dense_config, dense_model, make_batch, memory_config
 
 from src.assembly import build_model
 from src.config import compose_config
@@ -15,6 +14,7 @@ from src.models.backbones.image import NeckName
 from src.models.dense_bev.bev_decoder import BEVDecoder, BEVDecoderConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig, LossConfig
 from src.structures.boxes import Boxes3D
+from tests.models.dense_bev.dense_frames import GRID, backbone, dense_config, dense_model, make_batch, memory_config
 from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
 
 STEPS = 140

@@ -4,12 +4,12 @@ import itertools
 
 import pytest
 import torch
-from dense_frames import GRID, SIZE, lift_config
-from surroundings import AXES, camera_matrices
 
 from src.errors import ConfigError
 from src.models.dense_bev.lift_splat import LiftSplat
 from src.targets.depth import lid_centres
+from tests.models.dense_bev.dense_frames import GRID, SIZE, lift_config
+from tests.models.surroundings import AXES, camera_matrices
 
 CHANNELS = 6
 

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from dense_frames import GRID, make_batch
 
 from src.errors import ConfigError
 from src.models.backbones.sparse_voxel import POINT_SCALES
 from src.models.dense_bev.pillars import PillarConfig, PillarEncoder
+from tests.models.dense_bev.dense_frames import GRID, make_batch
 
 
 def make_encoder(num_layers=4):

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from src.geometry.bev_grid import BEVGrid
-from src.models.dense_layers import AllCells, map_of_rows, rows_of_map
 from src.models.heads.center_head import CenterHead, HeadConfig, TrainRegression
 from src.models.heads.decode import AttributeSource, Suppression
+from src.models.layers.dense import AllCells, map_of_rows, rows_of_map
 from src.structures.boxes import Boxes3D
 
 GRID = BEVGrid(cells=(24, 32), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))

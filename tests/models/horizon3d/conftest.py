@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from surroundings import DIAGONALS, camera_matrices, random_boxes
 
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.image import ImageEncoderConfig, NeckName
@@ -20,6 +19,7 @@ from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom
 from src.models.horizon3d.views import CameraViews
 from src.structures.batch import FrameBatch
 from src.targets.depth import DepthTarget
+from tests.models.surroundings import DIAGONALS, camera_matrices, random_boxes
 
 SIZE = (64, 96)  # image height, width
 

@@ -3,9 +3,9 @@
 import pytest
 import torch
 import torch.nn.functional as F
-from cells import FULL, TINY, C, bev_of, make_path, random_cells
 
 from src.models.horizon3d.bev_path import WarpedCells
+from tests.models.horizon3d.cells import FULL, TINY, C, bev_of, make_path, random_cells
 
 
 def warped_of(indices, features=None, elapsed_s=None, num_frames=8):

@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from cells import FULL, GRID, TINY, C, bev_of, make_path, random_cells
-from moving import UTM, bare_frame, bda, pose
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import cells_in_boxes
 from src.models.horizon3d.bev_path import CellPrediction
-from src.models.horizon3d.memory import Memory, MemoryFrame, StoredCells
+from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
+from tests.models.horizon3d.cells import FULL, GRID, TINY, C, bev_of, make_path, random_cells
+from tests.models.moving import UTM, bare_frame, bda, pose
 
 PAGE = Path(__file__).resolve().parents[4] / "shared/real/horizon3d_page/dptf_demo.json"
 SQUARE = BEVGrid(cells=(64, 64), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))

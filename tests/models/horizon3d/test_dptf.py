@@ -2,8 +2,6 @@
 
 import pytest
 import torch
-from cells import GRID, C, bev_of
-from moving import bare_frame, pose
 
 from src.errors import ConfigError
 from src.models.horizon3d.bev_path import CellPrediction
@@ -11,6 +9,8 @@ from src.models.horizon3d.dptf import DPTF, DPTFOutput
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.horizon3d.splatting import GaussianSplat
 from src.structures.gaussians import GaussianSet
+from tests.models.horizon3d.cells import GRID, C, bev_of
+from tests.models.moving import bare_frame, pose
 
 
 @pytest.fixture

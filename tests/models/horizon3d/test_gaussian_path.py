@@ -5,13 +5,13 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from moving import UTM, bare_frame, bda, pose
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.gaussian_path import GaussianPath, GaussianPathConfig, Sampling, SelfAttentionConfig
-from src.models.horizon3d.memory import Memory, MemoryFrame
 from src.structures.gaussians import GaussianSet, Source
+from tests.models.moving import UTM, bare_frame, bda, pose
 
 CHANNELS = 6
 GRID = BEVGrid(cells=(384, 384), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))

@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from cells import TINY, bev_of
 
 from src.models.horizon3d.bev_path import CellPrediction
 from src.models.horizon3d.loss import cell_losses, gaussian_velocity_loss
@@ -12,6 +11,7 @@ from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.horizon3d.splatting import GaussianSplat
 from src.structures.boxes import Boxes3D
 from src.structures.gaussians import GaussianSet
+from tests.models.horizon3d.cells import TINY, bev_of
 
 NAMES = ["cell_focal", "cell_dice", "cell_lovasz", "cell_velocity"]
 NAN = float("nan")

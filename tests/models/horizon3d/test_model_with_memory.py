@@ -4,11 +4,11 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from moving import pose
 
 from src.errors import ConfigError
 from src.models.horizon3d.gaussian_path import Sampling, SelfAttentionConfig
 from src.structures.gaussians import GaussianSet, Source
+from tests.models.moving import pose
 
 CURRENT = 24 + 12 + 8  # Gaussians of one frame in the small configuration
 PHASE_1_TERMS = {"heatmap", "box", "keypoint", "depth", "radar_objectness", "occupancy_focal", "occupancy_dice"}

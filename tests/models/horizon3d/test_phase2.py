@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from moving import UTM, bda, pose, tensors_of
 
-from src.handoff import MAY_BE_NEW
-from src.models.horizon3d.memory import Memory
-from src.training.checkpoints import load_model_weights
+from src.models.horizon3d.dptf_memory import Memory
+from src.reliability.checkpoints import load_model_weights
+from src.training.handoff import MAY_BE_NEW
+from tests.models.moving import UTM, bda, pose, tensors_of
 
 VARIANTS = {
     "both": ({}, {}),

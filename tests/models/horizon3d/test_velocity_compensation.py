@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from moving import UTM, pose
 
 from src.geometry.bev_grid import BEVGrid
-from src.models.horizon3d.memory import Memory
+from src.models.horizon3d.dptf_memory import Memory
 from src.models.horizon3d.model import Horizon3D
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CLASSES
+from tests.models.moving import UTM, pose
 
 GRID = BEVGrid(cells=(44, 176), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
 STEP_S = 0.5

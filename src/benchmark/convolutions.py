@@ -1,0 +1,356 @@
+"""Sparse convolutions layer by layer, and the whole radar backbone, against their floor, dense ones and spconv."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from src.benchmark.counting import counted_work
+from src.benchmark.machine import Product
+from src.benchmark.operation_table import operation_table
+from src.benchmark.spconv_baseline import (
+    SpconvEncoder,
+    build_layer,
+    largest_difference,
+    load_spconv,
+    sparse_tensor,
+    torch_threads,
+    uncached,
+)
+from src.benchmark.timing import in_turns, median_spread, with_gradient, without_gradient
+from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.sparse_voxel import RadarEncoder, RadarEncoderConfig
+from src.models.horizon3d.bev_path import TemporalConv
+from src.models.layers.sparse import SparseConv, SparseKernel, SubmanifoldConv
+from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
+from src.ops.sites import Sites
+from src.ops.sparse_conv import sparse_conv
+from src.reliability.allocator import tune_cpu_allocator
+from src.structures.sparse_bev import SparseMap
+
+logger = logging.getLogger(__name__)
+
+ROUNDS = 7
+LAYER_BUDGET_S, BACKBONE_BUDGET_S = 4.0, 20.0  # of each candidate; what takes longer has fewer rounds
+DENSE_LIMIT_BYTES = 2**31  # of the dense input and output together; larger grids have no dense peer
+DENSE_LIMIT_FLOPS = 1.5e12  # a quarter of a minute on two cores
+AGREEMENT = 1e-5  # of outputs and gradients, relative to the largest; float32 sums in another order
+SPCONV_TRIALS = 6  # runs on several threads that are looked at for spconv's fault
+
+
+@dataclass
+class Layer:
+    """One convolution on a set of sites, with its map."""
+
+    name: str
+    sites: Sites
+    kernel: SparseKernel
+    stride: tuple[int, ...]
+    padding: tuple[int, ...]
+
+    @property
+    def temporal(self) -> bool:
+        """Whether time shortens without spreading over the plane, which no peer offers."""
+        return isinstance(self.kernel, TemporalConv)
+
+    def map(self, sites: Sites) -> tuple[KernelMap, Sites]:
+        """The kernel map and the sites of the output, cached on the sites."""
+        if isinstance(self.kernel, SubmanifoldConv):
+            return submanifold_map(sites, self.kernel.kernel_size), sites
+        build = temporal_map if self.temporal else strided_map
+        return build(sites, self.kernel.kernel_size, self.stride, self.padding)
+
+
+def layers_of(
+    encoder: RadarEncoder,
+    voxels: SparseMap,
+    channels: int,
+    bev_sites: Sites,  # of a sparse BEV map
+    past_sites: Sites,  # [B, T, rows, cols] of remembered cells
+) -> list[Layer]:
+    """Layers as the models have them: those of the backbone's stages, of the BEV map, and over time."""
+    layers: list[Layer] = []
+    with torch.no_grad():
+        stages = encoder.eval().run_stages(voxels)
+    previous = voxels.sites
+    for number, stage in enumerate(stages):
+        ndim, width, axes = stage.sites.ndim, stage.channels, (1,) * stage.sites.ndim
+        if number and number == encoder.bev_stage:
+            narrow = stages[number - 1].channels
+            down = SparseConv(narrow, width, 3, ndim, bias=False, stride=2, padding=1)
+            name = f"stage {number + 1} stride 2, {narrow} to {width} channels"
+            layers.append(Layer(name, previous, down, (2,) * ndim, axes))
+        subm = SubmanifoldConv(width, width, 3, ndim, bias=False)
+        layers.append(Layer(f"stage {number + 1} submanifold {ndim}D, {width} channels", stage.sites, subm, axes, axes))
+        previous = stage.sites
+    flat = SubmanifoldConv(channels, channels, 3, 2, bias=False)
+    layers.append(Layer(f"BEV submanifold 2D, {channels} channels", bev_sites, flat, (1, 1), (1, 1)))
+    cube = SubmanifoldConv(channels, channels, 3, 3, bias=False)
+    layers.append(Layer(f"time submanifold (t, y, x), {channels} channels", past_sites, cube, (1, 1, 1), (1, 1, 1)))
+    halving = SparseConv(channels, channels, 3, 3, bias=False, stride=(2, 1, 1), padding=1)
+    layers.append(Layer(f"time stride (2, 1, 1), {channels} channels", past_sites, halving, (2, 1, 1), (1, 1, 1)))
+    kept = TemporalConv(channels, channels, dilating=False)
+    name = f"time stride (2, 1, 1) on occupied columns, {channels} channels"
+    layers.append(Layer(name, past_sites, kept, (2, 1, 1), (1, 1, 1)))
+    return layers
+
+
+def measure_layers(layers: list[Layer], device: torch.device, threads: list[int]) -> list[dict[str, Any]]:
+    """Rows of all layers at every number of threads."""
+    spconv, product = load_spconv(device), Product(device)
+    rows = []
+    for layer in layers:
+        logger.info("%s", layer.name)
+        layer.kernel.to(device)
+        for number in threads:
+            with torch_threads(number):
+                rows += measure_layer(layer, spconv, device, product, number)
+    return rows
+
+
+def measure_layer(
+    layer: Layer, spconv: ModuleType | None, device: torch.device, product: Product, threads: int
+) -> list[dict[str, Any]]:
+    """Forward, and forward with both gradients; kernel maps of all are made before, ours timed by themselves."""
+    kernel_map, out_sites = layer.map(layer.sites)
+    features = torch.randn(len(layer.sites), layer.kernel.in_channels, device=device, requires_grad=True)
+    weight = layer.kernel.weight
+    flops = 2 * len(kernel_map.inputs) * layer.kernel.in_channels * layer.kernel.out_channels
+    functions: dict[str, Callable[[], Tensor]] = {"ours": lambda: sparse_conv(features, weight, kernel_map)}
+    leaves: dict[str, list[Tensor]] = {"ours": [features, weight]}
+    if spconv is not None and not layer.temporal:
+        peer = build_layer(spconv, layer.kernel, layer.stride, layer.padding, "pairs").to(device)
+        empty = sparse_tensor(spconv, SparseMap(layer.sites, features))
+        peer(empty)  # fills the tensor's table of pairs
+        order = Sites.from_indices(peer(empty).indices.long(), out_sites.shape)[1]
+        functions["spconv"] = lambda: peer(empty.replace_feature(features)).features
+        leaves["spconv"] = [features, peer.weight]
+    if fits_dense(layer, out_sites):
+        functions["dense"] = lambda: dense_convolution(layer, features, out_sites)
+        leaves["dense"] = [features, weight]
+
+    gradient = torch.randn(kernel_map.num_outputs, layer.kernel.out_channels, device=device)
+    both = {
+        name: lambda name=name: torch.autograd.grad(functions[name](), leaves[name], gradient) for name in functions
+    }
+    agreement: dict[str, Any] = {}
+    if "spconv" in functions:
+        turned = torch.zeros_like(gradient).index_copy(0, order, gradient)
+        both["spconv"] = lambda: torch.autograd.grad(functions["spconv"](), leaves["spconv"], turned)
+        if threads == 1 or device.type == "cuda":
+            agreement["spconv differs by"] = spconv_difference(layer, functions, both, order)
+        else:
+            reference = sparse_conv(features, weight, kernel_map).detach()
+            runs = (functions["spconv"]().detach().index_select(0, order) for _ in range(SPCONV_TRIALS))
+            wrong = sum(largest_difference([reference], [run]) > AGREEMENT for run in runs)
+            agreement["spconv wrong"] = f"{wrong} of {SPCONV_TRIALS}"
+
+    def inferred(function: Callable[[], Tensor]) -> Callable[[], Tensor]:
+        def call() -> Tensor:
+            with torch.no_grad():
+                return function()
+
+        return call
+
+    forward = {name: inferred(function) for name, function in functions.items()}
+    forward["map"] = lambda: layer.map(Sites(layer.sites.shape, layer.sites.keys))
+    rows = []
+    for mode, candidates, times in (("forward", forward, 1), ("f+b", both, 3)):
+        seconds = in_turns(candidates | {"product": product}, device, ROUNDS, LAYER_BUDGET_S)
+        sizes = {"sites": len(layer.sites), "outputs": len(out_sites), "pairs": len(kernel_map.inputs)}
+        row = {"layer": layer.name, "mode": mode, "threads": threads}
+        row |= ratio_columns(seconds, times * flops, product)
+        if mode == "forward":
+            row["map ms"] = 1e3 * median_spread(seconds["map"])[0]
+        rows.append(row | agreement | sizes)
+    return rows
+
+
+def ratio_columns(seconds: dict[str, list[float]], flops: float, product: Product) -> dict[str, Any]:
+    """How many times faster ours is than its peers, its share of the product's rate beside it, then times."""
+    middle = {name: median_spread(values)[0] for name, values in seconds.items()}
+    row: dict[str, Any] = {
+        f"x faster than {name}": middle[name] / middle["ours"] for name in ("dense", "spconv") if name in middle
+    }
+    rate = product.flops / middle["product"]
+    row |= {"% of products": 100 * flops / middle["ours"] / rate, "ms": 1e3 * middle["ours"]}
+    row["± ms"] = 1e3 * median_spread(seconds["ours"])[1]
+    row |= {f"{name} ms": 1e3 * middle[name] for name in ("dense", "spconv") if name in middle}
+    return row | {"products GFLOP/s": rate / 1e9}
+
+
+def spconv_difference(
+    layer: Layer,
+    functions: dict[str, Callable[[], Tensor]],
+    both: dict[str, Callable[[], tuple[Tensor, ...]]],
+    order: Tensor,
+) -> float:
+    """Largest relative difference of outputs and of both gradients."""
+    ours, peer = both["ours"](), both["spconv"]()
+    cube = peer[1].permute(*range(1, peer[1].dim()), 0)  # [out, *k, in] -> [*k, in, out]
+    outputs = functions["ours"](), functions["spconv"]().index_select(0, order)
+    return largest_difference([outputs[0], *ours], [outputs[1], peer[0], cube.reshape(ours[1].shape)])
+
+
+def fits_dense(layer: Layer, out_sites: Sites) -> bool:
+    """Whether the dense peer has room and ends in time."""
+    cells = [torch.Size(sites.shape).numel() for sites in (layer.sites, out_sites)]
+    kernel = layer.kernel
+    room = 4 * (cells[0] * kernel.in_channels + cells[1] * kernel.out_channels)
+    flops = 2 * cells[1] * kernel.in_channels * kernel.out_channels * kernel.kernel_size**kernel.ndim
+    return not layer.temporal and room <= DENSE_LIMIT_BYTES and flops <= DENSE_LIMIT_FLOPS
+
+
+def dense_convolution(layer: Layer, features: Tensor, out_sites: Sites) -> Tensor:  # [M_out, Cout]
+    """All cells: scatter the features, convolve the whole grid, take the cells that ours computes."""
+    kernel, ndim = layer.kernel, layer.kernel.ndim
+    grid = SparseMap(layer.sites, features).to_dense()
+    cube = kernel.weight.view(*(kernel.kernel_size,) * ndim, *kernel.weight.shape[1:])
+    convolve = F.conv2d if ndim == 2 else F.conv3d
+    dense = convolve(grid, cube.permute(-1, -2, *range(ndim)), stride=layer.stride, padding=layer.padding)
+    return dense.movedim(1, -1).flatten(0, -2).index_select(0, out_sites.linear())
+
+
+# ---------------------------------------------------------------- the whole backbone
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """What a process of its own needs to build the radar backbone."""
+
+    config: RadarEncoderConfig
+    grid: BEVGrid
+    channels: int
+    seed: int
+
+    def build(self) -> RadarEncoder:
+        """Fresh weights, the same for the same seed; in training mode."""
+        torch.manual_seed(self.seed)
+        return RadarEncoder(self.config, self.grid, self.channels).train()
+
+
+def measure_backbone(
+    backbone: Backbone,
+    scenes: dict[str, Tensor],  # by name the radar points [P, 7] of one frame
+    device: torch.device,
+    threads: list[int],
+) -> list[dict[str, Any]]:
+    """Rows by scene, mode and threads; kernel maps are made anew every time, batch norm uses the batch."""
+    spconv, product = load_spconv(device), Product(device)
+    encoder = backbone.build().to(device)
+    encoder.local_means = None  # spconv has no counterpart, and it is not part of the backbone
+    rows = []
+    for number, (name, points) in enumerate(scenes.items()):
+        logger.info("backbone, %s", name)
+        points = points.to(device)
+        with torch.no_grad():
+            voxels = encoder.voxelise(points, torch.zeros(len(points), dtype=torch.int64, device=device), 1)
+        functions: dict[str, Callable[[], Tensor]] = {"ours": lambda v=voxels: encoder.encode(uncached(v)).features}
+        if spconv is not None:
+            twin = SpconvEncoder(spconv, encoder).to(device).train()
+            functions["spconv"] = lambda v=voxels, twin=twin: twin(v)[1]
+        for count in threads:
+            with torch_threads(count):
+                # A process each, so only of the first scene and with all threads.
+                with_memory = device.type == "cpu" and number == 0 and count == max(threads)
+                rows += _backbone_rows(name, backbone, points, voxels, functions, device, product, count, with_memory)
+    return rows
+
+
+def _backbone_rows(
+    name: str,
+    backbone: Backbone,
+    points: Tensor,
+    voxels: SparseMap,
+    functions: dict[str, Callable[[], Tensor]],
+    device: torch.device,
+    product: Product,
+    threads: int,
+    with_memory: bool,
+) -> list[dict[str, Any]]:
+    agreement = {}
+    if "spconv" in functions and threads == 1:
+        with torch.no_grad():
+            agreement["spconv differs by"] = largest_difference([functions["ours"]()], [functions["spconv"]()])
+    forward = {kind: without_gradient(function) for kind, function in functions.items()}
+    both = {kind: with_gradient(function) for kind, function in functions.items()}
+    rows = []
+    for mode, candidates in (("forward", forward), ("f+b", both)):
+        with counted_work() as work:
+            candidates["ours"]()
+        seconds = in_turns(candidates | {"product": product}, device, ROUNDS, BACKBONE_BUDGET_S)
+        row = {"scene": name, "mode": mode, "threads": threads} | ratio_columns(seconds, work.flops, product)
+        row |= {"GFLOP": work.flops / 1e9}
+        if with_memory:
+            for kind in functions:
+                held = memory_of(backbone, points, kind, mode == "f+b", threads)
+                if held is not None:
+                    row |= {f"{kind} peak MiB": held[1], f"{kind} MiB before": held[0]}
+        rows.append(row | agreement | {"voxels": len(voxels)})
+    return rows
+
+
+def backbone_operations(backbone: Backbone, points: Tensor) -> dict[str, list[dict[str, Any]]]:
+    """Where the time of our backbone goes, by mode, as `operation_table` has it."""
+    encoder = backbone.build().to(points.device)
+    owners = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+
+    def run() -> Tensor:
+        return encoder(points, owners, 1).features
+
+    return {
+        f"operations of the backbone, {mode}": operation_table(wrap(run), points.device)
+        for mode, wrap in (("forward", without_gradient), ("f+b", with_gradient))
+    }
+
+
+def memory_of(
+    backbone: Backbone, points: Tensor, kind: str, backward: bool, threads: int
+) -> tuple[float, float] | None:
+    """MiB that a process of its own holds before and at most, None where the system does not tell."""
+    if not Path("/proc/self/status").is_file():
+        return None
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(_run_alone, backbone, points, kind, backward, threads).result()
+
+
+def _run_alone(backbone: Backbone, points: Tensor, kind: str, backward: bool, threads: int) -> tuple[float, float]:
+    tune_cpu_allocator()
+    torch.set_num_threads(threads)
+    encoder = backbone.build()
+    encoder.local_means = None
+    with torch.no_grad():
+        voxels = encoder.voxelise(points, torch.zeros(len(points), dtype=torch.int64), 1)
+    if kind == "ours":
+        run: Callable[[], Tensor] = lambda: encoder.encode(voxels).features  # noqa: E731
+    else:
+        twin = SpconvEncoder(load_spconv(torch.device("cpu")), encoder).train()
+        run = lambda: twin(voxels)[1]  # noqa: E731
+    before = _status_mib("VmRSS")
+    (with_gradient if backward else without_gradient)(run)()
+    return before, _status_mib("VmHWM")
+
+
+def _status_mib(key: str) -> float:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(key + ":"))
+
+
+def remembered_sites(grid: BEVGrid, bev: Sites, frames: int) -> Sites:
+    """The cells of a map, moved by a few cells from frame to frame as traffic is: [1, T, rows, cols]."""
+    cells = bev.indices()
+    parts = []
+    for age in range(frames):
+        col = (cells[:, 2] + 7 * age * (1 - 2 * (cells[:, 1] % 2))) % grid.cols  # both directions of travel
+        parts.append(torch.stack([cells[:, 0], torch.full_like(col, age), cells[:, 1], col], 1))
+    return Sites.unique(torch.cat(parts), (1, frames, grid.rows, grid.cols))[0]

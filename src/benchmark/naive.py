@@ -1,0 +1,311 @@
+"""Splatting and the smaller operations beside the formulation that one would write first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from src.benchmark.parts import tensors_in
+from src.benchmark.timing import added_bytes, in_turns, median_spread, with_gradient, without_gradient
+from src.config import Config
+from src.geometry.bev_grid import BEVGrid
+from src.geometry.box_cells import cells_in_boxes
+from src.ops import (
+    deform_attend_images,
+    farthest_points,
+    sample_sparse_bev,
+    segment_sum,
+    splat_gaussians,
+    voxelize,
+)
+from src.ops.sites import Sites
+from src.structures.sparse_bev import SparseMap
+
+ROUNDS, BUDGET_S = 9, 8.0
+STD_RANGE_M = (0.5, 4.0)  # standard deviations of the Gaussians, log-uniform
+POINTS_PER_QUERY = 11
+VIEWS, HEADS, LEVEL_STRIDES = 4, 4, (8, 16, 32)
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How large the operations are; the channels are the model's."""
+
+    background: int  # radar points of the made-up scene beside those of vehicles
+    points_per_vehicle: int
+    cells: int  # of a sparse BEV map, and per remembered frame a quarter of it
+    frames: int
+    gaussians: int
+    queries: int  # of samples and attention
+    picks: int  # of farthest point sampling
+    boxes: int
+    rows: int  # of the segment sum
+    splat_subset: int  # Gaussians of the dense splat that are computed; time and memory are then multiplied
+
+
+SIZES = {
+    # The sizes at which formulations were chosen: 19 thousand voxels, 8 thousand cells, 2560 Gaussians.
+    "paper": Sizes(12_700, 113, 8000, 8, 2560, 2560, 256, 80, 60_000, 160),
+    "mini": Sizes(2600, 23, 2000, 4, 640, 640, 64, 40, 15_000, 160),
+    "debug": Sizes(200, 2, 200, 2, 32, 32, 8, 5, 500, 16),
+}
+
+
+# ---------------------------------------------------------------- splat
+
+Gaussians = dict[str, Tensor]
+
+
+def made_up_gaussians(number: int, channels: int, grid: BEVGrid, device: torch.device) -> Gaussians:
+    """Gaussians of all sizes, three fifths of them in clusters; what `splat_gaussians` takes."""
+    draw = torch.Generator().manual_seed(0)
+    half = torch.tensor(grid.half_extent_m)
+    centres = (2 * torch.rand(60, 2, generator=draw) - 1) * half
+    clustered = round(0.6 * number)
+    near = centres[torch.randint(0, 60, (clustered,), generator=draw)] + 3.0 * torch.randn(clustered, 2, generator=draw)
+    means = torch.cat([near, (2 * torch.rand(number - clustered, 2, generator=draw) - 1) * half])
+    low, high = STD_RANGE_M
+    angle = 2 * math.pi * torch.rand(number, generator=draw)
+    made = {
+        "means": means,
+        "scales": low * torch.exp(torch.rand(number, 2, generator=draw) * math.log(high / low)),
+        "directions": torch.stack([angle.cos(), angle.sin()], 1),
+        "opacity_logits": 2 * torch.randn(number, generator=draw) - 0.5,
+        "features": torch.randn(number, channels, generator=draw),
+    }
+    return {name: value.to(device).requires_grad_() for name, value in made.items()}
+
+
+def measure_splat(gaussians: Gaussians, grid: BEVGrid, subset: int, device: torch.device) -> list[dict[str, Any]]:
+    """Ours against every Gaussian at every cell: time and added memory, forward and with backward."""
+    number = len(gaussians["means"])
+    batch = torch.zeros(number, dtype=torch.int64, device=device)
+    options = {"threshold": 0.1, "max_cells": 32768, "support_sigmas": 3.0}
+
+    def ours() -> tuple[Tensor, Tensor]:
+        splat = splat_gaussians(**gaussians, batch=batch, grid=grid, batch_size=1, **options)
+        return splat.log_free, splat.features
+
+    few = {name: value[:subset].detach().requires_grad_() for name, value in gaussians.items()}
+    with torch.no_grad():
+        whole = splat_gaussians(**gaussians, batch=batch, grid=grid, batch_size=1, **options)
+    occupied = whole.occupied.linear()
+    factor = number / min(subset, number)
+    areas = math.pi * (options["support_sigmas"] / grid.cell_m) ** 2 * gaussians["scales"].detach().prod(1)
+    pairs = round(float(areas.sum()))  # (Gaussian, cell), less those that the edge of the grid cuts off
+
+    def dense() -> tuple[Tensor, Tensor]:
+        return dense_splat(few, occupied, grid, options["support_sigmas"])
+
+    rows = []
+    for mode, wrap in (("forward", without_gradient), ("f+b", with_gradient)):
+        candidates = {"ours": wrap(ours), "dense": wrap(dense)}
+        seconds = in_turns(candidates, device, ROUNDS, BUDGET_S)
+        middle = {name: median_spread(values)[0] for name, values in seconds.items()}
+        added = {name: added_bytes(function, device) for name, function in candidates.items()}
+        row = {"mode": mode, "x faster than dense": factor * middle["dense"] / middle["ours"]}
+        if None not in added.values():
+            row["x leaner than dense"] = factor * added["dense"] / max(added["ours"], 1)
+            row |= {f"{name} added MiB": value / 2**20 for name, value in added.items()}
+            row["dense added MiB"] *= factor
+        row |= {"ms": 1e3 * middle["ours"], "± ms": 1e3 * median_spread(seconds["ours"])[1]}
+        row |= {"dense ms": 1e3 * factor * middle["dense"]}
+        rows.append(row | {"gaussians": number, "pairs": pairs, "cells": len(whole.support), "occupied": len(occupied)})
+    return rows
+
+
+def dense_splat(gaussians: Gaussians, occupied: Tensor, grid: BEVGrid, support_sigmas: float) -> tuple[Tensor, Tensor]:
+    """Eq. 4-6 as they are written: every Gaussian against every cell, features at the occupied ones."""
+    cells = torch.arange(grid.rows * grid.cols, device=occupied.device)
+    centres = grid.centre_of(torch.stack([torch.div(cells, grid.cols, rounding_mode="floor"), cells % grid.cols], 1))
+    offset = centres - gaussians["means"][:, None]  # [G, cells, 2]
+    cosine, sine = gaussians["directions"][:, None].unbind(-1)
+    along = (cosine * offset[..., 0] + sine * offset[..., 1]) / gaussians["scales"][:, :1]
+    across = (cosine * offset[..., 1] - sine * offset[..., 0]) / gaussians["scales"][:, 1:]
+    q = along.square() + across.square()
+    kernel = torch.where(q <= support_sigmas**2, torch.exp(-0.5 * q), 0.0)
+    contribution = (gaussians["opacity_logits"].sigmoid()[:, None] * kernel).clamp(max=1 - 1e-4)
+    return torch.log1p(-contribution).sum(0), kernel.index_select(1, occupied).t() @ gaussians["features"]
+
+
+# ---------------------------------------------------------------- everything else
+
+
+def measure_rest(
+    config: Config, sizes: Sizes, grid: BEVGrid, points: Tensor, bev: Sites, device: torch.device
+) -> list[dict[str, Any]]:
+    """Rows of operations whose floor is not a product: ours against the formulation one would write first."""
+    draw, channels = torch.Generator(device=device).manual_seed(1), config.model.channels
+    rows = compare("segment sum", *segment_candidates(sizes, channels, draw, device), "index_add", device)
+    sampling = sampling_candidates(sizes, channels, grid, bev, draw)
+    rows += compare("bilinear sampling", *sampling, "densify + grid_sample", device)
+    attention = attention_candidates(config, sizes, draw, device)
+    rows += compare("image attention", *attention, "all views grid_sample", device)
+    half = torch.tensor(grid.half_extent_m, device=device)
+    spots = (2 * torch.rand(sizes.gaussians, 2, generator=draw, device=device) - 1) * half
+    valid = torch.ones(1, sizes.gaussians, dtype=torch.bool, device=device)
+    start = torch.zeros(1, dtype=torch.int64, device=device)
+    rows += compare(
+        "farthest points",
+        lambda: farthest_points(spots[None], valid, start, sizes.picks),
+        lambda: plain_farthest_points(spots, sizes.picks),
+        "plain loop",
+        device,
+    )
+    car = torch.tensor([[4.5, 1.9, 0.4]], device=device)  # length, width, yaw
+    boxes = torch.cat([spots[: sizes.boxes], car.expand(min(sizes.boxes, len(spots)), 3)], 1)
+    rows += compare(
+        "box raster",
+        lambda: cells_in_boxes(boxes, grid, 4.8),
+        lambda: dense_raster(boxes, grid, 4.8),
+        "every box at every cell",
+        device,
+    )
+    owners = torch.zeros(len(points), dtype=torch.int64, device=device)
+    lower, size = (grid.x_min_m, grid.y_min_m, grid.z_range_m[0]), (0.1, 0.1, 0.2)
+    shape = (round((grid.z_range_m[1] - grid.z_range_m[0]) / size[2]), 8 * grid.rows, 8 * grid.cols)
+    rows += compare(
+        "voxels",
+        lambda: voxelize(points, points[:, :3], owners, lower, size, shape, 1)[1],
+        lambda: plain_voxels(points, lower, size),
+        "unique rows + index_add",
+        device,
+    )
+    return rows
+
+
+def compare(
+    name: str, ours: Callable[[], Any], peer: Callable[[], Any], peer_name: str, device: torch.device
+) -> list[dict[str, Any]]:
+    """Ours and the peer in turns, forward and, where something can be derived, with backward."""
+    modes = {"forward": without_gradient}
+    if any(x.requires_grad for x in tensors_in(ours())):
+        modes["f+b"] = with_gradient
+    rows = []
+    for mode, wrap in modes.items():
+        seconds = in_turns({"ours": wrap(ours), "peer": wrap(peer)}, device, ROUNDS, BUDGET_S)
+        middle, spread = median_spread(seconds["ours"])
+        rows.append(
+            {
+                "operation": name,
+                "mode": mode,
+                "x faster": median_spread(seconds["peer"])[0] / middle,
+                "peer": peer_name,
+                "ms": 1e3 * middle,
+                "± ms": 1e3 * spread,
+                "peer ms": 1e3 * median_spread(seconds["peer"])[0],
+            }
+        )
+    return rows
+
+
+Candidates = tuple[Callable[[], Any], Callable[[], Any]]
+
+
+def segment_candidates(sizes: Sizes, channels: int, draw: torch.Generator, device: torch.device) -> Candidates:
+    """Rows that meet three at a time."""
+    values = torch.randn(sizes.rows, channels, generator=draw, device=device, requires_grad=True)
+    owners = torch.randint(0, sizes.rows // 3, (sizes.rows,), generator=draw, device=device)
+    zeros = torch.zeros(sizes.rows // 3, channels, device=device)
+    return lambda: segment_sum(values, owners, len(zeros)), lambda: zeros.index_add(0, owners, values)
+
+
+def sampling_candidates(sizes: Sizes, channels: int, grid: BEVGrid, bev: Sites, draw: torch.Generator) -> Candidates:
+    """Eleven points per query around cells of a sparse map."""
+    device = bev.device
+    values = torch.randn(len(bev), channels, generator=draw, device=device, requires_grad=True)
+    homes = torch.randint(0, len(bev), (sizes.queries,), generator=draw, device=device)
+    centres = grid.centre_of(bev.indices()[homes, 1:])
+    spread = 2.0 * torch.randn(sizes.queries, POINTS_PER_QUERY, 2, generator=draw, device=device)
+    points = (centres[:, None] + spread).requires_grad_()
+    owners = torch.zeros(points.shape[:2], dtype=torch.int64, device=device)
+    size = torch.tensor([grid.cols, grid.rows], device=device)
+
+    def ours() -> Tensor:
+        return sample_sparse_bev(values, Sites(bev.shape, bev.keys), points, owners, grid)
+
+    def dense() -> Tensor:
+        unit = 2 * grid.to_cells(points) / size - 1
+        return F.grid_sample(SparseMap(bev, values).to_dense(), unit[None], align_corners=False)
+
+    return ours, dense
+
+
+def attention_candidates(config: Config, sizes: Sizes, draw: torch.Generator, device: torch.device) -> Candidates:
+    """Queries that each lie in about one of the views, as around a truck."""
+    height, width = config.backbone.image_size_px
+    channels, queries = config.model.channels, sizes.queries
+    levels = [
+        torch.randn(1, VIEWS, channels, height // stride, width // stride, generator=draw, device=device)
+        for stride in LEVEL_STRIDES
+    ]
+    levels = [level.requires_grad_() for level in levels]
+    extent = torch.tensor([width, height], device=device)
+    shape = (1, queries, VIEWS, POINTS_PER_QUERY)
+    pixels = torch.rand(1, queries, 1, 1, 2, generator=draw, device=device) * extent
+    pixels = (pixels + 20.0 * torch.randn(*shape, 2, generator=draw, device=device)).requires_grad_()
+    home = torch.randint(0, VIEWS, (1, queries, 1), generator=draw, device=device)
+    visible = (home == torch.arange(VIEWS, device=device))[..., None].expand(shape)
+    weights = torch.rand(1, queries, HEADS, VIEWS, len(levels), POINTS_PER_QUERY, generator=draw, device=device)
+    weights.requires_grad_()
+
+    def ours() -> Tensor:
+        return deform_attend_images(levels, pixels, (height, width), weights, visible)
+
+    def everywhere() -> Tensor:
+        return attend_everywhere(levels, pixels, (height, width), weights, visible)
+
+    return ours, everywhere
+
+
+def attend_everywhere(
+    levels: Sequence[Tensor], pixels: Tensor, image_size_px: tuple[int, int], weights: Tensor, visible: Tensor
+) -> Tensor:  # [B, Q, C]
+    """Sample every point in every view, then mask: the same sum without choosing queries."""
+    b, q, n, p, _ = pixels.shape
+    heads = weights.shape[2]
+    unit = 2 * pixels / pixels.new_tensor(image_size_px[::-1]) - 1  # [B, Q, N, P, 2]
+    places = unit.permute(0, 2, 1, 3, 4).flatten(0, 1)  # [B*N, Q, P, 2]
+    total: Any = 0.0
+    for number, level in enumerate(levels):
+        sampled = F.grid_sample(level.flatten(0, 1), places, align_corners=False)  # [B*N, C, Q, P]
+        sampled = sampled.view(b, n, heads, -1, q, p)
+        weighed = (weights[:, :, :, :, number] * visible[:, :, None]).permute(0, 3, 2, 1, 4)  # [B, N, heads, Q, P]
+        total = total + torch.einsum("bnhcqp,bnhqp->bqhc", sampled, weighed)
+    return total.flatten(2)
+
+
+def plain_farthest_points(points: Tensor, count: int) -> Tensor:
+    """The loop one writes first: distances to the last pick, minimum, argmax."""
+    picks = points.new_zeros(count, dtype=torch.int64)
+    gap = points.new_full((len(points),), math.inf)
+    for step in range(1, count):
+        gap = torch.minimum(gap, (points - points[picks[step - 1]]).square().sum(1))
+        picks[step] = gap.argmax()
+    return picks
+
+
+def dense_raster(boxes: Tensor, grid: BEVGrid, margin_m: float) -> Tensor:
+    """Every box against every cell centre."""
+    cells = torch.arange(grid.rows * grid.cols, device=boxes.device)
+    centres = grid.centre_of(torch.stack([torch.div(cells, grid.cols, rounding_mode="floor"), cells % grid.cols], 1))
+    offset = centres.double() - boxes[:, None, :2].double()
+    cosine, sine = boxes[:, 4:].double().cos(), boxes[:, 4:].double().sin()
+    along = (cosine * offset[..., 0] + sine * offset[..., 1]).abs() <= 0.5 * (boxes[:, 2:3] + margin_m)
+    across = (cosine * offset[..., 1] - sine * offset[..., 0]).abs() <= 0.5 * (boxes[:, 3:4] + margin_m)
+    return (along & across).nonzero()
+
+
+def plain_voxels(points: Tensor, lower_m: Sequence[float], size_m: Sequence[float]) -> Tensor:
+    """Distinct rows of voxel indices, and means by scattered addition."""
+    cells = ((points[:, :3] - points.new_tensor(lower_m)) / points.new_tensor(size_m)).floor().long()
+    voxels, owners = torch.unique(cells, dim=0, return_inverse=True)
+    sums = points.new_zeros(len(voxels), points.shape[1]).index_add(0, owners, points)
+    counts = points.new_zeros(len(voxels)).index_add(0, owners, torch.ones_like(points[:, 0]))
+    return sums / counts[:, None]

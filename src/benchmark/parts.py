@@ -1,0 +1,176 @@
+"""The parts of a detector: what they are called, and each of them alone with the inputs it has within the model."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import importlib
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from torch import Tensor
+
+from src.benchmark.timing import replaced_methods
+from src.models.detector import Detector
+
+Paths = Mapping[str, tuple[str, ...]]
+"""By part the methods that it is, as in `module.method`, or functions, as in `package.module:function`."""
+
+PART_METHODS = ("forward", "recall", "aggregate", "remember", "decode")
+"""What a detector calls its parts by; a memory is not a function of one input, so it has no forward."""
+PARTS_WITHIN: dict[str, Paths] = {
+    "Horizon3D": {
+        "ocsf": ("ocsf.forward",),
+        "ocsf: gaussian encoder": ("ocsf.encoder.forward",),
+        "ocsf: splat": ("src.models.horizon3d.ocsf:splat_set",),
+        "ocsf: gated fusion": ("ocsf.fusion.forward",),
+        "dptf": ("dptf.recall", "dptf.aggregate", "dptf.remember"),
+        "dptf: recall": ("dptf.recall",),
+        "dptf: aggregate": ("dptf.aggregate",),
+        "dptf: remember": ("dptf.remember",),
+    }
+}
+"""By model the parts worth looking into; `part: inner` lies within `part`. A part is otherwise what a child does."""
+
+
+def parts_of(model: Detector) -> Paths:
+    """The parts in the order of the model's children; the module of a model may name its own as `BENCHMARK_PARTS`."""
+    own = getattr(sys.modules[type(model).__module__], "BENCHMARK_PARTS", None)
+    if own is not None:
+        return own
+    within = PARTS_WITHIN.get(type(model).__name__, {})
+    parts: dict[str, tuple[str, ...]] = {}
+    for child, module in model.named_children():
+        listed = {name: paths for name, paths in within.items() if name.partition(":")[0] == child}
+        methods = [method for method in PART_METHODS if method != "decode" and _defines(module, method)]
+        parts |= listed or {child: tuple(f"{child}.{method}" for method in methods)}
+        if _defines(module, "decode"):
+            parts[f"{child}: decode"] = (f"{child}.decode",)
+    return {name: paths for name, paths in parts.items() if paths}
+
+
+def _defines(module: torch.nn.Module, method: str) -> bool:
+    found = getattr(type(module), method, None)
+    return found is not None and found is not torch.nn.Module.forward
+
+
+def is_within(name: str) -> bool:
+    """Whether a part lies within another, so that sums leave it out; decoding comes after the model and counts."""
+    return ":" in name and not name.endswith(": decode")
+
+
+@contextmanager
+def wrapped_parts(
+    model: Detector,
+    parts: Paths,
+    wrap: Callable[[str, str, Callable[..., Any]], Callable[..., Any]],  # of part, path and the function
+) -> Iterator[None]:
+    """Within the context every method and function that is a part is wrapped."""
+    functions = {name: tuple(path for path in paths if ":" in path) for name, paths in parts.items()}
+    methods: dict[str, list[str]] = {}
+    for name, paths in parts.items():
+        for path in paths:
+            if ":" not in path:
+                methods.setdefault(path, []).append(name)
+
+    def wrap_method(_: str, path: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        for name in methods[path]:  # a method may be a part and lie within another
+            function = wrap(name, path, function)
+        return function
+
+    with ExitStack() as stack:
+        for name, paths in functions.items():
+            for path in paths:
+                module, _, function = path.partition(":")
+                owner = importlib.import_module(module)
+                stack.enter_context(patch.object(owner, function, wrap(name, path, getattr(owner, function))))
+        stack.enter_context(replaced_methods(model, {path: (path,) for path in methods}, wrap_method))
+        yield
+
+
+@dataclasses.dataclass
+class Call:
+    """A part's call within the model, to be made again alone."""
+
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    named: dict[str, Any]
+    result: Any
+
+    def prepare(self) -> Callable[[], Any]:
+        """The same call on fresh inputs: the values and caches of the first time, no history of gradients."""
+        arguments, named = fresh((self.arguments, self.named))
+        return lambda: self.function(*arguments, **named)
+
+
+def record_calls(model: Detector, parts: Paths, run: Callable[[], Any]) -> dict[str, list[Call]]:
+    """The calls of every part that happen while the model runs once; parts that are not called are left out."""
+    calls: dict[str, list[Call]] = {name: [] for name in parts}
+
+    def wrap(name: str, path: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **named: Any) -> Any:
+            kept = fresh((arguments, named))  # before the part fills the caches of its inputs
+            result = function(*arguments, **named)
+            calls[name].append(Call(plain, *kept, result))
+            return result
+
+        plain = getattr(function, "plain_function", function)
+        call.plain_function = plain
+        return call
+
+    with wrapped_parts(model, parts, wrap):
+        run()
+    return {name: found for name, found in calls.items() if found}
+
+
+def fresh(value: Any, memo: dict[int, Any] | None = None) -> Any:
+    """A copy of nested dataclasses and containers around the same numbers: tensors are leaves that want the gradients
+    they wanted, caches hold what they held, and what was shared stays shared."""
+    memo = {} if memo is None else memo
+    if id(value) in memo:
+        return memo[id(value)]
+    if isinstance(value, Tensor):
+        made: Any = value.detach()
+        if value.requires_grad:
+            made.requires_grad_()
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        made = copy.copy(value)
+        memo[id(value)] = made
+        for field in dataclasses.fields(value):
+            object.__setattr__(made, field.name, fresh(getattr(value, field.name), memo))
+    elif isinstance(value, dict):
+        made = {key: fresh(item, memo) for key, item in value.items()}
+    elif isinstance(value, (list, tuple)):
+        items = [fresh(item, memo) for item in value]
+        made = type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
+    else:
+        return value
+    memo[id(value)] = made
+    return made
+
+
+def tensors_in(value: Any, seen: set[int] | None = None) -> list[Tensor]:
+    """All tensors in nested dataclasses, lists and tuples; those in dicts are caches and left out."""
+    seen = set() if seen is None else seen
+    if id(value) in seen:
+        return []
+    seen.add(id(value))
+    if isinstance(value, Tensor):
+        return [value]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = [getattr(value, field.name) for field in dataclasses.fields(value)]
+    if isinstance(value, (list, tuple)):
+        return [tensor for item in value for tensor in tensors_in(item, seen)]
+    return []
+
+
+def derive(result: Any) -> bool:
+    """Backward from everything in a part's result that depends on weights or inputs; False where nothing does."""
+    roots = [x for x in tensors_in(result) if x.grad_fn is not None]
+    if roots:
+        torch.autograd.backward(roots, [torch.ones_like(x) for x in roots])
+    return bool(roots)

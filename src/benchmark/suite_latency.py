@@ -1,0 +1,118 @@
+"""suite=latency: milliseconds of a trained model's frame by part, in the streaming that prediction uses."""
+
+from __future__ import annotations
+
+import os
+import statistics
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from src.assembly import build_datamodule, data_root
+from src.benchmark.machine import busy_cores, describe_machine, processor
+from src.benchmark.page import page_of
+from src.benchmark.timing import chosen_device, clock, peak_bytes, timed_parts
+from src.config import Config, restore_config
+from src.data.clips import scenes_of
+from src.data.datamodule import DetectionDataModule
+from src.data.splits import split_samples
+from src.errors import ConfigError
+from src.reliability.checkpoints import read_checkpoint
+from src.streaming import StreamingDetector
+from src.structures.batch import FrameBatch
+from src.training.run_folder import current_commit
+
+LATENCY_FORMAT = 1
+WARM_UP_FRAMES = 5
+MEASURED_FRAMES = 20
+LATENCY_PARTS = {
+    "image_encoder": ("image_encoder.forward",),
+    "radar_encoder": ("radar_encoder.forward",),
+    "view_transform": ("view_transform.forward", "fuser.forward"),
+    # The dense peer's way from the fused map to the head; where the paper books its decoder is not known.
+    "temporal_fusion": ("temporal.recall", "temporal.aggregate", "temporal.remember", "decoder.forward"),
+    "kggi": ("kggi.forward",),
+    "ocsf": ("ocsf.forward",),
+    "gaussian_encoder": ("ocsf.encoder.forward",),  # within ocsf (Table 14)
+    "dptf": ("dptf.recall", "dptf.aggregate", "dptf.remember"),
+    "detection_head": ("head.forward", "head.decode"),
+}
+"""The parts of Table 15 by the methods of a model that they are; a part that a model lacks is left out."""
+
+
+def measure_latency(command: Config, overrides: list[str]) -> dict[str, Any]:
+    """What `latency.json` holds: a checkpoint's own model on its own validation frames; see `benchmark_latency`."""
+    if command.checkpoint is None:
+        raise ConfigError("suite=latency measures a trained model; give checkpoint=PATH of one")
+    path = Path(command.checkpoint)
+    checkpoint = read_checkpoint(path)
+    config = restore_config(checkpoint["horizon3d"]["config"], overrides)
+    detector = StreamingDetector.restore(config, checkpoint, path, chosen_device(config))
+    datamodule = build_datamodule(config, data_root(config, write=False))
+    result = benchmark_latency(detector, datamodule, config.model.memory_frames)
+    return {"format": LATENCY_FORMAT, **result, "precision": config.precision, "commit": current_commit()}
+
+
+def latency_page(content: dict[str, Any], overrides: list[str]) -> dict[str, Any]:
+    """The content of `latency.json` as a page."""
+    rows = [
+        {"part": part, "ms (median)": value, "± ms": content["spread_ms"][part]}
+        for part, value in content["ms"].items()
+    ]
+    rest = {name: value for name, value in content.items() if name not in ("format", "ms", "spread_ms")}
+    machine = describe_machine() | {"load": content["load"]}
+    return page_of("latency", overrides, machine, {"a frame by part": rows} | rest)
+
+
+def benchmark_latency(
+    detector: StreamingDetector, datamodule: DetectionDataModule, memory_frames: int
+) -> dict[str, Any]:
+    """Median milliseconds of a frame and of its parts, from the frame on the device to its boxes; reading is not in it.
+
+    The clocks of the parts run meanwhile, and on a GPU each of them waits for it.
+
+    The spread is the range of the middle half. Frames count once the memory is full, or as full as scenes are long.
+    `load` is how many processes wanted a core over the minute before, of `cores`.
+    `memory_gb` is the largest that torch held on a GPU, or the process with its libraries on a CPU, in 1e9 bytes.
+    """
+    device, now, load = detector.device, clock(detector.device), busy_cores()
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+    scenes = scenes_of(datamodule.index, split_samples(datamodule.index, datamodule.config.split))
+    full = min(memory_frames, max(map(len, scenes)) - 1)
+    frames, measured, seen = endless_stream(datamodule), [], 0
+    while len(measured) < MEASURED_FRAMES:
+        frame, number = next(frames)
+        frame, timings = frame.to(device), {}
+        with timed_parts(detector.model, LATENCY_PARTS, timings, device):
+            begin = now()
+            detector.run(frame)
+            total = now() - begin
+        seen += 1
+        if seen > WARM_UP_FRAMES and number >= full:
+            measured.append({name: 1e3 * sum(calls) for name, calls in timings.items()} | {"total": 1e3 * total})
+    columns = {name: [row[name] for row in measured] for name in (*LATENCY_PARTS, "total") if name in measured[0]}
+    quartiles = {name: statistics.quantiles(values, n=4) for name, values in columns.items()}
+    return {
+        "ms": {name: middle for name, (_, middle, _) in quartiles.items()},
+        "spread_ms": {name: high - low for name, (low, _, high) in quartiles.items()},
+        "fps": 1e3 / quartiles["total"][1],
+        "memory_gb": peak_bytes(device) / 1e9,
+        "frames": len(measured),
+        "device": str(device),
+        "processor": torch.cuda.get_device_name() if device.type == "cuda" else processor(),
+        "threads": torch.get_num_threads(),
+        "load": round(load, 2),
+        "cores": os.cpu_count() or 1,
+    }
+
+
+def endless_stream(datamodule: DetectionDataModule) -> Iterator[tuple[FrameBatch, int]]:
+    """The validation frames over and over, each with its place in its scene."""
+    while True:
+        number = 0
+        for frame in datamodule.stream():
+            number = 0 if bool(frame.starts[0]) else number + 1
+            yield frame, number

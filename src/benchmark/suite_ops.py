@@ -1,0 +1,107 @@
+"""suite=ops: each heavy operation against its floor and its peers, all in turns in one run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from src.assembly import build_datamodule, data_root
+from src.benchmark.convolutions import (
+    Backbone,
+    backbone_operations,
+    layers_of,
+    measure_backbone,
+    measure_layers,
+    remembered_sites,
+)
+from src.benchmark.machine import measure_roofline
+from src.benchmark.naive import SIZES, made_up_gaussians, measure_rest, measure_splat
+from src.benchmark.operation_table import NOTE as OPERATIONS_NOTE
+from src.benchmark.scenes import Highway, highway_points
+from src.benchmark.spconv_baseline import load_spconv
+from src.benchmark.timing import chosen_device
+from src.config import Config
+from src.geometry.bev_grid import BEVGrid
+from src.ops.sites import Sites
+
+NUM_VEHICLES = 60
+
+
+def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
+    """Tables of sparse convolutions, of the whole radar backbone, of splatting, and of everything else."""
+    torch.manual_seed(config.seed)
+    device, sizes, grid = chosen_device(config), SIZES[config.scale], config.grid.build()
+    every = torch.get_num_threads()
+    threads = sorted({1, every}) if device.type == "cpu" else [every]
+    points = highway_points(Highway(sizes.background, NUM_VEHICLES, sizes.points_per_vehicle, 150.0)).to(device)
+    backbone = Backbone(config.model.radar_encoder, grid, config.model.channels, config.seed)
+    encoder = backbone.build().to(device)
+    with torch.no_grad():
+        voxels = encoder.voxelise(points, torch.zeros(len(points), dtype=torch.int64, device=device), 1)
+    bev = bev_sites(points, grid, sizes.cells)
+    past = remembered_sites(grid, Sites(bev.shape, bev.keys[::4]), sizes.frames)
+    layers = layers_of(encoder, voxels, config.model.channels, bev, past)
+    scenes = {"highway, made up": points.cpu()} | recorded_scene(config)
+    gaussians = made_up_gaussians(sizes.gaussians, config.model.channels, grid, device)
+    peer = load_spconv(device)
+    return {
+        "notes": [
+            f"Scale {config.scale}, float32 on {device}; everything but the convolutions on {every} threads. A row's "
+            "candidates take turns in one run. Ratios above 1: ours is faster. % of products: the arithmetic's rate "
+            "as a share of that of one large matrix product, which takes its turns too. ± is the range of the middle "
+            "half.",
+            "Dense convolution: scatter to the whole grid, torch's convolution, gather; left blank where it does not "
+            "fit. Kernel maps are cached on the sites by all (made once for all layers of a stage): `map ms` is ours. "
+            "The backbone makes its maps anew.",
+            "spconv: " + ("not installed, so its columns are absent." if peer is None else spconv_note(device)),
+            f"Dense splat: {sizes.splat_subset} of {sizes.gaussians} Gaussians against every cell, time and memory "
+            "multiplied; all of them would not fit.",
+            OPERATIONS_NOTE,
+        ]
+        + ([] if device.type == "cuda" else [gpu_note(config)]),
+        "sparse convolution": measure_layers(layers, device, threads),
+        "radar backbone": measure_backbone(backbone, scenes, device, threads),
+        **backbone_operations(backbone, points),
+        "splat": measure_splat(gaussians, grid, sizes.splat_subset, device),
+        "other operations": measure_rest(config, sizes, grid, points, bev, device),
+        "roofline": measure_roofline(device),
+    }
+
+
+def spconv_note(device: torch.device) -> str:
+    """What is to be known of the peer's numbers."""
+    if device.type == "cuda":
+        return "its own choice of algorithm, float32."
+    return (
+        "CPU build, `ConvAlgo.Native`. `differs by` is the largest relative difference of outputs and gradients at one "
+        "thread. On several threads its gathering shares buffers between threads, so results are wrong at random: "
+        "`wrong` counts runs; its times there are of such runs."
+    )
+
+
+def gpu_note(config: Config) -> str:
+    """The command that measures the same on a GPU."""
+    return (
+        "Measured without a GPU. There: `python -m src.benchmark suite=ops "
+        f"scale={config.scale} trainer.accelerator=gpu out=DIR`, with the data of the command above."
+    )
+
+
+def recorded_scene(config: Config) -> dict[str, Tensor]:
+    """Radar points of the first training frame of the configured data."""
+    config.data.batch_size, config.data.num_workers = 1, 0
+    batch = next(iter(build_datamodule(config, data_root(config)).train_dataloader()))
+    return {f"first frame, {len(batch.radar_points)} points": batch.radar_points}
+
+
+def bev_sites(points: Tensor, grid: BEVGrid, number: int) -> Sites:
+    """As many cells as asked for, where the points are and around them."""
+    cells = grid.cell_of(points[grid.contains(points[:, :2]), :2])
+    near = torch.cat([cells + torch.tensor(shift, device=cells.device) for shift in ((0, 0), (0, 1), (1, 0), (1, 1))])
+    limit = torch.tensor(grid.cells, device=cells.device)
+    near = near[((near >= 0) & (near < limit)).all(1)]
+    sites, _ = Sites.unique(torch.cat([torch.zeros_like(near[:, :1]), near], 1), (1, *grid.cells))
+    kept = torch.linspace(0, len(sites) - 1, min(number, len(sites)), device=cells.device).long().unique()
+    return Sites(sites.shape, sites.keys[kept])

@@ -1,0 +1,298 @@
+"""suite=reader: frames per second of the reader on one core, stage by stage, against the plain ways to read."""
+
+from __future__ import annotations
+
+import math
+import resource
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from itertools import cycle, islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch.utils.data import DataLoader
+
+from src.assembly import build_datamodule, data_root
+from src.benchmark.timing import median_spread
+from src.config import Config
+from src.data import images, reader
+from src.data.augment import AugmentationConfig
+from src.data.datamodule import DetectionDataModule, collate
+from src.data.images import width_fit
+from src.data.jpeg import decode_fast, decoder_name
+from src.data.pcd import RADAR_FIELDS, read_radar_points
+from src.data.schema import CHANNELS
+from src.data.splits import split_samples
+from src.structures.taxonomy import CAMERAS, RADARS
+
+Array = np.ndarray
+
+READER_FRAMES = 60
+WARM_UP_FRAMES = 4
+LOADER_FRAMES = 60
+PEER_ROUNDS = 8
+STAGES = {
+    "JPEG decode": (images, "decode"),
+    "resample": (images, "resample"),
+    "mirror and rotate": (images, "turn"),
+    "radar files": (reader, "read_radar_points"),
+    "radar compensation": (reader, "compensate_sweeps"),
+}
+"""Functions of the reader by the names under which it calls them; what is in none of them is `assembling`."""
+
+
+def benchmark_reader(config: Config) -> dict[str, Any]:
+    """CPU seconds of reading, augmenting and batching in this process, on one thread; then beside a loader's worker.
+
+    The frames are the training split's, over and over with other draws of the augmentation, from the system's file
+    cache. `frames_per_second` is by CPU time and with the training's augmentation, its inverse the mean over frames.
+    """
+    torch.set_num_threads(1)
+    datamodule = build_datamodule(config, data_root(config))
+    samples = full_samples(datamodule)
+    # A world for measurements may have fewer frames than a batch.
+    config.data.batch_size = min(config.data.batch_size, len(split_samples(datamodule.index, config.data.train_split)))
+    runs = {"training": config.data.augmentation, "test": None}
+    measured = {name: time_frames(datamodule, samples, augmentation) for name, augmentation in runs.items()}
+    total = sum(measured["training"]["all"])
+    return {
+        "frames": READER_FRAMES,
+        "cpu_seconds": total,
+        "frames_per_second": READER_FRAMES / total,
+        "decoder": decoder_name(),
+        "image_px": "x".join(map(str, datamodule.index.data_sizes[datamodule.index.key_data[samples[0], 0]][::-1])),
+        "network_px": "x".join(map(str, (datamodule.settings.image_size_px or (0, 0))[::-1])),
+        "radar_files": len(radar_paths(datamodule, samples[0])),
+        "frames with and without augmentation": [frame_row(name, columns) for name, columns in measured.items()],
+        "stages": [stage_row(stage, measured) for stage in measured["training"] if stage not in ("all", "wall")],
+        "images of one frame": image_peers(datamodule, samples[0]) if datamodule.settings.image_size_px else [],
+        "radar files of one frame": radar_peers(datamodule, samples[0]),
+        "loader": [loader_row(config)],
+        "notes": [
+            "CPU time of one thread, medians and the range of the middle half over frames; files come from the "
+            "system's cache. A loader's worker also sends its batches: the row `loader` is a training epoch through "
+            "one worker, its start included."
+        ],
+    }
+
+
+def full_samples(datamodule: DetectionDataModule) -> list[int]:
+    """Frames of the training split with as many radar files as any has: early frames of a scene have fewer."""
+    samples = [int(sample) for sample in split_samples(datamodule.index, datamodule.config.train_split)]
+    counts = [len(radar_paths(datamodule, sample)) for sample in samples]
+    return [sample for sample, count in zip(samples, counts, strict=True) if count == max(counts)]
+
+
+def radar_paths(datamodule: DetectionDataModule, sample: int) -> list[str]:
+    """Files of a frame's sweeps."""
+    index, paths = datamodule.index, []
+    for channel in RADARS:
+        row = int(index.key_data[sample, CHANNELS.index(channel)])
+        for _ in range(datamodule.settings.num_sweeps):
+            if row >= 0:
+                paths.append(str(index.root / index.filename(row)))
+                row = int(index.data_previous[row])
+    return paths
+
+
+# -------------------------------------------------------------------- stages
+
+
+class StageClock:
+    """CPU seconds of nested calls by stage; a stage's own are without those of the stages within it."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._within = [0.0]
+
+    def timed(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, which now counts for the stage."""
+
+        def call(*arguments: Any, **named: Any) -> Any:
+            self._within.append(0.0)
+            begin = time.process_time()
+            try:
+                return function(*arguments, **named)
+            finally:
+                elapsed = time.process_time() - begin
+                self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed - self._within.pop()
+                self._within[-1] += elapsed
+
+        return call
+
+
+@contextmanager
+def timed_stages(clock: StageClock) -> Iterator[None]:
+    """Within the context the reader's stages count on the clock."""
+    kept = {(module, name): getattr(module, name) for module, name in STAGES.values()}
+    for stage, (module, name) in STAGES.items():
+        setattr(module, name, clock.timed(stage, kept[module, name]))
+    try:
+        yield
+    finally:
+        for (module, name), function in kept.items():
+            setattr(module, name, function)
+
+
+def time_frames(
+    datamodule: DetectionDataModule, samples: list[int], augmentation: AugmentationConfig | None
+) -> dict[str, list[float]]:
+    """CPU seconds of every frame by stage, of `all` stages, and its `wall` seconds; a batch's collation is shared."""
+    columns: dict[str, list[float]] = {stage: [] for stage in (*STAGES, "assembling", "collate", "all", "wall")}
+    frames, size = [], datamodule.config.batch_size
+    for number, sample in enumerate(islice(cycle(samples), WARM_UP_FRAMES + READER_FRAMES)):
+        clock = StageClock()
+        with timed_stages(clock):
+            wall = time.perf_counter()
+            read = clock.timed("assembling", datamodule.reader.read)
+            frames.append(read(sample, augmentation, datamodule.seed, number))
+            if len(frames) == size:
+                clock.timed("collate", collate)(frames)
+                frames = []
+            wall = time.perf_counter() - wall
+        if number >= WARM_UP_FRAMES:
+            for stage in (*STAGES, "assembling", "collate"):
+                columns[stage].append(clock.seconds.get(stage, 0.0))
+            columns["all"].append(sum(clock.seconds.values()))
+            columns["wall"].append(wall)
+    columns["collate"] = [statistics.mean(columns["collate"])] * READER_FRAMES
+    return columns
+
+
+def frame_row(name: str, columns: dict[str, list[float]]) -> dict[str, Any]:
+    """One line: how fast frames come, with or without augmentation."""
+    middle, spread = median_spread(columns["all"])
+    return {
+        "as in": name,
+        "frames/s (CPU)": len(columns["all"]) / sum(columns["all"]),
+        "frames/s (wall)": len(columns["wall"]) / sum(columns["wall"]),
+        "ms (median)": 1e3 * middle,
+        "spread ms": 1e3 * spread,
+    }
+
+
+def stage_row(stage: str, measured: dict[str, dict[str, list[float]]]) -> dict[str, Any]:
+    """One line: a stage's milliseconds in a frame."""
+    row: dict[str, Any] = {"stage": stage}
+    for name, columns in measured.items():
+        middle, spread = median_spread(columns[stage])
+        row |= {f"{name} ms": 1e3 * middle, f"{name} spread ms": 1e3 * spread}
+        row |= {f"{name} share": sum(columns[stage]) / sum(columns["all"])}
+    return row
+
+
+# -------------------------------------------------------------------- peers
+
+
+def peers(candidates: dict[str, Callable[[], Any]], column: str) -> list[dict[str, Any]]:
+    """CPU milliseconds of each candidate, taken in turns, and its share of the first one's in the same round."""
+    seconds: dict[str, list[float]] = {name: [] for name in candidates}
+    for number in range(1 + PEER_ROUNDS):
+        for name, function in candidates.items():
+            begin = time.process_time()
+            function()
+            if number:
+                seconds[name].append(time.process_time() - begin)
+    first = next(iter(seconds.values()))
+    rows = []
+    for name, values in seconds.items():
+        middle, spread = median_spread(values)
+        ratio = statistics.median(b / a for a, b in zip(first, values, strict=True))
+        rows.append({column: name, "ms": 1e3 * middle, "spread ms": 1e3 * spread, "ratio": ratio})
+    return rows
+
+
+def image_peers(datamodule: DetectionDataModule, sample: int) -> list[dict[str, Any]]:
+    """The frame's images without augmentation: plain Pillow, the reader with Pillow, the reader as it is."""
+    index, size_px = datamodule.index, datamodule.settings.image_size_px
+    rows = [int(row) for row in index.key_data[sample, [CHANNELS.index(channel) for channel in CAMERAS]] if row >= 0]
+    files = [(str(index.root / index.filename(row)), tuple(map(int, index.data_sizes[row]))) for row in rows]
+
+    def with_decoder(decode: Callable[..., Image.Image]) -> None:
+        for path, source_px in files:
+            crop = width_fit(source_px, size_px, datamodule.settings.test_resize_offset)
+            images.resample(decode(path, source_px, images.reduction_for(source_px, crop)), crop, source_px)
+
+    candidates: dict[str, Callable[[], Any]] = {
+        "decode, resize, crop": lambda: [plain_image(path, size_px) for path, _ in files],
+        "decode at 1/2^n, resize the crop: Pillow": partial(with_decoder, images.decode_by_pillow),
+    }
+    if decode_fast(*files[0], 1) is not None:
+        candidates[f"the same: {decoder_name()}"] = partial(with_decoder, images.decode)
+    return peers(candidates, "path")
+
+
+def plain_image(
+    path: str,
+    size_px: tuple[int, int],  # (height, width)
+) -> Array:  # [3, H, W] uint8
+    """What one writes first: everything decoded and resized, then the bottom kept."""
+    with Image.open(path) as image:
+        scale = size_px[1] / image.width
+        whole = image.convert("RGB").resize((size_px[1], math.floor(scale * image.height)), Image.Resampling.BILINEAR)
+    part = whole.crop((0, whole.height - size_px[0], whole.width, whole.height))
+    return np.ascontiguousarray(np.asarray(part).transpose(2, 0, 1))
+
+
+def radar_peers(datamodule: DetectionDataModule, sample: int) -> list[dict[str, Any]]:
+    """The frame's radar files: field by field, as general readers do, and as one view."""
+    paths = radar_paths(datamodule, sample)
+    candidates = {
+        "header and fields one by one": lambda: [fields_one_by_one(path) for path in paths],
+        "known headers, one view": lambda: [read_radar_points(path) for path in paths],
+    }
+    return peers(candidates, "path")
+
+
+def fields_one_by_one(path: str) -> Array:  # [n, 7] float32
+    """A binary file read as general readers of the format do."""
+    content = Path(path).read_bytes()
+    start = content.index(b"\n", content.index(b"\nDATA ") + 1) + 1
+    header = dict(line.split(maxsplit=1) for line in content[:start].decode("ascii").splitlines() if line[:1] != "#")
+    kinds = [
+        f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"].split(), header["SIZE"].split(), strict=True)
+    ]
+    dtype = np.dtype(list(zip(header["FIELDS"].split(), kinds, strict=True)))
+    table = np.frombuffer(content, dtype, int(header["POINTS"]), start)
+    return np.stack([table[name].astype(np.float32) for name in RADAR_FIELDS], axis=1)
+
+
+# -------------------------------------------------------------------- loader
+
+
+def loader_row(config: Config) -> dict[str, Any]:
+    """One worker beside this process: the CPU milliseconds of either for a frame."""
+    config.data.num_workers = 1
+    loader = build_datamodule(config, data_root(config)).train_dataloader()
+    counts, wall = [], time.perf_counter()
+    own, workers = time.process_time(), children_seconds()
+    for batch in islice(endless(loader), max(1, LOADER_FRAMES // config.data.batch_size)):
+        counts.append(len(batch))
+    own, wall = time.process_time() - own, time.perf_counter() - wall
+    del loader  # its worker ends, and its time is known
+    frames = sum(counts)
+    return {
+        "batch": config.data.batch_size,
+        "frames": frames,
+        "worker CPU ms/frame": 1e3 * (children_seconds() - workers) / frames,
+        "training process CPU ms/frame": 1e3 * own / frames,
+        "wall ms/frame": 1e3 * wall / frames,
+    }
+
+
+def endless(loader: DataLoader) -> Iterator[Any]:
+    """Its batches, epoch after epoch."""
+    while True:
+        yield from loader
+
+
+def children_seconds() -> float:
+    """CPU seconds of the processes that this one has started and that have ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime

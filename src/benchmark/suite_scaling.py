@@ -1,0 +1,307 @@
+"""suite=scaling: what a frame costs as range, traffic, radar, Gaussians and memory grow, ours beside the dense peer."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import logging
+import math
+import statistics
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from src.benchmark.counting import counted_work
+from src.benchmark.page import page_name
+from src.benchmark.parts import is_within, parts_of, tensors_in
+from src.benchmark.plots import draw_scaling
+from src.benchmark.scenes import Highway, highway_frame, highway_points
+from src.benchmark.suite_model import CANDIDATES, KEY_FRAME_S, Case, expect_trained_scores
+from src.benchmark.timing import added_bytes, chosen_device, in_turns, median_spread, timed_parts
+from src.config import Config, compose_config
+from src.geometry.bev_grid import BEVGrid
+from src.models import build_model
+from src.models.deploy.inference import prepare_for_inference
+
+logger = logging.getLogger(__name__)
+
+OURS, DENSE = "horizon3d", "dense_bev"
+ROUNDS, BUDGET_S = 5, 8.0  # of each model at each point; whole maps of 600 m are measured once
+NOMINAL_M = 150.0  # the range of the paper: `grid.cells` cover it
+EGO_STEP_M = 12.0  # between remembered frames: 24 m/s
+FIXED_REACH_M = 150.0  # the one fixed scene ends here, whatever the grid covers
+FACTORS = {
+    "objects": (0.0, 0.5, 1.0, 2.0, 4.0),
+    "radar points": (0.25, 0.5, 1.0, 2.0),
+    "gaussians": (0.25, 0.5, 1.0, 2.0),
+}
+MEMORY_FRAMES = (0, 1, 2, 4, 8)
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """The scene and the ranges at a scale."""
+
+    road: Highway  # at the nominal range
+    cells_per_object: int  # remembered in each frame
+    ranges_m: tuple[float, ...]
+
+
+SIZES = {
+    "paper": Sizes(Highway(12_700, 60, 113, 150.0), 17, (75.0, 150.0, 300.0, 600.0)),  # 8000 cells in eight frames
+    "mini": Sizes(Highway(2600, 60, 23, 150.0), 6, (75.0, 150.0, 300.0, 600.0)),
+    "debug": Sizes(Highway(200, 20, 5, 150.0), 2, (75.0, 150.0, 300.0)),
+}
+
+
+@dataclass(frozen=True)
+class Point:
+    """One setting of one sweep; what is not varied is nominal."""
+
+    x: float
+    range_m: float
+    road: Highway
+    gaussians: float = 1.0  # factor on the keypoints of all kinds
+    memory_frames: int | None = None  # None: as configured
+
+
+def benchmark_scaling(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
+    """Time and memory of a frame without its image encoder, at every point of every sweep; growth first."""
+    device = chosen_device(config)
+    configs = {name: config if config.model.name == name else peer_of(config, name) for name in (OURS, DENSE)}
+    sweeps = sweeps_of(SIZES[config.scale], config.phase.temporal)
+    measured = {name: measure_sweep(name, points, configs, device) for name, points in sweeps.items()}
+    result = {
+        "notes": [
+            f"Scale {config.scale}, {config.phase.name}, {config.precision} on {device}, batch 1, both models as "
+            "prediction prepares them, with fresh weights, from features that the image encoder has made already. The "
+            "cell stays 0.8 m, so a longer range has more cells. Medians; ± is the range of the middle half. `added` "
+            "is the most memory that a frame takes beyond inputs and weights, `remembered` waits for the next one. "
+            f"{CANDIDATES} cells pass the score threshold, as of trained models; fresh weights alone would pass half.",
+            "range, equal density: the road goes on to the end of the range. range, fixed scene: the road ends at "
+            f"{FIXED_REACH_M:g} m. Only these two have anything beyond {NOMINAL_M:g} m. Each remembered frame of "
+            f"{OURS} holds {SIZES[config.scale].cells_per_object} cells an object and the Gaussians it is configured "
+            f"for; {DENSE} remembers whole maps.",
+        ]
+        + ([] if device.type == "cuda" else [gpu_note(config)]),
+        "picture": None,
+        "growth": growth_rows(measured),
+    }
+    if config.out:
+        name = f"{page_name(config)}.png"
+        draw_scaling(
+            Path(config.out) / name, measured, f"Cost of a frame without its image encoder, scale {config.scale}"
+        )
+        result["picture"] = name
+    return result | measured
+
+
+def gpu_note(config: Config) -> str:
+    """The command that measures the same on a GPU."""
+    return (
+        f"Measured without a GPU. There: `python -m src.benchmark suite=scaling phase={config.phase.name} "
+        f"scale={config.scale} data=synthetic_full precision=bf16-mixed trainer.accelerator=gpu out=DIR`."
+    )
+
+
+def peer_of(config: Config, name: str) -> Config:
+    """The other model at the same scale, phase, grid and backbone."""
+    peer, _ = compose_config([f"model={name}", f"scale={config.scale}", f"phase={config.phase.name}", "data=synthetic"])
+    return replace(peer, grid=config.grid, backbone=config.backbone, precision=config.precision, seed=config.seed)
+
+
+def sweeps_of(sizes: Sizes, temporal: bool) -> dict[str, list[Point]]:
+    """The points of every sweep; what is nominal in several of them is measured in each."""
+    road = sizes.road
+    fixed = replace(road, reach_m=FIXED_REACH_M)
+
+    def vehicles(factor: float) -> Highway:
+        return replace(road, num_vehicles=round(factor * road.num_vehicles))
+
+    def returns(factor: float) -> Highway:
+        return replace(
+            road,
+            background=round(factor * road.background),
+            points_per_vehicle=max(1, round(factor * road.points_per_vehicle)),
+        )
+
+    returned = [returns(factor) for factor in FACTORS["radar points"]]
+    sweeps = {
+        "range, equal density": [Point(r, r, replace(road, reach_m=r)) for r in sizes.ranges_m],
+        "range, fixed scene": [Point(r, r, fixed) for r in sizes.ranges_m],
+        "objects": [Point(vehicles(f).num_vehicles, NOMINAL_M, vehicles(f)) for f in FACTORS["objects"]],
+        "radar points": [Point(len(highway_points(scene)), NOMINAL_M, scene) for scene in returned],
+        "gaussians": [Point(f, NOMINAL_M, road, gaussians=f) for f in FACTORS["gaussians"]],
+    }
+    if temporal:
+        sweeps["memory frames"] = [Point(n, NOMINAL_M, road, memory_frames=n) for n in MEMORY_FRAMES]
+    return sweeps
+
+
+def measure_sweep(
+    name: str, points: list[Point], configs: dict[str, Config], device: torch.device
+) -> list[dict[str, Any]]:
+    """A row for each point and model."""
+    rows = []
+    for number, point in enumerate(points, 1):
+        logger.info("%s: point %d of %d", name, number, len(points))
+        cases = {model: make_case(config, point, device) for model, config in configs.items()}
+        counts = {model: number_of_gaussians(config, point) for model, config in configs.items()}
+        x = counts[OURS] if name == "gaussians" else point.x
+        seconds, parts = measure_cases(cases)
+        for model, case in cases.items():
+            middle, spread = median_spread(seconds[model])
+            added = added_bytes(case.infer, device)
+            row = {name: int(x), "model": model, "ms": 1e3 * middle, "± ms": 1e3 * spread}
+            row["added MiB"] = None if added is None else added / 2**20
+            row["remembered MiB"] = sum(x.nbytes for x in tensors_in(case.memory)) / 2**20
+            with counted_work() as work:
+                case.infer()
+            row |= {"GFLOP": work.flops / 1e9, "radar points": len(case.batch.radar_points)}
+            rows.append(row | {f"{part} ms": 1e3 * statistics.median(values) for part, values in parts[model].items()})
+        del cases
+    return rows
+
+
+def measure_cases(cases: dict[str, Case]) -> tuple[dict[str, list[float]], dict[str, dict[str, list[float]]]]:
+    """Seconds of a frame and of its parts, the models in turns; the frame is timed with its parts' clocks running."""
+    parts: dict[str, dict[str, list[float]]] = {model: {} for model in cases}
+    device = next(iter(cases.values())).device
+
+    def timed(model: str, case: Case) -> Callable[[], None]:
+        paths = {
+            name: paths
+            for name, paths in parts_of(case.prepared).items()
+            if not is_within(name) and name != "image_encoder"
+        }
+
+        def run() -> None:
+            calls: dict[str, list[float]] = {}
+            with timed_parts(case.prepared, paths, calls, device):
+                case.infer()
+            for name, values in calls.items():  # several methods of one part
+                parts[model].setdefault(name, []).append(math.fsum(values))
+
+        return run
+
+    return in_turns({model: timed(model, case) for model, case in cases.items()}, device, ROUNDS, BUDGET_S), parts
+
+
+def make_case(config: Config, point: Point, device: torch.device) -> Case:
+    """A model on a grid of this range, with a full memory of frames that saw the same road a little behind."""
+    torch.manual_seed(config.seed)
+    grid = grid_of(config, point.range_m)
+    settings = model_settings(config, point)
+    model = build_model(settings, grid, config.backbone, velocity_code_weight=config.phase.velocity_code_weight)
+    bf16 = config.precision == "bf16-mixed"
+    prepared = prepare_for_inference(model.to(device), bf16)
+    batch = highway_frame(highway_points(point.road), tuple(config.backbone.image_size_px)).to(device)
+    case = Case(model, prepared, batch, None, device, bf16)
+    cache_images(case)
+    memory = expect_trained_scores(case)
+    if settings.memory_frames:
+        case.memory = aged(memory, settings)
+        case.batch = replace(batch, timestamps_s=batch.timestamps_s + KEY_FRAME_S)
+    return case
+
+
+def grid_of(config: Config, range_m: float) -> BEVGrid:
+    """The configured grid with more or fewer cells of the same size."""
+    factor = range_m / NOMINAL_M
+    cells = [round(number * factor) for number in config.grid.cells]
+    return replace(config.grid.build(), cells=tuple(cells))
+
+
+def model_settings(config: Config, point: Point) -> Any:
+    """The model's settings at a point. Fresh weights call no cell occupied: as many as traffic fills are kept."""
+    settings = copy.deepcopy(config.model)
+    if settings.name == OURS and settings.kggi is not None:
+        for kind in ("radar", "camera", "random"):
+            key = f"num_{kind}_keypoints"
+            setattr(settings.kggi, key, max(1, round(point.gaussians * getattr(settings.kggi, key))))
+    frames = point.memory_frames
+    part = "dptf" if settings.name == OURS else "temporal"
+    if frames == 0:
+        setattr(settings, part, None)
+    temporal = getattr(settings, part)
+    if temporal is None:
+        return settings
+    paths = [temporal] if settings.name == DENSE else [temporal.bev_path, temporal.gaussian_path]
+    for path in paths:
+        if path is not None and frames is not None:
+            path.num_frames = (
+                min(frames, path.num_frames) if path is getattr(temporal, "gaussian_path", None) else frames
+            )
+    if settings.name == OURS and temporal.bev_path is not None:
+        objects = max(1, round(point.road.num_vehicles * point.road.reach_m / NOMINAL_M))
+        temporal.bev_path.memory_threshold = 0.0
+        temporal.bev_path.max_cells_per_frame = objects * SIZES[config.scale].cells_per_object
+    return settings
+
+
+def number_of_gaussians(config: Config, point: Point) -> int:
+    """Of the current frame, for a model that has some."""
+    kggi = getattr(model_settings(config, point), "kggi", None)
+    return sum(kggi.counts.values()) if kggi is not None else 0
+
+
+def cache_images(case: Case) -> None:
+    """Give the model the features of its images without encoding them again."""
+    encoder = getattr(case.prepared, "image_encoder", None)
+    if encoder is not None:
+        with torch.no_grad(), case.precision():
+            features = encoder(case.batch.images)
+        encoder.forward = lambda images: features
+
+
+def aged(memory: Any, settings: Any) -> Any:
+    """The memory of one frame as a full one: the same cells seen from further and further behind."""
+    (frame,) = memory.frames
+    frames = []
+    for age in range(settings.memory_frames):
+        pose = frame.global_from_ego.clone()
+        pose[:, 0, 3] -= EGO_STEP_M * (age + 1)
+        own = {"global_from_ego": pose, "timestamps_s": frame.timestamps_s - KEY_FRAME_S * age}
+        frames.append(replace(_copied(frame), **own))
+    if settings.name == OURS:
+        for name, path in (("cells", settings.dptf.bev_path), ("gaussians", settings.dptf.gaussian_path)):
+            kept = path.num_frames if path is not None else 0
+            frames = [replace(old, **{name: None}) if age >= kept else old for age, old in enumerate(frames)]
+    return type(memory)(tuple(frames))
+
+
+def _copied(value: Any) -> Any:
+    """Memory of its own for every tensor in nested dataclasses."""
+    if isinstance(value, torch.Tensor):
+        return value.clone()
+    if dataclasses.is_dataclass(value):
+        return replace(value, **{f.name: _copied(getattr(value, f.name)) for f in dataclasses.fields(value)})
+    return value
+
+
+def growth_rows(measured: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """How much time and memory grow over each sweep; over ranges from the nominal one."""
+    rows = []
+    for name, points in measured.items():
+        row: dict[str, Any] = {"sweep": name}
+        for model in (OURS, DENSE):
+            own = [point for point in points if point["model"] == model]
+            first = next((point for point in own if point[name] == NOMINAL_M), own[0]) if "range" in name else own[0]
+            row |= {"from": first[name], "to": own[-1][name]}
+            row[f"{model} time x"] = own[-1]["ms"] / first["ms"]
+            if first["added MiB"] is not None:
+                row[f"{model} memory x"] = held_mib(own[-1]) / max(held_mib(first), 1e-9)
+        for place in ("from", "to"):
+            ours, dense = (point for point in points if point[name] == row[place])  # as they were measured
+            row[f"dense / ours at {place}"] = dense["ms"] / ours["ms"]
+            row[f"GFLOP dense / ours at {place}"] = dense["GFLOP"] / ours["GFLOP"]
+        rows.append(row)
+    return rows
+
+
+def held_mib(point: dict[str, Any]) -> float:
+    """What a frame adds and what is remembered."""
+    return (point["added MiB"] or 0.0) + point["remembered MiB"]

@@ -1,0 +1,273 @@
+"""The figures of sweeps and runs: which numbers go into which chart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from markupsafe import Markup
+
+from src.dashboard.board import Board, Run, Sweep
+from src.dashboard.charts import Bars, Series, category_chart, line_chart, nice_ticks
+from src.report.metric_names import RANGES, SPEEDS, Metric, find_metric
+from src.report.results import RunResult
+from src.report.score_tables import mean_and_spread
+from src.report.sweep_file import PlotConfig
+from src.report.sweep_table import PAPER, format_here, format_paper, rounded
+from src.structures.taxonomy import CLASSES
+
+CURVES = (
+    ("val/mAP", "mAP while training", "mAP, %", 100.0),
+    ("val/NDS", "NDS while training", "NDS, %", 100.0),
+    ("loss/total", "Training loss", "loss", 1.0),
+    ("step/total", "Training loss by step", "loss", 1.0),
+)
+LATENCY, ACCURACY = "latency.total", "NDS"
+
+
+def sweep_figures(board: Board, sweep: Sweep) -> dict[str, list[Markup]]:
+    """The figures of a sweep by section, sections in order; empty ones are left out."""
+    results, plots = results_by_row(board, sweep), sweep.record.sweep.plots
+    curves = {label: board_curves(board, runs) for label, runs in _runs_by_row(board, sweep).items()}
+    sections = {
+        "Metric against knob": [figure for plot in plots for figure in knob_figures(sweep, plot, results)],
+        "Search": search_figures(sweep),
+        "Latency against accuracy": latency_figures(sweep, results),
+        "By distance, speed and class": distance_figures(results) + class_figures(results),
+        "Learning curves": curve_figures(curves),
+    }  # fmt: skip
+    return {title: figures for title, figures in sections.items() if figures}
+
+
+def knob_figures(sweep: Sweep, plot: PlotConfig, results: dict[str, list[RunResult]]) -> list[Markup]:
+    """A plot's metric as measured here, and the paper's beside it; never on one axis, the data are not the same.
+
+    Both vertical axes have the same length, so that steps compare. Bars where the rows have no place on an axis.
+    """
+    metric = find_metric(plot.metric, sweep.key)
+    rows = sweep.record.sweep.rows
+    here = {row.label: _mean_and_spread(results.get(row.label, ()), metric) for row in rows}
+    paper = {row.label: row.paper.get(metric.name) for row in rows}
+    spread = any(value is not None and value[1] > 0 for value in here.values())
+    titles = (
+        f"{metric.title} here, scale {sweep.record.scale}{', ± deviation over seeds' if spread else ''}",
+        f"{metric.title} in the paper, TruckScenes",
+    )
+    known_paper = any(value is not None for value in paper.values())
+    if any(row.x is None for row in rows):
+        labels = [row.label for row in rows]
+        bars = [Bars(label="", values=[here[row] and here[row][0] for row in labels],
+                     spread=[here[row] and here[row][1] for row in labels])]  # fmt: skip
+        figures = [category_chart(titles[0], labels, bars, metric.heading, metric.digits)]
+        if known_paper:
+            shown = [Bars(label="", values=[paper[row] for row in labels], style=1)]
+            figures.append(category_chart(titles[1], labels, shown, metric.heading, metric.digits))
+        return figures
+    ordered = sorted(rows, key=lambda row: row.x)
+    measured = [row for row in ordered if here[row.label] is not None]
+    stated = [row for row in ordered if paper[row.label] is not None]
+    values = [here[row.label][0] + sign * here[row.label][1] for row in measured for sign in (-1, 1)]
+    span = max(_span(values), _span([paper[row.label] for row in stated]))
+    ticks = list({row.x: f"{row.x:g}" for row in ordered}.items())
+    ours = Series(
+        label="",
+        points=[(row.x, here[row.label][0]) for row in measured],
+        spread=[here[row.label][1] for row in measured],
+        notes=[_note(row.label, here[row.label], metric) for row in measured],
+    )
+    theirs = Series(
+        label="",
+        points=[(row.x, paper[row.label]) for row in stated],
+        notes=[f"{row.label}: {paper[row.label]:.{metric.digits}f}" for row in stated],
+        style=1,
+    )
+    chosen = ((titles[0], ours), (titles[1], theirs)) if known_paper else ((titles[0], ours),)
+    return [line_chart(t, [one], plot.label, metric.heading, x_ticks=ticks, y_span=span or None) for t, one in chosen]
+
+
+def search_figures(sweep: Sweep) -> list[Markup]:
+    """Of a search: its objective trial by trial with the best so far, and against every number it chose."""
+    search = sweep.record.sweep
+    tried = [run for run in sweep.record.runs.values() if run.value is not None] if search.is_search else []
+    if not tried:
+        return []
+    metric = find_metric(search.objective, sweep.key)
+    tried.sort(key=lambda run: run.ended or 0.0)
+    values = [run.value * metric.scale for run in tried]
+    best = [(place, max(values[:place])) for place in range(1, len(values) + 1)]
+    by_trial = list(enumerate(values, start=1))
+    trials = Series(label="trial", points=by_trial, notes=[run.label for run in tried], joined=False)
+    so_far = Series(label="best so far", points=best, style=1)
+    ticks = [(mark, f"{mark:g}") for mark in nice_ticks(1, len(tried)) if mark == round(mark)]
+    figures = [line_chart(f"{metric.title} by trial", [trials, so_far], "trial", metric.title, x_ticks=ticks)]
+    for key, dimension in search.space.items():
+        if dimension.choices is None:
+            settings = (dict(part.lstrip("+").split("=", 1) for part in run.overrides if "=" in part) for run in tried)
+            points = [
+                (float(of[key]), value) for of, value in zip(settings, values, strict=True) if _number(of.get(key))
+            ]
+            dots = Series(label="", points=points, joined=False)
+            figures.append(line_chart(f"{metric.title} by {key}", [dots], key, metric.title, log_x=dimension.log))
+    return figures
+
+
+def latency_figures(sweep: Sweep, results: dict[str, list[RunResult]]) -> list[Markup]:
+    """NDS over milliseconds per frame, one point for each row that was timed, where at least two were."""
+    accuracy, latency = find_metric(ACCURACY, sweep.key), find_metric(LATENCY, sweep.key)
+    points = []
+    for style, (label, runs) in enumerate(results.items()):
+        score, time = _mean_and_spread(runs, accuracy), _mean_and_spread(runs, latency)
+        if score is not None and time is not None:
+            note = f"{label}: {time[0]:.1f} ms, {score[0]:.1f} {accuracy.title}"
+            points.append(
+                Series(
+                    label=label,
+                    points=[(time[0], score[0])],
+                    spread=[score[1]],
+                    notes=[note],
+                    style=style,
+                    joined=False,
+                )
+            )
+    if len(points) < 2:
+        return []
+    return [line_chart(f"{ACCURACY} over latency", points, "milliseconds per frame", f"{ACCURACY}, %")]
+
+
+def distance_figures(results: dict[str, list[RunResult]]) -> list[Markup]:
+    """mAP by distance and, where it was scored, by speed: a line for each row."""
+    figures = []
+    for title, parts, name, axis in (
+        ("mAP by distance", RANGES, "ranges.{}.mAP", "distance, m"),
+        ("mAP by speed", SPEEDS, "speeds.{}.mAP_present", "speed of the ground truth, m/s"),
+    ):
+        lines = []
+        for style, (label, runs) in enumerate(results.items()):
+            found = [_mean_and_spread(runs, find_metric(name.format(part), title)) for part in parts]
+            known = [(place, value) for place, value in enumerate(found) if value is not None]
+            notes = [
+                f"{label}, {parts[place]} {axis.rpartition(' ')[2]}: {value[0]:.1f} ± {value[1]:.1f}"
+                for place, value in known
+            ]
+            points = [(float(place), value[0]) for place, value in known]
+            if points:
+                lines.append(Series(label=label, points=points, notes=notes, style=style))
+        if lines:
+            ticks = [(float(place), part) for place, part in enumerate(parts)]
+            figures.append(line_chart(title, lines, axis, "mAP, %", x_ticks=ticks))
+    return figures
+
+
+def class_figures(results: dict[str, list[RunResult]]) -> list[Markup]:
+    """AP by class: bars with numbers for one or two, dots for more."""
+    rows = []
+    for style, (label, runs) in enumerate(results.items()):
+        found = [_mean_and_spread(runs, find_metric(f"classes.{name}.AP", "by class")) for name in CLASSES]
+        if any(value is not None for value in found):
+            rows.append(Bars(label=label, values=[value and value[0] for value in found], style=style))
+    names = [name.replace("_", " ") for name in CLASSES]
+    return [category_chart("AP by class", names, rows, "AP, %", dots=len(rows) > 2)] if rows else []
+
+
+def curve_figures(curves: dict[str, Iterable[dict[str, Sequence[tuple[float, float]]]]]) -> list[Markup]:
+    """Scores and loss over steps: a line for each run, runs of one row alike."""
+    of_row = {label: list(runs) for label, runs in curves.items()}
+    has_epochs = any("loss/total" in run for runs in of_row.values() for run in runs)
+    figures = []
+    for name, title, words, scale in CURVES:
+        if name == "step/total" and has_epochs:
+            continue
+        lines = [
+            Series(label=label, points=[(x, y * scale) for x, y in run[name]], style=style)
+            for style, (label, runs) in enumerate(of_row.items())
+            for run in runs
+            if run.get(name)
+        ]
+        if lines:
+            few = max(len(line.points) for line in lines) <= 12
+            figures.append(line_chart(title, lines, "steps", words, markers=few))
+    return figures
+
+
+def run_figures(board: Board, runs: dict[str, Run]) -> dict[str, list[Markup]]:
+    """The figures of a run, or of runs held against one another, by section."""
+    results = {label: [run.result] for label, run in runs.items() if run.result is not None}
+    sections = {
+        "Learning curves": curve_figures({label: board_curves(board, [run]) for label, run in runs.items()}),
+        "By distance, speed and class": distance_figures(results) + class_figures(results),
+        "Losses": loss_figures(board_curves(board, list(runs.values())[:1])) if len(runs) == 1 else [],
+    }
+    return {title: figures for title, figures in sections.items() if figures}
+
+
+def loss_figures(curves: Iterable[dict[str, Sequence[tuple[float, float]]]]) -> list[Markup]:
+    """Every loss term of one run, as it stands in the total."""
+    figures = []
+    for run in curves:
+        terms = [(name, points) for name, points in run.items() if name.startswith("loss/") and name != "loss/total"]
+        lines = [
+            Series(label=name.removeprefix("loss/").replace("_", " "), points=points, style=style)
+            for style, (name, points) in enumerate(terms)
+        ]
+        if lines:
+            figures.append(line_chart("Loss terms", lines, "steps", "loss", markers=False))
+    return figures
+
+
+def board_curves(board: Board, runs: Iterable[Run]) -> list[dict[str, Sequence[tuple[float, float]]]]:
+    """Learning curves of runs that have any: from the result, or from the folder of one that still trains."""
+    found = (run.result.curves if run.result is not None else board.folders.curves(run.run_id) for run in runs)
+    return [curves for curves in found if curves]
+
+
+def _runs_by_row(board: Board, sweep: Sweep) -> dict[str, list[Run]]:
+    rows = sweep.record.rows
+    return {label: [board.runs[run] for run in seeds.values() if run in board.runs] for label, seeds in rows.items()}
+
+
+def results_by_row(board: Board, sweep: Sweep) -> dict[str, list[RunResult]]:
+    rows = _runs_by_row(board, sweep)
+    return {label: [run.result for run in runs if run.result is not None] for label, runs in rows.items()}
+
+
+def _mean_and_spread(results: Iterable[RunResult], metric: Metric) -> tuple[float, float] | None:
+    """Of the runs that have the number, as tables have it."""
+    found = [value for result in results if (value := result.metrics.get(metric.name)) is not None]
+    return mean_and_spread(found, metric)
+
+
+def headline(sweep: Sweep) -> str:
+    """The best row here by the sweep's first metric, and the paper's; nothing before there are numbers."""
+    table = next(iter(sweep.tables), None)
+    if table is None or not table.columns:
+        return ""
+    metric, rows = table.columns[0], [(row, row.cells[0]) for row in table.rows]
+    best = max if metric.higher_is_better else min
+    here = [(rounded(cell.mean, metric), row, cell) for row, cell in rows if cell.mean is not None]
+    here = [found for found in here if found[1].state == "done"] or here
+    paper = [(cell.paper, row.label) for row, cell in rows if cell.paper is not None and row.state != PAPER]
+    if not here:
+        return ""
+    top = best(value for value, _, _ in here)
+    tied = [(row, cell) for value, row, cell in here if value == top]
+    line = f"Best {metric.title} here: {' and '.join(row.label for row, _ in tied)}, "
+    line += format_here(tied[0][1], metric, tied[0][0].done) if len(tied) == 1 else f"{top:.{metric.digits}f}"
+    if paper:
+        value, label = best(paper)
+        line += f". In the paper: {label}, {format_paper(value, metric)}"
+    return line + "."
+
+
+def _span(values: Sequence[float]) -> float:
+    return max(values) - min(values) if values else 0.0
+
+
+def _note(label: str, value: tuple[float, float], metric: Metric) -> str:
+    return f"{label}: {value[0]:.{metric.digits}f} ± {value[1]:.{metric.digits}f}"
+
+
+def _number(text: str | None) -> bool:
+    try:
+        float(text)
+    except (TypeError, ValueError):
+        return False
+    return True

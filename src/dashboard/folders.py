@@ -1,0 +1,216 @@
+"""What lies in the run folders of paths.outputs: pictures, logs, learning curves so far. Reads, never writes.
+
+Names that come from an address are looked up among what a folder lists, never joined to a path unseen, and a link that
+leads out of its folder is as good as no file.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from src.report.plain_yaml import load_plain_yaml
+from src.report.results import thinned, without_places
+
+TAIL_BYTES = 24_000
+CONFIG_BYTES = 1_000_000
+"""A larger config.yaml is not a run's."""
+ALIVE_S = 300.0
+"""A run folder without a result counts as running as long as something was written in it this recently."""
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_PNG = b"\x89PNG\r\n\x1a\n"
+Curves = dict[str, list[tuple[float, float]]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """A PNG of a run."""
+
+    run_id: str
+    name: str
+    path: Path
+    width: int
+    height: int
+
+    @property
+    def title(self) -> str:
+        """What it shows, by its name: frames carry the beginning of their sample's token."""
+        kind, _, rest = self.path.stem.partition("_")
+        known = {"frame": "Cameras and bird's-eye view", "memory": "Memory", "curves": "Learning curves"}
+        words = known.get(kind, self.path.stem.replace("_", " ").capitalize())
+        return f"{words}, sample {rest.partition('_')[2]}" if kind in ("frame", "memory") and rest else words
+
+    @property
+    def order(self) -> tuple[int, str]:
+        """Frames first, charts (which pages draw themselves) last."""
+        return ("frame", "memory").index(self.kind) if self.kind in ("frame", "memory") else 2, self.name
+
+    @property
+    def kind(self) -> str:
+        """`frame`, `memory`, `curves`, `scores`, ..."""
+        return self.path.stem.partition("_")[0]
+
+
+class RunFolders:
+    """The folders of runs under one outputs folder; everything is empty where there is no such folder."""
+
+    def __init__(self, outputs: Path | None) -> None:
+        self.outputs = outputs.resolve() if outputs is not None and outputs.is_dir() else None
+
+    def names(self) -> list[str]:
+        """Run ids with a folder, without those a restart moved aside."""
+        return [entry.name for entry in self._entries()]
+
+    def find(self, run_id: str) -> Path | None:
+        """The folder of a run that there is."""
+        if self.outputs is None or not _is_run(run_id):
+            return None
+        folder = self.outputs / run_id
+        return folder if (folder / "config.yaml").is_file() and folder.resolve().parent == self.outputs else None
+
+    def pictures(self, run_id: str) -> list[Picture]:
+        """Whole PNG files of a run, frames first; a file still being written is left out."""
+        folder = self.find(run_id)
+        if folder is None or not (folder / "pictures").is_dir():
+            return []
+        found = []
+        for path in (folder / "pictures").glob("*.png"):
+            inside = _NAME.fullmatch(path.name) and path.is_file() and path.resolve().is_relative_to(folder)
+            size = _png_size(path) if inside else None
+            if size is not None:
+                found.append(Picture(run_id=run_id, name=path.name, path=path, width=size[0], height=size[1]))
+        return sorted(found, key=lambda picture: picture.order)
+
+    def picture(self, run_id: str, name: str) -> Picture | None:
+        """One picture by the name its folder lists."""
+        return next((picture for picture in self.pictures(run_id) if picture.name == name), None)
+
+    def log_tail(self, relative: str) -> str | None:
+        """The end of a text file inside outputs; None where it is not inside, or not there."""
+        path = self._inside(relative)
+        if path is None:
+            return None
+        try:
+            with path.open("rb") as file:
+                size = file.seek(0, os.SEEK_END)
+                file.seek(max(0, size - TAIL_BYTES))
+                text = file.read().decode(errors="replace")
+        except OSError:
+            return None
+        if size > TAIL_BYTES:
+            text = f"[the last lines of {size // 1000} kB]\n{text.partition(chr(10))[2]}"
+        for place in (f"{self.outputs}/", f"{Path.cwd()}/"):  # the exported file says nothing of where it was made
+            text = text.replace(place, "")
+        # A progress bar rewrites its line: what stands after the last carriage return is what a terminal shows.
+        return "\n".join(line.rstrip("\r").rpartition("\r")[2] for line in text.split("\n")).strip()
+
+    def curves(self, run_id: str) -> Curves:
+        """Losses and scores so far, from metrics.csv: steps and values, as thinned as those of a result."""
+        path = self._file_of(run_id, "metrics.csv")
+        return read_curves(path) if path is not None else {}
+
+    def config(self, run_id: str) -> dict[str, Any]:
+        """The configuration of a run that has no result yet, without what concerns the machine; empty if unreadable."""
+        path = self._file_of(run_id, "config.yaml")
+        if path is None or path.stat().st_size > CONFIG_BYTES:
+            return {}
+        try:
+            tree = load_plain_yaml(path.read_text())
+        except (OSError, ValueError, yaml.YAMLError):
+            return {}
+        return without_places(tree) if isinstance(tree, dict) else {}
+
+    def written(self, run_id: str, log: str | None = None) -> float | None:
+        """When a run last wrote numbers, a checkpoint or a line of a log; seconds since 1970, None without a trace."""
+        folder = self.find(run_id)
+        names = ("log.txt", "metrics.csv", "checkpoints", "config.yaml")
+        paths = [folder / name for name in names] if folder is not None else []
+        paths += [path] if log and (path := self._inside(log)) else []
+        times = []
+        for path in paths:
+            try:
+                times.append(path.stat().st_mtime)
+            except OSError:
+                continue
+        return max(times, default=None)
+
+    def has_result(self, run_id: str) -> bool:
+        """Whether the run has ended with numbers."""
+        folder = self.find(run_id)
+        return folder is not None and (folder / "metrics.json").is_file() and (folder / "run.json").is_file()
+
+    def _inside(self, relative: str) -> Path | None:
+        """A log file that lies inside outputs, whether or not it is there."""
+        if self.outputs is None:
+            return None
+        path = (self.outputs / relative).resolve()
+        if not path.is_relative_to(self.outputs) or path.suffix not in (".txt", ".log"):
+            return None
+        return path if path.is_file() or not path.exists() else None  # reading a pipe would wait for ever
+
+    def _file_of(self, run_id: str, name: str) -> Path | None:
+        """A file of a run's folder, where it is one and lies in there."""
+        folder = self.find(run_id)
+        path = (folder / name).resolve() if folder is not None else None
+        return path if path is not None and path.is_file() and path.is_relative_to(folder) else None
+
+    def _entries(self) -> Iterator[os.DirEntry]:
+        if self.outputs is None:
+            return
+        with os.scandir(self.outputs) as entries:
+            for entry in sorted(entries, key=lambda entry: entry.name):
+                if _is_run(entry.name) and os.path.isfile(os.path.join(entry.path, "config.yaml")):
+                    yield entry
+
+
+def read_curves(path: Path) -> Curves:
+    """Columns loss/*, step/total and val/* of a metrics.csv by step; blanks and what is not a number are left out."""
+    curves: Curves = {}
+    try:
+        with path.open(newline="") as file:
+            for row in csv.DictReader(file):
+                try:
+                    step = float(row.get("step") or "nan")
+                except ValueError:
+                    continue
+                for name, text in row.items():
+                    if not name or not text or not (name.startswith(("loss/", "val/")) or name == "step/total"):
+                        continue
+                    try:
+                        value = float(text)
+                    except (TypeError, ValueError):
+                        continue
+                    if math.isfinite(step) and math.isfinite(value):
+                        curves.setdefault(name, []).append((step, value))
+    except (OSError, csv.Error, UnicodeDecodeError):
+        return {}
+    return {name: thinned(points) for name, points in curves.items()}
+
+
+def _is_run(name: str) -> bool:
+    """Run ids are `<model>-<phase>-<scale>-<8 hex>`; a restart renames the old folder to `<run_id>.before-<time>`."""
+    return bool(_NAME.fullmatch(name)) and name.count("-") >= 3 and ".before-" not in name
+
+
+def _png_size(path: Path) -> tuple[int, int] | None:
+    """Width and height of a whole PNG, read from its first and last bytes; None for anything else."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(24)
+            file.seek(-12, os.SEEK_END)
+            end = file.read(12)
+    except OSError:
+        return None
+    if len(head) < 24 or not head.startswith(_PNG) or end[4:8] != b"IEND":
+        return None
+    return struct.unpack(">II", head[16:24])

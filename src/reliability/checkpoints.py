@@ -1,0 +1,310 @@
+"""Checkpoint files: written whole or not at all, proven before they replace another, read with a reason when broken."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import logging
+import os
+import pickle
+import re
+import shutil
+import struct
+import time
+import zipfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import torch
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from torch import nn
+
+from src.errors import CheckpointError
+from src.reliability.untrusted import fault_of_archive
+
+logger = logging.getLogger(__name__)
+
+LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
+"""What a run keeps: the newest, the one before it until the run has finished, and the best by validation."""
+WAIT_S = 240.0
+"""How long a save waits for a disk: less than the other processes of a training wait for this one."""
+RETRY_EVERY_S = 5.0
+PASSING = {errno.ENOSPC, errno.EDQUOT, errno.ENOENT, errno.ESTALE, errno.EIO}
+"""Full, or away, or failing: others make room and mounts come back. A forbidden or read-only folder stays so."""
+
+_MARK = b"horizon3d sha256 "
+_COMMENT_BYTES = len(_MARK) + hashlib.sha256().digest_size * 2
+_COMMENT_LENGTH = struct.pack("<H", _COMMENT_BYTES)
+_END = b"PK\5\6" + bytes(18)
+"""The last record of an archive: its signature first, the length of a comment last."""
+_PIECE_BYTES = 2**20
+_BROKEN = (
+    RuntimeError,
+    EOFError,
+    OSError,
+    LookupError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    struct.error,
+)
+"""How torch fails at a damaged pickle of plain values."""
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes beside the target, syncs, reads back, and only then renames: no crash costs the checkpoint before.
+
+    The file ends with the SHA-256 of itself, as the comment that a zip archive may have, so a copy keeps it. The
+    `last.ckpt` that is replaced stays as `previous.ckpt`, provided that it was whole.
+
+    Lightning's own writer goes through the system's temporary folder, which may be another file system, and there a
+    rename becomes a copy that can stop half-way.
+    """
+
+    def __init__(
+        self, check_folder: Callable[[], None] = lambda: None, hurried: Callable[[], bool] = lambda: False
+    ) -> None:
+        """`check_folder` raises where nothing may be written; while `hurried`, a save does not wait for a disk."""
+        super().__init__()
+        self._check_folder, self._hurried = check_folder, hurried
+        self._proven: set[Path] = set()
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None) -> None:
+        """Write `checkpoint` to `path`, waiting for a disk that is full or away.
+
+        Raises CheckpointError with the path, the reason and the free space when the disk goes on refusing.
+        """
+        target = Path(path)
+        deadline = time.monotonic() + WAIT_S
+        told = False
+        while True:
+            try:
+                return self._write(checkpoint, target)
+            except (OSError, RuntimeError) as error:
+                refusal = _refusal(target, error)
+                passing = isinstance(error, OSError) and error.errno in PASSING
+                if not passing or self._hurried() or time.monotonic() > deadline:
+                    raise CheckpointError(refusal) from error
+            if not told:
+                logger.warning("%s; trying again for %.0f s before the run ends", refusal, WAIT_S)
+                told = True
+            time.sleep(RETRY_EVERY_S)
+
+    def load_checkpoint(self, path: str | Path, *_: Any, **__: Any) -> dict[str, Any]:
+        """As `read_checkpoint`."""
+        content = read_checkpoint(Path(path))
+        self._proven.add(Path(path))
+        return content
+
+    def _write(self, checkpoint: dict[str, Any], target: Path) -> None:
+        self._check_folder()
+        temporary = target.with_name(target.name + ".tmp")
+        try:
+            digest = _write_digested(checkpoint, temporary)
+            _prove(temporary, digest)
+            if target.name == LAST and target in self._proven and target.is_file():
+                _keep(target, target.with_name(PREVIOUS))
+            os.replace(temporary, target)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+        self._proven.add(target)
+        sync_folder(target.parent)
+
+
+class _DigestedFile:
+    """Passes bytes on to a file and digests them as they were meant, whatever the disk makes of them."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.digest = hashlib.sha256()
+        self.refusal: OSError | None = None  # torch makes another error of it
+
+    def write(self, data: memoryview) -> int:
+        """Write all of it."""
+        try:
+            self._file.write(data)
+        except OSError as error:
+            self.refusal = error
+            raise
+        self.digest.update(data)
+        return len(data)
+
+    def flush(self) -> None:
+        """What torch calls at the end."""
+        self._file.flush()
+
+
+def _write_digested(checkpoint: dict[str, Any], path: Path) -> str:
+    """Write a checkpoint and its digest, which is that of the archive without a comment, onto the disk."""
+    with open(path, "wb") as file:
+        digested = _DigestedFile(file)
+        try:
+            torch.save(checkpoint, digested)
+        except (OSError, RuntimeError) as error:
+            raise digested.refusal or error from None
+        digest = digested.digest.hexdigest()
+        file.seek(-2, os.SEEK_END)  # the length of the comment, 0 so far
+        file.write(_COMMENT_LENGTH + _MARK + digest.encode())
+        file.flush()
+        os.fsync(file.fileno())
+    return digest
+
+
+def _prove(path: Path, digest: str) -> None:
+    """Read a file back, from the disk where the system allows it. Raises OSError when it is not what was written."""
+    with open(path, "rb") as file:
+        if hasattr(os, "posix_fadvise"):
+            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        if _digests(file) != (digest, digest):
+            raise OSError(errno.EIO, "it reads back otherwise than it was written", str(path))
+
+
+def _keep(path: Path, kept: Path) -> None:
+    """Give a file a second name in place of an older file; at no moment is there neither."""
+    link = kept.with_name(kept.name + ".tmp")
+    link.unlink(missing_ok=True)
+    try:
+        os.link(path, link)
+    except OSError:  # a file system without hard links
+        os.replace(path, kept)
+        return
+    os.replace(link, kept)
+    link.unlink(missing_ok=True)  # it stays where both names were of one file already
+
+
+def sync_folder(folder: Path) -> None:
+    """Put the names in a folder onto the disk, where its file system can."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _refusal(target: Path, error: Exception) -> str:
+    """Why a checkpoint could not be written, and what the disk has left."""
+    if not target.parent.is_dir():
+        return f"{target} could not be written: its folder is gone (deleted, moved, or its disk is no longer mounted)"
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+    free = shutil.disk_usage(target.parent).free / 2**20
+    return f"{target} could not be written ({reason}); {free:.0f} MiB are free there; the checkpoint before it is kept"
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """Load one of our checkpoints; tensors and plain values only, nothing in the file is executed.
+
+    The digest at the file's end is compared; a file from before there were digests is held to its archive's checksums.
+    Raises CheckpointError when the file is missing, broken, or not written by this project.
+    """
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise CheckpointError(f"checkpoint {path} {what}; runs keep theirs in outputs/<run_id>/checkpoints/last.ckpt")
+    try:
+        with open(path, "rb") as file:  # once: another process may put a newer file in its place
+            _verify(file, path)
+            file.seek(0)
+            content = torch.load(file, map_location="cpu", weights_only=True)
+    except zipfile.BadZipFile as error:
+        raise CheckpointError(f"checkpoint {path} is truncated, or no checkpoint at all ({error})") from error
+    except pickle.UnpicklingError as error:
+        raise CheckpointError(
+            f"checkpoint {path} holds more than tensors and plain values, so it is not of this project; "
+            "nothing in it was executed"
+        ) from error
+    except _BROKEN as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(f"checkpoint {path} is truncated or damaged ({reason})") from error
+    if not _is_ours(content):
+        raise CheckpointError(
+            f"checkpoint {path} is not of this project: it lacks 'state_dict' (tensors by name) or the configuration "
+            "in 'horizon3d'"
+        )
+    return content
+
+
+def _verify(file: BinaryIO, path: Path) -> None:
+    """Raises CheckpointError or BadZipFile unless the file is what was once written; torch loads flipped bits."""
+    digests = _digests(file)
+    if digests is not None and digests[0] != digests[1]:
+        raise CheckpointError(f"checkpoint {path} is damaged: its SHA-256 is not the one it states at its end")
+    fault = fault_of_archive(file)
+    if fault is not None:
+        raise CheckpointError(
+            f"checkpoint {path} holds more than tensors and plain values, so it is not of this project ({fault}); "
+            "nothing in it was executed"
+        )
+    if digests is None:  # of an earlier version, or torn
+        file.seek(-len(_END), os.SEEK_END)
+        end = file.read()
+        if end[:4] != _END[:4] or end[-2:] != _END[-2:]:
+            raise CheckpointError(f"checkpoint {path} is damaged: the digest at its end is torn")
+        with zipfile.ZipFile(file) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise CheckpointError(f"checkpoint {path} is damaged: the checksum of {damaged} in it is wrong")
+
+
+def _digests(file: BinaryIO) -> tuple[str, str] | None:
+    """(the SHA-256 that a file states, the one it has); None where it states none."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - _COMMENT_BYTES))
+    comment = file.read()
+    if not comment.startswith(_MARK):
+        return None
+    digest = hashlib.sha256()
+    file.seek(0)
+    left = size - _COMMENT_BYTES - 2
+    while left > 0 and (piece := file.read(min(left, _PIECE_BYTES))):
+        digest.update(piece)
+        left -= len(piece)
+    length = file.read(2)  # of the comment; it was 0 before there was one
+    digest.update(bytes(2) if length == _COMMENT_LENGTH else length)
+    return comment[len(_MARK) :].decode("ascii", "replace"), digest.hexdigest()
+
+
+def _is_ours(content: object) -> bool:
+    """Whether a file holds what `DetectionModule` and Lightning write: weights by name and the run's configuration."""
+    if not isinstance(content, dict):
+        return False
+    about, state = content.get("horizon3d"), content.get("state_dict")
+    return (
+        isinstance(about, dict)
+        and isinstance(about.get("config"), dict)
+        and isinstance(state, dict)
+        and all(isinstance(key, str) and isinstance(value, torch.Tensor) for key, value in state.items())
+    )
+
+
+def load_model_weights(
+    model: nn.Module, checkpoint: dict[str, Any], path: Path, may_be_new: re.Pattern[str] | None = None
+) -> list[str]:
+    """Put a checkpoint's weights into `model`; keys that match `may_be_new` may be missing and keep their values.
+
+    Returns those keys. Raises CheckpointError naming the keys that are missing, unexpected, of another shape or not
+    finite; never loads a part.
+    """
+    prefix = "model."
+    state = {key[len(prefix) :]: value for key, value in checkpoint["state_dict"].items() if key.startswith(prefix)}
+    wanted = model.state_dict()
+    new = [key for key in wanted if key not in state and may_be_new is not None and may_be_new.match(key)]
+    problems = [f"missing {key}" for key in wanted if key not in state and key not in new]
+    problems += [f"unexpected {key}" for key in state if key not in wanted]
+    problems += [
+        f"{key} is {list(state[key].shape)}, the model has {list(wanted[key].shape)}"
+        for key in wanted
+        if key in state and state[key].shape != wanted[key].shape
+    ]
+    if problems:
+        more = f" and {len(problems) - 6} more" if len(problems) > 6 else ""
+        raise CheckpointError(f"checkpoint {path} is of another model: {'; '.join(problems[:6])}{more}")
+    broken = [key for key, value in state.items() if not torch.isfinite(value).all()]
+    if broken:
+        raise CheckpointError(f"checkpoint {path} holds weights that are not finite, {broken[0]} for one")
+    model.load_state_dict({key: wanted[key] for key in new} | state)
+    return new

@@ -1,0 +1,132 @@
+"""`python -m src.report [scale=...] [phase=...]`: everything finished at one scale, into paths.reports.
+
+Results of the runs under paths.outputs, a page per phase, the tables of every sweep, and the dashboard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from src.config import PHASES, Config, compose_config
+from src.errors import DataError
+from src.pictures.comparison import BarPanel, draw_comparison
+from src.reliability.command import run_command
+from src.report.atomic_write import write_whole
+from src.report.metric_names import RANGES, SPEEDS
+from src.report.pages import PHASES_OF, compared_experiments, comparison_page, phase_page, runs_on_page, seeing
+from src.report.results import RunResult, finished_runs, publish_result, read_results
+from src.report.score_tables import BY_RANGE, BY_SPEED, ERROR_BY_SPEED, Experiment, mean_and_spread
+from src.report.sweep_record import SweepRecord, read_records
+from src.report.table_builder import write_sweep_tables
+from src.training.run_folder import make_writable
+
+
+def main(overrides: list[str]) -> None:
+    """Write all that can be written, show the page of `phase`, and end with what could not be.
+
+    Raises DataError for run folders, results and records that are broken, once the rest is done.
+    """
+    config, _ = compose_config(overrides)
+    outputs, reports = Path(config.paths.outputs), Path(config.paths.reports)
+    make_writable(reports, "paths.reports")
+    faults = publish_all(outputs, reports, config.scale)
+    results, broken = read_results(reports, config.scale)
+    records, broken_records = read_records(reports, config.scale)
+    faults += [*map(str, broken.values()), *map(str, broken_records.values())]
+    pages, of_pages = write_pages(config, results, {run for record in records for run in record.runs})
+    tables, of_tables = write_tables(reports, records, results)
+    faults += of_pages + of_tables
+    if not pages and not records:
+        what = f"{outputs}: no finished run of {config.phase.name} at scale={config.scale}"
+        raise DataError("\n".join([what, *faults]))
+    dashboard = export(reports, outputs)
+    if config.phase.name in pages:
+        text = pages[config.phase.name].read_text()
+        print(text[text.index("\n| ") + 1 :])
+    for path in [*pages.values(), *tables, dashboard]:
+        print(f"written: {path}")
+    if faults:
+        raise DataError("\n".join(["all else is written, but", *faults]))
+
+
+def publish_all(outputs: Path, reports: Path, scale: str) -> list[str]:
+    """Bring the results of all finished runs up to date; returns what is broken."""
+    faults = []
+    for folder in finished_runs(outputs, scale):
+        try:
+            publish_result(folder, reports)
+        except DataError as error:
+            faults.append(str(error))
+    return faults
+
+
+def write_pages(
+    config: Config, results: dict[str, RunResult], in_sweeps: Collection[str]
+) -> tuple[dict[str, Path], list[str]]:
+    """`<phase>_<scale>.md` of every phase that has runs, and what is wrong with the others."""
+    pages, faults = {}, []
+    with_settings = {result.phase for result in results.values() if result.settings} & set(PHASES)
+    defaults = {phase: compose_config([f"scale={config.scale}", f"phase={phase}"])[1] for phase in with_settings}
+    for phase in PHASES:
+        runs = runs_on_page(results.values(), phase, in_sweeps, defaults)
+        if runs:
+            try:
+                pages[phase] = write_page(Path(config.paths.reports), phase, config.scale, runs)
+            except ValueError as error:
+                kept = f"{config.paths.reports}/results"
+                faults.append(f"{kept}: {error}; keep results on different data in different paths.reports")
+    return pages, faults
+
+
+def write_page(reports: Path, phase: str, scale: str, runs: list[RunResult]) -> Path:
+    """One phase's page; phase 2's holds its runs against phase 1's, and has a picture."""
+    if phase in PHASES_OF:
+        experiments = compared_experiments(runs)
+        picture = f"pictures/{phase}_{scale}.png"
+        draw_comparison(reports / picture, bar_panels(seeing(experiments)), f"{phase}, scale {scale}")
+        text = comparison_page(experiments, scale, picture)
+    else:
+        text = phase_page(runs, scale)
+    path = reports / f"{phase}_{scale}.md"
+    write_whole(path, text)
+    return path
+
+
+def write_tables(
+    reports: Path, records: list[SweepRecord], results: dict[str, RunResult]
+) -> tuple[list[Path], list[str]]:
+    """The tables of every sweep, and what is wrong with the others."""
+    written, faults = [], []
+    for record in records:
+        try:
+            written += write_sweep_tables(reports, record, results)
+        except DataError as error:
+            faults.append(str(error))
+    return written, faults
+
+
+def export(reports: Path, outputs: Path) -> Path:
+    """The dashboard as one file."""
+    from src.dashboard.single_file import export_dashboard  # its templates are not needed before
+
+    path = reports / "dashboard.html"
+    export_dashboard(reports, outputs, path)
+    return path
+
+
+def bar_panels(experiments: list[Experiment]) -> list[BarPanel]:
+    """mAP by distance and by speed, and the velocity error by speed."""
+    panels = []
+    for title, columns, names, unit in (
+        ("mAP by distance, %", BY_RANGE, RANGES, "m"),
+        ("mAP by speed, %, over the classes that occur there", BY_SPEED, SPEEDS, "m/s"),
+        ("mAVE by speed, m/s, over the classes that occur there (less is better)", ERROR_BY_SPEED, SPEEDS, "m/s"),
+    ):
+        bars = {e.label: [mean_and_spread(e.values(c.name), c) for c in columns] for e in experiments}
+        panels.append(BarPanel(title, [f"{name} {unit}" for name in names], bars, columns[0].digits))
+    return panels
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,215 @@
+"""The pages under reports/: which runs belong on one, what experiments are called, and the text around the tables."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import replace
+from typing import Any
+
+import yaml
+
+from src.report.escaping import as_code
+from src.report.metric_names import SPEEDS
+from src.report.plain_yaml import load_plain_yaml
+from src.report.results import RunResult
+from src.report.score_tables import (
+    BY_RANGE,
+    BY_SPEED,
+    CAR_BY_SPEED,
+    CAR_ERROR_BY_SPEED,
+    ERROR_BY_SPEED,
+    SUMMARY,
+    SUMMARY_WITH_VELOCITY,
+    Experiment,
+    class_table,
+    cost_table,
+    gain_table,
+    group_runs,
+    score_table,
+)
+from src.training.identity import key_of
+
+PHASES_OF = {"phase2": ("phase1", "phase2")}
+"""Whose runs a phase's page reads; other phases' pages read their own."""
+
+GOES_ON = "phase.init_from="
+CONTINUED = "phase 1, as many further epochs"
+
+NAMES = {
+    ("phase1",): "KGGI + OCSF",
+    ("phase1", "model.kggi.initialization=random"): "OCSF, random Gaussians",
+    ("phase1", "model.kggi.initialization=keypoint"): "KGGI + OCSF, keypoints only",
+    ("phase1", "model.kggi=null", "model.ocsf=null"): "radar only",
+}
+NAMES_OF_COMPARISON = {
+    ("phase1",): "phase 1",
+    ("phase2",): "phase 2",
+    (
+        "phase2",
+        "model.dptf.bev_path.velocity_compensation=false",
+        "model.dptf.gaussian_path.velocity_compensation=false",
+    ): "phase 2, no velocity compensation",
+}
+"""By phase and sorted settings, in the order of the page; phase 1 that went on stands after phase 1."""
+
+SILENT = "data.silent_frames="
+
+METRIC = "official TruckScenes metric on the validation split; percent, mean ± standard deviation over seeds."
+
+BY_SPEED_TEXT = """By speed of the ground truth (a match follows its ground truth whatever speed it states, a false
+positive the speed it states). Means over the classes that occur at that speed; the velocity error (m/s, at 2 m) of a
+class that does not reach a recall of 0.1 counts as 1, the official rule, so read it beside the AP. Some classes have
+few boxes at a speed; the car's numbers stand on the most."""
+
+SILENT_TEXT = """From the share `data.silent_frames` of the frames, never a clip's first, all sensor data are taken
+away, in training and in validation: what is found there comes from the memory alone. These rows compare with one
+another only."""
+
+GAIN_TEXT = """Differences between runs of the same seed, mean ± standard deviation: points of percent, and m/s for the
+velocity error, where less is better."""
+
+
+def runs_on_page(
+    results: Iterable[RunResult], phase: str, in_sweeps: Collection[str], defaults: dict[str, dict[str, Any]]
+) -> list[RunResult]:
+    """Those of `results` that the page of `phase` shows; none when there is none of the phase itself.
+
+    Phase 1 that went on from phase 1 is what phase 2 is held against, so it stands on that page and not on its own;
+    there, phase 1 stands as it is, without its ablations. Runs of sweeps (their ids are `in_sweeps`) have tables of
+    their own: of them only experiments that have a name here are shown. `defaults` are the configurations of runs
+    without settings, by phase.
+    """
+    names = NAMES_OF_COMPARISON if phase in PHASES_OF else NAMES
+    shown = []
+    for result in results:
+        run = replace(result, overrides=without_defaults(result.overrides, defaults.get(result.phase, {})))
+        if phase in PHASES_OF:
+            belongs = run.phase == phase or (run.phase in PHASES_OF[phase] and (not run.settings or _goes_on(run)))
+        else:
+            belongs = run.phase == phase and not _goes_on(run)
+        known = (run.phase, *_seeing_settings(run)) in names or _goes_on(run)
+        if belongs and (known or run.run_id not in in_sweeps):
+            shown.append(run)
+    return shown if any(run.phase == phase for run in shown) else []
+
+
+def without_defaults(overrides: list[str], defaults: dict[str, Any]) -> list[str]:
+    """The last override of each key, less those that say what `defaults` say.
+
+    A sweep spells out the value of its baseline, which is then the same run as one without settings.
+    """
+    last = {key_of(override): override for override in overrides}
+    other = {key: override for key, override in last.items() if not _is_default(key, override, defaults)}
+    parts = tuple(f"{key}." for key in other)  # inside one, another choice has other defaults
+    return [override for key, override in last.items() if key in other or key.startswith(parts)]
+
+
+def _is_default(key: str, override: str, defaults: dict[str, Any]) -> bool:
+    value: Any = defaults
+    for name in key.split("."):
+        if not isinstance(value, dict) or name not in value:
+            return False
+        value = value[name]
+    try:
+        said = load_plain_yaml(override.partition("=")[2])
+    except yaml.YAMLError:
+        return False
+    if isinstance(value, dict):  # a part is chosen by its name
+        return said is not None and said == value.get("name")
+    return said == value and isinstance(said, bool) == isinstance(value, bool)  # to Python, 1 is true
+
+
+def phase_page(runs: list[RunResult], scale: str) -> str:
+    """The runs of one phase: summary, AP by class, cost. Raises ValueError when they are of different data."""
+    experiments = group_runs(runs, lambda run: NAMES.get((run.phase, *run.settings)))
+    tables = [score_table(experiments, SUMMARY), class_table(experiments), cost_table(experiments)]
+    epochs = ", ".join(map(str, sorted({run.epochs for run in runs})))
+    return _page(runs[0].phase, scale, f"{epochs} epochs", runs) + "\n\n".join(tables) + "\n"
+
+
+def compared_experiments(runs: list[RunResult]) -> list[Experiment]:
+    """The experiments of phase 2's page, in its order. Raises ValueError when the runs are of different data."""
+    epochs = {run.epochs for run in runs if (run.phase, *run.settings) == ("phase2",)}
+
+    def name(run: RunResult) -> str | None:
+        free = ("phase.epochs=", "phase.velocity_code_weight=")
+        if f"{GOES_ON}phase1" in run.settings and all(s.startswith((GOES_ON, *free)) for s in run.settings):
+            return CONTINUED if {run.epochs} == epochs else f"phase 1, {run.epochs} further epochs"
+        silent = [setting for setting in run.settings if setting.startswith(SILENT)]
+        known = NAMES_OF_COMPARISON.get((run.phase, *_seeing_settings(run)))
+        if known and silent:
+            return f"{known}, {as_code(silent)}"
+        return known or f"{run.phase.replace('phase', 'phase ')}, {as_code(run.settings)}"
+
+    def place(experiment: Experiment) -> float:
+        known, key = list(NAMES_OF_COMPARISON), tuple(part for part in experiment.key if not part.startswith(SILENT))
+        if key in known:
+            return known.index(key)
+        return 0.5 if experiment.key[0] == "phase1" else len(known)
+
+    return sorted(group_runs(runs, name), key=place)
+
+
+def comparison_page(experiments: list[Experiment], scale: str, picture: str) -> str:
+    """Phase 2 against phase 1 and against its own parts: scores, by speed, by class, cost, and gains seed by seed.
+
+    `experiments` are `compared_experiments`; `picture` is the address of their bars, seen from the page.
+    """
+    runs = [run for experiment in experiments for run in experiment.runs]
+    seen = seeing(experiments)
+    experiments, silent = seen, [experiment for experiment in experiments if experiment not in seen]
+    text = _page("phase2", scale, "a row of phase 2, and one of further epochs, starts from its seed's phase 1", runs)
+    text += f"![Scores by distance and by speed]({picture})\n\n{score_table(experiments, SUMMARY_WITH_VELOCITY)}\n\n"
+    by_speed, errors = BY_SPEED + CAR_BY_SPEED, ERROR_BY_SPEED + CAR_ERROR_BY_SPEED
+    text += f"## By speed\n\n{BY_SPEED_TEXT}{_boxes_by_speed(runs)}\n\n{score_table(experiments, by_speed)}\n\n"
+    text += f"{score_table(experiments, errors)}\n\n## AP by class\n\n{class_table(experiments)}\n\n"
+    text += (
+        f"## Cost\n\nOf the phase itself, without the one it starts from.\n\n{cost_table(experiments, epochs=True)}\n"
+    )
+    subject = next((experiment for experiment in experiments if experiment.key == ("phase2",)), None)
+    others = [experiment for experiment in experiments if experiment is not subject]
+    parts = (SUMMARY_WITH_VELOCITY[:4], BY_RANGE, by_speed, errors)
+    if subject is not None and others:
+        gains = "\n\n".join(gain_table(subject, others, columns) for columns in parts)
+        text += f"\n## Gain of phase 2\n\n{GAIN_TEXT}\n\n{gains}\n"
+    if silent:
+        scores = [score_table(silent, columns) for columns in (SUMMARY_WITH_VELOCITY, by_speed, errors)]
+        gains = [gain_table(silent[0], silent[1:], columns) for columns in parts if silent[1:]]
+        text += f"\n## With silent frames\n\n{SILENT_TEXT}\n\n" + "\n\n".join([*scores, *gains]) + "\n"
+    return text
+
+
+def seeing(experiments: list[Experiment]) -> list[Experiment]:
+    """Those whose every frame has its sensors."""
+    return [experiment for experiment in experiments if not any(part.startswith(SILENT) for part in experiment.key)]
+
+
+def _boxes_by_speed(runs: list[RunResult]) -> str:
+    """How much ground truth the speed classes have, from any run that was scored by them."""
+    for run in runs:
+        counts = [tuple(run.metrics.get(f"speeds.{n}.{key}") for key in ("boxes", "car.boxes")) for n in SPEEDS]
+        if (None, None) not in counts:
+            listed = (f"{n} m/s {boxes} (cars {cars})" for n, (boxes, cars) in zip(SPEEDS, counts, strict=True))
+            return f" Ground truth: {', '.join(listed)}."
+    return ""
+
+
+def _seeing_settings(run: RunResult) -> tuple[str, ...]:
+    return tuple(setting for setting in run.settings if not setting.startswith(SILENT))
+
+
+def _goes_on(run: RunResult) -> bool:
+    return any(setting.startswith(GOES_ON) for setting in run.settings)
+
+
+def _page(phase: str, scale: str, epochs: str, runs: list[RunResult]) -> str:
+    """Title, conventions and the commands of the runs."""
+    text = (
+        f"# {phase}, scale {scale}\n\n"
+        f"Data: {runs[0].dataset}; {epochs}; {METRIC} Written by "
+        f"`python -m src.report phase={phase} scale={scale}` from the runs\n\n```\n"
+    )
+    for run in sorted(runs, key=lambda run: (run.phase, run.settings, run.seed)):
+        changes = " ".join([*run.settings, f"seed={run.seed}"])
+        text += f"python -m src.train phase={run.phase} scale={scale} {changes}\n"
+    return f"{text}```\n\n"

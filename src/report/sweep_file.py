@@ -1,0 +1,162 @@
+"""What a file of sweeps/ may say: one question, its rows or its search space, the paper's numbers, and the tables.
+
+The dataclasses are the schema that src/sweep/compose.py checks each file against; nothing here knows Hydra.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from src.errors import ConfigError
+from src.report.metric_names import find_metric
+from src.training.identity import key_of
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+"""Of sweeps and tables: they are file names, parts of addresses and names of studies."""
+
+
+@dataclass(kw_only=True)
+class RowConfig:
+    """One row of the question: a change of configuration, trained and scored."""
+
+    label: str
+    overrides: list[str] = field(default_factory=list)  # as after `python -m src.train`
+    paper: dict[str, float] = field(default_factory=dict)  # the paper's numbers by metric, in the paper's units
+    x: float | None = None  # place on the plot's horizontal axis
+    baseline: str | None = None  # label of the row this one is compared with, where it is not the file's
+    scales: list[str] | None = None  # trained at these scales only, elsewhere the paper's numbers stand alone
+
+
+@dataclass(kw_only=True)
+class TableConfig:
+    """One table over the rows: a choice of columns, and of rows where not all have something to say."""
+
+    name: str  # file name under reports/tables, without scale
+    title: str
+    columns: list[str]  # names of src/report/metric_names.py
+    rows: list[str] | None = None  # labels, the paper's own rows included; null: all
+
+
+@dataclass(kw_only=True)
+class PlotConfig:
+    """One figure over the rows that have an `x`, or bars by label when they have none."""
+
+    metric: str
+    label: str  # of the horizontal axis
+
+
+@dataclass(kw_only=True)
+class PaperRowConfig:
+    """A row that only the paper has: another method, printed beside ours and never trained."""
+
+    label: str
+    paper: dict[str, float]
+
+
+@dataclass(kw_only=True)
+class DimensionConfig:
+    """What a search may try for one key: a range or a list of choices."""
+
+    low: float | None = None
+    high: float | None = None
+    log: bool = False
+    choices: list[Any] | None = None
+
+    def check(self, where: str) -> None:
+        """Raises ConfigError for neither or both, and for an empty or reversed range."""
+        ranged = self.low is not None and self.high is not None
+        if ranged == (self.choices is not None):
+            raise ConfigError(f"{where}: give either low and high or choices")
+        if ranged and not self.low < self.high:
+            raise ConfigError(f"{where}: low must be below high, but got {self.low} and {self.high}")
+        if ranged and self.log and self.low <= 0:
+            raise ConfigError(f"{where}: a logarithmic range starts above 0, but got {self.low}")
+        if self.choices is not None and len(self.choices) < 2:
+            raise ConfigError(f"{where}: choices must be at least two, but got {self.choices}")
+
+
+@dataclass(kw_only=True)
+class SweepConfig:
+    """One question of the paper, or of ours."""
+
+    title: str
+    question: str  # what the rows tell, one sentence
+    name: str = ""  # the file's; filled in when it is read
+    source: str | None = None  # the paper's table(s), as in `Table 12`
+    overrides: list[str] = field(default_factory=list)  # of every row
+    baseline: str | None = None  # label of the row that differences are taken to
+    latency: bool = False  # measure the latency of every finished row, one after the other
+    tables: list[TableConfig] = field(default_factory=list)
+    plots: list[PlotConfig] = field(default_factory=list)
+    rows: list[RowConfig] = field(default_factory=list)
+    paper_rows: list[PaperRowConfig] = field(default_factory=list)
+    space: dict[str, DimensionConfig] = field(default_factory=dict)  # a search instead of rows
+    objective: str = "NDS"  # of a search, larger is better
+    trials: int = 0  # of a search
+
+    def __post_init__(self) -> None:
+        where = f"sweeps/{self.name or '?'}.yaml"
+        if bool(self.rows) == bool(self.space):
+            raise ConfigError(f"{where}: give either rows or space, and at least one entry")
+        for name in (self.name, *(table.name for table in self.tables)):
+            if not NAME.fullmatch(name):
+                raise ConfigError(
+                    f"{where}: the name {name!r} must be of letters, digits, _ and -, and begin with a letter or digit"
+                )
+        given = [*self.overrides, *(override for row in self.rows for override in row.overrides), *self.space]
+        if any(key_of(override) == "seed" for override in given):
+            raise ConfigError(f"{where}: seed=... is no part of a sweep; seed= and seeds= of its command say them")
+        labels = [row.label for row in self.rows] + [row.label for row in self.paper_rows]
+        twice = sorted({label for label in labels if labels.count(label) > 1})
+        if not all(label.strip() for label in labels):
+            raise ConfigError(f"{where}: a label is empty; each row needs its own")
+        if twice:
+            raise ConfigError(f"{where}: label {', '.join(twice)} stands more than once; each row needs its own")
+        own = [row.label for row in self.rows]
+        for baseline in (self.baseline, *(row.baseline for row in self.rows)):
+            if baseline is not None and baseline not in own:
+                raise ConfigError(f"{where}: baseline {baseline!r} is not the label of a row ({', '.join(own)})")
+            if any(row.label == baseline and row.scales is not None for row in self.rows):
+                raise ConfigError(f"{where}: baseline {baseline!r} must be for every scale; leave its scales out")
+        for row in [*self.rows, *self.paper_rows]:
+            for metric, value in row.paper.items():
+                find_metric(metric, f"{where}, row {row.label!r}, paper")
+                if not math.isfinite(value):
+                    raise ConfigError(f"{where}, row {row.label!r}: {metric}={value} is not a finite number")
+        names = [table.name for table in self.tables]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"{where}: two tables have one name ({', '.join(names)})")
+        for table in self.tables:
+            for column in table.columns:
+                find_metric(column, f"{where}, table {table.name}, columns")
+            strange = [label for label in table.rows or () if label not in labels]
+            if strange:
+                raise ConfigError(f"{where}, table {table.name}: there is no row {', '.join(strange)}")
+            if not table.columns:
+                raise ConfigError(f"{where}, table {table.name}: columns is empty; name at least one metric")
+        for plot in self.plots:
+            find_metric(plot.metric, f"{where}, plots")
+        for key, dimension in self.space.items():
+            dimension.check(f"{where}, space, {key}")
+        if self.space:
+            find_metric(self.objective, f"{where}, objective")
+            if self.trials < 1:
+                raise ConfigError(f"{where}: trials must be at least 1, but got {self.trials}")
+
+    @property
+    def is_search(self) -> bool:
+        """Whether a sampler chooses what to train."""
+        return bool(self.space)
+
+    def baseline_of(self, label: str) -> str | None:
+        """Label of the row that this one's differences are taken to."""
+        return next((row.baseline for row in self.rows if row.label == label and row.baseline), self.baseline)
+
+    def at_scale(self, scale: str) -> SweepConfig:
+        """The same question at one scale: a row that is not for it becomes one that only the paper has."""
+        rows = [row for row in self.rows if row.scales is None or scale in row.scales]
+        others = [PaperRowConfig(label=row.label, paper=row.paper) for row in self.rows if row not in rows]
+        return replace(self, rows=rows, paper_rows=others + self.paper_rows)

@@ -1,0 +1,259 @@
+"""A sweep's tables from its record and its results: which numbers stand in which row, and what each row lacks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from src.errors import DataError
+from src.report.atomic_write import write_whole
+from src.report.metric_names import METRICS, Metric
+from src.report.orderings import paired_gains
+from src.report.results import RunResult, read_result, result_path
+from src.report.sweep_file import TableConfig
+from src.report.sweep_record import RunState, SweepRecord
+from src.report.sweep_table import PAPER, Cell, SweepRow, SweepTable, rounded
+from src.report.sweep_text import describe_differences, describe_latency, describe_runs, describe_search, findings
+from src.training.identity import key_of, without_keys
+
+EARLIER = "; the number is of an earlier training"
+"""Of a run that has a result, though it is to be trained, trains, or failed."""
+
+
+def sweep_tables(record: SweepRecord, results: dict[str, RunResult]) -> list[SweepTable]:
+    """The tables of one sweep at one scale, from the results of its runs by run id; other results do not matter.
+
+    Raises DataError naming the runs when they are of different scales or data, are not of the seed that they stand
+    for, or differ in more than their seed within a row.
+    """
+    used = {run_id: results[run_id] for run_id in _run_ids(record) if run_id in results}
+    check_same_data(record, used)
+    check_rows(record, used)
+    return [_search_table(record, used, table) if record.sweep.is_search else _row_table(record, used, table)
+            for table in _table_configs(record)]  # fmt: skip
+
+
+def write_sweep_tables(reports: Path, record: SweepRecord, results: dict[str, RunResult] | None = None) -> list[Path]:
+    """Write `tables/<table>_<scale><suffix of the record>.{md,csv,tex}` under `reports`; returns their paths.
+
+    Results that are not given are read; one that cannot be read is a missing one, and the table says so. Raises as
+    `sweep_tables`, and OSError naming the file for a disk that does not take it.
+    """
+    if results is None:
+        results = {}
+        for run_id in _run_ids(record):
+            try:
+                results[run_id] = read_result(result_path(reports, run_id))
+            except DataError:  # the row's state names the file
+                continue
+    written = []
+    for table in sweep_tables(record, results):
+        stem = reports / "tables" / f"{table.name}_{table.scale}{record.suffix}"
+        for ending, text in (("md", table.to_markdown()), ("csv", table.to_csv()), ("tex", table.to_latex())):
+            path = stem.with_name(f"{stem.name}.{ending}")
+            write_whole(path, text)
+            written.append(path)
+    return written
+
+
+def check_same_data(record: SweepRecord, results: dict[str, RunResult]) -> None:
+    """Raises DataError naming the runs when results of one sweep are of different scales or data."""
+    groups: dict[str, list[str]] = {}
+    for run_id, result in results.items():
+        data = ", ".join(f"{key} {value}" for key, value in sorted(result.data.items()))
+        groups.setdefault(f"scale {result.scale}, {data}", []).append(run_id)
+    strange = [run_id for run_id, result in results.items() if result.scale != record.scale]
+    if len(groups) > 1 or strange:
+        found = "; ".join(f"{' '.join(runs)} ({what})" for what, runs in groups.items())
+        raise DataError(
+            f"sweep {record.name}, scale {record.scale}: a table never mixes scales or data, but its runs are {found}; "
+            "delete those of one kind under results/ in the reports folder and train them on the same data"
+        )
+
+
+def check_rows(record: SweepRecord, results: dict[str, RunResult]) -> None:
+    """Raises DataError naming the runs when one is not of the seed it stands for, or a row's differ in other settings.
+
+    Configurations decide, not how they were typed: what is typed may be the default.
+    """
+    where = f"sweep {record.name}, scale {record.scale}"
+    remedy = "delete the wrong one under results/ in the reports folder and give the sweep's command again"
+    rows = {} if record.sweep.is_search else record.rows
+    planned = {run_id: run.seed for run_id, run in record.runs.items()}
+    planned |= {run_id: seed for runs in rows.values() for seed, run_id in runs.items()}
+    for run_id, result in results.items():
+        if result.seed != planned[run_id]:
+            raise DataError(
+                f"{where}: {run_id} stands for seed {planned[run_id]}, but its result is of seed {result.seed}; "
+                f"{remedy}"
+            )
+    for label, runs in rows.items():
+        first, *others = [results[run_id] for run_id in runs.values() if run_id in results] or [None]
+        for other in others:
+            if _experiment(other) != _experiment(first):
+                raise DataError(
+                    f"{where}, row {label}: a row never mixes configurations, but {first.run_id} and {other.run_id} "
+                    f"differ in more than their seed; {remedy}"
+                )
+
+
+def _experiment(result: RunResult) -> tuple[object, ...]:
+    """What the runs of a row have in common."""
+    config = without_keys(result.config, ["seed"])
+    return result.model, result.phase, config or result.settings
+
+
+def _table_configs(record: SweepRecord) -> list[TableConfig]:
+    columns = [record.sweep.objective] if record.sweep.is_search else ["mAP", "NDS"]
+    return record.sweep.tables or [TableConfig(name=record.name, title=record.sweep.title, columns=columns)]
+
+
+def _run_ids(record: SweepRecord) -> list[str]:
+    """Runs that a table shows, without those that others only start from."""
+    if not record.sweep.is_search:
+        return list(dict.fromkeys(run_id for runs in record.rows.values() for run_id in runs.values()))
+    sources = {run.needs for run in record.runs.values()}
+    return [run_id for run_id in record.runs if run_id not in sources]
+
+
+def _row_table(record: SweepRecord, results: dict[str, RunResult], config: TableConfig) -> SweepTable:
+    columns, sweep = [METRICS[name] for name in config.columns], record.sweep
+    rows: dict[str, SweepRow] = {}
+    for row in sweep.rows:
+        runs = record.rows.get(row.label, {})
+        own = {seed: results.get(run_id) for seed, run_id in runs.items()}
+        cells = [_cell(own, column, row.paper.get(column.name)) for column in columns]
+        done = sum(_is_done(record, run_id, results) for run_id in runs.values())
+        state, note = _state(record, runs, results)
+        baseline = sweep.baseline_of(row.label)
+        rows[row.label] = SweepRow(row.label, cells, state, note, len(runs), done, baseline, dict(runs), x=row.x)
+    for other in sweep.paper_rows:
+        cells = [Cell(paper=other.paper.get(column.name)) for column in columns]
+        rows[other.label] = SweepRow(other.label, cells, PAPER, baseline=sweep.baseline)
+    for row in rows.values():
+        _take_differences(row, rows.get(row.baseline or ""))
+    shown = [rows[label] for label in config.rows] if config.rows is not None else list(rows.values())
+    _mark_best(shown, columns)
+    table = SweepTable(config.name, record.scale, config.title, "", columns, shown, is_search=False)
+    trained = [row for row in shown if row.state != PAPER]
+    complete = all(row.state == "done" for row in trained)
+    table.caption = describe_runs(record, results, complete)
+    table.caption += describe_differences(table.baselines, any(map(table.has_paper, range(len(columns)))))
+    table.caption += describe_latency(columns, shown, results.values())
+    table.text = findings(columns, trained, next(iter(results.values()), None), complete)
+    return table
+
+
+def _search_table(record: SweepRecord, results: dict[str, RunResult], config: TableConfig) -> SweepTable:
+    """Trials by objective, the best first; pruned, failed and open ones below."""
+    columns = [METRICS[name] for name in config.columns]
+    objective = METRICS[record.sweep.objective]
+    scored: list[tuple[SweepRow, float | None]] = []
+    for run_id in _run_ids(record):
+        run, result = record.runs[run_id], results.get(run_id)
+        cells = [_cell({run.seed: result}, column) for column in columns]
+        state, note = _state(record, {run.seed: run_id}, results)
+        if state == "pruned" and run.value is not None:
+            note = f"pruned at {objective.title} {run.value * objective.scale:.{objective.digits}f}"
+            note += EARLIER if result is not None else ""
+        chosen = [override for override in run.overrides if key_of(override) in record.sweep.space]
+        done = int(_is_done(record, run_id, results))
+        row = SweepRow(run.label, cells, state, note, 1, done, None, {run.seed: run_id}, chosen)
+        scored.append((row, run.value if result is None else result.metrics.get(objective.name)))
+    order = ("done", "pruned", "failed", "running", "waiting")
+    scored.sort(key=lambda pair: (order.index(pair[0].state), -pair[1] if pair[1] is not None else float("inf")))
+    rows = [row for row, _ in scored]
+    _mark_best(rows, columns)
+    table = SweepTable(config.name, record.scale, config.title, "", columns, rows, is_search=True)
+    table.caption = describe_runs(record, results, complete=True)
+    table.caption += describe_latency(columns, rows, results.values())
+    best = next(((r.label, r.overrides, v) for r, v in scored[:1] if r.state == "done" and v is not None), None)
+    table.text = describe_search([row.state for row in rows], record.sweep.trials, objective, best)
+    return table
+
+
+def _take_differences(row: SweepRow, baseline: SweepRow | None) -> None:
+    if baseline is None or row is baseline:
+        return
+    for cell, base in zip(row.cells, baseline.cells, strict=True):
+        cell.differences = paired_gains(cell.values, base.values)
+        if cell.paper is not None and base.paper is not None:
+            cell.paper_difference = round(cell.paper - base.paper, 6)  # 18.6 - 20.3 is -1.6999999999999993
+
+
+def _mark_best(rows: list[SweepRow], columns: list[Metric]) -> None:
+    """The best mean of the finished rows and the paper's best number, column by column; none where all are equal.
+
+    Of means that tie at the digits shown all are best. Latencies have none where the best and the next are no further
+    apart than what stands after their ±.
+    """
+    for place, column in enumerate(columns):
+        best = max if column.higher_is_better else min
+        finished = [row.cells[place] for row in rows if row.state == "done" and row.cells[place].mean is not None]
+        means = {rounded(cell.mean, column) for cell in finished}
+        papers = {row.cells[place].paper for row in rows} - {None}
+        for cell in finished:
+            cell.best = len(means) > 1 and rounded(cell.mean, column) == best(means)
+        if column.name.startswith("latency.") and len(means) > 1:
+            next_best = best(means - {best(means)})
+            gap = abs(best(means) - next_best)
+            apart = all(
+                gap > first.uncertainty + second.uncertainty
+                for first in finished if first.best
+                for second in finished if rounded(second.mean, column) == next_best
+            )  # fmt: skip
+            for cell in finished:
+                cell.best = cell.best and apart
+        for row in rows:
+            row.cells[place].paper_best = len(papers) > 1 and row.cells[place].paper == best(papers)
+
+
+def _cell(results: dict[int, RunResult | None], metric: Metric, paper: float | None = None) -> Cell:
+    found = {seed: result.metrics.get(metric.name) for seed, result in results.items() if result is not None}
+    values = {seed: metric.scale * value for seed, value in found.items() if value is not None}
+    frames = [_frames(results[seed], metric.name) for seed in values]
+    return Cell(paper=paper, values=values, frames=frames[0] if len(frames) == 1 else None)
+
+
+def _frames(result: RunResult, metric: str) -> float | None:
+    """Half the range of the middle half of a run's frames; of the frames per second by that of their time."""
+    group, _, part = metric.partition(".")
+    if group != "latency" or result.latency is None:
+        return None
+    spreads = result.latency.get("spread_ms", {})
+    total = result.metrics.get("latency.total")
+    if part == "fps" and total and "total" in spreads:
+        return 0.5 * spreads["total"] / total * result.metrics["latency.fps"]
+    return 0.5 * spreads[part] if part in spreads else None
+
+
+def _is_done(record: SweepRecord, run_id: str, results: dict[str, RunResult]) -> bool:
+    """Whether there is a result and the record does not say that it is of an earlier training."""
+    return run_id in results and (run_id not in record.runs or record.runs[run_id].state == "done")
+
+
+def _state(record: SweepRecord, runs: dict[int, str], results: dict[str, RunResult]) -> tuple[str, str]:
+    """State of a row, and what is to be said of the runs that have not finished, or have no result."""
+    open_runs = {seed: run_id for seed, run_id in runs.items() if not _is_done(record, run_id, results)}
+    if not open_runs and runs:
+        return "done", ""
+    states, notes = set(), []
+    for seed, run_id in open_runs.items():
+        run = record.runs.get(run_id)
+        state = run.state if run is not None else "waiting"
+        states.add(state)
+        note = _note(run, run_id, has_result=run_id in results)
+        note += f", seed {seed}" if len(runs) > 1 and (state in ("failed", "done") or run_id in results) else ""
+        notes.append(note + (EARLIER if run_id in results else ""))
+    state = next((s for s in ("failed", "done", "running", "pruned", "waiting") if s in states), "waiting")
+    state = "failed" if state == "done" else state  # done without a result
+    return state, "; ".join(dict.fromkeys(notes)) or "not run yet"
+
+
+def _note(run: RunState | None, run_id: str, has_result: bool) -> str:
+    if run is None or run.state == "waiting":
+        return "waiting" if has_result else "not run yet"
+    if run.state == "failed":
+        return f"failed{' again' if has_result else ''}: {run.reason or 'no reason recorded'} ({run.log or 'no log'})"
+    if run.state == "done":
+        return f"result missing or not readable: results/{run_id}.json"
+    return run.state

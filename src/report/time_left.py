@@ -1,0 +1,48 @@
+"""The time that a sweep still needs, and durations as people say them."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping
+
+from src.report.sweep_record import RunState, SweepRecord
+
+
+def seconds_left(
+    record: SweepRecord,
+    taken: Mapping[str, float],  # seconds by run id, of finished runs
+    workers: int,
+    now: float,  # seconds since 1970
+) -> float | None:
+    """Mean duration of each phase's finished runs, over the runs that are not; None when none has finished yet."""
+    of_phase: dict[str, list[float]] = defaultdict(list)
+    for run in record.runs.values():
+        if run.state == "done" and run.run_id in taken:
+            of_phase[_phase(run)].append(taken[run.run_id])
+    if not of_phase:
+        return None
+    means = {phase: sum(values) / len(values) for phase, values in of_phase.items()}
+    overall = sum(means.values()) / len(means)
+    running = [run for run in record.runs.values() if run.state == "running"]
+    waiting = [run for run in record.runs.values() if run.state == "waiting"]
+    work = sum(means.get(_phase(run), overall) for run in waiting) + overall * record.unchosen
+    for run in running:
+        elapsed = max(0.0, now - (run.started or now))  # a clock that was set back says less than nothing
+        work += max(0.0, means.get(_phase(run), overall) - elapsed)
+    return work / max(workers, len(running), 1)
+
+
+def duration(seconds: float) -> str:
+    """`41 s`, `12 min`, `3 h 05 min`, `2 d 4 h`."""
+    if round(seconds) < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    if minutes < 90:
+        return f"{minutes} min"
+    if minutes < 48 * 60:
+        return f"{minutes // 60} h {minutes % 60:02d} min"
+    return f"{minutes // 1440} d {minutes % 1440 // 60} h"
+
+
+def _phase(run: RunState) -> str:
+    return run.run_id.rpartition("-")[0]  # <model>-<phase>-<scale>

@@ -1,0 +1,215 @@
+"""`python -m src.sweep +sweep=NAME ...`: every run of one question of sweeps/, its results and its tables."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import logging
+import os
+import re
+import shlex
+import signal
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from src.config import PHASES, Config, compose_config
+from src.errors import ConfigError, HorizonError, InterruptedRunError
+from src.reliability.command import run_command
+from src.reliability.passwords import hide_in_process_list, masked
+from src.reliability.processes import die_with_parent
+from src.report.results import publish_result
+from src.report.sweep_file import DimensionConfig
+from src.report.sweep_record import SweepRecord
+from src.report.table_builder import write_sweep_tables
+from src.sweep.compose import SweepCommand, compose_sweep
+from src.sweep.latency_runs import measure_latencies
+from src.sweep.launcher import Launcher
+from src.sweep.plan import Identified, Plan, compose_file, join_overrides, make_plan, split_machine
+from src.sweep.progress import progress_line
+from src.sweep.publisher import Keeper
+from src.sweep.run_status import is_done
+from src.sweep.runner import Runner
+from src.sweep.search import Search
+from src.sweep.storage_address import default_storage
+from src.sweep.sweep_study import FORMAT, SweepStudy
+from src.training.handoff import find_source
+from src.training.identity import key_of, run_identity
+from src.training.run_folder import make_writable
+
+logger = logging.getLogger(__name__)
+
+
+def main(overrides: list[str]) -> None:
+    """Plan the sweep, train what is missing, write its tables. Raises HorizonError when a run has failed."""
+    for override in overrides:
+        hide_in_process_list(override)
+    command, common = compose_sweep(overrides)
+    sweep = command.sweep
+    identify = Identifier()
+    compose_file(sweep, common, identify)
+    config, _ = identify.compose(join_overrides(sweep.overrides, common))
+    outputs, reports = Path(config.paths.outputs), Path(config.paths.reports)
+    if sweep.is_search and command.seeds > 1:
+        raise ConfigError(f"seeds={command.seeds}: a search compares single runs; leave seeds= out")
+    seeds = list(range(config.seed, config.seed + command.seeds))
+    common = [override for override in common if key_of(override) != "seed"]
+    plan = make_plan(sweep, common, seeds, identify)
+    if command.dry_run:
+        print(describe(plan, outputs))
+        return
+    make_writable(outputs / "sweeps", "paths.outputs")
+    make_writable(reports / "sweeps", "paths.reports")
+    study = SweepStudy(outputs, plan.study, command.storage or default_storage(outputs), definition(plan, common))
+    again = shlex.join(["python", "-m", "src.sweep", *[masked(override) for override in overrides]])
+    keeper = Keeper(plan, study, again, outputs, reports)
+    runner = build_runner(command, plan, study, keeper, common, identify)
+    record = runner.run()
+    if runner.stop.requested:
+        print(progress_line(record, outputs, command.workers))
+        raise InterruptedRunError(f"the sweep was stopped; nothing finished is lost, go on with\n    {again}")
+    if sweep.latency:
+        measured = measure_latencies(record, outputs, partial(latency_command, outputs), runner)
+        logger.info("latency measured of %d runs", measured)
+    finish(record, runner, outputs, reports, again)
+
+
+def build_runner(
+    command: SweepCommand,
+    plan: Plan,
+    study: SweepStudy,
+    keeper: Keeper,
+    common: list[str],
+    identify: Identifier,
+) -> Runner:
+    """The runner of a plan, or of a search."""
+    launcher = Launcher(
+        [sys.executable, "-m", "src.train"],
+        study.folder,
+        command.workers,
+        visible_gpus(),
+        in_child=partial(die_with_parent, signal.SIGTERM),  # a killed runner leaves checkpoints, no orphans
+        group=plan.study,
+    )
+    parts = (plan, study, keeper, launcher, partial(publish_result, reports=keeper.reports))
+    return Search(*parts, common=common, identify=identify) if plan.sweep.is_search else Runner(*parts)
+
+
+def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, again: str) -> None:
+    """Write and show the tables. Raises HorizonError listing what failed."""
+    problems = []
+    failed = [run for run in record.runs.values() if run.state == "failed"]
+    if failed:
+        problems = [f"{len(failed)} of {len(record.runs)} runs failed:"]
+        for run in failed:
+            log = str(outputs / run.log) if run.log is not None else "none"
+            problems.append(f"  {run.label}, seed {run.seed} ({run.run_id}): {run.reason}; log: {log}")
+        problems.append(f"the same command tries them again:\n    {again}")
+    runner.publish_done(strictly=True)
+    try:
+        paths = write_sweep_tables(reports, record)
+    except HorizonError as error:
+        if not problems:
+            raise
+        paths = []
+        problems.append(str(error))
+    for path in paths:
+        if path.suffix == ".md":
+            print(f"\n{path.read_text()}")
+    for path in paths:
+        print(f"table: {path}")
+    if isinstance(runner, Search) and (best := runner.best()) is not None:
+        print(f"best {record.sweep.objective}: {best.value:.4f} with\n    {' '.join(best.attrs['chosen'])}")
+    print(progress_line(record, outputs, 1))
+    if problems:
+        raise HorizonError("\n".join(problems))
+
+
+class Identifier:
+    """Run ids as `python -m src.train` computes them; command lines that differ in the seed alone are composed once."""
+
+    def __init__(self) -> None:
+        self._composed: dict[tuple[str, ...], tuple[Config, dict[str, Any]]] = {}
+
+    def compose(self, overrides: list[str]) -> tuple[Config, dict[str, Any]]:
+        """As `compose_config`."""
+        plain = [override for override in overrides if not re.fullmatch(r"seed=\d+", override)]
+        if tuple(plain) not in self._composed:
+            self._composed[tuple(plain)] = compose_config(plain)
+        config, tree = self._composed[tuple(plain)]
+        seeds = [int(override.removeprefix("seed=")) for override in overrides if override not in plain]
+        if not seeds:
+            return config, tree
+        return dataclasses.replace(config, seed=seeds[-1]), copy.deepcopy(tree) | {"seed": seeds[-1]}
+
+    def __call__(self, overrides: list[str]) -> Identified:
+        """What a command line comes to. Raises HorizonError where `python -m src.train` would before it starts."""
+        config, tree = self.compose(overrides)
+        source = find_source(config, overrides, self.compose, PHASES)
+        run_id = run_identity(tree, source.identity if source is not None else None)
+        return Identified(run_id, config.scale, source.overrides if source is not None else None)
+
+
+def definition(plan: Plan, common: list[str]) -> dict[str, Any]:
+    """What a study must have been made by. Rows may change: each run is known by what it is, not by its row."""
+    if not plan.sweep.is_search:
+        return {"format": FORMAT, "kind": "rows"}
+    fixed, _ = split_machine(join_overrides(plan.sweep.overrides, common))
+    space = {key: dataclasses.asdict(dimension) for key, dimension in sorted(plan.sweep.space.items())}
+    return {
+        "format": FORMAT,
+        "kind": "search",
+        "objective": plan.sweep.objective,
+        "overrides": sorted(fixed),
+        "seeds": plan.seeds,
+        "space": space,
+    }
+
+
+def describe(plan: Plan, outputs: Path) -> str:
+    """The plan as text: every run with its state, its rows and the command that trains it."""
+    lines = [f"# {plan.study}: {plan.sweep.title}"]
+    if plan.sweep.is_search:
+        space = [f"#   {key}: {_range(dimension)}" for key, dimension in plan.sweep.space.items()]
+        return "\n".join(
+            [*lines, f"# a search of {plan.sweep.trials} trials for the best {plan.sweep.objective}:", *space]
+        )
+    finished = sum(is_done(outputs / run_id) for run_id in plan.cells)
+    cells = len(plan.rows) * len(plan.seeds)
+    runs = f"{len(plan.cells)} runs, {finished} finished"
+    lines.append(f"# {len(plan.rows)} rows x {len(plan.seeds)} seeds = {cells} cells; {runs}")
+    for cell in plan.cells.values():
+        state = "finished" if is_done(outputs / cell.run_id) else "to train"
+        rows = plan.labels(cell.run_id) or [cell.label]
+        same = f" ({len(rows)} rows that coincide share it)" if len(rows) > 1 else ""
+        needs = f", starts from {cell.needs}" if cell.needs else ""
+        lines += ["", f"# {' = '.join(rows)}, seed {cell.seed}{same}: {cell.run_id}, {state}{needs}", cell.command]
+    return "\n".join(lines)
+
+
+def _range(dimension: DimensionConfig) -> str:
+    if dimension.choices is not None:
+        return f"one of {dimension.choices}"
+    return f"{dimension.low:g} to {dimension.high:g}" + (", logarithmic" if dimension.log else "")
+
+
+def latency_command(outputs: Path, folder: Path) -> list[str]:
+    """What measures the latency of a finished run, into `latency.json` of its folder."""
+    checkpoint = folder / "checkpoints" / "last.ckpt"
+    suite = [f"checkpoint={checkpoint}", f"out={folder}", f"paths.outputs={outputs}"]
+    return [sys.executable, "-m", "src.benchmark", "suite=latency", *suite]
+
+
+def visible_gpus() -> list[str]:
+    """Names of the GPUs this process may use, as CUDA_VISIBLE_DEVICES writes them."""
+    chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if chosen is not None:
+        return [name for name in chosen.split(",") if name.strip()] if torch.cuda.device_count() else []
+    return [str(index) for index in range(torch.cuda.device_count())]
+
+
+if __name__ == "__main__":
+    run_command(main)

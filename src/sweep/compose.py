@@ -1,0 +1,165 @@
+"""The command line of `python -m src.sweep`, and the files of sweeps/ that it names, checked.
+
+A run's configuration knows nothing of sweeps: what concerns the runner is composed apart, from conf/sweep.yaml.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from src.config import CONF, GROUPS, SCALES, Config, hydra_message
+from src.errors import ConfigError
+from src.reliability.passwords import masked
+from src.report.plain_yaml import check_plain_yaml
+from src.report.sweep_file import (
+    DimensionConfig,
+    PaperRowConfig,
+    PlotConfig,
+    RowConfig,
+    SweepConfig,
+    TableConfig,
+)
+from src.sweep.storage_address import check_address
+from src.training.identity import key_of
+
+SWEEPS = CONF.parent / "sweeps"
+OWN_KEYS = ("sweep", "seeds", "workers", "storage", "dry_run", "trials")
+MOST_SEEDS = 1000
+FILE_PARTS = (SweepConfig, RowConfig, TableConfig, PlotConfig, PaperRowConfig, DimensionConfig)
+
+
+@dataclass(kw_only=True)
+class SweepCommand:
+    """What the runner is told; the rest of the command line goes to every run."""
+
+    sweep: SweepConfig | None = None  # `+sweep=<file of sweeps/>`
+    seeds: int
+    workers: int
+    storage: str | None
+    dry_run: bool
+    trials: int | None
+
+    def __post_init__(self) -> None:
+        for name in ("seeds", "workers"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 1, but got {getattr(self, name)}")
+        if self.trials is not None:
+            if self.sweep is None or not self.sweep.is_search:
+                raise ConfigError(f"trials={self.trials} is for searches; a sweep of rows trains each of them")
+            self.sweep = dataclasses.replace(self.sweep, trials=self.trials)
+        if self.seeds > MOST_SEEDS:
+            raise ConfigError(f"seeds must be at most {MOST_SEEDS}, but got {self.seeds}; seed=... says the first one")
+
+
+def sweep_files() -> dict[str, Path]:
+    """Every file of sweeps/ by its name."""
+    return {path.stem: path for path in sorted(SWEEPS.glob("*.yaml"))}
+
+
+def compose_sweep(overrides: list[str]) -> tuple[SweepCommand, list[str]]:
+    """Split a command line into the runner's part, checked, and the overrides of every run.
+
+    Raises ConfigError for an unknown sweep (naming those there are), a file that says what it may not, and bad values.
+    """
+    own = [override for override in overrides if key_of(override) in OWN_KEYS]
+    rest = [override for override in overrides if override not in own]
+    _check_places(overrides)
+    chosen = [override.partition("=")[2] for override in own if key_of(override) == "sweep"]
+    chosen = [name for name in chosen if name]  # `make sweep` without SWEEP says `+sweep=`
+    if len(chosen) != 1:
+        raise ConfigError(f"give one +sweep=NAME of {', '.join(sweep_files())}; got {' '.join(chosen) or 'none'}")
+    # Taken as it is: an address may hold `=`, and Hydra's messages would show a password.
+    storages = [override.partition("=")[2].strip("'\"") for override in own if key_of(override) == "storage"]
+    own = [override for override in own if key_of(override) not in ("sweep", "storage")]
+    try:
+        command = _compose(load_sweep(chosen[0]), own)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(hydra_message(error, known=list(OWN_KEYS))) from error
+    if storages and storages[-1] != "null":
+        check_address(storages[-1])
+        command.storage = storages[-1]
+    return command, rest
+
+
+def _check_places(overrides: list[str]) -> None:
+    """Refuse what is no key of a run and nearly one of the runner, and passwords anywhere but in `storage`.
+
+    Values are not shown: they may be a mistyped `storage=`.
+    """
+    of_runs = {field.name for field in dataclasses.fields(Config)} | set(GROUPS)
+    for override in overrides:
+        name = key_of(override)
+        key = name.lstrip("~")
+        near = difflib.get_close_matches(key.lower(), OWN_KEYS, n=1, cutoff=0.75)
+        if near and "." not in key and name not in OWN_KEYS and key not in of_runs:
+            raise ConfigError(f"{name}: did you mean {near[0]}?")
+        if name != "storage" and masked(override) != override:
+            name = name if masked(name) == name and "@" not in name else "the command line"
+            raise ConfigError(f"{name}: holds what looks like a password; a database's address is given as storage=...")
+
+
+def load_sweep(name: str) -> SweepConfig:
+    """One file of sweeps/. Raises ConfigError naming the file and what is wrong with it."""
+    files = sweep_files()
+    if name not in files:
+        near = difflib.get_close_matches(name, files, n=1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise ConfigError(f"sweep={name}: there is no sweeps/{name}.yaml; {hint}there are {', '.join(files)}")
+    try:
+        check_plain_yaml(files[name].read_text(encoding="utf-8"))
+        stated = OmegaConf.load(files[name])
+        _refuse_interpolation(OmegaConf.to_container(stated, resolve=False))
+        content = OmegaConf.merge(OmegaConf.structured(SweepConfig), stated, {"name": name})
+        sweep = OmegaConf.to_object(content)
+    except ConfigError as error:
+        said = str(error)
+        raise ConfigError(said if said.startswith("sweeps/") else f"sweeps/{name}.yaml: {said}") from error
+    except OmegaConfBaseException as error:
+        known = [field.name for kind in FILE_PARTS for field in dataclasses.fields(kind)]
+        key = getattr(error, "full_key", None)
+        where = f"sweeps/{name}.yaml" + (f", {key}" if key else "")
+        raise ConfigError(f"{where}: {hydra_message(error, known)}") from error
+    except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, OSError) as error:
+        raise ConfigError(f"sweeps/{name}.yaml: {' '.join(str(error).split())}") from error
+    for row in [*stated.get("rows", []), *stated.get("paper_rows", [])]:
+        if isinstance(row.label, bool):
+            raise ConfigError(
+                f"sweeps/{name}.yaml: YAML reads a label as {row.label}; write on, off, yes and no in quotes"
+            )
+    strange = sorted({scale for row in sweep.rows for scale in row.scales or ()} - set(SCALES))
+    if strange:
+        raise ConfigError(
+            f"sweeps/{name}.yaml: scales: there is no scale {', '.join(strange)}; there are {', '.join(SCALES)}"
+        )
+    return sweep
+
+
+def _refuse_interpolation(content: Any, where: str = "") -> None:
+    """Raises ConfigError for `${`: labels go on to Hydra as they stand, and a file has nothing to refer to."""
+    if isinstance(content, dict | list):
+        for key, value in content.items() if isinstance(content, dict) else enumerate(content):
+            _refuse_interpolation(value, f"{where}.{key}" if where else str(key))
+    elif isinstance(content, str) and "${" in content:
+        raise ConfigError(f"{where}: must not hold ${{, but is {content!r}")
+
+
+def _compose(sweep: SweepConfig, overrides: list[str]) -> SweepCommand:
+    ConfigStore.instance().store(name="sweep_command", node=SweepCommand)
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        tree = compose("sweep", overrides=overrides)
+    missing = OmegaConf.missing_keys(tree)
+    if missing:
+        raise ConfigError(f"{min(missing)} has no value")
+    tree.sweep = sweep
+    return OmegaConf.to_object(tree)

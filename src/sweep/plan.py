@@ -1,0 +1,163 @@
+"""From a sweep's file, the command line and the seeds to the list of runs, each once, in the order they are trained."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from src.errors import ConfigError, HorizonError
+from src.report.sweep_file import RowConfig, SweepConfig
+from src.report.sweep_record import suffix_of
+from src.training.identity import OUTSIDE_IDENTITY, is_of, key_of
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What a command line after `python -m src.train` comes to."""
+
+    run_id: str
+    scale: str
+    source: list[str] | None  # command line of the run whose weights it starts from
+
+
+Identify = Callable[[list[str]], Identified]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run of the plan."""
+
+    run_id: str
+    overrides: list[str]  # what it is
+    machine: list[str]  # where and how it computes
+    seed: int
+    label: str  # of its first row; for a run that others only start from: what it is
+    needs: str | None  # run whose weights it starts from
+
+    @property
+    def command(self) -> str:
+        """What trains it, to be pasted."""
+        return shlex.join(["python", "-m", "src.train", *self.overrides, *self.machine])
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All runs of a sweep; none yet for a search."""
+
+    sweep: SweepConfig
+    scale: str
+    seeds: list[int]
+    changes: list[str] = field(default_factory=list)  # by the command line, of every row; see `changes_of`
+    rows: dict[str, dict[int, str]] = field(default_factory=dict)  # run id by label and seed
+    cells: dict[str, Cell] = field(default_factory=dict)  # by run id, what is needed before what needs it
+
+    @property
+    def study(self) -> str:
+        """Name of the study that coordinates it."""
+        return f"{self.sweep.name}-{self.scale}{suffix_of(self.changes)}"
+
+    def labels(self, run_id: str) -> list[str]:
+        """Rows that show this run."""
+        return [label for label, runs in self.rows.items() if run_id in runs.values()]
+
+
+def join_overrides(*parts: list[str]) -> list[str]:
+    """All of them in order, each key once: where its last value stands."""
+    joined: dict[str, str] = {}
+    for override in (override for part in parts for override in part):
+        joined.pop(key_of(override), None)
+        joined[key_of(override)] = override
+    return list(joined.values())
+
+
+def split_machine(overrides: list[str]) -> tuple[list[str], list[str]]:
+    """(what a run is, where and how it computes): the second part is given to its process and noted nowhere."""
+    machine = [override for override in overrides if is_of(override, OUTSIDE_IDENTITY)]
+    return [override for override in overrides if override not in machine], machine
+
+
+def changes_of(sweep: SweepConfig, common: list[str]) -> list[str]:
+    """What the command line makes of a sweep that its file does not say, sorted: with it, it is another experiment.
+
+    Raises ConfigError for a phase other than the file's own.
+    """
+    common = join_overrides(common)
+    told = [override for override in common if key_of(override) == "phase"]
+    for where, overrides in [("overrides", sweep.overrides), *((f"row {r.label!r}", r.overrides) for r in sweep.rows)]:
+        for own in overrides:
+            if told and key_of(own) == "phase" and _value_of(own) != _value_of(told[0]):
+                raise ConfigError(
+                    f"{told[0]} contradicts {own} of sweeps/{sweep.name}.yaml, {where}; leave it out or change the file"
+                )
+    outside = (*OUTSIDE_IDENTITY, "seed", "scale")
+    return sorted(change for change in common if not is_of(change, outside) and change not in sweep.overrides)
+
+
+def _value_of(override: str) -> str:
+    return override.partition("=")[2].strip("'\"")
+
+
+def make_plan(sweep: SweepConfig, common: list[str], seeds: list[int], identify: Identify) -> Plan:
+    """Plan every row with every seed; seed by seed, and of each seed first what several rows start from.
+
+    `common` is the command line's part for every run. Raises ConfigError naming file and row for one that does not
+    compose or is of another scale than the others.
+    """
+    scale = compose_file(sweep, common, identify).scale
+    sweep = sweep.at_scale(scale)
+    plan = Plan(sweep, scale, list(seeds), changes_of(sweep, common))
+    if sweep.is_search:
+        return plan
+    for seed in seeds:
+        needed: list[Cell] = []
+        own: list[Cell] = []
+        for row in sweep.rows:
+            joined = join_overrides(sweep.overrides, row.overrides, common)
+            overrides = join_overrides(joined, [f"seed={seed}"])
+            found = _compose(sweep, row, overrides, common, identify)
+            if found.scale != scale:
+                raise ConfigError(
+                    f"sweeps/{sweep.name}.yaml, row {row.label!r}: scale={found.scale}, but the sweep is of scale "
+                    f"{scale}; a table never mixes scales, give scale=... on the command line"
+                )
+            *sources, cell = cells_of(overrides, seed, row.label, identify)
+            needed += sources
+            own.append(cell)
+            plan.rows.setdefault(row.label, {})[seed] = cell.run_id
+        labelled = {cell.run_id: cell for cell in reversed(own)}  # the first row gives its label
+        for cell in [*needed, *own]:
+            plan.cells.setdefault(cell.run_id, labelled.get(cell.run_id, cell))
+    return plan
+
+
+def compose_file(sweep: SweepConfig, common: list[str], identify: Identify) -> Identified:
+    """What the file's own overrides and the command line come to. Raises ConfigError naming whichever is at fault."""
+    return _compose(sweep, None, join_overrides(sweep.overrides, common), common, identify)
+
+
+def cells_of(overrides: list[str], seed: int, label: str, identify: Identify) -> list[Cell]:
+    """The run of a command line, and before it those it starts from, the first first."""
+    found = identify(overrides)
+    before: list[Cell] = []
+    if found.source is not None:
+        what = label if label.startswith("weights for ") else f"weights for {label}"
+        before = cells_of(found.source, seed, what, identify)
+    needs = before[-1].run_id if before else None
+    return [*before, Cell(found.run_id, *split_machine(overrides), seed, label, needs)]
+
+
+def _compose(
+    sweep: SweepConfig, row: RowConfig | None, overrides: list[str], common: list[str], identify: Identify
+) -> Identified:
+    """Identify a row; blame it for what does not compose, unless the command line alone does not either."""
+    try:
+        return identify(overrides)
+    except HorizonError as error:
+        try:
+            identify(common)
+        except HorizonError as of_command:
+            if str(of_command) == str(error):
+                raise
+        where = f"sweeps/{sweep.name}.yaml" + (f", row {row.label!r}" if row is not None else ", overrides")
+        raise ConfigError(f"{where}: {error}") from error

@@ -1,0 +1,196 @@
+"""From one phase to the next: which run a phase starts from, and its weights, strictly (`phase.init_from`)."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from torch import nn
+
+from src.errors import CheckpointError, ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
+from src.reliability.checkpoints import load_model_weights, read_checkpoint
+from src.reliability.processes import die_with_parent
+from src.training.identity import is_of, run_identity
+from src.training.run_folder import RunFolder
+
+logger = logging.getLogger(__name__)
+
+MAY_BE_NEW = re.compile(r"(dptf|temporal)\.|ocsf\.encoder\.layers\.\d+\.temporal_attention\.")
+"""Parameters that a later phase adds; every other one must come from the checkpoint."""
+OF_THIS_RUN = ("phase", "resume")
+"""Overrides that never concern the run whose weights are taken."""
+OF_THE_LATER_PHASE = (
+    *("model.dptf", "model.temporal", "data.groups_per_scene", "data.lane_sets", "data.silent_frames"),
+    *(f"model.loss.cell_{term}_weight" for term in ("focal", "dice", "lovasz", "velocity")),
+)
+"""Nor do these, where that run is of the phase before."""
+WEIGHTS_OF_GAUSSIAN_VELOCITY = ("model.loss.dptf_weight", "model.loss.gaussian_velocity_weight")
+"""Nor these, unless `model.loss.gaussian_velocity_in_phase1`."""
+INPUT_SETTINGS = ("num_sweeps", "min_distance_m", "propagate_points", "test_resize_offset")
+"""Of `data`: what the weights have learnt to see."""
+
+Compose = Callable[[list[str]], tuple[Any, dict[str, Any]]]
+"""Overrides to a run's configuration, as dataclasses and as plain values (`compose_config`)."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a run's first weights come from."""
+
+    identity: str  # run id, or a digest of the file
+    checkpoint: Path
+    overrides: list[str] | None  # of the run that makes it; None for a given file
+    folder: RunFolder | None
+
+    @property
+    def ready(self) -> bool:
+        """Whether the weights are those of a finished run, or a given file."""
+        return self.folder is None or (self.folder.finished and self.checkpoint.is_file())
+
+    @property
+    def command(self) -> str:
+        """What makes it."""
+        return shlex.join(["python", "-m", "src.train", *(self.overrides or [])])
+
+
+def find_source(
+    config: Any,  # of the run, as `compose` gives it
+    overrides: list[str],
+    compose: Compose,
+    phases: Sequence[str],  # names that `phase.init_from` may have
+) -> Source | None:
+    """The run or file that `phase.init_from` names, finished or not; None for fresh weights.
+
+    A phase's name means the run of the same command in that phase, less the overrides of what only the later phase has.
+    Raises CheckpointError when a given file does not exist.
+    """
+    name = config.phase.init_from
+    if name is None:
+        return None
+    if name not in phases:
+        path = Path(name)
+        if not path.is_file():
+            raise CheckpointError(
+                f"phase.init_from={name}: there is no such checkpoint, and no phase of that name ({', '.join(phases)})"
+            )
+        return Source(hashlib.sha256(path.read_bytes()).hexdigest()[:16], path, None, None)
+    others = OF_THIS_RUN
+    if name != config.phase.name:
+        others += OF_THE_LATER_PHASE
+        if not getattr(config.model.loss, "gaussian_velocity_in_phase1", False):
+            others += WEIGHTS_OF_GAUSSIAN_VELOCITY
+    kept = [override for override in overrides if not is_of(override, others)]
+    wanted = [f"phase={name}", *kept]
+    its_config, tree = compose(wanted)
+    its_source = find_source(its_config, wanted, compose, phases)  # what that run starts from is part of its identity
+    identity = run_identity(tree, its_source.identity if its_source is not None else None)
+    folder = RunFolder(Path(config.paths.outputs), identity)
+    return Source(folder.run_id, folder.checkpoints / "last.ckpt", wanted, folder)
+
+
+def train_source(source: Source, train_missing: bool, processes_exist: bool) -> None:
+    """Train the run that a phase starts from, in a process of its own, which prints its progress here.
+
+    `processes_exist` says that ranks are already running side by side, so none of them can start a training of all.
+    Raises ConfigError when it may not be trained here, the error of its exit code when it fails, and CheckpointError
+    when it had finished before and has lost its weights since.
+    """
+    reason = None
+    if not train_missing:
+        reason = "phase.train_missing=false"
+    elif processes_exist:
+        reason = "the processes of this run were started from outside, and they cannot train another run first"
+    if reason is not None:
+        raise ConfigError(
+            f"the run {source.identity} that phase.init_from names has not finished ({reason}); make it with\n"
+            f"    {source.command}\nor give the path of a checkpoint as phase.init_from=PATH"
+        )
+    logger.info("no finished run %s to start from: training it first", source.identity)
+    code = _run_command([sys.executable, "-m", "src.train", *source.overrides])
+    if code != 0:
+        kinds: dict[int, type[HorizonError]] = {
+            kind.exit_code: kind for kind in (ConfigError, DataError, DivergedError, InterruptedRunError)
+        }
+        kinds |= dict.fromkeys((-signal.SIGINT, -signal.SIGTERM), InterruptedRunError)  # it was still starting
+        raise kinds.get(code, HorizonError)(
+            f"the run {source.identity} that comes first ended with exit code {code}, see above; {source.command}"
+        )
+    if not source.ready:
+        raise CheckpointError(
+            f"the run {source.identity} has finished, but {source.checkpoint} is gone; make it anew with\n"
+            f"    {source.command} resume=restart"
+        )
+
+
+def read_source(source: Source) -> dict[str, Any]:
+    """The source's checkpoint. Raises CheckpointError with the remedy when it is damaged."""
+    try:
+        return read_checkpoint(source.checkpoint)
+    except CheckpointError as error:
+        if source.overrides is None:
+            raise
+        raise CheckpointError(f"{error}; make it anew with\n    {source.command} resume=restart") from error
+
+
+def hand_over(model: nn.Module, source: Source, tree: dict[str, Any]) -> None:
+    """Give `model` the source's weights; what the new phase adds keeps its own. Settings that differ are logged.
+
+    Raises CheckpointError naming every key that does not fit.
+    """
+    checkpoint = read_source(source)
+    new = load_model_weights(model, checkpoint, source.checkpoint, MAY_BE_NEW)
+    parts = sorted({key.split(".temporal_attention.")[0].split(".")[0] for key in new})
+    logger.info("weights from %s; new: %d tensors in %s", source.checkpoint, len(new), ", ".join(parts) or "nothing")
+    for key, (old, now) in differing_settings(checkpoint["horizon3d"]["config"], tree).items():
+        logger.warning("%s was %s in the run these weights come from and is %s now", key, old, now)
+
+
+def differing_settings(old: dict[str, Any], new: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Dotted keys of the model, the backbone, the grid and of what is read that both have and whose values differ."""
+
+    def flat(node: Any, prefix: str) -> dict[str, Any]:
+        if not isinstance(node, dict):
+            return {prefix: node}
+        return {key: value for name in node for key, value in flat(node[name], f"{prefix}.{name}").items()}
+
+    def settings(tree: dict[str, Any]) -> dict[str, Any]:
+        parts = {name: tree.get(name) for name in ("model", "backbone", "grid")}
+        parts["data"] = {name: value for name, value in (tree.get("data") or {}).items() if name in INPUT_SETTINGS}
+        return {key: value for name, part in parts.items() for key, value in flat(part, name).items()}
+
+    before, after = settings(old), settings(new)
+    return {
+        key: (before[key], after[key])
+        for key in before.keys() & after.keys()
+        if before[key] != after[key] and not key.startswith(("model.loss.", "model.dptf", "model.temporal"))
+    }
+
+
+def _run_command(command: list[str]) -> int:
+    """Run a child to its end; a SIGTERM to this process goes to the child, whose exit code then tells the rest.
+
+    When this process is killed, the child gets a SIGTERM too, and so ends after a checkpoint.
+    """
+    child = subprocess.Popen(command, preexec_fn=partial(die_with_parent, signal.SIGTERM))
+
+    def forward(number: int, frame: FrameType | None) -> None:
+        child.send_signal(number)
+
+    before = signal.signal(signal.SIGTERM, forward)
+    try:
+        return child.wait()
+    except KeyboardInterrupt:  # the terminal gave it to the child as well, which ends after a checkpoint
+        return child.wait()
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,250 @@
+"""What stands or moves slowly beside the main road: roadworks, side road, parking area, animals, signs, look-alikes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from src.world.catalogue import KINDS, Kind
+from src.world.road import Road
+from src.world.world_config import WorldConfig
+
+Array = np.ndarray
+
+
+@dataclass(kw_only=True)
+class Actor:
+    """One object of a scene; where it is stands in the row of `Tracks` with the same number."""
+
+    kind: Kind
+    name: str  # key of KINDS
+    size: Array  # [3] length, width, height in m
+    colour: tuple[int, int, int]
+    has_rider: bool
+    parked: bool
+    variant: int  # of its look: sign face, coat, cargo
+
+
+@dataclass(frozen=True)
+class Start:
+    """Road position at the first key frame, constant rates, heading relative to the road."""
+
+    s: float
+    d: float
+    s_rate: float = 0.0
+    d_rate: float = 0.0
+    turn: float = 0.0
+
+
+class _Maker:
+    """Draws actors from one random stream."""
+
+    def __init__(self, config: WorldConfig, rng: np.random.Generator) -> None:
+        self.config, self.rng = config, rng
+
+    def actor(self, name: str, *, has_rider: bool = True, parked: bool = False) -> Actor:
+        kind, rng = KINDS[name], self.rng
+        return Actor(
+            kind=kind,
+            name=name,
+            size=kind.draw_size(rng),
+            colour=kind.colours[int(rng.integers(len(kind.colours)))],
+            has_rider=has_rider,
+            parked=parked,
+            variant=int(rng.integers(1 << 16)),
+        )
+
+    def count(self, mean: float) -> int:
+        return int(np.floor(mean * self.config.rare_objects + self.rng.random()))
+
+
+def bystanders(
+    config: WorldConfig, road: Road, reach_m: float, rng: np.random.Generator
+) -> Iterator[tuple[Actor, Start]]:
+    """Actors beside the road with their starts; `reach_m` is how far the ego truck will drive."""
+    make = _Maker(config, rng)
+    yield from _roadworks(make, road, reach_m)
+    yield from _side_road(make, road, reach_m)
+    yield from _apron(make, road)
+    yield from _fields(make, road, reach_m)
+    yield from _signs(make, road, reach_m)
+    yield from _lookalikes(make, road, reach_m)
+
+
+def _roadworks(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
+    """Cones along a shoulder, barriers, workers and a machine; on either side of the motorway."""
+    rng = make.rng
+    side = -1 if rng.random() < 0.65 else 1
+    start = rng.uniform(15, max(20.0, reach_m - 60))
+    for i in range(make.count(3)):
+        yield (
+            make.actor("cone"),
+            Start(start + 9.0 * i + rng.normal(0, 0.6), side * (road.edge_m + 0.35 + 0.12 * i), turn=rng.uniform(0, 3)),
+        )
+    begin = start + 40
+    for i in range(make.count(2.3)):
+        across = rng.random() < 0.5
+        yield (
+            make.actor("barrier"),
+            Start(
+                begin + 3.5 * i + rng.normal(0, 0.3),
+                side * (road.edge_m + rng.uniform(0.8, 2.2)),
+                turn=rng.normal(0, 0.12) + (0.0 if across else np.pi / 2),
+            ),
+        )
+    if make.count(0.8):
+        yield (
+            make.actor("excavator", parked=True),
+            Start(begin + 30, side * (road.edge_m + 5.5), turn=rng.normal(0, 0.3)),
+        )
+    for _ in range(make.count(1.1)):
+        yield (
+            make.actor("police_officer" if rng.random() < 0.15 else "worker"),
+            Start(
+                begin + rng.uniform(-30, 40),
+                side * (road.edge_m + rng.uniform(1.2, 5.0)),
+                s_rate=rng.choice([0.0, 0.8, -0.8]),
+                turn=rng.uniform(-3.1, 3.1),
+            ),
+        )
+    for i in range(make.count(1)):
+        yield (
+            make.actor("temporary_sign"),
+            Start(start - 35 * (i + 1), side * (road.edge_m + 1.9), turn=np.pi if side < 0 else 0.0),
+        )
+
+
+def _side_road(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
+    """Cyclists, walkers and slow vehicles on the parallel minor road, or on a path where there is none."""
+    rng = make.rng
+    centre = road.side_road_centre() if road.side_road else road.edge_m + 14.0
+    for _ in range(make.count(1.5)):
+        way = int(rng.choice([-1, 1]))
+        speed = rng.uniform(3.5, 7.5)
+        yield (
+            make.actor("bicycle"),
+            Start(
+                rng.uniform(25, reach_m - 5),
+                centre - way * rng.uniform(2.0, 2.8),
+                s_rate=way * speed,
+                turn=0.0 if way > 0 else np.pi,
+            ),
+        )
+    for _ in range(make.count(1.0)):
+        way = int(rng.choice([-1, 1]))
+        standing = rng.random() < 0.3
+        yield (
+            make.actor("child" if rng.random() < 0.25 else "adult"),
+            Start(
+                rng.uniform(15, reach_m),
+                centre - rng.choice([-1, 1]) * rng.uniform(3.4, 4.4),
+                s_rate=0.0 if standing else way * rng.uniform(0.9, 1.8),
+                turn=0.0 if way > 0 else np.pi,
+            ),
+        )
+    if road.side_road:
+        for name, speed in (
+            ("motorcycle", rng.uniform(17, 24)),
+            ("farm_tractor", rng.uniform(6, 11)),
+            ("car", rng.uniform(18, 25)),
+        ):
+            if make.count(0.35):
+                way = int(rng.choice([-1, 1]))
+                s = rng.uniform(-30, 60) if way > 0 else rng.uniform(reach_m - 60, reach_m + 120)
+                yield make.actor(name), Start(s, centre - way * 1.5, s_rate=way * speed, turn=0.0 if way > 0 else np.pi)
+
+
+def _apron(make: _Maker, road: Road) -> Iterator[tuple[Actor, Start]]:
+    """Parked vehicles in slots across the parking area, people and cycles between them."""
+    if road.apron is None:
+        return
+    rng = make.rng
+    (first, last), (far, near) = road.apron, road.apron_band()
+    names = ["semi_trailer", "rigid_truck", "bus", "car", "excavator", "van", "container", "semi_trailer"]
+    chance = [0.4, 0.3, 0.3, 0.4, 0.25, 0.2, 0.6, 0.2]
+    slots = np.linspace(first + 4, last - 4, len(names))
+    for slot, k in zip(slots, rng.permutation(len(names)), strict=True):
+        if make.count(chance[k]):
+            actor = make.actor(names[k], parked=True)
+            d = far + 0.5 * actor.size[0] + rng.uniform(2.0, 8.0)
+            yield actor, Start(slot, d, turn=float(rng.choice([-1, 1])) * np.pi / 2 + rng.normal(0, 0.04))
+    for name, mean in (("adult", 0.6), ("motorcycle", 0.3), ("bicycle", 0.4), ("child", 0.2)):
+        for _ in range(make.count(mean)):
+            walks = name in ("adult", "child") and rng.random() < 0.6
+            turn = rng.uniform(-3.1, 3.1)
+            speed = rng.uniform(0.7, 1.5) if walks else 0.0
+            yield (
+                make.actor(name, has_rider=False, parked=name in ("motorcycle", "bicycle")),
+                Start(
+                    rng.uniform(first, last),
+                    rng.uniform(near - 13, near - 1.5),
+                    s_rate=speed * np.cos(turn),
+                    d_rate=speed * np.sin(turn),
+                    turn=turn,
+                ),
+            )
+
+
+def _fields(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
+    """Deer and cattle beyond the rails."""
+    rng = make.rng
+    for name, mean in (("deer", 1.0), ("cow", 0.8)):
+        for _ in range(make.count(mean)):
+            side = int(rng.choice([-1, 1]))
+            turn = rng.uniform(-3.1, 3.1)
+            speed = float(rng.choice([0.0, 0.5, 1.1]))
+            yield (
+                make.actor(name),
+                Start(
+                    rng.uniform(15, reach_m + 10),
+                    side * (road.rail_m + rng.uniform(3, 8)),
+                    s_rate=speed * np.cos(turn),
+                    d_rate=0.3 * speed * np.sin(turn),
+                    turn=turn,
+                ),
+            )
+
+
+def _signs(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
+    """Signs face the traffic they are for: own signs stand on the right and look back along the road."""
+    rng = make.rng
+    for direction in (1, -1):
+        turn = np.pi if direction > 0 else 0.0
+        s = rng.uniform(-180, -100)
+        while s < reach_m + 230:
+            name = "guide_sign" if rng.random() < 0.3 else "sign"
+            yield (
+                make.actor(name),
+                Start(s, -direction * (road.rail_m + rng.uniform(1.0, 2.5)), turn=turn + rng.normal(0, 0.05)),
+            )
+            s += rng.uniform(150, 380)
+    gantry = rng.uniform(40, reach_m + 60)
+    for lane in range(road.lanes):
+        if lane == 0 or rng.random() < 0.4:
+            yield make.actor("gantry_sign"), Start(gantry, road.lane_centre(1, lane), turn=np.pi)
+
+
+def _lookalikes(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
+    """Things that reflect like cones, barriers, signs, animals, people or parked vehicles and are not labelled."""
+    rng, clutter = make.rng, make.config.clutter_density
+    for name, mean, low, high in (
+        ("bollard", 9, -1.0, 4.0),
+        ("cabinet", 5, 0.8, 7.0),
+        ("concrete_block", 5, -1.2, 6.0),
+        ("hay_bale", 5, 5.0, 20.0),
+        ("bush", 16, 1.5, 25.0),
+        ("lamp_post", 5, 0.8, 2.0),
+        ("container", 1, 14.0, 25.0),
+    ):
+        for _ in range(int(mean * clutter + rng.random())):
+            side = int(rng.choice([-1, 1]))
+            yield (
+                make.actor(name, parked=True),
+                Start(
+                    rng.uniform(-160, reach_m + 180),
+                    side * (road.rail_m + rng.uniform(low, high)),
+                    turn=rng.normal(0, 0.25) + float(rng.choice([0.0, 0.0, 1.57])),
+                ),
+            )

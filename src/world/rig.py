@@ -1,0 +1,121 @@
+"""Where the ego truck's sensors sit and how they look: extrinsics, intrinsics and firing times of all channels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from src.structures.taxonomy import CAMERAS, LIDARS, RADARS
+from src.world.motion import rotation_zyx
+from src.world.world_config import WorldConfig
+
+Array = np.ndarray
+
+RADAR_AZIMUTH_RAD = np.radians(60.0)
+RADAR_ELEVATION_RAD = np.radians(11.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mount:
+    """One sensor: point_ego = rotation @ point_sensor + translation."""
+
+    channel: str
+    modality: str  # camera, radar, lidar or imu
+    rotation: Array  # [3, 3]
+    translation: Array  # [3] m
+    intrinsic: Array | None  # [3, 3] px, cameras only
+    delay_s: float  # from the key frame's time to this sensor's firing
+
+
+def _degrees(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> Array:
+    return rotation_zyx(np.radians(yaw), np.radians(pitch), np.radians(roll))
+
+
+# x forward, y left, z up -> x right, y down, z forward
+_EGO_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+# Two of the six are published (RADAR_LEFT_FRONT and RADAR_RIGHT_BACK, the latter upside down); the others mirror them.
+_RADARS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float], float]] = {
+    "RADAR_LEFT_FRONT": ((5.26, 1.23, 2.01), (-19.6, 0.3, 0.4), -0.011),
+    "RADAR_RIGHT_FRONT": ((5.26, -1.23, 2.00), (19.4, -0.2, -0.3), 0.006),
+    "RADAR_RIGHT_SIDE": ((5.12, -1.38, 2.02), (-88.0, 0.4, 0.2), -0.004),
+    "RADAR_RIGHT_BACK": ((5.01, -1.40, 2.00), (-146.0, 0.2, 180.0), 0.013),
+    "RADAR_LEFT_BACK": ((5.01, 1.40, 2.01), (147.0, -0.3, 0.3), -0.017),
+    "RADAR_LEFT_SIDE": ((5.12, 1.38, 2.02), (89.0, 0.1, -0.4), 0.009),
+}
+_CAMERAS: dict[str, tuple[tuple[float, float, float], float, float]] = {
+    "CAMERA_LEFT_FRONT": ((5.05, 1.25, 2.12), 42.0, 0.008),
+    "CAMERA_RIGHT_FRONT": ((5.05, -1.25, 2.12), -42.0, 0.011),
+    "CAMERA_RIGHT_BACK": ((4.85, -1.30, 2.10), -138.0, -0.006),
+    "CAMERA_LEFT_BACK": ((4.85, 1.30, 2.10), 138.0, -0.003),
+}
+_LIDARS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+    "LIDAR_LEFT": ((4.95, 1.45, 1.95), (45.0, 0.0, 0.5)),
+    "LIDAR_RIGHT": ((4.95, -1.45, 1.95), (-45.0, 0.0, -0.5)),
+    "LIDAR_REAR": ((-0.86, 0.0, 1.10), (180.0, 0.0, 0.0)),
+    "LIDAR_TOP_FRONT": ((4.90, 0.0, 3.70), (0.0, 8.0, 0.0)),
+    "LIDAR_TOP_LEFT": ((4.70, 1.10, 3.65), (90.0, 8.0, 0.0)),
+    "LIDAR_TOP_RIGHT": ((4.70, -1.10, 3.65), (-90.0, 8.0, 0.0)),
+}
+
+
+def camera_intrinsic(config: WorldConfig) -> Array:
+    """[3, 3] pinhole matrix; the optical axis meets the middle of the image, pixel centres lie at halves."""
+    focal = 0.5 * config.image_width_px / np.tan(0.5 * np.radians(config.camera_fov_deg))
+    return np.array(
+        [[focal, 0.0, 0.5 * config.image_width_px], [0.0, focal, 0.5 * config.image_height_px], [0.0, 0.0, 1.0]]
+    )
+
+
+def sensor_rig(config: WorldConfig) -> dict[str, Mount]:
+    """All 18 channels by name: four cameras, six radars, six lidars, two IMUs."""
+    mounts = []
+    for name in CAMERAS:
+        place, yaw, delay = _CAMERAS[name]
+        mounts.append(
+            Mount(
+                channel=name,
+                modality="camera",
+                rotation=_degrees(yaw, 1.5) @ _EGO_FROM_OPTICAL,
+                translation=np.array(place),
+                intrinsic=camera_intrinsic(config),
+                delay_s=delay,
+            )
+        )
+    for name in RADARS:
+        place, angles, delay = _RADARS[name]
+        mounts.append(
+            Mount(
+                channel=name,
+                modality="radar",
+                rotation=_degrees(*angles),
+                translation=np.array(place),
+                intrinsic=None,
+                delay_s=delay,
+            )
+        )
+    for name in LIDARS:
+        place, angles = _LIDARS[name]
+        mounts.append(
+            Mount(
+                channel=name,
+                modality="lidar",
+                rotation=_degrees(*angles),
+                translation=np.array(place),
+                intrinsic=None,
+                delay_s=0.001,
+            )
+        )
+    for name, place in (("XSENSE_CABIN", (4.4, 0.0, 1.9)), ("XSENSE_CHASSIS", (0.2, 0.0, 0.9))):
+        mounts.append(
+            Mount(
+                channel=name,
+                modality="imu",
+                rotation=np.eye(3),
+                translation=np.array(place),
+                intrinsic=None,
+                delay_s=0.0,
+            )
+        )
+    return {mount.channel: mount for mount in mounts}

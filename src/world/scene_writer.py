@@ -1,0 +1,345 @@
+"""Writes the sensor files of one scene and returns its table rows."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from src.structures.taxonomy import CAMERAS, LIDARS, RADARS, REFERENCE_CHANNEL
+from src.world.camera_render import Studio
+from src.world.catalogue import attribute_of
+from src.world.labels import (
+    FrameTruth,
+    count_inside,
+    estimate_lidar_points,
+    frame_truth,
+    labelled,
+    visibility_level,
+)
+from src.world.lidar import scan_lidars
+from src.world.motion import LEAD_IN_S
+from src.world.pcd_writer import LIDAR_TYPE, lidar_pcd, radar_pcd
+from src.world.radar import simulate_sweeps
+from src.world.rig import Mount, sensor_rig
+from src.world.scenery import make_scenery
+from src.world.simulate import Scene, make_scene, scene_rng
+from src.world.table_rows import Row, Tables, link_by, link_chain, quaternions, rounded, token
+from src.world.world_config import CAMERA_RATE_HZ, KEY_FRAME_RATE_HZ, RADAR_RATE_HZ, WorldConfig
+
+Array = np.ndarray
+
+EPOCH_US = 1_695_000_000_000_000
+SCENE_GAP_US = 3_600_000_000
+JITTER_S = 0.0015
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Shot:
+    """One sensor file to come: which sensor fires when, for which key frame."""
+
+    channel: str
+    frame: int
+    time_s: float
+    is_key: bool
+
+
+class SceneWriter:
+    """One scene on its way to disk. `write()` does everything; the other methods are its steps."""
+
+    def __init__(self, config: WorldConfig, index: int, folder: Path) -> None:
+        self.config, self.index, self.folder = config, index, folder
+        self.rig = sensor_rig(config)
+        self.scene: Scene = make_scene(config, index)
+        scene = self.scene
+        at_start = np.stack([scene.tracks.s[:, 0], scene.tracks.d[:, 0]], 1)
+        scenery_rng = scene_rng(config, index, 1)
+        reach = float(scene.ego.tracks.s[0, -1])
+        self.scenery = make_scenery(config, scene.road, scene.actors, at_start, reach, scenery_rng)
+        self.studio = Studio(
+            scene, self.scenery, config.image_width_px, config.image_height_px, scene_rng(config, index, 2)
+        )
+        self.clock = scene_rng(config, index, 3)
+        self.start_us = EPOCH_US + index * SCENE_GAP_US + int(self.clock.integers(0, 1_000_000_000))
+        self.key_times = [
+            self._quantised(k / KEY_FRAME_RATE_HZ + self._jitter()) for k in range(config.key_frames_per_scene)
+        ]
+        self.name = f"scene-{self._token('drive')}-1"
+
+    def write(self) -> Tables:
+        """Simulate, render and store the scene; returns its rows of every table."""
+        radar_shots, key_points = self._write_radars()
+        camera_shots, pixels = self._write_cameras()
+        lidar_shots, lidar_points = self._write_lidars()
+        frames = self._truths(pixels, key_points, lidar_points)
+        tables = self._annotation_tables(frames)
+        tables |= self._sample_tables(radar_shots + camera_shots + lidar_shots)
+        tables |= self._motion_tables()
+        return tables
+
+    def _token(self, *parts: object) -> str:
+        return token(self.config.seed, "scene", self.index, *parts)
+
+    def _quantised(self, time_s: float) -> float:
+        return round(time_s * 1e6) / 1e6
+
+    def _jitter(self) -> float:
+        return float(np.clip(self.clock.normal(0, JITTER_S / 2), -JITTER_S, JITTER_S))
+
+    def _stamp(self, time_s: float) -> int:
+        return self.start_us + round(time_s * 1e6)
+
+    def _filename(self, shot: _Shot) -> str:
+        kind, ending = "samples" if shot.is_key else "sweeps", "jpg" if shot.channel in CAMERAS else "pcd"
+        return f"{kind}/{shot.channel}/{shot.channel}_{self._stamp(shot.time_s)}.{ending}"
+
+    def _store(self, shot: _Shot, data: bytes) -> None:
+        (self.folder / self._filename(shot)).write_bytes(data)
+
+    def _write_radars(self) -> tuple[list[tuple[_Shot, int]], list[Array]]:
+        """All radar sweeps; returns shots with point counts and, per key frame, its points in local coordinates."""
+        mounts = [self.rig[name] for name in RADARS]
+        rng = scene_rng(self.config, self.index, 4)
+        per_frame = RADAR_RATE_HZ // KEY_FRAME_RATE_HZ
+        shots, key_points = [], []
+        for frame, key_time in enumerate(self.key_times):
+            for back in range(self.config.radar_sweeps_per_key_frame - 1, -1, -1):
+                base = key_time if back == 0 else frame / KEY_FRAME_RATE_HZ - back / per_frame / KEY_FRAME_RATE_HZ
+                times = [self._quantised(base + m.delay_s + self._jitter()) for m in mounts]
+                sweeps = simulate_sweeps(self.config, self.scene, self.scenery, mounts, times, rng)
+                here = []
+                for mount, time, points in zip(mounts, times, sweeps, strict=True):
+                    shot = _Shot(channel=mount.channel, frame=frame, time_s=time, is_key=back == 0)
+                    self._store(shot, radar_pcd(points))
+                    shots.append((shot, len(points)))
+                    here.append(self._to_local(mount, time, points[:, :3]))
+                if back == 0:
+                    key_points.append(np.concatenate(here))
+        return shots, key_points
+
+    def _to_local(self, mount: Mount, time_s: float, points: Array) -> Array:
+        rotation, translation = self.scene.ego.pose(time_s)
+        return (points.astype(np.float64) @ mount.rotation.T + mount.translation) @ rotation.T + translation
+
+    def _write_cameras(self) -> tuple[list[tuple[_Shot, int]], list[tuple[Array, Array]]]:
+        """All images; returns shots and, per key frame, each actor's own and seen pixels over all cameras."""
+        rng = scene_rng(self.config, self.index, 5)
+        count = len(self.scene.actors)
+        per_frame = CAMERA_RATE_HZ // KEY_FRAME_RATE_HZ
+        shots, pixels = [], []
+        for frame, key_time in enumerate(self.key_times):
+            own, seen = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
+            for back in range(per_frame - 1 if self.config.camera_sweeps else 0, -1, -1):
+                base = key_time if back == 0 else frame / KEY_FRAME_RATE_HZ - back / CAMERA_RATE_HZ
+                stage = None
+                for name in CAMERAS:
+                    mount = self.rig[name]
+                    time = self._quantised(base + mount.delay_s + self._jitter())
+                    rotation, translation = self.scene.ego.pose(time)
+                    stage = self.studio.stage(time, translation)
+                    photo = self.studio.photograph(mount, rotation, translation, stage, rng)
+                    buffer = io.BytesIO()
+                    Image.fromarray(photo.rgb).save(buffer, "JPEG", quality=self.config.jpeg_quality)
+                    shot = _Shot(channel=name, frame=frame, time_s=time, is_key=back == 0)
+                    self._store(shot, buffer.getvalue())
+                    shots.append((shot, 0))
+                    if back == 0:
+                        own, seen = own + photo.own_pixels, seen + photo.seen_pixels
+            pixels.append((own, seen))
+        return shots, pixels
+
+    def _write_lidars(self) -> tuple[list[tuple[_Shot, int]], list[Array] | None]:
+        """Key-frame clouds, six or an empty LIDAR_LEFT; returns shots and, if scanned, local points per frame."""
+        rng = scene_rng(self.config, self.index, 6)
+        channels = LIDARS if self.config.lidar else (REFERENCE_CHANNEL,)
+        shots, points = [], []
+        for frame, key_time in enumerate(self.key_times):
+            time = self._quantised(key_time + self.rig[REFERENCE_CHANNEL].delay_s)
+            clouds = {REFERENCE_CHANNEL: np.zeros(0, dtype=LIDAR_TYPE)}
+            if self.config.lidar:
+                mounts = [self.rig[name] for name in LIDARS]
+                clouds = scan_lidars(self.config, self.scene, self.studio, mounts, time, self._stamp(time), rng)
+            here = []
+            for name in channels:
+                shot = _Shot(channel=name, frame=frame, time_s=time, is_key=True)
+                cloud = clouds[name]
+                self._store(shot, lidar_pcd(cloud))
+                shots.append((shot, len(cloud)))
+                here.append(self._to_local(self.rig[name], time, np.stack([cloud["x"], cloud["y"], cloud["z"]], 1)))
+            points.append(np.concatenate(here))
+        return shots, points if self.config.lidar else None
+
+    def _truths(
+        self, pixels: list[tuple[Array, Array]], radar: list[Array], lidar: list[Array] | None
+    ) -> list[FrameTruth]:
+        rng = scene_rng(self.config, self.index, 7)
+        sizes = self.scene.sizes
+        frames = []
+        for k, time in enumerate(self.key_times):
+            truth = frame_truth(self.scene, time, *pixels[k])
+            truth.radar_points = count_inside(truth, sizes, radar[k])
+            if lidar is None:
+                truth.lidar_points = estimate_lidar_points(truth, sizes, self.scene.ego.pose(time)[1], rng)
+            else:
+                truth.lidar_points = count_inside(truth, sizes, lidar[k])
+            frames.append(truth)
+        return frames
+
+    def _annotation_tables(self, frames: list[FrameTruth]) -> Tables:
+        """sample_annotation and instance."""
+        seed, scene = self.config.seed, self.scene
+        present = labelled(self.config, scene, frames)
+        annotations: list[Row] = []
+        instances: list[Row] = []
+        for n in np.flatnonzero(present.any(0)):
+            actor, own_rows = scene.actors[n], []
+            for k in np.flatnonzero(present[:, n]):
+                truth = frames[k]
+                attribute = attribute_of(
+                    actor.kind, float(truth.speeds[n]), has_rider=actor.has_rider, parked=actor.parked
+                )
+                level = visibility_level(int(truth.own_pixels[n]), int(truth.seen_pixels[n]))
+                half = 0.5 * truth.yaws[n]
+                length, width, height = actor.size
+                own_rows.append(
+                    {
+                        "token": self._token("annotation", n, k),
+                        "sample_token": self._token("sample", k),
+                        "instance_token": self._token("instance", n),
+                        "attribute_tokens": [] if attribute is None else [token(seed, "attribute", attribute)],
+                        "visibility_token": "" if level is None else token(seed, "visibility", level),
+                        "translation": rounded(truth.centres[n] + scene.utm_offset, 4),
+                        "size": rounded(np.array([width, length, height]), 4),
+                        "rotation": rounded(np.array([np.cos(half), 0.0, 0.0, np.sin(half)]), 12),
+                        "num_lidar_pts": int(truth.lidar_points[n]),
+                        "num_radar_pts": int(truth.radar_points[n]),
+                    }
+                )
+            link_chain(own_rows)
+            annotations += own_rows
+            instances.append(
+                {
+                    "token": self._token("instance", n),
+                    "category_token": token(seed, "category", actor.kind.category),
+                    "nbr_annotations": len(own_rows),
+                    "first_annotation_token": own_rows[0]["token"],
+                    "last_annotation_token": own_rows[-1]["token"],
+                }
+            )
+        order = {self._token("sample", k): k for k in range(len(frames))}
+        annotations.sort(key=lambda row: order[str(row["sample_token"])])
+        return {"sample_annotation": annotations, "instance": instances}
+
+    def _sample_tables(self, shots: list[tuple[_Shot, int]]) -> Tables:
+        """scene, sample, sample_data, ego_pose and weather_annotation."""
+        config, scene = self.config, self.scene
+        samples: list[Row] = [
+            {"token": self._token("sample", k), "timestamp": self._stamp(time), "scene_token": self._token()}
+            for k, time in enumerate(self.key_times)
+        ]
+        link_chain(samples)
+        shots = sorted(shots, key=lambda item: (item[0].time_s, item[0].channel))
+        data: list[Row] = []
+        for shot, points in shots:
+            camera = shot.channel in CAMERAS
+            stamp = self._stamp(shot.time_s)
+            data.append(
+                {
+                    "token": self._token("data", shot.channel, stamp),
+                    "sample_token": samples[shot.frame]["token"],
+                    "ego_pose_token": self._token("pose", stamp),
+                    "calibrated_sensor_token": token(config.seed, "calibration", shot.channel),
+                    "timestamp": stamp,
+                    "fileformat": "jpg" if camera else "pcd",
+                    "is_key_frame": shot.is_key,
+                    "width": config.image_width_px if camera else points,
+                    "height": config.image_height_px if camera else 1,
+                    "filename": self._filename(shot),
+                }
+            )
+        link_by(data, "calibrated_sensor_token")
+        times = sorted({shot.time_s for shot, _ in shots} | set(self._ego_times()))
+        rotations, translations = scene.ego.poses(np.array(times))
+        poses = [
+            {
+                "token": self._token("pose", self._stamp(time)),
+                "timestamp": self._stamp(time),
+                "rotation": rounded(rotation, 12),
+                "translation": rounded(place, 6),
+            }
+            for time, rotation, place in zip(
+                times, quaternions(rotations), translations + scene.utm_offset, strict=True
+            )
+        ]
+        sky = scene.conditions
+        weather = {
+            "token": self._token("weather"),
+            "precipitation": sky.precipitation_mm,
+            "temperature": sky.temperature_k,
+            "wind_speed": sky.wind_mps,
+            "wind_direction": sky.wind_rad,
+        }
+        row = {
+            "token": self._token(),
+            "name": self.name,
+            "description": sky.tags,
+            "log_token": "",
+            "nbr_samples": len(samples),
+            "first_sample_token": samples[0]["token"],
+            "last_sample_token": samples[-1]["token"],
+            "weather_annotation_token": weather["token"],
+        }
+        return {
+            "scene": [row],
+            "sample": samples,
+            "sample_data": data,
+            "ego_pose": poses,
+            "weather_annotation": [weather],
+        }
+
+    def _ego_times(self) -> list[float]:
+        step = 1.0 / self.config.ego_rate_hz
+        return [
+            self._quantised(i * step)
+            for i in range(-int((LEAD_IN_S - 0.1) / step), int((self.config.duration_s + 0.1) / step) + 1)
+        ]
+
+    def _motion_tables(self) -> Tables:
+        """Both ego_motion tables. The chassis one reads zero speed for stretches, as in the real data."""
+        times = self._ego_times()
+        speed, spin = self.scene.ego.rates_at(np.array(times))
+        accel = np.gradient(speed, np.array(times), axis=0) if len(times) > 1 else np.zeros_like(speed)
+        rotations, _ = self.scene.ego.poses(np.array(times))
+        angles = np.stack(
+            [
+                np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]),
+                -np.arcsin(rotations[:, 2, 0]),
+                np.arctan2(rotations[:, 2, 1], rotations[:, 2, 2]),
+            ],
+            1,
+        )
+        rng = scene_rng(self.config, self.index, 8)
+        silent = np.zeros(len(times), dtype=bool)
+        for _ in range(int(rng.integers(0, 4))):
+            first = int(rng.integers(0, len(times)))
+            silent[first : first + int(rng.uniform(0.05, 0.3) * len(times))] = True
+        names = ("vx", "vy", "vz", "ax", "ay", "az", "yaw", "pitch", "roll", "roll_rate", "pitch_rate", "yaw_rate")
+        tables: Tables = {}
+        for table, noise in (("ego_motion_cabin", 0.02), ("ego_motion_chassis", 0.01)):
+            values = np.concatenate([speed + noise * rng.standard_normal(speed.shape), accel, angles, spin], 1)
+            if table == "ego_motion_chassis":
+                values[silent, :2] = 0.0
+            tables[table] = [
+                {"token": self._token(table, i), "timestamp": self._stamp(time)}
+                | dict(zip(names, rounded(row, 5), strict=True))
+                for i, (time, row) in enumerate(zip(times, values, strict=True))
+            ]
+        return tables
+
+
+def write_scene(config: WorldConfig, index: int, folder: Path) -> Tables:
+    """Write the sensor files of scene `index` under `folder` (its channel folders exist) and return its table rows."""
+    return SceneWriter(config, index, folder).write()

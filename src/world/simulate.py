@@ -1,0 +1,212 @@
+"""One scene of the world: its road, its actors and how they move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from src.world.catalogue import KINDS, Kind
+from src.world.conditions import Conditions, draw_conditions
+from src.world.motion import LEAD_IN_S, EgoMotion, Tracks
+from src.world.placement import Actor, bystanders
+from src.world.road import Road, make_road
+from src.world.traffic import STEP_S, Vehicle, simulate_traffic
+from src.world.world_config import WorldConfig
+
+Array = np.ndarray
+
+EGO_CENTRE_M = 2.1
+"""From the ego origin (under the rear axle) to the middle of the truck."""
+EGO_LENGTH_M = 7.5
+MIN_REACH_M = 80.0
+"""Roadside objects are spread at least this far ahead, however short the scene is."""
+HITCH_OVERLAP_M = {"tractor_unit": 1.9, "rigid_truck": -1.2}
+"""How far a trailer reaches over its truck; negative for a drawbar."""
+
+
+@dataclass(kw_only=True)
+class Scene:
+    """Everything that the sensors look at, in local coordinates (metres; the writer adds the UTM offset)."""
+
+    index: int
+    split: str
+    conditions: Conditions
+    road: Road
+    actors: list[Actor]
+    tracks: Tracks  # row n belongs to actors[n]
+    ego: EgoMotion
+    utm_offset: Array  # [3] m
+
+    @property
+    def sizes(self) -> Array:
+        """[N, 3] length, width, height."""
+        return np.array([actor.size for actor in self.actors])
+
+
+def scene_rng(config: WorldConfig, index: int, purpose: int) -> np.random.Generator:
+    """A random stream of its own for each scene and purpose, so that one part's draws never move another's."""
+    return np.random.default_rng([config.seed, index, purpose])
+
+
+def make_scene(config: WorldConfig, index: int) -> Scene:
+    """Simulate scene `index` (train scenes first). Every scene has its own road."""
+    rng = scene_rng(config, index, 0)
+    split = "train" if index < config.num_train_scenes else "val"
+    within = index if split == "train" else index - config.num_train_scenes
+    conditions = draw_conditions(rng, within)
+    road = make_road(rng)
+    steps = int(np.ceil((config.duration_s + 2 * LEAD_IN_S) / STEP_S)) + 2
+    ego_mps = rng.uniform(60, 90) / 3.6
+    fleet = _draw_fleet(config, road, ego_mps, rng)
+    s, s_rate, d, d_rate = simulate_traffic(fleet, road, steps, rng)
+    ego_s = s[:1] - EGO_CENTRE_M
+    shift = float(np.interp(LEAD_IN_S, np.arange(steps) * STEP_S, ego_s[0]))
+    ego_tracks = Tracks(
+        road=road, s=ego_s - shift, s_rate=s_rate[:1], d=d[:1], d_rate=d_rate[:1], turn=np.zeros((1, steps))
+    )
+    actors, rows = _split_trains(fleet, s - shift, s_rate, d, d_rate, rng)
+    reach = max(float(ego_tracks.s[0, -1]), MIN_REACH_M)
+    for actor, start in bystanders(config, road, reach, rng):
+        time = np.arange(steps) * STEP_S - LEAD_IN_S
+        still = np.ones(steps)
+        rows.append(
+            (
+                start.s + start.s_rate * time,
+                start.s_rate * still,
+                start.d + start.d_rate * time,
+                start.d_rate * still,
+                start.turn * still,
+            )
+        )
+        actors.append(actor)
+    columns = [np.stack(column) for column in zip(*rows, strict=True)]
+    tracks = Tracks(road=road, s=columns[0], s_rate=columns[1], d=columns[2], d_rate=columns[3], turn=columns[4])
+    offset = np.array([7.0e5, 5.3e6, 0.0]) + np.array([rng.uniform(-2e4, 2e4), rng.uniform(-2e4, 2e4), 0.0])
+    return Scene(
+        index=index,
+        split=split,
+        conditions=conditions,
+        road=road,
+        actors=actors,
+        tracks=tracks,
+        ego=EgoMotion.draw(ego_tracks, rng),
+        utm_offset=np.round(offset, 3),
+    )
+
+
+def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.Generator) -> list[Vehicle]:
+    """The ego truck first, then a bus, motorcycles and a slow machine near it, then ordinary traffic in every lane."""
+    slow = road.lanes - 1
+    fleet = [Vehicle("ego", 1, slow, EGO_CENTRE_M - LEAD_IN_S * ego_mps, ego_mps, EGO_LENGTH_M, may_change=False)]
+    company = [
+        (
+            "bus",
+            slow if road.lanes == 2 else slow - int(rng.integers(0, 2)),
+            rng.uniform(1, 4),
+            rng.choice([-55, -38, 40, 62, 85]),
+        ),
+        ("motorcycle", int(rng.integers(0, slow)), rng.uniform(1, 8), rng.uniform(-70, 20)),
+        ("motorcycle", int(rng.integers(0, slow + 1)), rng.uniform(-1, 4), rng.choice([-30, 28, 50])),
+        ("farm_tractor" if rng.random() < 0.5 else "excavator", slow, rng.uniform(-3.5, -1), rng.uniform(70, 120)),
+    ]
+    for kind, lane, faster, place in company:
+        chosen = "bendy_bus" if kind == "bus" and rng.random() < 0.3 else kind
+        if rng.random() < 0.75 * config.rare_objects:
+            _add(fleet, chosen, 1, lane, float(place), ego_mps + faster, may_change=False)
+    for direction, low, high in ((1, -460.0, 620.0), (-1, -980.0, 260.0)):
+        for lane in range(road.lanes):
+            busy = config.vehicles_per_lane_km * (0.8 if lane == 0 else 1.1)
+            place = low + rng.uniform(0, 40)
+            while busy > 0 and place < high:
+                kind, wanted = _draw_vehicle(road, lane, rng)
+                _add(fleet, kind, direction, lane, place, wanted, has_trailer=rng.random() < 0.62)
+                place += max(rng.exponential(1000.0 / busy), 12 + 0.9 * wanted)
+    return fleet
+
+
+def _add(
+    fleet: list[Vehicle],
+    kind: str,
+    direction: int,
+    lane: int,
+    place: float,
+    wanted: float,
+    *,
+    has_trailer: bool = False,
+    may_change: bool = True,
+) -> None:
+    """Put a vehicle into a lane unless something is too close already."""
+    with_trailer = has_trailer and kind in HITCH_OVERLAP_M
+    length = KINDS[kind].size_m[0]
+    if with_trailer:
+        length += KINDS[_trailer_of(kind)].size_m[0] - HITCH_OVERLAP_M[kind]
+    near = (v for v in fleet if v.direction == direction and v.lane == lane)
+    if all(abs(v.along_m - place) > 0.5 * (v.length_m + length) + 7 for v in near):
+        fleet.append(Vehicle(kind, direction, lane, place, wanted, length, with_trailer, may_change))
+
+
+def _trailer_of(kind: str) -> str:
+    return "semi_trailer" if kind == "tractor_unit" else "drawbar_trailer"
+
+
+def _draw_vehicle(road: Road, lane: int, rng: np.random.Generator) -> tuple[str, float]:
+    """Kind and wanted speed (m/s) of ordinary traffic in a lane; up to 50 m/s (180 km/h) on the left."""
+    from_right = road.lanes - 1 - lane
+    if from_right == 0:
+        kind = rng.choice(
+            ["car", "tractor_unit", "rigid_truck", "van", "bus", "motorcycle"], p=[0.5, 0.24, 0.12, 0.1, 0.02, 0.02]
+        )
+    elif from_right == 1:
+        kind = rng.choice(
+            ["car", "tractor_unit", "rigid_truck", "van", "bus", "motorcycle"], p=[0.83, 0.03, 0.03, 0.08, 0.015, 0.015]
+        )
+    else:
+        kind = rng.choice(["car", "van", "motorcycle"], p=[0.94, 0.04, 0.02])
+    if kind in ("tractor_unit", "rigid_truck"):
+        return str(kind), float(np.clip(rng.normal(23.5, 1.0), 20, 27))
+    if kind == "bus":
+        return "bendy_bus" if rng.random() < 0.25 else "bus", float(np.clip(rng.normal(26, 1.5), 22, 29))
+    mean = {0: 35.0, 1: 44.0}.get(from_right, 46.5)
+    return str(kind), float(np.clip(rng.normal(mean, 3.2), 25, 50))
+
+
+def _split_trains(
+    fleet: list[Vehicle], s: Array, s_rate: Array, d: Array, d_rate: Array, rng: np.random.Generator
+) -> tuple[list[Actor], list[tuple[Array, ...]]]:
+    """Turn simulated vehicles into actors: a truck with a trailer becomes two that follow one another."""
+    actors, rows = [], []
+    for i, vehicle in enumerate(fleet[1:], start=1):
+        parts = [vehicle.kind] + ([_trailer_of(vehicle.kind)] if vehicle.has_trailer else [])
+        sizes = [KINDS[name].draw_size(rng) for name in parts]
+        total = sum(size[0] for size in sizes) - (HITCH_OVERLAP_M[vehicle.kind] if vehicle.has_trailer else 0.0)
+        for part, (name, size) in enumerate(zip(parts, sizes, strict=True)):
+            offset = 0.5 * total - 0.5 * size[0] if part == 0 else 0.5 * size[0] - 0.5 * total
+            late = int(round((0.5 * total - 0.5 * size[0] - offset) / max(vehicle.wanted_mps, 5.0) / STEP_S))
+            sideways = np.concatenate([np.zeros(late), d_rate[i]])[: d.shape[1]]
+            across = np.concatenate([np.full(late, d[i, 0]), d[i]])[: d.shape[1]]
+            along_rate = s_rate[i] * vehicle.direction
+            turn = np.arctan2(sideways * vehicle.direction, np.maximum(along_rate, 2.0))
+            rows.append(
+                (
+                    s[i] + vehicle.direction * offset,
+                    s_rate[i],
+                    across,
+                    sideways,
+                    turn + (np.pi if vehicle.direction < 0 else 0.0),
+                )
+            )
+            actors.append(_actor(KINDS[name], name, size, rng))
+    return actors, rows
+
+
+def _actor(kind: Kind, name: str, size: Array, rng: np.random.Generator) -> Actor:
+    return Actor(
+        kind=kind,
+        name=name,
+        size=size,
+        colour=kind.colours[int(rng.integers(len(kind.colours)))],
+        has_rider=True,
+        parked=False,
+        variant=int(rng.integers(1 << 16)),
+    )

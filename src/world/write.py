@@ -1,0 +1,135 @@
+"""A whole world on disk in the TruckScenes layout: made once, complete or not at all."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+from tqdm import tqdm
+
+from src.data.schema import TABLES
+from src.errors import ConfigError, DataError
+from src.structures.taxonomy import CAMERAS, LIDARS, RADARS
+from src.world.rig import sensor_rig
+from src.world.scene_writer import write_scene
+from src.world.table_rows import Tables, shared_tables
+from src.world.world_config import WorldConfig, stored_config, world_digest
+
+__all__ = ["VERSION", "ensure_world", "world_digest", "write_world"]
+
+VERSION = "v1.2-trainval"
+CONFIG_FILE = "world.json"
+
+
+def ensure_world(config: WorldConfig, root: Path, progress: bool = True) -> Path:
+    """The world of this config at `root`, written now unless it is there already.
+
+    Raises ConfigError if the world at `root` has another config, DataError if `root` holds something else or half of
+    a world.
+    """
+    root = Path(root)
+    if not root.exists() or (root.is_dir() and not any(root.iterdir())):
+        return write_world(config, root, progress)
+    stored = _read_stored(root)
+    wanted = json.loads(json.dumps(stored_config(config)))
+    if stored != wanted:
+        differing = sorted(k for k in stored.keys() | wanted.keys() if stored.get(k) != wanted.get(k))
+        pairs = ", ".join(f"{k}: stored {stored.get(k)!r}, asked {wanted.get(k)!r}" for k in differing)
+        raise ConfigError(f"{root} holds a world of another config ({pairs}); choose another folder or remove this one")
+    return root
+
+
+def write_world(config: WorldConfig, root: Path, progress: bool = True) -> Path:
+    """Write a world to `root`, which must not exist or be empty, and return `root`.
+
+    Everything goes into a hidden folder beside `root` that is renamed at the end, so an interrupted run leaves no
+    `root`. The bytes depend on the config alone, not on `num_workers`. Raises DataError if `root` is taken or cannot be
+    written.
+    """
+    root = Path(root)
+    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+        raise DataError(
+            f"{root}: a world needs a new or empty folder, but this one is in use; choose another or remove it"
+        )
+    partial_root = root.parent / f".{root.name}.partial-{uuid.uuid4().hex[:8]}"
+    try:
+        try:
+            root.parent.mkdir(parents=True, exist_ok=True)
+            _fill(config, partial_root, progress)
+        except OSError as error:
+            raise DataError(
+                f"{root}: the world could not be written ({error.strerror or error}); make room, or choose another "
+                "data.root or paths.outputs"
+            ) from error
+        try:
+            os.replace(partial_root, root)
+        except OSError as error:
+            # Another process may have finished the same world in the meantime.
+            if not root.exists():
+                raise DataError(f"{root}: the finished world could not be moved here: {error}") from error
+            ensure_world(config, root, progress)
+    finally:
+        shutil.rmtree(partial_root, ignore_errors=True)
+    return root
+
+
+def _read_stored(root: Path) -> dict[str, object]:
+    try:
+        stored = json.loads((root / CONFIG_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(
+            f"{root}: not a complete synthetic world ({CONFIG_FILE}: {error}); remove the folder or choose another"
+        ) from error
+    if not isinstance(stored, dict):
+        raise DataError(
+            f"{root / CONFIG_FILE}: expected an object, but found {type(stored).__name__}; remove the folder"
+        )
+    missing = [name for name in TABLES if not (root / VERSION / f"{name}.json").is_file()]
+    if missing:
+        raise DataError(f"{root}: a synthetic world without its tables {missing}; remove the folder to make it again")
+    return stored
+
+
+def _fill(config: WorldConfig, folder: Path, progress: bool) -> None:
+    """Write every file of the world below `folder`; the config comes last."""
+    lidars = LIDARS if config.lidar else LIDARS[:1]
+    for channel in (*CAMERAS, *RADARS, *lidars):
+        (folder / "samples" / channel).mkdir(parents=True)
+        if channel not in lidars:
+            (folder / "sweeps" / channel).mkdir(parents=True)
+    tables: Tables = {name: [] for name in TABLES} | shared_tables(config.seed, sensor_rig(config))
+    names = []
+    bar = tqdm(total=config.num_scenes, desc="writing the synthetic world", unit="scene", disable=not progress)
+    with bar:
+        for rows in _scenes(config, folder):
+            for name, more in rows.items():
+                tables[name].extend(more)
+            names.append(str(rows["scene"][0]["name"]))
+            bar.update()
+    (folder / VERSION).mkdir()
+    for name, table in tables.items():
+        (folder / VERSION / f"{name}.json").write_text(json.dumps(table, separators=(",", ":")), encoding="utf-8")
+    splits = {"train": names[: config.num_train_scenes], "val": names[config.num_train_scenes :]}
+    (folder / "splits.json").write_text(json.dumps(splits, indent=1), encoding="utf-8")
+    (folder / CONFIG_FILE).write_text(json.dumps(stored_config(config), indent=1), encoding="utf-8")
+
+
+def _scenes(config: WorldConfig, folder: Path) -> Iterator[Tables]:
+    """Rows of all scenes in order, written by `num_workers` processes."""
+    work = partial(_write_one, config, folder)
+    workers = min(config.num_workers, config.num_scenes)
+    if workers < 2:
+        yield from map(work, range(config.num_scenes))
+        return
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        yield from pool.imap(work, range(config.num_scenes))
+
+
+def _write_one(config: WorldConfig, folder: Path, index: int) -> Tables:
+    return write_scene(config, index, folder)

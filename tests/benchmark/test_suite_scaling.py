@@ -1,0 +1,89 @@
+"""Growth ratios by hand, scenes that begin alike, and settings that vary one thing at a time."""
+
+from dataclasses import replace
+
+import torch
+
+from src.benchmark.scenes import Highway, highway_frame, highway_points
+from src.benchmark.suite_scaling import NOMINAL_M, SIZES, Point, growth_rows, model_settings, peer_of, sweeps_of
+from src.config import compose_config
+
+ROAD = Highway(background=400, num_vehicles=20, points_per_vehicle=10, reach_m=150.0)
+
+
+def row(sweep, x, model, milliseconds, added, remembered):
+    work = 2.0 * milliseconds if model == "horizon3d" else 3.0 * milliseconds
+    return {sweep: x, "model": model, "ms": milliseconds, "added MiB": added, "remembered MiB": remembered} | {
+        "GFLOP": work
+    }
+
+
+def test_growth_is_from_the_nominal_range_and_else_from_the_first_point():
+    ranged, objects = "range, fixed scene", "objects"
+    measured = {
+        ranged: [
+            row(ranged, 75.0, "horizon3d", 8.0, 5.0, 1.0), row(ranged, 75.0, "dense_bev", 10.0, 10.0, 0.0),
+            row(ranged, 150.0, "horizon3d", 10.0, 8.0, 2.0), row(ranged, 150.0, "dense_bev", 50.0, 30.0, 10.0),
+            row(ranged, 600.0, "horizon3d", 12.0, 9.0, 3.0), row(ranged, 600.0, "dense_bev", 800.0, 480.0, 160.0),
+        ],
+        objects: [
+            row(objects, 0, "horizon3d", 10.0, None, 0.0), row(objects, 0, "dense_bev", 40.0, None, 0.0),
+            row(objects, 80, "horizon3d", 15.0, None, 0.0), row(objects, 80, "dense_bev", 40.0, None, 0.0),
+        ],
+    }  # fmt: skip
+    first, second = growth_rows(measured)
+    assert (first["from"], first["to"]) == (150.0, 600.0)
+    assert (first["horizon3d time x"], first["dense_bev time x"]) == (1.2, 16.0)
+    assert (first["horizon3d memory x"], first["dense_bev memory x"]) == (1.2, 16.0)
+    assert (first["dense / ours at from"], first["dense / ours at to"]) == (5.0, 800.0 / 12.0)
+    assert first["GFLOP dense / ours at from"] == 1.5 * first["dense / ours at from"]
+    assert (second["from"], second["horizon3d time x"], second["dense_bev time x"]) == (0, 1.5, 1.0)
+    assert "horizon3d memory x" not in second  # not known there
+
+
+def test_a_longer_road_begins_as_the_shorter_one():
+    short, long = highway_points(ROAD), highway_points(replace(ROAD, reach_m=600.0))
+    assert torch.equal(long[: len(short)], short) and torch.equal(highway_points(ROAD), short)
+    beyond = long[len(short) :, 0].abs()
+    assert beyond.min() > 130.0 and 300.0 < beyond.max() < 640.0  # noise and the length of a truck cross the line
+    assert short[:, 0].abs().max() < 170.0 and len(beyond) < len(short)  # few returns come from far away
+
+
+def test_twice_the_traffic_gives_twice_its_returns():
+    numbers = [len(highway_points(replace(ROAD, num_vehicles=number))) for number in (0, 20, 40)]
+    assert numbers[0] == 400 and abs(numbers[1] - 600) <= 2 and abs(numbers[2] - 800) <= 2
+
+
+def test_a_point_ahead_of_a_camera_is_seen_where_it_should_be():
+    frame = highway_frame(highway_points(ROAD), (256, 864))
+    ahead_left = frame.pix_from_aug[0, 0] @ torch.tensor([20.0, 20.0, 2.2, 1.0])  # the first looks at 45 degrees
+    assert torch.allclose(ahead_left[:2] / ahead_left[2], torch.tensor([432.0, 128.0]), atol=1e-3)
+    assert abs(float(ahead_left[2]) - 800**0.5) < 1e-3
+    left_of_it = frame.pix_from_aug[0, 0] @ torch.tensor([15.0, 25.0, 2.2, 1.0])
+    assert left_of_it[0] / left_of_it[2] < 432.0
+
+
+def test_only_the_ranges_reach_beyond_the_nominal_one():
+    for name, points in sweeps_of(SIZES["paper"], temporal=True).items():
+        beyond = [point for point in points if max(point.range_m, point.road.reach_m) > NOMINAL_M]
+        assert bool(beyond) == name.startswith("range"), name
+    assert "memory frames" not in sweeps_of(SIZES["paper"], temporal=False)
+
+
+def test_a_point_changes_what_it_names():
+    config, _ = compose_config(["scale=debug", "phase=phase2"])
+    point = Point(1.0, NOMINAL_M, ROAD, gaussians=0.5, memory_frames=5)
+    settings = model_settings(config, point)
+    assert (settings.kggi.num_radar_keypoints, settings.kggi.num_camera_keypoints) == (16, 8)
+    assert settings.dptf.bev_path.num_frames == 5 and settings.dptf.gaussian_path.num_frames == 2
+    assert settings.dptf.bev_path.max_cells_per_frame == 20 * SIZES["debug"].cells_per_object
+    twice_as_far = replace(point, road=replace(ROAD, reach_m=300.0))
+    assert (
+        model_settings(config, twice_as_far).dptf.bev_path.max_cells_per_frame == 40 * SIZES["debug"].cells_per_object
+    )
+    assert model_settings(config, replace(point, memory_frames=0)).dptf is None
+    assert config.model.kggi.num_radar_keypoints == 32 and config.model.dptf.bev_path.num_frames == 2
+
+    peer = peer_of(config, "dense_bev")
+    assert model_settings(peer, point).temporal.num_frames == 5 and peer.grid == config.grid
+    assert model_settings(peer, replace(point, memory_frames=0)).temporal is None

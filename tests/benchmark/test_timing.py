@@ -1,0 +1,97 @@
+"""Turns, spreads and memory of what is measured."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from src.benchmark import timing
+from src.benchmark.timing import added_bytes, in_turns, interleaved, median_spread, timed_parts
+from src.ops.tiled_rulebook import scratch
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def ticking(monkeypatch):
+    """A clock that candidates push on."""
+    now = {"s": 0.0}
+    monkeypatch.setattr(timing, "clock", lambda device: lambda: now["s"])
+    return now
+
+
+def test_median_and_spread():
+    assert median_spread([5.0]) == (5.0, 0.0)
+    assert median_spread([1.0, 9.0, 2.0]) == (2.0, 8.0)  # the whole range of so few
+    assert median_spread([1.0, 2.0, 3.0, 4.0, 100.0]) == (3.0, 52.0 - 1.5)  # the middle half
+
+
+def test_candidates_take_turns_and_warm_up(ticking):
+    order = []
+
+    def candidate(name, seconds):
+        def run():
+            order.append(name)
+            ticking["s"] += seconds
+
+        return run
+
+    seconds = interleaved({"a": candidate("a", 1.0), "b": candidate("b", 2.0)}, CPU, 2)
+    assert order == ["a", "b"] * 3 and seconds == {"a": [1.0, 1.0], "b": [2.0, 2.0]}
+
+
+def test_what_is_slow_has_fewer_rounds(ticking):
+    calls = {"quick": 0, "slow": 0, "slower": 0, "endless": 0}
+
+    def candidate(name, seconds):
+        def run():
+            calls[name] += 1
+            ticking["s"] += seconds
+
+        return run
+
+    made = {"quick": candidate("quick", 0.1), "slow": candidate("slow", 2.0)}
+    made |= {"slower": candidate("slower", 10.0), "endless": candidate("endless", 50.0)}
+    seconds = in_turns(made, CPU, rounds=6, budget_s=5.0)
+    assert calls == {"quick": 7, "slow": 3, "slower": 2, "endless": 1}  # the first call of each tells how slow it is
+    assert [len(values) for values in seconds.values()] == [6, 2, 1, 1]
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="the peak of a process is told by Linux only")
+def test_added_memory_is_that_of_the_call():
+    held = torch.ones(8 * 2**20)  # 32 MiB that were there before
+
+    def call():
+        first = torch.ones(16 * 2**20)  # 64 MiB, given back
+        del first
+        return torch.ones(4 * 2**20).sum() + held.sum()
+
+    added = added_bytes(call, CPU)
+    if added is None:
+        pytest.skip("the system does not let a process begin its peak anew")
+    assert 60 * 2**20 < added < 96 * 2**20
+    assert added_bytes(lambda: None, CPU) < 8 * 2**20  # the peak of the call before is forgotten
+
+
+def test_memory_that_is_used_again_counts_for_every_call():
+    def call():
+        return scratch("of a test", 32 * 2**20, 1, torch.uint8, CPU).fill_(1)[0, 0]
+
+    call()
+    added = [added_bytes(call, CPU) for _ in range(2)]
+    if None in added:
+        pytest.skip("the system does not let a process begin its peak anew")
+    assert 30 * 2**20 < min(added) and max(added) < 60 * 2**20
+
+
+def test_timed_parts_add_up_calls_and_leave_the_model_as_it_was():
+    model = torch.nn.Module()
+    model.first, model.second = torch.nn.Linear(2, 2), None
+    before = dict(vars(model.first))
+    timings = {}
+    parts = {"both": ("first.forward", "first.extra_repr"), "absent": ("second.forward", "third.forward")}
+    with pytest.raises(ZeroDivisionError), timed_parts(model, parts, timings, torch.device("cpu")):
+        model.first(torch.zeros(1, 2))
+        model.first.extra_repr()
+        1 / 0  # noqa: B018
+    assert list(timings) == ["both"] and len(timings["both"]) == 2 and vars(model.first) == before

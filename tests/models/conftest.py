@@ -1,1 +1,0 @@
-"""For the tests in the folders below, which import the modules beside this file (`moving`, `surroundings`)."""

@@ -1,0 +1,37 @@
+import pytest
+import torch
+
+from src.ops.checkpointed_mlp import row_mlp
+
+
+def operands(rows, dtype=torch.float64):
+    torch.manual_seed(0)
+    sizes = ((rows, 5), (5, 7), (7,), (7, 3), (3,))
+    return [torch.randn(*size, dtype=dtype, requires_grad=True) for size in sizes]
+
+
+@pytest.mark.parametrize("rows", [0, 1, 9])
+def test_gradcheck_over_several_spans(rows, monkeypatch):
+    monkeypatch.setattr("src.ops.checkpointed_mlp.CPU_ROWS", 4)
+    values = operands(rows)
+    x, w, b, v, c = values
+    torch.testing.assert_close(row_mlp(*values), (x @ w + b).relu() @ v + c)
+    assert torch.autograd.gradcheck(row_mlp, values)
+
+
+def test_half_precision_sums_gradients_in_full():
+    """1e5 equal rows: sums in bfloat16 would stop growing at 256."""
+    x = torch.ones(100_000, 1, dtype=torch.bfloat16, requires_grad=True)
+    one = torch.ones(1, 1, dtype=torch.bfloat16)
+    w = one.clone().requires_grad_()
+    row_mlp(x, w, torch.zeros(1, dtype=torch.bfloat16), one, torch.zeros(1, dtype=torch.bfloat16)).sum().backward()
+    assert w.grad.item() == pytest.approx(100_000, rel=0.01)
+
+
+def test_autocast_computes_in_its_type():
+    values = operands(9, torch.float32)
+    with torch.autocast("cpu", torch.bfloat16):
+        out = row_mlp(*values)
+    assert out.dtype == torch.bfloat16
+    out.float().sum().backward()
+    assert values[0].grad.dtype == torch.float32

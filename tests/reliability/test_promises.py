@@ -1,0 +1,35 @@
+"""Every promise of docs/reliability.md names a test that exists."""
+
+import ast
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def promised_tests():
+    """(file, function) of every test in the tables; `::name` alone is of the file named before it in its row."""
+    named = []
+    for line in (ROOT / "docs" / "reliability.md").read_text().splitlines():
+        file = ""
+        for path, name in re.findall(r"`((?:tests/[\w/]+\.py)?)::(\w+)`", line):
+            file = path or file
+            named.append((file, name))
+    return named
+
+
+def functions_of(file):
+    path = ROOT / file
+    tree = ast.parse(path.read_text() if path.is_file() else "")
+    return {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+
+
+def test_every_promise_names_a_test_that_exists():
+    named = promised_tests()
+    assert len(named) > 30
+    assert not [f"{file}::{name}" for file, name in named if name not in functions_of(file)]
+
+
+def test_every_row_of_a_table_names_a_test():
+    rows = [line for line in (ROOT / "docs" / "reliability.md").read_text().splitlines() if line.startswith("| ")]
+    assert not [row for row in rows if "::" not in row and row != "| fault | what happens | test |"]

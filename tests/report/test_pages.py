@@ -1,0 +1,207 @@
+"""Which runs stand on which page and what they are called, through the command's own entry."""
+
+import pytest
+from PIL import Image
+
+from src.dashboard import single_file as export
+from src.errors import DataError
+from src.report.__main__ import main
+from src.report.pages import without_defaults
+from src.report.results import result_path
+from src.report.sweep_record import record_path, write_record
+
+NO_VELOCITY = [
+    "model.dptf.gaussian_path.velocity_compensation=false",
+    "model.dptf.bev_path.velocity_compensation=false",
+]
+FURTHER = ["phase=phase1", "phase.init_from=phase1", "phase.velocity_code_weight=1.0"]
+
+
+@pytest.fixture
+def exported(monkeypatch):
+    """What the dashboard was exported from, call by call; it has tests of its own."""
+    calls = []
+    monkeypatch.setattr(export, "export_dashboard", lambda *arguments: calls.append(arguments))
+    return calls
+
+
+@pytest.fixture
+def report(tmp_path, capsys, exported):
+    def run(phase):
+        main([f"phase={phase}", "scale=mini", f"paths.outputs={tmp_path}", f"paths.reports={tmp_path / 'reports'}"])
+        assert f"{phase}_mini.md" in capsys.readouterr().out
+        return (tmp_path / "reports" / f"{phase}_mini.md").read_text()
+
+    return run
+
+
+@pytest.fixture
+def both_phases(write_run):
+    for seed in (0, 1):
+        write_run(f"plain{seed}", [f"seed={seed}"], seed, 0.30 + 0.1 * seed)  # scored before there were speed classes
+        write_run(f"further{seed}", [*FURTHER, f"seed={seed}"], seed, 0.33 + 0.1 * seed, speeds=True)
+        write_run(f"full{seed}", ["phase=phase2"], seed, 0.38 + 0.1 * seed, phase="phase2", speeds=True)
+        write_run(f"still{seed}", NO_VELOCITY, seed, 0.35 + 0.1 * seed, phase="phase2", speeds=True)
+    write_run("radar", ["model.kggi=null", "model.ocsf=null"], 0, 0.2)
+
+
+def rows(text, heading):
+    """Lines of the table whose heading starts so, by label."""
+    lines = text.split(heading)[1].splitlines()[2:]
+    lines = lines[: next((i for i, line in enumerate(lines) if not line), len(lines))]
+    return {line.split(" | ")[0].strip("| "): line for line in lines}
+
+
+def test_phase_2_is_held_against_phase_1(both_phases, report, tmp_path):
+    text = report("phase2")
+    summary = rows(text, "| experiment | mAP | NDS | mAVE, m/s |")
+    assert list(summary) == [
+        "phase 1", "phase 1, as many further epochs", "phase 2", "phase 2, no velocity compensation"
+    ]  # fmt: skip
+    assert summary["phase 2"].startswith("| phase 2 | **43.0 ± 7.1** | **43.0 ± 7.1** | **1.57 ± 0.07** |")
+    assert rows(text, "| experiment | mAP 0-0.5 m/s |")["phase 1"] == "| phase 1 |" + " - |" * 8
+    assert "0-0.5 m/s 13 (cars 3), 0.5-10 m/s 13 (cars 3)" in text
+    gain = rows(text, "| phase 2 over | seeds | mAP |")
+    assert "| 2 | +8.0 ± 0.0 |" in gain["phase 1"]
+    assert "| 2 | +5.0 ± 0.0 |" in gain["phase 1, as many further epochs"]
+    fast = rows(text, "| phase 2 over | seeds | mAVE 0-0.5 m/s |")["phase 2, no velocity compensation"]
+    assert fast.endswith("| -0.03 ± 0.00 |")
+    for command in ("phase=phase1 scale=mini phase.init_from=phase1 phase.velocity_code_weight=1.0 seed=1",
+                    "phase=phase2 scale=mini seed=0"):  # fmt: skip
+        assert f"python -m src.train {command}\n" in text
+    assert Image.open(tmp_path / "reports" / "pictures" / "phase2_mini.png").width == 1600
+    assert "(pictures/phase2_mini.png)" in text
+
+
+def test_phase_1_keeps_its_own_page(both_phases, report):
+    text = report("phase1")
+    assert list(rows(text, "| experiment | mAP | NDS | car AP |")) == ["KGGI + OCSF", "radar only"]
+    assert "init_from" not in text and "phase2" not in text
+
+
+def test_further_epochs_must_be_as_many(both_phases, write_run, report):
+    write_run("longer", [*FURTHER, "phase.epochs=9"], 0, 0.2, epochs=9)
+    write_run("weight", ["phase.init_from=phase1"], 0, 0.3)
+    summary = rows(report("phase2"), "| experiment | mAP | NDS | mAVE, m/s |")
+    assert [name for name in summary if "further" in name] == [
+        "phase 1, as many further epochs (`phase.init_from=phase1 phase.velocity_code_weight=1.0`)",
+        "phase 1, as many further epochs (`phase.init_from=phase1`)",
+        "phase 1, 9 further epochs",
+    ]
+
+
+def test_an_unnamed_setting_shows_itself_last(both_phases, write_run, report):
+    write_run("a", ["model.dptf.gaussian_path.sampling=random"], 0, 0.9, phase="phase2")
+    names = list(rows(report("phase2"), "| experiment | mAP | NDS | mAVE, m/s |"))
+    assert names[-1] == "phase 2, `model.dptf.gaussian_path.sampling=random`"
+
+
+def test_silent_frames_have_tables_of_their_own(both_phases, write_run, report):
+    for seed, (with_velocity, without) in enumerate([(0.3, 0.2), (0.4, 0.2)]):
+        write_run(f"with-{seed}", ["data.silent_frames=0.25"], seed, with_velocity, phase="phase2")
+        write_run(f"without-{seed}", ["data.silent_frames=0.25", *NO_VELOCITY], seed, without, phase="phase2")
+    seen, silent = report("phase2").split("## With silent frames")
+    for part in seen.split("```")[2:]:  # after the commands
+        assert "silent" not in part
+    names = ["phase 2, `data.silent_frames=0.25`", "phase 2, no velocity compensation, `data.silent_frames=0.25`"]
+    assert list(rows(silent, "| experiment | mAP | NDS | mAVE, m/s |")) == names
+    gains = rows(silent, f"| {names[0]} over | seeds | mAP |")
+    assert "| 2 | +15.0 ± 7.1 |" in gains[names[1]]
+
+
+def test_phase_2_without_its_plain_run_has_no_gains(write_run, report):
+    write_run("a", NO_VELOCITY, 0, 0.3, phase="phase2")
+    assert "Gain" not in report("phase2")
+
+
+def test_no_run_of_the_phase_itself(write_run, report):
+    write_run("further", FURTHER, 0, 0.3)
+    for phase in ("phase1", "phase2"):
+        with pytest.raises(DataError, match=f"no finished run of {phase} at scale=mini"):
+            report(phase)
+
+
+def test_other_data_is_refused(both_phases, write_run, report):
+    write_run("other", ["phase=phase2"], 5, 0.3, phase="phase2", root="elsewhere")
+    with pytest.raises(DataError, match="never mixes data.*different paths.reports"):
+        report("phase2")
+
+
+def test_everything_of_a_scale_is_written(both_phases, report, tmp_path, make_record, exported):
+    record = make_record({"4.8 m": {"mAP": 20.3}}, seeds=1)
+    write_record(record_path(tmp_path / "reports", "epsilon", "mini"), record)
+    write_record(
+        record_path(tmp_path / "reports", "other", "debug"), make_record({"x": {}}, scale="debug", name="other")
+    )
+    report("phase1")
+    reports = tmp_path / "reports"
+    assert {path.name for path in reports.iterdir()} >= {"phase1_mini.md", "phase2_mini.md", "results", "tables"}
+    assert len(list((reports / "results").iterdir())) == 9
+    assert {path.name for path in (reports / "tables").iterdir()} == {
+        f"table_epsilon_mini.{ending}" for ending in ("md", "csv", "tex")
+    }
+    assert exported == [(reports, tmp_path, reports / "dashboard.html")]
+
+
+def test_results_outlive_their_runs(both_phases, report, tmp_path):
+    before = report("phase2")
+    for record in tmp_path.glob("*/run.json"):
+        record.unlink()
+    assert report("phase2") == before
+
+
+def test_what_is_broken_is_named_after_the_rest(both_phases, write_run, tmp_path, report):
+    broken = write_run("broken", [], 7, 0.9)
+    (broken / "metrics.json").write_text("{")
+    reports = tmp_path / "reports"
+    (reports / "results").mkdir(parents=True)
+    (reports / "sweeps").mkdir()
+    result_path(reports, "horizon3d-phase1-mini-old").write_text('{"format": 0}')
+    record_path(reports, "torn", "mini").write_text("{")
+    with pytest.raises(DataError) as raised:
+        report("phase2")
+    assert raised.value.exit_code == 4
+    for name in ("broken/metrics.json", "horizon3d-phase1-mini-old.json: format must be 1", "torn_mini.json"):
+        assert name in str(raised.value)
+    assert "phase 2" in (reports / "phase2_mini.md").read_text()
+
+
+def test_sweeps_with_different_data_stop_no_other(both_phases, write_run, tmp_path, report, make_record):
+    for end, root in (("a0", "world"), ("b0", "elsewhere"), ("c0", "world")):
+        write_run(end, [f"x={end}"], 0, 0.3, root=root)
+    reports = tmp_path / "reports"
+    write_record(record_path(reports, "mixed", "mini"), make_record({"a": {}, "b": {}}, seeds=1, name="mixed"))
+    write_record(record_path(reports, "pure", "mini"), make_record({"a": {}}, seeds=1, name="pure"))
+    with pytest.raises(DataError, match="sweep mixed, scale mini: a table never mixes"):
+        report("phase2")
+    assert [path.name for path in (reports / "tables").glob("*.md")] == ["table_pure_mini.md"]
+
+
+def test_rows_of_sweeps_do_not_flood_the_pages(both_phases, write_run, tmp_path, report, make_record):
+    write_run("a0", ["model.ocsf.margin_m=0.8"], 0, 0.9)  # a row of the sweep
+    write_run("b0", ["model.ocsf.margin_m=4.8"], 2, 0.5)  # its baseline, which is the plain run with another seed
+    write_run("c0", ["model.kggi.initialization=random"], 0, 0.2)  # a row that has a name on the page
+    write_run("d0", ["model.ocsf.num_layers=4"], 0, 0.1)  # of no sweep
+    record = make_record({"0.8 m": {}, "4.8 m": {}, "random": {}}, seeds=1)
+    record.rows["4.8 m"] = {2: record.rows["4.8 m"][0]}
+    record.runs[record.rows["4.8 m"][2]].seed = 2
+    write_record(record_path(tmp_path / "reports", "epsilon", "mini"), record)
+    text = report("phase1")
+    summary = rows(text, "| experiment | mAP | NDS | car AP |")
+    assert list(summary) == ["KGGI + OCSF", "OCSF, random Gaussians", "radar only", "`model.ocsf.num_layers=4`"]
+    assert summary["KGGI + OCSF"].startswith("| KGGI + OCSF | **40.0 ± 10.0** |")  # 30, 40 and 50
+    assert "margin_m" not in text
+    assert "margin_m" not in report("phase2")
+
+
+def test_overrides_that_say_the_default_are_none():
+    defaults = {"seed": 0, "model": {"name": "horizon3d", "kggi": {"init": "both"}, "margin_m": 4.8, "dptf": None},
+                "backbone": {"name": "small", "lr": 1.0}, "flag": True}  # fmt: skip
+    same = ["model=horizon3d", "model.kggi.init=both", "model.margin_m=4.80", "model.dptf=null", "backbone=small",
+            "flag=true", "++model.margin_m=4.8"]  # fmt: skip
+    assert without_defaults(same, defaults) == []
+    other = ["model.kggi=null", "model.margin_m=0.8", "backbone=vovnet99", "backbone.lr=1.0", "flag=1", "new.key=1",
+             "model.list=[1"]  # fmt: skip
+    assert without_defaults(other, defaults) == other  # backbone.lr is inside a backbone with a default of its own
+    assert without_defaults(["model.margin_m=0.8", "model.margin_m=4.8"], defaults) == []  # the later wins
+    assert without_defaults(["model.margin_m=4.8", "model.margin_m=0.8"], {}) == ["model.margin_m=0.8"]

@@ -1,0 +1,55 @@
+"""Every file of sweeps/ by its real command at debug scale: every row trained, every table complete (some minutes)."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from src.report.results import read_results
+from src.report.sweep_record import read_record, record_path
+from src.report.table_builder import sweep_tables
+from src.sweep.compose import sweep_files
+
+ROOT = Path(__file__).resolve().parents[2]
+PARTS_OF_SOME = ("kggi", "ocsf", "gaussian_encoder", "dptf", "view_transform", "temporal_fusion")
+"""Of Table 15: not every model has each of them."""
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where all of them work: rows that are the same run are trained by the first that needs it."""
+    return tmp_path_factory.mktemp("sweeps")
+
+
+@pytest.mark.parametrize("name", sweep_files())
+def test_a_sweep_ends_with_complete_tables(name, folder):
+    reports = folder / "reports"
+    places = (f"paths.outputs={folder / 'outputs'}", f"paths.reports={reports}", "trainer.num_pictures=0")
+    fewer = ("trials=2",) if name == "tune" else ()
+    result = subprocess.run(
+        [sys.executable, "-m", "src.sweep", f"+sweep={name}", "scale=debug", *fewer, *places],
+        cwd=ROOT, capture_output=True, text=True, timeout=900,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-3000:]
+    record = read_record(record_path(reports, name, "debug"))
+    assert record.runs and {run.state for run in record.runs.values()} <= {"done", "pruned"}
+    assert sum(run.state == "done" for run in record.runs.values()) >= max(1, len(record.rows))
+    results, broken = read_results(reports, "debug")
+    assert not broken
+    tables = sweep_tables(record, results)
+    assert len(tables) == len(record.sweep.tables) > 0
+    for table in tables:
+        assert (reports / "tables" / f"{table.name}_debug.md").is_file()
+        for row in table.rows:
+            assert row.state in ("done", "paper", "pruned"), row
+        # What a table has columns for is there for every row that is trained, latencies included.
+        trained = [row for row in table.rows if row.state == "done"]
+        assert trained
+        for place, column in enumerate(table.columns):
+            shown = [row.cells[place].mean for row in trained]
+            present_here = column.name.startswith(("speeds.", "classes."))  # the debug world lacks most of them
+            own = column.name.removeprefix("latency.") in PARTS_OF_SOME
+            complete = any(value is not None for value in shown) if own else None not in shown
+            assert present_here or complete, (table.name, column.name)

@@ -1,0 +1,93 @@
+"""The plan: what is trained, in which order, and by which command."""
+
+import pytest
+
+from src.errors import ConfigError
+from src.report.sweep_record import suffix_of
+from src.sweep.plan import changes_of, join_overrides, make_plan, split_machine
+from tests.sweep.fake_sweep import make_sweep
+from tests.sweep.fake_train import identify
+
+
+def test_the_later_override_wins_and_stands_once():
+    assert join_overrides(["phase=phase1", "model.x=1"], ["phase=phase2"], ["+model.x=2"]) == [
+        "phase=phase2",
+        "+model.x=2",
+    ]
+    order = join_overrides(["model.a=null"], ["model.a.b=1"], ["model.a=null"])
+    assert order == ["model.a.b=1", "model.a=null"]
+
+
+def test_what_a_machine_needs_is_no_part_of_a_run():
+    overrides = ["paths.outputs=/o", "model.x=1", "trainer=cpu", "trainer.devices=2", "data.num_workers=1", "data.x=1"]
+    overrides += ["data.root=/d", "phase.train_missing=false", "phase=phase1", "resume=restart", "logger=wandb"]
+    what, machine = split_machine(overrides)
+    assert what == ["model.x=1", "data.x=1", "phase=phase1"] and len(what) + len(machine) == len(overrides)
+
+
+def test_order_is_seed_by_seed_and_first_what_others_start_from():
+    rows = {
+        "b": ["phase=phase2"],
+        "a": ["phase=phase1"],
+        "c": ["phase=phase2", "model.dptf=null"],
+        "b again": ["phase=phase2"],
+    }
+    plan = make_plan(make_sweep(rows, overrides=["model.x=1"]), ["model.x=2"], [3, 4], identify)
+    labels = [(cell.label, cell.seed) for cell in plan.cells.values()]
+    assert labels == [("a", 3), ("b", 3), ("c", 3), ("a", 4), ("b", 4), ("c", 4)]
+    first, second, *_ = plan.cells.values()
+    assert first.overrides == ["phase=phase1", "model.x=2", "seed=3"] and first.needs is None
+    assert second.overrides == ["model.x=2", "phase=phase2", "seed=3"] or second.needs == first.run_id
+    assert plan.rows["b"] == plan.rows["b again"] and plan.labels(second.run_id) == ["b", "b again"]
+    assert plan.changes == ["model.x=2"] and plan.study == f"fake-debug{suffix_of(plan.changes)}"
+
+
+def test_a_run_that_no_row_shows_says_what_it_is_for():
+    plan = make_plan(make_sweep({"b": ["phase=phase2"]}), ["paths.outputs=o"], [0], identify)
+    first, second = plan.cells.values()
+    assert first.label == "weights for b" and plan.labels(first.run_id) == [] and second.needs == first.run_id
+    assert first.command == "python -m src.train phase=phase1 seed=0 paths.outputs=o"
+
+
+def test_a_row_that_does_not_compose_is_named_with_its_file():
+    with pytest.raises(ConfigError, match=r"sweeps/fake.yaml, row 'b': optmi.lr is not a configuration key"):
+        make_plan(make_sweep({"a": [], "b": ["optmi.lr=1"]}), [], [0], identify)
+    with pytest.raises(ConfigError, match=r"sweeps/fake.yaml, overrides: optmi.lr"):
+        make_plan(make_sweep({"a": []}, overrides=["optmi.lr=1"]), [], [0], identify)
+    with pytest.raises(ConfigError, match=r"^optmi.lr"):  # the command line's own fault
+        make_plan(make_sweep({"a": []}), ["optmi.lr=1"], [0], identify)
+
+
+def test_a_sweep_is_of_one_scale():
+    with pytest.raises(ConfigError, match="row 'b': scale=mini, but the sweep is of scale debug"):
+        make_plan(make_sweep({"a": [], "b": ["scale=mini"]}), [], [0], lambda o: identify(o))
+    sweep = make_sweep({"a": [], "b": ["model.x=1"]})
+    sweep.rows[1].scales = ["paper"]
+    plan = make_plan(sweep, [], [0], identify)
+    assert list(plan.rows) == ["a"] and [row.label for row in plan.sweep.paper_rows] == ["b"]
+
+
+def test_what_a_command_line_changes_makes_another_experiment():
+    sweep = make_sweep({"a": ["model.x=1"]}, overrides=["phase=phase1"])
+    places = ["scale=debug", "seed=3", "paths.outputs=/o", "trainer=cpu", "logger=wandb", "data.num_workers=2"]
+    assert make_plan(sweep, places, [0], identify).study == "fake-debug"
+    assert changes_of(sweep, [*places, "phase=phase1"]) == []  # as the file says
+    assert changes_of(sweep, ["phase=phase1", "optim.lr=1", "data=synthetic", "optim.lr=2"]) == [
+        "data=synthetic",
+        "optim.lr=2",
+    ]
+    names = {
+        make_plan(sweep, [*places, *more], [0], identify).study
+        for more in ([], ["optim.lr=1"], ["optim.lr=2"], ["optim.lr=2", "model.z=1"], ["model.z=1", "optim.lr=2"])
+    }
+    assert len(names) == 4 and all(name.startswith("fake-debug") for name in names)
+
+
+def test_a_phase_other_than_the_files_is_refused():
+    with pytest.raises(ConfigError, match="phase=phase2 contradicts phase=phase1 of sweeps/fake.yaml, overrides"):
+        make_plan(make_sweep({"a": []}, overrides=["phase=phase1"]), ["phase=phase2"], [0], identify)
+    rows = {"a": ["phase=phase2"], "b": ["phase=phase1"]}
+    with pytest.raises(ConfigError, match="phase=phase2 contradicts phase=phase1 of sweeps/fake.yaml, row 'b'"):
+        make_plan(make_sweep(rows), ["phase=phase2"], [0], identify)
+    plan = make_plan(make_sweep({"a": ["model.x=1"]}), ["phase=phase2"], [0], identify)  # the file says none
+    assert plan.changes == ["phase=phase2"]

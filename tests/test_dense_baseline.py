@@ -1,0 +1,71 @@
+"""The dense peer by the commands that people type, at debug scale: phase 1, phase 2, evaluation, streaming."""
+
+import json
+
+import pytest
+import torch
+
+from src.assembly import build_datamodule
+from src.config import restore_config
+from src.reliability.checkpoints import read_checkpoint
+from src.streaming import StreamingDetector
+from tests.running import command
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def outputs(tmp_path_factory):
+    return tmp_path_factory.mktemp("outputs")
+
+
+@pytest.fixture(scope="module")
+def trained(outputs):
+    """A run of phase 2, which trains its phase 1 first."""
+    few = "model.head.score_threshold=0.005"  # one step leaves every score near where it began
+    command("train", "phase=phase2", "model=dense_bev", "scale=debug", few, f"paths.outputs={outputs}")
+    (folder,) = outputs.glob("dense_bev-phase2-debug-*")
+    return folder
+
+
+def test_both_phases_leave_what_is_promised(trained, outputs):
+    (first,) = outputs.glob("dense_bev-phase1-debug-*")
+    for folder in (first, trained):
+        names = ("config.yaml", "metrics.json", "metrics.csv", "run.json", "submission.json", "checkpoints/last.ckpt")
+        assert all((folder / name).is_file() for name in names), folder
+        header = (folder / "metrics.csv").read_text().splitlines()[0].split(",")
+        assert {"loss/heatmap", "loss/box", "loss/depth", "loss/total", "state/pillars"} <= set(header)
+        assert list((folder / "pictures").glob("frame_*.png"))
+    assert "state/remembered_frames" in header
+    log = (trained / "log.txt").read_text()
+    assert "weights from" in log and "in temporal" in log
+    meta = json.loads((trained / "submission.json").read_text())["meta"]
+    assert meta["use_camera"] and meta["use_radar"] and "memory of up to 6 s" in meta["description"]
+    weights = [read_checkpoint(folder / "checkpoints" / "last.ckpt")["state_dict"] for folder in (first, trained)]
+    assert {key for key in weights[1] if key not in weights[0]} == {key for key in weights[1] if ".temporal." in key}
+
+
+def test_evaluation_agrees_with_training(trained, outputs, tmp_path):
+    checkpoint = f"checkpoint={trained / 'checkpoints' / 'last.ckpt'}"
+    command("evaluate", checkpoint, f"out={tmp_path}", f"paths.outputs={outputs}")
+    assert (tmp_path / "metrics.json").read_text() == (trained / "metrics.json").read_text()
+
+
+def test_frames_are_streamed_as_the_validation_does(trained, outputs):
+    """One at a time with the memory in the detector: what a batch of the model with that memory gives."""
+    path = trained / "checkpoints" / "last.ckpt"
+    detector = StreamingDetector.load(path)
+    (world,) = (outputs / "worlds").iterdir()
+    config = restore_config(read_checkpoint(path)["horizon3d"]["config"], [])
+    frames = list(build_datamodule(config, world).stream())[:3]
+    memory, seen = None, []
+    for frame in frames:
+        boxes = detector.step(frame)
+        with torch.inference_mode():
+            output, memory = detector.model(frame, None if bool(frame.starts[0]) else memory)
+            (wanted,) = detector.model.decode(output)
+        assert len(boxes) == len(wanted) and torch.allclose(boxes.centers, wanted.centers, atol=1e-4)
+        seen.append(float(detector.model.diagnostics(output)["remembered_frames"]))
+    assert seen == [0.0, 1.0, 2.0]  # the debug memory holds two frames
+    detector.reset()
+    assert detector.memory is None
