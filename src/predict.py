@@ -26,7 +26,7 @@ from src.streaming import StreamingDetector
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
-from src.structures.skipped import PassedOver
+from src.structures.skipped import SkippedFiles
 from src.training.identity import digest_of_changes
 from src.training.run_folder import make_writable
 from src.training.snapshots import SHOWN_SCORE, scene_of, views_of
@@ -95,10 +95,10 @@ def chosen_device(config: Config) -> str:
 
 def predict(
     detector: StreamingDetector, frames: Iterable[FrameBatch], film: Film | None
-) -> tuple[dict[str, Prediction], PassedOver]:
+) -> tuple[dict[str, Prediction], SkippedFiles]:
     """What is detected in each frame by token, and the sensor files passed over; the first scene goes into the film."""
     found: dict[str, Prediction] = {}
-    skipped = PassedOver()
+    skipped = SkippedFiles()
     scenes = 0
     with tempfile.TemporaryDirectory() as folder:
         for frame in frames:

@@ -34,9 +34,9 @@ from src.reliability.processes import (
     launch,
     process_group,
 )
-from src.structures.skipped import SHOWN_NAMES, PassedOver
+from src.structures.skipped import SHOWN_NAMES, SkippedFiles
 from src.training.fit import build_loggers, build_trainer, fit
-from src.training.handoff import Source, find_source, hand_over, read_source, train_source
+from src.training.handoff import WeightSource, find_source, hand_over, read_source, train_source
 from src.training.identity import run_identity
 from src.training.module import DetectionModule, gather_by_rank
 from src.training.run_folder import Resume, RunFolder, current_commit, write_json
@@ -64,7 +64,7 @@ def main(overrides: list[str]) -> None:
             run(config, tree, folder, source, start, started, overrides)
 
 
-def ensure_source(config: Config, folder: RunFolder, source: Source | None, processes_exist: bool) -> None:
+def ensure_source(config: Config, folder: RunFolder, source: WeightSource | None, processes_exist: bool) -> None:
     """Where this run really begins now: train the run whose weights it starts from, if missing, and try to read them.
 
     Comes before the own folder is touched: what fails here leaves everything as it was.
@@ -83,7 +83,9 @@ def begins(folder: RunFolder, resume: Resume) -> bool:
     return resume is Resume.restart or not (folder.finished or folder.newest_checkpoint() is not None)
 
 
-def prepare(config: Config, tree: dict[str, Any], folder: RunFolder, source: Source | None) -> dict[str, Any] | None:
+def prepare(
+    config: Config, tree: dict[str, Any], folder: RunFolder, source: WeightSource | None
+) -> dict[str, Any] | None:
     """What one process decides for all: the checkpoint to go on from and the data folder; None for a finished run."""
     ensure_source(config, folder, source, processes_exist=config.trainer.num_processes > 1)
     folder.open(config.resume)
@@ -103,7 +105,7 @@ def run(
     config: Config,
     tree: dict[str, Any],
     folder: RunFolder,
-    source: Source | None,
+    source: WeightSource | None,
     start: dict[str, Any],  # see `prepare`
     started: float,  # time.monotonic()
     overrides: list[str],
@@ -123,7 +125,7 @@ def run(
     training_started = time.monotonic()
     fit(trainer, module, datamodule, resume_from)
     seconds = time.monotonic() - training_started
-    skipped = PassedOver()
+    skipped = SkippedFiles()
     skipped.restore(gather_by_rank(module.skipped.state()))
     end_processes()
     if not is_main_process():

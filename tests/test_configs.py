@@ -141,7 +141,7 @@ FULL_SIZE = {
     "data": {
         "train_split": "train", "split": "val", "batch_size": 8, "num_sweeps": 10, "min_distance_m": 1.0,
         "propagate_points": False, "on_bad_file": "error", "test_resize_offset": 0.0, "groups_per_scene": 2,
-        "lane_sets": 1, "silent_frames": 0.0,
+        "stream_sets": 1, "sensor_dropout": 0.0,
     },
     "data.augmentation.image": {"resize": [-0.06, 0.11], "rotation_deg": 5.4, "flip_probability": 0.5},
     "data.augmentation.bev": {"scale": [0.95, 1.05], "rotation_rad": 0.3925, "flip_probability": 0.5},
@@ -240,7 +240,7 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["phase=phase2", "model.dptf.gaussian_path.self_attention.num_heads=3"], "num_heads=3.*model.channels=64"),
         (["phase=phase2", "model.dptf.gaussian_path.selfattention=null"], "did you mean .*self_attention"),
         (["data.groups_per_scene=0"], "groups_per_scene"),
-        (["data.lane_sets=0"], "lane_sets"),
+        (["data.stream_sets=0"], "stream_sets"),
         (["phase.init_from="], "phase.init_from is empty"),
     ],
 )

@@ -102,10 +102,10 @@ def test_reset_and_a_marked_start_begin_anew(phase2):
     frame = make_frame(phase2, 1.0, seed=7)
     phase2.reset()
     assert same(phase2.step(frame), alone(phase2, frame))
-    marked = replace(frame, lanes=torch.zeros(1, dtype=torch.int64), starts=torch.ones(1, dtype=torch.bool))
+    marked = replace(frame, streams=torch.zeros(1, dtype=torch.int64), starts=torch.ones(1, dtype=torch.bool))
     assert same(phase2.step(marked), alone(phase2, frame))
     following = make_frame(phase2, 1.5)
-    unmarked = replace(following, lanes=marked.lanes, starts=~marked.starts)
+    unmarked = replace(following, streams=marked.streams, starts=~marked.starts)
     assert not same(phase2.step(unmarked), alone(phase2, following))
 
 

@@ -34,7 +34,7 @@ VIEWS, HEADS, LEVEL_STRIDES = 4, 4, (8, 16, 32)
 
 
 @dataclass(frozen=True)
-class Sizes:
+class NaiveSizes:
     """How large the operations are; the channels are the model's."""
 
     background: int  # radar points of the made-up scene beside those of vehicles
@@ -51,9 +51,9 @@ class Sizes:
 
 SIZES = {
     # The sizes at which formulations were chosen: 19 thousand voxels, 8 thousand cells, 2560 Gaussians.
-    "paper": Sizes(12_700, 113, 8000, 8, 2560, 2560, 256, 80, 60_000, 160),
-    "mini": Sizes(2600, 23, 2000, 4, 640, 640, 64, 40, 15_000, 160),
-    "debug": Sizes(200, 2, 200, 2, 32, 32, 8, 5, 500, 16),
+    "paper": NaiveSizes(12_700, 113, 8000, 8, 2560, 2560, 256, 80, 60_000, 160),
+    "mini": NaiveSizes(2600, 23, 2000, 4, 640, 640, 64, 40, 15_000, 160),
+    "debug": NaiveSizes(200, 2, 200, 2, 32, 32, 8, 5, 500, 16),
 }
 
 
@@ -138,7 +138,7 @@ def dense_splat(gaussians: Gaussians, occupied: Tensor, grid: BEVGrid, support_s
 
 
 def measure_rest(
-    config: Config, sizes: Sizes, grid: BEVGrid, points: Tensor, bev: Sites, device: torch.device
+    config: Config, sizes: NaiveSizes, grid: BEVGrid, points: Tensor, bev: Sites, device: torch.device
 ) -> list[dict[str, Any]]:
     """Rows of operations whose floor is not a product: ours against the formulation one would write first."""
     draw, channels = torch.Generator(device=device).manual_seed(1), config.model.channels
@@ -208,7 +208,7 @@ def compare(
 Candidates = tuple[Callable[[], Any], Callable[[], Any]]
 
 
-def segment_candidates(sizes: Sizes, channels: int, draw: torch.Generator, device: torch.device) -> Candidates:
+def segment_candidates(sizes: NaiveSizes, channels: int, draw: torch.Generator, device: torch.device) -> Candidates:
     """Rows that meet three at a time."""
     values = torch.randn(sizes.rows, channels, generator=draw, device=device, requires_grad=True)
     owners = torch.randint(0, sizes.rows // 3, (sizes.rows,), generator=draw, device=device)
@@ -216,7 +216,9 @@ def segment_candidates(sizes: Sizes, channels: int, draw: torch.Generator, devic
     return lambda: segment_sum(values, owners, len(zeros)), lambda: zeros.index_add(0, owners, values)
 
 
-def sampling_candidates(sizes: Sizes, channels: int, grid: BEVGrid, bev: Sites, draw: torch.Generator) -> Candidates:
+def sampling_candidates(
+    sizes: NaiveSizes, channels: int, grid: BEVGrid, bev: Sites, draw: torch.Generator
+) -> Candidates:
     """Eleven points per query around cells of a sparse map."""
     device = bev.device
     values = torch.randn(len(bev), channels, generator=draw, device=device, requires_grad=True)
@@ -237,7 +239,7 @@ def sampling_candidates(sizes: Sizes, channels: int, grid: BEVGrid, bev: Sites, 
     return ours, dense
 
 
-def attention_candidates(config: Config, sizes: Sizes, draw: torch.Generator, device: torch.device) -> Candidates:
+def attention_candidates(config: Config, sizes: NaiveSizes, draw: torch.Generator, device: torch.device) -> Candidates:
     """Queries that each lie in about one of the views, as around a truck."""
     height, width = config.backbone.image_size_px
     channels, queries = config.model.channels, sizes.queries

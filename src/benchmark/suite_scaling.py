@@ -42,7 +42,7 @@ MEMORY_FRAMES = (0, 1, 2, 4, 8)
 
 
 @dataclass(frozen=True)
-class Sizes:
+class ScalingSizes:
     """The scene and the ranges at a scale."""
 
     road: Highway  # at the nominal range
@@ -51,9 +51,11 @@ class Sizes:
 
 
 SIZES = {
-    "paper": Sizes(Highway(12_700, 60, 113, 150.0), 17, (75.0, 150.0, 300.0, 600.0)),  # 8000 cells in eight frames
-    "mini": Sizes(Highway(2600, 60, 23, 150.0), 6, (75.0, 150.0, 300.0, 600.0)),
-    "debug": Sizes(Highway(200, 20, 5, 150.0), 2, (75.0, 150.0, 300.0)),
+    "paper": ScalingSizes(
+        Highway(12_700, 60, 113, 150.0), 17, (75.0, 150.0, 300.0, 600.0)
+    ),  # 8000 cells in eight frames
+    "mini": ScalingSizes(Highway(2600, 60, 23, 150.0), 6, (75.0, 150.0, 300.0, 600.0)),
+    "debug": ScalingSizes(Highway(200, 20, 5, 150.0), 2, (75.0, 150.0, 300.0)),
 }
 
 
@@ -113,7 +115,7 @@ def peer_of(config: Config, name: str) -> Config:
     return replace(peer, grid=config.grid, backbone=config.backbone, precision=config.precision, seed=config.seed)
 
 
-def sweeps_of(sizes: Sizes, temporal: bool) -> dict[str, list[Point]]:
+def sweeps_of(sizes: ScalingSizes, temporal: bool) -> dict[str, list[Point]]:
     """The points of every sweep; what is nominal in several of them is measured in each."""
     road = sizes.road
     fixed = replace(road, reach_m=FIXED_REACH_M)

@@ -1,7 +1,7 @@
-"""Which frames each step reads: shuffled single frames, or lanes of consecutive frames (spec section 6.4).
+"""Which frames each step reads: shuffled single frames, or streams of consecutive frames (spec section 6.4).
 
-A lane is one row of the batch over time. A clip is a run of consecutive key frames of one scene in one lane; memory
-begins empty where a clip starts. Lanes are numbered over all ranks; rank r of W serves the r-th of W equal blocks, so
+A stream is one row of the batch over time. A clip is a run of consecutive key frames of one scene in one stream; memory
+begins empty where a clip starts. Streams are numbered over all ranks; rank r of W serves the r-th of W equal blocks, so
 that the ranks together read exactly the batch that one process would read, in the same order.
 """
 
@@ -26,7 +26,7 @@ class FrameKey(NamedTuple):
 
     epoch: int
     sample: int  # row of the sample table
-    lane: int | None = None  # None: a frame without order
+    stream: int | None = None  # None: a frame without order
     clip: int | None = None  # row of the clip's first frame
 
     @property
@@ -37,11 +37,11 @@ class FrameKey(NamedTuple):
 
 @dataclass(frozen=True)
 class Schedule:
-    """The frames of T steps in L lanes over all ranks, as rows of the sample table; -1 where a lane has run out."""
+    """The frames of T steps in L streams over all ranks, as rows of the sample table; -1 where a stream has run out."""
 
     samples: Array  # [T, L] int64
     clips: Array | None  # [T, L] int64, first frame of the clip that the frame belongs to; None: frames without order
-    lane_sets: int = 1  # sets of L lanes that take turns: step t reads those of set t % lane_sets
+    stream_sets: int = 1  # sets of L streams that take turns: step t reads those of set t % stream_sets
 
 
 def scenes_of(index: DatasetIndex, samples: Array) -> list[Array]:
@@ -71,68 +71,68 @@ def scenes_of(index: DatasetIndex, samples: Array) -> list[Array]:
 
 def shuffled_frames(
     samples: Array,  # [n] int64
-    num_lanes: int,
+    num_streams: int,
     seed: int,
     epoch: int,
 ) -> Schedule:
     """Whole batches of unordered frames; the last incomplete one is left out."""
-    steps = len(samples) // num_lanes
+    steps = len(samples) // num_streams
     order = np.random.default_rng((seed, epoch)).permutation(samples)
-    return Schedule(order[: steps * num_lanes].reshape(steps, num_lanes), None)
+    return Schedule(order[: steps * num_streams].reshape(steps, num_streams), None)
 
 
 def frames_in_order(
     samples: Array,  # [n] int64
-    num_lanes: int,
+    num_streams: int,
 ) -> Schedule:
     """Every frame once, as given; the last batch may be smaller."""
-    missing = -len(samples) % num_lanes
-    return Schedule(np.concatenate([samples, np.full(missing, -1)]).reshape(-1, num_lanes), None)
+    missing = -len(samples) % num_streams
+    return Schedule(np.concatenate([samples, np.full(missing, -1)]).reshape(-1, num_streams), None)
 
 
 def streamed_groups(
-    scenes: list[Array], groups_per_scene: int, num_lanes: int, lane_sets: int, seed: int, epoch: int
+    scenes: list[Array], groups_per_scene: int, num_streams: int, stream_sets: int, seed: int, epoch: int
 ) -> Schedule:
-    """Training: scenes cut into groups, the groups shuffled into one stream, the stream cut into equal lanes.
+    """Training: scenes cut into groups, the groups shuffled into one sequence, the sequence cut into equal streams.
 
-    With several sets of lanes, neighbouring steps show other scenes; there are at most as many sets as groups to fill
-    their lanes, since more would cut the groups shorter. Lane l of all sets reads the l-th part of the stream of N
-    frames, N // lanes long, so every lane and every epoch has that number of frames; a group cut by the end of a lane
-    becomes two clips, and the fewer frames than lanes that are left are passed over.
+    With several sets of streams, neighbouring steps show other scenes; there are at most as many sets as groups to fill
+    their streams, since more would cut the groups shorter. Stream l of all sets reads the l-th part of the N
+    frames, N // streams long, so every stream and every epoch has that number of frames; a group cut by the end of a
+    stream becomes two clips, and the fewer frames than streams that are left are skipped.
     """
     groups = [group for scene in scenes for group in np.array_split(scene, min(groups_per_scene, len(scene)))]
     groups = [groups[at] for at in np.random.default_rng((seed, epoch)).permutation(len(groups))]
-    lane_sets = max(1, min(lane_sets, len(groups) // num_lanes))
+    stream_sets = max(1, min(stream_sets, len(groups) // num_streams))
     stream = np.concatenate(groups)
     group_starts = np.repeat(np.cumsum([0, *map(len, groups[:-1])]), [len(group) for group in groups])
-    turns = len(stream) // (num_lanes * lane_sets)
-    position = np.arange(turns * num_lanes * lane_sets).reshape(num_lanes * lane_sets, turns)
-    begins = np.maximum(group_starts[position], position[:, :1])  # a lane's first frame starts a clip too
-    # [lanes of all sets, turns] -> [turns * sets, lanes of a set]
-    steps, clips = (stream[rows].T.reshape(turns * lane_sets, num_lanes) for rows in (position, begins))
-    return Schedule(steps, clips, lane_sets)
+    turns = len(stream) // (num_streams * stream_sets)
+    position = np.arange(turns * num_streams * stream_sets).reshape(num_streams * stream_sets, turns)
+    begins = np.maximum(group_starts[position], position[:, :1])  # a stream's first frame starts a clip too
+    # [streams of all sets, turns] -> [turns * sets, streams of a set]
+    steps, clips = (stream[rows].T.reshape(turns * stream_sets, num_streams) for rows in (position, begins))
+    return Schedule(steps, clips, stream_sets)
 
 
-def whole_scenes(scenes: list[Array], num_lanes: int, world_size: int) -> Schedule:
-    """Validation: every scene once and uncut; the longest is placed first, each in the lane with the fewest frames.
+def whole_scenes(scenes: list[Array], num_streams: int, world_size: int) -> Schedule:
+    """Validation: every scene once and uncut; the longest is placed first, each in the stream with the fewest frames.
 
-    Among equally long lanes the rank with the fewest frames comes first. Each lane reads its scenes in the given order.
+    Among equally long streams the rank with the fewest frames comes first. Each reads its scenes in the given order.
     """
-    lanes: list[list[int]] = [[] for _ in range(num_lanes)]
-    lengths = np.zeros((world_size, num_lanes // world_size), np.int64)
+    streams: list[list[int]] = [[] for _ in range(num_streams)]
+    lengths = np.zeros((world_size, num_streams // world_size), np.int64)
     for scene in sorted(range(len(scenes)), key=lambda at: -len(scenes[at])):
         of_rank = np.broadcast_to(lengths.sum(axis=1, keepdims=True), lengths.shape)
-        lane = int(np.lexsort((of_rank.ravel(), lengths.ravel()))[0])
-        lanes[lane].append(scene)
-        lengths.flat[lane] += len(scenes[scene])
-    samples = np.full((lengths.max(), num_lanes), -1)
+        stream = int(np.lexsort((of_rank.ravel(), lengths.ravel()))[0])
+        streams[stream].append(scene)
+        lengths.flat[stream] += len(scenes[scene])
+    samples = np.full((lengths.max(), num_streams), -1)
     clips = samples.copy()
-    for lane, members in enumerate(lanes):
+    for stream, members in enumerate(streams):
         end = 0
         for scene in sorted(members):
             begin, end = end, end + len(scenes[scene])
-            samples[begin:end, lane] = scenes[scene]
-            clips[begin:end, lane] = scenes[scene][0]
+            samples[begin:end, stream] = scenes[scene]
+            clips[begin:end, stream] = scenes[scene][0]
     return Schedule(samples, clips)
 
 
@@ -155,7 +155,7 @@ class ScheduleSampler(Sampler[list[FrameKey]]):
         self._steps = int((self._mine(schedule(0).samples) >= 0).any(axis=1).sum())
 
     def _mine(self, table: Array) -> Array:
-        """This rank's lanes of [T, L]."""
+        """This rank's streams of [T, L]."""
         return np.split(table, self.world_size, axis=1)[self.rank]
 
     def __len__(self) -> int:
@@ -169,14 +169,14 @@ class ScheduleSampler(Sampler[list[FrameKey]]):
         epoch, done = self.position(self._steps)
         schedule = self.schedule(epoch)
         samples = self._mine(schedule.samples)
-        num_lanes = schedule.samples.shape[1]
+        num_streams = schedule.samples.shape[1]
         clips = None if schedule.clips is None else self._mine(schedule.clips)
         for step in range(done, self._steps):
-            first_lane = step % schedule.lane_sets * num_lanes + self.rank * samples.shape[1]
+            first_stream = step % schedule.stream_sets * num_streams + self.rank * samples.shape[1]
             yield [
                 FrameKey(epoch, int(sample))
                 if clips is None
-                else FrameKey(epoch, int(sample), first_lane + lane, int(clips[step, lane]))
-                for lane, sample in enumerate(samples[step])
+                else FrameKey(epoch, int(sample), first_stream + stream, int(clips[step, stream]))
+                for stream, sample in enumerate(samples[step])
                 if sample >= 0
             ]

@@ -29,7 +29,7 @@ from src.data.clips import (
     whole_scenes,
 )
 from src.data.evaluation_set import evaluation_set
-from src.data.packed_batch import Parcel
+from src.data.packed_batch import PackedBatch
 from src.data.reader import FrameReader, OnBadFile, ReaderSettings
 from src.data.schema import DatasetIndex
 from src.data.splits import split_samples
@@ -48,10 +48,10 @@ class DataConfig:
     version: str  # table folder, e.g. v1.2-trainval
     train_split: str
     split: str  # what validation and evaluation read
-    batch_size: int  # total over all devices; the lanes when clips are streamed
+    batch_size: int  # total over all devices; the streams when clips are streamed
     groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; spec section 6.4
-    lane_sets: int  # at most so many sets of lanes take turns when clips are streamed; 1: all lanes at every step
-    silent_frames: float  # share of streamed frames, never a clip's first, from which all sensor data are taken away
+    stream_sets: int  # at most so many sets of streams take turns when clips are streamed; 1: all streams at every step
+    sensor_dropout: float  # share of streamed frames, never a clip's first, from which all sensor data are taken away
     num_workers: int  # loader processes per device
     num_sweeps: int  # past sweeps of each radar
     min_distance_m: float  # nearer points are the truck itself
@@ -64,7 +64,7 @@ class DataConfig:
         least_values = {
             "batch_size": 1,
             "groups_per_scene": 1,
-            "lane_sets": 1,
+            "stream_sets": 1,
             "num_workers": 0,
             "num_sweeps": 1,
             "min_distance_m": 0,
@@ -72,8 +72,8 @@ class DataConfig:
         for name, least in least_values.items():
             if not getattr(self, name) >= least:
                 raise ConfigError(f"data.{name}={getattr(self, name)}: must be at least {least}")
-        if not 0 <= self.silent_frames < 1:
-            raise ConfigError(f"data.silent_frames={self.silent_frames}: must be at least 0 and below 1")
+        if not 0 <= self.sensor_dropout < 1:
+            raise ConfigError(f"data.sensor_dropout={self.sensor_dropout}: must be at least 0 and below 1")
         if not -0.5 < self.test_resize_offset < 1:
             raise ConfigError(f"data.test_resize_offset={self.test_resize_offset}: must lie between -0.5 and 1")
 
@@ -100,9 +100,9 @@ class FrameDataset(Dataset[FrameBatch]):
     """
 
     def __init__(
-        self, reader: FrameReader, augmentation: AugmentationConfig | None, seed: int, silent_frames: float = 0.0
+        self, reader: FrameReader, augmentation: AugmentationConfig | None, seed: int, sensor_dropout: float = 0.0
     ) -> None:
-        self.reader, self.augmentation, self.seed, self.silent_frames = reader, augmentation, seed, silent_frames
+        self.reader, self.augmentation, self.seed, self.sensor_dropout = reader, augmentation, seed, sensor_dropout
 
     def __getitem__(self, key: FrameKey) -> FrameBatch | HorizonError:
         clip = None if key.clip is None else str(self.reader.index.sample_tokens[key.clip])
@@ -110,20 +110,20 @@ class FrameDataset(Dataset[FrameBatch]):
             frame = self.reader.read(key.sample, self.augmentation, self.seed, key.epoch, clip)
         except HorizonError as error:
             return error
-        if key.lane is None:
+        if key.stream is None:
             return frame
-        frame = in_lane(frame, key.lane, key.starts)
+        frame = in_stream(frame, key.stream, key.starts)
         # Without augmentation the same frames in every run and epoch, so that scores compare.
         draw = (key.sample,) if self.augmentation is None else (key.sample, self.seed, key.epoch)
-        return silence_some(frame, self.silent_frames, draw)
+        return drop_sensors(frame, self.sensor_dropout, draw)
 
 
-def in_lane(frame: FrameBatch, lane: int, starts: bool) -> FrameBatch:
-    """A batch of one, marked as the next frame of a lane."""
-    return replace(frame, lanes=torch.tensor([lane]), starts=torch.tensor([starts]))
+def in_stream(frame: FrameBatch, stream: int, starts: bool) -> FrameBatch:
+    """A batch of one, marked as the next frame of a stream."""
+    return replace(frame, streams=torch.tensor([stream]), starts=torch.tensor([starts]))
 
 
-def silence_some(frame: FrameBatch, share: float, draw: tuple[int, ...]) -> FrameBatch:
+def drop_sensors(frame: FrameBatch, share: float, draw: tuple[int, ...]) -> FrameBatch:
     """The frame, or with the probability `share` the same without radar points and images, unless it starts a clip."""
     if frame.starts[0] or np.random.default_rng(draw).random() >= share:
         return frame
@@ -143,7 +143,7 @@ class FrameLoader(DataLoader):
             for batch in super().__iter__():
                 if isinstance(batch, HorizonError):
                     raise batch
-                yield batch.unpack() if isinstance(batch, Parcel) else batch
+                yield batch.unpack() if isinstance(batch, PackedBatch) else batch
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing: the place in an epoch follows from the trainer's step. Lightning warns of a loader without this."""
@@ -171,7 +171,7 @@ def dead_workers_named() -> Iterator[None]:
 class DetectionDataModule(L.LightningDataModule):
     """Key frames of the training and the validation split as `FrameBatch`.
 
-    `image_size_px` None leaves images unread. `temporal` streams clips, with `lanes` and `starts` in every batch;
+    `image_size_px` None leaves images unread. `temporal` streams clips, with `streams` and `starts` in every batch;
     without it training reads shuffled frames and validation reads frames in table order.
     Raises DataError when tables, split or files are not right.
     """
@@ -209,7 +209,7 @@ class DetectionDataModule(L.LightningDataModule):
         }
 
     def validation_clips(self, count: int, length: int) -> list[list[FrameBatch]]:
-        """Up to `count` clips that end at different frames spread evenly over the validation split, in lane 0.
+        """Up to `count` clips that end at different frames spread evenly over the validation split, in stream 0.
 
         A clip has `length` consecutive frames in batches of one, fewer where its scene begins later than that.
         """
@@ -227,7 +227,7 @@ class DetectionDataModule(L.LightningDataModule):
         return list(self._scenes())
 
     def stream(self, scenes: list[str] | None = None) -> Iterator[FrameBatch]:
-        """The frames of some or all scenes of the validation split one by one, in lane 0; each scene is a clip.
+        """The frames of some or all scenes of the validation split one by one, in stream 0; each scene is a clip.
 
         Raises ConfigError for a scene that the split does not have.
         """
@@ -248,10 +248,10 @@ class DetectionDataModule(L.LightningDataModule):
         return {str(self.index.scene_names[self.index.sample_scenes[scene[0]]]): scene for scene in scenes}
 
     def _in_order(self, samples: np.ndarray) -> Iterator[FrameBatch]:
-        """One clip in lane 0, without augmentation."""
+        """One clip in stream 0, without augmentation."""
         for at, sample in enumerate(samples):
-            frame = in_lane(self.reader.read(int(sample), None), 0, at == 0)
-            yield silence_some(frame, self.config.silent_frames, (int(sample),))
+            frame = in_stream(self.reader.read(int(sample), None), 0, at == 0)
+            yield drop_sensors(frame, self.config.sensor_dropout, (int(sample),))
 
     def train_dataloader(self) -> DataLoader:
         """Augmented batches of the training split, shuffled frames or clips.
@@ -271,7 +271,7 @@ class DetectionDataModule(L.LightningDataModule):
         schedule: Callable[[int], Schedule]
         if self.temporal:
             scenes = scenes_of(index, samples)
-            cut = (config.groups_per_scene, config.batch_size, config.lane_sets)
+            cut = (config.groups_per_scene, config.batch_size, config.stream_sets)
             schedule = partial(streamed_groups, scenes, *cut, seed)
         else:
             schedule = partial(shuffled_frames, samples, config.batch_size, seed)
@@ -306,7 +306,7 @@ class DetectionDataModule(L.LightningDataModule):
     def _loader(self, sampler: ScheduleSampler, augmentation: AugmentationConfig | None) -> DataLoader:
         workers = self.config.num_workers
         return FrameLoader(
-            FrameDataset(self.reader, augmentation, self.seed, self.config.silent_frames),
+            FrameDataset(self.reader, augmentation, self.seed, self.config.sensor_dropout),
             batch_sampler=sampler,
             num_workers=workers,
             collate_fn=collate_in_worker if workers else collate,
@@ -346,10 +346,10 @@ def collate(frames: list[FrameBatch | HorizonError]) -> FrameBatch | HorizonErro
     return FrameBatch(**values)
 
 
-def collate_in_worker(frames: list[FrameBatch | HorizonError]) -> Parcel | HorizonError:
+def collate_in_worker(frames: list[FrameBatch | HorizonError]) -> PackedBatch | HorizonError:
     """As `collate`, packed for the way to the training process."""
     batch = collate(frames)
-    return batch if isinstance(batch, HorizonError) else Parcel.pack(batch)
+    return batch if isinstance(batch, HorizonError) else PackedBatch.pack(batch)
 
 
 def _evenly_spread(samples: np.ndarray, count: int) -> np.ndarray:

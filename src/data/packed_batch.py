@@ -17,7 +17,7 @@ LARGE_BYTES = 2**18
 
 
 @dataclass
-class Parcel:
+class PackedBatch:
     """Large tensors as they are, everything else as bytes.
 
     Torch sends each tensor of a worker as a file of shared memory of its own: opened, mapped and handed over a socket,
@@ -28,7 +28,7 @@ class Parcel:
     large: list[Tensor]
 
     @classmethod
-    def pack(cls, batch: FrameBatch) -> Parcel:
+    def pack(cls, batch: FrameBatch) -> PackedBatch:
         """A parcel that `unpack` makes the same batch of."""
         buffer = io.BytesIO()
         pickler = _Pickler(buffer, protocol=pickle.HIGHEST_PROTOCOL)

@@ -17,7 +17,7 @@ Array = np.ndarray
 
 
 @dataclass
-class Pairs:
+class CandidatePairs:
     """Candidate pairs, ordered by priority of the prediction, then distance, then row of the ground truth."""
 
     predictions: Array  # [p] int64, place of the prediction in the order of matching
@@ -27,8 +27,8 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.predictions)
 
-    def __getitem__(self, rows: Array) -> Pairs:
-        return Pairs(self.predictions[rows], self.ground_truth[rows], self.distances[rows])
+    def __getitem__(self, rows: Array) -> CandidatePairs:
+        return CandidatePairs(self.predictions[rows], self.ground_truth[rows], self.distances[rows])
 
 
 def find_pairs(
@@ -41,14 +41,14 @@ def find_pairs(
     truth_offsets: Array,  # [k] m
     num_groups: int,
     radius_m: float,
-) -> Pairs:
+) -> CandidatePairs:
     """Pairs of one group that are nearer than `radius_m`.
 
     Groups are cut into stripes of x a little wider than the radius, so that a prediction meets only the ground truth
     of three stripes, which lie next to each other in one sorted list.
     """
     if not len(prediction_groups) or not len(truth_groups):
-        return Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
+        return CandidatePairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
     stripe_m = radius_m * 1.0025  # wider than the radius by more than any rounding of x
     low = min(prediction_offsets.min(), truth_offsets.min())
     high = max(prediction_offsets.max(), truth_offsets.max())
@@ -67,11 +67,11 @@ def find_pairs(
     delta = prediction_xy[rows] - truth_xy[truth]
     distances = np.sqrt(np.vecdot(delta, delta))  # rounds as the official norm does, which decides exact borders
     near = distances < radius_m
-    pairs = Pairs(prediction_places[rows[near]], truth[near], distances[near])
+    pairs = CandidatePairs(prediction_places[rows[near]], truth[near], distances[near])
     return pairs[np.lexsort((pairs.ground_truth, pairs.distances, pairs.predictions))]
 
 
-def match_greedily(pairs: Pairs, num_ground_truth: int) -> Array:
+def match_greedily(pairs: CandidatePairs, num_ground_truth: int) -> Array:
     """Rows of `pairs` that become matches, ordered by priority of the prediction: [m] int64.
 
     Every unmatched prediction proposes to its nearest ground truth that has not refused it; a ground truth keeps the

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from src.errors import DataError
-from src.metrics.matching import Pairs, find_pairs, match_greedily
+from src.metrics.matching import CandidatePairs, find_pairs, match_greedily
 from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERROR_THRESHOLD_M, ERRORS
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import CLASSES
@@ -72,7 +72,7 @@ def rank_predictions(
     )
 
 
-def find_candidates(ranking: Ranking) -> Pairs:
+def find_candidates(ranking: Ranking) -> CandidatePairs:
     """Pairs of one sample and class nearer than the largest threshold; rows count within `ranking`."""
     truth, ego_x = ranking.evaluation_set.ground_truth, ranking.evaluation_set.ego_centers[:, 0]
     in_file_order = np.argsort(ranking.rows)  # neighbours in the file share a sample, hence memory
@@ -92,7 +92,7 @@ def find_candidates(ranking: Ranking) -> Pairs:
     )
 
 
-def match_predictions(ranking: Ranking, pairs: Pairs) -> Matching:
+def match_predictions(ranking: Ranking, pairs: CandidatePairs) -> Matching:
     """Match at each threshold among `pairs`, and measure the matches at 2 m.
 
     Raises DataError when matched ground truth has a size that is not positive, as the official evaluator does.
@@ -109,7 +109,7 @@ def match_predictions(ranking: Ranking, pairs: Pairs) -> Matching:
     return Matching(places, ground_truth, errors)
 
 
-def _check_sizes(ranking: Ranking, matches: Pairs) -> None:
+def _check_sizes(ranking: Ranking, matches: CandidatePairs) -> None:
     truth, rows = ranking.evaluation_set.ground_truth, ranking.truth_rows[matches.ground_truth]
     flat = ~(truth.sizes[rows] > 0).all(axis=1)
     if flat.any():
@@ -120,7 +120,7 @@ def _check_sizes(ranking: Ranking, matches: Pairs) -> None:
         )
 
 
-def _match_errors(ranking: Ranking, matches: Pairs) -> Array:
+def _match_errors(ranking: Ranking, matches: CandidatePairs) -> Array:
     """The five errors of each match, NaN where the ground truth (or a velocity) leaves one undefined: [m, 5]."""
     predicted = ranking.predictions[ranking.rows[matches.predictions]]
     truth = ranking.evaluation_set.ground_truth[ranking.truth_rows[matches.ground_truth]]

@@ -33,14 +33,14 @@ class ModelConfig(Protocol):
 
 
 class TemporalMemory(Protocol):
-    """What a temporal detector carries from frame to frame, detached, one row per lane."""
+    """What a temporal detector carries from frame to frame, detached, one row per stream."""
 
     def select(
         self,
-        rows: Tensor,  # [B'] int64, row of each lane of the next batch in this memory
-        keep: Tensor,  # [B'] bool, False: the lane starts anew
+        rows: Tensor,  # [B'] int64, row of each stream of the next batch in this memory
+        keep: Tensor,  # [B'] bool, False: the stream starts anew
     ) -> Self:
-        """Memory for the next batch's lanes."""
+        """Memory for the next batch's streams."""
 
     def to(self, device: torch.device | str) -> Self:
         """The same memory on another device."""
@@ -66,7 +66,7 @@ class Detector(nn.Module, ABC):
     ) -> tuple[Any, Any]:  # each model returns its own dataclass and memory
         """Everything that `loss` and `decode` need for the B frames of a batch, and the memory with these frames added.
 
-        `memory` is what the call for the previous frames of the same lanes returned, row by row (see
+        `memory` is what the call for the previous frames of the same streams returned, row by row (see
         `TemporalMemory.select`); None where there is none. A detector of single frames takes and returns None.
         """
 

@@ -1,4 +1,4 @@
-"""The past of a detector's lanes: when and where each remembered frame was made, and its way to the present (6)."""
+"""The past of a detector's streams: when and where each remembered frame was made, and its way to the present (6)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from src.structures.batch import MAX_EGO_SPEED_MPS, FrameBatch
 
 @dataclass
 class Motion:
-    """How each lane got from a stored frame to the current one."""
+    """How each stream got from a stored frame to the current one."""
 
     aug_from_past: Tensor  # [B, 4, 4] float32, A_t T_{t-k -> t}
     elapsed_s: Tensor  # [B] float32, dt_k; 0 where not usable
@@ -23,16 +23,16 @@ class Motion:
 
 @dataclass
 class RememberedFrame:
-    """Time and place of one remembered key frame of each of B lanes; models add what they remember of it."""
+    """Time and place of one remembered key frame of each of B streams; models add what they remember of it."""
 
     timestamps_s: Tensor  # [B] float64
     global_from_ego: Tensor  # [B, 4, 4] float64
-    present: Tensor  # [B] bool, False for a lane whose clip began later
+    present: Tensor  # [B] bool, False for a stream whose clip began later
 
     def motion(self, batch: FrameBatch, max_age_s: float) -> Motion:
         """From this frame to the batch's, composed in float64.
 
-        Not usable: an absent lane, a frame that is not in the past or older than `max_age_s`, a pose that jumped.
+        Not usable: an absent stream, a frame that is not in the past or older than `max_age_s`, a pose that jumped.
         """
         ego_from_past, elapsed, driven = self._way_to(batch)
         usable = self.present & driven & (elapsed <= max_age_s)
@@ -42,7 +42,7 @@ class RememberedFrame:
         return Motion(matrix.float(), torch.where(usable, elapsed, 0.0).float(), usable)
 
     def jumped(self, batch: FrameBatch) -> Tensor:  # [B] bool
-        """Lanes whose pose jumped between this frame and the batch's, which is later."""
+        """Streams whose pose jumped between this frame and the batch's, which is later."""
         _, elapsed, driven = self._way_to(batch)
         return self.present & (elapsed > 0) & ~driven
 
@@ -58,7 +58,7 @@ class RememberedFrame:
         rows: Tensor,  # [B'] int64, distinct where kept
         keep: Tensor,  # [B'] bool
     ) -> Self:
-        """The lanes at `rows`, those without `keep` forgotten; a model's frame selects what it added."""
+        """The streams at `rows`, those without `keep` forgotten; a model's frame selects what it added."""
         return replace(
             self,
             timestamps_s=self.timestamps_s[rows],
@@ -88,7 +88,7 @@ def motions(frames: Sequence[RememberedFrame], batch: FrameBatch, max_age_s: flo
 
 @dataclass(frozen=True)
 class FrameMemory(Generic[Frame]):
-    """The last key frames of each of B lanes, newest first. A value: what changes it makes a new one."""
+    """The last key frames of each of B streams, newest first. A value: what changes it makes a new one."""
 
     frames: tuple[Frame, ...]
 
@@ -98,9 +98,9 @@ class FrameMemory(Generic[Frame]):
         return len(self.frames[0].present) if self.frames else 0
 
     def before(self, batch: FrameBatch) -> Self:
-        """What of the memory is in the past of the batch, lane by lane; the rest is forgotten for good.
+        """What of the memory is in the past of the batch, stream by stream; the rest is forgotten for good.
 
-        Gone are frames that are not older than the batch's, and, where the pose jumped since a lane's last frame, all
+        Gone are frames that are not older than the batch's, and, where the pose jumped since a stream's last frame, all
         that lies before the jump. Only neighbouring frames tell: over several seconds the same jump could pass for a
         drive.
         """
@@ -114,10 +114,10 @@ class FrameMemory(Generic[Frame]):
 
     def select(
         self,
-        rows: Tensor,  # [B'] int64, row of each new lane in this memory, distinct where kept
-        keep: Tensor,  # [B'] bool, False: the lane starts anew
+        rows: Tensor,  # [B'] int64, row of each new stream in this memory, distinct where kept
+        keep: Tensor,  # [B'] bool, False: the stream starts anew
     ) -> Self:
-        """Memory for a batch whose lanes come from these rows; frames that no lane has any more are dropped."""
+        """Memory for a batch whose streams come from these rows; frames that no stream has any more are dropped."""
         return self._shared(frame.select(rows, keep) for frame in self.frames)
 
     def to(self, device: torch.device | str) -> Self:
@@ -126,7 +126,7 @@ class FrameMemory(Generic[Frame]):
 
     @classmethod
     def _shared(cls, frames: Iterable[Frame]) -> Self:
-        """A memory without the frames that no lane has any more, so that they take no place of others."""
+        """A memory without the frames that no stream has any more, so that they take no place of others."""
         frames = tuple(frames)
         if not frames:
             return cls(())

@@ -11,7 +11,7 @@ GPU_ROWS = 1 << 18
 """Rows at a time: on a CPU their hidden layer stays in the cache, on a GPU it bounds the memory."""
 
 
-def row_mlp(
+def checkpointed_mlp(
     x: Tensor,  # [n, C]
     hidden_weight: Tensor,  # [C, H]
     hidden_bias: Tensor,  # [H]
@@ -26,10 +26,10 @@ def row_mlp(
     operands = (x, hidden_weight, hidden_bias, weight, bias)
     if torch.is_autocast_enabled(x.device.type) and x.dtype != torch.float64:
         operands = tuple(value.to(torch.get_autocast_dtype(x.device.type)) for value in operands)
-    return _RowMLP.apply(*operands)
+    return _CheckpointedMLP.apply(*operands)
 
 
-class _RowMLP(torch.autograd.Function):
+class _CheckpointedMLP(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: FunctionCtx, x: Tensor, hidden_weight: Tensor, hidden_bias: Tensor, weight: Tensor, bias: Tensor

@@ -9,7 +9,7 @@ from torch import Tensor
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
 from src.ops.backend import implementation, register
-from src.ops.segment_reduce import weighted_bag
+from src.ops.segment_reduce import weighted_segment_sum
 from src.ops.sites import Sites
 
 
@@ -28,7 +28,7 @@ def sample_sparse_bev(
     _check_bev(values, sites, points, batch, grid)
     rows, weights = _corners(sites, points.reshape(-1, 2), batch.reshape(-1), grid)
     present = (rows.reshape(-1) >= 0).nonzero().squeeze(1)
-    sampled = weighted_bag(
+    sampled = weighted_segment_sum(
         values.to(weights.dtype),
         weights.reshape(-1).index_select(0, present),
         rows.reshape(-1).index_select(0, present),
@@ -62,7 +62,7 @@ def deform_attend_bev(
 def deform_attend_bev_reference(
     values: Tensor, sites: Sites, points: Tensor, batch: Tensor, weights: Tensor, grid: BEVGrid
 ) -> Tensor:
-    """Sample whole rows once, then weigh the heads: wide rows suit bags, one bag per head would not."""
+    """Sample whole rows once, then weigh the heads: wide rows suit segments, one segment per head would not."""
     queries, num_points, _ = points.shape
     sampled = sample_sparse_bev(
         values.flatten(1), sites, points, batch[:, None].expand(queries, num_points), grid

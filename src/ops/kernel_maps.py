@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.ops.segment_reduce import bags
+from src.ops.segment_reduce import segments
 from src.ops.sites import HALO, Sites
 
 Size = int | tuple[int, ...]
@@ -50,16 +50,16 @@ class KernelMap:
             self.cache["ends"] = torch.tensor(ends, dtype=torch.int32, device=self.inputs.device)
         return self.cache["ends"]
 
-    def bags_by_output(self) -> tuple[Tensor, Tensor]:
+    def segments_by_output(self) -> tuple[Tensor, Tensor]:
         """Pairs ordered by output row [pairs] int32 and the first pair of each row [num_outputs + 1] int32."""
         if "by_output" not in self.cache:
-            self.cache["by_output"] = bags(self.outputs, self.num_outputs)
+            self.cache["by_output"] = segments(self.outputs, self.num_outputs)
         return self.cache["by_output"]
 
-    def bags_by_input(self) -> tuple[Tensor, Tensor]:
+    def segments_by_input(self) -> tuple[Tensor, Tensor]:
         """Pairs ordered by input row [pairs] int32 and the first pair of each row [num_inputs + 1] int32."""
         if "by_input" not in self.cache:
-            self.cache["by_input"] = bags(self.inputs, self.num_inputs)
+            self.cache["by_input"] = segments(self.inputs, self.num_inputs)
         return self.cache["by_input"]
 
 

@@ -7,28 +7,28 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-# Pairs multiplied at a time in `row_products`: cache-sized on a CPU, few launches on a GPU.
+# Pairs multiplied at a time in `paired_dot`: cache-sized on a CPU, few launches on a GPU.
 CPU_CHUNK = 1024
 GPU_CHUNK = 65536
 
 
-def bags(
+def segments(
     rows: Tensor,  # [pairs] integer
     num_rows: int,
 ) -> tuple[Tensor, Tensor]:
-    """Stable order of the pairs by row [pairs], and the start of each row's bag [num_rows + 1], both int32."""
+    """Stable order of the pairs by row [pairs], and the start of each row's segment [num_rows + 1], both int32."""
     ordered, order = torch.sort(rows, stable=True)
     starts = torch.searchsorted(ordered, torch.arange(num_rows + 1, dtype=rows.dtype, device=rows.device))
     return order.to(torch.int32), starts.to(torch.int32)
 
 
-def bag_sum(
+def gather_segment_sum(
     values: Tensor,  # [n, C]
-    picks: Tensor,  # [pairs] integer, rows of `values`, bag by bag
-    starts: Tensor,  # [bags + 1], same type: first pair of each bag
+    picks: Tensor,  # [pairs] integer, rows of `values`, segment by segment
+    starts: Tensor,  # [segments + 1], same type: first pair of each segment
     weights: Tensor | None = None,  # [pairs]
-) -> Tensor:  # [bags, C]
-    """(Weighted) sum of the picked rows of every bag, 0 for an empty bag. Without gradient."""
+) -> Tensor:  # [segments, C]
+    """(Weighted) sum of the picked rows of every segment, 0 for an empty segment. Without gradient."""
     if len(picks) == 0:
         return values.new_zeros(len(starts) - 1, values.shape[1])
     return F.embedding_bag(picks, values, starts, mode="sum", include_last_offset=True, per_sample_weights=weights)
@@ -57,7 +57,7 @@ class _SegmentSum(torch.autograd.Function):
     @staticmethod
     def forward(ctx: FunctionCtx, values: Tensor, rows: Tensor, num_rows: int) -> Tensor:
         ctx.save_for_backward(rows)
-        return bag_sum(values, *bags(rows, num_rows))
+        return gather_segment_sum(values, *segments(rows, num_rows))
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None, None]:
@@ -65,16 +65,16 @@ class _SegmentSum(torch.autograd.Function):
         return F.embedding(rows, grad.contiguous()), None, None
 
 
-def exchange_rows(
+def permute_rows(
     values: Tensor,  # [n, C]
     there: Tensor,  # [m] int64, the row of `values` that each result takes, -1 for zeros; none twice
     back: Tensor,  # [n] int64, the inverse: the result that takes each row, -1 for none
 ) -> Tensor:  # [m, C]
     """Rows in other places. Differentiable; the way back is a gather as well, so nothing is added up."""
-    return _ExchangeRows.apply(values, there, back)
+    return _PermuteRows.apply(values, there, back)
 
 
-class _ExchangeRows(torch.autograd.Function):
+class _PermuteRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: FunctionCtx, values: Tensor, there: Tensor, back: Tensor) -> Tensor:
         ctx.save_for_backward(back)
@@ -92,7 +92,7 @@ def _take(values: Tensor, rows: Tensor) -> Tensor:
     return values.index_select(0, rows.clamp(min=0)).masked_fill_((rows < 0)[:, None], 0.0)
 
 
-def best_rows(
+def topk_per_sample(
     scores: Tensor,  # [M]
     sample: Tensor,  # [M] int64
     batch_size: int,
@@ -109,48 +109,48 @@ def best_rows(
     return rows[:, :count]
 
 
-def weighted_bag(
+def weighted_segment_sum(
     values: Tensor,  # [n, C]
     weights: Tensor,  # [pairs]
     picks: Tensor,  # [pairs] int64, row of `values`
-    bag: Tensor,  # [pairs] int64, ascending
-    num_bags: int,
+    segment: Tensor,  # [pairs] int64, ascending
+    num_segments: int,
     by_pick: Tensor | None = None,  # [pairs] int64, the pairs ordered by `picks`, where the caller knows it
-) -> Tensor:  # [num_bags, C]
-    """Weighted sum of the picked rows of every bag, differentiable in the values and in the weights."""
-    return _WeightedBag.apply(values, weights, picks, bag, num_bags, by_pick)
+) -> Tensor:  # [num_segments, C]
+    """Weighted sum of the picked rows of every segment, differentiable in the values and in the weights."""
+    return _WeightedSegmentSum.apply(values, weights, picks, segment, num_segments, by_pick)
 
 
-class _WeightedBag(torch.autograd.Function):
+class _WeightedSegmentSum(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: FunctionCtx,
         values: Tensor,
         weights: Tensor,
         picks: Tensor,
-        bag: Tensor,
-        num_bags: int,
+        segment: Tensor,
+        num_segments: int,
         by_pick: Tensor | None,
     ) -> Tensor:
-        ctx.save_for_backward(values, weights, picks, bag)
+        ctx.save_for_backward(values, weights, picks, segment)
         ctx.by_pick = by_pick
-        return bag_sum(values, picks, _starts(bag, num_bags), weights)
+        return gather_segment_sum(values, picks, _starts(segment, num_segments), weights)
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None, None]:
-        values, weights, picks, bag = ctx.saved_tensors
+        values, weights, picks, segment = ctx.saved_tensors
         grad = grad.contiguous()
         grad_values = grad_weights = None
         if ctx.needs_input_grad[0]:
             order = torch.argsort(picks, stable=True) if ctx.by_pick is None else ctx.by_pick
-            back, turned = bag.index_select(0, order), weights.index_select(0, order)
-            grad_values = bag_sum(grad, back, _starts(picks, len(values)), turned)
+            back, turned = segment.index_select(0, order), weights.index_select(0, order)
+            grad_values = gather_segment_sum(grad, back, _starts(picks, len(values)), turned)
         if ctx.needs_input_grad[1]:
-            grad_weights = row_products(grad, bag, values, picks)
+            grad_weights = paired_dot(grad, segment, values, picks)
         return grad_values, grad_weights, None, None, None, None
 
 
-def row_products(
+def paired_dot(
     a: Tensor,  # [n, C]
     rows_a: Tensor,  # [pairs]
     b: Tensor,  # [m, C]

@@ -9,9 +9,9 @@ from torch.autograd.function import FunctionCtx
 
 from src.ops.backend import implementation, register
 from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
-from src.ops.segment_reduce import bag_sum
+from src.ops.segment_reduce import gather_segment_sum
 from src.ops.sites import Sites, union
-from src.ops.tiled_rulebook import pair_tiles, scratch
+from src.ops.tiled_rulebook import scratch, tiled_rulebook
 
 __all__ = [
     "KernelMap",
@@ -54,8 +54,8 @@ def neighbour_sum(
     kernel_map: KernelMap,
 ) -> Tensor:  # [M_out, C]
     """Sum of the input rows that each output sees: the convolution whose weights are all one. Without gradient."""
-    order, starts = kernel_map.bags_by_output()
-    return bag_sum(features, kernel_map.inputs.index_select(0, order), starts)
+    order, starts = kernel_map.segments_by_output()
+    return gather_segment_sum(features, kernel_map.inputs.index_select(0, order), starts)
 
 
 @register("sparse_conv", "reference")
@@ -86,8 +86,8 @@ class _SparseConv(torch.autograd.Function):
         ctx.save_for_backward(features, weight)
         ctx.kernel_map = kernel_map
         if _is_grouped(features):
-            picks, bags = kernel_map.inputs, kernel_map.bags_by_output()
-            out = _gather_multiply_sum(features, weight, picks, kernel_map, bags)
+            picks, segments = kernel_map.inputs, kernel_map.segments_by_output()
+            out = _gather_multiply_sum(features, weight, picks, kernel_map, segments)
         else:
             out, _ = _tiled(features, weight, kernel_map, backward=False)
         return out if bias is None else out.add_(bias)
@@ -105,12 +105,12 @@ class _SparseConv(torch.autograd.Function):
                 grad_features, grad_weight = _tiled(grad, weight, maps, backward=True, others=others)
         else:
             if need_features and maps.mirrored:
-                # The transposed map is the map itself with reversed offsets, whose bags exist already.
+                # The transposed map is the map itself with reversed offsets, whose segments exist already.
                 back = weight.flip(0).transpose(1, 2)
-                grad_features = _gather_multiply_sum(grad, back, maps.inputs, maps, maps.bags_by_output())
+                grad_features = _gather_multiply_sum(grad, back, maps.inputs, maps, maps.segments_by_output())
             elif need_features:
                 back = weight.transpose(1, 2)
-                grad_features = _gather_multiply_sum(grad, back, maps.outputs, maps, maps.bags_by_input())
+                grad_features = _gather_multiply_sum(grad, back, maps.outputs, maps, maps.segments_by_input())
             if need_weight:
                 grad_weight = _weight_gradient(features, grad, maps)
         return grad_features, grad_weight, grad.sum(0) if need_bias else None, None
@@ -148,14 +148,14 @@ def _tiled(
             gradients[centre].add_(torch.mm(others.t(), rows))
     if backward and kernel_map.mirrored:  # the tiles are those of the way forward
         matrices, gradients = matrices[::-1], gradients[::-1]
-    cut = pair_tiles(kernel_map, backward, width_in + width, rows.dtype)
+    cut = tiled_rulebook(kernel_map, backward, width_in + width, rows.dtype)
     gathered_rows = scratch("gathered", cut.most_pairs, width_in, rows.dtype, rows.device)
     products = scratch("products", cut.most_pairs, width, rows.dtype, rows.device)
     for tile in cut.tiles:
         gathered = torch.index_select(rows, 0, tile.gathered, out=gathered_rows[: len(tile.gathered)])
         for offset, first, last in tile.spans:
             torch.mm(gathered[first:last], matrices[offset], out=products[first:last])
-        sums = bag_sum(products, tile.order, tile.starts)
+        sums = gather_segment_sum(products, tile.order, tile.starts)
         block = out[tile.first : tile.last]
         if centre is None:
             block.copy_(sums)
@@ -174,16 +174,16 @@ def _gather_multiply_sum(
     weight: Tensor,  # [K, Ca, Cb]
     picks: Tensor,  # [pairs] int32
     kernel_map: KernelMap,
-    bags: tuple[Tensor, Tensor],
-) -> Tensor:  # [number of bags, Cb]
+    segments: tuple[Tensor, Tensor],
+) -> Tensor:  # [number of segments, Cb]
     if len(picks) == 0:
-        return rows.new_zeros(len(bags[1]) - 1, weight.shape[2])
+        return rows.new_zeros(len(segments[1]) - 1, weight.shape[2])
     width = weight.shape[2]
     # Rows of a grouped product must be multiples of 16 bytes.
     rows, weight = _padded(rows, 1), _padded(_padded(weight, 1), 2)
     products = F.grouped_mm(F.embedding(picks, rows), weight, offs=kernel_map.ends())
-    order, starts = bags
-    out = bag_sum(products, order, starts)
+    order, starts = segments
+    out = gather_segment_sum(products, order, starts)
     return out if out.shape[1] == width else out[:, :width].contiguous()
 
 

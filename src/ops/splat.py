@@ -13,7 +13,7 @@ from torch.autograd.function import FunctionCtx
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import window_cells
 from src.ops.backend import implementation, register
-from src.ops.segment_reduce import bag_sum, weighted_bag
+from src.ops.segment_reduce import gather_segment_sum, weighted_segment_sum
 from src.ops.sites import Sites
 
 # A contribution is at most 1 - CAP, so that the logarithm of the free probability stays finite.
@@ -111,7 +111,7 @@ def splat_gaussians(
 
 
 @dataclass(eq=False)
-class Pairs:
+class GaussianCellPairs:
     """(Gaussian, cell) pairs in the order of the cells, and the way back to the order of the Gaussians.
 
     By Gaussian, the pairs of one Gaussian stand in the order of their cells.
@@ -136,7 +136,7 @@ def gaussian_cells(
     grid: BEVGrid,
     batch_size: int,
     support_sigmas: float,
-) -> tuple[Pairs, Tensor]:
+) -> tuple[GaussianCellPairs, Tensor]:
     """All pairs with q <= support_sigmas^2, and the linear keys [n] of the cells they reach."""
     squares, turned = scales.square(), directions.square()
     variances = torch.stack([(turned * squares).sum(1), (turned.flip(1) * squares).sum(1)], 1)  # Sigma_xx, Sigma_yy
@@ -165,7 +165,7 @@ def gaussian_cells(
     by_gaussian[order] = in_turn
     owners = torch.arange(len(means) + 1, device=gaussian.device)
     near = near.index_select(0, order)
-    pairs = Pairs(
+    pairs = GaussianCellPairs(
         gaussian=gaussian.index_select(0, order),
         cell=cell,
         delta=torch.stack([delta_x.index_select(0, near), delta_y.index_select(0, near)], 1),
@@ -186,7 +186,7 @@ class _LogFree(torch.autograd.Function):
         ctx: FunctionCtx,
         q: Tensor,
         opacity_logits: Tensor,
-        pairs: Pairs,
+        pairs: GaussianCellPairs,
         smooth_cap: bool,
     ) -> Tensor:
         surprise = F.softplus(-opacity_logits).index_select(0, pairs.gaussian) + 0.5 * q  # -log a
@@ -196,12 +196,12 @@ class _LogFree(torch.autograd.Function):
             surprise = surprise.clamp(min=-math.log1p(-CAP))
         ctx.save_for_backward(surprise, opacity_logits)
         ctx.pairs, ctx.smooth_cap = pairs, smooth_cap
-        return bag_sum(log1mexp(surprise)[:, None], pairs.in_turn, pairs.cell_starts).squeeze(1)
+        return gather_segment_sum(log1mexp(surprise)[:, None], pairs.in_turn, pairs.cell_starts).squeeze(1)
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
         surprise, opacity_logits = ctx.saved_tensors
-        pairs: Pairs = ctx.pairs
+        pairs: GaussianCellPairs = ctx.pairs
         slope = grad.index_select(0, pairs.cell) / torch.expm1(surprise)  # d log(1 - a) / d(-log a) = a / (1 - a)
         if not ctx.smooth_cap:
             slope = torch.where(surprise > -math.log1p(-CAP), slope, 0.0)
@@ -218,7 +218,7 @@ class _Distance(torch.autograd.Function):
         means: Tensor,
         scales: Tensor,
         directions: Tensor,
-        pairs: Pairs,
+        pairs: GaussianCellPairs,
     ) -> Tensor:
         ctx.save_for_backward(scales, directions)
         ctx.pairs = pairs
@@ -227,7 +227,7 @@ class _Distance(torch.autograd.Function):
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
         scales, directions = ctx.saved_tensors
-        pairs: Pairs = ctx.pairs
+        pairs: GaussianCellPairs = ctx.pairs
         cosine, sine, size_x, size_y = torch.cat([directions, scales], 1).index_select(0, pairs.gaussian).unbind(1)
         delta_x, delta_y = pairs.delta.unbind(1)
         along, across = cosine * delta_x + sine * delta_y, cosine * delta_y - sine * delta_x
@@ -282,7 +282,7 @@ def splat_reference(
     rank = (kept.cumsum(0) - 1).index_select(0, pairs.by_gaussian)
     by_gaussian = rank[kept.index_select(0, pairs.by_gaussian)]
     distance = q.index_select(0, chosen)
-    out = weighted_bag(features, torch.exp(-0.5 * distance), gaussian, cell, len(occupied_rows), by_gaussian)
+    out = weighted_segment_sum(features, torch.exp(-0.5 * distance), gaussian, cell, len(occupied_rows), by_gaussian)
     keys = support.index_select(0, occupied_rows)
     peak_cell = _nearest_cell(distance.detach(), gaussian, keys.index_select(0, cell), len(means))
     return Splat(
@@ -331,6 +331,6 @@ def _nearest_cell(
     return torch.where(peak == none, -1, peak)
 
 
-def _gaussian_sum(values: Tensor, pairs: Pairs) -> Tensor:
+def _gaussian_sum(values: Tensor, pairs: GaussianCellPairs) -> Tensor:
     """Sums of pair values [pairs, C] per Gaussian [G, C]."""
-    return bag_sum(values, pairs.by_gaussian, pairs.gaussian_starts)
+    return gather_segment_sum(values, pairs.by_gaussian, pairs.gaussian_starts)

@@ -33,19 +33,19 @@ class Tile:
 
 
 @dataclass(frozen=True, eq=False)
-class PairTiles:
+class TiledRulebook:
     """Every pair of a kernel map but those of its centre, where it has one, tile by tile."""
 
     tiles: tuple[Tile, ...]
     most_pairs: int  # of any tile
 
 
-def pair_tiles(
+def tiled_rulebook(
     kernel_map: KernelMap,
     backward: bool,
     values_per_pair: int,
     dtype: torch.dtype,
-) -> PairTiles:
+) -> TiledRulebook:
     """The map's pairs in tiles of about TILE_BYTES of these values; cached on the map.
 
     Forward, input rows are gathered and output rows summed; backward the other way round. A submanifold map is its own
@@ -65,7 +65,7 @@ def pair_tiles(
     return kernel_map.cache[key]
 
 
-def _cut(kernel_map: KernelMap, backward: bool, rows: int, num: int) -> PairTiles:
+def _cut(kernel_map: KernelMap, backward: bool, rows: int, num: int) -> TiledRulebook:
     gathered, summed = kernel_map.inputs, kernel_map.outputs
     if backward:
         gathered, summed = summed, gathered
@@ -95,7 +95,7 @@ def _cut(kernel_map: KernelMap, backward: bool, rows: int, num: int) -> PairTile
         wanted = torch.arange(first, last + 1, dtype=torch.int32, device=device)
         starts = torch.searchsorted(by_row, wanted, out_int32=True)
         tiles.append(Tile(first, last, sources, targets, tuple(spans), order.to(torch.int32), starts))
-    return PairTiles(tuple(tiles), max((len(tile.gathered) for tile in tiles), default=0))
+    return TiledRulebook(tuple(tiles), max((len(tile.gathered) for tile in tiles), default=0))
 
 
 class _Scratch(threading.local):

@@ -27,7 +27,7 @@ MIN_LABELLED_PX = 16
 
 
 @dataclass
-class CameraViews:
+class PictureViews:
     """N cameras of one frame. Raises ValueError when counts or shapes disagree."""
 
     images: Sequence[Array | None]  # N of [H, W, 3] uint8 RGB, None where the camera gave no image
@@ -39,7 +39,7 @@ class CameraViews:
         n = len(self.images)
         if len(self.names) != n or self.pix_from_ego.shape != (n, 4, 4):
             raise ValueError(
-                f"CameraViews of {n} images must have {n} names and pix_from_ego [{n}, 4, 4], "
+                f"PictureViews of {n} images must have {n} names and pix_from_ego [{n}, 4, 4], "
                 f"but got {len(self.names)} names and {list(self.pix_from_ego.shape)}"
             )
         for name, image in zip(self.names, self.images, strict=True):
@@ -220,7 +220,7 @@ def paint_camera(
 
 
 def cameras_height(
-    views: CameraViews,
+    views: PictureViews,
     width: int,
 ) -> int:
     """Height in picture pixels of all cameras, two to a row."""
@@ -229,13 +229,13 @@ def cameras_height(
     return round(rows * each + max(rows - 1, 0) * GAP_PX)
 
 
-def _camera_width(views: CameraViews, width: int) -> float:
+def _camera_width(views: PictureViews, width: int) -> float:
     return width if len(views) == 1 else (width - GAP_PX) / 2
 
 
 def paint_cameras(
     canvas: Canvas,
-    views: CameraViews,
+    views: PictureViews,
     area: tuple[float, float, float],  # left, top, width in picture pixels
     predictions: PictureBoxes,
     ground_truth: PictureBoxes,
@@ -254,7 +254,7 @@ def paint_cameras(
 
 def draw_cameras(
     path: Path | str,
-    views: CameraViews,
+    views: PictureViews,
     predictions: PictureBoxes,
     ground_truth: PictureBoxes,
     score_threshold: float = 0.0,

@@ -9,7 +9,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 
 from src.pictures.bev import BevScene, paint_detections, paint_evidence
-from src.pictures.cameras import CameraViews, cameras_height, paint_cameras
+from src.pictures.cameras import PictureViews, cameras_height, paint_cameras
 from src.pictures.canvas import SHEET_PX, Canvas
 from src.pictures.contents import MUTED, match_boxes
 from src.pictures.legends import class_keys, gaussian_keys, radar_keys, reading_keys
@@ -116,7 +116,7 @@ def paint_bev(canvas: Canvas, scene: BevScene, top: float) -> None:
 def draw_frame(
     path: Path | str,
     scene: BevScene,
-    views: CameraViews | None = None,
+    views: PictureViews | None = None,
     title: str = "",
     score_threshold: float = 0.0,
 ) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from src.pictures.bev import frame_axes, paint_boxes, paint_ego, paint_radar
-from src.pictures.cameras import CameraViews, cameras_height, paint_cameras
+from src.pictures.cameras import PictureViews, cameras_height, paint_cameras
 from src.pictures.canvas import SHEET_PX, Canvas
 from src.pictures.contents import INK, MUTED, PictureBoxes
 from src.pictures.legends import class_keys, radar_keys
@@ -28,7 +28,7 @@ SIMULATED_COLOUR = "#0072B2"
 
 def draw_scene_preview(
     path: Path | str,
-    views: CameraViews,
+    views: PictureViews,
     boxes: PictureBoxes,  # ground truth
     radar_points: Array,  # [P, 7] x, y, z (m), rcs (dB), vx, vy (m/s, compensated, radial), dt (s)
     title: str,

@@ -52,7 +52,7 @@ NAMES_OF_COMPARISON = {
 }
 """By phase and sorted settings, in the order of the page; phase 1 that went on stands after phase 1."""
 
-SILENT = "data.silent_frames="
+SILENT = "data.sensor_dropout="
 
 METRIC = "official TruckScenes metric on the validation split; percent, mean ± standard deviation over seeds."
 
@@ -61,7 +61,7 @@ positive the speed it states). Means over the classes that occur at that speed; 
 class that does not reach a recall of 0.1 counts as 1, the official rule, so read it beside the AP. Some classes have
 few boxes at a speed; the car's numbers stand on the most."""
 
-SILENT_TEXT = """From the share `data.silent_frames` of the frames, never a clip's first, all sensor data are taken
+SILENT_TEXT = """From the share `data.sensor_dropout` of the frames, never a clip's first, all sensor data are taken
 away, in training and in validation: what is found there comes from the memory alone. These rows compare with one
 another only."""
 

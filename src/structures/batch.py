@@ -35,8 +35,12 @@ class FrameBatch:
     image_valid: Tensor | None = None  # [B, N] bool, False where a camera is missing
     pix_from_aug: Tensor | None = None  # [B, N, 4, 4] float32: P_n over (0, 0, 0, 1); (u*d, v*d, d, 1) = P (x, y, z, 1)
     boxes: list[Boxes3D] | None = None  # B, aug frame
-    lanes: Tensor | None = None  # [B] int64, unique: the stream of frames that each row is the next of; None: unordered
-    starts: Tensor | None = None  # [B] bool, the row begins a clip: memory of its lane ends here; given with `lanes`
+    streams: Tensor | None = (
+        None  # [B] int64, unique: the stream of frames that each row is the next of; None: unordered
+    )
+    starts: Tensor | None = (
+        None  # [B] bool, the row begins a clip: memory of its stream ends here; given with `streams`
+    )
     skipped: dict[str, int] = field(default_factory=dict)  # unreadable files passed over, by channel
     bad_files: list[str] = field(default_factory=list)  # which these were, relative to the data set's root
 
@@ -57,13 +61,13 @@ class FrameBatch:
             self._expect("images", (b, n, 3, h, w), torch.uint8)
             self._expect("image_valid", (b, n), torch.bool)
             self._expect("pix_from_aug", (b, n, 4, 4), torch.float32)
-        if (self.lanes is None) != (self.starts is None):
-            raise ValueError("FrameBatch.lanes and FrameBatch.starts must be given together")
-        if self.lanes is not None:
-            self._expect("lanes", (b,), torch.int64)
+        if (self.streams is None) != (self.starts is None):
+            raise ValueError("FrameBatch.streams and FrameBatch.starts must be given together")
+        if self.streams is not None:
+            self._expect("streams", (b,), torch.int64)
             self._expect("starts", (b,), torch.bool)
-            if self.lanes.device.type == "cpu" and len(set(self.lanes.tolist())) != b:
-                raise ValueError(f"FrameBatch.lanes must be unique, but got {self.lanes.tolist()}")
+            if self.streams.device.type == "cpu" and len(set(self.streams.tolist())) != b:
+                raise ValueError(f"FrameBatch.streams must be unique, but got {self.streams.tolist()}")
         if self.boxes is not None and len(self.boxes) != b:
             raise ValueError(f"FrameBatch.boxes must hold {b} entries, one per sample, but got {len(self.boxes)}")
 

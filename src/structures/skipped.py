@@ -12,7 +12,7 @@ MAX_NAMES, SHOWN_NAMES = 1000, 10
 """Names kept in a record, and of these on a line; the counts are of all."""
 
 
-class PassedOver:
+class SkippedFiles:
     """How often a sensor's file was passed over, by channel, and which files these were."""
 
     def __init__(self) -> None:

@@ -31,7 +31,7 @@ MAY_BE_NEW = re.compile(r"(dptf|temporal)\.|ocsf\.encoder\.layers\.\d+\.temporal
 OF_THIS_RUN = ("phase", "resume")
 """Overrides that never concern the run whose weights are taken."""
 OF_THE_LATER_PHASE = (
-    *("model.dptf", "model.temporal", "data.groups_per_scene", "data.lane_sets", "data.silent_frames"),
+    *("model.dptf", "model.temporal", "data.groups_per_scene", "data.stream_sets", "data.sensor_dropout"),
     *(f"model.loss.cell_{term}_weight" for term in ("focal", "dice", "lovasz", "velocity")),
 )
 """Nor do these, where that run is of the phase before."""
@@ -45,7 +45,7 @@ Compose = Callable[[list[str]], tuple[Any, dict[str, Any]]]
 
 
 @dataclass(frozen=True)
-class Source:
+class WeightSource:
     """Where a run's first weights come from."""
 
     identity: str  # run id, or a digest of the file
@@ -69,7 +69,7 @@ def find_source(
     overrides: list[str],
     compose: Compose,
     phases: Sequence[str],  # names that `phase.init_from` may have
-) -> Source | None:
+) -> WeightSource | None:
     """The run or file that `phase.init_from` names, finished or not; None for fresh weights.
 
     A phase's name means the run of the same command in that phase, less the overrides of what only the later phase has.
@@ -84,7 +84,7 @@ def find_source(
             raise CheckpointError(
                 f"phase.init_from={name}: there is no such checkpoint, and no phase of that name ({', '.join(phases)})"
             )
-        return Source(hashlib.sha256(path.read_bytes()).hexdigest()[:16], path, None, None)
+        return WeightSource(hashlib.sha256(path.read_bytes()).hexdigest()[:16], path, None, None)
     others = OF_THIS_RUN
     if name != config.phase.name:
         others += OF_THE_LATER_PHASE
@@ -96,10 +96,10 @@ def find_source(
     its_source = find_source(its_config, wanted, compose, phases)  # what that run starts from is part of its identity
     identity = run_identity(tree, its_source.identity if its_source is not None else None)
     folder = RunFolder(Path(config.paths.outputs), identity)
-    return Source(folder.run_id, folder.checkpoints / "last.ckpt", wanted, folder)
+    return WeightSource(folder.run_id, folder.checkpoints / "last.ckpt", wanted, folder)
 
 
-def train_source(source: Source, train_missing: bool, processes_exist: bool) -> None:
+def train_source(source: WeightSource, train_missing: bool, processes_exist: bool) -> None:
     """Train the run that a phase starts from, in a process of its own, which prints its progress here.
 
     `processes_exist` says that ranks are already running side by side, so none of them can start a training of all.
@@ -133,7 +133,7 @@ def train_source(source: Source, train_missing: bool, processes_exist: bool) -> 
         )
 
 
-def read_source(source: Source) -> dict[str, Any]:
+def read_source(source: WeightSource) -> dict[str, Any]:
     """The source's checkpoint. Raises CheckpointError with the remedy when it is damaged."""
     try:
         return read_checkpoint(source.checkpoint)
@@ -143,7 +143,7 @@ def read_source(source: Source) -> dict[str, Any]:
         raise CheckpointError(f"{error}; make it anew with\n    {source.command} resume=restart") from error
 
 
-def hand_over(model: nn.Module, source: Source, tree: dict[str, Any]) -> None:
+def hand_over(model: nn.Module, source: WeightSource, tree: dict[str, Any]) -> None:
     """Give `model` the source's weights; what the new phase adds keeps its own. Settings that differ are logged.
 
     Raises CheckpointError naming every key that does not fit.

@@ -78,7 +78,7 @@ def run_identity(tree: dict[str, Any], source: str | None = None) -> str:
     if source is not None:
         tree["phase"]["init_from"] = source
     if not tree["phase"]["temporal"]:
-        for key in ("groups_per_scene", "lane_sets", "silent_frames"):
+        for key in ("groups_per_scene", "stream_sets", "sensor_dropout"):
             tree["data"].pop(key)
     digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:8]
     return f"{tree['model']['name']}-{tree['phase']['name']}-{tree['scale']}-{digest}"

@@ -29,7 +29,7 @@ from src.reliability.nonfinite import (
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable, EvaluationSet
-from src.structures.skipped import PassedOver
+from src.structures.skipped import SkippedFiles
 from src.training.optim import OptimConfig, build_optimizer
 
 logger = logging.getLogger(__name__)
@@ -66,7 +66,7 @@ class DetectionModule(L.LightningModule):
         self.scores: DetectionScores | None = None
         self.detections: DetectionTable | None = None
         self.scored_step = -1
-        self.skipped = PassedOver()
+        self.skipped = SkippedFiles()
         self.guard = StepGuard(skip_nonfinite)
         self._step: tuple[FrameBatch, dict[str, Tensor], dict[str, Tensor]] | None = None  # batch, terms, diagnostics
 

@@ -15,7 +15,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.detector import Detector
 from src.models.horizon3d.dptf import DPTFConfig
 from src.pictures.bev import BevScene
-from src.pictures.cameras import CameraViews
+from src.pictures.cameras import PictureViews
 from src.pictures.contents import PictureBoxes, PictureGaussians, PictureGrid, PictureMemory
 from src.pictures.frame import draw_frame
 from src.pictures.memory_picture import MemoryScene, draw_memory
@@ -115,13 +115,13 @@ def _memory_config(model: Detector) -> DPTFConfig | None:
     return getattr(getattr(model, "config", None), "dptf", None)
 
 
-def views_of(batch: FrameBatch) -> CameraViews | None:
+def views_of(batch: FrameBatch) -> PictureViews | None:
     """The four images with their projection, or None for a model without cameras. Without augmentation aug = ego."""
     if batch.images is None:
         return None
     images = _numpy(batch.images[0].permute(0, 2, 3, 1))
     valid = _numpy(batch.image_valid[0])
-    return CameraViews(
+    return PictureViews(
         images=[image if seen else None for image, seen in zip(images, valid, strict=True)],
         pix_from_ego=_numpy(batch.pix_from_aug[0]),
         names=CAMERAS,

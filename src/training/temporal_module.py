@@ -1,4 +1,4 @@
-"""Phase 2: a detector with memory, trained and validated on lanes of consecutive key frames (specification 6)."""
+"""Phase 2: a detector with memory, trained and validated on streams of consecutive key frames (specification 6)."""
 
 from __future__ import annotations
 
@@ -16,53 +16,53 @@ logger = logging.getLogger(__name__)
 
 
 class TemporalModule(DetectionModule):
-    """Keeps the memory of its lanes between steps; the model itself stays without state.
+    """Keeps the memory of its streams between steps; the model itself stays without state.
 
-    A lane's memory ends where a clip starts, where the lane is missing from its set's next batch, and between passes:
-    each epoch of training and each validation begins without memory. A checkpoint inside an epoch carries it.
+    A stream's memory ends where a clip starts, where the stream is missing from its set's next batch, and between
+    passes: each epoch of training and each validation begins without memory. A checkpoint inside an epoch carries it.
     """
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
-        # Sets of lanes take turns (`data.lane_sets`): the lanes [B] int64 of each set's last batch, and their memory.
+        # Sets of streams take turns (`data.stream_sets`): the streams [B] int64 of each last batch, and their memory.
         self.memories: list[tuple[Tensor, TemporalMemory]] = []
         self._before_step: list[tuple[Tensor, TemporalMemory]] = []
 
     def run(self, batch: FrameBatch) -> Any:
-        """The model's output for the next frames of the batch's lanes; they are remembered.
+        """The model's output for the next frames of the batch's streams; they are remembered.
 
-        Raises ValueError for a batch without lanes.
+        Raises ValueError for a batch without streams.
         """
         past = self.recall(batch)
-        # Before the forward pass: on a GPU the look at the lanes would otherwise wait for all of it.
-        self.memories = [entry for entry in self.memories if not _common(batch.lanes, entry[0]).any()]
+        # Before the forward pass: on a GPU the look at the streams would otherwise wait for all of it.
+        self.memories = [entry for entry in self.memories if not _common(batch.streams, entry[0]).any()]
         output, memory = self.model(batch, past)
         if memory is not None:
-            self.memories.append((batch.lanes, memory))
+            self.memories.append((batch.streams, memory))
         return output
 
     def recall(self, batch: FrameBatch) -> TemporalMemory | None:
-        """Memory of the batch's lanes, row by row, or None where none of them has any."""
-        if batch.lanes is None:
+        """Memory of the batch's streams, row by row, or None where none of them has any."""
+        if batch.streams is None:
             raise ValueError(
-                f"samples {batch.tokens} come without lanes, but a temporal model needs FrameBatch.lanes and "
+                f"samples {batch.tokens} come without streams, but a temporal model needs FrameBatch.streams and "
                 "FrameBatch.starts; read them with a clip sampler"
             )
-        for lanes, memory in self.memories:
-            same = _common(batch.lanes, lanes)  # [B of now, B of before]
+        for streams, memory in self.memories:
+            same = _common(batch.streams, streams)  # [B of now, B of before]
             if same.any():
                 keep = same.any(dim=1) & ~batch.starts
                 return memory.select(same.int().argmax(dim=1), keep) if keep.any() else None
         return None
 
     def forget(self) -> None:
-        """Drop the memory of all lanes."""
+        """Drop the memory of all streams."""
         self.memories.clear()
         self._before_step.clear()
 
     def forget_step(self, batch: FrameBatch) -> None:
-        """Let the lanes of a step that counts for nothing begin anew: what they remember may not be finite."""
-        self.memories = [entry for entry in self.memories if not _common(batch.lanes, entry[0]).any()]
+        """Let the streams of a step that counts for nothing begin anew: what they remember may not be finite."""
+        self.memories = [entry for entry in self.memories if not _common(batch.streams, entry[0]).any()]
 
     def memories_before_step(self) -> list[dict[str, Any]]:
         """As in `rank_state`, of the time before the running step."""
@@ -75,7 +75,7 @@ class TemporalModule(DetectionModule):
 
     def on_fit_start(self) -> None:
         """Bring a restored memory to the device: a checkpoint is read before the module is moved there."""
-        self.memories = [(lanes.to(self.device), memory.to(self.device)) for lanes, memory in self.memories]
+        self.memories = [(streams.to(self.device), memory.to(self.device)) for streams, memory in self.memories]
 
     def on_train_epoch_start(self) -> None:
         """Begin without memory; not called when a run goes on inside an epoch."""
@@ -97,21 +97,21 @@ class TemporalModule(DetectionModule):
         self.forget()
 
     def rank_state(self) -> dict[str, Any]:
-        """As the base, with `memories`: a list of {lanes: list[int], frames: `TemporalMemory.state`}."""
+        """As the base, with `memories`: a list of {streams: list[int], frames: `TemporalMemory.state`}."""
         return super().rank_state() | {"memories": _plain(self.memories)}
 
     def restore_rank(self, state: dict[str, Any]) -> None:
-        """As the base, with the memory of this rank's lanes."""
+        """As the base, with the memory of this rank's streams."""
         super().restore_rank(state)
         for entry in state.get("memories", []):
-            self.memories.append((torch.tensor(entry["lanes"]), self.model.restore_memory(entry["frames"])))
+            self.memories.append((torch.tensor(entry["streams"]), self.model.restore_memory(entry["frames"])))
 
     def adopt_ranks(self, states: list[dict[str, Any]]) -> None:
-        """As the base; lanes are dealt out anew, so they begin without memory, and the log says so."""
+        """As the base; streams are dealt out anew, so they begin without memory, and the log says so."""
         super().adopt_ranks(states)
         if any(state.get("memories") for state in states):
             logger.warning(
-                "the checkpoint inside an epoch is of %d processes, this run has %d: the lanes begin without memory, "
+                "the checkpoint inside an epoch is of %d processes, this run has %d: the streams begin without memory, "
                 "so the rest of this epoch differs from the uninterrupted run",
                 len(states),
                 self.trainer.world_size,
@@ -119,11 +119,11 @@ class TemporalModule(DetectionModule):
 
 
 def _plain(memories: list[tuple[Tensor, TemporalMemory]]) -> list[dict[str, Any]]:
-    return [{"lanes": lanes.tolist(), "frames": memory.to("cpu").state()} for lanes, memory in memories]
+    return [{"streams": streams.tolist(), "frames": memory.to("cpu").state()} for streams, memory in memories]
 
 
 def _common(
-    lanes: Tensor,  # [B] int64
+    streams: Tensor,  # [B] int64
     others: Tensor,  # [B'] int64
 ) -> Tensor:  # [B, B'] bool
-    return lanes[:, None] == others
+    return streams[:, None] == others

@@ -8,7 +8,7 @@ from pathlib import Path
 from src.assembly import data_root
 from src.config import compose_config
 from src.errors import ConfigError
-from src.pictures.cameras import CameraViews
+from src.pictures.cameras import PictureViews
 from src.pictures.contents import PictureBoxes
 from src.pictures.scene_preview import draw_scene_preview
 from src.reliability.command import run_command
@@ -33,7 +33,7 @@ def main(overrides: list[str]) -> None:
             path = folder / f"scene_{number:03d}.png"
             draw_scene_preview(
                 path,
-                CameraViews(frame.images, frame.pix_from_ego, CAMERAS),
+                PictureViews(frame.images, frame.pix_from_ego, CAMERAS),
                 PictureBoxes(frame.centers, frame.sizes, frame.yaws, frame.velocities, frame.labels),
                 frame.radar_points,
                 frame.title,

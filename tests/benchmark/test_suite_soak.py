@@ -146,7 +146,7 @@ def frame(token, seconds, matrix, starts):
         aug_from_ego=torch.eye(4)[None],
         radar_points=torch.zeros(0, 7),
         radar_batch=torch.zeros(0, dtype=torch.int64),
-        lanes=torch.tensor([0]),
+        streams=torch.tensor([0]),
         starts=torch.tensor([starts]),
     )
 

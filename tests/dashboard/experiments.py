@@ -56,7 +56,7 @@ def write_run(outputs: Path, run_id: str, seed: int, value: float, margin: float
         "ranges": dict.fromkeys(RANGES, part), "speeds": dict.fromkeys(SPEEDS, part),
     }  # fmt: skip
     config = {"model": {"name": "horizon3d", "ocsf": {"margin_m": margin}}, "phase": {"name": phase}, "seed": seed,
-              "data": {"root": "/nowhere", "silent_frames": None}, "paths": {"outputs": str(outputs)}}  # fmt: skip
+              "data": {"root": "/nowhere", "sensor_dropout": None}, "paths": {"outputs": str(outputs)}}  # fmt: skip
     (folder / "run.json").write_text(json.dumps(record))
     (folder / "metrics.json").write_text(json.dumps(metrics))
     (folder / "config.yaml").write_text(yaml.safe_dump(config))

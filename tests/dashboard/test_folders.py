@@ -78,7 +78,7 @@ def test_curves_of_a_file_that_is_being_written(tmp_path):
 def test_configuration_of_an_unfinished_run_says_nothing_of_the_machine(world, folders):
     run = world.run_id(0, 0)
     assert folders.config(run)["model"] == {"name": "horizon3d", "ocsf": {"margin_m": 0.8}}
-    assert "paths" not in folders.config(run) and folders.config(run)["data"] == {"silent_frames": None}
+    assert "paths" not in folders.config(run) and folders.config(run)["data"] == {"sensor_dropout": None}
     for text in ("model: [", "just words", ""):
         (world.outputs / run / "config.yaml").write_text(text)
         assert folders.config(run) == {}

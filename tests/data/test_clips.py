@@ -29,24 +29,24 @@ def follows(row, before):
     return row == before + 3
 
 
-@pytest.mark.parametrize(("lengths", "groups", "lanes"), CASES)
+@pytest.mark.parametrize(("lengths", "groups", "streams"), CASES)
 @pytest.mark.parametrize("epoch", [0, 1])
-def test_training_lanes_hold_consecutive_frames_between_starts(lengths, groups, lanes, epoch):
-    schedule = streamed_groups(scenes(lengths), groups, lanes, 1, 3, epoch)
+def test_training_lanes_hold_consecutive_frames_between_starts(lengths, groups, streams, epoch):
+    schedule = streamed_groups(scenes(lengths), groups, streams, 1, 3, epoch)
     total = sum(lengths)
-    assert schedule.samples.shape == schedule.clips.shape == (total // lanes, lanes)  # the same in every epoch
+    assert schedule.samples.shape == schedule.clips.shape == (total // streams, streams)  # the same in every epoch
     rows = schedule.samples.ravel().tolist()
-    assert len(set(rows)) == len(rows) > total - lanes and set(rows) <= set(np.concatenate(scenes(lengths)).tolist())
+    assert len(set(rows)) == len(rows) > total - streams and set(rows) <= set(np.concatenate(scenes(lengths)).tolist())
     starts = schedule.samples == schedule.clips
     assert starts[0].all()
-    for lane in range(lanes):
+    for stream in range(streams):
         clip = None
-        for step, (row, start) in enumerate(zip(schedule.samples[:, lane], starts[:, lane], strict=True)):
-            assert start or follows(row, schedule.samples[step - 1, lane])
+        for step, (row, start) in enumerate(zip(schedule.samples[:, stream], starts[:, stream], strict=True)):
+            assert start or follows(row, schedule.samples[step - 1, stream])
             clip = row if start else clip
-            assert schedule.clips[step, lane] == clip
+            assert schedule.clips[step, stream] == clip
     groups_at_most = sum(min(groups, length) for length in lengths)
-    assert starts.sum() <= groups_at_most + lanes - 1  # a lane's end cuts one group more
+    assert starts.sum() <= groups_at_most + streams - 1  # a stream's end cuts one group more
 
 
 def test_a_scene_is_cut_into_groups_of_nearly_equal_length():
@@ -62,22 +62,22 @@ def test_a_group_cut_by_the_end_of_a_lane_becomes_two_clips():
 
 @pytest.mark.parametrize("world_size", [1, 2])
 def test_sets_of_lanes_take_turns(world_size):
-    def schedule(lane_sets):
-        return lambda epoch: streamed_groups(scenes([8, 8, 8]), 2, 2 * 3 // lane_sets, lane_sets, 0, epoch)
+    def schedule(stream_sets):
+        return lambda epoch: streamed_groups(scenes([8, 8, 8]), 2, 2 * 3 // stream_sets, stream_sets, 0, epoch)
 
-    together = list(ScheduleSampler(schedule(1), 0, 1))  # six lanes at every step
+    together = list(ScheduleSampler(schedule(1), 0, 1))  # six streams at every step
     ranks = [list(ScheduleSampler(schedule(3), rank, world_size)) for rank in range(world_size)]
     turns = [sum(of_step, []) for of_step in zip(*ranks, strict=True)]
     assert [len(batch) for batch in turns] == [2] * 12
-    # Three steps of two lanes are one step of six: same frames, same lanes, same clips.
+    # Three steps of two streams are one step of six: same frames, same streams, same clips.
     assert [turns[at] + turns[at + 1] + turns[at + 2] for at in range(0, 12, 3)] == together
 
 
-@pytest.mark.parametrize(("lanes", "sets"), [(2, 12), (4, 6), (8, 3), (9, 2), (13, 1), (40, 1)])
-def test_there_are_no_more_sets_of_lanes_than_groups_fill(lanes, sets):
+@pytest.mark.parametrize(("streams", "sets"), [(2, 12), (4, 6), (8, 3), (9, 2), (13, 1), (40, 1)])
+def test_there_are_no_more_sets_of_lanes_than_groups_fill(streams, sets):
     """24 groups of ten frames: more sets would tear them into shorter clips."""
-    schedule = streamed_groups(scenes([20] * 12), 2, lanes, 12, 0, 0)
-    assert schedule.lane_sets == sets and schedule.samples.shape == (240 // (lanes * sets) * sets, lanes)
+    schedule = streamed_groups(scenes([20] * 12), 2, streams, 12, 0, 0)
+    assert schedule.stream_sets == sets and schedule.samples.shape == (240 // (streams * sets) * sets, streams)
 
 
 def test_order_follows_seed_and_epoch():
@@ -93,7 +93,7 @@ def test_order_follows_seed_and_epoch():
 
 def test_validation_lanes_are_filled_longest_scene_first():
     schedule = whole_scenes(scenes([2, 4, 1, 3]), 2, 1)
-    # Placed: 4 frames in lane 0, 3 in lane 1, 2 in lane 1, 1 in lane 0; read in the order of the table.
+    # Placed: 4 frames in stream 0, 3 in stream 1, 2 in stream 1, 1 in stream 0; read in the order of the table.
     assert schedule.samples.T.tolist() == [[2000, 2003, 2006, 2009, 3000], [1000, 1003, 4000, 4003, 4006]]
     assert schedule.clips.T.tolist() == [[2000] * 4 + [3000], [1000] * 2 + [4000] * 3]
 
@@ -109,12 +109,12 @@ def test_validation_reads_every_frame_once_and_no_scene_is_cut(lengths, world_si
         assert len(sampler) == max(1, len(batches)) and all(batches)
         last = {}
         for keys in batches:
-            lanes = [key.lane for key in keys]
-            assert lanes == sorted(set(lanes)) and {lane * world_size // 8 for lane in lanes} == {rank}
+            streams = [key.stream for key in keys]
+            assert streams == sorted(set(streams)) and {stream * world_size // 8 for stream in streams} == {rank}
             for key in keys:
                 assert key.starts == (key.sample % 1000 == 0)  # the first of its scene and nothing else
-                assert key.starts or follows(key.sample, last[key.lane])
-                last[key.lane] = key.sample
+                assert key.starts or follows(key.sample, last[key.stream])
+                last[key.stream] = key.sample
                 seen.append(key.sample)
         steps.append(len(batches))
     assert sorted(seen) == np.concatenate(scenes(lengths)).tolist()
@@ -142,8 +142,8 @@ def test_ranks_together_read_the_batches_of_one_process(world_size, temporal):
     alone = batches(0, 1)
     assert len(alone) == 7 and alone == [sum(of_step, []) for of_step in zip(*parts, strict=True)]
     assert {key.epoch for batch in alone for key in batch} == {2}
-    lanes = [[key.lane for key in batch] for batch in alone]
-    assert lanes == [[0, 1, 2, 3] if temporal else [None] * 4] * 7
+    streams = [[key.stream for key in batch] for batch in alone]
+    assert streams == [[0, 1, 2, 3] if temporal else [None] * 4] * 7
 
 
 def test_iteration_goes_on_from_the_position_asked_for_when_it_begins():
@@ -208,4 +208,4 @@ def test_jump_between_two_frames_of_a_scene(x_m):
 def test_schedule_is_split_into_blocks_of_lanes():
     table = np.arange(12).reshape(3, 4)
     samplers = [ScheduleSampler(lambda epoch: Schedule(table, table), rank, 2) for rank in range(2)]
-    assert [[key.lane for key in next(iter(sampler))] for sampler in samplers] == [[0, 1], [2, 3]]
+    assert [[key.stream for key in next(iter(sampler))] for sampler in samplers] == [[0, 1], [2, 3]]

@@ -26,8 +26,8 @@ BEV = BevAugmentationConfig(scale=[0.95, 1.05], rotation_rad=0.4, flip_probabili
 
 def config(**changes):
     values = dict(
-        root=None, version=VERSION, train_split="train", split="val", batch_size=2, groups_per_scene=2, lane_sets=1,
-        silent_frames=0.0, num_workers=0, num_sweeps=2, min_distance_m=1.0, propagate_points=False,
+        root=None, version=VERSION, train_split="train", split="val", batch_size=2, groups_per_scene=2, stream_sets=1,
+        sensor_dropout=0.0, num_workers=0, num_sweeps=2, min_distance_m=1.0, propagate_points=False,
         on_bad_file=OnBadFile.error, test_resize_offset=0.0,
         augmentation=AugmentationConfig(image=None, bev=BEV),
     )  # fmt: skip
@@ -153,8 +153,8 @@ def test_errors_travel_between_processes():
 
 @pytest.mark.parametrize(
     "change",
-    [{"batch_size": 0}, {"groups_per_scene": 0}, {"lane_sets": 0}, {"num_sweeps": 0}, {"num_workers": -1},
-     {"silent_frames": 1.0}, {"silent_frames": -0.1}, {"min_distance_m": float("nan")},
+    [{"batch_size": 0}, {"groups_per_scene": 0}, {"stream_sets": 0}, {"num_sweeps": 0}, {"num_workers": -1},
+     {"sensor_dropout": 1.0}, {"sensor_dropout": -0.1}, {"min_distance_m": float("nan")},
      {"test_resize_offset": float("nan")}],
     ids=str,
 )  # fmt: skip
@@ -204,22 +204,22 @@ def test_streamed_batches_mark_lanes_and_clip_starts(drives):
     batches = list(data.train_dataloader())
     assert len(batches) == 7 == len(data.train_dataloader())
     for batch in batches:
-        assert batch.lanes.tolist() == [0, 1] and batch.starts.dtype == torch.bool
-        for lane, (name, start) in enumerate(zip(batch.tokens, batch.starts.tolist(), strict=True)):
+        assert batch.streams.tolist() == [0, 1] and batch.starts.dtype == torch.bool
+        for stream, (name, start) in enumerate(zip(batch.tokens, batch.starts.tolist(), strict=True)):
             row = index.sample_tokens.tolist().index(name)
-            assert start or (row == last[lane] + 1 and index.sample_scenes[row] == index.sample_scenes[last[lane]])
-            last[lane] = row
+            assert start or (row == last[stream] + 1 and index.sample_scenes[row] == index.sample_scenes[last[stream]])
+            last[stream] = row
     assert sum(int(batch.starts.sum()) for batch in batches) <= 7
     for batch in (*module(drives, None).train_dataloader(), *module(drives, None).val_dataloader()):
-        assert batch.lanes is None and batch.starts is None
+        assert batch.streams is None and batch.starts is None
 
 
 def test_streamed_validation_reads_whole_scenes_and_batches_shrink(drives):
     batches = list(module(drives, None, temporal=True, batch_size=2).val_dataloader())
-    assert [batch.lanes.tolist() for batch in batches] == [[0, 1]] * 4
+    assert [batch.streams.tolist() for batch in batches] == [[0, 1]] * 4
     assert [batch.starts.tolist() for batch in batches] == [[1, 1], [0, 1], [0, 0], [0, 0]]
     many = list(module(drives, None, temporal=True, batch_size=6).val_dataloader())
-    assert [len(batch) for batch in many] == [3, 2, 2, 1]  # fewer scenes than lanes
+    assert [len(batch) for batch in many] == [3, 2, 2, 1]  # fewer scenes than streams
     tokens = sorted(name for batch in many for name in batch.tokens)
     assert tokens == sorted(module(drives, None).evaluation_set().tokens)
 
@@ -274,7 +274,7 @@ def test_silent_frames_are_never_a_clips_first_and_in_validation_always_the_same
         ]
 
     streamed = {"temporal": True, "batch_size": 1, "groups_per_scene": 1, "split": "train"}
-    made = [module(data_set, seed=seed, silent_frames=0.8, **streamed) for seed in (0, 1)]
+    made = [module(data_set, seed=seed, sensor_dropout=0.8, **streamed) for seed in (0, 1)]
     in_validation = [silent(one.val_dataloader()) for one in made]
     assert in_validation[0] == in_validation[1] == silent(made[0].val_dataloader())
     frames = [frame.tokens[0] for frame in made[0].stream() if len(frame.radar_points) == 0]
@@ -288,7 +288,7 @@ def test_stream_of_scenes(drives):
     frames = list(data.stream())
     assert [frame.tokens[0] for frame in frames] == data.evaluation_set().tokens
     assert [bool(frame.starts) for frame in frames] == [1, 0, 0, 0, 1, 1, 0, 0]
-    assert all(len(frame) == 1 and frame.lanes.tolist() == [0] for frame in frames)
+    assert all(len(frame) == 1 and frame.streams.tolist() == [0] for frame in frames)
     assert torch.equal(frames[0].aug_from_ego[0], torch.eye(4))
     one = list(data.stream(["scene-val-2"]))
     assert [frame.tokens for frame in one] == [frame.tokens for frame in frames[5:]] and bool(one[0].starts)
@@ -368,7 +368,7 @@ def test_ranks_of_the_module_read_one_process_s_batches(drives):
             world_size=world_size, global_rank=rank, global_step=0, num_training_batches=float("inf")
         )
         loader = data.train_dataloader() if kind == "train" else data.val_dataloader()
-        return [list(zip(batch.lanes.tolist(), batch.tokens, batch.starts.tolist(), strict=True)) for batch in loader]
+        return [list(zip(batch.streams.tolist(), batch.tokens, batch.starts.tolist(), strict=True)) for batch in loader]
 
     alone, parts = read(0, 1, "train"), [read(rank, 2, "train") for rank in range(2)]
     assert alone == [left + right for left, right in zip(*parts, strict=True)]

@@ -7,15 +7,15 @@ from dataclasses import fields, replace
 import pytest
 from torch import Tensor
 
-from src.data.datamodule import collate, in_lane
-from src.data.packed_batch import LARGE_BYTES, Parcel
+from src.data.datamodule import collate, in_stream
+from src.data.packed_batch import LARGE_BYTES, PackedBatch
 from src.structures.boxes import Boxes3D
 
 
 @pytest.fixture
 def batch(data_set):
     frames = [data_set.reader(image_size_px=(200, 400)).read(row, None) for row in (0, 1)]
-    return collate([in_lane(frame, lane, lane == 1) for lane, frame in enumerate(frames)])
+    return collate([in_stream(frame, stream, stream == 1) for stream, frame in enumerate(frames)])
 
 
 def pieces(value):
@@ -39,11 +39,11 @@ def test_what_is_packed_is_unpacked(batch):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for one in (batch, without_images, empty):
-            assert_same(Parcel.pack(one).unpack(), one)
+            assert_same(PackedBatch.pack(one).unpack(), one)
 
 
 def test_only_large_tensors_are_sent_one_by_one(batch):
-    parcel = Parcel.pack(batch)
+    parcel = PackedBatch.pack(batch)
     assert parcel.large[0] is batch.images and len(parcel.large) == 1
     assert len(parcel.content) < LARGE_BYTES
     travelled = pickle.loads(pickle.dumps(parcel))
@@ -52,7 +52,7 @@ def test_only_large_tensors_are_sent_one_by_one(batch):
 
 def test_what_arrives_can_be_written_to_and_keeps_no_image_alive(batch):
     """Poses and boxes outlive their batch in a memory; images must not stay with them."""
-    found = Parcel.pack(batch).unpack()
+    found = PackedBatch.pack(batch).unpack()
     found.radar_points += 1
     assert found.radar_points.untyped_storage().data_ptr() != batch.radar_points.untyped_storage().data_ptr()
     assert found.global_from_ego.untyped_storage().nbytes() == found.global_from_ego.nbytes

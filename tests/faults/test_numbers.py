@@ -16,7 +16,7 @@ import torch
 from src import replay, train
 from src.assembly import build_datamodule, build_module, data_root
 from src.config import OnNonfinite, compose_config, restore_config
-from src.data.datamodule import collate, in_lane
+from src.data.datamodule import collate, in_stream
 from src.errors import CheckpointError, ConfigError, DivergedError
 from src.models.horizon3d.model import Horizon3D
 from src.reliability.checkpoints import read_checkpoint
@@ -52,7 +52,7 @@ def load(world, tmp_path_factory):
         module = build_module(config, tree, datamodule).train()
         frames = [datamodule.reader.read(sample, None) for sample in range(2)]
         if config.phase.temporal:
-            frames = [in_lane(frame, 0, number == 0) for number, frame in enumerate(frames)]
+            frames = [in_stream(frame, 0, number == 0) for number, frame in enumerate(frames)]
         return module, tree, [collate([frame]) for frame in frames]
 
     return build

@@ -29,11 +29,11 @@ def bda(rotation=0.0, scale=1.0, flip_x=False, flip_y=False):
 
 
 def bare_frame(time_s, poses, augs=None):
-    """B frames at one time (or B times), one pose and one augmentation a lane, nothing seen."""
+    """B frames at one time (or B times), one pose and one augmentation a stream, nothing seen."""
     b = len(poses)
     times = torch.as_tensor(time_s, dtype=torch.float64).expand(b).clone()
     return FrameBatch(
-        tokens=[f"lane{i}" for i in range(b)],
+        tokens=[f"stream{i}" for i in range(b)],
         timestamps_s=times,
         global_from_ego=torch.stack(list(poses)),
         aug_from_ego=torch.stack(list(augs)) if augs is not None else torch.eye(4).repeat(b, 1, 1),

@@ -7,7 +7,7 @@ from tests.models.moving import UTM, bare_frame, bda, pose
 
 
 def test_frames_together_move_as_each_alone_to_the_last_bit():
-    """Lanes that are absent, too old, not in the past or jumped among them."""
+    """Streams that are absent, too old, not in the past or jumped among them."""
     poses = [pose(20.0, 3.0, 0.4, UTM), pose(1.0, 0.0), pose(0.0, 0.0)]
     now = bare_frame([4.0, 4.5, 4.0], poses, [bda(0.3), bda(), bda()])
     frames = []

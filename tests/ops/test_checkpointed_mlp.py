@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from src.ops.checkpointed_mlp import row_mlp
+from src.ops.checkpointed_mlp import checkpointed_mlp
 
 
 def operands(rows, dtype=torch.float64):
@@ -15,8 +15,8 @@ def test_gradcheck_over_several_spans(rows, monkeypatch):
     monkeypatch.setattr("src.ops.checkpointed_mlp.CPU_ROWS", 4)
     values = operands(rows)
     x, w, b, v, c = values
-    torch.testing.assert_close(row_mlp(*values), (x @ w + b).relu() @ v + c)
-    assert torch.autograd.gradcheck(row_mlp, values)
+    torch.testing.assert_close(checkpointed_mlp(*values), (x @ w + b).relu() @ v + c)
+    assert torch.autograd.gradcheck(checkpointed_mlp, values)
 
 
 def test_half_precision_sums_gradients_in_full():
@@ -24,14 +24,15 @@ def test_half_precision_sums_gradients_in_full():
     x = torch.ones(100_000, 1, dtype=torch.bfloat16, requires_grad=True)
     one = torch.ones(1, 1, dtype=torch.bfloat16)
     w = one.clone().requires_grad_()
-    row_mlp(x, w, torch.zeros(1, dtype=torch.bfloat16), one, torch.zeros(1, dtype=torch.bfloat16)).sum().backward()
+    zero = torch.zeros(1, dtype=torch.bfloat16)
+    checkpointed_mlp(x, w, zero, one, zero).sum().backward()
     assert w.grad.item() == pytest.approx(100_000, rel=0.01)
 
 
 def test_autocast_computes_in_its_type():
     values = operands(9, torch.float32)
     with torch.autocast("cpu", torch.bfloat16):
-        out = row_mlp(*values)
+        out = checkpointed_mlp(*values)
     assert out.dtype == torch.bfloat16
     out.float().sum().backward()
     assert values[0].grad.dtype == torch.float32

@@ -1,11 +1,18 @@
 import torch
 
 from src.ops import segment_mean, segment_sum
-from src.ops.segment_reduce import bag_sum, bags, best_rows, exchange_rows, row_products, weighted_bag
+from src.ops.segment_reduce import (
+    gather_segment_sum,
+    paired_dot,
+    permute_rows,
+    segments,
+    topk_per_sample,
+    weighted_segment_sum,
+)
 
 
 def test_bags_keep_the_order_of_their_pairs():
-    order, starts = bags(torch.tensor([2, 0, 2, 0]), 4)
+    order, starts = segments(torch.tensor([2, 0, 2, 0]), 4)
     assert order.tolist() == [1, 3, 0, 2]
     assert starts.tolist() == [0, 2, 2, 4, 4]
 
@@ -13,9 +20,9 @@ def test_bags_keep_the_order_of_their_pairs():
 def test_bag_sum_by_hand():
     values = torch.tensor([[1.0], [10.0], [100.0]])
     picks, starts = torch.tensor([0, 2, 1]), torch.tensor([0, 2, 2, 3])
-    assert bag_sum(values, picks, starts).tolist() == [[101.0], [0.0], [10.0]]
-    assert bag_sum(values, picks, starts, torch.tensor([2.0, 1.0, 3.0])).tolist() == [[102.0], [0.0], [30.0]]
-    assert bag_sum(values, picks[:0], torch.zeros(3, dtype=torch.int64)).tolist() == [[0.0], [0.0]]
+    assert gather_segment_sum(values, picks, starts).tolist() == [[101.0], [0.0], [10.0]]
+    assert gather_segment_sum(values, picks, starts, torch.tensor([2.0, 1.0, 3.0])).tolist() == [[102.0], [0.0], [30.0]]
+    assert gather_segment_sum(values, picks[:0], torch.zeros(3, dtype=torch.int64)).tolist() == [[0.0], [0.0]]
 
 
 def test_segment_sum_and_mean():
@@ -30,37 +37,37 @@ def test_segment_sum_and_mean():
 
 def test_weighted_bag_gradients():
     torch.manual_seed(0)
-    picks, bag = torch.tensor([0, 2, 0, 1, 2]), torch.tensor([0, 0, 2, 2, 2])
+    picks, segment = torch.tensor([0, 2, 0, 1, 2]), torch.tensor([0, 0, 2, 2, 2])
     values, weights = torch.randn(3, 2).double().requires_grad_(), torch.randn(5).double().requires_grad_()
     for by_pick in (None, torch.argsort(picks, stable=True)):
         assert torch.autograd.gradcheck(
-            lambda v, w, by=by_pick: weighted_bag(v, w, picks, bag, 4, by), (values, weights)
+            lambda v, w, by=by_pick: weighted_segment_sum(v, w, picks, segment, 4, by), (values, weights)
         )
-    dense = torch.zeros(4, 2).double().index_add(0, bag, weights[:, None] * values[picks])
-    torch.testing.assert_close(weighted_bag(values, weights, picks, bag, 4), dense)
+    dense = torch.zeros(4, 2).double().index_add(0, segment, weights[:, None] * values[picks])
+    torch.testing.assert_close(weighted_segment_sum(values, weights, picks, segment, 4), dense)
 
 
 def test_row_products_in_chunks(monkeypatch):
     monkeypatch.setattr("src.ops.segment_reduce.CPU_CHUNK", 3)
     a, b = torch.randn(4, 5), torch.randn(6, 5)
     rows_a, rows_b = torch.randint(0, 4, (10,)), torch.randint(0, 6, (10,))
-    torch.testing.assert_close(row_products(a, rows_a, b, rows_b), (a[rows_a] * b[rows_b]).sum(1))
+    torch.testing.assert_close(paired_dot(a, rows_a, b, rows_b), (a[rows_a] * b[rows_b]).sum(1))
 
 
 def test_best_rows_by_hand():
     scores, sample = torch.tensor([0.1, 0.9, 0.5, 0.5, 0.7]), torch.tensor([0, 0, 0, 2, 2])
-    assert best_rows(scores, sample, 3, 2).tolist() == [[1, 2], [-1, -1], [4, 3]]
-    assert best_rows(scores[:0], sample[:0], 2, 2).tolist() == [[-1, -1], [-1, -1]]
+    assert topk_per_sample(scores, sample, 3, 2).tolist() == [[1, 2], [-1, -1], [4, 3]]
+    assert topk_per_sample(scores[:0], sample[:0], 2, 2).tolist() == [[-1, -1], [-1, -1]]
 
 
 def test_exchanged_rows_and_their_gradient():
     values = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
     there, back = torch.tensor([2, -1, 0, -1, 3]), torch.tensor([2, -1, 0, 4])
-    found = exchange_rows(values, there, back)
+    found = permute_rows(values, there, back)
     zeros = torch.zeros(3, dtype=torch.float64)
     torch.testing.assert_close(found, torch.stack([values[2], zeros, values[0], zeros, values[3]]))
-    assert torch.autograd.gradcheck(lambda x: exchange_rows(x, there, back), values)
+    assert torch.autograd.gradcheck(lambda x: permute_rows(x, there, back), values)
     empty = torch.zeros(0, 3, requires_grad=True)
-    none = exchange_rows(empty, torch.tensor([-1, -1]), torch.zeros(0, dtype=torch.int64))
+    none = permute_rows(empty, torch.tensor([-1, -1]), torch.zeros(0, dtype=torch.int64))
     none.sum().backward()
     assert none.tolist() == [[0.0] * 3] * 2 and empty.grad.shape == (0, 3)

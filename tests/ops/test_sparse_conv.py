@@ -10,7 +10,7 @@ import torch.nn.functional as F
 
 from src.ops import Sites, neighbour_sum, sparse_conv, strided_map, submanifold_map, temporal_map
 from src.ops.kernel_maps import KernelMap, stacked_map
-from src.ops.tiled_rulebook import pair_tiles
+from src.ops.tiled_rulebook import tiled_rulebook
 
 GOLDEN = np.load(Path(__file__).parents[1] / "golden" / "sparse_conv" / "cases.npz")
 CASES = json.loads(str(GOLDEN["meta_json"]))
@@ -158,7 +158,7 @@ def test_tiles_change_nothing(mode, monkeypatch):
         out = sparse_conv(x, w, kernel_map)
         (out * torch.randn(out.shape, dtype=torch.float64)).sum().backward()
         results.append((out.detach(), x.grad, w.grad))
-        assert (len(pair_tiles(kernel_map, False, 7, torch.float64).tiles) > 10) == (budget == 64)
+        assert (len(tiled_rulebook(kernel_map, False, 7, torch.float64).tiles) > 10) == (budget == 64)
     torch.testing.assert_close(results[0], results[1])
 
 
@@ -251,7 +251,7 @@ def test_autocast_computes_in_bfloat16_and_returns_gradients_in_the_type_of_the_
 def test_nothing_the_size_of_the_pairs_is_kept_for_backward():
     sites = random_sites((1, 32, 32), 900)
     kernel_map = submanifold_map(sites, 3)
-    kernel_map.bags_by_output()
+    kernel_map.segments_by_output()
     features, weight = torch.randn(900, 8, requires_grad=True), torch.randn(9, 8, 8, requires_grad=True)
     kept = []
     with torch.autograd.graph.saved_tensors_hooks(lambda x: kept.append(x.numel()) or x, lambda x: x):

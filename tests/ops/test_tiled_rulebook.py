@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from src.ops import Sites, sparse_conv, submanifold_map
-from src.ops.tiled_rulebook import pair_tiles, scratch
+from src.ops.tiled_rulebook import scratch, tiled_rulebook
 
 
 def place_of(name, rows, dtype=torch.float32):
@@ -41,5 +41,5 @@ def test_half_precision_sums_over_tiles_in_full(monkeypatch):
     x = torch.ones(1600, 1, dtype=torch.bfloat16)
     weight = torch.ones(3, 1, 1, dtype=torch.bfloat16, requires_grad=True)
     sparse_conv(x, weight, kernel_map).sum().backward()
-    assert len(pair_tiles(kernel_map, True, 2, torch.bfloat16).tiles) == 400
+    assert len(tiled_rulebook(kernel_map, True, 2, torch.bfloat16).tiles) == 400
     assert weight.grad.flatten().tolist() == pytest.approx([1599, 1600, 1599], rel=0.005)

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from src.pictures.cameras import NEAR_M, CameraViews, clip_edges, clip_polygon, draw_cameras
+from src.pictures.cameras import NEAR_M, PictureViews, clip_edges, clip_polygon, draw_cameras
 from src.pictures.contents import CLASS_COLOURS, PictureBoxes
 from src.structures.taxonomy import CLASSES
 
@@ -29,7 +29,7 @@ def one_box(center: tuple, size: tuple, yaw: float = 0.0, score: float | None = 
 def render(tmp_path: Path, predictions: PictureBoxes, truth: PictureBoxes, threshold: float = 0.0) -> np.ndarray:
     """A single camera of the sheet's width: one image pixel is one picture pixel."""
     image = np.full((HEIGHT, WIDTH, 3), GREY, np.uint8)
-    views = CameraViews([image], forward_camera()[None], ["CAMERA_LEFT_FRONT"])
+    views = PictureViews([image], forward_camera()[None], ["CAMERA_LEFT_FRONT"])
     draw_cameras(tmp_path / "cameras.png", views, predictions, truth, threshold)
     return np.asarray(Image.open(tmp_path / "cameras.png").convert("RGB")).astype(int)
 
@@ -127,19 +127,19 @@ def test_clip_polygon_cuts_at_border_and_drops_what_is_behind() -> None:
 
 def test_cameras_stand_as_a_person_sits() -> None:
     names = ["CAMERA_RIGHT_BACK", "CAMERA_LEFT_BACK", "CAMERA_RIGHT_FRONT", "CAMERA_LEFT_FRONT"]
-    views = CameraViews([None] * 4, np.zeros((4, 4, 4)), names)
+    views = PictureViews([None] * 4, np.zeros((4, 4, 4)), names)
     assert [names[i] for i in views.order()] == [names[3], names[2], names[1], names[0]]
 
 
 def test_missing_image_and_odd_names(tmp_path: Path) -> None:
     image = np.zeros((20, 60, 3), np.uint8)
-    views = CameraViews([None, image, None], np.tile(forward_camera(), (3, 1, 1)), ["$\\frac{", "<b>_$x$\n", "A%s{0}"])
+    views = PictureViews([None, image, None], np.tile(forward_camera(), (3, 1, 1)), ["$\\frac{", "<b>_$x$\n", "A%s{0}"])
     draw_cameras(tmp_path / "a" / "b.png", views, one_box((20, 0, 0), (4, 2, 2), score=1.0), PictureBoxes.empty())
     assert Image.open(tmp_path / "a" / "b.png").size == (1600, 539)  # two rows of 796 / 3 and a gap of 8
 
 
 def test_wrong_views_name_what_is_wrong() -> None:
     with pytest.raises(ValueError, match="2 names and pix_from_ego"):
-        CameraViews([None, None], np.zeros((1, 4, 4)), ["a", "b"])
+        PictureViews([None, None], np.zeros((1, 4, 4)), ["a", "b"])
     with pytest.raises(ValueError, match="image of a must be"):
-        CameraViews([np.zeros((4, 4, 3))], np.zeros((1, 4, 4)), ["a"])
+        PictureViews([np.zeros((4, 4, 3))], np.zeros((1, 4, 4)), ["a"])

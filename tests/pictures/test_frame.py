@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from src.pictures.bev import BevScene, radial_speeds
-from src.pictures.cameras import CameraViews
+from src.pictures.cameras import PictureViews
 from src.pictures.contents import (
     CLASS_COLOURS,
     SOURCE_COLOURS,
@@ -112,14 +112,14 @@ def test_radar_speed_has_the_sign_of_its_direction() -> None:
 
 
 def test_empty_and_broken_inputs_still_give_a_picture(tmp_path: Path) -> None:
-    draw_frame(tmp_path / "deep" / "a.png", BevScene(GRID), CameraViews([], np.zeros((0, 4, 4)), []))
+    draw_frame(tmp_path / "deep" / "a.png", BevScene(GRID), PictureViews([], np.zeros((0, 4, 4)), []))
     gaussians = PictureGaussians([(np.nan, 0), (0, 0)], np.ones((2, 2)), [(0, 0), (1, 0)], [0.5, np.inf], [0, 3])
     radar = np.array([[np.nan] * 7, [10, 0, 0, 0, 0, 0, 0]])
     occupancy = (np.array([[-1, 0], [0, 999], [3, 3]]), np.array([1.0, 1.0, np.nan]))
     broken = box(np.inf, 0, (1, 1), 0.5)
     scene = BevScene(GRID, broken, broken, radar, gaussians, occupancy)
     title = "scene $\\frac{ <b> \n 100% {0} " + "x" * 200
-    draw_frame(tmp_path / "b.png", scene, CameraViews([None], np.eye(4)[None], ["CAMERA_$"]), title, 0.3)
+    draw_frame(tmp_path / "b.png", scene, PictureViews([None], np.eye(4)[None], ["CAMERA_$"]), title, 0.3)
     for name in ("deep/a.png", "b.png"):
         with Image.open(tmp_path / name) as picture:
             picture.verify()

@@ -3,7 +3,7 @@
 import numpy as np
 from PIL import Image
 
-from src.pictures.cameras import CameraViews
+from src.pictures.cameras import PictureViews
 from src.pictures.contents import PictureBoxes
 from src.pictures.scene_preview import draw_radar_comparison, draw_scene_preview
 from src.structures.taxonomy import CAMERAS
@@ -17,7 +17,7 @@ def a_box(x, y, velocity):
 
 def preview(path, boxes, points):
     image = np.full((40, 80, 3), 90, dtype=np.uint8)
-    views = CameraViews([image] * 4, np.tile(np.eye(4), (4, 1, 1)), CAMERAS)
+    views = PictureViews([image] * 4, np.tile(np.eye(4), (4, 1, 1)), CAMERAS)
     draw_scene_preview(path, views, boxes, points, "a scene")
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 

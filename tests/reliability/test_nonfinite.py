@@ -24,7 +24,7 @@ from tests.training.toys import STEPS, ToyData, toy_batch, toy_module
 from tests.training.two_ranks import spawn_two
 
 EPOCHS = 2
-BAD_STEP = 4  # the second of the second epoch, so that its lanes have memory
+BAD_STEP = 4  # the second of the second epoch, so that its streams have memory
 
 
 class Faulty(TemporalModule):
@@ -138,9 +138,9 @@ def test_the_dump_holds_the_step(tmp_path, fault):
     wanted = toy_batch([0, 1], [False, False], number=11)
     if fault == "point":
         wanted.radar_points[1, 3] = math.nan
-    for name in ("radar_points", "radar_batch", "lanes", "starts", "global_from_ego"):
+    for name in ("radar_points", "radar_batch", "streams", "starts", "global_from_ego"):
         assert torch.allclose(getattr(batch, name), getattr(wanted, name), rtol=0, atol=0, equal_nan=True), name
-    assert batch.tokens == wanted.tokens and len(step["memories"]) == 1 and step["memories"][0]["lanes"] == [0, 1]
+    assert batch.tokens == wanted.tokens and len(step["memories"]) == 1 and step["memories"][0]["streams"] == [0, 1]
 
     again = toy_module(TemporalModule)
     again.model.dropout = nn.Sequential(nn.BatchNorm1d(7), again.model.dropout)

@@ -6,7 +6,7 @@ import torch
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 
-STREAM = ("lanes", "starts")
+STREAM = ("streams", "starts")
 
 
 def batch(**changes):
@@ -50,31 +50,31 @@ def test_a_sample_may_lack_points_boxes_and_images():
         ("image_valid", torch.ones(3, 4)),
         ("pix_from_aug", torch.eye(4).repeat(3, 3, 1, 1)),
         ("boxes", [Boxes3D.empty()]),
-        ("lanes", torch.arange(2)),
-        ("lanes", torch.arange(3).int()),
-        ("lanes", torch.tensor([4, 0, 4])),
+        ("streams", torch.arange(2)),
+        ("streams", torch.arange(3).int()),
+        ("streams", torch.tensor([4, 0, 4])),
         ("starts", torch.zeros(3)),
         ("starts", torch.zeros(2, dtype=torch.bool)),
     ],
 )
 def test_what_does_not_fit_is_named(name, value):
-    streamed = {"lanes": torch.arange(3), "starts": torch.zeros(3, dtype=torch.bool)} if name in STREAM else {}
+    streamed = {"streams": torch.arange(3), "starts": torch.zeros(3, dtype=torch.bool)} if name in STREAM else {}
     with pytest.raises(ValueError, match=f"FrameBatch.{name} must"):
         batch(**streamed | {name: value})
 
 
 @pytest.mark.parametrize("given", STREAM)
 def test_lanes_and_starts_belong_together(given):
-    assert batch().lanes is None and batch().starts is None
-    value = {"lanes": torch.arange(3), "starts": torch.zeros(3, dtype=torch.bool)}[given]
-    with pytest.raises(ValueError, match="lanes and FrameBatch.starts must be given together"):
+    assert batch().streams is None and batch().starts is None
+    value = {"streams": torch.arange(3), "starts": torch.zeros(3, dtype=torch.bool)}[given]
+    with pytest.raises(ValueError, match="streams and FrameBatch.starts must be given together"):
         batch(**{given: value})
 
 
 def test_moving_keeps_every_value():
     original = batch(
         skipped={"RADAR_LEFT_SIDE": 2},
-        lanes=torch.tensor([4, 0, 9]),
+        streams=torch.tensor([4, 0, 9]),
         starts=torch.tensor([True, False, True]),
     )
     same = original.to("cpu")

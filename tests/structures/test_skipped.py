@@ -3,7 +3,7 @@ import json
 import torch
 
 from src.structures.batch import FrameBatch
-from src.structures.skipped import MAX_NAMES, PassedOver
+from src.structures.skipped import MAX_NAMES, SkippedFiles
 
 
 def frame(skipped, bad_files):
@@ -20,12 +20,12 @@ def frame(skipped, bad_files):
 
 
 def test_counts_and_names_add_up_over_frames_and_ranks():
-    first, second = PassedOver(), PassedOver()
+    first, second = SkippedFiles(), SkippedFiles()
     assert not first and first.state() == {"channels": {}, "files": {}}
     first.add(frame({"RADAR": 2}, ["r/1", "r/2"]))
     first.add(frame({"RADAR": 1, "CAMERA (not recorded)": 1}, ["r/1"]))
     second.add(frame({"CAMERA": 1}, ["c/9"]))
-    total = PassedOver()
+    total = SkippedFiles()
     total.restore(json.loads(json.dumps([first.state(), second.state()])))
     assert total.channels == {"RADAR": 3, "CAMERA (not recorded)": 1, "CAMERA": 1}
     assert total.files == {"r/1": 2, "r/2": 1, "c/9": 1} and total.names() == ["c/9", "r/1", "r/2"]
@@ -36,7 +36,7 @@ def test_counts_and_names_add_up_over_frames_and_ranks():
 
 
 def test_names_are_bounded_and_counts_are_not():
-    over = PassedOver()
+    over = SkippedFiles()
     names = [f"{at:05d}" for at in range(MAX_NAMES + 200)]
     over.add(frame({"RADAR": len(names)}, names))
     assert over.names() == names[:MAX_NAMES]

@@ -26,7 +26,7 @@ from src.errors import (
     InterruptedRunError,
 )
 from src.training import handoff
-from src.training.handoff import MAY_BE_NEW, Source, find_source, hand_over, train_source
+from src.training.handoff import MAY_BE_NEW, WeightSource, find_source, hand_over, train_source
 from src.training.identity import run_identity
 from src.training.run_folder import RunFolder
 from tests.untrained import write_checkpoint
@@ -260,7 +260,7 @@ def give(path, *overrides):
     model = build_model(config)
     before = {key: value.clone() for key, value in model.state_dict().items()}
     try:
-        hand_over(model, Source("x", path, None, None), tree)
+        hand_over(model, WeightSource("x", path, None, None), tree)
     except CheckpointError:
         assert all(torch.equal(value, before[key]) for key, value in model.state_dict().items())  # no part either
         raise

@@ -44,7 +44,7 @@ def frame(number: int) -> FrameBatch:
         radar_points=torch.zeros(0, 7),
         radar_batch=torch.zeros(0, dtype=torch.int64),
         boxes=[boxes],
-        lanes=torch.zeros(1, dtype=torch.int64),
+        streams=torch.zeros(1, dtype=torch.int64),
         starts=torch.tensor([number == 0]),
     )
 

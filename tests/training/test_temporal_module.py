@@ -1,4 +1,4 @@
-"""Whose memory a lane gets, and when it ends."""
+"""Whose memory a stream gets, and when it ends."""
 
 import logging
 
@@ -18,7 +18,7 @@ def past(module, batch):
 
 @pytest.fixture
 def module():
-    """After one batch of the lanes 5, 3 and 8, which remember 50, 30 and 80."""
+    """After one batch of the streams 5, 3 and 8, which remember 50, 30 and 80."""
     module = toy_module().eval()
     module.run(toy_batch([5, 3, 8], [True] * 3))
     ((_, memory),) = module.memories
@@ -32,8 +32,8 @@ def test_the_first_batch_has_no_memory():
     batch = toy_batch([0, 1], [False, False])
     assert module.recall(batch) is None
     output = module.run(batch)
-    ((lanes, memory),) = module.memories
-    assert lanes.tolist() == [0, 1] and torch.equal(memory.values, output) and not memory.values.requires_grad
+    ((streams, memory),) = module.memories
+    assert streams.tolist() == [0, 1] and torch.equal(memory.values, output) and not memory.values.requires_grad
 
 
 def test_rows_follow_their_lanes(module):
@@ -55,7 +55,7 @@ def test_sets_of_lanes_take_turns(module):
     module.run(toy_batch([1, 2], [True, True]))
     assert len(module.memories) == 2 and past(module, toy_batch([3, 5, 8], [False] * 3)) == [30, 50, 80]
     module.run(toy_batch([5, 3, 8], [False] * 3, number=1))
-    assert sorted(lanes.tolist() for lanes, _ in module.memories) == [[1, 2], [5, 3, 8]]
+    assert sorted(streams.tolist() for streams, _ in module.memories) == [[1, 2], [5, 3, 8]]
     assert past(module, toy_batch([1, 2], [True, False]))[0] == 0
 
 
@@ -71,7 +71,7 @@ def test_the_output_uses_the_memory(module):
 
 
 def test_batches_without_lanes_are_refused(module):
-    with pytest.raises(ValueError, match="FrameBatch.lanes"):
+    with pytest.raises(ValueError, match="FrameBatch.streams"):
         module.run(toy_batch(None, None))
 
 
@@ -119,15 +119,15 @@ def test_a_restored_memory_follows_the_module_to_its_device(module):
     other.restore_rank(module.rank_state())
     other.to("meta")
     other.on_fit_start()
-    ((lanes, memory),) = other.memories
-    assert lanes.device.type == memory.values.device.type == "meta"
+    ((streams, memory),) = other.memories
+    assert streams.device.type == memory.values.device.type == "meta"
 
 
 def test_each_rank_takes_its_own_part():
     states = [
         {
             "means": {"a": [1.0, 2.0]},
-            "memories": [{"lanes": [rank], "frames": [{"values": torch.tensor([7.0 + rank])}]}],
+            "memories": [{"streams": [rank], "frames": [{"values": torch.tensor([7.0 + rank])}]}],
         }
         for rank in range(2)
     ]
@@ -136,7 +136,7 @@ def test_each_rank_takes_its_own_part():
 
 
 def test_another_number_of_ranks_keeps_the_means_and_drops_the_memory(caplog):
-    memory = {"lanes": [0], "frames": [{"values": torch.zeros(1)}]}
+    memory = {"streams": [0], "frames": [{"values": torch.zeros(1)}]}
     states = [
         {"means": {"a": [1.0, 2.0], "b": [5.0, 1.0]}, "memories": [memory]},
         {"means": {"a": [3.0, 6.0]}, "memories": []},

@@ -15,7 +15,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from src.benchmark.suite_metric import random_problem
-from src.data.datamodule import collate, in_lane
+from src.data.datamodule import collate, in_stream
 from src.errors import InterruptedRunError
 from src.metrics.detection import DetectionMetric, score_detections
 from src.models.horizon3d.kggi import Initialization
@@ -30,7 +30,7 @@ from tests.training.toys import STEPS as TOY_STEPS
 from tests.training.toys import Positions, toy_batch, toy_module
 from tests.training.two_ranks import spawn_two
 
-LANES, STEPS = 4, 3
+STREAMS, STEPS = 4, 3
 FIRST_RANK, SECOND_RANK = (0, 1), (2, 3)
 COLUMNS = tuple(DetectionTable.__dataclass_fields__)
 
@@ -54,7 +54,7 @@ class Work:
     """What one process does, as values that travel to it."""
 
     model: torch.nn.Module
-    train: list[list]  # per step and lane, a batch of one
+    train: list[list]  # per step and stream, a batch of one
     validation: list[list]  # of each of two processes, batches
     truth: EvaluationSet
     folder: Path
@@ -100,8 +100,8 @@ def work_as(rank, port, world_size, work):
     # Tensors travel to a process as shared memory, in which the other would see them trained.
     module = Module(copy.deepcopy(work.model), optim, 1.0, work.truth, 0, {})
     module.eval_norms = work.eval_norms
-    lanes = (FIRST_RANK, SECOND_RANK)[rank] if world_size > 1 else range(LANES)
-    train = [collate([frames[lane] for lane in lanes]) for frames in work.train]
+    streams = (FIRST_RANK, SECOND_RANK)[rank] if world_size > 1 else range(STREAMS)
+    train = [collate([frames[stream] for stream in streams]) for frames in work.train]
     validation = work.validation[rank] if world_size > 1 else [batch for part in work.validation for batch in part]
     with process_group("cpu", world_size):
         trainer = L.Trainer(
@@ -135,24 +135,24 @@ def in_two_processes(work):
 
 @pytest.fixture
 def frames(make_batch):
-    """Batches of one: (lane, step, points, boxes, cameras) -> the frame of that lane and step, half a second each."""
+    """Batches of one: (stream, step, points, boxes, cameras) -> that stream's frame of a step of half a second."""
 
-    def build(lane, step, points=60, boxes=5, cameras=True):
-        frame = make_batch(points=(points,), boxes=(boxes,), seed=10 * step + lane)
+    def build(stream, step, points=60, boxes=5, cameras=True):
+        frame = make_batch(points=(points,), boxes=(boxes,), seed=10 * step + stream)
         frame = replace(
             frame,
-            tokens=[f"{lane}/{step}"],
+            tokens=[f"{stream}/{step}"],
             timestamps_s=torch.tensor([0.5 * step], dtype=torch.float64),
             image_valid=frame.image_valid & cameras,
         )
-        return in_lane(frame, lane, step % 10 == 0)
+        return in_stream(frame, stream, step % 10 == 0)
 
     return build
 
 
 @pytest.fixture
 def work(make_model, frames, tmp_path):
-    """Three steps in which one process or the other, or a lane, lacks what the other has."""
+    """Three steps in which one process or the other, or a stream, lacks what the other has."""
     model = make_model(dptf=parts.dptf_config(), initialization=Initialization.keypoint)
     model.head.config = replace(model.head.config, score_threshold=0.05)
     generator = torch.Generator().manual_seed(1)
@@ -161,11 +161,14 @@ def work(make_model, frames, tmp_path):
             parameter += 0.03 * torch.randn(parameter.shape, generator=generator)
     nothing = {"points": 0, "cameras": False}  # no keypoint, hence no Gaussian at all
     lacking = [
-        {lane: {"boxes": 0} for lane in SECOND_RANK},
+        {stream: {"boxes": 0} for stream in SECOND_RANK},
         {0: {"points": 0}, 1: {"points": 0, "boxes": 1}, 3: {"boxes": 0}},
-        {lane: nothing for lane in SECOND_RANK},
+        {stream: nothing for stream in SECOND_RANK},
     ]
-    train = [[frames(lane, step, **lacks.get(lane, {})) for lane in range(LANES)] for step, lacks in enumerate(lacking)]
+    train = [
+        [frames(stream, step, **lacks.get(stream, {})) for stream in range(STREAMS)]
+        for step, lacks in enumerate(lacking)
+    ]
     validation = [
         [collate([frames(0, 10), frames(1, 10)]), collate([frames(0, 11)]), collate([frames(0, 12, points=0)])],
         [collate([frames(2, 10)])],
@@ -262,22 +265,23 @@ class Single(DetectionModule):
 
 
 class Shared:
-    """This rank's part of the four lanes of (epoch, step)."""
+    """This rank's part of the four streams of (epoch, step)."""
 
-    def __init__(self, lanes):
-        self.lanes = lanes
+    def __init__(self, streams):
+        self.streams = streams
 
     def __getitem__(self, key):
         epoch, step = key
-        return collate([toy_batch([lane], [False], number=1000 * lane + 10 * epoch + step) for lane in self.lanes])
+        numbers = {stream: 1000 * stream + 10 * epoch + step for stream in self.streams}
+        return collate([toy_batch([stream], [False], number=number) for stream, number in numbers.items()])
 
 
 class SharedData(L.LightningDataModule):
     """The same batches however many ranks share them; validation in unequal parts."""
 
     def train_dataloader(self):
-        lanes = (FIRST_RANK, SECOND_RANK)[self.trainer.global_rank] if self.trainer.world_size > 1 else range(LANES)
-        return DataLoader(Shared(lanes), batch_size=None, sampler=Positions(self.trainer, []))
+        streams = (FIRST_RANK, SECOND_RANK)[self.trainer.global_rank] if self.trainer.world_size > 1 else range(STREAMS)
+        return DataLoader(Shared(streams), batch_size=None, sampler=Positions(self.trainer, []))
 
     def val_dataloader(self):
         samples = range(PROBLEM[0])

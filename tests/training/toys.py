@@ -1,4 +1,4 @@
-"""A detector of a few parameters with a memory of one number per lane, and frames to stream to it."""
+"""A detector of a few parameters with a memory of one number per stream, and frames to stream to it."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ STEPS = 3  # of one epoch
 
 @dataclass(frozen=True)
 class ToyMemory:
-    """One number per lane."""
+    """One number per stream."""
 
     values: torch.Tensor  # [B]
 
@@ -35,7 +35,7 @@ class ToyMemory:
 
 
 class ToyDetector(Detector):
-    """Mean of the points through a linear layer and dropout, plus what the lane remembers of it."""
+    """Mean of the points through a linear layer and dropout, plus what the stream remembers of it."""
 
     def __init__(self):
         super().__init__()
@@ -61,9 +61,9 @@ class ToyDetector(Detector):
         return {"spread": output.detach().std()}
 
 
-def toy_batch(lanes, starts, number=0):
-    """Random frames of some lanes; None for frames without lanes."""
-    size = len(lanes) if lanes is not None else 2
+def toy_batch(streams, starts, number=0):
+    """Random frames of some streams; None for frames without streams."""
+    size = len(streams) if streams is not None else 2
     generator = torch.Generator().manual_seed(number)
     return FrameBatch(
         tokens=[f"frame {number} {row}" for row in range(size)],
@@ -72,8 +72,8 @@ def toy_batch(lanes, starts, number=0):
         aug_from_ego=torch.eye(4).repeat(size, 1, 1),
         radar_points=torch.randn(3 * size, 7, generator=generator),
         radar_batch=torch.arange(size).repeat_interleave(3),
-        lanes=None if lanes is None else torch.tensor(lanes),
-        starts=None if lanes is None else torch.tensor(starts),
+        streams=None if streams is None else torch.tensor(streams),
+        starts=None if streams is None else torch.tensor(starts),
     )
 
 
@@ -101,19 +101,19 @@ class Positions(Sampler):
 
 
 class Frames:
-    """Batches by (epoch, step); the second lane begins a new clip at step 2."""
+    """Batches by (epoch, step); the second stream begins a new clip at step 2."""
 
     def __init__(self, rank):
         self.rank = rank
 
     def __getitem__(self, key):
         epoch, step = key
-        lanes, starts = [2 * self.rank, 2 * self.rank + 1], [step == 0, step in (0, 2)]
-        return toy_batch(lanes, starts, number=1000 * self.rank + 10 * epoch + step)
+        streams, starts = [2 * self.rank, 2 * self.rank + 1], [step == 0, step in (0, 2)]
+        return toy_batch(streams, starts, number=1000 * self.rank + 10 * epoch + step)
 
 
 class ToyData(L.LightningDataModule):
-    """Clips in two lanes of each rank for training; three batches for validation, the last on every rank."""
+    """Clips in two streams of each rank for training; three batches for validation, the last on every rank."""
 
     def __init__(self):
         super().__init__()

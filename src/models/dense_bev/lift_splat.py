@@ -11,7 +11,7 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.resnet import BasicBlock
 from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
-from src.ops.segment_reduce import weighted_bag
+from src.ops.segment_reduce import weighted_segment_sum
 from src.targets.depth import lid_centres
 
 
@@ -56,7 +56,7 @@ class LiftedViews:
 
 
 class LiftSplat(nn.Module):
-    """Depth distribution times context features of every pixel, pooled into cells as one weighted bag.
+    """Depth distribution times context features of every pixel, pooled into cells as one weighted segment.
 
     The frustum tensor [N, D, C, h, w] of the published formulation is never made: a cell is the sum over its
     (pixel, bin) pairs, weights the probabilities, values the rows of the pixels.
@@ -90,7 +90,7 @@ class LiftSplat(nn.Module):
             pixels = torch.div(pairs, self.config.num_depth_bins, rounding_mode="floor")
             shape = (b, self.grid.rows, self.grid.cols)
             values = rows_of_map(context.float())
-            pooled = weighted_bag(values, weights, pixels, cells, torch.Size(shape).numel(), by_pixel)
+            pooled = weighted_segment_sum(values, weights, pixels, cells, torch.Size(shape).numel(), by_pixel)
         return LiftedViews(map_of_rows(pooled, shape), depth.unflatten(0, (b, n)), len(pairs))
 
     @torch.no_grad()

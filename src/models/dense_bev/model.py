@@ -16,7 +16,7 @@ from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.dense_bev.bev_decoder import MIN_CHANNELS, BEVDecoder, BEVDecoderConfig, ConvFuser
 from src.models.dense_bev.lift_splat import LiftedViews, LiftSplat, LiftSplatConfig
 from src.models.dense_bev.pillars import PillarConfig, PillarEncoder
-from src.models.dense_bev.temporal_fusion import MapMemory, Recollection, TemporalConfig, TemporalFusion
+from src.models.dense_bev.temporal_fusion import MapMemory, TemporalConfig, TemporalFusion, WarpedMaps
 from src.models.detector import Detector
 from src.models.heads.center_head import CenterHead, HeadConfig, HeadOutput
 from src.structures.batch import FrameBatch
@@ -27,7 +27,7 @@ from src.targets.supervision import supervised_boxes
 
 
 @dataclass(kw_only=True)
-class LossConfig:
+class DenseBEVLossConfig:
     """Weights of the terms (`model.loss`); null switches a term off, uncomputed."""
 
     heatmap_weight: float | None
@@ -55,7 +55,7 @@ class DenseBEVConfig:
     decoder: BEVDecoderConfig
     temporal: TemporalConfig | None  # null: single frames, phase 1
     head: HeadConfig
-    loss: LossConfig
+    loss: DenseBEVLossConfig
 
     def __post_init__(self) -> None:
         for name, least in (("channels", 1), ("fused_channels", MIN_CHANNELS)):
@@ -85,7 +85,7 @@ class DenseBEVOutput:
     views: LiftedViews
     radar_bev: Tensor  # [B, C_radar, rows, cols]
     fused_bev: Tensor  # [B, C_fused, rows, cols]
-    recollection: Recollection | None  # None in phase 1
+    warped_maps: WarpedMaps | None  # None in phase 1
     head: HeadOutput
 
 
@@ -124,22 +124,22 @@ class DenseBEV(Detector):
         return self.image_encoder.backbone
 
     def forward(self, batch: FrameBatch, memory: MapMemory | None = None) -> tuple[DenseBEVOutput, MapMemory | None]:
-        """Detect in the frames of B lanes, given what is remembered of them; the new memory is detached.
+        """Detect in the frames of B streams, given what is remembered of them; the new memory is detached.
 
-        Raises ValueError when images are absent, or when the memory is of another number of lanes.
+        Raises ValueError when images are absent, or when the memory is of another number of streams.
         """
         if batch.images is None or batch.image_valid is None or batch.pix_from_aug is None:
             raise ValueError("FrameBatch.images is None, but this model uses images; read them with the frames")
         if memory is not None and memory.frames and memory.batch_size != len(batch):
-            raise ValueError(f"the memory holds {memory.batch_size} lanes, but the batch {len(batch)} frames")
-        recollection = self.temporal.recall(memory, batch) if self.temporal is not None else None
+            raise ValueError(f"the memory holds {memory.batch_size} streams, but the batch {len(batch)} frames")
+        warped_maps = self.temporal.recall(memory, batch) if self.temporal is not None else None
         (level,) = self.image_encoder(batch.images)
         views = self.view_transform(level, batch.pix_from_aug, batch.image_valid, self.image_encoder.image_size_px)
         radar_bev = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
         current = fused = self.fuser(views.bev, radar_bev)
         if self.temporal is not None:
-            current, memory = self.temporal.aggregate(fused, recollection), self.temporal.remember(memory, batch, fused)
-        output = DenseBEVOutput(views, radar_bev, fused, recollection, self.head(self.decoder(current)))
+            current, memory = self.temporal.aggregate(fused, warped_maps), self.temporal.remember(memory, batch, fused)
+        output = DenseBEVOutput(views, radar_bev, fused, warped_maps, self.head(self.decoder(current)))
         return output, memory if self.temporal is not None else None
 
     def restore_memory(self, state: list[dict[str, Any]]) -> MapMemory:
@@ -186,8 +186,8 @@ class DenseBEV(Detector):
             "lifted_pairs": output.views.num_lifted / frames,
             "depth_confidence": probabilities.amax(2).mean(),
         }
-        if output.recollection is not None:
-            values["remembered_frames"] = output.recollection.usable.sum() / frames
+        if output.warped_maps is not None:
+            values["remembered_frames"] = output.warped_maps.usable.sum() / frames
         targets = output.head.targets
         if targets is not None:
             values["objects"] = len(targets.rows) / frames

@@ -38,7 +38,7 @@ class TemporalConfig:
 
 @dataclass
 class MapFrame(RememberedFrame):
-    """The fused map of one key frame of each of B lanes, detached.
+    """The fused map of one key frame of each of B streams, detached.
 
     Its cells are those of the frame's own augmented ego frame, and `aug_from_ego` says how to find a point of the ego
     frame in them: a map is resampled once, from there to the present.
@@ -52,7 +52,7 @@ class MapFrame(RememberedFrame):
         rows: Tensor,  # [B'] int64, distinct where kept
         keep: Tensor,  # [B'] bool
     ) -> MapFrame:
-        """The lanes at `rows`, those without `keep` forgotten."""
+        """The streams at `rows`, those without `keep` forgotten."""
         return replace(
             super().select(rows, keep), aug_from_ego=self.aug_from_ego[rows], cells=self.cells.index_select(0, rows)
         )
@@ -64,7 +64,7 @@ class MapFrame(RememberedFrame):
 
 @dataclass(frozen=True)
 class MapMemory(FrameMemory[MapFrame]):
-    """The last maps of each of B lanes, newest first."""
+    """The last maps of each of B streams, newest first."""
 
     def state(self) -> list[dict[str, Any]]:
         """Tensors and plain containers, for a checkpoint."""
@@ -77,7 +77,7 @@ class MapMemory(FrameMemory[MapFrame]):
 
 
 @dataclass
-class Recollection:
+class WarpedMaps:
     """Past maps and their way to the current augmented frame, newest first; not yet moved there."""
 
     frames: tuple[MapFrame, ...]  # as many as are remembered
@@ -102,18 +102,18 @@ class TemporalFusion(nn.Module):
         self.register_buffer("centres_m", grid.centre_of(torch.stack([row, col], -1)), persistent=False)
 
     @torch.no_grad()
-    def recall(self, memory: MapMemory | None, batch: FrameBatch) -> Recollection:
+    def recall(self, memory: MapMemory | None, batch: FrameBatch) -> WarpedMaps:
         """Find every remembered map's way to the batch's time and augmented frame."""
         frames = memory.before(batch).frames[: self.config.num_frames] if memory is not None else ()
         motions = [frame.motion(batch, self.config.max_age_s) for frame in frames]
         usable = torch.zeros(self.config.num_frames, len(batch), dtype=torch.bool, device=batch.device)
         for age, motion in enumerate(motions):
             usable[age] = motion.usable
-        return Recollection(frames, motions, usable)
+        return WarpedMaps(frames, motions, usable)
 
-    def maps(self, recollection: Recollection) -> Iterator[Tensor]:  # of [B, C, rows, cols] float32
+    def maps(self, warped_maps: WarpedMaps) -> Iterator[Tensor]:  # of [B, C, rows, cols] float32
         """Past maps as they look in the current augmented frame, newest first; zero where nothing is known."""
-        for frame, motion in zip(recollection.frames, recollection.motions, strict=True):
+        for frame, motion in zip(warped_maps.frames, warped_maps.motions, strict=True):
             yield self.align(frame, motion.aug_from_past, motion.usable)
 
     @torch.no_grad()
@@ -138,7 +138,7 @@ class TemporalFusion(nn.Module):
     def aggregate(
         self,
         fused: Tensor,  # [B, C, rows, cols]
-        recollection: Recollection,
+        warped_maps: WarpedMaps,
     ) -> Tensor:  # [B, C, rows, cols]
         """The current map, changed by what is remembered.
 
@@ -147,7 +147,7 @@ class TemporalFusion(nn.Module):
         """
         current, *slices = self.reduce.conv.weight.split(self.channels, dim=1)
         total = F.conv2d(fused, current, self.reduce.conv.bias)
-        for past, weight in zip(self.maps(recollection), slices, strict=False):  # younger clips remember fewer
+        for past, weight in zip(self.maps(warped_maps), slices, strict=False):  # younger clips remember fewer
             total = total + F.conv2d(past.to(fused.dtype), weight)
         return fused + self.norm(self.refine(F.relu(self.reduce.norm(total))))
 

@@ -27,7 +27,7 @@ from src.models.heads.decode import (
 )
 from src.models.layers.dense import AllCells, DenseConvNormReLU
 from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv
-from src.ops.checkpointed_mlp import row_mlp
+from src.ops.checkpointed_mlp import checkpointed_mlp
 from src.ops.nms import maxpool_peaks
 from src.structures.boxes import Boxes3D
 from src.structures.sparse_bev import SparseBEV
@@ -118,7 +118,7 @@ def evaluate_branches(
         shift = torch.cat([part.norm.bias for part in parts]) - mean * scale
         outputs = [output for part in parts for output in part.outputs]
         out_weight, out_bias = torch.block_diag(*(out.weight for out in outputs)), torch.cat([o.bias for o in outputs])
-    return full_precision(row_mlp(x, (weight * scale[:, None]).t(), shift, out_weight.t(), out_bias))
+    return full_precision(checkpointed_mlp(x, (weight * scale[:, None]).t(), shift, out_weight.t(), out_bias))
 
 
 def _hidden_statistics(

@@ -14,7 +14,7 @@ from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.layers.sparse import ConvNormReLU, RowNorm, SparseKernel, SubmanifoldConv
 from src.models.memory import motions
-from src.ops.segment_reduce import best_rows, segment_mean
+from src.ops.segment_reduce import segment_mean, topk_per_sample
 from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv, strided_map, temporal_map
 from src.structures.batch import FrameBatch
@@ -127,7 +127,7 @@ class BEVPath(nn.Module):
         score = cells.occupancy_logits.sigmoid()
         worth = (score > self.config.memory_threshold).nonzero().squeeze(1)
         indices = fused.indices[worth]
-        best = best_rows(score[worth], indices[:, 0], len(batch), self.config.max_cells_per_frame).flatten()
+        best = topk_per_sample(score[worth], indices[:, 0], len(batch), self.config.max_cells_per_frame).flatten()
         best = best[best >= 0]  # sample by sample, so the owners ascend
         worth, indices = worth[best], indices[best]
         ego_from_aug = torch.linalg.inv_ex(batch.aug_from_ego).inverse[indices[:, 0]]  # [n, 4, 4]

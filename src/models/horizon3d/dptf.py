@@ -42,7 +42,7 @@ class DPTFConfig:
 
 
 @dataclass
-class Recollection:
+class WarpedMemory:
     """The memory as it looks in the current frame."""
 
     past: Memory  # less what is not in the frame's past (`Memory.before`)
@@ -71,7 +71,7 @@ class DPTF(nn.Module):
             GaussianPath(config.gaussian_path, channels, grid) if config.gaussian_path is not None else None
         )
 
-    def recall(self, memory: Memory | None, batch: FrameBatch) -> Recollection:
+    def recall(self, memory: Memory | None, batch: FrameBatch) -> WarpedMemory:
         """Bring the memory to the batch's time and frame."""
         history = warped = None
         memory = Memory(()) if memory is None else memory.before(batch)
@@ -79,19 +79,19 @@ class DPTF(nn.Module):
             history = self.gaussian_path.recall(memory, batch, self.config.max_age_s)
         if self.bev_path is not None:
             warped = self.bev_path.recall(memory, batch, self.config.max_age_s)
-        return Recollection(memory, history, warped)
+        return WarpedMemory(memory, history, warped)
 
-    def aggregate(self, fused: SparseBEV, recollection: Recollection) -> DPTFOutput:
+    def aggregate(self, fused: SparseBEV, warped_memory: WarpedMemory) -> DPTFOutput:
         """F_fuse and the remembered cells into F_out."""
         cells, bev = None, fused
         if self.bev_path is not None:
             cells = self.bev_path.predict(fused)
-            bev = self.bev_path.aggregate(fused, recollection.warped)
-        return DPTFOutput(recollection.history, recollection.warped, cells, bev)
+            bev = self.bev_path.aggregate(fused, warped_memory.warped)
+        return DPTFOutput(warped_memory.history, warped_memory.warped, cells, bev)
 
     def remember(
         self,
-        past: Memory,  # of the batch, see `Recollection`
+        past: Memory,  # of the batch, see `WarpedMemory`
         batch: FrameBatch,
         fused: SparseBEV,
         output: DPTFOutput,

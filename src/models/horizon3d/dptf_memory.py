@@ -1,4 +1,4 @@
-"""What phase 2 remembers of past key frames, lane by lane: cells and Gaussians (specification 6)."""
+"""What phase 2 remembers of past key frames, stream by stream: cells and Gaussians (specification 6)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from src.structures.gaussians import GaussianSet
 
 @dataclass
 class StoredCells:
-    """BEV cells worth remembering of one key frame of every lane: rows of all lanes, one after the other."""
+    """BEV cells worth remembering of one key frame of every stream: rows of all streams, one after the other."""
 
     xy: Tensor  # [n, 2] m, cell centres in the ego frame of their own time
     velocities: Tensor  # [n, 2] m/s over ground, same axes
@@ -29,7 +29,7 @@ class StoredCells:
 
 @dataclass
 class MemoryFrame(RememberedFrame):
-    """One remembered key frame of each of B lanes, detached, in unaugmented ego coordinates of its own time."""
+    """One remembered key frame of each of B streams, detached, in unaugmented ego coordinates of its own time."""
 
     cells: StoredCells | None
     gaussians: GaussianSet | None  # [B, n]
@@ -39,7 +39,7 @@ class MemoryFrame(RememberedFrame):
         rows: Tensor,  # [B'] int64, distinct where kept
         keep: Tensor,  # [B'] bool
     ) -> MemoryFrame:
-        """The lanes at `rows`, those without `keep` forgotten."""
+        """The streams at `rows`, those without `keep` forgotten."""
         cells, gaussians = self.cells, self.gaussians
         if cells is not None:
             target = torch.full_like(self.present, -1, dtype=torch.int64)  # new row of every old one
@@ -65,7 +65,7 @@ class MemoryFrame(RememberedFrame):
 
 @dataclass(frozen=True)
 class Memory(FrameMemory[MemoryFrame]):
-    """The last key frames of each of B lanes, newest first. A value: pushing makes a new one."""
+    """The last key frames of each of B streams, newest first. A value: pushing makes a new one."""
 
     def push(self, frame: MemoryFrame, num_cell_frames: int, num_gaussian_frames: int) -> Memory:
         """Put the current frame first and forget what no path looks at any more, so memory never grows."""

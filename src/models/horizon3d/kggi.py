@@ -14,7 +14,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.heads.keypoint_head import KEYPOINT_BIAS, CameraKeypointHead, CameraMaps, keypoint_scores
 from src.models.horizon3d.gaussian_encoder import RAW_ATTRIBUTES, GaussianBounds
 from src.models.horizon3d.views import CameraViews
-from src.ops.segment_reduce import best_rows
+from src.ops.segment_reduce import topk_per_sample
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV
 from src.targets.depth import DepthTarget, check_depth_target, lid_centres
@@ -163,7 +163,7 @@ class KGGI(nn.Module):
         scores: Tensor,  # [M]
         radar_bev: SparseBEV,
     ) -> GaussianSet:
-        rows = best_rows(scores, radar_bev.indices[:, 0], radar_bev.batch_size, self.config.num_radar_keypoints)
+        rows = topk_per_sample(scores, radar_bev.indices[:, 0], radar_bev.batch_size, self.config.num_radar_keypoints)
         valid = rows >= 0
         cells = F.pad(radar_bev.indices, (0, 0, 0, 1))  # one more row for padding to point at
         features = F.pad(radar_bev.features, (0, 0, 0, 1))

@@ -27,7 +27,7 @@ from src.targets.velocity import velocity_raster
 
 
 @dataclass(kw_only=True)
-class LossConfig:
+class Horizon3DLossConfig:
     """Weights of the terms (`model.loss`); an inner weight of null switches its term off, uncomputed."""
 
     kggi_weight: float  # lambda_kggi, on keypoint, depth and radar objectness
@@ -61,7 +61,7 @@ def kggi_losses(
     boxes: list[Boxes3D],  # B, aug frame
     grid: BEVGrid,
     settings: KGGIConfig,
-    config: LossConfig,
+    config: Horizon3DLossConfig,
 ) -> dict[str, Tensor]:
     """2D keypoints, depth and radar objectness (specification 4.1, 4.3), weighted; {} without keypoint heads."""
     terms: dict[str, Tensor] = {}
@@ -92,7 +92,7 @@ def ocsf_losses(
     boxes: list[Boxes3D],  # B, aug frame
     grid: BEVGrid,
     margin_m: float,
-    config: LossConfig,
+    config: Horizon3DLossConfig,
 ) -> dict[str, Tensor]:
     """Occupancy of the splat against the enlarged boxes (specification 5.6), weighted."""
     terms: dict[str, Tensor] = {}
@@ -113,7 +113,7 @@ def gaussian_velocity_loss(
     boxes: list[Boxes3D],  # B, aug frame
     grid: BEVGrid,
     margin_m: float,
-    config: LossConfig,
+    config: Horizon3DLossConfig,
 ) -> dict[str, Tensor]:
     """Velocities of Gaussians against the enlarged box at the cell where each contributes most (Eq. 9), weighted."""
     if config.gaussian_velocity_weight is None:
@@ -129,7 +129,7 @@ def cell_losses(
     fused: SparseBEV,
     boxes: list[Boxes3D],  # B, aug frame
     grid: BEVGrid,
-    config: LossConfig,
+    config: Horizon3DLossConfig,
 ) -> dict[str, Tensor]:
     """Occupancy and velocity of the cells of F_fuse against the tight boxes (specification 6.1, 8.1), weighted."""
     terms: dict[str, Tensor] = {}

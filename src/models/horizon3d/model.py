@@ -18,7 +18,7 @@ from src.models.horizon3d.cross_attention import NUM_HEADS
 from src.models.horizon3d.dptf import DPTF, DPTFConfig, DPTFOutput
 from src.models.horizon3d.dptf_memory import Memory
 from src.models.horizon3d.kggi import KGGI, KGGIConfig, KGGIOutput
-from src.models.horizon3d.loss import LossConfig, cell_losses, gaussian_velocity_loss, kggi_losses, ocsf_losses
+from src.models.horizon3d.loss import Horizon3DLossConfig, cell_losses, gaussian_velocity_loss, kggi_losses, ocsf_losses
 from src.models.horizon3d.ocsf import OCSF, OCSFConfig, OCSFOutput
 from src.models.horizon3d.views import CameraViews
 from src.structures.batch import FrameBatch
@@ -43,7 +43,7 @@ class Horizon3DConfig:
     ocsf: OCSFConfig | None
     dptf: DPTFConfig | None  # null: single frames, phase 1
     head: HeadConfig
-    loss: LossConfig
+    loss: Horizon3DLossConfig
 
     def __post_init__(self) -> None:
         if (self.kggi is None) != (self.ocsf is None):
@@ -138,25 +138,25 @@ class Horizon3D(Detector):
         return None if self.image_encoder is None else self.image_encoder.backbone
 
     def forward(self, batch: FrameBatch, memory: Memory | None = None) -> tuple[Horizon3DOutput, Memory | None]:
-        """Detect in the frames of B lanes, given what is remembered of them; the new memory is detached.
+        """Detect in the frames of B streams, given what is remembered of them; the new memory is detached.
 
-        Raises ValueError when images are needed and absent, or when the memory is of another number of lanes.
+        Raises ValueError when images are needed and absent, or when the memory is of another number of streams.
         """
         if memory is not None and memory.frames and memory.batch_size != len(batch):
-            raise ValueError(f"the memory holds {memory.batch_size} lanes, but the batch {len(batch)} frames")
-        recollection = self.dptf.recall(memory, batch) if self.dptf is not None else None
+            raise ValueError(f"the memory holds {memory.batch_size} streams, but the batch {len(batch)} frames")
+        warped_memory = self.dptf.recall(memory, batch) if self.dptf is not None else None
         radar_bev = fused = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
         views = kggi = ocsf = None
         if self.image_encoder is not None:
             views = self._encode_views(batch)
-            kggi = self.kggi(radar_bev, views, recollection.history if recollection is not None else None)
+            kggi = self.kggi(radar_bev, views, warped_memory.history if warped_memory is not None else None)
             ocsf = self.ocsf(kggi.gaussians, radar_bev, views)
             fused = ocsf.fused_bev
         if self.dptf is None:
             return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, None, self.head(fused)), None
-        dptf = self.dptf.aggregate(fused, recollection)
+        dptf = self.dptf.aggregate(fused, warped_memory)
         output = Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, dptf, self.head(dptf.bev))
-        return output, self.dptf.remember(recollection.past, batch, fused, dptf, ocsf)
+        return output, self.dptf.remember(warped_memory.past, batch, fused, dptf, ocsf)
 
     def restore_memory(self, state: list[dict[str, Any]]) -> Memory:
         """The memory that `Memory.state` described."""

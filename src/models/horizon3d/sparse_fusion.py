@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from src.models.layers.sparse import RowNorm, SubmanifoldConv
 from src.ops.kernel_maps import stacked_map
-from src.ops.segment_reduce import exchange_rows
+from src.ops.segment_reduce import permute_rows
 from src.ops.sites import union
 from src.ops.sparse_conv import sparse_conv
 from src.structures.sparse_bev import SparseBEV
@@ -42,16 +42,16 @@ class SparseFusion(nn.Module):
         place_gaussian, place_radar = (_places(part, len(sites)) for part in rows)
         radar_there, gaussian_there = place_radar.index_select(0, rows[0]), place_gaussian.index_select(0, rows[1])
         pairs = (
-            torch.cat([gaussian, exchange_rows(radar, radar_there, gaussian_there)], dim=1),  # [G, 2C] F_G's cells
-            torch.cat([exchange_rows(gaussian, gaussian_there, radar_there), radar], dim=1),  # [R, 2C] F_R's cells
+            torch.cat([gaussian, permute_rows(radar, radar_there, gaussian_there)], dim=1),  # [G, 2C] F_G's cells
+            torch.cat([permute_rows(gaussian, gaussian_there, radar_there), radar], dim=1),  # [R, 2C] F_R's cells
         )
         if self.gate_kernel_size == 1:
             gates = [_at_own_cells(conv, pair) for conv, pair in zip(self._gates, pairs, strict=True)]
         else:
             joined = torch.cat(
                 [
-                    exchange_rows(gaussian, place_gaussian, rows[0]),
-                    exchange_rows(radar, place_radar, rows[1]),
+                    permute_rows(gaussian, place_gaussian, rows[0]),
+                    permute_rows(radar, place_radar, rows[1]),
                 ],
                 dim=1,
             )  # [M, 2C]
@@ -67,7 +67,7 @@ class SparseFusion(nn.Module):
         for part, matrix, place, own in zip(
             gated, self.shortcut.weight[0].chunk(2), (place_gaussian, place_radar), rows, strict=True
         ):
-            y = y + exchange_rows(part @ matrix, place, own)
+            y = y + permute_rows(part @ matrix, place, own)
         return x.with_features(F.relu(y, inplace=True))
 
     @property

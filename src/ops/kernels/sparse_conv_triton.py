@@ -14,7 +14,7 @@ from torch.autograd.function import FunctionCtx
 
 from src.ops.backend import REFERENCE, TRITON, implementation, interpreted, register, runs_kernels
 from src.ops.kernel_maps import KernelMap
-from src.ops.segment_reduce import bag_sum
+from src.ops.segment_reduce import gather_segment_sum
 
 DTYPES = (torch.float32, torch.float16, torch.bfloat16)
 # Output rows a program computes, and pairs it multiplies at a time for the gradient of the weights.
@@ -193,7 +193,7 @@ def _weight_gradient(
                 num_stages=3,
                 enable_fp_fusion=True,
             )
-    return bag_sum(partial.flatten(1), spans, first_span).view(-1, c_in, c_out).to(features.dtype)
+    return gather_segment_sum(partial.flatten(1), spans, first_span).view(-1, c_in, c_out).to(features.dtype)
 
 
 @triton.jit

@@ -14,7 +14,7 @@ from torch.autograd.function import FunctionCtx
 from src.geometry.bev_grid import BEVGrid
 from src.ops.backend import REFERENCE, TRITON, implementation, register, runs_kernels
 from src.ops.sites import Sites
-from src.ops.splat import CAP, Pairs, Splat, gaussian_cells, occupied_cells
+from src.ops.splat import CAP, GaussianCellPairs, Splat, gaussian_cells, occupied_cells
 
 # Cells a program sums the free probability of, one lane each.
 CELLS = 128
@@ -79,7 +79,7 @@ class _Splat(torch.autograd.Function):
         directions: Tensor,
         opacity_logits: Tensor,
         features: Tensor,
-        pairs: Pairs,
+        pairs: GaussianCellPairs,
         choice: tuple[Tensor, float, int, int],  # support, threshold, max_cells, cells of a sample
         extra: float,
         least: float,
@@ -127,7 +127,7 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     def backward(ctx: FunctionCtx, grad_log_free: Tensor, grad_out: Tensor, *_: None) -> tuple[Tensor | None, ...]:
         scales, directions, opacity_logits, surprise, features, place = ctx.saved_tensors
-        pairs: Pairs = ctx.pairs
+        pairs: GaussianCellPairs = ctx.pairs
         shape_grad = features.new_zeros(len(features), 7)  # means, scales, directions, logits
         grad_features = torch.zeros_like(features)
         if len(pairs.q) > 0:

@@ -9,7 +9,7 @@ from src.models.backbones.image import ImageEncoderConfig, NeckName
 from src.models.backbones.weights import BackboneName
 from src.models.dense_bev.bev_decoder import BEVDecoderConfig
 from src.models.dense_bev.lift_splat import LiftSplatConfig
-from src.models.dense_bev.model import DenseBEV, DenseBEVConfig, LossConfig
+from src.models.dense_bev.model import DenseBEV, DenseBEVConfig, DenseBEVLossConfig
 from src.models.dense_bev.pillars import PillarConfig
 from src.models.dense_bev.temporal_fusion import TemporalConfig
 from src.models.heads.center_head import HeadConfig, TrainRegression
@@ -51,7 +51,7 @@ def make_batch(points=(150, 120), boxes=(6, 4), seed=0):
 
 
 def drive(step, **changes):
-    """Step k of a drive of two lanes at 10 and 20 m/s, half a second a step, each lane augmented in its own way."""
+    """Step k of a drive of two streams at 10 and 20 m/s, half a second a step, each stream augmented in its own way."""
     batch = make_batch(**({"seed": step} | changes))
     b = len(batch)
     return replace(
@@ -59,7 +59,7 @@ def drive(step, **changes):
         timestamps_s=torch.tensor([100.0 + 0.5 * step, 7.0 + 0.5 * step], dtype=torch.float64)[:b],
         global_from_ego=torch.stack([pose(5.0 * step, 0.0, 0.02 * step), pose(10.0 * step, 1.0, 0.3)])[:b],
         aug_from_ego=torch.stack([moving.bda(0.1, 1.02), moving.bda(-0.2, 0.97, flip_y=True)])[:b],
-        lanes=torch.arange(b),
+        streams=torch.arange(b),
         starts=torch.full((b,), step == 0),
     )
 
@@ -109,7 +109,7 @@ def dense_config(temporal=None, **changes):
             attributes=AttributeSource.rule,
             train_regression=TrainRegression.sampled,
         ),
-        loss=LossConfig(**weights),
+        loss=DenseBEVLossConfig(**weights),
     )
 
 

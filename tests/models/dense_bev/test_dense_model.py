@@ -12,7 +12,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models import MODELS
 from src.models.backbones.image import NeckName
 from src.models.dense_bev.bev_decoder import BEVDecoder, BEVDecoderConfig
-from src.models.dense_bev.model import DenseBEV, DenseBEVConfig, LossConfig
+from src.models.dense_bev.model import DenseBEV, DenseBEVConfig, DenseBEVLossConfig
 from src.structures.boxes import Boxes3D
 from tests.models.dense_bev.dense_frames import GRID, backbone, dense_config, dense_model, make_batch, memory_config
 from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
@@ -94,7 +94,7 @@ def test_two_samples_do_not_mix():
             torch.testing.assert_close(model(single)[0].head.logits, both[sample], atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", [field.name for field in fields(LossConfig)])
+@pytest.mark.parametrize("name", [field.name for field in fields(DenseBEVLossConfig)])
 def test_weights_multiply_and_null_switches_a_term_off(name):
     batch, term = make_batch(), name.removesuffix("_weight")
     model = dense_model().eval()

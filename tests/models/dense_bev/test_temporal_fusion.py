@@ -1,4 +1,4 @@
-"""Memory of maps: alignment under ego motion and augmentation, what is usable, lanes, storage, the first step."""
+"""Memory of maps: alignment under ego motion and augmentation, what is usable, streams, storage, the first step."""
 
 import io
 from dataclasses import replace
@@ -110,12 +110,12 @@ def test_aggregation_is_the_convolution_of_all_maps_side_by_side():
     for step in range(2):  # of three that there is room for
         frame = bare_frame(0.5 * step, [pose(4.0 * step), pose(step, 1.0)])
         memory = fusion.remember(memory, frame, torch.randn(2, 2, 96, 96))
-    recollection = fusion.recall(memory, bare_frame(1.0, [pose(8.0), pose(2.0, 1.0)]))
+    warped_maps = fusion.recall(memory, bare_frame(1.0, [pose(8.0), pose(2.0, 1.0)]))
     fused = torch.randn(2, 2, 96, 96)
-    past = list(fusion.maps(recollection))
+    past = list(fusion.maps(warped_maps))
     stack = torch.cat([fused, *past, torch.zeros_like(fused)], dim=1)
     wanted = fused + fusion.norm(fusion.refine(fusion.reduce(stack)))
-    torch.testing.assert_close(fusion.aggregate(fused, recollection), wanted, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(fusion.aggregate(fused, warped_maps), wanted, rtol=1e-5, atol=1e-5)
     assert len(past) == 2 and (wanted - fused).abs().max() > 0.5
 
 
@@ -227,7 +227,7 @@ def test_every_parameter_of_the_memory_learns(pair, steps):
 def test_a_memory_of_other_lanes_is_refused(pair):
     model = pair[1].eval()
     memory = fill(model, 1)
-    with pytest.raises(ValueError, match="2 lanes, but the batch 1 frames"):
+    with pytest.raises(ValueError, match="2 streams, but the batch 1 frames"):
         model(drive(1, points=(10,), boxes=(1,)), memory)
 
 
@@ -237,8 +237,8 @@ def test_a_jump_of_the_clock_or_the_pose_empties_the_memory(pair):
     batch = drive(2)
     late = replace(batch, timestamps_s=batch.timestamps_s + 100.0)
     with torch.no_grad():
-        assert not model(late, memory)[0].recollection.usable.any()
+        assert not model(late, memory)[0].warped_maps.usable.any()
         far = replace(batch, global_from_ego=torch.stack([pose(1000.0), pose(2000.0)]))
-        assert not model(far, memory)[0].recollection.usable.any()
-        assert model(batch, memory)[0].recollection.usable[:2].all()
+        assert not model(far, memory)[0].warped_maps.usable.any()
+        assert model(batch, memory)[0].warped_maps.usable[:2].all()
     assert GRID.rows == 48  # the small grid of the model, not the wide one above

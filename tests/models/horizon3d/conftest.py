@@ -13,7 +13,7 @@ from src.models.horizon3d.bev_path import BEVPathConfig
 from src.models.horizon3d.dptf import DPTFConfig
 from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling, SelfAttentionConfig
 from src.models.horizon3d.kggi import Initialization, KGGIConfig
-from src.models.horizon3d.loss import LossConfig
+from src.models.horizon3d.loss import Horizon3DLossConfig
 from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom
 from src.models.horizon3d.views import CameraViews
@@ -155,7 +155,7 @@ def make_config():
             ocsf=None if radar_only else OCSFConfig(**ocsf),
             dptf=dptf,
             head=head_config(),
-            loss=LossConfig(**loss),
+            loss=Horizon3DLossConfig(**loss),
         )
 
     return build

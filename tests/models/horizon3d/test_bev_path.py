@@ -204,7 +204,7 @@ def test_augmentation_on_and_off_agree_within_quantisation(augs):
     assert compared > 35
 
 
-# -- slots, ages, lanes --------------------------------------------------------------------------------------------
+# -- slots, ages, streams --------------------------------------------------------------------------------------------
 
 
 def test_slots_run_from_the_oldest_to_the_newest_and_ages_come_from_time_stamps():
@@ -265,32 +265,32 @@ def test_lanes_with_different_motions_equal_single_lanes():
     poses = [[pose(), pose(5.0, 0.0, 1.0)], [pose(1.0), pose(6.0, 1.0, 1.2)], [pose(1.5), pose(6.5, 1.0, 1.1)]]
     stamps, augs = [[0.0, 100.0], [0.5, 101.0], [1.0, 101.5]], [bda(0.2), bda(flip_x=True)]
 
-    def run(lanes):
+    def run(streams):
         memory = Memory(())
         for step in range(3):
             batch = bare_frame(
-                torch.tensor(stamps[step])[lanes], [poses[step][i] for i in lanes], [augs[i] for i in lanes]
+                torch.tensor(stamps[step])[streams], [poses[step][i] for i in streams], [augs[i] for i in streams]
             )
             cells, velocities, features = random_cells(40, 2, TINY, step)
-            mine = torch.isin(cells[:, 0], torch.tensor(lanes))
+            mine = torch.isin(cells[:, 0], torch.tensor(streams))
             cells, velocities, features = cells[mine], velocities[mine], features[mine]
-            cells[:, 0] = cells[:, 0] - min(lanes)
-            fused, _ = bev_of(cells, TINY, features, len(lanes))
+            cells[:, 0] = cells[:, 0] - min(streams)
+            fused, _ = bev_of(cells, TINY, features, len(streams))
             warped = path.recall(memory, batch, 6.0)
             output = path.aggregate(fused, warped)
             stored = path.store(fused, CellPrediction(torch.ones(len(cells)), velocities), batch)
-            present = torch.ones(len(lanes)).bool()
+            present = torch.ones(len(streams)).bool()
             memory = memory.push(MemoryFrame(batch.timestamps_s, batch.global_from_ego, present, stored, None), 8, 0)
         return warped, output
 
     both_warped, both = run([0, 1])
-    for lane in (0, 1):
-        warped, alone = run([lane])
-        mine = both_warped.indices[:, 0] == lane
+    for stream in (0, 1):
+        warped, alone = run([stream])
+        mine = both_warped.indices[:, 0] == stream
         assert len(warped.indices) and torch.equal(both_warped.indices[mine, 1:], warped.indices[:, 1:])
         for name in ("xy", "velocities", "elapsed_s", "features"):
             assert torch.equal(getattr(both_warped, name)[mine], getattr(warped, name)), name
-        mine = both.indices[:, 0] == lane
+        mine = both.indices[:, 0] == stream
         assert torch.equal(both.indices[mine, 1:], alone.indices[:, 1:])
         torch.testing.assert_close(both.features[mine], alone.features, rtol=1e-5, atol=1e-5)
 
@@ -321,10 +321,10 @@ def test_geometry_is_stored_without_augmentation():
     path, augs = make_path(), [bda(0.3, 1.05, flip_y=True), bda(-0.2, 0.95)]
     cells, velocities = torch.tensor([[0, 20, 30], [1, 60, 90]]), torch.tensor([[3.0, -4.0], [10.0, 1.0]])
     stored = remember(path, bare_frame(0.0, [pose(), pose()], augs), cells, velocities).cells
-    for lane, aug in enumerate(augs):
+    for stream, aug in enumerate(augs):
         linear = aug[:2, :2]
-        torch.testing.assert_close(linear @ stored.xy[lane], GRID.centre_of(cells[lane, 1:]), rtol=0, atol=1e-4)
-        torch.testing.assert_close(linear @ stored.velocities[lane], velocities[lane], rtol=0, atol=1e-4)
+        torch.testing.assert_close(linear @ stored.xy[stream], GRID.centre_of(cells[stream, 1:]), rtol=0, atol=1e-4)
+        torch.testing.assert_close(linear @ stored.velocities[stream], velocities[stream], rtol=0, atol=1e-4)
 
 
 def test_autocast_halves_stored_features_and_leaves_positions_alone():

@@ -15,7 +15,7 @@ from tests.models.moving import bare_frame, pose
 
 @pytest.fixture
 def make_parts(make_dptf):
-    """Path switches and values -> DPTF, and a function that remembers one cell and one Gaussian of a lane."""
+    """Path switches and values -> DPTF, and a function that remembers one cell and one Gaussian of a stream."""
 
     def build(**changes):
         torch.manual_seed(0)
@@ -47,10 +47,10 @@ def make_parts(make_dptf):
     return build
 
 
-def counts(recollection, lane):
-    """(cells, Gaussians) that a lane recalls."""
-    cells = int((recollection.warped.indices[:, 0] == lane).sum()) if recollection.warped is not None else None
-    return cells, int(recollection.history.valid[lane].sum()) if recollection.history is not None else None
+def counts(warped_memory, stream):
+    """(cells, Gaussians) that a stream recalls."""
+    cells = int((warped_memory.warped.indices[:, 0] == stream).sum()) if warped_memory.warped is not None else None
+    return cells, int(warped_memory.history.valid[stream].sum()) if warped_memory.history is not None else None
 
 
 @pytest.mark.parametrize(

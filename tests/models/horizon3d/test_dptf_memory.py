@@ -1,4 +1,4 @@
-"""Memory of the lanes: motion from past to present, what is usable, lanes that come and go, bounded size, storage."""
+"""Memory of streams: motion from past to present, what is usable, streams that come and go, bounded size, storage."""
 
 import io
 
@@ -14,7 +14,7 @@ DIM = 3
 
 
 def gaussians_for(b, count=4, value=0.0):
-    """A set whose means tell lane and value."""
+    """A set whose means tell stream and value."""
     means = torch.arange(b, dtype=torch.float32)[:, None, None] + torch.full((b, count, 2), value)
     zeros = torch.zeros(b, count)
     return GaussianSet(
@@ -31,7 +31,7 @@ def gaussians_for(b, count=4, value=0.0):
 
 
 def cells_for(counts, value=0.0):
-    """counts[i] cells for lane i, whose first coordinate is the lane and whose second tells value and order."""
+    """counts[i] cells for stream i, whose first coordinate is the stream and whose second tells value and order."""
     rows = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
     order = torch.cat([torch.arange(count) for count in counts]) if counts else torch.zeros(0)
     xy = torch.stack([rows.float(), value + 0.01 * order.float()], dim=1)
@@ -44,7 +44,7 @@ def remembered(batch, cells=None, gaussians=None, present=True):
 
 
 def frames_of(b, steps, counts=None):
-    """Memory after `steps` frames of `b` lanes, half a second apart; frame k holds the value 10 k."""
+    """Memory after `steps` frames of `b` streams, half a second apart; frame k holds the value 10 k."""
     memory = Memory(())
     for k in range(steps):
         batch = bare_frame(0.5 * k, [pose(10.0 * k + i) for i in range(b)])
@@ -104,7 +104,7 @@ def test_motion_is_the_same_under_autocast():
     ],
 )
 def test_what_is_not_a_usable_past_is_masked_and_harmless(elapsed_s, distance_m, present, usable):
-    """Another lane, always usable, stays so."""
+    """Another stream, always usable, stays so."""
     past = remembered(bare_frame(0.0, [pose(), pose()]), present=[present, True])
     batch = bare_frame([elapsed_s, 0.25], [pose(distance_m), pose(2.0)])
     motion = past.motion(batch, 0.6)
@@ -141,7 +141,7 @@ def test_no_jump_where_the_vehicle_drove_or_stood():
 
 
 def test_frames_that_are_not_in_the_past_give_up_their_places():
-    """Frames at 1.0, 0.5 and 0.0 s; in two lanes of different clocks a place is free when both give it up."""
+    """Frames at 1.0, 0.5 and 0.0 s; in two streams of different clocks a place is free when both give it up."""
     for now, left in ((1.0, [0.5, 0.0]), (0.7, [0.5, 0.0]), (0.5, [0.0]), (-1.0, [])):
         past = frames_of(1, 3).before(bare_frame(now, [pose(20.0)]))
         assert [float(frame.timestamps_s[0]) for frame in past.frames] == left
@@ -151,7 +151,7 @@ def test_frames_that_are_not_in_the_past_give_up_their_places():
 
 def test_select_follows_lanes_that_move_vanish_restart_and_appear():
     memory = frames_of(4, 3, counts=[2, 0, 3, 1])
-    # New lanes: old lane 2, a new one, old lane 0, old lane 3 restarting; old lane 1 is gone.
+    # New streams: old stream 2, a new one, old stream 0, old stream 3 restarting; old stream 1 is gone.
     rows, keep = torch.tensor([2, 0, 0, 3]), torch.tensor([True, False, True, False])
     chosen = memory.select(rows, keep)
     assert chosen.batch_size == 4 and len(chosen.frames) == 3
@@ -178,7 +178,7 @@ def test_select_to_fewer_and_to_more_lanes():
 
 def test_frames_that_no_lane_has_any_more_are_dropped_oldest_first():
     memory = frames_of(2, 2).select(torch.tensor([0, 1]), torch.tensor([True, False]))
-    for k in (2, 3):  # lane 1 starts anew at frame 2
+    for k in (2, 3):  # stream 1 starts anew at frame 2
         batch = bare_frame(0.5 * k, [pose(10.0 * k + i) for i in range(2)])
         memory = memory.push(remembered(batch, cells_for([2, 2], 10.0 * k)), 8, 4)
     only_second = memory.select(torch.tensor([1]), torch.tensor([True]))

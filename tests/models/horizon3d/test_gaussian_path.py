@@ -290,7 +290,7 @@ def test_what_leaves_the_grid_is_padding():
         (-0.5, 10.0, True, False),  # from the future
         (0.5, 51.0, True, False),  # faster than 100 m/s: the localisation jumped
         (0.5, 49.0, True, True),
-        (0.5, 10.0, False, False),  # the lane began later
+        (0.5, 10.0, False, False),  # the stream began later
         (math.nan, 10.0, True, False),
         (0.5, math.nan, True, False),
         (0.5, 1e300, True, False),
@@ -323,7 +323,7 @@ def test_nothing_remembered():
 
 
 def test_lanes_do_not_mix():
-    """Each lane has its own clock, pose, augmentation and past."""
+    """Each stream has its own clock, pose, augmentation and past."""
     path, stored = make_path(), make_gaussians(b=3, seed=4)
     befores = [pose(origin=UTM), pose(0.0, 0.0, 2.0, UTM), pose(0.0, 0.0, -1.0)]
     afters = [pose(9.0, 0.0, 0.1, UTM), pose(-8.0, 9.0, 2.2, UTM), pose(500.0, 0.0, -1.0)]  # the third one jumps
@@ -331,13 +331,13 @@ def test_lanes_do_not_mix():
     times, later = [1.0, 77.0, 5.0], [1.5, 78.0, 5.5]
     together = path.recall(remembered(make_frame(times, befores), stored), make_frame(later, afters, augs), 6.0)
     assert together.valid.any(dim=1).tolist() == [True, True, False]
-    for lane in range(3):
+    for stream in range(3):
         past = remembered(
-            make_frame(times[lane : lane + 1], [befores[lane]]), stored.map(lambda v, i=lane: v[i : i + 1])
+            make_frame(times[stream : stream + 1], [befores[stream]]), stored.map(lambda v, i=stream: v[i : i + 1])
         )
-        alone = path.recall(past, make_frame(later[lane : lane + 1], [afters[lane]], [augs[lane]]), 6.0)
+        alone = path.recall(past, make_frame(later[stream : stream + 1], [afters[stream]], [augs[stream]]), 6.0)
         for field in fields(GaussianSet):
-            torch.testing.assert_close(getattr(together, field.name)[lane], getattr(alone, field.name)[0])
+            torch.testing.assert_close(getattr(together, field.name)[stream], getattr(alone, field.name)[0])
 
 
 def test_four_frames_of_256_are_the_papers_1024_newest_first():

@@ -45,7 +45,7 @@ def lively(model):
 
 @pytest.fixture
 def with_past(make_model, make_batch, make_dptf):
-    """A lively model in eval mode, the memory of one frame of two lanes, and the next frames."""
+    """A lively model in eval mode, the memory of one frame of two streams, and the next frames."""
 
     def build(**changes):
         model = lively(make_model(dptf=make_dptf(**changes))).eval()
@@ -191,5 +191,5 @@ def test_what_cannot_go_together_is_refused(make_config, make_model, make_dptf):
 
 def test_a_memory_of_other_lanes_is_refused(with_past, make_batch):
     model, memory, _ = with_past()
-    with pytest.raises(ValueError, match="memory holds 2 lanes, but the batch 1 frames"):
+    with pytest.raises(ValueError, match="memory holds 2 streams, but the batch 1 frames"):
         model(at(make_batch(points=(100,), boxes=(3,)), 10.5), memory)

@@ -24,7 +24,7 @@ EVERYTHING = {"memory_threshold": 0.0}  # an untrained occupancy head stays belo
 
 @pytest.fixture
 def drive(make_batch):
-    """Step k of a drive of two lanes at 10 and 20 m/s, half a second a step, each lane augmented in its own way."""
+    """Step k of a drive of two streams at 10 and 20 m/s, half a second a step, each stream augmented in its own way."""
 
     def frame(step, **changes):
         batch = make_batch(**({"seed": step} | changes))
@@ -34,7 +34,7 @@ def drive(make_batch):
             timestamps_s=torch.tensor([100.0 + 0.5 * k, 7.0 + 0.5 * k], dtype=torch.float64)[:b],
             global_from_ego=torch.stack([pose(5.0 * k, 0.0, 0.02 * k, UTM), pose(10.0 * k, 1.0, 0.3)])[:b],
             aug_from_ego=torch.stack([bda(0.1, 1.02), bda(-0.2, 0.97, flip_y=True)])[:b],
-            lanes=torch.arange(b),
+            streams=torch.arange(b),
             starts=torch.full((b,), step == 0),
         )
 
@@ -183,7 +183,7 @@ def test_no_gradient_flows_into_the_frame_before(make_model, make_dptf, drive):
 
 EMPTY = {
     "no radar now": {"points": (0, 0)},
-    "no radar in one lane": {"points": (120, 0)},
+    "no radar in one stream": {"points": (120, 0)},
     "no boxes": {"boxes": (0, 0)},
     "nothing": {"points": (0, 0), "boxes": (0, 0)},
 }
@@ -228,9 +228,9 @@ def test_lanes_with_memory_equal_single_lanes(pair, drive):
     with torch.no_grad():
         model.dptf.bev_path.norms[-1].weight.fill_(1.0)
         both = model(batch, memory)[0]
-        for lane in (0, 1):
-            rows = batch.radar_batch == lane
-            pick = slice(lane, lane + 1)
+        for stream in (0, 1):
+            rows = batch.radar_batch == stream
+            pick = slice(stream, stream + 1)
             single = replace(
                 batch,
                 radar_points=batch.radar_points[rows],
@@ -242,11 +242,11 @@ def test_lanes_with_memory_equal_single_lanes(pair, drive):
                     for name in ("timestamps_s", "global_from_ego", "aug_from_ego", "images", "image_valid")
                 },
                 pix_from_aug=batch.pix_from_aug[pick],
-                lanes=batch.lanes[pick],
+                streams=batch.streams[pick],
                 starts=batch.starts[pick],
             )
-            alone = model(single, memory.select(torch.tensor([lane]), torch.tensor([True])))[0]
-            mine = both.dptf.bev.indices[:, 0] == lane
+            alone = model(single, memory.select(torch.tensor([stream]), torch.tensor([True])))[0]
+            mine = both.dptf.bev.indices[:, 0] == stream
             assert torch.equal(both.dptf.bev.indices[mine, 1:], alone.dptf.bev.indices[:, 1:])
             torch.testing.assert_close(both.head.logits[mine], alone.head.logits, rtol=1e-4, atol=1e-4)
 

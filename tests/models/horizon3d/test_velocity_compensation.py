@@ -15,13 +15,13 @@ from tests.models.moving import UTM, pose
 
 GRID = BEVGrid(cells=(44, 176), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
 STEP_S = 0.5
-ROADS_M = torch.tensor([-11.0, -7.0, -3.0, 3.0, 7.0, 11.0])  # y of the lanes of traffic, along x
+ROADS_M = torch.tensor([-11.0, -7.0, -3.0, 3.0, 7.0, 11.0])  # y of the streams of traffic, along x
 NUM_FAST, NUM_PARKED, NUM_POINTS, NUM_CLUTTER = 3, 2, 5, 8
 SIZE_M = torch.tensor([4.5, 1.9, 1.6])
 NEAR_M = 4.0
 """The widest matching distance of the benchmark; no less than the next road, a third of what the slowest of the fast
 drive between the frames."""
-LANES, STEPS, LEARNING_RATE = 12, 100, 1e-2
+STREAMS, STEPS, LEARNING_RATE = 12, 100, 1e-2
 
 
 def between(low, high, generator, *shape):
@@ -71,57 +71,57 @@ def clutter(generator):
     return torch.cat([place, torch.tensor([0.5, -5.0, 0.0, 0.0, 0.0]).expand(NUM_CLUTTER, 5)], 1)
 
 
-def traffic(seed, lanes, steps):
+def traffic(seed, streams, steps):
     """Batches of a stream of clips of two key frames: the radar sees the vehicles in the first, not in the second.
 
-    The ego drives at 5 to 15 m/s and turns. Every other lane is a frame ahead, so that each batch holds first and
-    second frames and the batch statistics are those of both. Lanes that are ahead begin with a second frame.
+    The ego drives at 5 to 15 m/s and turns. Every other stream is a frame ahead, so that each batch holds first and
+    second frames and the batch statistics are those of both. Streams that are ahead begin with a second frame.
     """
     generator, clips = torch.Generator().manual_seed(seed), {}
     for step in range(steps):
-        hidden = (torch.arange(lanes) + step) % 2 == 1
+        hidden = (torch.arange(streams) + step) % 2 == 1
         clouds, boxes, poses = [], [], []
-        for lane in range(lanes):
-            if not hidden[lane] or lane not in clips:
+        for stream in range(streams):
+            if not hidden[stream] or stream not in clips:
                 drive = [between(5.0, 15.0, generator, 1).item(), between(-0.1, 0.1, generator, 1).item()]
-                clips[lane] = (*vehicles_of(generator), *drive)
-            places, velocities, ego_mps, turn = clips[lane]
-            elapsed = STEP_S * float(hidden[lane])
+                clips[stream] = (*vehicles_of(generator), *drive)
+            places, velocities, ego_mps, turn = clips[stream]
+            elapsed = STEP_S * float(hidden[stream])
             world_from_ego = pose(ego_mps * elapsed, 0.0, turn * elapsed)
             rotation, origin = world_from_ego[:2, :2].float(), world_from_ego[:2, 3].float()
             xy = (places + velocities * elapsed - origin) @ rotation
             yaws = torch.where(velocities[:, 0] < 0, torch.pi, 0.0) - turn * elapsed
             boxes.append(cars(xy, velocities @ rotation, yaws))
             noise = clutter(generator)
-            clouds.append(noise if hidden[lane] else torch.cat([returns(boxes[-1], generator), noise]))
+            clouds.append(noise if hidden[stream] else torch.cat([returns(boxes[-1], generator), noise]))
             poses.append(pose(ego_mps * elapsed, 0.0, turn * elapsed, UTM))
         yield FrameBatch(
-            tokens=[f"{step}-{lane}" for lane in range(lanes)],
-            timestamps_s=torch.full((lanes,), 100.0 + STEP_S * step, dtype=torch.float64),
+            tokens=[f"{step}-{stream}" for stream in range(streams)],
+            timestamps_s=torch.full((streams,), 100.0 + STEP_S * step, dtype=torch.float64),
             global_from_ego=torch.stack(poses),
-            aug_from_ego=torch.eye(4).repeat(lanes, 1, 1),
+            aug_from_ego=torch.eye(4).repeat(streams, 1, 1),
             radar_points=torch.cat(clouds),
-            radar_batch=torch.arange(lanes).repeat_interleave(torch.tensor([len(cloud) for cloud in clouds])),
+            radar_batch=torch.arange(streams).repeat_interleave(torch.tensor([len(cloud) for cloud in clouds])),
             boxes=boxes,
-            lanes=torch.arange(lanes),
+            streams=torch.arange(streams),
             starts=~hidden,
         )
 
 
-def stream(model, seed, lanes, steps):
+def stream(model, seed, streams, steps):
     """Batches and the model's output for them, each clip with its own memory."""
     memory = Memory(())
-    for batch in traffic(seed, lanes, steps):
-        output, memory = model(batch, memory.select(batch.lanes, ~batch.starts))
+    for batch in traffic(seed, streams, steps):
+        output, memory = model(batch, memory.select(batch.streams, ~batch.starts))
         yield batch, output
 
 
-def train(config, seed=0, steps=STEPS, lanes=LANES):
+def train(config, seed=0, steps=STEPS, streams=STREAMS):
     torch.manual_seed(seed)
     model = Horizon3D(config, GRID, None, velocity_code_weight=0.2).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps)
-    for batch, output in stream(model, seed, lanes, steps):
+    for batch, output in stream(model, seed, streams, steps):
         optimizer.zero_grad()
         model.loss(output, batch)["total"].backward()
         optimizer.step()
@@ -130,15 +130,15 @@ def train(config, seed=0, steps=STEPS, lanes=LANES):
 
 
 @torch.no_grad()
-def shares_found(model, seed=10**6, lanes=64):
+def shares_found(model, seed=10**6, streams=64):
     """Shares of the hidden vehicles, fast and parked, near one of the best boxes, of which as many count as there are.
 
     In clips that the training has not seen.
     """
-    batch, output = list(stream(model, seed, lanes, 2))[-1]
+    batch, output = list(stream(model, seed, streams, 2))[-1]
     predicted, found = model.decode(output), []
-    for lane in (~batch.starts).nonzero().squeeze(1).tolist():
-        truth, best = batch.boxes[lane].centers[:, :2], predicted[lane].centers[:, :2]
+    for row in (~batch.starts).nonzero().squeeze(1).tolist():
+        truth, best = batch.boxes[row].centers[:, :2], predicted[row].centers[:, :2]
         found.append((torch.cdist(truth, best[: len(truth)]) < NEAR_M).any(1))
     found = torch.stack(found).float()
     return found[:, :NUM_FAST].mean().item(), found[:, NUM_FAST:].mean().item()
