@@ -213,7 +213,7 @@ def format_paper(value: float | None, metric: Metric, signed: bool = False) -> s
 
 
 def format_here(cell: TableCell, metric: Metric, done: int) -> str:
-    """Mean ± standard deviation; of one run's latency ± `TableCell.frames`; with n where not all `done` runs have it."""
+    """Mean ± standard deviation; of one run's latency ± `TableCell.frames`; n where not all `done` have it."""
     if cell.mean is None:
         return MISSING
     text = f"{rounded(cell.mean, metric):.{metric.digits}f}"
