@@ -1,4 +1,4 @@
-"""Image encoder: backbone and neck, raw camera bytes in, a feature pyramid out (spec section 3)."""
+"""Image encoder: backbone and neck, raw camera bytes in, a feature pyramid out (method 3)."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class SecondFPN16(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """Backbone and neck over all cameras of all samples (spec section 3).
+    """Backbone and neck over all cameras of all samples (method 3).
 
     Feature row r of a level with stride s covers pixel rows r * s to (r + 1) * s of the input image, whether or not
     padding is trimmed. `strides` and `channels` describe the output, all levels of the neck unless fewer are asked for;
@@ -201,7 +201,7 @@ def count_black_rows(
     """Rows on top that are black in every view, as a whole number of stride-32 rows; at least one of those is kept.
 
     640 x 960 holds 183 padded rows at the test-time resize of a 1980 x 943 camera: 160 are skipped, 480 x 960 remain.
-    Training resizes move that edge, hence the look at the images themselves; a batch keeps what its fullest view needs.
+    Training resizes move that edge, so it is read off the images; a batch keeps what its fullest view needs.
     """
     height = views.shape[2]
     lit = views.amax(dim=(0, 1, 3)).nonzero()[:, 0]  # rows with any light

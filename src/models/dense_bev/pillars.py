@@ -1,4 +1,4 @@
-"""Radar points to a dense BEV map: pillars of one cell, encoded point by point (PointPillars; specification 13)."""
+"""Radar points to a dense BEV map: pillars of one cell, encoded point by point (PointPillars; method 13)."""
 
 from __future__ import annotations
 

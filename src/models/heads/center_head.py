@@ -1,4 +1,4 @@
-"""The sparse CenterPoint head: heat maps and box codes on active cells, its loss and its decoding (spec section 7)."""
+"""The sparse CenterPoint head: heat maps and box codes on active cells, its loss and its decoding (method 7)."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class TrainRegression(Enum):
 class HeadConfig:
     """Settings of the head (`model.head`). Raises ConfigError for impossible values."""
 
-    nms: Suppression  # per_group: the table of section 7
+    nms: Suppression  # per_group: the table of method 7
     score_threshold: float  # boxes at or below are dropped
     max_boxes: int  # per sample, best scores
     attributes: AttributeSource
@@ -234,7 +234,7 @@ class CenterHead(nn.Module):
     ) -> dict[str, Tensor]:
         """Weighted terms `heatmap`, `box` and, if learned, `attribute`; a weight of None leaves its term out.
 
-        Focal loss per group over its positive cells, L1 per group over its objects (section 8.1). Without objects the
+        Focal loss per group over its positive cells, L1 per group over its objects (method 8.1). Without objects the
         box term is 0 with zero gradients.
         """
         targets = output.targets = self.targets(output, boxes)

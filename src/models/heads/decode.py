@@ -1,4 +1,4 @@
-"""From head predictions to boxes: candidates, box codes, suppression, attributes, limits (spec section 7)."""
+"""From head predictions to boxes: candidates, box codes, suppression, attributes, limits (method 7)."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def top_candidates(
 ) -> Candidates:
     """Per group and sample the `limit` best scores above the threshold, in descending order, ties by cell and class.
 
-    A GPU is waited for once.
+    Synchronises with a GPU once.
     """
     columns, groups = constant((GROUP_COLUMNS, COLUMN_GROUPS), torch.int64, scores.device)  # [12] each, by group
     passing = scores.index_select(1, columns) > threshold
@@ -158,7 +158,7 @@ def suppress(
     ranges = constant(RANGES_M, boxes.centers.dtype, boxes.centers.device)
     near = boxes.centers[:, :2].norm(dim=1) < ranges[boxes.labels]
 
-    # One transfer of all that the choice depends on, since a GPU is waited for; float64 holds every value of it.
+    # One transfer of all that the choice depends on, since each synchronises a GPU; float64 holds every value exactly.
     parts = (better, worse, near, boxes.scores)
     values = torch.cat([part.double() for part in parts]).cpu().split([len(part) for part in parts])
     better, worse = values[0].long().tolist(), values[1].long().tolist()
@@ -178,7 +178,7 @@ def suppress(
 def rule_attributes(
     boxes: Boxes3D,
 ) -> Tensor:  # [K] int64, -1 for none
-    """Attributes from the speed (table of section 7); signs are overhanging where their lower edge is above 3.5 m."""
+    """Attributes from the speed (table of method 7); signs are overhanging where their lower edge is above 3.5 m."""
     labels = boxes.labels
     moving, still = constant((MOVING_ATTRIBUTES, STILL_ATTRIBUTES), labels.dtype, labels.device)
     chosen = torch.where(boxes.velocities.norm(dim=1) > MOVING_MPS, moving[labels], still[labels])

@@ -1,4 +1,4 @@
-"""Where objects are in the images and how deep: the camera heads of KGGI (specification 4.2)."""
+"""Camera heads of KGGI: where objects are in the images, and their depth (method 4.2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""DPTF, dual-path temporal fusion: a memory of BEV cells and one of Gaussians (Sec. 3.3; specification 6)."""
+"""DPTF, dual-path temporal fusion: a memory of BEV cells and one of Gaussians (Sec. 3.3; method 6)."""
 
 from __future__ import annotations
 

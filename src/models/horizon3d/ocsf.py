@@ -85,7 +85,7 @@ class OCSFOutput:
 
 
 class OCSF(nn.Module):
-    """Gaussian encoder, splatting and sparse fusion (specification section 5)."""
+    """Gaussian encoder, splatting and sparse fusion (method 5)."""
 
     def __init__(
         self,
