@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -14,6 +15,7 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.layers.dense import DenseConvNormReLU
 from src.models.memory import FrameMemory, Motion, RememberedFrame
+from src.ops.concat_conv import concat_conv2d
 from src.structures.batch import FrameBatch
 
 STORED = torch.bfloat16
@@ -140,16 +142,10 @@ class TemporalFusion(nn.Module):
         fused: Tensor,  # [B, C, rows, cols]
         warped_maps: WarpedMaps,
     ) -> Tensor:  # [B, C, rows, cols]
-        """The current map, changed by what is remembered.
-
-        `reduce` of all maps side by side is the sum of its slices of the single maps: no stack of them is ever held,
-        and a map that is not remembered, zero, costs nothing.
-        """
-        current, *slices = self.reduce.conv.weight.split(self.channels, dim=1)
-        total = F.conv2d(fused, current, self.reduce.conv.bias)
-        for past, weight in zip(self.maps(warped_maps), slices, strict=False):  # younger clips remember fewer
-            total = total + F.conv2d(past.to(fused.dtype), weight)
-        return fused + self.norm(self.refine(F.relu(self.reduce.norm(total))))
+        """F + norm(refine(reduce([F, M_1, ..., M_T]))): the current map F, changed by the warped past maps M."""
+        maps = itertools.chain([fused], self.maps(warped_maps))  # younger clips remember fewer, the others are zero
+        x = concat_conv2d(maps, self.reduce.conv.weight, self.reduce.conv.bias)  # of torch.cat(maps, dim=1)
+        return fused + self.norm(self.refine(F.relu(self.reduce.norm(x))))
 
     @torch.no_grad()
     def remember(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -15,6 +14,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import penalty_reduced_focal
 from src.losses.normalizers import full_precision, mean_over_ranks
 from src.losses.regression import masked_l1
+from src.models.heads.branches import Branches, checkpointed_branches
 from src.models.heads.decode import (
     AttributeSource,
     Suppression,
@@ -26,8 +26,7 @@ from src.models.heads.decode import (
     top_candidates,
 )
 from src.models.layers.dense import AllCells, DenseConvNormReLU
-from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv
-from src.ops.checkpointed_mlp import checkpointed_mlp
+from src.models.layers.sparse import ConvNormReLU, SubmanifoldConv
 from src.ops.nms import maxpool_peaks
 from src.structures.boxes import Boxes3D
 from src.structures.sparse_bev import SparseBEV
@@ -85,65 +84,6 @@ class HeadOutput:
     targets: HeadTargets | None = None  # what the loss compared with, once there was one; for diagnostics
 
 
-class Branches(nn.Module):
-    """Branches of two kernel-1 layers with the same input, their hidden layers evaluated as one."""
-
-    def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
-        super().__init__()
-        self.hidden = nn.Linear(channels, len(widths) * channels, bias=False)
-        self.norm = RowNorm(len(widths) * channels)
-        self.outputs = nn.ModuleList(nn.Linear(channels, width) for width in widths)
-
-    def forward(
-        self,
-        x: Tensor,  # [n, C]
-    ) -> Tensor:  # [n, sum of widths] float32
-        """Outputs of all branches side by side."""
-        return evaluate_branches([self], x)
-
-
-def evaluate_branches(
-    parts: Sequence[Branches],
-    x: Tensor,  # [n, C]
-) -> Tensor:  # [n, sum of all widths] float32
-    """Outputs of several sets of branches side by side, as one network of two layers.
-
-    A batch norm behind a linear layer is a linear layer once its statistics are known, and those of every hidden
-    channel follow from mean and covariance of the input: no hidden layer is ever stored, normalised or read again.
-    """
-    with torch.autocast(x.device.type, enabled=False):
-        weight = torch.cat([part.hidden.weight for part in parts])  # [H, C]
-        mean, variance = _hidden_statistics(parts, x, weight)
-        scale = torch.cat([part.norm.weight for part in parts]) * (variance + parts[0].norm.eps).rsqrt()
-        shift = torch.cat([part.norm.bias for part in parts]) - mean * scale
-        outputs = [output for part in parts for output in part.outputs]
-        out_weight, out_bias = torch.block_diag(*(out.weight for out in outputs)), torch.cat([o.bias for o in outputs])
-    return full_precision(checkpointed_mlp(x, (weight * scale[:, None]).t(), shift, out_weight.t(), out_bias))
-
-
-def _hidden_statistics(
-    parts: Sequence[Branches],
-    x: Tensor,  # [n, C]
-    weight: Tensor,  # [H, C]
-) -> tuple[Tensor, Tensor]:  # [H], [H]
-    """Mean and variance that the norms divide by: the batch's in training, where the running ones learn from them."""
-    if not parts[0].training or len(x) < 2:
-        return torch.cat([p.norm.running_mean for p in parts]), torch.cat([p.norm.running_var for p in parts])
-    x = full_precision(x)
-    centre = x.mean(0)
-    x = x - centre
-    covariance = x.t() @ x / len(x)  # [C, C]
-    mean, variance = weight @ centre, (weight @ covariance * weight).sum(1).clamp(min=0)
-    with torch.no_grad():
-        widths = [len(part.norm.running_mean) for part in parts]
-        unbiased = variance * (len(x) / (len(x) - 1))
-        for part, its_mean, its_variance in zip(parts, mean.split(widths), unbiased.split(widths), strict=True):
-            part.norm.running_mean.lerp_(its_mean, part.norm.momentum)
-            part.norm.running_var.lerp_(its_variance, part.norm.momentum)
-            part.norm.num_batches_tracked.add_(1)
-    return mean, variance
-
-
 class CenterHead(nn.Module):
     """CenterPoint head on sparse cells (VoxelNeXt's nuScenes head, seven groups); 0.86 M parameters at C = 128.
 
@@ -177,13 +117,13 @@ class CenterHead(nn.Module):
         """Heat maps of all cells; box codes only where training needs them everywhere."""
         bev = self.shared(bev)
         if isinstance(self.heatmaps[0], Branches):
-            logits = evaluate_branches(list(self.heatmaps), bev.features)
+            logits = checkpointed_branches(list(self.heatmaps), bev.features)
         else:  # prepared for inference
             logits = self.heatmaps[0](bev.features)
         logits = logits[:, self.class_columns]
         codes = None
         if self.training and self.config.train_regression is TrainRegression.all:
-            codes = torch.stack([branches(bev.features) for branches in self.regressions], dim=1)
+            codes = torch.stack([checkpointed_branches([part], bev.features) for part in self.regressions], dim=1)
         return HeadOutput(bev, logits, codes)
 
     def regress(
