@@ -24,7 +24,7 @@ class Motion:
 
 @dataclass
 class RememberedFrame:
-    """Time and place of one remembered key frame of each of B streams; models add what they remember of it."""
+    """Time and pose of one remembered key frame of each of B streams; models add what they remember of it."""
 
     timestamps_s: Tensor  # [B] float64
     global_from_ego: Tensor  # [B, 4, 4] float64
@@ -101,8 +101,8 @@ class FrameMemory(Generic[Frame]):
     def before(self, batch: FrameBatch) -> Self:
         """What of the memory is in the past of the batch, stream by stream; the rest is forgotten for good.
 
-        Gone are frames that are not older than the batch's, and, where the pose jumped since a stream's last frame, all
-        that lies before the jump. Only neighbouring frames tell: over several seconds the same jump could pass for a
+        Dropped are frames that are not older than the batch's, and, where the pose jumped since a stream's last frame,
+        all before the jump. Only consecutive frames are compared: over several seconds the same jump could pass for a
         drive.
         """
         if not self.frames:
@@ -127,7 +127,7 @@ class FrameMemory(Generic[Frame]):
 
     @classmethod
     def _shared(cls, frames: Iterable[Frame]) -> Self:
-        """A memory without the frames that no stream has any more, so that they take no place of others."""
+        """A memory without the frames that no stream has any more, so that they take no other's slot."""
         frames = tuple(frames)
         if not frames:
             return cls(())

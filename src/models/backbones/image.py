@@ -72,7 +72,7 @@ class ImageEncoderConfig:
 class FPN(nn.Module):
     """Feature pyramid at strides 8, 16 and 32: 1x1 laterals, nearest upsampling, 3x3 output convolutions, no norm.
 
-    Of `strides` fewer, ascending, may be asked for; what no wanted level needs is not built.
+    `strides` may list fewer, in ascending order; laterals that no output level needs are not built.
     """
 
     offered = (8, 16, 32)
@@ -132,7 +132,7 @@ class ImageEncoder(nn.Module):
     """Backbone and neck over all cameras of all samples (method 3).
 
     Feature row r of a level with stride s covers pixel rows r * s to (r + 1) * s of the input image, whether or not
-    padding is trimmed. `strides` and `channels` describe the output, all levels of the neck unless fewer are asked for;
+    padding is trimmed. `strides` and `channels` describe the output, by default all levels of the neck;
     `lr_multiplier` is meant for the parameters of `backbone`. Loads `config.weights` when given: raises CheckpointError
     for a file that does not fit, and ConfigError for a stride that the neck does not offer.
     """
@@ -187,7 +187,7 @@ class ImageEncoder(nn.Module):
 
 
 def build_backbone(config: ImageEncoderConfig) -> ResNet | VoVNet99:
-    """The network that `config.name` stands for, from scratch."""
+    """The backbone named by `config.name`, from scratch."""
     if config.name is BackboneName.vovnet99:
         return VoVNet99()
     if config.name is BackboneName.resnet50:

@@ -173,7 +173,7 @@ class RadarEncoder(nn.Module):
 
 
 def _stage(in_channels: int | None, channels: int, blocks: int, ndim: int, norm: dict[str, float]) -> nn.Sequential:
-    """Residual blocks, behind a convolution of stride 2 unless the stage is the first (`in_channels` None)."""
+    """Residual blocks, after a convolution of stride 2 unless the stage is the first (`in_channels` None)."""
     layers: list[nn.Module] = []
     if in_channels is not None:
         conv = SparseConv(in_channels, channels, 3, ndim, bias=False, stride=2, padding=1)

@@ -121,11 +121,11 @@ class LiftSplat(nn.Module):
         low, high = self.config.z_range_m
         inside = self.grid.contains(points[..., :2]) & (points[..., 2] >= low) & (points[..., 2] < high)
         inside &= valid[:, :, None, None, None]
-        met = inside.flatten().nonzero().squeeze(1)  # synchronises a GPU
-        cell = self.grid.cell_of(points.view(-1, 3).index_select(0, met)[:, :2])
-        sample = torch.div(met, points[0].numel() // 3, rounding_mode="floor")
+        hits = inside.flatten().nonzero().squeeze(1)  # synchronises a GPU
+        cell = self.grid.cell_of(points.view(-1, 3).index_select(0, hits)[:, :2])
+        sample = torch.div(hits, points[0].numel() // 3, rounding_mode="floor")
         keys = (sample * self.grid.rows + cell[:, 0]) * self.grid.cols + cell[:, 1]
         keys, order = torch.sort(keys, stable=True)
         by_pixel = torch.empty_like(order)
         by_pixel[order] = torch.arange(len(order), device=order.device)
-        return met[order], keys, by_pixel
+        return hits[order], keys, by_pixel

@@ -42,7 +42,7 @@ def checkpointed_branches(
 ) -> Tensor:  # [n, sum of all widths] float32
     """Outputs of several sets of branches side by side, as one network of two layers whose hidden layer is not kept.
 
-    A batch norm behind a linear layer is a linear layer once its statistics are known, and those follow from mean and
+    A batch norm after a linear layer is a linear layer once its statistics are known, and those follow from mean and
     covariance of the input: no hidden layer is ever stored, normalised or read again. Layer by layer, a training step
     on 50,000 cells keeps some 2 GiB of them (seven groups of six branches, C = 128).
     """

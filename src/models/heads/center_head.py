@@ -87,8 +87,7 @@ class HeadOutput:
 class CenterHead(nn.Module):
     """CenterPoint head on sparse cells (VoxelNeXt's nuScenes head, seven groups); 0.86 M parameters at C = 128.
 
-    With `dense` it reads a whole map [B, C, rows, cols] and every cell is a site; all behind the shared convolution is
-    the same.
+    With `dense` it reads a whole map [B, C, rows, cols] and every cell is a site; the rest is the same.
     """
 
     def __init__(
@@ -151,18 +150,18 @@ class CenterHead(nn.Module):
     ) -> Tensor:  # [n, CODE_SIZE (+ 11)]
         features = output.bev.features
         step = max(1, len(features) // SAMPLED_CELLS)
-        spread = features[::step] if self.training else features[:0]
+        sampled = features[::step] if self.training else features[:0]
         codes = []
-        for branches, mine in zip(self.regressions, rows.split(counts), strict=True):
-            chosen = torch.cat([features[mine], spread])
+        for branches, own in zip(self.regressions, rows.split(counts), strict=True):
+            chosen = torch.cat([features[own], sampled])
             if not torch.is_autocast_enabled(chosen.device.type):
                 chosen = chosen.to(branches.hidden.weight.dtype)
             if len(chosen) or self.training or len(rows) == 0:  # otherwise a group without cells costs nothing
-                codes.append(branches(chosen)[: len(mine)])
+                codes.append(branches(chosen)[: len(own)])
         return torch.cat(codes)
 
     def targets(self, output: HeadOutput, boxes: list[Boxes3D]) -> HeadTargets:
-        """What the head should predict on its cells, with the counts of objects that cannot be met."""
+        """What the head should predict on its cells, with the counts of objects that it cannot represent."""
         return head_targets(boxes, output.bev.sites, self.grid)
 
     def loss(
@@ -179,20 +178,20 @@ class CenterHead(nn.Module):
         """
         targets = output.targets = self.targets(output, boxes)
         group_of_class = targets.labels.new_tensor(GROUP_OF_CLASS)
-        none = output.logits.new_zeros(len(HEAD_GROUPS))
+        zeros = output.logits.new_zeros(len(HEAD_GROUPS))
         terms: dict[str, Tensor] = {}
         if heatmap_weight is not None:
             focal = penalty_reduced_focal(output.logits, targets.heatmap).sum(0)  # [12]
-            positives = (targets.heatmap == 1).sum(0).to(none.dtype)
-            normalizer = mean_over_ranks(none.index_add(0, group_of_class, positives))
-            terms["heatmap"] = heatmap_weight * (none.index_add(0, group_of_class, focal) / normalizer).sum()
+            positives = (targets.heatmap == 1).sum(0).to(zeros.dtype)
+            normalizer = mean_over_ranks(zeros.index_add(0, group_of_class, positives))
+            terms["heatmap"] = heatmap_weight * (zeros.index_add(0, group_of_class, focal) / normalizer).sum()
         if box_weight is None and not self.learned:
             return terms
         predicted = self.regress(output, targets.rows, targets.groups)
         if box_weight is not None:
-            errors = masked_l1(predicted[:, :CODE_SIZE], targets.codes) * none.new_tensor(self.code_weights)
+            errors = masked_l1(predicted[:, :CODE_SIZE], targets.codes) * zeros.new_tensor(self.code_weights)
             objects = torch.bincount(targets.groups, minlength=len(HEAD_GROUPS))
-            sums = none.index_add(0, targets.groups, errors.sum(1))
+            sums = zeros.index_add(0, targets.groups, errors.sum(1))
             terms["box"] = box_weight * (sums / mean_over_ranks(objects)).sum()
         if self.learned:
             terms["attribute"] = ATTRIBUTE_WEIGHT * _attribute_loss(predicted[:, CODE_SIZE:], targets)

@@ -100,9 +100,9 @@ def top_candidates(
         by_column = columns.new_zeros(batch_size, len(columns)).index_add(0, samples, passing.long())
     found = columns.new_zeros(len(HEAD_GROUPS), batch_size).index_add(0, groups, by_column.t()).tolist()
 
-    places = torch.nonzero_static(passing.flatten(), size=sum(map(sum, found))).squeeze(1)
-    rows = torch.div(places, len(columns), rounding_mode="floor")
-    column = places - rows * len(columns)
+    hits = torch.nonzero_static(passing.flatten(), size=sum(map(sum, found))).squeeze(1)
+    rows = torch.div(hits, len(columns), rounding_mode="floor")
+    column = hits - rows * len(columns)
     labels = columns[column]
     best = scores[rows, labels]
     order = best.argsort(descending=True, stable=True)
@@ -143,7 +143,7 @@ def suppress(
     method: Suppression,
     max_boxes: int,
 ) -> list[Boxes3D]:  # one of each sample, best first
-    """Thin out overlapping boxes of a group, whatever their classes, and keep the best MAX_BOXES_PER_GROUP of them.
+    """Thin out overlapping boxes of a group, of any class, and keep the best MAX_BOXES_PER_GROUP of them.
 
     Then drop those beyond their class's evaluation range (xy distance to the ego origin) and keep the `max_boxes` best
     of a sample. `maxpool` has thinned the cells before and only applies the limits.
@@ -166,11 +166,11 @@ def suppress(
     survivors = iter(greedy_survivors(better, worse, len(boxes)))
     row, chosen = next(survivors, None), [[] for _ in counts[0]]
     for block, end in enumerate(itertools.accumulate(blocks)):
-        mine = []
+        kept = []
         while row is not None and row < end:
-            mine.append(row)
+            kept.append(row)
             row = next(survivors, None)
-        chosen[block % len(chosen)] += [row for row in mine[:MAX_BOXES_PER_GROUP] if near[row]]
+        chosen[block % len(chosen)] += [row for row in kept[:MAX_BOXES_PER_GROUP] if near[row]]
     best = [sorted(rows, key=lambda row: -scores[row])[:max_boxes] for rows in chosen]  # stable: ties by group
     return [boxes[torch.tensor(rows, dtype=torch.int64, device=boxes.labels.device)] for rows in best]
 

@@ -56,7 +56,7 @@ class BEVPathConfig:
 
 @dataclass
 class CellPrediction:
-    """What the two heads say about the cells of F_fuse (Eq. 7)."""
+    """Predictions of the two heads for the cells of F_fuse (Eq. 7)."""
 
     occupancy_logits: Tensor  # [M] float32, delta before its sigmoid
     velocities: Tensor  # [M, 2] float32, u in m/s over ground, augmented axes
@@ -64,7 +64,7 @@ class CellPrediction:
 
 @dataclass
 class WarpedCells:
-    """Remembered cells at their place in the current augmented frame, inside the grid; several may share a cell."""
+    """Remembered cells at their position in the current augmented frame, inside the grid; several may share a cell."""
 
     indices: Tensor  # [n, 4] int64 (batch, slot, row, col), the oldest slot first, the current frame's last
     xy: Tensor  # [n, 2] m, before quantisation
@@ -103,7 +103,7 @@ class BEVPath(nn.Module):
             self.convs.append(TemporalConv(width, channels, config.spatial_dilation))
             self.norms.append(RowNorm(channels, **NORM))
             slots, width = (slots + 1) // 2, channels
-        # Untrained, the path adds exactly zero. A ReLU behind this norm would sit at 0 and never pass a gradient.
+        # Untrained, the path adds exactly zero. A ReLU after this norm would sit at 0 and never pass a gradient.
         nn.init.zeros_(self.norms[-1].weight)
 
     @property

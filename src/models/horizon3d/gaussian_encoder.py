@@ -132,7 +132,7 @@ class Refinement(nn.Module):
         self.trunk = linear_relu_norm(channels, channels)
         self.output = nn.Linear(channels, 2 + len(RAW_ATTRIBUTES))
         self.output_scale = nn.Parameter(torch.ones(2 + len(RAW_ATTRIBUTES)))
-        # Untrained, a Gaussian keeps the place and the attributes that KGGI gives it.
+        # Untrained, a Gaussian keeps the position and the attributes that KGGI gives it.
         nn.init.normal_(self.output.weight, std=REFINEMENT_STD)
         with torch.no_grad():
             self.output.bias.copy_(torch.tensor((0.0, 0.0, *RAW_ATTRIBUTES)))
