@@ -19,8 +19,8 @@ class SparseFusion(nn.Module):
     """
 
     skip_zeros = True
-    """Compute both equations by `gated_fusion_conv`, which skips the zeros: the literal form makes a training step on a
-    CPU 4 to 7 % longer."""
+    """Compute both equations by `gated_fusion_conv`. The literal form multiplies zeros in half of the rows: some 5 % of
+    a training step and of a frame on a CPU (mini scale)."""
 
     def __init__(self, channels: int, gate_kernel_size: int) -> None:
         super().__init__()
