@@ -75,7 +75,7 @@ def begins(folder: RunFolder, resume: Resume) -> bool:
 
 
 @dataclass
-class Start:
+class StartingPoint:
     """What a run starts from; each process has opened its checkpoint once, and no other before the first step."""
 
     root: Path  # of the data
@@ -83,7 +83,9 @@ class Start:
     weights: OpenCheckpoint | None = None  # its source's, where there is none of its own
 
 
-def prepare(config: Config, tree: dict[str, Any], folder: RunFolder, source: WeightSource | None) -> Start | None:
+def prepare(
+    config: Config, tree: dict[str, Any], folder: RunFolder, source: WeightSource | None
+) -> StartingPoint | None:
     """Decide in the main process what all start from, and open it in each; None for a finished run, which is shown.
 
     The source's weights are opened before the own folder is touched: where that fails, everything is as it was.
@@ -108,8 +110,8 @@ def prepare(config: Config, tree: dict[str, Any], folder: RunFolder, source: Wei
     if decided is None:
         return None
     if decided["resume"] is not None:
-        return Start(Path(decided["root"]), resume=resume or open_checkpoint(Path(decided["resume"])))
-    return Start(Path(decided["root"]), weights=weights or (source and open_source(source)))
+        return StartingPoint(Path(decided["root"]), resume=resume or open_checkpoint(Path(decided["resume"])))
+    return StartingPoint(Path(decided["root"]), weights=weights or (source and open_source(source)))
 
 
 def start_log(config: Config, tree: dict[str, Any], folder: RunFolder) -> None:
@@ -126,7 +128,7 @@ def run(
     tree: dict[str, Any],
     folder: RunFolder,
     source: WeightSource | None,
-    start: Start,
+    start: StartingPoint,
     started: float,  # time.monotonic()
     overrides: list[str],
 ) -> None:
