@@ -111,7 +111,7 @@ class StreamingDetector:
         # Every weight comes from the checkpoint; the file that training began from may not be on this machine.
         model = build_model(replace(config, backbone=replace(config.backbone, weights=None)))
         load_model_weights(model, checkpoint, path)
-        settings = config.data.reader_settings(config.image_size_px)
+        settings = config.data.reader_settings(config.model.sensors, config.image_size_px)
         bf16 = config.precision == Precision.bf16.value
         return cls(model, config.grid.build(), settings, device, bf16, **switches)
 
