@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from src.data.pcd import LidarCloud
 from src.structures.batch import LIDAR_POINT_FIELDS
 
 Array = np.ndarray
@@ -16,21 +15,20 @@ Placed = tuple[Array, Array | None]
 
 
 def place_sweep(
-    cloud: LidarCloud,  # sensor frame
+    points: Array,  # [n, 4] float32: x, y, z (m, sensor frame), intensity
     *,
-    pose_time_us: int,  # of the sweep's ego pose
-    key_time_us: int,
+    ages_s: Array,  # [n] key frame's time less the point's
+    offsets_s: Array,  # [n] the point's time less that of the sweep's pose; zeros leave the sweep as it is
     ego_from_sensor: Array,  # [4, 4]
     aug_from_sweep: Array,  # [4, 4] (augmented) ego frame of the key frame from the ego frame at the sweep's pose
-    velocity: Array,  # [3] m/s of the ego at that pose, its own axes; zeros leave the sweep as it is
+    velocity: Array,  # [3] m/s of the ego at that pose, its own axes
     rate: Array,  # [3] rad/s, same axes
     min_distance_m: float,  # points nearer than this in both x and y of the sensor are dropped
     origins: bool,
 ) -> Placed:
     """Points of one sweep, each moved from the ego frame at its own time, and where the sensor was at that time."""
-    kept = (np.abs(cloud.points[:, :2]) >= max(min_distance_m, 1e-6)).any(axis=1)
-    points, times_us = cloud.points[kept], cloud.times_us[kept]
-    offsets_s = (1e-6 * (times_us - pose_time_us)).astype(np.float32)
+    kept = (np.abs(points[:, :2]) >= max(min_distance_m, 1e-6)).any(axis=1)
+    points, ages_s, offsets_s = points[kept], ages_s[kept], offsets_s[kept].astype(np.float32)
     mount, target = ego_from_sensor.astype(np.float32), aug_from_sweep.astype(np.float32)
 
     def place(in_ego: Array) -> Array:  # [n, 3] -> [n, 3]
@@ -39,7 +37,7 @@ def place_sweep(
     placed = np.empty((len(points), len(LIDAR_POINT_FIELDS)), np.float32)
     placed[:, :3] = place(points[:, :3] @ mount[:3, :3].T + mount[:3, 3])
     placed[:, 3] = points[:, 3]
-    placed[:, 4] = 1e-6 * (key_time_us - times_us)
+    placed[:, 4] = ages_s
     return placed, place(np.broadcast_to(mount[:3, 3], (len(points), 3))) if origins else None
 
 

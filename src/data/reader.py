@@ -203,9 +203,9 @@ class FrameReader:
             velocity, rate = ego_motion(index, index.pose_times_us[poses], global_from_sweep[:, :3, :3])
         sweeps = [
             place_sweep(
-                cloud,
-                pose_time_us=int(index.pose_times_us[poses[at]]),
-                key_time_us=int(index.frame_times_us[sample]),
+                cloud.points,
+                ages_s=1e-6 * (int(index.frame_times_us[sample]) - cloud.times_us),
+                offsets_s=1e-6 * (cloud.times_us - int(index.pose_times_us[poses[at]])),
                 ego_from_sensor=index.ego_from_sensor[calibrations[at]],
                 aug_from_sweep=aug_from_sweep[at],
                 velocity=velocity[at],
