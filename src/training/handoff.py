@@ -37,7 +37,10 @@ OF_THE_LATER_PHASE = (
 """Nor do these, where that run is of the phase before."""
 WEIGHTS_OF_GAUSSIAN_VELOCITY = ("model.loss.dptf_weight", "model.loss.gaussian_velocity_weight")
 """Nor these, unless `model.loss.gaussian_velocity_in_phase1`."""
-INPUT_SETTINGS = ("num_sweeps", "min_distance_m", "propagate_points", "test_resize_offset")
+INPUT_SETTINGS = (
+    *("num_sweeps", "num_lidar_sweeps", "deskew_lidar"),
+    *("min_distance_m", "propagate_points", "test_resize_offset"),
+)
 """Of `data`: what the weights have learnt to see."""
 
 Compose = Callable[[list[str]], tuple[Any, dict[str, Any]]]
