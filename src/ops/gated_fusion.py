@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.ops.kernel_maps import stacked_map, submanifold_map
-from src.ops.segment_reduce import permute_rows
+from src.ops.segment_reduce import inverse_rows, permute_rows
 from src.ops.sites import Sites, union
 from src.ops.sparse_conv import sparse_conv
 
@@ -30,7 +30,7 @@ def gated_fusion_conv(
     side, and a gate of kernel size 1 is computed where its branch has a site.
     """
     joint, *rows = union(*sites)
-    places = [_places(own, len(joint)) for own in rows]  # row of a branch in each cell of the union, -1 for none
+    places = [inverse_rows(own, len(joint)) for own in rows]  # row of a branch in each cell of the union, -1 for none
     gated = [x * gate.sigmoid() for x, gate in zip(features, _gates(features, joint, rows, places, gates), strict=True)]
     kernel_map = stacked_map(joint, math.isqrt(len(weight)), rows)
     convolved = sparse_conv(torch.cat(gated), torch.cat(weight.chunk(2, dim=1)), kernel_map, bias)
@@ -64,10 +64,3 @@ def _gates(
         sparse_conv(both, weight, kernel_map, bias).index_select(0, own)
         for (weight, bias), own in zip(gates, rows, strict=True)
     ]
-
-
-def _places(rows: Tensor, count: int) -> Tensor:  # [count] int64
-    """Where each of `count` rows stands in `rows`, -1 for those it lacks."""
-    place = rows.new_full((count,), -1)
-    place[rows] = torch.arange(len(rows), device=rows.device)
-    return place

@@ -95,7 +95,7 @@ class TemporalFusion(nn.Module):
 
     def __init__(self, config: TemporalConfig, channels: int, grid: BEVGrid) -> None:
         super().__init__()
-        self.config, self.grid, self.channels = config, grid, channels
+        self.config, self.grid = config, grid
         self.reduce = DenseConvNormReLU((config.num_frames + 1) * channels, channels, 1)
         self.refine = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
         self.norm = nn.BatchNorm2d(channels)
