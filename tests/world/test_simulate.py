@@ -142,6 +142,7 @@ def test_quaternions_turn_vectors_as_their_matrices_do():
         ("returns_density", -1.0),
         ("doppler_noise_mps", float("nan")),
         ("radar_sweeps_per_key_frame", 11),
+        ("lidar_sweeps_per_key_frame", 6),
         ("image_width_px", 8),
         ("jpeg_quality", 100),
     ],
