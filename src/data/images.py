@@ -118,7 +118,7 @@ def decode_by_pillow(
             return image if image.mode == "RGB" else image.convert("RGB")
     except (DataError, MemoryError):
         raise
-    except Exception as error:  # Pillow promises no set of them: damaged metadata fails in its parsers in many ways
+    except Exception as error:  # damaged metadata fails in Pillow's parsers with many types
         # Its message may hold an address in memory: the same fault always reads the same.
         reason = "no JPEG file" if isinstance(error, UnidentifiedImageError) else str(error)
         raise DataError(f"{path}: not a readable image ({reason})") from error

@@ -324,7 +324,7 @@ class FrameReader:
             return read(self._inside(name))
         except DataError as error:
             if self.settings.on_bad_file is OnBadFile.error:
-                remedy = "restore the file, or count and pass over such files with data.on_bad_file=skip"
+                remedy = "restore the file, or skip and count such files with data.on_bad_file=skip"
                 raise DataError(f"{error} (sample {self.index.sample_tokens[sample]}); {remedy}") from error
             skipped.count(channel)
             skipped.files.append(name)

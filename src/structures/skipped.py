@@ -1,4 +1,4 @@
-"""Sensor files that were not read, counted over many frames and told at the end."""
+"""Skipped sensor files, counted over many frames and reported at the end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MAX_NAMES, SHOWN_NAMES = 1000, 10
 
 
 class SkippedFiles:
-    """How often a sensor's file was passed over, by channel, and which files these were."""
+    """How many files of each sensor were skipped, by channel, and which."""
 
     def __init__(self) -> None:
         self.channels: Counter[str] = Counter()
@@ -23,7 +23,7 @@ class SkippedFiles:
         return bool(self.channels)
 
     def add(self, batch: FrameBatch) -> None:
-        """Count what a batch had to do without."""
+        """Count the skipped files of a batch."""
         self.channels.update(batch.skipped)
         self.files.update(batch.bad_files)
 
