@@ -28,7 +28,7 @@ from src.structures.taxonomy import CAMERAS
 class StreamingDetector:
     """A trained detector of either phase that takes consecutive frames of one vehicle and remembers them.
 
-    What a frame may use of the past is decided frame by frame, by its time and pose (specification 6.4):
+    What a frame may use of the past is decided frame by frame, by its time and pose (method 6.4):
 
     - On the first frame, after `reset`, and on a frame that says so (`FrameBatch.starts`) nothing is remembered.
     - Frames older than `model.dptf.max_age_s` are not used, so a long gap is as a first frame.

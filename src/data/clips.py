@@ -1,4 +1,4 @@
-"""Which frames each step reads: shuffled single frames, or streams of consecutive frames (spec section 6.4).
+"""Which frames each step reads: shuffled single frames, or streams of consecutive frames (method 6.4).
 
 A stream is one row of the batch over time. A clip is a run of consecutive key frames of one scene in one stream; memory
 begins empty where a clip starts. Streams are numbered over all ranks; rank r of W serves the r-th of W equal blocks, so

@@ -50,7 +50,7 @@ class DataConfig:
     train_split: str
     split: str  # what validation and evaluation read
     batch_size: int  # total over all devices; the streams when clips are streamed
-    groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; spec section 6.4
+    groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; method 6.4
     stream_sets: int  # at most so many sets of streams take turns when clips are streamed; 1: all streams at every step
     sensor_dropout: float  # share of streamed frames, never a clip's first, that come without any sensor data
     num_workers: int  # loader processes per device

@@ -1,4 +1,4 @@
-"""Camera files: one decode, one resampling of the part that is used (spec section 3, section 9)."""
+"""Camera files: one decode, one resampling of the part that is used (method 3, 9)."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def width_fit(
     flip: bool = False,
     rotation_rad: float = 0.0,
 ) -> ImageCrop:
-    """Scale so that the width fits (plus an offset), keep the bottom, crop or pad the top (spec sections 3, 9).
+    """Scale so that the width fits (plus an offset), keep the bottom, crop or pad the top (method 3, 9).
 
     Raises ConfigError when the offset leaves no positive scale.
     """
