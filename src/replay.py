@@ -33,7 +33,7 @@ from src.predict import chosen_device
 from src.reliability.checkpoints import load_model_weights
 from src.reliability.command import run_command
 from src.reliability.nonfinite import describe_gradients, gradient_norm, read_dump
-from src.structures.batch import RADAR_POINT_FIELDS, FrameBatch
+from src.structures.batch import LIDAR_POINT_FIELDS, RADAR_POINT_FIELDS, FrameBatch
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.training.module import DetectionModule
 from src.training.temporal_module import TemporalModule
@@ -68,7 +68,7 @@ def main(overrides: list[str]) -> None:
 
 @dataclass
 class Step:
-    """A step of a training, to be run as often as one likes."""
+    """A step of a training, that can be run any number of times."""
 
     path: Path
     config: Config
@@ -100,22 +100,22 @@ class Step:
     def stop_at_first(self, seen: Watch) -> None:
         """Run up to the first number that is not finite, and raise DivergedError there.
 
-        `seen` is what a run to the end has found: the modules are held to it, since some may rightly give infinities.
+        `seen` holds the findings of a complete run, which alone stop this one: modules may rightly give infinities.
         """
         module = self.build()
-        with warnings.catch_warnings(record=True) as told, torch.autograd.set_detect_anomaly(True):
-            warnings.simplefilter("always")  # autograd tells the line of the forward pass in a warning
+        with warnings.catch_warnings(record=True) as caught, torch.autograd.set_detect_anomaly(True):
+            warnings.simplefilter("always")  # autograd names the line of the forward pass in a warning
             try:
                 with Watch(stop_at=seen.first).over(module.model):
                     self.forward(module)["total"].backward()
             except RuntimeError as error:  # anomaly detection knows NaN only
-                trace = next((str(w.message) for w in told if "forward call" in str(w.message)), "")
+                trace = next((str(w.message) for w in caught if "forward call" in str(w.message)), "")
                 raise DivergedError(f"{error} {_own_line(trace)}") from error
-        raise DivergedError("no module to blame: the loss terms themselves, or their weights, are not finite")
+        raise DivergedError("the loss terms themselves, or their weights, are not finite")
 
 
 class Watch:
-    """Notes modules whose output is not finite, and those where the gradient at the output is not."""
+    """Records modules whose output is not finite, and those where the gradient at the output is not."""
 
     def __init__(self, stop_at: str | None = None) -> None:
         self.stop_at = stop_at  # raise DivergedError at this finding
@@ -136,24 +136,24 @@ class Watch:
 
     @contextmanager
     def over(self, model: nn.Module) -> Iterator[None]:
-        """Look at every module's outputs and their gradients for the time within."""
+        """Hook every module's outputs and their gradients for the time within."""
 
-        def look(name: str, module: nn.Module, output: Any) -> None:
+        def check(name: str, module: nn.Module, output: Any) -> None:
             what = f"{name} ({type(module).__name__})"
             values = [value for value in _tensors(output) if value.is_floating_point()]
             if not all(bool(torch.isfinite(value).all()) for value in values):
                 self._note(self.outputs, f"the output of {what}")
 
-            def look_back(gradient: Tensor) -> None:
+            def check_gradient(gradient: Tensor) -> None:
                 if not torch.isfinite(gradient).all():
                     self._note(self.gradients, f"the gradient at the output of {what}")
 
             for value in values:
                 if value.requires_grad:
-                    value.register_hook(look_back)
+                    value.register_hook(check_gradient)
 
         handles = [
-            module.register_forward_hook(lambda module, _, output, name=name: look(name, module, output))
+            module.register_forward_hook(lambda module, _, output, name=name: check(name, module, output))
             for name, module in model.named_modules()
             if name
         ]
@@ -192,10 +192,12 @@ def report(step: Step, watch: Watch) -> bool:
 
 def describe_inputs(batch: FrameBatch) -> Iterator[str]:
     """A line for each kind of input that is not finite; unknown velocities of annotations are NaN by design."""
-    rows = ~torch.isfinite(batch.radar_points).all(dim=1)
-    for row in rows.nonzero().flatten()[:MAX_SHOWN].tolist():
-        point = ", ".join(f"{n} {v:.4g}" for n, v in zip(RADAR_POINT_FIELDS, batch.radar_points[row], strict=True))
-        yield f"input: radar point {row} of {batch.tokens[int(batch.radar_batch[row])]} is not finite: {point}"
+    for sensor, names in (("radar", RADAR_POINT_FIELDS), ("lidar", LIDAR_POINT_FIELDS)):
+        points, owners = getattr(batch, f"{sensor}_points"), getattr(batch, f"{sensor}_batch")
+        rows = [] if points is None else (~torch.isfinite(points).all(dim=1)).nonzero().flatten()[:MAX_SHOWN].tolist()
+        for row in rows:
+            point = ", ".join(f"{n} {v:.4g}" for n, v in zip(names, points[row], strict=True))
+            yield f"input: {sensor} point {row} of {batch.tokens[int(owners[row])]} is not finite: {point}"
     for name in ("timestamps_s", "global_from_ego", "aug_from_ego", "pix_from_aug"):
         value = getattr(batch, name)
         if value is not None and not torch.isfinite(value).all():

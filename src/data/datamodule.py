@@ -1,10 +1,10 @@
-"""Frames into batches: data sets, order, workers. It knows no model."""
+"""Frames into batches: data sets, order, workers. Independent of the model."""
 
 from __future__ import annotations
 
 import difflib
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -36,6 +36,7 @@ from src.data.splits import split_samples
 from src.errors import ConfigError, DataError, HorizonError
 from src.structures.batch import FrameBatch
 from src.structures.detections import EvaluationSet
+from src.structures.taxonomy import SENSORS
 
 TERMINATION_GRACE_S = 10
 
@@ -49,11 +50,15 @@ class DataConfig:
     train_split: str
     split: str  # what validation and evaluation read
     batch_size: int  # total over all devices; the streams when clips are streamed
-    groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; spec section 6.4
+    groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; method 6.4
     stream_sets: int  # at most so many sets of streams take turns when clips are streamed; 1: all streams at every step
-    sensor_dropout: float  # share of streamed frames, never a clip's first, from which all sensor data are taken away
+    sensor_dropout: float  # share of streamed frames, never a clip's first, that come without any sensor data
     num_workers: int  # loader processes per device
     num_sweeps: int  # past sweeps of each radar
+    num_lidar_sweeps: int  # past sweeps of each LiDAR
+    lidar_origins: bool  # also where the ray of each LiDAR point began
+    deskew_lidar: bool  # move LiDAR points by what was driven between their own times and their sweep's
+    num_future_frames: int  # next key frames of the scene whose LiDAR comes along as supervision
     min_distance_m: float  # nearer points are the truck itself
     propagate_points: bool  # move points by their own radial velocity
     on_bad_file: OnBadFile
@@ -67,6 +72,8 @@ class DataConfig:
             "stream_sets": 1,
             "num_workers": 0,
             "num_sweeps": 1,
+            "num_lidar_sweeps": 1,
+            "num_future_frames": 0,
             "min_distance_m": 0,
         }
         for name, least in least_values.items():
@@ -79,15 +86,22 @@ class DataConfig:
 
     def reader_settings(
         self,
-        image_size_px: tuple[int, int] | None,  # (height, width); None leaves images unread
+        sensors: Collection[str],  # of taxonomy.SENSORS: what is read
+        image_size_px: tuple[int, int] | None,  # (height, width); None for a model without images
     ) -> ReaderSettings:
-        """How a frame is read."""
+        """How a frame is read. Raises ValueError for sensors that are none, or a camera without an image size."""
+        if not sensors or not set(sensors) <= set(SENSORS) or ("camera" in sensors and image_size_px is None):
+            raise ValueError(f"sensors must be some of {SENSORS}, a camera with its image size, but got {sensors}")
         return ReaderSettings(
-            num_sweeps=self.num_sweeps,
+            num_sweeps=self.num_sweeps if "radar" in sensors else 0,
+            num_lidar_sweeps=self.num_lidar_sweeps if "lidar" in sensors else 0,
+            lidar_origins=self.lidar_origins,
+            deskew_lidar=self.deskew_lidar,
+            num_future_frames=self.num_future_frames,
             min_distance_m=self.min_distance_m,
             propagate_points=self.propagate_points,
             on_bad_file=self.on_bad_file,
-            image_size_px=image_size_px,
+            image_size_px=image_size_px if "camera" in sensors else None,
             test_resize_offset=self.test_resize_offset,
         )
 
@@ -124,14 +138,14 @@ def in_stream(frame: FrameBatch, stream: int, starts: bool) -> FrameBatch:
 
 
 def drop_sensors(frame: FrameBatch, share: float, draw: tuple[int, ...]) -> FrameBatch:
-    """The frame, or with the probability `share` the same without radar points and images, unless it starts a clip."""
+    """The frame, or with the probability `share` the same without points and images, unless it starts a clip."""
     if frame.starts[0] or np.random.default_rng(draw).random() >= share:
         return frame
-    silent = replace(frame, radar_points=frame.radar_points[:0], radar_batch=frame.radar_batch[:0])
+    names = ("radar_points", "radar_batch", "lidar_points", "lidar_batch", "lidar_origins")
+    changes = {name: getattr(frame, name)[:0] for name in names if getattr(frame, name) is not None}
     if frame.images is not None:
-        images, valid = torch.zeros_like(frame.images), torch.zeros_like(frame.image_valid)
-        silent = replace(silent, images=images, image_valid=valid)
-    return silent
+        changes |= {"images": torch.zeros_like(frame.images), "image_valid": torch.zeros_like(frame.image_valid)}
+    return replace(frame, **changes)
 
 
 class FrameLoader(DataLoader):
@@ -164,15 +178,15 @@ def dead_workers_named() -> Iterator[None]:
     except RuntimeError as error:
         if "DataLoader worker" not in str(error):
             raise
-        remedy = "the usual cause is too little memory: lower data.num_workers, then give the same command to go on"
+        remedy = "the usual cause is too little memory: lower data.num_workers; the same command then resumes"
         raise DataError(f"{str(error).splitlines()[0]}; {remedy}") from error
 
 
 class DetectionDataModule(L.LightningDataModule):
     """Key frames of the training and the validation split as `FrameBatch`.
 
-    `image_size_px` None leaves images unread. `temporal` streams clips, with `streams` and `starts` in every batch;
-    without it training reads shuffled frames and validation reads frames in table order.
+    Of `taxonomy.SENSORS` those in `sensors` are read. `temporal` streams clips, with `streams` and `starts` in every
+    batch; without it training reads shuffled frames and validation reads frames in table order.
     Raises DataError when tables, split or files are not right.
     """
 
@@ -180,7 +194,8 @@ class DetectionDataModule(L.LightningDataModule):
         self,
         config: DataConfig,
         root: Path,
-        image_size_px: tuple[int, int] | None,  # (height, width)
+        sensors: Collection[str],
+        image_size_px: tuple[int, int] | None,  # (height, width); None for a model without images
         seed: int,
         cache: Path,
         *,
@@ -190,7 +205,7 @@ class DetectionDataModule(L.LightningDataModule):
         super().__init__()
         self.config, self.root, self.seed, self.temporal = config, root, seed, temporal
         self.name = name or root.name
-        self.settings = config.reader_settings(image_size_px)
+        self.settings = config.reader_settings(sensors, image_size_px)
         self.index: DatasetIndex = load_index(root, config.version, cache)
         self.reader = FrameReader(self.index, self.settings)
 
@@ -199,7 +214,7 @@ class DetectionDataModule(L.LightningDataModule):
         return evaluation_set(self.index, self.config.split)
 
     def identity(self) -> dict[str, Any]:
-        """What data these are, without machine paths."""
+        """Name, version and splits of the data, without machine paths."""
         return {
             "name": self.name,
             "version": self.config.version,
@@ -256,7 +271,7 @@ class DetectionDataModule(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader:
         """Augmented batches of the training split, shuffled frames or clips.
 
-        It starts where the trainer stands: after `global_step` steps, in the middle of an epoch if need be. One
+        It starts at the trainer's `global_step`, inside an epoch if need be. One
         optimiser step per batch is assumed. Raises DataError when there are too few frames for one batch.
         """
         config, seed, index = self.config, self.seed, self.index
@@ -313,7 +328,7 @@ class DetectionDataModule(L.LightningDataModule):
             pin_memory=torch.cuda.is_available(),
             persistent_workers=workers > 0,
             prefetch_factor=4 if workers else None,
-            worker_init_fn=_as_helper,
+            worker_init_fn=_init_worker,
         )
 
     def transfer_batch_to_device(self, batch: FrameBatch, device: torch.device, dataloader_idx: int) -> FrameBatch:
@@ -337,9 +352,12 @@ def collate(frames: list[FrameBatch | HorizonError]) -> FrameBatch | HorizonErro
             values[field.name] = default_collate([part[0] for part in parts]) if stack else torch.cat(parts)
         elif isinstance(parts[0], list):
             values[field.name] = [item for part in parts for item in part]
-    values["radar_batch"] = torch.repeat_interleave(
-        torch.arange(len(frames)), torch.tensor([len(frame.radar_points) for frame in frames])
-    )
+    for sensor in ("radar", "lidar"):
+        clouds = [getattr(frame, f"{sensor}_points") for frame in frames]
+        if clouds[0] is not None:
+            counts = torch.tensor([len(cloud) for cloud in clouds])
+            values[f"{sensor}_batch"] = torch.repeat_interleave(torch.arange(len(frames)), counts)
+    values["future"] = tuple(collate(list(parts)) for parts in zip(*(frame.future for frame in frames), strict=True))
     values["skipped"] = {
         name: sum(frame.skipped.get(name, 0) for frame in frames) for frame in frames for name in frame.skipped
     }
@@ -358,8 +376,8 @@ def _evenly_spread(samples: np.ndarray, count: int) -> np.ndarray:
     return samples[np.unique(picks)]
 
 
-def _as_helper(worker: int) -> None:
-    """Loader processes share the cores with the training process, and outlive a signal to the whole group for a while.
+def _init_worker(worker: int) -> None:
+    """One thread, since loader processes share the cores; and a delayed end on a signal to the whole process group.
 
     The training process finishes its step on such a signal and needs their batches; it ends them itself afterwards.
     """

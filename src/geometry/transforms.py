@@ -1,6 +1,7 @@
-"""Rotations and rigid transforms in float64 numpy: `dst_from_src`, quaternions as (w, x, y, z).
+"""Rotations and rigid transforms in float64 numpy: `dst_from_src`, quaternions as (w, x, y, z); for torch see
+`tensor_transforms`.
 
-Global coordinates are UTM metres near 5e6, where float32 steps are 0.5 m (spec section 1.1): compose here, cast the
+Global coordinates are UTM metres near 5e6, where float32 steps are 0.5 m (method 1.1): compose here, cast the
 ego-relative result.
 """
 
@@ -23,6 +24,21 @@ def quaternion_to_matrix(
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotation_zyx(
+    yaw: Array | float,  # [...] rad
+    pitch: Array | float,
+    roll: Array | float,
+) -> Array:  # [..., 3, 3]
+    """Rz(yaw) Ry(pitch) Rx(roll); a positive pitch lowers the nose."""
+    cy, sy, cp, sp, cr, sr = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
 def matrix_to_quaternion(

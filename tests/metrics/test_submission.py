@@ -69,7 +69,7 @@ HUGE = 10**400  # JSON has no largest integer
         ("translation", [1.0, 2.0, True], "'translation' must be a list of 3 finite numbers .*, but got bool True"),
         ("size", [1.0, 2.0, 3.0, 4.0], "'size' must be a list of 3 positive numbers of at most 1e.09, but got list"),
         ("size", [1.0, 2.0, 0.0], "'size' must be a list of 3 positive numbers .*, but got float 0.0"),
-        ("translation", [1.0, 2.0, 1e10], "'translation' must be .* finite numbers of at most 1e.09 in size, but got float 1"),
+        ("translation", [1.0, 2.0, 1e10], "'translation' must be .*numbers of at most 1e.09 in size, .*float 1"),
         ("rotation", [0.0, 1e-200, 0.0, 0.0], "'rotation' must be a quaternion"),
         ("size", [1.0, 2.0, math.inf], "'size' must be a list of 3 positive numbers .*, but got float inf"),
         ("rotation", [1.0, 0.0, 0.0], "'rotation' must be a quaternion .*, but got list"),

@@ -165,6 +165,17 @@ def test_only_the_results_were_missing(run, validate_every, ema):
     assert module.seen == [] and found == expected
 
 
+@STOPPED_OFTEN
+def test_the_checkpoint_is_read_once(run, monkeypatch):
+    with pytest.raises(InterruptedRunError):
+        run("stopped", fault=terminate, at_step=4, ema=0.9)
+    load, loads = torch.load, []
+    monkeypatch.setattr(torch, "load", lambda file, **options: loads.append(file.name) or load(file, **options))
+    fault = lambda: loads.append("step 5")  # noqa: E731
+    _, module = run("stopped", fault=fault, at_step=5, ema=0.9)
+    assert module.seen[0] == 5 and [Path(name).name for name in loads[:2]] == ["last.ckpt", "step 5"]
+
+
 def killed_at_save(monkeypatch, number, after):
     """Make the process end at one of its writes of a checkpoint, before or after it."""
     write, saves = AtomicCheckpointIO._write, []
@@ -199,7 +210,7 @@ def test_killed_around_every_write(run, monkeypatch, tmp_path, lost):
                 run(name)
             checkpoints = tmp_path / name / "checkpoints"
             torn = [checkpoints / file for file in lost if (checkpoints / file).is_file()]
-            if len(torn) < len(list(checkpoints.glob("*.ckpt"))):  # with none left, the run does not go on unasked
+            if len(torn) < len(list(checkpoints.glob("*.ckpt"))):  # with none left, the run does not start anew unasked
                 for path in torn:
                     path.write_bytes(path.read_bytes()[:1000])
             found, _ = run(name)
@@ -305,7 +316,7 @@ def outcome(outputs):
 
 
 @pytest.mark.slow
-def test_commands_go_on_as_if_nothing_had_happened(tmp_path):
+def test_commands_resume_as_if_nothing_had_happened(tmp_path):
     """The full model on clips: stopped inside either epoch, by Ctrl-C with loader processes, killed, and not at all."""
     world = tmp_path / "world"
     finish(command(tmp_path / "whole", world))
