@@ -1,4 +1,4 @@
-"""What the numbers were measured on, and what that machine can do at most."""
+"""What the numbers were measured on, and that machine's roofline."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.benchmark.timing import interleaved
+from src.benchmark.timing import clock, interleaved
 from src.report.sweep_text import is_busy
 
 # Square products large enough to reach the highest rate, small enough for seconds on two cores.
@@ -43,7 +43,7 @@ def busy_warning(machine: dict[str, Any]) -> str | None:
         return None
     return (
         f"warning: {machine['load']:.1f} of {machine['cores']} cores were at work when this began: the machine is "
-        "busy, so times are too long; ratios of what was measured in turns still tell; measure again when nothing "
+        "busy, so times are too long; ratios of what was measured in turns still hold; measure again when nothing "
         "else runs"
     )
 
@@ -93,19 +93,19 @@ def measure_roofline(device: torch.device) -> dict[str, float]:
     With torch's number of threads, each the fastest of some rounds. `bf16` is absent where the processor has no
     arithmetic of its own for it, which the rate tells: below that of fp32 nobody would choose it.
     """
-    products = {name: Product(device, dtype) for name, dtype in (("fp32", torch.float32), ("bf16", torch.bfloat16))}
-    timed = interleaved(products, device, ROUNDS)
-    rates = {f"{name}_gflops": product.flops / min(timed[name]) / 1e9 for name, product in products.items()}
+    products = {name: Gemm(device, dtype) for name, dtype in (("fp32", torch.float32), ("bf16", torch.bfloat16))}
+    timed = interleaved(products, clock(device), ROUNDS)
+    rates = {f"{name}_gflops": gemm.flops / min(timed[name]) / 1e9 for name, gemm in products.items()}
     if rates["bf16_gflops"] < rates["fp32_gflops"]:
         del rates["bf16_gflops"]
     size = COPY_BYTES[device.type]
     source = torch.ones(size // 4, device=device)
     target = torch.empty_like(source)
-    seconds = interleaved({"copy": lambda: target.copy_(source)}, device, ROUNDS)["copy"]
+    seconds = interleaved({"copy": lambda: target.copy_(source)}, clock(device), ROUNDS)["copy"]
     return rates | {"copy_gbps": 2 * size / min(seconds) / 1e9}
 
 
-class Product:
+class Gemm:
     """A matrix product large enough to reach the machine's rate; a call makes it, `flops` of arithmetic."""
 
     def __init__(self, device: torch.device, dtype: torch.dtype = torch.float32) -> None:

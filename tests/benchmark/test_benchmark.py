@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from src.benchmark import __main__ as benchmark
-from src.benchmark import convolutions, machine
-from src.benchmark import naive as plain_peers
+from src.benchmark import convolutions, machine, naive
 from src.benchmark import operation_table as operations
 from src.benchmark import suite_model as model
 from src.benchmark import suite_scaling as scaling
@@ -28,7 +27,7 @@ def in_a_hurry(monkeypatch):
     """Few rounds and a small roofline; what is measured stays the same. All operations are rows, not the longest."""
     monkeypatch.setattr(machine, "GEMM_SIZE", {"cpu": 128, "cuda": 128})
     monkeypatch.setattr(machine, "COPY_BYTES", {"cpu": 2**20, "cuda": 2**20})
-    for module in (model, plain_peers, scaling, convolutions):
+    for module in (model, naive, scaling, convolutions):
         monkeypatch.setattr(module, "ROUNDS", 1)
     monkeypatch.setattr(operations, "NUM_ROWS", 1000)
     monkeypatch.setattr(training, "WARM_UP_STEPS", 1)
@@ -83,7 +82,7 @@ def test_parts_that_a_model_lacks_are_left_out(outputs, tmp_path, own, absent):
 
 
 @pytest.mark.slow
-def test_model_of_the_dense_peer(outputs, tmp_path):
+def test_model_of_the_dense_baseline(outputs, tmp_path):
     own = ["suite=model", "model=dense_bev", "phase=phase2"]
     result = measured("model_dense_bev_phase2_debug", outputs, tmp_path, *own)
     parts = column(result["time by part"], "part", "f+b ms")
@@ -109,7 +108,7 @@ def test_ops(outputs, tmp_path, monkeypatch):
     monkeypatch.setattr(convolutions, "DENSE_LIMIT_FLOPS", 1e9)
     result = measured("ops_debug", outputs, tmp_path, "suite=ops")
     layers = result["sparse convolution"]
-    assert {row["mode"] for row in layers} == {"forward", "f+b"} and all(row["% of products"] > 0 for row in layers)
+    assert {row["mode"] for row in layers} == {"forward", "f+b"} and all(row["% of GEMM"] > 0 for row in layers)
     assert any(row.get("x faster than dense") for row in layers)
     assert any("x faster than dense" not in row for row in layers)  # too large
     for row in [*layers, *result["radar backbone"]]:
@@ -124,8 +123,8 @@ def test_ops(outputs, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_scaling(outputs, tmp_path, monkeypatch):
-    small = scaling.Sizes(Highway(100, 10, 5, 150.0), 2, (37.5, 75.0, 150.0))
-    monkeypatch.setattr(scaling, "SIZES", {"debug": small})
+    monkeypatch.setattr(scaling, "ROADS", {"debug": Highway(100, 10, 5, 150.0)})
+    monkeypatch.setattr(scaling, "RANGES_M", {"debug": (37.5, 75.0, 150.0)})
     monkeypatch.setattr(scaling, "NOMINAL_M", 75.0)
     monkeypatch.setattr(scaling, "MEMORY_FRAMES", (0, 2))
     monkeypatch.setattr(scaling, "FACTORS", {name: (0.5, 1.0) for name in scaling.FACTORS})
