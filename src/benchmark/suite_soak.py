@@ -31,7 +31,7 @@ from src.benchmark.timing import chosen_device, clock, median_iqr, status_bytes,
 from src.config import Config
 from src.data.datamodule import DetectionDataModule
 from src.errors import ConfigError
-from src.models.memory import rigid_inverse
+from src.geometry.tensor_transforms import invert_rigid
 from src.streaming import StreamingDetector
 from src.structures.batch import FrameBatch
 from src.training.fit import build_loggers, build_trainer, fit
@@ -136,7 +136,7 @@ def joined(
     before: FrameBatch | None = None
     for frame in frames:
         if before is not None and bool(frame.starts[0]):
-            onward = made_rigid(before.global_from_ego @ step @ rigid_inverse(frame.global_from_ego))
+            onward = made_rigid(before.global_from_ego @ step @ invert_rigid(frame.global_from_ego))
             later_s = before.timestamps_s + step_s - frame.timestamps_s
         moved = replace(
             frame,
@@ -145,7 +145,7 @@ def joined(
             starts=torch.tensor([before is None]),
         )
         if before is not None:
-            step = rigid_inverse(before.global_from_ego) @ moved.global_from_ego
+            step = invert_rigid(before.global_from_ego) @ moved.global_from_ego
             step_s = moved.timestamps_s - before.timestamps_s
         before = moved
         yield moved
