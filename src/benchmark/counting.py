@@ -21,7 +21,6 @@ aten = torch.ops.aten
 # Operations that give out memory without writing it, or names for memory that exists.
 FREE = {aten.detach, aten.alias, aten.empty, aten.empty_strided, aten.empty_like, aten.new_empty, aten.resize_}
 
-
 Shape = tuple[int, ...]
 
 
@@ -51,10 +50,13 @@ FORMULAS: dict[Any, Callable[..., int]] = {
 }
 """What torch's own table lacks."""
 
+# Its table without its context: the hooks of its module tracker add copies of gradients, which would count as traffic.
+FLOPS = FlopCounterMode(display=False, custom_mapping=FORMULAS).flop_registry
+
 
 @dataclass
 class Work:
-    """What ran inside `counted_work`; `flops` are known at its end."""
+    """What ran inside `counted_work`."""
 
     flops: int = 0  # of matrix products, convolutions and attention: two per multiply-add
     bytes: int = 0  # inputs and outputs of every operation but views: the traffic without fusion and without a cache
@@ -69,16 +71,13 @@ def counted_work() -> Iterator[Work]:
     work, chosen = Work(), backend.chosen()
     backend.use(backend.REFERENCE)
     try:
-        with FlopCounterMode(display=False, custom_mapping=FORMULAS) as counter, _TrafficCounter(work):
+        with _Counter(work):
             yield work
-        work.flops = counter.get_total_flops()
     finally:
         backend.use(chosen)
 
 
-class _TrafficCounter(TorchDispatchMode):
-    """Bytes by operation, which torch counts nowhere."""
-
+class _Counter(TorchDispatchMode):
     def __init__(self, work: Work) -> None:
         super().__init__()
         self.work = work
@@ -88,9 +87,12 @@ class _TrafficCounter(TorchDispatchMode):
     ) -> Any:
         kwargs = kwargs or {}
         result = func(*args, **kwargs)
-        if not func.is_view and func.overloadpacket not in FREE:
+        packet = func.overloadpacket
+        if not func.is_view and packet not in FREE:
             inputs = [args, {name: value for name, value in kwargs.items() if name != "out"}]
             self.work.bytes += sum(x.nbytes for x in tree_leaves([inputs, result]) if isinstance(x, Tensor))
+        if packet in FLOPS:
+            self.work.flops += FLOPS[packet](*args, **kwargs, out_val=result)
         return result
 
 

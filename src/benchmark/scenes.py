@@ -47,7 +47,7 @@ ROADS = {
     "mini": Highway(2600, 60, 23, 150.0),
     "debug": Highway(200, 20, 5, 150.0),
 }
-"""The road at a scale; with that of `paper` formulations were chosen: 19 thousand voxels, 8 thousand cells."""
+"""The road of 150 m at a scale."""
 
 
 def highway_points(road: Highway, seed: int = 0) -> Tensor:  # [P, 7] x, y, z (m), rcs (dB), vx, vy (m/s), dt (s)

@@ -20,7 +20,7 @@ from src.benchmark.machine import measure_roofline
 from src.benchmark.naive import SIZES, measure_rest, measure_splat, random_gaussians
 from src.benchmark.operation_table import OPERATIONS_NOTE
 from src.benchmark.page import gpu_notes
-from src.benchmark.scenes import ROADS, highway_points
+from src.benchmark.scenes import highway_points
 from src.benchmark.spconv_baseline import load_spconv
 from src.benchmark.timing import chosen_device
 from src.config import Config
@@ -34,7 +34,7 @@ def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     device, sizes, grid = chosen_device(config), SIZES[config.scale], config.grid.build()
     every = torch.get_num_threads()
     threads = sorted({1, every}) if device.type == "cpu" else [every]
-    points = highway_points(ROADS[config.scale]).to(device)
+    points = highway_points(sizes.road).to(device)
     backbone = Backbone(config.model.radar_encoder, grid, config.model.channels, config.seed)
     encoder = backbone.build().to(device)
     with torch.no_grad():
