@@ -304,7 +304,7 @@ def backbone_operations(backbone: Backbone, points: Tensor) -> dict[str, list[di
 
 
 def memory_of(backbone: Backbone, points: Tensor, kind: str, mode: str, threads: int) -> tuple[float, float] | None:
-    """MiB that a process of its own holds before and at most, None where the system does not tell."""
+    """MiB that a process of its own holds before and at most, None where the system does not report it."""
     if status_bytes("VmRSS") is None:
         return None
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:

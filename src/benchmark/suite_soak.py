@@ -130,7 +130,7 @@ def soak_inference(
 def joined(
     frames: Iterator[FrameBatch],  # clip after clip, batches of one
 ) -> Iterator[FrameBatch]:
-    """The clips as one drive: each goes on where the one before would have gone, at its last speed."""
+    """The clips as one drive: each starts where the one before would have arrived at its last speed."""
     onward = torch.eye(4, dtype=torch.float64)[None]  # joined from own global frame
     later_s, step, step_s = 0.0, onward, KEY_FRAME_S
     before: FrameBatch | None = None
@@ -246,7 +246,7 @@ class Curve:
 
 
 def held(device: torch.device, memory: Any) -> Row:
-    """What the process holds now, MiB and numbers; without what this system does not tell."""
+    """What the process holds now, MiB and numbers; without what this system does not report."""
     objects = gc.get_objects()
     resident = status_bytes("VmRSS")
     workers = [status_bytes("VmRSS", worker.pid) for worker in multiprocessing.active_children()]
@@ -309,7 +309,7 @@ def growth_row(
 ) -> Row:
     """How much everything grows in a thousand frames once it has settled, and the times of two quarters.
 
-    Within a training epoch the clips' memories fill, so only points at the same place of two epochs tell of growth.
+    Within a training epoch the clips' memories fill, so only points at the same place of two epochs show growth.
     """
     last_frame = rows[-1]["frames"]
     settled = [row for row in rows if row["frames"] > max(SETTLED * last_frame, settled_after)]

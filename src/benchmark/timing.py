@@ -75,7 +75,7 @@ def interleaved(
 ) -> dict[str, list[float]]:
     """Seconds of every candidate, called in turns: what else the machine does then slows all of them alike.
 
-    The first call of each does not count: it warms up and tells how many rounds fit into the budget, at least one. If
+    The first call of each does not count: it warms up and sets how many rounds fit into the budget, at least one. If
     it alone takes several times the budget, it is the only one and counts.
     """
     first = {name: seconds_of(function, now) for name, function in candidates.items()}
@@ -142,7 +142,7 @@ def peak_bytes(device: torch.device) -> int:
 
 
 def added_bytes(function: Callable[[], Any], device: torch.device) -> int | None:
-    """The most that a call takes beyond what was held before it; None where the system does not tell.
+    """The most that a call takes beyond what was held before it; None where the system does not report it.
 
     On a GPU what torch allocates; on a CPU pages of the process (Linux), after the allocator has given back what it
     kept of earlier calls. Memory that convolutions use again is part of the call.

@@ -154,7 +154,7 @@ def test_a_disagreement_of_the_metric_is_an_error_after_the_page(tmp_path, monke
     assert "max_difference 0.5" in (tmp_path / "metric.md").read_text()
 
 
-def test_a_folder_that_cannot_be_written_is_told_first(tmp_path):
+def test_a_folder_that_cannot_be_written_is_reported_first(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="out"):
         main(["suite=model", f"out={tmp_path / 'file'}"])

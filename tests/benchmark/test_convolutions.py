@@ -113,6 +113,6 @@ def test_memory_of_a_process_of_its_own():
     backbone, _, points, _ = encoder_of("debug")
     held = memory_of(backbone, points, "ours", "f+b", threads=1)
     if held is None:
-        pytest.skip("the system does not tell what a process holds")
+        pytest.skip("the system does not report what a process holds")
     before, most = held
     assert 50 < before <= most < 4000

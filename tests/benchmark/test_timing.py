@@ -47,11 +47,11 @@ def test_what_is_slow_has_fewer_rounds():
     made = {name: clock.candidate(name, seconds) for name, seconds in each.items()}
     seconds = interleaved(made, clock.now, rounds=6, budget_s=5.0)
     calls = {name: clock.order.count(name) for name in each}
-    assert calls == {"quick": 7, "slow": 3, "slower": 2, "endless": 1}  # the first call of each tells how slow it is
+    assert calls == {"quick": 7, "slow": 3, "slower": 2, "endless": 1}  # the first call of each shows how slow it is
     assert [len(values) for values in seconds.values()] == [6, 2, 1, 1]
 
 
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="the peak of a process is told by Linux only")
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux reports the peak of a process")
 def test_added_memory_is_that_of_the_call():
     held = torch.ones(8 * 2**20)  # 32 MiB that were there before
 
