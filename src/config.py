@@ -211,6 +211,10 @@ class Config:
         for name in ("checkpoint", "predictions", "out", "scene"):
             _refuse_empty(name, getattr(self, name))
         _refuse_empty("data.root", self.data.root)
+        if "lidar" in self.model.sensors and self.data.world is not None and not self.data.world.lidar:
+            raise ConfigError(
+                f"model={self.model.name} reads LiDAR, which this world lacks; give data.world.lidar=true"
+            )
         if self.data.batch_size % self.trainer.num_processes:
             raise ConfigError(
                 f"data.batch_size={self.data.batch_size} is the total over all devices and must be divisible by "
@@ -220,7 +224,7 @@ class Config:
     @property
     def image_size_px(self) -> tuple[int, int] | None:
         """(height, width) of the images that the model uses, None for a model without."""
-        return tuple(self.backbone.image_size_px) if self.model.uses_images else None
+        return tuple(self.backbone.image_size_px) if "camera" in self.model.sensors else None
 
 
 def _refuse_empty(key: str, value: str | None) -> None:

@@ -23,7 +23,7 @@ def test_every_scale_composes(scale, radar_only):
     overrides = [f"scale={scale}", "data.root=x"] + (["model.kggi=null", "model.ocsf=null"] if radar_only else [])
     config, tree = compose_config(overrides)
     assert config.scale == tree["scale"] == scale
-    assert config.model.uses_images is not radar_only
+    assert config.model.sensors == (("radar",) if radar_only else ("camera", "radar"))
     # The range and the cell are those of the paper at every scale.
     assert config.grid.cells == [384, 384] and config.grid.cell_m == 0.8
 
@@ -44,7 +44,7 @@ def test_phase_2_composes_at_every_scale(scale):
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
-def test_the_dense_peer_composes_at_every_scale(scale, phase):
+def test_the_dense_baseline_composes_at_every_scale(scale, phase):
     """At the same range and cell; phase 1 drops what its settings name as temporal."""
     config, tree = compose_config([f"scale={scale}", "data.root=x", "model=dense_bev", f"phase={phase}"])
     model = config.model
@@ -141,7 +141,8 @@ FULL_SIZE = {
     "data": {
         "train_split": "train", "split": "val", "batch_size": 8, "num_sweeps": 10, "min_distance_m": 1.0,
         "propagate_points": False, "on_bad_file": "error", "test_resize_offset": 0.0, "groups_per_scene": 2,
-        "stream_sets": 1, "sensor_dropout": 0.0,
+        "stream_sets": 1, "sensor_dropout": 0.0, "num_lidar_sweeps": 5, "lidar_origins": False, "deskew_lidar": True,
+        "num_future_frames": 0,
     },
     "data.augmentation.image": {"resize": [-0.06, 0.11], "rotation_deg": 5.4, "flip_probability": 0.5},
     "data.augmentation.bev": {"scale": [0.95, 1.05], "rotation_rad": 0.3925, "flip_probability": 0.5},
@@ -274,7 +275,7 @@ def test_a_stored_phase_2_comes_back_with_its_memory():
         restore_config(single, ["model.dptf.max_age_s=0.55"])
 
 
-def test_a_stored_dense_peer_comes_back_as_such():
+def test_a_stored_dense_baseline_comes_back_as_such():
     """Also where the command line says nothing of the model, whose default is another."""
     _, tree = compose_config(["scale=debug", "phase=phase2", "model=dense_bev", "model.temporal.num_frames=3"])
     for named in ([], ["model=dense_bev"]):  # commands compose their line by itself, and then need to be told

@@ -18,7 +18,7 @@ from torch import nn
 
 from src.benchmark.parts import Paths, backward_from, wrapped_parts
 from src.config import Accelerator, Config
-from src.ops.tiled_rulebook import release_scratch
+from src.ops.sparse_conv_tiled import release_scratch
 from src.reliability.processes import check_devices
 
 PATIENCE = 4.0  # a first call that takes so many times what a candidate may take is its only one

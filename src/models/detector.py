@@ -20,8 +20,8 @@ class ModelConfig(Protocol):
     """The key of all that is temporal; phase 1 sets it to null."""
 
     @property
-    def uses_images(self) -> bool:
-        """Whether images are read and encoded."""
+    def sensors(self) -> tuple[str, ...]:
+        """Which of `taxonomy.SENSORS` are read: all that `forward` takes of a batch, and what a submission states."""
 
     @property
     def memory_frames(self) -> int:

@@ -1,4 +1,4 @@
-"""Linear-increasing depth bins and the painted depth target of the camera branch (spec sections 4.2 and 4.3)."""
+"""Linear-increasing depth bins and the painted depth target of the camera branch (method 4.2, 4.3)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from src.errors import ConfigError
-from src.targets.pairs import enumerate_pairs
+from src.geometry.ragged import enumerate_windows
 from src.targets.projection import BoxViews
 
 
@@ -34,7 +34,7 @@ def lid_edges(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
 ) -> Tensor:  # [num_bins + 1] m
-    """Bin edges e_i = low + delta i (i + 1) / 2 with delta = 2 (high - low) / (n (n + 1)) (section 4.2)."""
+    """Bin edges e_i = low + delta i (i + 1) / 2 with delta = 2 (high - low) / (n (n + 1)) (method 4.2)."""
     low, high = depth_range_m
     number = torch.arange(num_bins + 1, dtype=torch.float64)
     edges = low + (high - low) * number * (number + 1) / (num_bins * (num_bins + 1))
@@ -71,7 +71,7 @@ def paint_depth(
     num_bins: int,
     stride_px: int,
 ) -> Tensor:  # [B * N, H / stride, W / stride] int64
-    """Depth bin of the nearest box whose clipped 2D hull covers each cell, -1 for background (section 4.3).
+    """Depth bin of the nearest box whose clipped 2D hull covers each cell, -1 for background (method 4.3).
 
     Boxes out of the depth range are painted, too, and leave background: what stands before an object hides it.
     """
@@ -79,10 +79,7 @@ def paint_depth(
     limit = seen.hulls_px.new_tensor([cols, rows])
     low = (seen.hulls_px[:, :2] / stride_px).floor().long()
     high = torch.minimum((seen.hulls_px[:, 2:] / stride_px).ceil(), limit).long()
-    width, height = (high - low).clamp(min=0).unbind(1)
-    owners, offsets = enumerate_pairs(width * height)
-    row = low[owners, 1] + torch.div(offsets, width[owners], rounding_mode="floor")
-    col = low[owners, 0] + offsets % width[owners]
+    owners, row, col = enumerate_windows(low, high - 1)
     depths = seen.depths_m.new_full((num_views * rows * cols,), torch.inf)
     depths.scatter_reduce_(0, (seen.views[owners] * rows + row) * cols + col, seen.depths_m[owners], "amin")
     return lid_index(depths, depth_range_m, num_bins).view(num_views, rows, cols)

@@ -1,4 +1,4 @@
-"""Targets of the sparse CenterPoint head: Gaussians over non-empty cells and box codes at the nearest ones (7)."""
+"""Targets of the sparse CenterPoint head: Gaussians over active cells and box codes at the nearest ones (method 7)."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.ragged import enumerate_items
 from src.ops.sites import Sites
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CLASSES
-from src.targets.pairs import enumerate_pairs
 from src.targets.supervision import supervised_boxes
 
 HEAD_GROUPS: tuple[tuple[str, ...], ...] = (
@@ -23,7 +23,7 @@ HEAD_GROUPS: tuple[tuple[str, ...], ...] = (
     ("pedestrian", "traffic_cone", "animal"),
     ("traffic_sign",),
 )
-"""Classes that share one set of regression branches and one NMS (table of section 7)."""
+"""Classes that share one set of regression branches and one NMS (table of method 7)."""
 
 GROUP_OF_CLASS: tuple[int, ...] = tuple(
     next(number for number, group in enumerate(HEAD_GROUPS) if name in group) for name in CLASSES
@@ -81,7 +81,7 @@ def head_targets(
     sites: Sites,  # non-empty cells, shape (B, rows, cols)
     grid: BEVGrid,
 ) -> HeadTargets:
-    """Heat map and box codes of a batch (section 7; VoxelNeXt's assignment with our guard).
+    """Heat map and box codes of a batch (method 7; VoxelNeXt's assignment with our guard).
 
     With g = (xy - lower corner) / cell, an object belongs to the non-empty cell j that minimises |(col, row) - g|: a
     cell stands for its lower corner, as in the public heads. Ties go to the lowest key. The heat map is the maximum of
@@ -122,7 +122,7 @@ def _first_of_each_group(boxes: Boxes3D, batch: Tensor) -> tuple[Boxes3D, Tensor
     owner = batch * len(HEAD_GROUPS) + boxes.labels.new_tensor(GROUP_OF_CLASS)[boxes.labels]
     order = owner.argsort(stable=True)
     counts = torch.bincount(owner)
-    kept = order[enumerate_pairs(counts)[1] < MAX_OBJECTS_PER_GROUP].sort().values
+    kept = order[enumerate_items(counts)[1] < MAX_OBJECTS_PER_GROUP].sort().values
     return boxes[kept], batch[kept]
 
 
@@ -142,7 +142,7 @@ def _pairs_in_bands(
     linear = sites.linear()
     start = torch.searchsorted(linear, (batch * height + low) * width)
     stop = torch.searchsorted(linear, (batch * height + high) * width)
-    owners, offsets = enumerate_pairs((stop - start).clamp(min=0))
+    owners, offsets = enumerate_items((stop - start).clamp(min=0))
     rows = start[owners] + offsets
     cells = sites.indices()[:, 1:].to(g.dtype)
     squared = (cells[rows, 1] - g[owners, 0]) ** 2 + (cells[rows, 0] - g[owners, 1]) ** 2

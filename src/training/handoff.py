@@ -19,7 +19,7 @@ from typing import Any
 from torch import nn
 
 from src.errors import CheckpointError, ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
-from src.reliability.checkpoints import load_model_weights, read_checkpoint
+from src.reliability.checkpoints import OpenCheckpoint, load_model_weights, open_checkpoint
 from src.reliability.processes import die_with_parent
 from src.training.identity import is_of, run_identity
 from src.training.run_folder import RunFolder
@@ -37,7 +37,10 @@ OF_THE_LATER_PHASE = (
 """Nor do these, where that run is of the phase before."""
 WEIGHTS_OF_GAUSSIAN_VELOCITY = ("model.loss.dptf_weight", "model.loss.gaussian_velocity_weight")
 """Nor these, unless `model.loss.gaussian_velocity_in_phase1`."""
-INPUT_SETTINGS = ("num_sweeps", "min_distance_m", "propagate_points", "test_resize_offset")
+INPUT_SETTINGS = (
+    *("num_sweeps", "num_lidar_sweeps", "deskew_lidar"),
+    *("min_distance_m", "propagate_points", "test_resize_offset"),
+)
 """Of `data`: what the weights have learnt to see."""
 
 Compose = Callable[[list[str]], tuple[Any, dict[str, Any]]]
@@ -133,25 +136,25 @@ def train_source(source: WeightSource, train_missing: bool, processes_exist: boo
         )
 
 
-def read_source(source: WeightSource) -> dict[str, Any]:
+def open_source(source: WeightSource) -> OpenCheckpoint:
     """The source's checkpoint. Raises CheckpointError with the remedy when it is damaged."""
     try:
-        return read_checkpoint(source.checkpoint)
+        return open_checkpoint(source.checkpoint)
     except CheckpointError as error:
         if source.overrides is None:
             raise
         raise CheckpointError(f"{error}; make it anew with\n    {source.command} resume=restart") from error
 
 
-def hand_over(model: nn.Module, source: WeightSource, tree: dict[str, Any]) -> None:
-    """Give `model` the source's weights; what the new phase adds keeps its own. Settings that differ are logged.
+def hand_over(model: nn.Module, weights: OpenCheckpoint, tree: dict[str, Any]) -> None:
+    """Take the earlier phase's `weights` into `model`; what the new phase adds keeps its own.
 
-    Raises CheckpointError naming every key that does not fit.
+    Settings that differ are logged. Raises CheckpointError naming every key that does not fit.
     """
-    checkpoint = read_source(source)
-    new = load_model_weights(model, checkpoint, source.checkpoint, MAY_BE_NEW)
+    checkpoint = weights.take()
+    new = load_model_weights(model, checkpoint, weights.path, MAY_BE_NEW)
     parts = sorted({key.split(".temporal_attention.")[0].split(".")[0] for key in new})
-    logger.info("weights from %s; new: %d tensors in %s", source.checkpoint, len(new), ", ".join(parts) or "nothing")
+    logger.info("weights from %s; new: %d tensors in %s", weights.path, len(new), ", ".join(parts) or "nothing")
     for key, (old, now) in differing_settings(checkpoint["horizon3d"]["config"], tree).items():
         logger.warning("%s was %s in the run these weights come from and is %s now", key, old, now)
 

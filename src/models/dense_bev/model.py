@@ -63,9 +63,9 @@ class DenseBEVConfig:
                 raise ConfigError(f"model.{name}={getattr(self, name)}: must be at least {least}")
 
     @property
-    def uses_images(self) -> bool:
-        """Always: without cameras there is nothing to fuse."""
-        return True
+    def sensors(self) -> tuple[str, ...]:
+        """Always both: without cameras there is nothing to fuse."""
+        return ("camera", "radar")
 
     @property
     def memory_frames(self) -> int:

@@ -69,9 +69,9 @@ class Horizon3DConfig:
             )
 
     @property
-    def uses_images(self) -> bool:
-        """Whether images are read and encoded."""
-        return self.ocsf is not None
+    def sensors(self) -> tuple[str, ...]:
+        """Radar, and cameras where images are encoded."""
+        return ("camera", "radar") if self.ocsf is not None else ("radar",)
 
     @property
     def memory_frames(self) -> int:

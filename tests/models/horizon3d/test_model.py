@@ -111,7 +111,7 @@ def test_two_samples_do_not_mix(make_model, make_batch):
 def test_radar_only_needs_no_images_and_builds_no_image_part(make_config, make_batch, grid):
     config = make_config(radar_only=True)
     model = Horizon3D(config, grid, None, velocity_code_weight=0.2)
-    assert not config.uses_images and model.image_backbone is None
+    assert config.sensors == ("radar",) and model.image_backbone is None
     output, terms = train_step(model, make_batch(images=False))
     assert set(terms) == {"heatmap", "box", "total"}
     assert output.fused_bev is output.radar_bev
