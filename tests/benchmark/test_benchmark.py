@@ -100,7 +100,7 @@ def test_training(outputs, tmp_path, phase):
         assert all(row[f"{stage} ms"] >= 0 for stage in stages)
         # Medians of three steps each: their sum is near the median of the sum.
         assert sum(row[f"{stage} ms"] for stage in stages) == pytest.approx(row["step ms"], rel=0.8)
-    assert "_SparseConvBackward" in column(result["operations of a step"], "operation", "ms")
+    assert "_TiledSparseConvBackward" in column(result["operations of a step"], "operation", "ms")
 
 
 def test_ops(outputs, tmp_path, monkeypatch):
@@ -115,8 +115,8 @@ def test_ops(outputs, tmp_path, monkeypatch):
         assert row.get("spconv differs by", 0.0) < 1e-5
     assert {row["mode"] for row in result["splat"]} == {"forward", "f+b"}
     backward = column(result["operations of the backbone, f+b"], "operation", "ms")
-    assert "_SparseConvBackward" in backward
-    assert "_SparseConvBackward" not in column(result["operations of the backbone, forward"], "operation", "ms")
+    assert "_TiledSparseConvBackward" in backward
+    assert "_TiledSparseConvBackward" not in column(result["operations of the backbone, forward"], "operation", "ms")
     others = {row["operation"] for row in result["other operations"]}
     assert {"segment sum", "bilinear sampling", "image attention", "farthest points", "box raster", "voxels"} == others
 
