@@ -1,4 +1,4 @@
-"""Radar encoder: points to voxels to a sparse BEV map (VoxelNeXt, spec section 2)."""
+"""Radar encoder: points to voxels to a sparse BEV map (VoxelNeXt; method 2)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from src.ops.sites import Sites
 from src.ops.voxelize import voxelize
 from src.structures.sparse_bev import SparseBEV, SparseMap
 
-# x, y, z (m), rcs (dB), vx, vy (m/s), dt (s) divided by these (spec section 1.3)
+# x, y, z (m), rcs (dB), vx, vy (m/s), dt (s) divided by these (method 1.3)
 POINT_SCALES = (150.0, 150.0, 5.0, 20.0, 20.0, 20.0, 0.5)
 BACKBONE_NORM_EPS = 1e-3
 SHARED_NORM = {"eps": 1e-5, "momentum": 0.1}  # the public code leaves torch's defaults here
@@ -65,7 +65,7 @@ class RadarEncoderConfig:
 
 
 class RadarEncoder(nn.Module):
-    """Radar points to F_R, a sparse map of `channels` on the BEV grid (spec section 2).
+    """Radar points to F_R, a sparse map of `channels` on the BEV grid (method 2).
 
     Stages of submanifold residual blocks run at strides 1, 2, 4 ... voxels; those from the BEV cell on are summed over
     height and stride into one map. A single layer of voxels (pillars) runs the same network in two dimensions.
@@ -173,7 +173,7 @@ class RadarEncoder(nn.Module):
 
 
 def _stage(in_channels: int | None, channels: int, blocks: int, ndim: int, norm: dict[str, float]) -> nn.Sequential:
-    """Residual blocks, behind a convolution of stride 2 unless the stage is the first (`in_channels` None)."""
+    """Residual blocks, after a convolution of stride 2 unless the stage is the first (`in_channels` None)."""
     layers: list[nn.Module] = []
     if in_channels is not None:
         conv = SparseConv(in_channels, channels, 3, ndim, bias=False, stride=2, padding=1)

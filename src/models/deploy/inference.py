@@ -19,7 +19,8 @@ from src.models.backbones.vovnet import ConvNorm
 from src.models.dense_bev.pillars import PillarEncoder
 from src.models.dense_bev.temporal_fusion import TemporalFusion
 from src.models.detector import Detector
-from src.models.heads.center_head import Branches, CenterHead
+from src.models.heads.branches import Branches
+from src.models.heads.center_head import CenterHead
 from src.models.horizon3d.bev_path import BEVPath
 from src.models.horizon3d.gaussian_encoder import AnchorEncoder, Refinement
 from src.models.horizon3d.gaussian_path import GaussianPath

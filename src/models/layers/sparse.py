@@ -92,7 +92,7 @@ class ConvNormReLU(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Two submanifold convolutions with bias and norm around an identity (spec section 2)."""
+    """Two submanifold convolutions with bias and norm around an identity (method 2)."""
 
     def __init__(self, channels: int, ndim: int, eps: float, momentum: float) -> None:
         super().__init__()
