@@ -77,7 +77,7 @@ def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[Detec
     tokens = module.metric.evaluation_set.tokens
     written = save_submission(out / "submission.json", tokens, module.detections, config)
     if module.skipped:
-        print(f"sensor files passed over: {module.skipped.text()}")
+        print(f"skipped sensor files: {module.skipped.text()}")
     return module.scores, written
 
 

@@ -113,6 +113,41 @@ def test_empty_and_full_frames_share_a_batch(data_set):
 
 
 @pytest.mark.parametrize("num_workers", [0, 1])
+def test_what_is_read_follows_from_the_sensors(lidar_set, num_workers, quick_end):
+    chosen = {"num_lidar_sweeps": 2, "num_future_frames": 1, "lidar_origins": True, "num_workers": num_workers}
+    data = module(lidar_set, sensors=("lidar",), **chosen)
+    first, second = data.val_dataloader()
+    assert first.radar_points is None and first.radar_batch is None and first.images is None
+    assert first.lidar_batch.bincount().tolist() == [80, 80] and second.lidar_batch.bincount().tolist() == [80]
+    assert len(first.lidar_origins) == 160
+    (future,) = first.future
+    assert future.tokens == [first.tokens[1], second.tokens[0]] and future.lidar_batch.bincount().tolist() == [40, 40]
+    assert len(second.future[0].lidar_points) == 0  # the scene has ended
+    alone = data.reader.read(4, None)
+    rows = first.lidar_batch == 1
+    assert torch.equal(first.lidar_points[rows], alone.lidar_points)
+    assert torch.equal(first.lidar_origins[rows], alone.lidar_origins)
+    every = next(iter(module(lidar_set, sensors=("lidar", "camera", "radar")).val_dataloader()))
+    assert every.images is not None and len(every.radar_points) and len(every.lidar_points) and every.future == ()
+
+
+@pytest.mark.parametrize("sensors", [(), ("sonar",), ("radar", "sonar")])
+def test_sensors_that_are_none(data_set, sensors):
+    with pytest.raises(ValueError, match="sensors must be some of .*'lidar'"):
+        module(data_set, sensors=sensors)
+
+
+def test_lidar_is_dropped_with_the_other_sensors(lidar_set):
+    chosen = {"sensor_dropout": 0.99, "num_future_frames": 1, "lidar_origins": True}
+    data = module(lidar_set, ("lidar", "radar"), temporal=True, **chosen)
+    first, second, _ = data.stream()
+    assert len(first.lidar_points) and len(first.radar_points)
+    assert second.lidar_points.shape == (0, 5) and second.radar_points.shape == (0, 7)
+    assert second.lidar_origins.shape == (0, 3) and len(second.lidar_batch) == 0
+    assert len(second.future[0].lidar_points)  # what is to be predicted stays
+
+
+@pytest.mark.parametrize("num_workers", [0, 1])
 def test_faults_of_workers_keep_their_message(broken_files, num_workers, quick_end):
     index = load_index(broken_files.root, VERSION, None)
     name = index.filename(index.key_data[4, 4])
@@ -155,6 +190,7 @@ def test_errors_travel_between_processes():
 @pytest.mark.parametrize(
     "change",
     [{"batch_size": 0}, {"groups_per_scene": 0}, {"stream_sets": 0}, {"num_sweeps": 0}, {"num_workers": -1},
+     {"num_lidar_sweeps": 0}, {"num_future_frames": -1},
      {"sensor_dropout": 1.0}, {"sensor_dropout": -0.1}, {"min_distance_m": float("nan")},
      {"test_resize_offset": float("nan")}],
     ids=str,
@@ -198,7 +234,7 @@ def test_identity_holds_no_path(data_set):
     assert str(data_set.root.parent) not in str(module(data_set).identity())
 
 
-def test_streamed_batches_mark_lanes_and_clip_starts(drives):
+def test_streamed_batches_mark_streams_and_clip_starts(drives):
     data = module(drives, ("radar",), temporal=True, batch_size=2)
     index = data.index
     last = {}
@@ -261,8 +297,8 @@ def test_images_are_augmented_frame_by_frame_within_a_clip(data_set):
     torch.testing.assert_close(second.global_from_ego, plain.global_from_ego)  # memory lives here, unaugmented
 
 
-def test_silent_frames_are_never_a_clips_first_and_in_validation_always_the_same(data_set):
-    def silent(loader):
+def test_sensor_dropout_spares_a_clips_first_frame_and_is_always_the_same_in_validation(data_set):
+    def dropped(loader):
         batches = list(loader)
         for batch in batches:
             for row, starts in enumerate(batch.starts):
@@ -276,11 +312,11 @@ def test_silent_frames_are_never_a_clips_first_and_in_validation_always_the_same
 
     streamed = {"temporal": True, "batch_size": 1, "groups_per_scene": 1, "split": "train"}
     made = [module(data_set, seed=seed, sensor_dropout=0.8, **streamed) for seed in (0, 1)]
-    in_validation = [silent(one.val_dataloader()) for one in made]
-    assert in_validation[0] == in_validation[1] == silent(made[0].val_dataloader())
+    in_validation = [dropped(one.val_dataloader()) for one in made]
+    assert in_validation[0] == in_validation[1] == dropped(made[0].val_dataloader())
     frames = [frame.tokens[0] for frame in made[0].stream() if len(frame.radar_points) == 0]
     assert sorted(frames) == sorted(in_validation[0]) and len(frames) > 0
-    assert silent(made[0].train_dataloader()) and not silent(module(data_set, **streamed).train_dataloader())
+    assert dropped(made[0].train_dataloader()) and not dropped(module(data_set, **streamed).train_dataloader())
 
 
 def test_stream_of_scenes(drives):
@@ -347,7 +383,7 @@ def test_poses_that_jump_between_frames(drives, split):
 
 
 @pytest.mark.parametrize("temporal", [False, True])
-def test_training_goes_on_where_the_trainer_stands_and_validation_does_not(drives, temporal):
+def test_training_resumes_at_the_trainers_step_and_validation_does_not(drives, temporal):
     def read(steps, limit=float("inf"), kind="train"):
         data = module(drives, ("radar",), temporal=temporal, batch_size=3)
         data.trainer = SimpleNamespace(world_size=1, global_rank=0, global_step=steps, num_training_batches=limit)
@@ -422,7 +458,7 @@ def fit(data, folder, epochs, checkpoint=None, resume=None, stop_at=None):
 
 
 @pytest.mark.parametrize("num_workers", [0, 1])
-def test_lightning_epochs_differ_and_resume_goes_on(data_set, tmp_path, num_workers):
+def test_lightning_epochs_differ_and_resume(data_set, tmp_path, num_workers):
     def make():
         return module(data_set, ("radar",), batch_size=1, num_workers=num_workers)
 

@@ -1,4 +1,4 @@
-"""Dense peer: radar-camera fusion on a whole BEV map, in the way of BEVFusion (specification 13)."""
+"""Dense baseline: radar-camera fusion on a whole BEV map, in the way of BEVFusion (specification 13)."""
 
 from __future__ import annotations
 
