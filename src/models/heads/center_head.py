@@ -88,6 +88,8 @@ class HeadOutput:
 class Branches(nn.Module):
     """Branches of two kernel-1 layers with the same input, their hidden layers evaluated as one."""
 
+    norm_pairs = (("hidden", "norm"),)
+
     def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
         super().__init__()
         self.hidden = nn.Linear(channels, len(widths) * channels, bias=False)

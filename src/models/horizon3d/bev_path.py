@@ -12,6 +12,7 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
+from src.models.layers.merging import block_diagonal, joined_convs
 from src.models.layers.sparse import ConvNormReLU, RowNorm, SparseKernel, SubmanifoldConv
 from src.models.memory import motions
 from src.ops.segment_reduce import segment_mean, topk_per_sample
@@ -87,6 +88,8 @@ class TemporalConv(SparseKernel):
 class BEVPath(nn.Module):
     """Sparse memory of occupied BEV cells (specification 6.1)."""
 
+    full_precision_parts = ("occupancy.1",)
+
     def __init__(self, config: BEVPathConfig, channels: int, grid: BEVGrid) -> None:
         super().__init__()
         self.config, self.grid = config, grid
@@ -108,6 +111,18 @@ class BEVPath(nn.Module):
     def num_slots(self) -> int:
         """T, the remembered frames and the current one."""
         return self.config.num_frames + 1
+
+    @property
+    def norm_pairs(self) -> list[tuple[str, str]]:
+        """Each temporal convolution has its norm."""
+        return [(f"convs.{number}", f"norms.{number}") for number in range(len(self.convs))]
+
+    def merge_for_inference(self) -> None:
+        """Occupancy and velocity read the same cells: one convolution and one linear layer for both."""
+        (occupancy, first), (velocity, second) = self.occupancy, self.velocity
+        occupancy.conv = joined_convs([occupancy.conv, velocity.conv])
+        self.occupancy = nn.ModuleList([occupancy, block_diagonal([first, second])])
+        self.velocity = None
 
     def predict(self, fused: SparseBEV) -> CellPrediction:
         """Occupancy and velocity of every cell of F_fuse."""

@@ -22,6 +22,8 @@ class SparseFusion(nn.Module):
     cells only, and the first convolution and the shortcut read the branches stacked instead of side by side.
     """
 
+    norm_pairs = (("conv1", "norm1"), ("conv2", "norm2"))
+
     def __init__(self, channels: int, gate_kernel_size: int) -> None:
         super().__init__()
         both = 2 * channels

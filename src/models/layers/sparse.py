@@ -80,6 +80,8 @@ class RowNorm(nn.BatchNorm1d):
 class ConvNormReLU(nn.Module):
     """A sparse convolution, batch norm and ReLU."""
 
+    norm_pairs = (("conv", "norm"),)
+
     def __init__(self, conv: SubmanifoldConv | SparseConv, eps: float, momentum: float) -> None:
         super().__init__()
         self.conv = conv
@@ -92,6 +94,8 @@ class ConvNormReLU(nn.Module):
 
 class ResidualBlock(nn.Module):
     """Two submanifold convolutions with bias and norm around an identity (spec section 2)."""
+
+    norm_pairs = (("conv1", "bn1"), ("conv2", "bn2"))
 
     def __init__(self, channels: int, ndim: int, eps: float, momentum: float) -> None:
         super().__init__()
