@@ -14,8 +14,8 @@ from src.metrics.submission import write_submission
 from src.models import build_model as build_model_of
 from src.models.detector import Detector
 from src.structures.detections import DetectionTable
-from src.training.module import DetectionModule
-from src.training.temporal_module import TemporalModule
+from src.training.module import TrainingModule
+from src.training.phases import EVALUATORS, MODULES
 from src.world.write import ensure_world, world_digest
 
 logger = logging.getLogger(__name__)
@@ -60,12 +60,10 @@ def build_datamodule(config: Config, root: Path) -> DetectionDataModule:
 
 def build_model(config: Config) -> Detector:
     """The configured detector with fresh weights (and pretrained backbone weights where given)."""
-    return build_model_of(
-        config.model, config.grid.build(), config.backbone, velocity_code_weight=config.phase.velocity_code_weight
-    )
+    return build_model_of(config.model, config.grid.build(), config.backbone, config.phase.options)
 
 
-def save_submission(path: Path, tokens: list[str], table: DetectionTable, config: Config) -> bool:
+def save_submission(config: Config, path: Path, tokens: list[str], table: DetectionTable) -> bool:
     """Write boxes of these samples as a submission; False, with a warning and no file, when there is none."""
     if not len(table):
         path.unlink(missing_ok=True)  # of an earlier command, whose boxes these are not
@@ -74,8 +72,7 @@ def save_submission(path: Path, tokens: list[str], table: DetectionTable, config
     max_age_s = config.model.memory_max_age_s  # the benchmark's rules are about how far back a detector looks
     memory = "no memory" if max_age_s is None else f"memory of up to {max_age_s:g} s"
     meta = {
-        "use_camera": config.model.uses_images,
-        "use_radar": True,
+        **{f"use_{sensor}": sensor in config.model.sensors for sensor in ("camera", "lidar", "radar")},
         "method_name": config.model.name,
         "description": f"scale {config.scale}, seed {config.seed}, {memory}",
     }
@@ -83,14 +80,13 @@ def save_submission(path: Path, tokens: list[str], table: DetectionTable, config
     return True
 
 
-def build_module(config: Config, tree: dict[str, Any], datamodule: DetectionDataModule) -> DetectionModule:
+def build_module(config: Config, tree: dict[str, Any], datamodule: DetectionDataModule) -> TrainingModule:
     """The LightningModule of a run; `tree` is the configuration as plain values."""
-    kind = TemporalModule if config.phase.temporal else DetectionModule
-    return kind(
+    return MODULES[config.phase.module](
         build_model(config),
         optim=config.optim,
         backbone_lr_multiplier=config.backbone.lr_multiplier,
-        evaluation_set=datamodule.evaluation_set(),
+        evaluator=EVALUATORS[config.phase.task].of(datamodule),
         seed=config.seed,
         config=tree,
         skip_nonfinite=config.trainer.on_nonfinite is OnNonfinite.skip,

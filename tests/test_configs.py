@@ -23,7 +23,7 @@ def test_every_scale_composes(scale, radar_only):
     overrides = [f"scale={scale}", "data.root=x"] + (["model.kggi=null", "model.ocsf=null"] if radar_only else [])
     config, tree = compose_config(overrides)
     assert config.scale == tree["scale"] == scale
-    assert config.model.uses_images is not radar_only
+    assert ("camera" in config.model.sensors) is not radar_only
     # The range and the cell are those of the paper at every scale.
     assert config.grid.cells == [384, 384] and config.grid.cell_m == 0.8
 
@@ -223,7 +223,7 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["model=dense_bev", "model.view_transform.image_stride_px=0"], "image_stride_px=0"),
         (["model=dense_bev", "phase=phase2", "model.temporal.num_frames=0"], "num_frames=0.*model.temporal=null"),
         (["phase=phase2", "phase.name=phase1"], "phase.name=phase1.*phase=\\.\\.\\."),
-        (["phase.velocity_code_weight=-1"], "velocity_code_weight"),
+        (["phase.options.velocity_code_weight=-1"], "velocity_code_weight"),
         (["optim.final_lr_ratio=-1"], "final_lr_ratio"),
         (["trainer.accelerator=cuda9"], "accelerator.*gpu"),
         (["trainer.num_pictures=-1"], "num_pictures"),

@@ -197,7 +197,7 @@ def make_case(config: Config, point: Point, device: torch.device) -> Case:
     torch.manual_seed(config.seed)
     grid = grid_of(config, point.range_m)
     settings = model_settings(config, point)
-    model = build_model(settings, grid, config.backbone, velocity_code_weight=config.phase.velocity_code_weight)
+    model = build_model(settings, grid, config.backbone, config.phase.options)
     bf16 = config.precision == "bf16-mixed"
     prepared = prepare_for_inference(model.to(device), bf16)
     batch = highway_frame(highway_points(point.road), tuple(config.backbone.image_size_px)).to(device)

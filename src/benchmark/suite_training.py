@@ -18,7 +18,7 @@ from src.benchmark.timing import chosen_device, clock, median_spread, peak_bytes
 from src.config import Config
 from src.data.datamodule import DetectionDataModule
 from src.structures.batch import FrameBatch
-from src.training.module import DetectionModule
+from src.training.module import TrainingModule
 from src.training.optim import CyclicSchedule, build_optimizer
 
 WARM_UP_STEPS = 5  # first calls choose algorithms, fill the allocator and the loader's queue
@@ -90,7 +90,7 @@ def endless_batches(datamodule: DetectionDataModule) -> Iterator[FrameBatch]:
 
 
 def run_steps(
-    module: DetectionModule, source: Iterator[FrameBatch], device: torch.device, autocast: bool
+    module: TrainingModule, source: Iterator[FrameBatch], device: torch.device, autocast: bool
 ) -> tuple[tuple[dict[str, list[float]], list[int]], list[FrameBatch]]:
     """Seconds of each stage of the measured steps with the frames of each, and all batches that came."""
     now, model = clock(device), module.model
@@ -114,7 +114,7 @@ def run_steps(
 
 
 def timed_step(
-    module: DetectionModule,
+    module: TrainingModule,
     batch: FrameBatch,
     optimizer: torch.optim.Optimizer,
     schedule: CyclicSchedule,
@@ -128,12 +128,12 @@ def timed_step(
         warnings.filterwarnings("ignore", message=".*self.trainer.*")  # nothing is logged without a trainer
         begin = now()
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=autocast):
-            total = module.training_step(batch, 0)
+            objective = module.objective(batch)
         computed = now()
         optimizer.zero_grad(set_to_none=True)
-        total.backward()
+        objective.terms["total"].backward()
         derived = now()
-        module.configure_gradient_clipping(optimizer)
+        module.clip_gradients_or_skip(batch, objective)
         optimizer.step()
         schedule.step()
         end = now()

@@ -27,10 +27,16 @@ def build_model(
 ) -> Detector:
     """The detector that a configuration asks for, with fresh weights. Raises ConfigError when its parts do not fit."""
     _, family = FAMILIES[config.name]
+    return family(config, grid, backbone, read_phase_options(config.name, options))
+
+
+def read_phase_options(name: str, options: Mapping[str, Any]) -> Any:
+    """`phase.options` as a family's own dataclass. Raises ConfigError for others than it takes."""
+    _, family = FAMILIES[name]
     known = [field.name for field in dataclasses.fields(family.phase_options)]
     if set(options) != set(known):
         raise ConfigError(
-            f"phase.options has {', '.join(sorted(options)) or 'nothing'}, but model={config.name} takes "
+            f"phase.options has {', '.join(sorted(options)) or 'nothing'}, but model={name} takes "
             f"{', '.join(known) or 'nothing'}"
         )
-    return family(config, grid, backbone, family.phase_options(**options))
+    return family.phase_options(**options)

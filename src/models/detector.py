@@ -73,7 +73,7 @@ class Detector(nn.Module, ABC):
     """
 
     phase_options: ClassVar[type]
-    """Dataclass of what a phase says to this family, `phase.options`; an instance is the constructor's last argument."""
+    """Dataclass of what a phase says to this family, `phase.options`; an instance is the constructor's last."""
     benchmark_parts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """Parts worth looking into, beside the model's children: by name the methods, `ocsf.encoder.forward`, or functions,
     `package.module:function`, that each is; `part: inner` lies within `part`."""

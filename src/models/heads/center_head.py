@@ -256,7 +256,11 @@ class CenterHead(nn.Module):
         box term is 0 with zero gradients.
         """
         targets = self.targets(output, boxes)
-        counts = {"objects": len(targets.rows), "distant_objects": targets.num_distant, "shared_objects": targets.num_shared}
+        counts = {
+            "objects": len(targets.rows),
+            "distant_objects": targets.num_distant,
+            "shared_objects": targets.num_shared,
+        }
         diagnostics = {
             name: torch.as_tensor(count / len(boxes), dtype=torch.float32, device=output.logits.device)
             for name, count in counts.items()
