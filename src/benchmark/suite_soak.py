@@ -32,8 +32,8 @@ from src.benchmark.timing import chosen_device, clock, median_spread, replaced_m
 from src.config import Config
 from src.data.datamodule import DetectionDataModule
 from src.errors import ConfigError
+from src.geometry.tensor_transforms import invert_rigid
 from src.models.detector import Detector
-from src.models.memory import rigid_inverse
 from src.reliability.checkpoints import load_model_weights, read_checkpoint
 from src.streaming import StreamingDetector
 from src.structures.batch import FrameBatch
@@ -153,7 +153,7 @@ def joined(
     before: FrameBatch | None = None
     for frame in frames:
         if before is not None and bool(frame.starts[0]):
-            onward = made_rigid(before.global_from_ego @ step @ rigid_inverse(frame.global_from_ego))
+            onward = made_rigid(before.global_from_ego @ step @ invert_rigid(frame.global_from_ego))
             later_s = before.timestamps_s + step_s - frame.timestamps_s
         moved = replace(
             frame,
@@ -162,7 +162,7 @@ def joined(
             starts=torch.tensor([before is None]),
         )
         if before is not None:
-            step = rigid_inverse(before.global_from_ego) @ moved.global_from_ego
+            step = invert_rigid(before.global_from_ego) @ moved.global_from_ego
             step_s = moved.timestamps_s - before.timestamps_s
         before = moved
         yield moved

@@ -1,4 +1,4 @@
-"""`python -m src.dashboard [port=8000] [export=FILE]`: sweeps and runs to look at, live on this machine or as one file.
+"""`python -m src.dashboard [port=8000] [export=FILE]`: sweeps and runs in the browser, live or as one file.
 
 Does without the run's configuration, and so without torch: the dashboard is there within a second.
 """

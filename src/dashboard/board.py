@@ -21,7 +21,7 @@ from src.report.time_left import seconds_left
 
 logger = logging.getLogger(__name__)
 STALLED_S = 120.0
-"""A runner whose runs write neither log nor numbers for this long has probably ended without a word."""
+"""A runner whose runs write neither log nor metrics for this long has probably been killed."""
 LARGEST_BYTES = 64_000_000
 """Of a record or a result; those of the largest sweeps have a hundredth of it."""
 SCALES = ("paper", "mini", "debug")
@@ -46,11 +46,11 @@ class Sweep:
 
     @property
     def state(self) -> str:
-        """`done`, `running`, `stalled` (a run runs, and the runner is silent), `unfinished`, or `failed`."""
+        """`done`, `running`, `stalled` (a run is running, and nothing is written), `unfinished`, or `failed`."""
         if self.record.count("running"):
-            return "stalled" if self.silent_s > STALLED_S else "running"
+            return "stalled" if self.idle_s > STALLED_S else "running"
         if self.record.count("waiting") or self.record.unchosen:
-            return "unfinished" if self.silent_s > STALLED_S else "running"
+            return "unfinished" if self.idle_s > STALLED_S else "running"
         return "failed" if self.record.count("failed") else "done"
 
     @property
@@ -59,7 +59,7 @@ class Sweep:
         return {"failed": "ended with failures", "unfinished": "not finished"}.get(self.state, self.state)
 
     @property
-    def silent_s(self) -> float:
+    def idle_s(self) -> float:
         """How long ago the runner, or what it runs, last wrote."""
         return max(0.0, self.now - self.written)
 
@@ -74,7 +74,7 @@ class Run:
     """One run: finished (with a result), of a sweep, or a folder that is being trained in."""
 
     run_id: str
-    state: str  # of a sweep record, or `stopped`: unfinished and silent, not part of a sweep
+    state: str  # of a sweep record, or `stopped`: unfinished and idle, not part of a sweep
     result: RunResult | None = None
     planned: RunState | None = None
     has_folder: bool = False
@@ -140,7 +140,7 @@ class Board:
         return next((sweep for sweep in self.sweeps if sweep.key == key), None)
 
     def baseline_of(self, run: Run) -> tuple[Run, str] | None:
-        """What a run is held against, with its name: its sweep's baseline row of the same seed, else plain defaults."""
+        """What a run is compared with, and its name: its sweep's baseline row of the same seed, else plain defaults."""
         for key, label in run.rows:
             record = self.sweep(key).record
             baseline = record.sweep.baseline_of(label) if label in record.rows else None
@@ -179,7 +179,7 @@ class BoardReader:
             stamps = {path: stamp for kind in ("sweeps", "results") for path, stamp in _stamps(self.reports / kind)}
             unfinished = {name: folders.written(name) for name in names if not folders.has_result(name)}
             mark = (tuple(stamps.items()), tuple(unfinished.items()), tuple(names))
-            # What is shown of time itself (time left, silent for) moves on in steps while something runs.
+            # Times on the page (left, idle) advance in steps while something runs.
             step = 15.0 if self._board is not None and self._board.live else 600.0
             if self._board is None or mark != self._mark or now - self._board.now > step:
                 self._board, self._mark = self._assemble(stamps, names, unfinished, folders, now), mark
@@ -207,7 +207,7 @@ class BoardReader:
             try:
                 sweep = self._sweep(record, results, folders, now)
                 _ = sweep.state, sweep.left_s, [settings_of(run.overrides) for run in record.runs.values()]
-            except Exception as error:  # whatever a record holds, the others are shown
+            except Exception as error:  # one bad record must not hide the others
                 logger.exception("%s cannot be shown", path)
                 broken[str(path.relative_to(self.reports))] = f"{type(error).__name__}: {error}"
             else:
@@ -253,14 +253,14 @@ class BoardReader:
             content = read_record(path) if path.parent.name == "sweeps" else read_result(path)
         except DataError as error:
             content = error
-        except Exception as error:  # whatever a file holds, the others are shown
+        except Exception as error:  # one bad file must not hide the others
             logger.exception("%s cannot be read", path)
             content = DataError(f"{path}: not readable ({type(error).__name__}: {error}); delete it")
         self._files[path] = (stamp, content)
         return content
 
     def _refuse(self, path: Path, stamp: Stamp) -> None:
-        """Raises DataError for a file that is not looked into."""
+        """Raises DataError for a file that is not read."""
         if not path.resolve().is_relative_to(self.reports.resolve()):
             raise DataError(f"{path}: a link that leads out of the reports folder, which is not followed; delete it")
         if not path.is_file():

@@ -189,7 +189,7 @@ def curve_figures(curves: dict[str, Iterable[dict[str, Sequence[tuple[float, flo
 
 
 def run_figures(board: Board, runs: dict[str, Run]) -> dict[str, list[Markup]]:
-    """The figures of a run, or of runs held against one another, by section."""
+    """The figures of a run, or of runs side by side, by section."""
     results = {label: [run.result] for label, run in runs.items() if run.result is not None}
     sections = {
         "Learning curves": curve_figures({label: board_curves(board, [run]) for label, run in runs.items()}),

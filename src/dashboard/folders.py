@@ -1,7 +1,7 @@
 """What lies in the run folders of paths.outputs: pictures, logs, learning curves so far. Reads, never writes.
 
-Names that come from an address are looked up among what a folder lists, never joined to a path unseen, and a link that
-leads out of its folder is as good as no file.
+Names that come from an address are looked up among what a folder lists, never joined to a path unchecked, and a link
+that leads out of its folder counts as missing.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 from src.report.plain_yaml import load_plain_yaml
-from src.report.results import thinned, without_places
+from src.report.results import thinned, without_local_paths
 
 TAIL_BYTES = 24_000
 CONFIG_BYTES = 1_000_000
@@ -109,7 +109,7 @@ class RunFolders:
             return None
         if size > TAIL_BYTES:
             text = f"[the last lines of {size // 1000} kB]\n{text.partition(chr(10))[2]}"
-        for place in (f"{self.outputs}/", f"{Path.cwd()}/"):  # the exported file says nothing of where it was made
+        for place in (f"{self.outputs}/", f"{Path.cwd()}/"):  # an exported file must not show local paths
             text = text.replace(place, "")
         # A progress bar rewrites its line: what stands after the last carriage return is what a terminal shows.
         return "\n".join(line.rstrip("\r").rpartition("\r")[2] for line in text.split("\n")).strip()
@@ -128,7 +128,7 @@ class RunFolders:
             tree = load_plain_yaml(path.read_text())
         except (OSError, ValueError, yaml.YAMLError):
             return {}
-        return without_places(tree) if isinstance(tree, dict) else {}
+        return without_local_paths(tree) if isinstance(tree, dict) else {}
 
     def written(self, run_id: str, log: str | None = None) -> float | None:
         """When a run last wrote numbers, a checkpoint or a line of a log; seconds since 1970, None without a trace."""

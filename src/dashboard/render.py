@@ -96,18 +96,18 @@ class Renderer:
 
     def sweep(self, board: Board, sweep: Sweep) -> Page:
         """One sweep: tables, figures, runs, failures; or why it cannot be shown."""
-        return self._guarded(f"sweep-{sweep.key}", sweep.key, lambda: self._sweep(board, sweep))
+        return self._page_or_error(f"sweep-{sweep.key}", sweep.key, lambda: self._sweep(board, sweep))
 
     def run(self, board: Board, run: Run, against: Run | None = None) -> Page:
-        """One run, alone beside its baseline's numbers, or held against another one; or why it cannot be shown."""
-        return self._guarded(f"run-{run.run_id}", run.run_id, lambda: self._run(board, run, against))
+        """One run, alone beside its baseline's numbers, or side by side with another one; or why it cannot be shown."""
+        return self._page_or_error(f"run-{run.run_id}", run.run_id, lambda: self._run(board, run, against))
 
     def compare(self, board: Board) -> Page:
         """Where the exported file puts two runs side by side; or why it cannot be shown."""
-        return self._guarded("compare", "Two runs side by side", lambda: self._compare(board))
+        return self._page_or_error("compare", "Two runs side by side", lambda: self._compare(board))
 
-    def _guarded(self, page_id: str, title: str, draw: Callable[[], Page]) -> Page:
-        """The page, or one with the message of whatever a record or a result makes fail: others are still shown."""
+    def _page_or_error(self, page_id: str, title: str, draw: Callable[[], Page]) -> Page:
+        """The page, or one with the error message where a record or a result makes it fail: others are still shown."""
         try:
             return draw()
         except Exception as error:
@@ -182,7 +182,7 @@ class Renderer:
             figures=run_figures(board, shown),
             choices=_other_runs(board, run) if self.live else [], command=train_command(run),
             progress=_progress(board, run),
-            silent=max(0.0, board.now - (board.folders.written(run.run_id) or board.now)),
+            idle=max(0.0, board.now - (board.folders.written(run.run_id) or board.now)),
         )  # fmt: skip
         return Page(id=f"run-{run.run_id}", title=run_name(run), content=content)
 
@@ -313,7 +313,7 @@ def signed(value: float, digits: int) -> str:
 
 
 def _other_runs(board: Board, run: Run) -> list[Run]:
-    """What a run can be held against, those of its own scale first."""
+    """Runs that a run can be compared with, those of its own scale first."""
     others = [(other.scale != run.scale, run_name(other), other.run_id) for other in board.runs.values()]
     return [board.runs[run_id] for *_, run_id in sorted(others) if run_id != run.run_id]
 

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
+from src.geometry.tensor_transforms import rotate_back
 
 # Closed rectangles: a cell centre on the edge counts, whatever the rounding of its coordinates says.
 EDGE_TOLERANCE_M = 1e-6
@@ -58,9 +59,8 @@ def cells_in_boxes(
     box, row, col, _ = window_cells(centres, reach / grid.cell_m, grid)
     offset = (torch.stack([col, row], 1) - centres.index_select(0, box)) * grid.cell_m  # [pairs, 2] m
     cosine, sine, half = cosine.index_select(0, box), sine.index_select(0, box), half.index_select(0, box)
-    inside = ((cosine * offset[:, 0] + sine * offset[:, 1]).abs() <= half[:, 0]) & (
-        (cosine * offset[:, 1] - sine * offset[:, 0]).abs() <= half[:, 1]
-    )
+    along, across = rotate_back(cosine, sine, *offset.unbind(1))
+    inside = (along.abs() <= half[:, 0]) & (across.abs() <= half[:, 1])
     box, cell = box[inside], (row * grid.cols + col)[inside]
 
     bare = torch.bincount(box, minlength=len(boxes)) == 0

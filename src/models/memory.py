@@ -9,6 +9,7 @@ from typing import Generic, Self, TypeVar
 import torch
 from torch import Tensor
 
+from src.geometry.tensor_transforms import invert_rigid
 from src.structures.batch import MAX_EGO_SPEED_MPS, FrameBatch
 
 
@@ -48,7 +49,7 @@ class RememberedFrame:
 
     def _way_to(self, batch: FrameBatch) -> tuple[Tensor, Tensor, Tensor]:
         """[B, 4, 4] and [B] s from here to the batch, float64, and whether a vehicle can drive it in that time [B]."""
-        ego_from_past = rigid_inverse(batch.global_from_ego) @ self.global_from_ego
+        ego_from_past = invert_rigid(batch.global_from_ego) @ self.global_from_ego
         elapsed = batch.timestamps_s - self.timestamps_s
         distance = ego_from_past[..., :3, 3].norm(dim=-1)
         return ego_from_past, elapsed, (elapsed > 0) & (distance <= MAX_EGO_SPEED_MPS * elapsed)
@@ -132,15 +133,3 @@ class FrameMemory(Generic[Frame]):
             return cls(())
         kept = torch.stack([frame.present.any() for frame in frames]).tolist()  # one look, since a GPU waits for it
         return cls(tuple(frame for frame, wanted in zip(frames, kept, strict=True) if wanted))
-
-
-def rigid_inverse(
-    dst_from_src: Tensor,  # [..., 4, 4] rotation and translation
-) -> Tensor:  # [..., 4, 4]
-    """Inverse of rigid transforms, without a general solve."""
-    rotation = dst_from_src[..., :3, :3].transpose(-1, -2)
-    inverse = torch.zeros_like(dst_from_src)
-    inverse[..., :3, :3] = rotation
-    inverse[..., :3, 3] = -(rotation @ dst_from_src[..., :3, 3:]).squeeze(-1)
-    inverse[..., 3, 3] = 1.0
-    return inverse

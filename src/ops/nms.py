@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from src.geometry.tensor_transforms import rotate_back
 from src.ops.kernel_maps import submanifold_map
 from src.ops.sites import Sites
 
@@ -187,8 +188,7 @@ def _intersection(
     formula: shared edges, equal boxes and nearly parallel sides need no special case.
     """
     cosine, sine = b[:, 4].cos(), b[:, 4].sin()
-    shift = a[:, :2] - b[:, :2]
-    centre = torch.stack([cosine * shift[:, 0] + sine * shift[:, 1], cosine * shift[:, 1] - sine * shift[:, 0]], 1)
+    centre = torch.stack(rotate_back(cosine, sine, *(a[:, :2] - b[:, :2]).unbind(1)), 1)
     turn = a[:, 4] - b[:, 4]
     along = torch.stack([turn.cos(), turn.sin()], 1) * 0.5 * a[:, 2:3]
     across = torch.stack([-turn.sin(), turn.cos()], 1) * 0.5 * a[:, 3:4]

@@ -8,21 +8,9 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
 from src.ops.backend import implementation, register
-from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
+from src.ops.kernel_maps import KernelMap
 from src.ops.segment_reduce import gather_segment_sum
-from src.ops.sites import Sites, union
 from src.ops.tiled_rulebook import scratch, tiled_rulebook
-
-__all__ = [
-    "KernelMap",
-    "Sites",
-    "neighbour_sum",
-    "sparse_conv",
-    "strided_map",
-    "submanifold_map",
-    "temporal_map",
-    "union",
-]
 
 # Types of the grouped product, one kernel launch for all offsets; others, and torch without it, go offset by offset.
 GROUPED_DTYPES = (torch.float32, torch.bfloat16, torch.float16) if hasattr(F, "grouped_mm") else ()

@@ -12,6 +12,7 @@ from torch.autograd.function import FunctionCtx
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import window_cells
+from src.geometry.tensor_transforms import rotate_back
 from src.ops.backend import implementation, register
 from src.ops.segment_reduce import gather_segment_sum, weighted_segment_sum
 from src.ops.sites import Sites
@@ -149,9 +150,8 @@ def gaussian_cells(
     table = torch.cat([nearest, rest, directions, scales], 1).index_select(0, gaussian)
     base_x, base_y, rest_x, rest_y, cosine, sine, size_x, size_y = table.unbind(1)  # [candidates] each
     delta_x, delta_y = (col - base_x) * grid.cell_m - rest_x, (row - base_y) * grid.cell_m - rest_y
-    along = (cosine * delta_x + sine * delta_y) / size_x
-    across = (cosine * delta_y - sine * delta_x) / size_y
-    q = along.square() + across.square()
+    along, across = rotate_back(cosine, sine, delta_x, delta_y)
+    q = (along / size_x).square() + (across / size_y).square()
     near = (q <= support_sigmas**2).nonzero().squeeze(1)
 
     gaussian = gaussian.index_select(0, near)  # ascending
@@ -230,7 +230,7 @@ class _Distance(torch.autograd.Function):
         pairs: GaussianCellPairs = ctx.pairs
         cosine, sine, size_x, size_y = torch.cat([directions, scales], 1).index_select(0, pairs.gaussian).unbind(1)
         delta_x, delta_y = pairs.delta.unbind(1)
-        along, across = cosine * delta_x + sine * delta_y, cosine * delta_y - sine * delta_x
+        along, across = rotate_back(cosine, sine, delta_x, delta_y)
         push_x, push_y = 2 * grad * along / size_x.square(), 2 * grad * across / size_y.square()  # dL/du, u = R^T d
         sums = _gaussian_sum(
             torch.stack(

@@ -14,7 +14,7 @@ from src.pictures.comparison import BarPanel, draw_comparison
 from src.reliability.command import run_command
 from src.report.atomic_write import write_whole
 from src.report.metric_names import RANGES, SPEEDS
-from src.report.pages import PHASES_OF, compared_experiments, comparison_page, phase_page, runs_on_page, seeing
+from src.report.pages import PHASES_OF, compared_experiments, comparison_page, phase_page, runs_on_page, without_dropout
 from src.report.results import RunResult, finished_runs, publish_result, read_results
 from src.report.score_tables import BY_RANGE, BY_SPEED, ERROR_BY_SPEED, Experiment, mean_and_spread
 from src.report.sweep_record import SweepRecord, read_records
@@ -84,7 +84,7 @@ def write_page(reports: Path, phase: str, scale: str, runs: list[RunResult]) -> 
     if phase in PHASES_OF:
         experiments = compared_experiments(runs)
         picture = f"pictures/{phase}_{scale}.png"
-        draw_comparison(reports / picture, bar_panels(seeing(experiments)), f"{phase}, scale {scale}")
+        draw_comparison(reports / picture, bar_panels(without_dropout(experiments)), f"{phase}, scale {scale}")
         text = comparison_page(experiments, scale, picture)
     else:
         text = phase_page(runs, scale)

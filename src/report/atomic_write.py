@@ -10,7 +10,7 @@ from pathlib import Path
 def write_whole(path: Path, text: str) -> None:
     """Write a text file in one step, and make its folder.
 
-    Raises OSError with the file's name for whatever the machine refuses, such as a full disk; what stood there stays.
+    Raises OSError with the file's name for any failure to write, such as a full disk; an older file then stays.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:

@@ -1,4 +1,4 @@
-"""Labels and notes that people write, into markup: whatever they hold is shown and never obeyed."""
+"""Escaping of labels and notes in markup: whatever people write is shown and never interpreted."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from src.training.identity import key_of
 PHASES_OF = {"phase2": ("phase1", "phase2")}
 """Whose runs a phase's page reads; other phases' pages read their own."""
 
-GOES_ON = "phase.init_from="
+INIT_FROM = "phase.init_from="
 CONTINUED = "phase 1, as many further epochs"
 
 NAMES = {
@@ -50,9 +50,9 @@ NAMES_OF_COMPARISON = {
         "model.dptf.gaussian_path.velocity_compensation=false",
     ): "phase 2, no velocity compensation",
 }
-"""By phase and sorted settings, in the order of the page; phase 1 that went on stands after phase 1."""
+"""By phase and sorted settings, in the order of the page; continued phase 1 comes after phase 1."""
 
-SILENT = "data.sensor_dropout="
+DROPOUT = "data.sensor_dropout="
 
 METRIC = "official TruckScenes metric on the validation split; percent, mean ± standard deviation over seeds."
 
@@ -61,7 +61,7 @@ positive the speed it states). Means over the classes that occur at that speed; 
 class that does not reach a recall of 0.1 counts as 1, the official rule, so read it beside the AP. Some classes have
 few boxes at a speed; the car's numbers stand on the most."""
 
-SILENT_TEXT = """From the share `data.sensor_dropout` of the frames, never a clip's first, all sensor data are taken
+DROPOUT_TEXT = """From the share `data.sensor_dropout` of the frames, never a clip's first, all sensor data are taken
 away, in training and in validation: what is found there comes from the memory alone. These rows compare with one
 another only."""
 
@@ -74,20 +74,19 @@ def runs_on_page(
 ) -> list[RunResult]:
     """Those of `results` that the page of `phase` shows; none when there is none of the phase itself.
 
-    Phase 1 that went on from phase 1 is what phase 2 is held against, so it stands on that page and not on its own;
-    there, phase 1 stands as it is, without its ablations. Runs of sweeps (their ids are `in_sweeps`) have tables of
-    their own: of them only experiments that have a name here are shown. `defaults` are the configurations of runs
-    without settings, by phase.
+    Phase 1 continued from phase 1 is what phase 2 is compared with, so it is on that page and not on its own; phase 1
+    is there without its ablations. Runs of sweeps (their ids are `in_sweeps`) have tables of their own: of them only
+    experiments that have a name here are shown. `defaults` are the configurations of runs without settings, by phase.
     """
     names = NAMES_OF_COMPARISON if phase in PHASES_OF else NAMES
     shown = []
     for result in results:
         run = replace(result, overrides=without_defaults(result.overrides, defaults.get(result.phase, {})))
         if phase in PHASES_OF:
-            belongs = run.phase == phase or (run.phase in PHASES_OF[phase] and (not run.settings or _goes_on(run)))
+            belongs = run.phase == phase or (run.phase in PHASES_OF[phase] and (not run.settings or _is_continued(run)))
         else:
-            belongs = run.phase == phase and not _goes_on(run)
-        known = (run.phase, *_seeing_settings(run)) in names or _goes_on(run)
+            belongs = run.phase == phase and not _is_continued(run)
+        known = (run.phase, *_settings_without_dropout(run)) in names or _is_continued(run)
         if belongs and (known or run.run_id not in in_sweeps):
             shown.append(run)
     return shown if any(run.phase == phase for run in shown) else []
@@ -133,16 +132,16 @@ def compared_experiments(runs: list[RunResult]) -> list[Experiment]:
 
     def name(run: RunResult) -> str | None:
         free = ("phase.epochs=", "phase.options.velocity_code_weight=")
-        if f"{GOES_ON}phase1" in run.settings and all(s.startswith((GOES_ON, *free)) for s in run.settings):
+        if f"{INIT_FROM}phase1" in run.settings and all(s.startswith((INIT_FROM, *free)) for s in run.settings):
             return CONTINUED if {run.epochs} == epochs else f"phase 1, {run.epochs} further epochs"
-        silent = [setting for setting in run.settings if setting.startswith(SILENT)]
-        known = NAMES_OF_COMPARISON.get((run.phase, *_seeing_settings(run)))
-        if known and silent:
-            return f"{known}, {as_code(silent)}"
+        dropout = [setting for setting in run.settings if setting.startswith(DROPOUT)]
+        known = NAMES_OF_COMPARISON.get((run.phase, *_settings_without_dropout(run)))
+        if known and dropout:
+            return f"{known}, {as_code(dropout)}"
         return known or f"{run.phase.replace('phase', 'phase ')}, {as_code(run.settings)}"
 
     def place(experiment: Experiment) -> float:
-        known, key = list(NAMES_OF_COMPARISON), tuple(part for part in experiment.key if not part.startswith(SILENT))
+        known, key = list(NAMES_OF_COMPARISON), tuple(part for part in experiment.key if not part.startswith(DROPOUT))
         if key in known:
             return known.index(key)
         return 0.5 if experiment.key[0] == "phase1" else len(known)
@@ -156,8 +155,8 @@ def comparison_page(experiments: list[Experiment], scale: str, picture: str) -> 
     `experiments` are `compared_experiments`; `picture` is the address of their bars, seen from the page.
     """
     runs = [run for experiment in experiments for run in experiment.runs]
-    seen = seeing(experiments)
-    experiments, silent = seen, [experiment for experiment in experiments if experiment not in seen]
+    dropout = [experiment for experiment in experiments if experiment not in without_dropout(experiments)]
+    experiments = without_dropout(experiments)
     text = _page("phase2", scale, "a row of phase 2, and one of further epochs, starts from its seed's phase 1", runs)
     text += f"![Scores by distance and by speed]({picture})\n\n{score_table(experiments, SUMMARY_WITH_VELOCITY)}\n\n"
     by_speed, errors = BY_SPEED + CAR_BY_SPEED, ERROR_BY_SPEED + CAR_ERROR_BY_SPEED
@@ -172,16 +171,16 @@ def comparison_page(experiments: list[Experiment], scale: str, picture: str) -> 
     if subject is not None and others:
         gains = "\n\n".join(gain_table(subject, others, columns) for columns in parts)
         text += f"\n## Gain of phase 2\n\n{GAIN_TEXT}\n\n{gains}\n"
-    if silent:
-        scores = [score_table(silent, columns) for columns in (SUMMARY_WITH_VELOCITY, by_speed, errors)]
-        gains = [gain_table(silent[0], silent[1:], columns) for columns in parts if silent[1:]]
-        text += f"\n## With silent frames\n\n{SILENT_TEXT}\n\n" + "\n\n".join([*scores, *gains]) + "\n"
+    if dropout:
+        scores = [score_table(dropout, columns) for columns in (SUMMARY_WITH_VELOCITY, by_speed, errors)]
+        gains = [gain_table(dropout[0], dropout[1:], columns) for columns in parts if dropout[1:]]
+        text += f"\n## With sensor dropout\n\n{DROPOUT_TEXT}\n\n" + "\n\n".join([*scores, *gains]) + "\n"
     return text
 
 
-def seeing(experiments: list[Experiment]) -> list[Experiment]:
-    """Those whose every frame has its sensors."""
-    return [experiment for experiment in experiments if not any(part.startswith(SILENT) for part in experiment.key)]
+def without_dropout(experiments: list[Experiment]) -> list[Experiment]:
+    """Experiments whose frames all have their sensors."""
+    return [experiment for experiment in experiments if not any(part.startswith(DROPOUT) for part in experiment.key)]
 
 
 def _boxes_by_speed(runs: list[RunResult]) -> str:
@@ -194,12 +193,12 @@ def _boxes_by_speed(runs: list[RunResult]) -> str:
     return ""
 
 
-def _seeing_settings(run: RunResult) -> tuple[str, ...]:
-    return tuple(setting for setting in run.settings if not setting.startswith(SILENT))
+def _settings_without_dropout(run: RunResult) -> tuple[str, ...]:
+    return tuple(setting for setting in run.settings if not setting.startswith(DROPOUT))
 
 
-def _goes_on(run: RunResult) -> bool:
-    return any(setting.startswith(GOES_ON) for setting in run.settings)
+def _is_continued(run: RunResult) -> bool:
+    return any(setting.startswith(INIT_FROM) for setting in run.settings)
 
 
 def _page(phase: str, scale: str, epochs: str, runs: list[RunResult]) -> str:

@@ -27,8 +27,8 @@ MAX_POINTS = 200
 
 NOT_A_SETTING = ("seed", "scale", "phase")
 """Keys that do not make another experiment within a phase and a scale."""
-ELSEWHERE = re.compile(r"""["']*(/|~|\$|\.\./|file:|[A-Za-z]:[\\/])""")
-"""How a value begins that names a place on one machine."""
+LOCAL_PATH = re.compile(r"""["']*(/|~|\$|\.\./|file:|[A-Za-z]:[\\/])""")
+"""How a value begins that is a path of one machine."""
 
 KEPT_OF_A_CLASS = ("AP", "AVE", "num_gt")
 """Within a range or a speed class; the run's metrics.json has the rest."""
@@ -129,7 +129,7 @@ def _publish(run_folder: Path, reports: Path) -> Path:
     latency_path = run_folder / "latency.json"
     latency = JsonObject(latency_path, "delete it and measure again") if latency_path.is_file() else None
     fields = _record(record)
-    overrides = [_without_place(o) for o in fields["overrides"] if not is_of(o, OUTSIDE_IDENTITY)]
+    overrides = [_without_local_path(o) for o in fields["overrides"] if not is_of(o, OUTSIDE_IDENTITY)]
     _metrics(scores, latency)
     content = {
         "format": FORMAT,
@@ -137,7 +137,7 @@ def _publish(run_folder: Path, reports: Path) -> Path:
         "phase": config["phase"]["name"],
         **fields,
         "overrides": overrides,
-        "config": without_places(config),
+        "config": without_local_paths(config),
         "metrics": _slim(scores.content),
         "curves": _read_curves(run_folder / "metrics.csv"),
         "latency": latency.content if latency is not None else None,
@@ -280,7 +280,7 @@ def _read_config(path: Path) -> dict[str, Any]:
     try:
         content = load_plain_yaml(path.read_text())
         if not all(isinstance(content[part]["name"], str) for part in ("model", "phase")):
-            raise TypeError("model.name and phase.name must be words")
+            raise TypeError("model.name and phase.name must be strings")
         json.dumps(content, allow_nan=False)  # a result holds it: no dates, and no number that is not finite
     except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError) as error:
         what = " ".join(str(error).split())
@@ -312,23 +312,23 @@ def thinned(points: list[Point]) -> list[Point]:
     return [points[round(index * last / (MAX_POINTS - 1))] for index in range(MAX_POINTS)]
 
 
-def _without_place(text: str) -> str:
-    """`key=value`, or a value; a path that holds on one machine only becomes its last name and a digest."""
+def _without_local_path(text: str) -> str:
+    """`key=value`, or a value; a path of one machine becomes its last name and a digest."""
     key, equals, value = text.rpartition("=") if "=" in text else ("", "", text)
-    if not ELSEWHERE.match(value):
+    if not LOCAL_PATH.match(value):
         return text
     name = re.split(r"[/\\]", value.strip("\"'").rstrip("/\\"))[-1]
     return f"{key}{equals}{name}@{hashlib.sha256(value.encode()).hexdigest()[:8]}"
 
 
-def without_places(config: dict[str, Any]) -> dict[str, Any]:
-    """A run's configuration less what is outside its identity, its paths as `_without_place` writes them."""
+def without_local_paths(config: dict[str, Any]) -> dict[str, Any]:
+    """A run's configuration less what is outside its identity, its paths as `_without_local_path` writes them."""
 
     def clean(value: Any) -> Any:
         if isinstance(value, dict):
             return {key: clean(inner) for key, inner in value.items()}
         if isinstance(value, list):
             return [clean(inner) for inner in value]
-        return _without_place(value) if isinstance(value, str) else value
+        return _without_local_path(value) if isinstance(value, str) else value
 
     return clean(without_keys(config, OUTSIDE_IDENTITY))

@@ -132,9 +132,9 @@ class SweepConfig:
         for table in self.tables:
             for column in table.columns:
                 find_metric(column, f"{where}, table {table.name}, columns")
-            strange = [label for label in table.rows or () if label not in labels]
-            if strange:
-                raise ConfigError(f"{where}, table {table.name}: there is no row {', '.join(strange)}")
+            unknown = [label for label in table.rows or () if label not in labels]
+            if unknown:
+                raise ConfigError(f"{where}, table {table.name}: there is no row {', '.join(unknown)}")
             if not table.columns:
                 raise ConfigError(f"{where}, table {table.name}: columns is empty; name at least one metric")
         for plot in self.plots:

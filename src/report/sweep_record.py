@@ -1,4 +1,4 @@
-"""What became of a sweep: `reports/sweeps/<name>_<scale>.json`, enough to draw its tables without the configuration.
+"""The state of a sweep: `reports/sweeps/<name>_<scale>.json`, enough to draw its tables without the configuration.
 
 The runner writes it whenever something changes; tables and the dashboard read it. Imports neither torch nor Hydra.
 """
@@ -28,7 +28,7 @@ STATES = ("waiting", "running", "done", "failed", "pruned")
 
 @dataclass(kw_only=True)
 class RunState:
-    """Where one planned run stands."""
+    """The state of one planned run."""
 
     run_id: str
     overrides: list[str]  # after `python -m src.train`; paths, devices and loggers of the machine are not among them
@@ -50,7 +50,7 @@ class SweepRecord:
 
     sweep: SweepConfig
     scale: str
-    command: str  # that goes on with it
+    command: str  # that resumes it
     seeds: list[int]
     rows: dict[str, dict[int, str]]  # run id by label and seed, in the order of the file; empty for a search
     runs: dict[str, RunState]  # by run id, in the order they are trained
@@ -169,10 +169,10 @@ def _built(kind: Any, value: Any, where: str) -> Any:
         return None if value is None else _built(other, value, where)
     if dataclasses.is_dataclass(kind):
         found, types = _of(dict, value, where), _types_of(kind)
-        strange = sorted(found.keys() - types.keys())
+        unknown = sorted(found.keys() - types.keys())
         missing = [f.name for f in dataclasses.fields(kind) if f.name not in found and _is_required(f)]
-        if strange or missing:
-            raise ValueError(f"{where or 'it'} lacks {missing}, and has {strange}, which this version does not know")
+        if unknown or missing:
+            raise ValueError(f"{where or 'it'} lacks {missing}, and has {unknown}, which this version does not know")
         prefix = f"{where}." if where else ""
         return kind(**{name: _built(types[name], inner, f"{prefix}{name}") for name, inner in found.items()})
     if get_origin(kind) is list:

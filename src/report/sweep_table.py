@@ -17,7 +17,7 @@ PAPER = "paper"
 
 
 @dataclass
-class Cell:
+class TableCell:
     """One metric of one row, in the table's unit."""
 
     paper: float | None = None
@@ -65,7 +65,7 @@ class SweepRow:
     """One row of a table."""
 
     label: str
-    cells: list[Cell]  # one per column
+    cells: list[TableCell]  # one per column
     state: str  # of sweep_record.STATES: what is left of its runs; or PAPER
     note: str = ""  # why numbers are missing
     planned: int = 0  # seeds
@@ -212,8 +212,8 @@ def format_paper(value: float | None, metric: Metric, signed: bool = False) -> s
     return f"{value:{'+' if signed else ''}.{digits}f}"
 
 
-def format_here(cell: Cell, metric: Metric, done: int) -> str:
-    """Mean ± standard deviation, of one run's latency ± `Cell.frames`; with n where not all `done` runs have it."""
+def format_here(cell: TableCell, metric: Metric, done: int) -> str:
+    """Mean ± standard deviation; of one run's latency ± `TableCell.frames`; n where not all `done` have it."""
     if cell.mean is None:
         return MISSING
     text = f"{rounded(cell.mean, metric):.{metric.digits}f}"
@@ -222,7 +222,7 @@ def format_here(cell: Cell, metric: Metric, done: int) -> str:
     return text + (f" (n = {cell.seeds})" if cell.seeds != done else "")
 
 
-def format_difference(cell: Cell, metric: Metric, done: int | None = None) -> str:
+def format_difference(cell: TableCell, metric: Metric, done: int | None = None) -> str:
     """What the row has more than the baseline; in brackets the paper's, and n where not all `done` runs have both."""
     text, notes = MISSING, []
     if cell.difference is not None:

@@ -1,4 +1,4 @@
-"""The words under a sweep's table: what was run, and which of the paper's orderings hold here."""
+"""The text under a sweep's table: what was run, and which of the paper's orderings hold here."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from src.report.orderings import paired_gains
 from src.report.results import RunResult, read_result, result_path
 from src.report.sweep_file import TableConfig
 from src.report.sweep_record import RunState, SweepRecord
-from src.report.sweep_table import PAPER, Cell, SweepRow, SweepTable, rounded
+from src.report.sweep_table import PAPER, SweepRow, SweepTable, TableCell, rounded
 from src.report.sweep_text import describe_differences, describe_latency, describe_runs, describe_search, findings
 from src.training.identity import key_of, without_keys
 
@@ -61,8 +61,8 @@ def check_same_data(record: SweepRecord, results: dict[str, RunResult]) -> None:
     for run_id, result in results.items():
         data = ", ".join(f"{key} {value}" for key, value in sorted(result.data.items()))
         groups.setdefault(f"scale {result.scale}, {data}", []).append(run_id)
-    strange = [run_id for run_id, result in results.items() if result.scale != record.scale]
-    if len(groups) > 1 or strange:
+    unknown = [run_id for run_id, result in results.items() if result.scale != record.scale]
+    if len(groups) > 1 or unknown:
         found = "; ".join(f"{' '.join(runs)} ({what})" for what, runs in groups.items())
         raise DataError(
             f"sweep {record.name}, scale {record.scale}: a table never mixes scales or data, but its runs are {found}; "
@@ -127,7 +127,7 @@ def _row_table(record: SweepRecord, results: dict[str, RunResult], config: Table
         baseline = sweep.baseline_of(row.label)
         rows[row.label] = SweepRow(row.label, cells, state, note, len(runs), done, baseline, dict(runs), x=row.x)
     for other in sweep.paper_rows:
-        cells = [Cell(paper=other.paper.get(column.name)) for column in columns]
+        cells = [TableCell(paper=other.paper.get(column.name)) for column in columns]
         rows[other.label] = SweepRow(other.label, cells, PAPER, baseline=sweep.baseline)
     for row in rows.values():
         _take_differences(row, rows.get(row.baseline or ""))
@@ -207,11 +207,11 @@ def _mark_best(rows: list[SweepRow], columns: list[Metric]) -> None:
             row.cells[place].paper_best = len(papers) > 1 and row.cells[place].paper == best(papers)
 
 
-def _cell(results: dict[int, RunResult | None], metric: Metric, paper: float | None = None) -> Cell:
+def _cell(results: dict[int, RunResult | None], metric: Metric, paper: float | None = None) -> TableCell:
     found = {seed: result.metrics.get(metric.name) for seed, result in results.items() if result is not None}
     values = {seed: metric.scale * value for seed, value in found.items() if value is not None}
     frames = [_frames(results[seed], metric.name) for seed in values]
-    return Cell(paper=paper, values=values, frames=frames[0] if len(frames) == 1 else None)
+    return TableCell(paper=paper, values=values, frames=frames[0] if len(frames) == 1 else None)
 
 
 def _frames(result: RunResult, metric: str) -> float | None:

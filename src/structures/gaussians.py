@@ -10,6 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
+
 
 class Source(IntEnum):
     """Where a Gaussian came from."""
@@ -68,17 +70,13 @@ class GaussianSet:
         Directions become those of their transformed unit vectors, scales and velocities take the scale along.
         """
         matrix = dst_from_src[:, None].to(self.means.dtype)  # [B, 1, 4, 4]
-
-        def turn(vectors: Tensor) -> Tensor:  # [B, G, 2]; a matrix product would be rounded by autocast
-            return matrix[..., :2, 0] * vectors[..., :1] + matrix[..., :2, 1] * vectors[..., 1:]
-
         scale = torch.linalg.det(matrix[..., :2, :2]).abs().sqrt()[..., None]
         return replace(
             self,
-            means=turn(self.means) + matrix[..., :2, 3],
+            means=transform_points_xy(matrix, self.means),
             scales=self.scales * scale,
-            directions=F.normalize(turn(self.directions), dim=-1),
-            velocities=turn(self.velocities),
+            directions=F.normalize(transform_vectors_xy(matrix, self.directions), dim=-1),
+            velocities=transform_vectors_xy(matrix, self.velocities),
         )
 
     def map(self, function: Callable[[Tensor], Tensor]) -> GaussianSet:

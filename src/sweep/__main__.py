@@ -28,9 +28,9 @@ from src.report.table_builder import write_sweep_tables
 from src.sweep.compose import SweepCommand, compose_sweep
 from src.sweep.latency_runs import measure_latencies
 from src.sweep.launcher import Launcher
-from src.sweep.plan import Identified, Plan, compose_file, join_overrides, make_plan, split_machine
+from src.sweep.plan import Plan, RunIdentity, compose_file, join_overrides, make_plan, split_machine
 from src.sweep.progress import progress_line
-from src.sweep.publisher import Keeper
+from src.sweep.record_writer import RecordWriter
 from src.sweep.run_status import is_done
 from src.sweep.runner import Runner
 from src.sweep.search import Search
@@ -65,12 +65,12 @@ def main(overrides: list[str]) -> None:
     make_writable(reports / "sweeps", "paths.reports")
     study = SweepStudy(outputs, plan.study, command.storage or default_storage(outputs), definition(plan, common))
     again = shlex.join(["python", "-m", "src.sweep", *[masked(override) for override in overrides]])
-    keeper = Keeper(plan, study, again, outputs, reports)
-    runner = build_runner(command, plan, study, keeper, common, identify)
+    writer = RecordWriter(plan, study, again, outputs, reports)
+    runner = build_runner(command, plan, study, writer, common, identify)
     record = runner.run()
     if runner.stop.requested:
         print(progress_line(record, outputs, command.workers))
-        raise InterruptedRunError(f"the sweep was stopped; nothing finished is lost, go on with\n    {again}")
+        raise InterruptedRunError(f"the sweep was stopped; nothing finished is lost, resume it with\n    {again}")
     if sweep.latency:
         measured = measure_latencies(record, outputs, partial(latency_command, outputs), runner)
         logger.info("latency measured of %d runs", measured)
@@ -81,7 +81,7 @@ def build_runner(
     command: SweepCommand,
     plan: Plan,
     study: SweepStudy,
-    keeper: Keeper,
+    writer: RecordWriter,
     common: list[str],
     identify: Identifier,
 ) -> Runner:
@@ -94,7 +94,7 @@ def build_runner(
         in_child=partial(die_with_parent, signal.SIGTERM),  # a killed runner leaves checkpoints, no orphans
         group=plan.study,
     )
-    parts = (plan, study, keeper, launcher, partial(publish_result, reports=keeper.reports))
+    parts = (plan, study, writer, launcher, partial(publish_result, reports=writer.reports))
     return Search(*parts, common=common, identify=identify) if plan.sweep.is_search else Runner(*parts)
 
 
@@ -107,7 +107,7 @@ def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, ag
         for run in failed:
             log = str(outputs / run.log) if run.log is not None else "none"
             problems.append(f"  {run.label}, seed {run.seed} ({run.run_id}): {run.reason}; log: {log}")
-        problems.append(f"the same command tries them again:\n    {again}")
+        problems.append(f"the same command retries them:\n    {again}")
     runner.publish_done(strictly=True)
     try:
         paths = write_sweep_tables(reports, record)
@@ -145,12 +145,12 @@ class Identifier:
             return config, tree
         return dataclasses.replace(config, seed=seeds[-1]), copy.deepcopy(tree) | {"seed": seeds[-1]}
 
-    def __call__(self, overrides: list[str]) -> Identified:
-        """What a command line comes to. Raises HorizonError where `python -m src.train` would before it starts."""
+    def __call__(self, overrides: list[str]) -> RunIdentity:
+        """The run that a command line resolves to. Raises HorizonError for what `python -m src.train` refuses."""
         config, tree = self.compose(overrides)
         source = find_source(config, overrides, self.compose, PHASES)
         run_id = run_identity(tree, source.identity if source is not None else None)
-        return Identified(run_id, config.scale, source.overrides if source is not None else None)
+        return RunIdentity(run_id, config.scale, source.overrides if source is not None else None)
 
 
 def definition(plan: Plan, common: list[str]) -> dict[str, Any]:
@@ -177,16 +177,18 @@ def describe(plan: Plan, outputs: Path) -> str:
         return "\n".join(
             [*lines, f"# a search of {plan.sweep.trials} trials for the best {plan.sweep.objective}:", *space]
         )
-    finished = sum(is_done(outputs / run_id) for run_id in plan.cells)
-    cells = len(plan.rows) * len(plan.seeds)
-    runs = f"{len(plan.cells)} runs, {finished} finished"
-    lines.append(f"# {len(plan.rows)} rows x {len(plan.seeds)} seeds = {cells} cells; {runs}")
-    for cell in plan.cells.values():
-        state = "finished" if is_done(outputs / cell.run_id) else "to train"
-        rows = plan.labels(cell.run_id) or [cell.label]
+    finished = sum(is_done(outputs / run_id) for run_id in plan.specs)
+    results = len(plan.rows) * len(plan.seeds)
+    lines.append(
+        f"# {len(plan.rows)} rows x {len(plan.seeds)} seeds = {results} results of {len(plan.specs)} runs, "
+        f"{finished} finished"
+    )
+    for spec in plan.specs.values():
+        state = "finished" if is_done(outputs / spec.run_id) else "to train"
+        rows = plan.labels(spec.run_id) or [spec.label]
         same = f" ({len(rows)} rows that coincide share it)" if len(rows) > 1 else ""
-        needs = f", starts from {cell.needs}" if cell.needs else ""
-        lines += ["", f"# {' = '.join(rows)}, seed {cell.seed}{same}: {cell.run_id}, {state}{needs}", cell.command]
+        needs = f", starts from {spec.needs}" if spec.needs else ""
+        lines += ["", f"# {' = '.join(rows)}, seed {spec.seed}{same}: {spec.run_id}, {state}{needs}", spec.command]
     return "\n".join(lines)
 
 

@@ -41,7 +41,7 @@ FILE_PARTS = (SweepConfig, RowConfig, TableConfig, PlotConfig, PaperRowConfig, D
 
 @dataclass(kw_only=True)
 class SweepCommand:
-    """What the runner is told; the rest of the command line goes to every run."""
+    """Options of the runner itself; the rest of the command line goes to every run."""
 
     sweep: SweepConfig | None = None  # `+sweep=<file of sweeps/>`
     seeds: int
@@ -79,7 +79,7 @@ def compose_sweep(overrides: list[str]) -> tuple[SweepCommand, list[str]]:
     chosen = [name for name in chosen if name]  # `make sweep` without SWEEP says `+sweep=`
     if len(chosen) != 1:
         raise ConfigError(f"give one +sweep=NAME of {', '.join(sweep_files())}; got {' '.join(chosen) or 'none'}")
-    # Taken as it is: an address may hold `=`, and Hydra's messages would show a password.
+    # Taken as it is: an address may lock `=`, and Hydra's messages would show a password.
     storages = [override.partition("=")[2].strip("'\"") for override in own if key_of(override) == "storage"]
     own = [override for override in own if key_of(override) not in ("sweep", "storage")]
     try:
@@ -151,7 +151,7 @@ def _refuse_interpolation(content: Any, where: str = "") -> None:
         for key, value in content.items() if isinstance(content, dict) else enumerate(content):
             _refuse_interpolation(value, f"{where}.{key}" if where else str(key))
     elif isinstance(content, str) and "${" in content:
-        raise ConfigError(f"{where}: must not hold ${{, but is {content!r}")
+        raise ConfigError(f"{where}: must not lock ${{, but is {content!r}")
 
 
 def _compose(sweep: SweepConfig, overrides: list[str]) -> SweepCommand:

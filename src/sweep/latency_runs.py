@@ -14,7 +14,7 @@ logger = logging.getLogger(__name__)
 
 
 def measure_latencies(record: SweepRecord, outputs: Path, command: Callable[[Path], list[str]], runner: Runner) -> int:
-    """Measure each row's first finished seed that lacks `latency.json`; a failure is told and leaves the row without.
+    """Measure each row's first finished seed that lacks `latency.json`; a failure is logged and leaves the row without.
 
     Measurements of all sweeps of these outputs come one after the other. Returns how many were made.
     """
@@ -28,10 +28,10 @@ def measure_latencies(record: SweepRecord, outputs: Path, command: Callable[[Pat
             if (folder / "latency.json").is_file():
                 continue  # a runner beside this one has measured it
             logger.info("[%s]: measuring the latency of %s", label, done[0])
-            ended = runner.launcher.run_command(command(folder), f"{done[0]}.latency", 0, runner.stop)
-        if ended.code or not (folder / "latency.json").is_file():
+            status = runner.launcher.run_command(command(folder), f"{done[0]}.latency", 0, runner.stop)
+        if status.code or not (folder / "latency.json").is_file():
             log = runner.launcher.log_of(f"{done[0]}.latency")
-            reason = ended.reason or "it left no latency.json"
+            reason = status.reason or "it left no latency.json"
             logger.warning("[%s]: no latency of %s: %s; log: %s", label, done[0], reason, log)
             continue
         runner.publish(folder)

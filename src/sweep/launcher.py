@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from src.errors import BusyError, ConfigError, DataError, DivergedError, InterruptedRunError
-from src.sweep.plan import Cell
+from src.sweep.plan import RunSpec
 from src.training.identity import key_of
 
-GRACE_S = 60.0
-"""What a run gets to finish its step and write a checkpoint once it is asked to end."""
-LOOK_EVERY_S = 0.25
+GRACE_PERIOD_S = 60.0
+"""Time for a run to finish its step and write a checkpoint after SIGTERM; SIGKILL follows."""
+POLL_S = 0.25
 MEANINGS = {
     ConfigError.exit_code: "configuration or checkpoint",
     DataError.exit_code: "data",
@@ -28,8 +28,8 @@ _ERROR_LINE = re.compile(
 )
 
 
-class Stop:
-    """Whether the runner has been told to end. Set in signal handlers, where an Event could block."""
+class StopRequest:
+    """Whether the runner is to stop. Set in signal handlers, where an Event could block."""
 
     def __init__(self) -> None:
         self.requested = False
@@ -37,18 +37,18 @@ class Stop:
 
 
 @dataclass(frozen=True)
-class Ended:
+class ExitStatus:
     """How a process ended."""
 
     code: int  # negative: of the signal that killed it
     reason: str  # in a line, empty for success
-    told: bool  # whether it was asked to end by us
+    stop_requested: bool  # whether we sent it a signal to stop
 
     @property
     def interrupted(self) -> bool:
-        """Whether the run can go on where it was: it ended on request, or was still starting."""
+        """Whether the run can be resumed: it stopped on request, or was still starting."""
         stops = (InterruptedRunError.exit_code, -signal.SIGTERM, -signal.SIGINT)
-        return self.code in stops or (self.told and self.code == -signal.SIGKILL)
+        return self.code in stops or (self.stop_requested and self.code == -signal.SIGKILL)
 
     @property
     def busy(self) -> bool:
@@ -84,25 +84,25 @@ class Launcher:
             result["CUDA_VISIBLE_DEVICES"] = ",".join(share)
         return result
 
-    def run(self, cell: Cell, worker: int, stop: Stop, watch: Callable[[], bool] | None = None) -> Ended:
-        """Train to the end, or until the runner stops or `watch`, asked now and then, says to end it."""
-        shown = self.shown_as(cell) if "logger=wandb" in cell.machine else []
-        command = [*self.command, *cell.overrides, *cell.machine, *shown]
-        return self.run_command(command, cell.run_id, worker, stop, watch)
+    def run(self, spec: RunSpec, worker: int, stop: StopRequest, watch: Callable[[], bool] | None = None) -> ExitStatus:
+        """Train to the end, or until the runner stops or `watch`, polled meanwhile, returns True."""
+        shown = self.shown_as(spec) if "logger=wandb" in spec.machine else []
+        command = [*self.command, *spec.overrides, *spec.machine, *shown]
+        return self.run_command(command, spec.run_id, worker, stop, watch)
 
-    def shown_as(self, cell: Cell) -> list[str]:
+    def shown_as(self, spec: RunSpec) -> list[str]:
         """Where Weights & Biases shows the run: its sweep and its row, unless the command line says otherwise."""
-        places = [f"logger.wandb.group={self._group}", f"logger.wandb.row={quoted(cell.label)}"]
-        return [place for place in places if key_of(place) not in map(key_of, cell.machine)]
+        places = [f"logger.wandb.group={self._group}", f"logger.wandb.row={quoted(spec.label)}"]
+        return [place for place in places if key_of(place) not in map(key_of, spec.machine)]
 
     def run_command(
         self,
         command: list[str],
         name: str,  # of the log
         worker: int,
-        stop: Stop,
+        stop: StopRequest,
         watch: Callable[[], bool] | None = None,
-    ) -> Ended:
+    ) -> ExitStatus:
         """Like `run` for any command."""
         self.logs.mkdir(parents=True, exist_ok=True)
         path = self.log_of(name)
@@ -121,27 +121,28 @@ class Launcher:
                     preexec_fn=self._in_child,
                 )
             except OSError as error:
-                return Ended(1, f"{command[0]} could not be started: {error}", told=False)
-        told = self._wait(process, stop, watch)
+                return ExitStatus(1, f"{command[0]} could not be started: {error}", stop_requested=False)
+        stop_requested = self._wait(process, stop, watch)
         code = process.returncode
-        return Ended(code, explain(code, _text_from(path, begin)) if code else "", told)
+        return ExitStatus(code, explain(code, _text_from(path, begin)) if code else "", stop_requested)
 
-    def _wait(self, process: subprocess.Popen, stop: Stop, watch: Callable[[], bool] | None) -> bool:
+    def _wait(self, process: subprocess.Popen, stop: StopRequest, watch: Callable[[], bool] | None) -> bool:
+        """Wait for the process; whether it was signalled to stop."""
         deadline = None
         try:
             while True:
                 try:
-                    process.wait(timeout=LOOK_EVERY_S)
+                    process.wait(timeout=POLL_S)
                     return deadline is not None
                 except subprocess.TimeoutExpired:
                     pass
                 if deadline is None and (stop.requested or (watch is not None and watch())):
                     process.send_signal(signal.SIGTERM)
-                    deadline = time.monotonic() + GRACE_S
+                    deadline = time.monotonic() + GRACE_PERIOD_S
                 if stop.at_once or (deadline is not None and time.monotonic() > deadline):
                     deadline = deadline or 0.0
                     _kill_group(process)
-        except BaseException:  # nothing may train on unwatched
+        except BaseException:  # no run may outlive its runner
             _kill_group(process)
             process.wait()
             raise

@@ -13,20 +13,20 @@ from src.training.identity import OUTSIDE_IDENTITY, is_of, key_of
 
 
 @dataclass(frozen=True)
-class Identified:
-    """What a command line after `python -m src.train` comes to."""
+class RunIdentity:
+    """The run that a command line after `python -m src.train` resolves to."""
 
     run_id: str
     scale: str
     source: list[str] | None  # command line of the run whose weights it starts from
 
 
-Identify = Callable[[list[str]], Identified]
+Identify = Callable[[list[str]], RunIdentity]
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One run of the plan."""
+class RunSpec:
+    """One planned run."""
 
     run_id: str
     overrides: list[str]  # what it is
@@ -37,7 +37,7 @@ class Cell:
 
     @property
     def command(self) -> str:
-        """What trains it, to be pasted."""
+        """The shell command that trains it."""
         return shlex.join(["python", "-m", "src.train", *self.overrides, *self.machine])
 
 
@@ -50,7 +50,7 @@ class Plan:
     seeds: list[int]
     changes: list[str] = field(default_factory=list)  # by the command line, of every row; see `changes_of`
     rows: dict[str, dict[int, str]] = field(default_factory=dict)  # run id by label and seed
-    cells: dict[str, Cell] = field(default_factory=dict)  # by run id, what is needed before what needs it
+    specs: dict[str, RunSpec] = field(default_factory=dict)  # by run id, what is needed before what needs it
 
     @property
     def study(self) -> str:
@@ -72,7 +72,7 @@ def join_overrides(*parts: list[str]) -> list[str]:
 
 
 def split_machine(overrides: list[str]) -> tuple[list[str], list[str]]:
-    """(what a run is, where and how it computes): the second part is given to its process and noted nowhere."""
+    """(what a run is, where and how it computes): the second part goes to its process and is stored nowhere."""
     machine = [override for override in overrides if is_of(override, OUTSIDE_IDENTITY)]
     return [override for override in overrides if override not in machine], machine
 
@@ -83,12 +83,13 @@ def changes_of(sweep: SweepConfig, common: list[str]) -> list[str]:
     Raises ConfigError for a phase other than the file's own.
     """
     common = join_overrides(common)
-    told = [override for override in common if key_of(override) == "phase"]
+    phases = [override for override in common if key_of(override) == "phase"]
     for where, overrides in [("overrides", sweep.overrides), *((f"row {r.label!r}", r.overrides) for r in sweep.rows)]:
         for own in overrides:
-            if told and key_of(own) == "phase" and _value_of(own) != _value_of(told[0]):
+            if phases and key_of(own) == "phase" and _value_of(own) != _value_of(phases[0]):
                 raise ConfigError(
-                    f"{told[0]} contradicts {own} of sweeps/{sweep.name}.yaml, {where}; leave it out or change the file"
+                    f"{phases[0]} contradicts {own} of sweeps/{sweep.name}.yaml, {where}; "
+                    "leave it out or change the file"
                 )
     outside = (*OUTSIDE_IDENTITY, "seed", "scale")
     return sorted(change for change in common if not is_of(change, outside) and change not in sweep.overrides)
@@ -110,8 +111,8 @@ def make_plan(sweep: SweepConfig, common: list[str], seeds: list[int], identify:
     if sweep.is_search:
         return plan
     for seed in seeds:
-        needed: list[Cell] = []
-        own: list[Cell] = []
+        needed: list[RunSpec] = []
+        own: list[RunSpec] = []
         for row in sweep.rows:
             joined = join_overrides(sweep.overrides, row.overrides, common)
             overrides = join_overrides(joined, [f"seed={seed}"])
@@ -121,36 +122,36 @@ def make_plan(sweep: SweepConfig, common: list[str], seeds: list[int], identify:
                     f"sweeps/{sweep.name}.yaml, row {row.label!r}: scale={found.scale}, but the sweep is of scale "
                     f"{scale}; a table never mixes scales, give scale=... on the command line"
                 )
-            *sources, cell = cells_of(overrides, seed, row.label, identify)
+            *sources, spec = run_specs_of(overrides, seed, row.label, identify)
             needed += sources
-            own.append(cell)
-            plan.rows.setdefault(row.label, {})[seed] = cell.run_id
-        labelled = {cell.run_id: cell for cell in reversed(own)}  # the first row gives its label
-        for cell in [*needed, *own]:
-            plan.cells.setdefault(cell.run_id, labelled.get(cell.run_id, cell))
+            own.append(spec)
+            plan.rows.setdefault(row.label, {})[seed] = spec.run_id
+        labelled = {spec.run_id: spec for spec in reversed(own)}  # the first row gives its label
+        for spec in [*needed, *own]:
+            plan.specs.setdefault(spec.run_id, labelled.get(spec.run_id, spec))
     return plan
 
 
-def compose_file(sweep: SweepConfig, common: list[str], identify: Identify) -> Identified:
-    """What the file's own overrides and the command line come to. Raises ConfigError naming whichever is at fault."""
+def compose_file(sweep: SweepConfig, common: list[str], identify: Identify) -> RunIdentity:
+    """The run of the file's own overrides and the command line. Raises ConfigError naming whichever is at fault."""
     return _compose(sweep, None, join_overrides(sweep.overrides, common), common, identify)
 
 
-def cells_of(overrides: list[str], seed: int, label: str, identify: Identify) -> list[Cell]:
-    """The run of a command line, and before it those it starts from, the first first."""
+def run_specs_of(overrides: list[str], seed: int, label: str, identify: Identify) -> list[RunSpec]:
+    """The run of a command line, preceded by those whose weights it starts from, in training order."""
     found = identify(overrides)
-    before: list[Cell] = []
+    sources: list[RunSpec] = []
     if found.source is not None:
         what = label if label.startswith("weights for ") else f"weights for {label}"
-        before = cells_of(found.source, seed, what, identify)
-    needs = before[-1].run_id if before else None
-    return [*before, Cell(found.run_id, *split_machine(overrides), seed, label, needs)]
+        sources = run_specs_of(found.source, seed, what, identify)
+    needs = sources[-1].run_id if sources else None
+    return [*sources, RunSpec(found.run_id, *split_machine(overrides), seed, label, needs)]
 
 
 def _compose(
     sweep: SweepConfig, row: RowConfig | None, overrides: list[str], common: list[str], identify: Identify
-) -> Identified:
-    """Identify a row; blame it for what does not compose, unless the command line alone does not either."""
+) -> RunIdentity:
+    """Identify a row; errors name it, unless the command line alone already fails the same way."""
     try:
         return identify(overrides)
     except HorizonError as error:

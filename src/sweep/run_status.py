@@ -1,4 +1,4 @@
-"""What the folder of a run tells the runner: whether it is finished, its numbers, and whether a process is at it."""
+"""State of a run by its folder: whether it is finished, its scores, and whether a process trains in it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def read_score(folder: Path, metric: str) -> float | None:
 
 
 def _find(node: Any, name: str) -> Any:
-    """Follow a dotted name through nested objects; keys such as `0-0.5` hold dots themselves."""
+    """Follow a dotted name through nested objects; keys such as `0-0.5` lock dots themselves."""
     if not isinstance(node, dict):
         return None
     if name in node:
@@ -54,7 +54,7 @@ def read_seconds(folder: Path) -> float | None:
 
 
 def is_busy(folder: Path) -> bool:
-    """Whether a process is training in the folder at this moment (it holds `.lock`)."""
+    """Whether a process is training in the folder (it holds `.lock`)."""
     try:
         with (folder / ".lock").open() as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -76,5 +76,5 @@ def read_validations(folder: Path, metric: str) -> dict[int, float]:
                     if abs(value) <= LARGEST:
                         values[int(row["epoch"])] = value
     except (OSError, ValueError, csv.Error):
-        return values  # a line is being written; the next look sees it whole
+        return values  # a line is being written; the next poll reads it whole
     return values

@@ -1,4 +1,4 @@
-"""Trains what a plan says: workers that take a cell each, train it as a process, and note what became of it."""
+"""Trains the runs of a plan: each worker takes a run spec, trains it as a process, and records its outcome."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from optuna.trial import Trial
 
 from src.errors import HorizonError
 from src.report.sweep_record import SweepRecord
-from src.sweep.launcher import Ended, Launcher, Stop
-from src.sweep.plan import Cell, Plan
+from src.sweep.launcher import ExitStatus, Launcher, StopRequest
+from src.sweep.plan import Plan, RunSpec
 from src.sweep.progress import progress_line
-from src.sweep.publisher import Keeper
+from src.sweep.record_writer import RecordWriter
 from src.sweep.run_status import is_busy, is_finished, read_score
-from src.sweep.sweep_study import Attempt, CellEndedError, DatabaseError, SweepStudy
+from src.sweep.sweep_study import DatabaseError, SweepStudy, SweepTrial, TrialEndedError
 
 logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
 
-IDLE_S = 1.0
-"""Between two looks of a worker that has nothing to do."""
+POLL_S = 1.0
+"""Of a worker that has nothing to do."""
 PROGRESS_EVERY_S = 60.0
 RECORD_EVERY_S = 20.0
-AWAY_S = 900.0
-"""How long a running sweep waits for its database; runs that train go on meanwhile. At the start it waits for none."""
-AWAY_RETRY_S = 5.0
-IMPATIENT_AFTER_S = 2.0
-"""A second Ctrl-C this long after the first ends everything at once; launchers repeat a signal within milliseconds."""
+DATABASE_TIMEOUT_S = 900.0
+"""How long a running sweep waits for its database while its runs train; at the start it does not wait."""
+DATABASE_RETRY_S = 5.0
+INTERRUPT_GRACE_S = 2.0
+"""A second Ctrl-C this long after the first kills all runs; launchers repeat a signal within milliseconds."""
 MOST_INTERRUPTIONS = 3
-"""A run that ends so often as if interrupted, while nobody stopped the sweep, has failed."""
+"""A run that ends this often as if interrupted, while nobody stopped the sweep, has failed."""
 
 
 class Runner:
@@ -50,59 +50,59 @@ class Runner:
         self,
         plan: Plan,
         study: SweepStudy,
-        keeper: Keeper,
+        writer: RecordWriter,
         launcher: Launcher,
         publish: Callable[[Path], object],
     ) -> None:
-        self.plan, self.study, self.keeper, self.launcher, self.publish = plan, study, keeper, launcher, publish
-        self.outputs = keeper.outputs
-        self.stop = Stop()
+        self.plan, self.study, self.writer, self.launcher, self.publish = plan, study, writer, launcher, publish
+        self.outputs = writer.outputs
+        self.stop = StopRequest()
         self._published: set[str] = set()
         self._interruptions: Counter[str] = Counter()
-        self._broken: list[BaseException] = []
+        self._worker_errors: list[BaseException] = []
         self._first_own = 0  # number of the first trial since this call began
 
     def run(self) -> SweepRecord:
-        """Work until every cell is done or has failed, or a signal comes. Returns the record of that moment."""
-        with self._listening():
+        """Work until every run is done or has failed, or a signal comes. Returns the final record."""
+        with self._handling_signals():
             with self.study.lock():
-                self._report_dead(self.study.clear_dead())
-                self._first_own = len(self.study.attempts())
+                self._log_dead(self.study.release_dead())
+                self._first_own = len(self.study.trials())
             self.publish_done()
-            self._show(self.keeper.write())
+            self._show(self.writer.write())
             workers = [threading.Thread(target=self._work, args=(index,)) for index in range(self.launcher.workers)]
             for worker in workers:
                 worker.start()
-            told = written = time.monotonic()
-            told_to_stop = False
+            shown = written = time.monotonic()
+            stop_logged = False
             while any(worker.is_alive() for worker in workers):
                 time.sleep(0.1)
-                if self.stop.requested and not told_to_stop:
-                    told_to_stop = True
-                    logger.info("stopping: runs write a checkpoint and end; Ctrl-C again ends them at once")
-                if time.monotonic() - written > RECORD_EVERY_S and not self._broken:
+                if self.stop.requested and not stop_logged:
+                    stop_logged = True
+                    logger.info("stopping: runs write a checkpoint and end; Ctrl-C again kills them")
+                if time.monotonic() - written > RECORD_EVERY_S and not self._worker_errors:
                     written = time.monotonic()
-                    record = self._guarded(self.keeper.write)
-                    if record is not None and written - told > PROGRESS_EVERY_S:
-                        told = written
+                    record = self._logging_errors(self.writer.write)
+                    if record is not None and written - shown > PROGRESS_EVERY_S:
+                        shown = written
                         self._show(record)
-            if self._broken:
-                raise self._broken[0]
-            self._patiently(self.publish_done)
-            return self._patiently(self.keeper.write)
+            if self._worker_errors:
+                raise self._worker_errors[0]
+            self._with_retries(self.publish_done)
+            return self._with_retries(self.writer.write)
 
     def publish_done(self, strictly: bool = False) -> None:
-        """Put the results of finished runs, whoever trained them, where tables find them.
+        """Write the results of finished runs, whoever trained them, to where tables find them.
 
-        What cannot be written is told, and with `strictly` raises OSError.
+        What cannot be written is logged, and with `strictly` raises OSError.
         """
-        for cell in self.cells():
-            if self.keeper.is_done(cell.run_id) and cell.run_id not in self._published:
-                self._publish(cell.run_id, strictly)
+        for spec in self.specs():
+            if self.writer.is_done(spec.run_id) and spec.run_id not in self._published:
+                self._publish(spec.run_id, strictly)
 
-    def cells(self) -> list[Cell]:
-        """Every run of the sweep, as far as known."""
-        return list(self.plan.cells.values())
+    def specs(self) -> list[RunSpec]:
+        """The runs of the sweep known so far."""
+        return list(self.plan.specs.values())
 
     def _publish(self, run_id: str, strictly: bool = False) -> None:
         """Publish one result; a broken file or a full disk costs that result only, not the sweep."""
@@ -118,161 +118,161 @@ class Runner:
 
     def _work(self, worker: int) -> None:
         try:
-            while not self.stop.requested and self._patiently(partial(self._step, worker)):
+            while not self.stop.requested and self._with_retries(partial(self._step, worker)):
                 pass
         except BaseException as error:
-            self._broken.append(error)
+            self._worker_errors.append(error)
             self.stop.requested = True
 
-    def _patiently(self, action: Callable[[], Result]) -> Result:
-        """What needs the database, again and again while it is away. Raises DatabaseError when it stays away."""
+    def _with_retries(self, action: Callable[[], Result]) -> Result:
+        """Retry an action while the database is away. Raises DatabaseError when it stays away."""
         since = None
         while True:
             try:
                 return action()
             except DatabaseError as error:
                 now = time.monotonic()
-                if self.stop.requested or (since is not None and now - since > AWAY_S):
+                if self.stop.requested or (since is not None and now - since > DATABASE_TIMEOUT_S):
                     raise
                 if since is None:
                     since = now
-                    logger.warning("%s; trying again for %.0f minutes", error, AWAY_S / 60)
-            time.sleep(AWAY_RETRY_S)
+                    logger.warning("%s; retrying for %.0f minutes", error, DATABASE_TIMEOUT_S / 60)
+            time.sleep(DATABASE_RETRY_S)
             self.study.reconnect()
 
     def _step(self, worker: int) -> bool:
-        """Take and train one cell, or wait a little. False when nothing is left for anyone."""
-        with self.study.lock() as hold:
-            self._report_dead(self.study.clear_dead())
-            cell, settled = self._next(self.study.attempts())
-            if cell is not None:
-                attrs = {"run_id": cell.run_id, "label": cell.label, "seed": cell.seed, "overrides": cell.overrides}
-                self.study.take(hold, lambda trial: self._train(cell, worker, trial), attrs=attrs, params={})
-        if cell is not None:
-            self._guarded(self.keeper.write)
+        """Take and train one run, or wait a little. False when no run is left for any worker."""
+        with self.study.lock() as lock:
+            self._log_dead(self.study.release_dead())
+            spec, settled = self._next(self.study.trials())
+            if spec is not None:
+                attrs = {"run_id": spec.run_id, "label": spec.label, "seed": spec.seed, "overrides": spec.overrides}
+                self.study.take(lock, lambda trial: self._train(spec, worker, trial), attrs=attrs, params={})
+        if spec is not None:
+            self._logging_errors(self.writer.write)
             return True
         if not settled:
-            time.sleep(IDLE_S)
+            time.sleep(POLL_S)
         return not settled
 
-    def _next(self, attempts: list[Attempt]) -> tuple[Cell | None, bool]:
-        """(the next cell to train, whether all are done or have failed); the lock is held."""
-        latest = {attempt.run_id: attempt for attempt in attempts if attempt.run_id is not None}
+    def _next(self, trials: list[SweepTrial]) -> tuple[RunSpec | None, bool]:
+        """(the next run to train, whether all are done or have failed); the lock is held."""
+        latest = {trial.run_id: trial for trial in trials if trial.run_id is not None}
         failed: dict[str, str] = {}
         settled = True
-        for cell in self.plan.cells.values():  # what is needed stands before what needs it
-            attempt = latest.get(cell.run_id)
-            if self.keeper.is_done(cell.run_id):
+        for spec in self.plan.specs.values():  # in training order: a source comes before the runs that start from it
+            trial = latest.get(spec.run_id)
+            if self.writer.is_done(spec.run_id):
                 continue
-            if attempt is not None and attempt.state == "failed" and attempt.number >= self._first_own:
-                failed[cell.run_id] = attempt.reason or ""
+            if trial is not None and trial.state == "failed" and trial.number >= self._first_own:
+                failed[spec.run_id] = trial.reason or ""
                 continue
-            if attempt is not None and attempt.state == "running":
+            if trial is not None and trial.state == "running":
                 settled = False
                 continue
-            if cell.needs in failed:
-                reason = f"{cell.needs}, which it starts from, failed: {failed[cell.needs]}"
-                attrs = {"run_id": cell.run_id, "label": cell.label, "seed": cell.seed, "overrides": cell.overrides}
+            if spec.needs in failed:
+                reason = f"{spec.needs}, which it starts from, failed: {failed[spec.needs]}"
+                attrs = {"run_id": spec.run_id, "label": spec.label, "seed": spec.seed, "overrides": spec.overrides}
                 self.study.add_failed(attrs, reason)
-                failed[cell.run_id] = reason
+                failed[spec.run_id] = reason
                 continue
             settled = False
-            if cell.needs is None or self.keeper.is_done(cell.needs):
-                return cell, False
+            if spec.needs is None or self.writer.is_done(spec.needs):
+                return spec, False
         return None, settled
 
-    def _train(self, cell: Cell, worker: int, trial: Trial) -> float:
-        """Train a cell that is taken; its score. Raises CellEndedError when there is none."""
-        self._guarded(self.keeper.write)
-        ended = self.train(cell, worker)
-        if ended is not None:
-            if ended.reason:
-                self.study.note(trial, "reason", ended.reason)
-            raise CellEndedError(ended.reason)
-        return read_score(self.outputs / cell.run_id, "mAP") or 0.0
+    def _train(self, spec: RunSpec, worker: int, trial: Trial) -> float:
+        """Train a run that is taken; its score. Raises TrialEndedError when there is none."""
+        self._logging_errors(self.writer.write)
+        status = self.train(spec, worker)
+        if status is not None:
+            if status.reason:
+                self.study.set_attr(trial, "reason", status.reason)
+            raise TrialEndedError(status.reason)
+        return read_score(self.outputs / spec.run_id, "mAP") or 0.0
 
-    def train(self, cell: Cell, worker: int, watch: Callable[[], bool] | None = None) -> Ended | None:
-        """Bring one run to its end, here or by whoever has it: None when done, else how it ended.
+    def train(self, spec: RunSpec, worker: int, watch: Callable[[], bool] | None = None) -> ExitStatus | None:
+        """Train one run, or wait for whoever trains it: None when it is done, else the exit status.
 
-        The reason is empty where it was interrupted and can go on.
+        The reason is empty where it was interrupted and can be resumed.
         """
-        folder = self.outputs / cell.run_id
+        folder = self.outputs / spec.run_id
         while True:
-            self._wait_for_others(cell, folder)
-            if self.keeper.is_done(cell.run_id):
+            self._wait_for_others(spec, folder)
+            if self.writer.is_done(spec.run_id):
                 return None
             if self.stop.requested:
-                return Ended(0, "", told=True)
-            logger.info("%s: started %s", name_of(cell), cell.run_id)
+                return ExitStatus(0, "", stop_requested=True)
+            logger.info("%s: started %s", name_of(spec), spec.run_id)
             began = time.monotonic()
-            ended = self.launcher.run(cell, worker, self.stop, watch)
-            if not ended.busy:
+            status = self.launcher.run(spec, worker, self.stop, watch)
+            if not status.busy:
                 break
         seconds = time.monotonic() - began
-        if ended.interrupted and not self.keeper.is_done(cell.run_id):
-            self._interruptions[cell.run_id] += not ended.told
-            if self._interruptions[cell.run_id] < MOST_INTERRUPTIONS:
-                logger.info("%s: interrupted after %.0f s; it can go on", name_of(cell), seconds)
-                return replace(ended, reason="")
-        reason = ended.reason
+        if status.interrupted and not self.writer.is_done(spec.run_id):
+            self._interruptions[spec.run_id] += not status.stop_requested
+            if self._interruptions[spec.run_id] < MOST_INTERRUPTIONS:
+                logger.info("%s: interrupted after %.0f s; it can be resumed", name_of(spec), seconds)
+                return replace(status, reason="")
+        reason = status.reason
         if not reason and not is_finished(folder):
             reason = f"it ended with exit code 0, but {folder} has no run.json and metrics.json"
-        elif not reason and not self.keeper.is_done(cell.run_id):
+        elif not reason and not self.writer.is_done(spec.run_id):
             reason = f"{folder / 'metrics.json'} has no finite mAP"
         if reason:
-            logger.warning("%s: FAILED after %.0f s: %s; log: %s", name_of(cell), seconds, reason, self._log(cell))
-            return replace(ended, reason=reason)
+            logger.warning("%s: FAILED after %.0f s: %s; log: %s", name_of(spec), seconds, reason, self._log(spec))
+            return replace(status, reason=reason)
         score = read_score(folder, "mAP") or 0.0
-        logger.info("%s: done after %.0f s, mAP %.1f %%", name_of(cell), seconds, 100 * score)
-        self._publish(cell.run_id)
+        logger.info("%s: done after %.0f s, mAP %.1f %%", name_of(spec), seconds, 100 * score)
+        self._publish(spec.run_id)
         return None
 
-    def _log(self, cell: Cell) -> Path:
-        return self.launcher.log_of(cell.run_id)
+    def _log(self, spec: RunSpec) -> Path:
+        return self.launcher.log_of(spec.run_id)
 
-    def _wait_for_others(self, cell: Cell, folder: Path) -> None:
-        """Wait while a process that is none of the study's trains the run."""
-        said = False
+    def _wait_for_others(self, spec: RunSpec, folder: Path) -> None:
+        """Wait while a process outside the study trains the run."""
+        logged = False
         while is_busy(folder) and not self.stop.requested:
-            if not said:
-                logger.info("%s: another process is training %s; waiting for it", name_of(cell), cell.run_id)
-                said = True
-            time.sleep(IDLE_S)
+            if not logged:
+                logger.info("%s: another process is training %s; waiting for it", name_of(spec), spec.run_id)
+                logged = True
+            time.sleep(POLL_S)
 
     # ---------------------------------------------------------------- around
 
-    def _guarded(self, action: Callable[[], SweepRecord]) -> SweepRecord | None:
-        """What only reports must not end a run that trains; the next step of a worker meets the same fault."""
+    def _logging_errors(self, action: Callable[[], SweepRecord]) -> SweepRecord | None:
+        """Reporting must not end a run that trains; the next step of a worker meets the same error."""
         try:
             return action()
         except HorizonError as error:
             logger.warning("%s", error)
             return None
 
-    def _report_dead(self, dead: list[Attempt]) -> None:
-        for attempt in dead:
-            if attempt.run_id is not None:
-                logger.warning("worker %s is gone; %s is free again", attempt.worker, attempt.run_id)
+    def _log_dead(self, dead: list[SweepTrial]) -> None:
+        for trial in dead:
+            if trial.run_id is not None:
+                logger.warning("worker %s is gone; %s is released", trial.worker, trial.run_id)
 
     def _show(self, record: SweepRecord) -> None:
         logger.info("%s", progress_line(record, self.outputs, self.launcher.workers))
 
     @contextmanager
-    def _listening(self) -> Iterator[None]:
-        """Take Ctrl-C and SIGTERM as the wish to stop after checkpoints; a later second Ctrl-C stops at once."""
+    def _handling_signals(self) -> Iterator[None]:
+        """Ctrl-C and SIGTERM request a stop after checkpoints; a later second Ctrl-C kills the runs."""
         first: list[float] = []
 
         def request(number: int, frame: FrameType | None) -> None:
             first.append(time.monotonic())
             if not self.stop.requested:
                 self.stop.requested = True
-            elif number == signal.SIGINT and first[-1] - first[0] > IMPATIENT_AFTER_S:
+            elif number == signal.SIGINT and first[-1] - first[0] > INTERRUPT_GRACE_S:
                 self.stop.at_once = True
 
-        def missed(args: threading.ExceptHookArgs) -> None:  # of Optuna's heartbeat threads; ours keep their errors
+        def log_missed(args: threading.ExceptHookArgs) -> None:  # of Optuna's heartbeat threads; ours keep their errors
             logger.warning("the database of the sweep did not take a heartbeat (%s)", args.exc_type.__name__)
 
-        hook, threading.excepthook = threading.excepthook, missed
+        hook, threading.excepthook = threading.excepthook, log_missed
         before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
         for number, handler in before.items():
             if handler is not signal.SIG_IGN:  # a shell's background job ignores Ctrl-C
@@ -285,6 +285,6 @@ class Runner:
                 signal.signal(number, handler)
 
 
-def name_of(cell: Cell) -> str:
-    """A run as people know it."""
-    return f"[{cell.label}, seed {cell.seed}]"
+def name_of(spec: RunSpec) -> str:
+    """A run's name in messages."""
+    return f"[{spec.label}, seed {spec.seed}]"

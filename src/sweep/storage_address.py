@@ -16,7 +16,7 @@ def default_storage(outputs: Path) -> str:
 
 
 def check_address(url: str) -> None:
-    """Raises ConfigError, without showing the address, for one that would be read as another than was meant."""
+    """Raises ConfigError, without showing the address, for one that SQLAlchemy would misread."""
     if not url.strip():
         raise ConfigError("storage is empty; give the address of a database, or leave storage= out for SQLite")
     if url.count("@") > 1 and not url.startswith("sqlite"):

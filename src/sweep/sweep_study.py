@@ -1,8 +1,8 @@
-"""The Optuna study of a sweep: who trains what at this moment, on which machine, and what became of it.
+"""The Optuna study of a sweep: which worker on which machine trains what, and the outcome of each trial.
 
-Every step that looks at the trials and then acts on them happens under one file lock: a worker chooses a cell, makes
-its trial and takes it before another worker looks. So Optuna never holds a trial that nobody has taken, and a taken
-one always names its worker.
+Every step that reads the trials and then acts on them holds one file lock: a worker chooses a run, creates its trial
+and takes it before another worker reads. So the study never holds a waiting trial, and a running one always names its
+worker.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from src.sweep.storage_address import for_optuna
 
 FORMAT = 1
 HEARTBEAT_S = 60
-GRACE_S = 300
-"""A worker of another machine that has not been heard of for so long is dead."""
+GRACE_PERIOD_S = 300
+"""A worker of another machine without a heartbeat for this long is dead."""
 CONNECT_S = 15
 DATABASE_FAULTS = (
     SQLAlchemyError, optuna.exceptions.StorageInternalError, ImportError, RuntimeError, ValueError, LookupError,
@@ -45,17 +45,17 @@ class DatabaseError(ConfigError):
     """The database of a sweep cannot be used, which may pass."""
 
 
-class CellEndedError(Exception):
-    """Ends a trial as failed; with a reason unless the cell is to be trained on."""
+class TrialEndedError(Exception):
+    """Ends a trial as failed; with a reason unless its run is to be resumed."""
 
 
 @dataclass(frozen=True)
-class Attempt:
+class SweepTrial:
     """One trial of the study."""
 
     number: int
     run_id: str | None
-    state: str  # running, done, pruned, failed, or interrupted: to be gone on with
+    state: str  # running, done, pruned, failed, or interrupted (to be resumed)
     worker: str | None
     reason: str | None
     started: float | None  # seconds since 1970
@@ -65,30 +65,30 @@ class Attempt:
     attrs: dict[str, Any]
 
 
-def trials_begun(attempts: Iterable[Attempt]) -> int:
-    """Trials of a search that have got their values; one that goes on with another is that one."""
-    return sum(attempt.run_id is not None and "retry_of" not in attempt.attrs for attempt in attempts)
+def trials_begun(trials: Iterable[SweepTrial]) -> int:
+    """Trials of a search that have values; one that resumes another is not counted again."""
+    return sum(trial.run_id is not None and "retry_of" not in trial.attrs for trial in trials)
 
 
-class Hold:
-    """A lock that is held; it can be let go before the block ends."""
+class Lock:
+    """A held file lock, which can be released before its `with` block ends."""
 
     def __init__(self, file: Any) -> None:
         self._file = file
 
     def release(self) -> None:
-        """Let go; nothing happens the second time."""
+        """Release the lock; a second call does nothing."""
         self._file.close()
 
 
 @contextmanager
-def file_lock(path: Path) -> Iterator[Hold]:
-    """Hold the lock file, waiting for it; the system lets go when the process dies."""
+def file_lock(path: Path) -> Iterator[Lock]:
+    """Wait for the lock file and hold it; the system releases it when the process dies."""
     path.parent.mkdir(parents=True, exist_ok=True)
     file = path.open("a")
     try:
         fcntl.flock(file, fcntl.LOCK_EX)
-        yield Hold(file)
+        yield Lock(file)
     finally:
         file.close()
 
@@ -96,7 +96,7 @@ def file_lock(path: Path) -> Iterator[Hold]:
 @contextmanager
 def database_errors(url: str) -> Iterator[None]:
     """Turn what a database and its driver raise into one line with the masked address. Raises DatabaseError."""
-    remedy = "check storage=..., and that the server runs; finished runs are kept, the same command goes on"
+    remedy = "check storage=..., and that the server runs; finished runs are kept, the same command resumes the sweep"
     try:
         yield
     except DATABASE_FAULTS as error:
@@ -106,12 +106,12 @@ def database_errors(url: str) -> Iterator[None]:
         if cause is None and isinstance(error, UnboundLocalError):
             raise
         error = cause or error
-        said = str(getattr(error, "orig", None) or error).strip().splitlines() or [type(error).__name__]
-        said = without_secrets(" ".join(line.strip() for line in said[:2]), url)
+        message = str(getattr(error, "orig", None) or error).strip().splitlines() or [type(error).__name__]
+        message = without_secrets(" ".join(line.strip() for line in message[:2]), url)
         if isinstance(error, ImportError):
             remedy = 'a PostgreSQL server needs `pip install "horizon3d[postgres]"`'
         raise DatabaseError(
-            f"storage={masked(url)}: the database of the sweep cannot be used ({said}); {remedy}"
+            f"storage={masked(url)}: the database of the sweep cannot be used ({message}); {remedy}"
         ) from error
 
 
@@ -125,9 +125,9 @@ class SweepStudy:
         self.name, self.url = name, url
         self.folder = outputs / "sweeps" / name
         self._this_machine = _machine()
-        self._lost: set[int] = set()  # trials of this process whose end the database did not take
+        self._lost: set[int] = set()  # trials of this process whose end could not be stored
         optuna.logging.set_verbosity(optuna.logging.ERROR)
-        with file_lock(outputs / "sweeps" / ".lock"), database_errors(url):  # two creators at once would collide
+        with file_lock(outputs / "sweeps" / ".lock"), database_errors(url):  # concurrent creators would collide
             self._storage = _open_storage(url)
             study = optuna.create_study(
                 storage=self._storage, study_name=name, direction="maximize", load_if_exists=True
@@ -149,20 +149,20 @@ class SweepStudy:
             )
 
     def lock(self) -> Any:
-        """The lock under which workers look and choose, and the record is written."""
+        """The lock under which workers choose and the record is written."""
         return file_lock(self.folder / ".lock")
 
-    def attempts(self) -> list[Attempt]:
+    def trials(self) -> list[SweepTrial]:
         """Every trial, oldest first."""
         with database_errors(self.url):
-            return [_attempt(trial) for trial in self._load().get_trials(deepcopy=False)]
+            return [_sweep_trial(trial) for trial in self._load().get_trials(deepcopy=False)]
 
-    def clear_dead(self) -> list[Attempt]:
-        """Free what dead workers had; the lock is held. Returns what was theirs.
+    def release_dead(self) -> list[SweepTrial]:
+        """Release the trials of dead workers and return them; the lock is held.
 
-        Dead is a worker of this machine whose process is gone, one of another that has not been heard of for
-        `GRACE_S`, and one that took a trial and left no name. A trial that waits is nobody's: see the module. So is
-        one of this process that ended while the database was away.
+        Dead is a worker of this machine whose process is gone, one of another without a heartbeat for
+        `GRACE_PERIOD_S`, and one that took a trial but did not store its name. A waiting trial has no worker (see the
+        module), nor has one of this process that ended while the database was away.
         """
         with database_errors(self.url), warnings.catch_warnings():
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
@@ -170,41 +170,41 @@ class SweepStudy:
             open_states = (TrialState.RUNNING, TrialState.WAITING)
             before = study.get_trials(deepcopy=False, states=open_states)
             for trial in before:
-                if trial.state == TrialState.WAITING or self._is_gone(trial):
+                if trial.state == TrialState.WAITING or self._is_dead(trial):
                     self._fail(trial)
             optuna.storages.fail_stale_trials(study)
             still = {trial.number for trial in study.get_trials(deepcopy=False, states=open_states)}
-            return [_attempt(trial) for trial in before if trial.number not in still]
+            return [_sweep_trial(trial) for trial in before if trial.number not in still]
 
     def _fail(self, trial: FrozenTrial) -> None:
         try:
             self._storage.set_trial_state_values(trial._trial_id, state=TrialState.FAIL)
         except optuna.exceptions.UpdateFinishedTrialError:
-            pass  # its worker ended it at this moment
+            pass  # its worker has just ended it
 
-    def _is_gone(self, trial: FrozenTrial) -> bool:
+    def _is_dead(self, trial: FrozenTrial) -> bool:
         worker = trial.user_attrs.get("worker")
         if worker is None or trial._trial_id in self._lost:
             return True
         if worker["machine"] == self._this_machine:
-            return _born(worker["pid"]) != worker["born"]
+            return _start_time_of(worker["pid"]) != worker["start_time"]
         # Optuna never calls a trial stale whose worker died before its first heartbeat.
-        old = trial.datetime_start is not None and time.time() - trial.datetime_start.timestamp() > GRACE_S
-        return old and trial._trial_id not in self._heard_of()
+        old = trial.datetime_start is not None and time.time() - trial.datetime_start.timestamp() > GRACE_PERIOD_S
+        return old and trial._trial_id not in self._with_heartbeat()
 
-    def _heard_of(self) -> set[int]:
+    def _with_heartbeat(self) -> set[int]:
         with self._storage.engine.connect() as connection:
             return set(connection.execute(text("SELECT trial_id FROM trial_heartbeats")).scalars())
 
     def add_failed(self, attrs: dict[str, Any], reason: str) -> None:
-        """Note a cell that fails without having been tried; the lock is held."""
+        """Add the trial of a run that fails without being started; the lock is held."""
         with database_errors(self.url):
             attrs = attrs | {"reason": reason}
             self._load().add_trial(optuna.create_trial(state=TrialState.FAIL, user_attrs=attrs))
 
     def take(
         self,
-        hold: Hold,
+        lock: Lock,
         work: Callable[[Trial], float],
         choose: Callable[[Trial], None] | None = None,
         attrs: dict[str, Any] | None = None,
@@ -212,20 +212,20 @@ class SweepStudy:
         sampler: optuna.samplers.BaseSampler | None = None,
         pruner: optuna.pruners.BasePruner | None = None,
     ) -> None:
-        """Make a trial and take it; the lock, which is held, is let go once the trial names its worker. Then `work`.
+        """Create a trial and take it; release the held lock once the trial names its worker. Then `work`.
 
-        `params` are tried again as they are; None lets the sampler choose. `choose` sees the trial before the lock is
-        let go. `work` returns the score, or raises CellEndedError or TrialPruned.
+        `params` are retried as they are; None lets the sampler choose. `choose` gets the trial before the lock is
+        released. `work` returns the score, or raises TrialEndedError or TrialPruned.
         """
         me = {
             "machine": self._this_machine,
             "host": socket.gethostname(),
             "pid": os.getpid(),
-            "born": _born(os.getpid()),
+            "start_time": _start_time_of(os.getpid()),
         }
         taken: list[int] = []
         ended: list[bool] = []
-        defects: list[BaseException] = []  # kept apart from what the database raises
+        defects: list[BaseException] = []  # not to be taken for errors of the database
 
         def objective(trial: Trial) -> float:
             taken.append(trial._trial_id)
@@ -237,14 +237,14 @@ class SweepStudy:
                     choose(trial)
                 trial.set_user_attr("worker", me)
             finally:
-                hold.release()
+                lock.release()
             try:
                 return work(trial)
-            except (CellEndedError, optuna.TrialPruned):
+            except (TrialEndedError, optuna.TrialPruned):
                 raise
             except BaseException as error:
                 defects.append(error)
-                raise CellEndedError from error
+                raise TrialEndedError from error
             finally:
                 ended.append(True)
 
@@ -254,9 +254,9 @@ class SweepStudy:
                 if params is not None:
                     study.enqueue_trial(params, user_attrs=attrs)
                 try:
-                    study.optimize(objective, n_trials=1, catch=(CellEndedError,))
+                    study.optimize(objective, n_trials=1, catch=(TrialEndedError,))
                 except (AssertionError, optuna.exceptions.UpdateFinishedTrialError):
-                    # Another worker took this one for dead, as after a suspended machine; what the run left stays.
+                    # Another worker found this one dead, as after a suspended machine; the run folder stays.
                     if not ended:
                         raise
         except DatabaseError:
@@ -267,16 +267,16 @@ class SweepStudy:
             raise defects[0]
 
     def reconnect(self) -> None:
-        """Let go of the connections that are open: they may lead to a database that is no longer there."""
+        """Close open connections: their database may be gone."""
         self._storage.engine.dispose()
 
-    def note(self, trial: Trial, key: str, value: Any) -> None:
-        """Keep something with a trial, unless it was ended from outside."""
+    def set_attr(self, trial: Trial, key: str, value: Any) -> None:
+        """Set a user attribute of a trial, unless it was ended from outside."""
         with database_errors(self.url), suppress(optuna.exceptions.UpdateFinishedTrialError):
             trial.set_user_attr(key, value)
 
     def report(self, trial: Trial, value: float, step: int) -> bool:
-        """Tell the pruner a value; whether it would end the trial, which it never would of one ended from outside."""
+        """Report a value to the pruner; whether it prunes the trial (never one that was ended from outside)."""
         with database_errors(self.url), suppress(optuna.exceptions.UpdateFinishedTrialError):
             trial.report(value, step)
             return trial.should_prune()
@@ -285,7 +285,7 @@ class SweepStudy:
     def _load(
         self, sampler: optuna.samplers.BaseSampler | None = None, pruner: optuna.pruners.BasePruner | None = None
     ) -> optuna.Study:
-        """A study object of this thread; without a sampler one that costs nothing."""
+        """A study object of this thread; the default sampler is a cheap one that draws nothing."""
         sampler = sampler or optuna.samplers.RandomSampler(seed=0)
         return optuna.load_study(
             study_name=self.name, storage=self._storage, sampler=sampler, pruner=pruner or optuna.pruners.NopPruner()
@@ -301,16 +301,16 @@ def _open_storage(url: str) -> RDBStorage:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         return RDBStorage(
-            for_optuna(url), engine_kwargs=arguments, heartbeat_interval=HEARTBEAT_S, grace_period=GRACE_S
+            for_optuna(url), engine_kwargs=arguments, heartbeat_interval=HEARTBEAT_S, grace_period=GRACE_PERIOD_S
         )
 
 
-def _attempt(trial: FrozenTrial) -> Attempt:
+def _sweep_trial(trial: FrozenTrial) -> SweepTrial:
     attrs = trial.user_attrs
     states = {TrialState.RUNNING: "running", TrialState.COMPLETE: "done", TrialState.PRUNED: "pruned"}
     state = states.get(trial.state) or ("failed" if attrs.get("reason") else "interrupted")
     worker = attrs.get("worker")
-    return Attempt(
+    return SweepTrial(
         number=trial.number,
         run_id=attrs.get("run_id"),
         state=state,
@@ -325,7 +325,7 @@ def _attempt(trial: FrozenTrial) -> Attempt:
 
 
 def _machine() -> str:
-    """What tells machines apart, and containers of one machine that do not see each other's processes."""
+    """Identifies the machine, and its container where processes of others are not visible."""
     parts = [socket.gethostname()]
     for read in (lambda: Path("/proc/sys/kernel/random/boot_id").read_text(), lambda: os.readlink("/proc/self/ns/pid")):
         try:
@@ -335,8 +335,8 @@ def _machine() -> str:
     return "/".join(parts)
 
 
-def _born(pid: int) -> str | None:
-    """When a process of this machine started, None when there is none: numbers are used again."""
+def _start_time_of(pid: int) -> str | None:
+    """Start time of a process of this machine, None when there is none; it tells reused process numbers apart."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return None if fields[0] in "ZX" else fields[19]

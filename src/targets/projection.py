@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from src.geometry.tensor_transforms import rotate
 from src.structures.boxes import Boxes3D
 
 NEAR_M = 0.1
@@ -60,8 +61,8 @@ def _corners(boxes: Boxes3D) -> Tensor:  # [K, 8, 3], the lower four first
     signs = boxes.sizes.new_tensor([(x, y, z) for z in (-1, 1) for x, y in CORNERS])
     local = 0.5 * signs * boxes.sizes[:, None]
     cos, sin = boxes.yaws.cos()[:, None], boxes.yaws.sin()[:, None]
-    turned = [cos * local[..., 0] - sin * local[..., 1], sin * local[..., 0] + cos * local[..., 1], local[..., 2]]
-    return boxes.centers[:, None] + torch.stack(turned, dim=-1)
+    along, across, up = local.unbind(-1)
+    return boxes.centers[:, None] + torch.stack([*rotate(cos, sin, along, across), up], dim=-1)
 
 
 def _homogeneous(points: Tensor) -> Tensor:  # [K, q, 3] -> [K, 1, q, 4]

@@ -18,7 +18,7 @@ def read(world):
     return BoardReader(world.reports, world.outputs).read()[0]
 
 
-def state_of(states, silent_s=0.0, **fields):
+def state_of(states, idle_s=0.0, **fields):
     """A sweep whose six runs have these states; others are done."""
     record = epsilon("mini")
     for run, state in zip(record.runs.values(), states, strict=False):
@@ -26,17 +26,17 @@ def state_of(states, silent_s=0.0, **fields):
         for name, value in fields.items():
             setattr(run, name, value)
     now, taken = 10_000.0, dict.fromkeys(record.runs, 60.0)
-    return Sweep(record=record, tables=[], problem=None, taken=taken, written=now - silent_s, now=now)
+    return Sweep(record=record, tables=[], problem=None, taken=taken, written=now - idle_s, now=now)
 
 
 @pytest.mark.parametrize(
-    "states, silent_s, expected",
+    "states, idle_s, expected",
     [([], 0, "done"), ([], 9999, "done"), (["failed"], 9999, "failed"), (["pruned"], 9999, "done"),
      (["running", "waiting"], 60, "running"), (["running", "waiting"], 180, "stalled"),
      (["waiting"], 60, "running"), (["waiting", "failed"], 180, "unfinished")],
 )  # fmt: skip
-def test_state_of_a_sweep(states, silent_s, expected):
-    assert state_of(states, silent_s).state == expected
+def test_state_of_a_sweep(states, idle_s, expected):
+    assert state_of(states, idle_s).state == expected
 
 
 def test_a_search_is_not_done_while_trials_are_to_come():

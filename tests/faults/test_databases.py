@@ -1,4 +1,4 @@
-"""The database of a sweep is lost, broken or slow in time while cells train; what they leave is not lost."""
+"""The database of a sweep is lost, broken or slow in time while runs train; what they leave is not lost."""
 
 import logging
 import sqlite3
@@ -11,7 +11,7 @@ import pytest
 from src.errors import ConfigError
 from src.report.sweep_record import read_record, record_path
 from src.sweep import runner as runner_module
-from src.sweep.sweep_study import GRACE_S
+from src.sweep.sweep_study import GRACE_PERIOD_S
 from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep
 
 ROWS = {"a": ["model.x=1"], "b": ["model.x=2"], "c": ["model.x=3"]}
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.faults
 @pytest.fixture(autouse=True)
 def at_the_root(monkeypatch):
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(runner_module, "AWAY_RETRY_S", 0.2)
+    monkeypatch.setattr(runner_module, "DATABASE_RETRY_S", 0.2)
 
 
 def sweep_of(seconds, rows=ROWS):
@@ -61,7 +61,7 @@ def database(folder):
 
 
 def away(folder, began, until):
-    """Overwrite the database once a cell has begun, and bring the old content back when `until` is true."""
+    """Overwrite the database once a run has begun, and bring the old content back when `until` is true."""
 
     def act():
         wait_for(lambda: lines(folder, "begin").total() >= began)
@@ -73,27 +73,27 @@ def away(folder, began, until):
     return act
 
 
-def test_a_database_that_comes_back_costs_no_cell(tmp_path, caplog):
-    """It is garbage while the first cell ends, so its end cannot be noted."""
+def test_a_database_that_comes_back_costs_no_run(tmp_path, caplog):
+    """It is garbage while the first run ends, so its end cannot be stored."""
     runner = make_runner(tmp_path, sweep_of(0.4))
-    thread, failures = beside(away(tmp_path, 1, lambda: "trying again" in caplog.text))
+    thread, failures = beside(away(tmp_path, 1, lambda: "retrying" in caplog.text))
     with caplog.at_level(logging.WARNING):
         record = runner.run()
     thread.join()
-    assert not failures and "trying again for 15 minutes" in caplog.text
+    assert not failures and "retrying for 15 minutes" in caplog.text
     assert record.count("done") == 3
     assert set(lines(tmp_path, "begin").values()) == {1} and lines(tmp_path, "begin").total() == 3
 
 
-def test_a_cell_that_failed_meanwhile_is_free_again(tmp_path, caplog):
+def test_a_run_that_failed_meanwhile_is_released(tmp_path, caplog):
     """Nobody else would free it: the process that had it lives."""
     runner = make_runner(tmp_path, sweep_of(0.3, {"a": ["model.x=1"]}))
-    (cell,) = runner.plan.cells.values()
-    fault = tmp_path / "outputs" / "faults" / cell.run_id
+    (spec,) = runner.plan.specs.values()
+    fault = tmp_path / "outputs" / "faults" / spec.run_id
     fault.parent.mkdir(parents=True)
     fault.write_text("1")
-    thread, failures = beside(away(tmp_path, 1, lambda: "trying again" in caplog.text))
-    enough = threading.Timer(0.7 * GRACE_S, setattr, (runner.stop, "requested", True))
+    thread, failures = beside(away(tmp_path, 1, lambda: "retrying" in caplog.text))
+    enough = threading.Timer(0.7 * GRACE_PERIOD_S, setattr, (runner.stop, "requested", True))
     enough.start()  # by its silence the trial would be found dead in the end
     record = runner.run()
     enough.cancel()
@@ -103,8 +103,8 @@ def test_a_cell_that_failed_meanwhile_is_free_again(tmp_path, caplog):
 
 
 @pytest.mark.parametrize("loss", ["garbage", "deleted"])
-def test_a_database_that_is_lost_ends_the_sweep_and_no_finished_cell(tmp_path, monkeypatch, loss):
-    monkeypatch.setattr(runner_module, "AWAY_S", 1.0)
+def test_a_database_that_is_lost_ends_the_sweep_and_no_finished_run(tmp_path, monkeypatch, loss):
+    monkeypatch.setattr(runner_module, "DATABASE_TIMEOUT_S", 1.0)
 
     def lose():
         wait_for(lambda: lines(tmp_path, "begin").total() >= 2)
@@ -129,20 +129,20 @@ def test_a_database_that_is_lost_ends_the_sweep_and_no_finished_cell(tmp_path, m
     assert stored.count("done") == 3
 
 
-def test_a_clock_that_jumps_ahead_makes_no_cell_train_twice(tmp_path):
-    """The heartbeat of a cell that trains looks old; a second runner must not train beside it."""
+def test_a_clock_that_jumps_ahead_makes_no_run_train_twice(tmp_path):
+    """The heartbeat of a run that trains looks old; a second runner must not train beside it."""
     second = []
 
     def jump():
         wait_for(lambda: lines(tmp_path, "begin").total() == 1)
         with sqlite3.connect(database(tmp_path), timeout=30) as connection:
-            past = f"-{10 * GRACE_S} seconds"
+            past = f"-{10 * GRACE_PERIOD_S} seconds"
             wait_for(lambda: connection.execute("SELECT count(*) FROM trial_heartbeats").fetchone()[0] == 1)
             connection.execute("UPDATE trial_heartbeats SET heartbeat = datetime('now', ?)", (past,))
             connection.execute("UPDATE trials SET datetime_start = datetime('now', ?)", (past,))
         runner = make_runner(tmp_path, sweep_of(2.0, {"a": ["model.x=1"]}))
         with runner.study.lock():
-            second.append([attempt.run_id for attempt in runner.study.clear_dead()])
+            second.append([trial.run_id for trial in runner.study.release_dead()])
         second.append(runner._step(1))
 
     thread, failures = beside(jump)

@@ -86,7 +86,7 @@ def test_the_password_of_a_database_is_neither_shown_nor_written(tmp_path):
     pytest.importorskip("psycopg")
     lines = set()
     for module, words, expect, said in (
-        ("sweep", ["+sweep=epsilon", "dry_run=true", ADDRESS], 0, "5 cells"),
+        ("sweep", ["+sweep=epsilon", "dry_run=true", ADDRESS], 0, "5 results"),
         ("sweep", ["+sweep=epsilon", ADDRESS], 3, "cannot be used"),
         ("train", ["phase=phase1", ADDRESS], 3, "looks like a password"),
     ):

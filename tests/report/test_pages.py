@@ -96,16 +96,16 @@ def test_an_unnamed_setting_shows_itself_last(both_phases, write_run, report):
     assert names[-1] == "phase 2, `model.dptf.gaussian_path.sampling=random`"
 
 
-def test_silent_frames_have_tables_of_their_own(both_phases, write_run, report):
+def test_runs_with_sensor_dropout_have_tables_of_their_own(both_phases, write_run, report):
     for seed, (with_velocity, without) in enumerate([(0.3, 0.2), (0.4, 0.2)]):
         write_run(f"with-{seed}", ["data.sensor_dropout=0.25"], seed, with_velocity, phase="phase2")
         write_run(f"without-{seed}", ["data.sensor_dropout=0.25", *NO_VELOCITY], seed, without, phase="phase2")
-    seen, silent = report("phase2").split("## With silent frames")
+    seen, dropout = report("phase2").split("## With sensor dropout")
     for part in seen.split("```")[2:]:  # after the commands
-        assert "silent" not in part
+        assert "dropout" not in part
     names = ["phase 2, `data.sensor_dropout=0.25`", "phase 2, no velocity compensation, `data.sensor_dropout=0.25`"]
-    assert list(rows(silent, "| experiment | mAP | NDS | mAVE, m/s |")) == names
-    gains = rows(silent, f"| {names[0]} over | seeds | mAP |")
+    assert list(rows(dropout, "| experiment | mAP | NDS | mAVE, m/s |")) == names
+    gains = rows(dropout, f"| {names[0]} over | seeds | mAP |")
     assert "| 2 | +15.0 ± 7.1 |" in gains[names[1]]
 
 

@@ -11,7 +11,7 @@ from src.errors import HorizonError
 from src.report.sweep_file import DimensionConfig, RowConfig, SweepConfig
 from src.sweep.launcher import Launcher
 from src.sweep.plan import make_plan
-from src.sweep.publisher import Keeper
+from src.sweep.record_writer import RecordWriter
 from src.sweep.runner import Runner
 from src.sweep.search import Search
 from src.sweep.storage_address import default_storage
@@ -34,11 +34,11 @@ def make_runner(folder, sweep, seeds=(0,), common=(), workers=1, definition=None
     plan = make_plan(sweep, common, list(seeds), identify)
     definition = definition or {"format": 1, "kind": "search" if sweep.is_search else "rows"}
     study = SweepStudy(outputs, plan.study, storage or default_storage(outputs), definition)
-    keeper = Keeper(plan, study, "the command", outputs, reports)
+    writer = RecordWriter(plan, study, "the command", outputs, reports)
     prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else lambda *_: None
     command = [sys.executable, "-m", "tests.sweep.fake_train"]
     launcher = Launcher(command, study.folder, workers, [], in_child=lambda: prctl(1, signal.SIGTERM))
-    parts = (plan, study, keeper, launcher, publish or (lambda path: None))
+    parts = (plan, study, writer, launcher, publish or (lambda path: None))
     return Search(*parts, common=common, identify=identify) if sweep.is_search else Runner(*parts)
 
 

@@ -12,7 +12,7 @@ import sys
 import time
 from pathlib import Path
 
-from src.sweep.plan import Identified, split_machine
+from src.sweep.plan import RunIdentity, split_machine
 from src.training.identity import is_of
 
 SOURCE = ("phase", "model.dptf")
@@ -34,7 +34,7 @@ def identify(overrides):
     source = None
     if phase == "phase2":
         source = ["phase=phase1", *[override for override in overrides if not is_of(override, SOURCE)]]
-    return Identified(f"fake-{phase}-{scale}-{digest}", scale, source)
+    return RunIdentity(f"fake-{phase}-{scale}-{digest}", scale, source)
 
 
 def main(overrides):

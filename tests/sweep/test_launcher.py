@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import pytest
 
-from src.sweep.launcher import Launcher, Stop, explain, quoted
-from src.sweep.plan import Cell
+from src.sweep.launcher import Launcher, StopRequest, explain, quoted
+from src.sweep.plan import RunSpec
 
 
 @pytest.mark.parametrize(
@@ -44,22 +44,22 @@ def test_reasons_in_a_line(code, output, expected):
 
 
 def test_a_run_that_does_not_end_when_asked_is_killed_with_its_children(tmp_path, monkeypatch):
-    monkeypatch.setattr("src.sweep.launcher.GRACE_S", 0.5)
+    monkeypatch.setattr("src.sweep.launcher.GRACE_PERIOD_S", 0.5)
     script = (
         "import os, signal, subprocess, sys, time\n"
         "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
         "child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])\n"
         "print(child.pid, flush=True); time.sleep(60)"
     )
-    stop, launcher = Stop(), Launcher([], tmp_path, 1, [])
+    stop, launcher = StopRequest(), Launcher([], tmp_path, 1, [])
 
     def watch():
         stop.requested = len(launcher.log_of("name").read_text().splitlines()[-1:][0].split()) == 1
         return False
 
     began = time.monotonic()
-    ended = launcher.run_command([sys.executable, "-c", script], "name", 0, stop, watch)
-    assert ended.code == -signal.SIGKILL and ended.interrupted and time.monotonic() - began < 20
+    status = launcher.run_command([sys.executable, "-c", script], "name", 0, stop, watch)
+    assert status.code == -signal.SIGKILL and status.interrupted and time.monotonic() - began < 20
     child = int(launcher.log_of("name").read_text().split()[-1])
     deadline = time.monotonic() + 5
     while time.monotonic() < deadline:
@@ -75,12 +75,12 @@ def test_a_run_that_does_not_end_when_asked_is_killed_with_its_children(tmp_path
 
 def test_the_log_is_continued_and_only_the_last_start_explains(tmp_path):
     launcher = Launcher([], tmp_path, 1, [])
-    run = lambda code: launcher.run_command([sys.executable, "-c", code], "x", 0, Stop())  # noqa: E731
+    run = lambda code: launcher.run_command([sys.executable, "-c", code], "x", 0, StopRequest())  # noqa: E731
     assert "first" in run("raise ValueError('first')").reason
     assert run("import sys; sys.exit(2)").reason == "it printed nothing (exit code 2)"
     assert run("pass").reason == ""
     assert "first" in launcher.log_of("x").read_text() and launcher.log_of("x").read_text().count("====") == 3
-    assert "could not be started" in launcher.run_command(["/no/such"], "x", 0, Stop()).reason
+    assert "could not be started" in launcher.run_command(["/no/such"], "x", 0, StopRequest()).reason
 
 
 @pytest.mark.parametrize("label", ["a\\b", "end\\", 'quo"te', 'both\\"', "\\\\", "it's, a=b {c} [d]"])
@@ -94,8 +94,8 @@ def test_weights_and_biases_is_told_sweep_and_row(tmp_path):
     from src.config import compose_config
 
     launcher = Launcher([], tmp_path, 1, [], group="epsilon-mini")
-    cell = Cell("r", ["model.ocsf.margin_m=0"], ["logger=wandb"], 0, 'a "b", 4.8 m = x', None)
-    config, _ = compose_config([*cell.overrides, *cell.machine, *launcher.shown_as(cell)])
-    assert (config.logger.wandb.group, config.logger.wandb.row) == ("epsilon-mini", cell.label)
-    own = replace(cell, machine=["logger=wandb", "logger.wandb.group=mine"])
+    spec = RunSpec("r", ["model.ocsf.margin_m=0"], ["logger=wandb"], 0, 'a "b", 4.8 m = x', None)
+    config, _ = compose_config([*spec.overrides, *spec.machine, *launcher.shown_as(spec)])
+    assert (config.logger.wandb.group, config.logger.wandb.row) == ("epsilon-mini", spec.label)
+    own = replace(spec, machine=["logger=wandb", "logger.wandb.group=mine"])
     assert [place.split("=")[0] for place in launcher.shown_as(own)] == ["logger.wandb.row"]

@@ -33,9 +33,9 @@ def test_order_is_seed_by_seed_and_first_what_others_start_from():
         "b again": ["phase=phase2"],
     }
     plan = make_plan(make_sweep(rows, overrides=["model.x=1"]), ["model.x=2"], [3, 4], identify)
-    labels = [(cell.label, cell.seed) for cell in plan.cells.values()]
+    labels = [(spec.label, spec.seed) for spec in plan.specs.values()]
     assert labels == [("a", 3), ("b", 3), ("c", 3), ("a", 4), ("b", 4), ("c", 4)]
-    first, second, *_ = plan.cells.values()
+    first, second, *_ = plan.specs.values()
     assert first.overrides == ["phase=phase1", "model.x=2", "seed=3"] and first.needs is None
     assert second.overrides == ["model.x=2", "phase=phase2", "seed=3"] or second.needs == first.run_id
     assert plan.rows["b"] == plan.rows["b again"] and plan.labels(second.run_id) == ["b", "b again"]
@@ -44,7 +44,7 @@ def test_order_is_seed_by_seed_and_first_what_others_start_from():
 
 def test_a_run_that_no_row_shows_says_what_it_is_for():
     plan = make_plan(make_sweep({"b": ["phase=phase2"]}), ["paths.outputs=o"], [0], identify)
-    first, second = plan.cells.values()
+    first, second = plan.specs.values()
     assert first.label == "weights for b" and plan.labels(first.run_id) == [] and second.needs == first.run_id
     assert first.command == "python -m src.train phase=phase1 seed=0 paths.outputs=o"
 

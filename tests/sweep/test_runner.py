@@ -14,7 +14,7 @@ import pytest
 
 from src.errors import ConfigError
 from src.report.sweep_record import read_record, record_path, write_record
-from src.sweep.launcher import Ended
+from src.sweep.launcher import ExitStatus
 from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep
 from tests.sweep.fake_train import identify
 
@@ -87,7 +87,7 @@ def test_what_rows_start_from_comes_first_and_is_shared(tmp_path):
     assert set(trained(tmp_path).values()) == {1} and record.count("done") == 3
 
 
-def test_a_failed_row_is_told_and_tried_again_by_the_next_call(tmp_path):
+def test_a_failed_row_is_reported_and_retried_by_the_next_call(tmp_path):
     rows = {"good": ["model.x=1"], "bad": ["model.x=2"], "killed": ["model.x=3"]}
     bad = fault(tmp_path, ["model.x=2", "seed=0"], "5", "3")
     killed = fault(tmp_path, ["model.x=3", "seed=0"], "kill")
@@ -113,7 +113,7 @@ def test_what_starts_from_a_failed_run_fails_with_its_reason(tmp_path):
     assert make_runner(tmp_path, make_sweep(rows)).run().count("done") == 3
 
 
-def test_an_interrupted_run_goes_on_but_not_for_ever(tmp_path):
+def test_an_interrupted_run_is_resumed_but_not_for_ever(tmp_path):
     rows = {"twice": ["model.x=1"], "always": ["model.x=2"]}
     fault(tmp_path, ["model.x=1", "seed=0"], "6", "6")
     always = fault(tmp_path, ["model.x=2", "seed=0"], *["6"] * 9)
@@ -148,7 +148,7 @@ def test_another_command_line_is_another_sweep_beside_the_first(tmp_path):
     changed = runner.run()
     assert changed.changes == ["optim.lr=0.01"] and changed.rows != plain.rows and changed.study == runner.study.name
     assert record_of(tmp_path) == plain  # not replaced
-    assert read_record(runner.keeper.path) == changed and runner.keeper.path.stem == changed.stem != plain.stem
+    assert read_record(runner.writer.path) == changed and runner.writer.path.stem == changed.stem != plain.stem
     assert make_runner(tmp_path, sweep).run().seeds == [0] and changed.study != plain.study
 
 
@@ -178,13 +178,14 @@ def test_words_of_a_failure_decide_nothing(tmp_path):
     assert run.state == "failed" and "is being trained by another process" in run.reason
 
 
-def test_a_busy_folder_is_waited_for_even_when_it_is_free_at_the_next_look(tmp_path):
+def test_a_busy_folder_is_waited_for_even_when_it_is_free_at_the_next_poll(tmp_path):
     runner = make_runner(tmp_path, make_sweep({"a": ["model.x=1"]}))
     own, starts = runner.launcher.run, []
 
     def run(*arguments):
         starts.append(1)
-        busy = Ended(3, "BusyError: the folder is being trained by another process (exit code 3)", told=False)
+        reason = "BusyError: the folder is being trained by another process (exit code 3)"
+        busy = ExitStatus(3, reason, stop_requested=False)
         return busy if len(starts) == 1 else own(*arguments)
 
     runner.launcher.run = run
@@ -206,7 +207,7 @@ def test_a_run_that_someone_else_trains_is_waited_for(tmp_path):
 
 
 @pytest.mark.slow
-def test_several_runners_at_once_train_every_cell_once(tmp_path):
+def test_several_runners_at_once_train_every_run_once(tmp_path):
     runners = [start(tmp_path, rows=TWELVE, barrier=True, workers=2) for _ in range(3)]
     for runner in runners:
         assert runner.stdout.readline() == "ready\n"
@@ -281,10 +282,10 @@ def test_a_broken_record_is_replaced_and_one_that_cannot_be_written_ends_nothing
     def full(path, record):
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr("src.sweep.publisher.write_record", full)
+    monkeypatch.setattr("src.sweep.record_writer.write_record", full)
     record = make_runner(tmp_path, make_sweep({"a": [], "b": ["model.x=2"]})).run()
     assert record.count("done") == 2
-    monkeypatch.setattr("src.sweep.publisher.write_record", write_record)
+    monkeypatch.setattr("src.sweep.record_writer.write_record", write_record)
 
 
 def test_a_result_that_cannot_be_published_costs_no_other(tmp_path):

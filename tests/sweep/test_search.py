@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from src.errors import ConfigError
-from src.sweep.search import _Watch
+from src.sweep.search import _PruningWatch
 from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep
 from tests.sweep.test_runner import fault, finish, record_of, start, trained, wait_for
 
@@ -93,7 +93,7 @@ def test_a_database_that_is_away_for_a_moment_ends_no_run(tmp_path):
                 raise answer
             return answer
 
-    watch = _Watch(Study(), None, tmp_path, "NDS")
+    watch = _PruningWatch(Study(), None, tmp_path, "NDS")
     assert watch() is False and watch.last == 0.0  # tried again at the next look, with the same numbers
     assert watch() is True and watch.last == 0.5 and not answers
     assert watch() is True and watch.pruned  # nothing has changed since; what was said stays said

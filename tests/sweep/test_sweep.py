@@ -80,7 +80,7 @@ def test_dry_run_prints_commands_and_touches_nothing(sweeps, places, tmp_path, c
     )
     sweep.main(["+sweep=paths", "scale=debug", "seeds=2", "seed=5", "dry_run=true", *places])
     out = capsys.readouterr().out
-    assert "3 rows x 2 seeds = 6 cells; 6 runs, 0 finished" in out
+    assert "3 rows x 2 seeds = 6 results of 6 runs, 0 finished" in out
     commands = [line for line in out.splitlines() if line.startswith("python -m src.train ")]
     assert (
         len(commands) == len(set(commands)) == 6

@@ -131,21 +131,21 @@ def test_numbers_of_all_methods_are_those_reported():
     assert found == wanted
 
 
-def test_the_dense_peer_is_trained_as_the_method_it_stands_for():
+def test_the_dense_baseline_is_trained_as_the_method_it_stands_for():
     """Same phase, data, backbone and head settings as the row it is compared with; only the model differs."""
     sweep = load_sweep(OTHER_METHODS)
     (row,) = [row for row in sweep.rows if row.label == "BEVFusion"]
     (ours,) = [row for row in sweep.rows if row.label == sweep.baseline]
     for scale in SCALES:
-        peer, own = (build_config(tree_of(scale, overrides_of(sweep, one))) for one in (row, ours))
-        assert (peer.model.name, own.model.name) == ("dense_bev", "horizon3d")
+        baseline, own = (build_config(tree_of(scale, overrides_of(sweep, one))) for one in (row, ours))
+        assert (baseline.model.name, own.model.name) == ("dense_bev", "horizon3d")
         for part in ("data", "backbone", "phase", "optim", "grid", "precision", "seed"):
-            assert getattr(peer, part) == getattr(own, part), (scale, part)
+            assert getattr(baseline, part) == getattr(own, part), (scale, part)
         for name in ("nms", "score_threshold", "max_boxes", "attributes"):
-            assert getattr(peer.model.head, name) == getattr(own.model.head, name)
+            assert getattr(baseline.model.head, name) == getattr(own.model.head, name)
         for name in ("heatmap_weight", "box_weight", "depth_weight"):
-            assert getattr(peer.model.loss, name) == getattr(own.model.loss, name)
-        assert peer.model.memory_max_age_s == own.model.memory_max_age_s and peer.model.memory_frames > 0
+            assert getattr(baseline.model.loss, name) == getattr(own.model.loss, name)
+        assert baseline.model.memory_max_age_s == own.model.memory_max_age_s and baseline.model.memory_frames > 0
 
 
 def test_tables_show_every_number_of_the_paper_that_a_file_has():

@@ -15,7 +15,7 @@ from optuna.trial import TrialState
 
 from src.errors import ConfigError
 from src.sweep.storage_address import default_storage
-from src.sweep.sweep_study import CellEndedError, SweepStudy
+from src.sweep.sweep_study import SweepStudy, TrialEndedError
 from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep
 
 ROWS = {"format": 1, "kind": "rows"}
@@ -27,9 +27,9 @@ def study(tmp_path):
 
 
 def take(study, work, **more):
-    with study.lock() as hold:
-        study.clear_dead()
-        study.take(hold, work, attrs={"run_id": "a"}, params={}, **more)
+    with study.lock() as lock:
+        study.release_dead()
+        study.take(lock, work, attrs={"run_id": "a"}, params={}, **more)
 
 
 @pytest.mark.parametrize(
@@ -61,30 +61,30 @@ def test_a_server_that_does_not_answer_is_told_without_its_password(tmp_path):
 def test_the_lock_is_let_go_while_work_is_done_and_the_worker_is_named(study):
     def work(trial):
         with study.lock():  # another would wait for ever
-            (attempt,) = study.attempts()
-            assert attempt.state == "running" and attempt.worker == f"{socket.gethostname()}:{os.getpid()}"
-            assert study.clear_dead() == []
+            (trial,) = study.trials()
+            assert trial.state == "running" and trial.worker == f"{socket.gethostname()}:{os.getpid()}"
+            assert study.release_dead() == []
         return 0.5
 
     take(study, work)
-    (attempt,) = study.attempts()
-    assert (attempt.state, attempt.value, attempt.run_id) == ("done", 0.5, "a")
+    (trial,) = study.trials()
+    assert (trial.state, trial.value, trial.run_id) == ("done", 0.5, "a")
 
 
 def test_failed_and_interrupted_differ_by_the_reason(study):
     def fail(trial):
-        study.note(trial, "reason", "why")
-        raise CellEndedError
+        study.set_attr(trial, "reason", "why")
+        raise TrialEndedError
 
     def interrupt(trial):
-        raise CellEndedError
+        raise TrialEndedError
 
     take(study, fail)
     take(study, interrupt)
-    assert [attempt.state for attempt in study.attempts()] == ["failed", "interrupted"]
+    assert [trial.state for trial in study.trials()] == ["failed", "interrupted"]
     with study.lock():
         study.add_failed({"run_id": "b"}, "needs a")
-    assert study.attempts()[-1].reason == "needs a"
+    assert study.trials()[-1].reason == "needs a"
 
 
 def test_what_dead_workers_had_is_free_at_once(study, tmp_path):
@@ -94,9 +94,9 @@ def test_what_dead_workers_had_is_free_at_once(study, tmp_path):
     gone.wait()
     mine = study._this_machine
     workers = [
-        {"machine": mine, "host": "h", "pid": gone.pid, "born": "1"},  # dead
-        {"machine": mine, "host": "h", "pid": os.getpid(), "born": "1"},  # its number was used again
-        {"machine": "elsewhere", "host": "h", "pid": gone.pid, "born": "1"},  # not known to be dead
+        {"machine": mine, "host": "h", "pid": gone.pid, "start_time": "1"},  # dead
+        {"machine": mine, "host": "h", "pid": os.getpid(), "start_time": "1"},  # its number was used again
+        {"machine": "elsewhere", "host": "h", "pid": gone.pid, "start_time": "1"},  # not known to be dead
         None,  # killed between taking the trial and naming itself
     ]
     for worker in workers:
@@ -106,7 +106,7 @@ def test_what_dead_workers_had_is_free_at_once(study, tmp_path):
             trial.set_user_attr("worker", worker)
     raw.enqueue_trial({})  # killed before taking it
     with study.lock():
-        study.clear_dead()
+        study.release_dead()
     states = [trial.state for trial in raw.trials]
     assert states == [TrialState.FAIL, TrialState.FAIL, TrialState.RUNNING, TrialState.FAIL, TrialState.FAIL]
 
@@ -114,28 +114,28 @@ def test_what_dead_workers_had_is_free_at_once(study, tmp_path):
 def test_a_worker_elsewhere_that_is_silent_too_long_is_dead(study, tmp_path, monkeypatch):
     def freeze(trial):
         deadline = time.monotonic() + 20
-        while not study._heard_of():
+        while not study._with_heartbeat():
             assert time.monotonic() < deadline
             time.sleep(0.02)
         with study._storage.engine.begin() as connection:  # as if no heartbeat had come for ten minutes
             connection.exec_driver_sql("UPDATE trial_heartbeats SET heartbeat = datetime('now', '-600 seconds')")
         monkeypatch.setattr(study, "_this_machine", "another")
         with study.lock():
-            (dead,) = study.clear_dead()
+            (dead,) = study.release_dead()
         assert dead.run_id == "a"
         return 0.5  # it was alive after all: no error, and what it trained stays in its folder
 
     take(study, freeze)
-    assert [attempt.state for attempt in study.attempts()] == ["interrupted"]
+    assert [trial.state for trial in study.trials()] == ["interrupted"]
 
 
 def test_a_worker_elsewhere_that_died_before_its_first_heartbeat_is_dead_too(study, tmp_path, monkeypatch):
     raw = optuna.load_study(study_name="fake-debug", storage=optuna.storages.RDBStorage(default_storage(tmp_path)))
     trial = raw.ask()
-    trial.set_user_attr("worker", {"machine": "elsewhere", "host": "h", "pid": 1, "born": "1"})
-    assert study.clear_dead() == []
-    monkeypatch.setattr("src.sweep.sweep_study.GRACE_S", 0)
-    assert len(study.clear_dead()) == 1
+    trial.set_user_attr("worker", {"machine": "elsewhere", "host": "h", "pid": 1, "start_time": "1"})
+    assert study.release_dead() == []
+    monkeypatch.setattr("src.sweep.sweep_study.GRACE_PERIOD_S", 0)
+    assert len(study.release_dead()) == 1
 
 
 def test_another_definition_is_refused(study, tmp_path):

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.tensor_transforms import invert_projection, pixel_centres
 from src.models.backbones.resnet import BasicBlock
 from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
 from src.ops.segment_reduce import weighted_segment_sum
@@ -102,17 +103,10 @@ class LiftSplat(nn.Module):
         level_size: tuple[int, int],  # (h, w)
     ) -> Tensor:  # [B, N, h, w, D, 3] aug metres, float32
         """Points at the pixel centres and the bins' mean depths."""
-        (height, width), (h, w), device = image_size_px, level_size, pix_from_aug.device
-        v, u = torch.meshgrid(
-            (torch.arange(h, device=device) + 0.5) * (height / h),
-            (torch.arange(w, device=device) + 0.5) * (width / w),
-            indexing="ij",
-        )
-        # A missing view may carry any matrix; its points are never used, but must not stop the inversion.
-        matrix = torch.where(valid[..., None, None], pix_from_aug, torch.eye(4, device=device))
-        aug_from_pix = torch.linalg.inv_ex(matrix.double())[0].float()[:, :, None, None]  # [B, N, 1, 1, 4, 4]
+        aug_from_pix = invert_projection(pix_from_aug, valid)[:, :, None, None]  # [B, N, 1, 1, 4, 4]
+        pixels = pixel_centres(image_size_px, level_size, pix_from_aug.device).unbind(-1)  # u, v, 1: [h, w] each
         # Not a matrix product: a GPU may round its factors to fewer digits.
-        rays = sum(aug_from_pix[..., :3, i] * part[..., None] for i, part in enumerate((u, v, torch.ones_like(u))))
+        rays = sum(aug_from_pix[..., :3, i] * part[..., None] for i, part in enumerate(pixels))
         return rays[..., None, :] * self.depth_centres_m[:, None] + aug_from_pix[..., None, :3, 3]
 
     @torch.no_grad()

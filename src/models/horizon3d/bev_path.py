@@ -10,14 +10,16 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
 from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.layers.merging import block_diagonal, joined_convs
 from src.models.layers.sparse import ConvNormReLU, RowNorm, SparseKernel, SubmanifoldConv
 from src.models.memory import motions
+from src.ops.kernel_maps import strided_map, temporal_map
 from src.ops.segment_reduce import segment_mean, topk_per_sample
 from src.ops.sites import Sites
-from src.ops.sparse_conv import sparse_conv, strided_map, temporal_map
+from src.ops.sparse_conv import sparse_conv
 from src.structures.batch import FrameBatch
 from src.structures.sparse_bev import SparseBEV, SparseMap
 
@@ -150,8 +152,8 @@ class BEVPath(nn.Module):
         if torch.is_autocast_enabled(features.device.type):
             features = features.to(torch.get_autocast_dtype(features.device.type))
         return StoredCells(
-            xy=_move(ego_from_aug, self.grid.centre_of(indices[:, 1:])),
-            velocities=_rotate(ego_from_aug, cells.velocities.detach()[worth]),
+            xy=transform_points_xy(ego_from_aug, self.grid.centre_of(indices[:, 1:])),
+            velocities=transform_vectors_xy(ego_from_aug, cells.velocities.detach()[worth]),
             features=features,
             rows=indices[:, 0],
         )
@@ -178,10 +180,10 @@ class BEVPath(nn.Module):
         )
         if self.config.velocity_compensation:
             xy = xy + velocities * elapsed[:, None]
-        xy = _move(matrix, xy)
+        xy = transform_points_xy(matrix, xy)
         kept = (motion.usable.flatten()[way] & self.grid.contains(xy)).nonzero().squeeze(1)
         indices = torch.cat([rows[:, None], torch.cat(slots)[:, None], self.grid.cell_of(xy)], dim=1)
-        values = (indices, xy, _rotate(matrix, velocities), elapsed, features)
+        values = (indices, xy, transform_vectors_xy(matrix, velocities), elapsed, features)
         return WarpedCells(*(value[kept] for value in values))
 
     def aggregate(self, fused: SparseBEV, warped: WarpedCells | None) -> SparseBEV:
@@ -217,19 +219,3 @@ def _cell_head(channels: int, outputs: int) -> nn.ModuleList:
     hidden = channels // 2
     conv = SubmanifoldConv(channels, hidden, 3, 2, bias=False)
     return nn.ModuleList([ConvNormReLU(conv, **NORM), nn.Linear(hidden, outputs)])
-
-
-def _move(
-    matrix: Tensor,  # [n, 4, 4]
-    xy: Tensor,  # [n, 2] m
-) -> Tensor:  # [n, 2]
-    """Points of the z = 0 plane in another frame."""
-    return _rotate(matrix, xy) + matrix[:, :2, 3]
-
-
-def _rotate(
-    matrix: Tensor,  # [n, 4, 4]
-    vectors: Tensor,  # [n, 2]
-) -> Tensor:  # [n, 2]
-    # No matrix product: autocast would round positions to half precision.
-    return matrix[:, :2, 0] * vectors[:, :1] + matrix[:, :2, 1] * vectors[:, 1:]

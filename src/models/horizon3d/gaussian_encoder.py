@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.tensor_transforms import rotate
 from src.models.horizon3d.cross_attention import (
     ImageCrossAttention,
     RadarCrossAttention,
@@ -202,9 +203,7 @@ class EncoderLayer(nn.Module):
             phi = torch.cat([phi, learnt.unflatten(-1, (-1, 2))], dim=2)
         local = gaussians.scales[:, :, None] * phi  # [B, G, P, 2] along and across the direction
         cos, sin = gaussians.directions[:, :, None].unbind(-1)  # [B, G, 1]
-        along, across = local.unbind(-1)
-        rotated = torch.stack([cos * along - sin * across, sin * along + cos * across], dim=-1)
-        return gaussians.means[:, :, None] + rotated
+        return gaussians.means[:, :, None] + torch.stack(rotate(cos, sin, *local.unbind(-1)), dim=-1)
 
     def forward(
         self,

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from src.geometry.tensor_transforms import invert_projection, pixel_centres
+
 MIN_DEPTH_M = 0.5
 """Points nearer to the image plane count as invisible (specification 5.3)."""
 
@@ -50,14 +52,8 @@ class CameraViews:
     ) -> Tensor:  # [B, N, h, w, 3] aug metres
         """3D points at the pixel centres of the finest level, without gradient."""
         with torch.no_grad(), torch.autocast(depth.device.type, enabled=False):
-            height, width = depth.shape[-2:]
-            v = (torch.arange(height, device=depth.device) + 0.5) * (self.image_size_px[0] / height)
-            u = (torch.arange(width, device=depth.device) + 0.5) * (self.image_size_px[1] / width)
-            v, u = torch.meshgrid(v, u, indexing="ij")
-            rays = torch.stack([u, v, torch.ones_like(u)], -1)  # [h, w, 3]
-            # A missing view may carry any matrix; its points are never used, but must not stop the inversion.
-            matrix = torch.where(self.valid[..., None, None], self.pix_from_aug, torch.eye(4, device=depth.device))
-            aug_from_pix = torch.linalg.inv_ex(matrix.double())[0].float()[:, :, :3]  # [B, N, 3, 4]
+            rays = pixel_centres(self.image_size_px, depth.shape[-2:], depth.device)  # [h, w, 3]
+            aug_from_pix = invert_projection(self.pix_from_aug, self.valid)[:, :, :3]  # [B, N, 3, 4]
             points = rays * depth.float()[..., None]  # [B, N, h, w, 3] (u*d, v*d, d)
             lifted = torch.einsum("bnij,bnhwj->bnhwi", aug_from_pix[..., :3], points)
             return lifted + aug_from_pix[:, :, None, None, :, 3]

@@ -8,7 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.ops.sparse_conv import sparse_conv, strided_map, submanifold_map
+from src.ops.kernel_maps import strided_map, submanifold_map
+from src.ops.sparse_conv import sparse_conv
 from src.structures.sparse_bev import SparseMap
 
 

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
-from src.models.memory import rigid_inverse
 from src.structures.gaussians import GaussianSet
 from tests.models.moving import UTM, bare_frame, bda, pose, tensors_of
 
@@ -51,12 +50,6 @@ def frames_of(b, steps, counts=None):
         frame = remembered(batch, cells_for(counts or [2] * b, 10.0 * k), gaussians_for(b, value=10.0 * k))
         memory = memory.push(frame, 8, 4)
     return memory
-
-
-def test_rigid_inverse():
-    matrix = torch.stack([pose(3.0, -2.0, 0.7, UTM, 0.1), pose(0.0, 0.0, -3.0, UTM)])
-    eye = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
-    torch.testing.assert_close(rigid_inverse(matrix) @ matrix, eye, rtol=0, atol=1e-8)
 
 
 def test_motion_by_hand():
