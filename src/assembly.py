@@ -14,6 +14,7 @@ from src.metrics.submission import write_submission
 from src.models import build_model as build_model_of
 from src.models.detector import Detector
 from src.structures.detections import DetectionTable
+from src.structures.taxonomy import SENSORS
 from src.training.module import TrainingModule
 from src.training.phases import EVALUATORS, MODULES
 from src.world.write import ensure_world, world_digest
@@ -40,7 +41,7 @@ def data_root(config: Config, write: bool = True) -> Path:
 
 
 def build_datamodule(config: Config, root: Path) -> DetectionDataModule:
-    """The data of a run; images are left out for a model that uses none."""
+    """The data of a run, of the sensors that its model uses."""
     cores = os.cpu_count() or 1
     if config.data.num_workers > MAX_WORKERS_PER_CORE * cores:
         raise ConfigError(
@@ -50,6 +51,7 @@ def build_datamodule(config: Config, root: Path) -> DetectionDataModule:
     return DetectionDataModule(
         config.data,
         root=root,
+        sensors=config.model.sensors,
         image_size_px=config.image_size_px,
         seed=config.seed,
         cache=Path(config.paths.outputs) / "cache",
@@ -72,7 +74,7 @@ def save_submission(config: Config, path: Path, tokens: list[str], table: Detect
     max_age_s = config.model.memory_max_age_s  # the benchmark's rules are about how far back a detector looks
     memory = "no memory" if max_age_s is None else f"memory of up to {max_age_s:g} s"
     meta = {
-        **{f"use_{sensor}": sensor in config.model.sensors for sensor in ("camera", "lidar", "radar")},
+        **{f"use_{sensor}": sensor in config.model.sensors for sensor in SENSORS},
         "method_name": config.model.name,
         "description": f"scale {config.scale}, seed {config.seed}, {memory}",
     }

@@ -222,6 +222,10 @@ class Config:
         for name in ("checkpoint", "predictions", "out", "scene"):
             _refuse_empty(name, getattr(self, name))
         _refuse_empty("data.root", self.data.root)
+        if "lidar" in self.model.sensors and self.data.world is not None and not self.data.world.lidar:
+            raise ConfigError(
+                f"model={self.model.name} reads LiDAR, which this world lacks; give data.world.lidar=true"
+            )
         if self.data.batch_size % self.trainer.num_processes:
             raise ConfigError(
                 f"data.batch_size={self.data.batch_size} is the total over all devices and must be divisible by "

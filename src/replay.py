@@ -32,7 +32,7 @@ from src.predict import chosen_device
 from src.reliability.checkpoints import load_model_weights
 from src.reliability.command import run_command
 from src.reliability.nonfinite import describe_gradients, gradient_norm, read_dump
-from src.structures.batch import RADAR_POINT_FIELDS, FrameBatch
+from src.structures.batch import LIDAR_POINT_FIELDS, RADAR_POINT_FIELDS, FrameBatch
 from src.training.module import TrainingModule
 from src.training.phases import MODULES
 
@@ -189,10 +189,12 @@ def report(step: Step, watch: Watch) -> bool:
 
 def describe_inputs(batch: FrameBatch) -> Iterator[str]:
     """A line for each kind of input that is not finite; unknown velocities of annotations are NaN by design."""
-    rows = ~torch.isfinite(batch.radar_points).all(dim=1)
-    for row in rows.nonzero().flatten()[:MAX_SHOWN].tolist():
-        point = ", ".join(f"{n} {v:.4g}" for n, v in zip(RADAR_POINT_FIELDS, batch.radar_points[row], strict=True))
-        yield f"input: radar point {row} of {batch.tokens[int(batch.radar_batch[row])]} is not finite: {point}"
+    for sensor, names in (("radar", RADAR_POINT_FIELDS), ("lidar", LIDAR_POINT_FIELDS)):
+        points, owners = getattr(batch, f"{sensor}_points"), getattr(batch, f"{sensor}_batch")
+        rows = [] if points is None else (~torch.isfinite(points).all(dim=1)).nonzero().flatten()[:MAX_SHOWN].tolist()
+        for row in rows:
+            point = ", ".join(f"{n} {v:.4g}" for n, v in zip(names, points[row], strict=True))
+            yield f"input: {sensor} point {row} of {batch.tokens[int(owners[row])]} is not finite: {point}"
     for name in ("timestamps_s", "global_from_ego", "aug_from_ego", "pix_from_aug"):
         value = getattr(batch, name)
         if value is not None and not torch.isfinite(value).all():

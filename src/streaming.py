@@ -13,7 +13,7 @@ import torch
 from src.assembly import build_model
 from src.config import Config, Precision, restore_config
 from src.data.reader import ReaderSettings
-from src.data.sensors import Camera, RadarSweep, frame_from_sensors
+from src.data.sensors import Camera, LidarSweep, RadarSweep, frame_from_sensors
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.deploy.inference import prepare_for_inference
@@ -111,7 +111,7 @@ class StreamingDetector:
         # Every weight comes from the checkpoint; the file that training began from may not be on this machine.
         model = build_model(replace(config, backbone=replace(config.backbone, weights=None)))
         load_model_weights(model, checkpoint, path)
-        settings = config.data.reader_settings(config.image_size_px)
+        settings = config.data.reader_settings(config.model.sensors, config.image_size_px)
         bf16 = config.precision == Precision.bf16.value
         return cls(model, config.grid.build(), settings, device, bf16, **switches)
 
@@ -124,15 +124,16 @@ class StreamingDetector:
         timestamp_s: float,
         global_from_ego: np.ndarray,  # [4, 4] float64; any fixed frame serves, the same one for all frames
         cameras: Mapping[str, Camera | None],
-        radars: Mapping[str, Sequence[RadarSweep]],
+        radars: Mapping[str, Sequence[RadarSweep] | None],
+        lidars: Mapping[str, Sequence[LidarSweep] | None] | None = None,
     ) -> FrameBatch:
         """A frame of one's own sensors, prepared as this detector was trained; see `frame_from_sensors`."""
-        return frame_from_sensors(timestamp_s, global_from_ego, cameras, radars, self.settings)
+        return frame_from_sensors(timestamp_s, global_from_ego, cameras, radars, self.settings, lidars=lidars)
 
     def step(self, frame: FrameBatch) -> Boxes3D:
         """Boxes of the next frame (a batch of one) in its ego frame, with scores, best first, on the CPU.
 
-        Raises ValueError for a batch that is not one frame, is augmented, or has other images than the model needs.
+        Raises ValueError for a batch that is not one frame, is augmented, or lacks what the model reads.
         """
         return self.run(frame)[0].to("cpu")
 
@@ -157,6 +158,11 @@ class StreamingDetector:
             raise ValueError(
                 f"frame {frame.tokens[0]}: aug_from_ego must be the identity, augmentation is for training"
             )
+        for sensor, sweeps in (("radar", self.settings.num_sweeps), ("lidar", self.settings.num_lidar_sweeps)):
+            if sweeps and getattr(frame, f"{sensor}_points") is None:
+                raise ValueError(
+                    f"frame {frame.tokens[0]}: {sensor}_points must be there for this model; no return is no row"
+                )
         if self.settings.image_size_px is None:
             return
         wanted = [1, len(CAMERAS), 3, *self.settings.image_size_px]

@@ -23,7 +23,7 @@ def test_every_scale_composes(scale, radar_only):
     overrides = [f"scale={scale}", "data.root=x"] + (["model.kggi=null", "model.ocsf=null"] if radar_only else [])
     config, tree = compose_config(overrides)
     assert config.scale == tree["scale"] == scale
-    assert ("camera" in config.model.sensors) is not radar_only
+    assert config.model.sensors == (("radar",) if radar_only else ("camera", "radar"))
     # The range and the cell are those of the paper at every scale.
     assert config.grid.cells == [384, 384] and config.grid.cell_m == 0.8
 
@@ -141,7 +141,8 @@ FULL_SIZE = {
     "data": {
         "train_split": "train", "split": "val", "batch_size": 8, "num_sweeps": 10, "min_distance_m": 1.0,
         "propagate_points": False, "on_bad_file": "error", "test_resize_offset": 0.0, "groups_per_scene": 2,
-        "stream_sets": 1, "sensor_dropout": 0.0,
+        "stream_sets": 1, "sensor_dropout": 0.0, "num_lidar_sweeps": 5, "lidar_origins": False, "deskew_lidar": True,
+        "num_future_frames": 0,
     },
     "data.augmentation.image": {"resize": [-0.06, 0.11], "rotation_deg": 5.4, "flip_probability": 0.5},
     "data.augmentation.bev": {"scale": [0.95, 1.05], "rotation_rad": 0.3925, "flip_probability": 0.5},

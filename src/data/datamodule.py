@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -36,6 +36,7 @@ from src.data.splits import split_samples
 from src.errors import ConfigError, DataError, HorizonError
 from src.structures.batch import FrameBatch
 from src.structures.detections import EvaluationSet
+from src.structures.taxonomy import SENSORS
 
 TERMINATION_GRACE_S = 10
 
@@ -54,6 +55,10 @@ class DataConfig:
     sensor_dropout: float  # share of streamed frames, never a clip's first, from which all sensor data are taken away
     num_workers: int  # loader processes per device
     num_sweeps: int  # past sweeps of each radar
+    num_lidar_sweeps: int  # past sweeps of each LiDAR
+    lidar_origins: bool  # also where the ray of each LiDAR point began
+    deskew_lidar: bool  # move LiDAR points by what was driven between their own times and their sweep's
+    num_future_frames: int  # next key frames of the scene whose LiDAR comes along as supervision
     min_distance_m: float  # nearer points are the truck itself
     propagate_points: bool  # move points by their own radial velocity
     on_bad_file: OnBadFile
@@ -67,6 +72,8 @@ class DataConfig:
             "stream_sets": 1,
             "num_workers": 0,
             "num_sweeps": 1,
+            "num_lidar_sweeps": 1,
+            "num_future_frames": 0,
             "min_distance_m": 0,
         }
         for name, least in least_values.items():
@@ -79,15 +86,22 @@ class DataConfig:
 
     def reader_settings(
         self,
-        image_size_px: tuple[int, int] | None,  # (height, width); None leaves images unread
+        sensors: Collection[str],  # of taxonomy.SENSORS: what is read
+        image_size_px: tuple[int, int] | None,  # (height, width); None for a model without images
     ) -> ReaderSettings:
-        """How a frame is read."""
+        """How a frame is read. Raises ValueError for sensors that are none, or a camera without an image size."""
+        if not sensors or not set(sensors) <= set(SENSORS) or ("camera" in sensors and image_size_px is None):
+            raise ValueError(f"sensors must be some of {SENSORS}, a camera with its image size, but got {sensors}")
         return ReaderSettings(
-            num_sweeps=self.num_sweeps,
+            num_sweeps=self.num_sweeps if "radar" in sensors else 0,
+            num_lidar_sweeps=self.num_lidar_sweeps if "lidar" in sensors else 0,
+            lidar_origins=self.lidar_origins,
+            deskew_lidar=self.deskew_lidar,
+            num_future_frames=self.num_future_frames,
             min_distance_m=self.min_distance_m,
             propagate_points=self.propagate_points,
             on_bad_file=self.on_bad_file,
-            image_size_px=image_size_px,
+            image_size_px=image_size_px if "camera" in sensors else None,
             test_resize_offset=self.test_resize_offset,
         )
 
@@ -124,14 +138,14 @@ def in_stream(frame: FrameBatch, stream: int, starts: bool) -> FrameBatch:
 
 
 def drop_sensors(frame: FrameBatch, share: float, draw: tuple[int, ...]) -> FrameBatch:
-    """The frame, or with the probability `share` the same without radar points and images, unless it starts a clip."""
+    """The frame, or with the probability `share` the same without points and images, unless it starts a clip."""
     if frame.starts[0] or np.random.default_rng(draw).random() >= share:
         return frame
-    silent = replace(frame, radar_points=frame.radar_points[:0], radar_batch=frame.radar_batch[:0])
+    names = ("radar_points", "radar_batch", "lidar_points", "lidar_batch", "lidar_origins")
+    changes = {name: getattr(frame, name)[:0] for name in names if getattr(frame, name) is not None}
     if frame.images is not None:
-        images, valid = torch.zeros_like(frame.images), torch.zeros_like(frame.image_valid)
-        silent = replace(silent, images=images, image_valid=valid)
-    return silent
+        changes |= {"images": torch.zeros_like(frame.images), "image_valid": torch.zeros_like(frame.image_valid)}
+    return replace(frame, **changes)
 
 
 class FrameLoader(DataLoader):
@@ -171,8 +185,8 @@ def dead_workers_named() -> Iterator[None]:
 class DetectionDataModule(L.LightningDataModule):
     """Key frames of the training and the validation split as `FrameBatch`.
 
-    `image_size_px` None leaves images unread. `temporal` streams clips, with `streams` and `starts` in every batch;
-    without it training reads shuffled frames and validation reads frames in table order.
+    Of `taxonomy.SENSORS` those in `sensors` are read. `temporal` streams clips, with `streams` and `starts` in every
+    batch; without it training reads shuffled frames and validation reads frames in table order.
     Raises DataError when tables, split or files are not right.
     """
 
@@ -180,7 +194,8 @@ class DetectionDataModule(L.LightningDataModule):
         self,
         config: DataConfig,
         root: Path,
-        image_size_px: tuple[int, int] | None,  # (height, width)
+        sensors: Collection[str],
+        image_size_px: tuple[int, int] | None,  # (height, width); None for a model without images
         seed: int,
         cache: Path,
         *,
@@ -190,7 +205,7 @@ class DetectionDataModule(L.LightningDataModule):
         super().__init__()
         self.config, self.root, self.seed, self.temporal = config, root, seed, temporal
         self.name = name or root.name
-        self.settings = config.reader_settings(image_size_px)
+        self.settings = config.reader_settings(sensors, image_size_px)
         self.index: DatasetIndex = load_index(root, config.version, cache)
         self.reader = FrameReader(self.index, self.settings)
 
@@ -337,9 +352,12 @@ def collate(frames: list[FrameBatch | HorizonError]) -> FrameBatch | HorizonErro
             values[field.name] = default_collate([part[0] for part in parts]) if stack else torch.cat(parts)
         elif isinstance(parts[0], list):
             values[field.name] = [item for part in parts for item in part]
-    values["radar_batch"] = torch.repeat_interleave(
-        torch.arange(len(frames)), torch.tensor([len(frame.radar_points) for frame in frames])
-    )
+    for sensor in ("radar", "lidar"):
+        clouds = [getattr(frame, f"{sensor}_points") for frame in frames]
+        if clouds[0] is not None:
+            counts = torch.tensor([len(cloud) for cloud in clouds])
+            values[f"{sensor}_batch"] = torch.repeat_interleave(torch.arange(len(frames)), counts)
+    values["future"] = tuple(collate(list(parts)) for parts in zip(*(frame.future for frame in frames), strict=True))
     values["skipped"] = {
         name: sum(frame.skipped.get(name, 0) for frame in frames) for frame in frames for name in frame.skipped
     }

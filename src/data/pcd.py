@@ -3,27 +3,42 @@
 from __future__ import annotations
 
 import os
+import struct
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
+import lzf
 import numpy as np
 
 from src.data.files import read_whole
+from src.data.tables import LAST_TIME_US
 from src.errors import DataError
 
 Array = np.ndarray
 
 RADAR_FIELDS = ("x", "y", "z", "vrel_x", "vrel_y", "vrel_z", "rcs")
+LIDAR_FIELDS = ("x", "y", "z", "intensity", "timestamp")
 MAX_POINTS = 1_000_000
 """More than any sensor gives in one sweep; a larger number is a damaged header."""
 MAX_VALUES = 8 * MAX_POINTS
 """Points times fields; what a file may take in memory follows from it."""
 MAX_FILE_BYTES = 2**27
 MAX_HEADER_BYTES = 4096
-LARGEST = np.array([1e4, 1e4, 1e4, 1e3, 1e3, 1e3, 1e3], np.float32)
-"""Of each of RADAR_FIELDS in size, in m, m/s and dB: hundreds of times what a radar gives, so beyond it is damage."""
+LARGEST = {
+    RADAR_FIELDS: np.array([1e4, 1e4, 1e4, 1e3, 1e3, 1e3, 1e3], np.float32),
+    LIDAR_FIELDS[:4]: np.array([1e4, 1e4, 1e4, 1e6], np.float32),
+}
+"""Of each field in size, in m, m/s, dB and counts: hundreds of times what a sensor gives, so beyond it is damage."""
 _KINDS = {(kind, size): f"<{kind.lower()}{size}" for kind in "IU" for size in "1248"}
 _KINDS |= {("F", "4"): "<f4", ("F", "8"): "<f8"}
+
+
+class LidarCloud(NamedTuple):
+    """One sweep of one LiDAR."""
+
+    points: Array  # [n, 4] float32: x, y, z (m, sensor frame), intensity as stored
+    times_us: Array  # [n] int64, when each point was measured
 
 
 @dataclass(frozen=True)
@@ -35,7 +50,7 @@ class _Layout:
     count: int  # points
     encoding: str
     start: int  # byte at which the data begin
-    plain: bool  # nothing but RADAR_FIELDS as float32 in their order: the data are the array
+    plain: bool  # nothing but the wanted fields as float32 in their order: the data are the array
 
 
 def read_radar_points(
@@ -43,57 +58,124 @@ def read_radar_points(
 ) -> Array:  # [n, 7] float32 in the order of RADAR_FIELDS, sensor frame
     """Positions (m), relative radial velocity vectors (m/s) and RCS of one radar sweep; a file may hold no point.
 
-    Fields are taken by name, in any order, from `binary` or `ascii` data; usual files are one read-only view of their
-    bytes. Raises DataError naming the file, what was expected and what was found.
+    Fields are taken by name, in any order; usual files are one read-only view of their bytes.
+    Raises DataError naming the file, what was expected and what was found.
     """
     content = read_whole(path, MAX_FILE_BYTES)
     try:
-        layout = _layout(content)
-        points = _points(content, layout)
+        layout = _layout(content, RADAR_FIELDS)
+        if layout.plain and layout.encoding == "binary":
+            points = _table(content, layout).view("<f4").reshape(layout.count, len(RADAR_FIELDS))
+        else:
+            points = _floats(_columns(content, layout), RADAR_FIELDS)
+        _check_range(points, RADAR_FIELDS, "radar")
+        return points
     except DataError as error:
         raise DataError(f"{path}: {error}") from error.__cause__
-    possible = np.abs(points) <= LARGEST  # False for NaN too
+
+
+def read_lidar_points(path: str | os.PathLike[str]) -> LidarCloud:
+    """Points and their times of one LiDAR sweep; a file may hold no point.
+
+    Points without a return, whose x, y and z are all NaN, are left out. Raises DataError as `read_radar_points`.
+    """
+    content = read_whole(path, MAX_FILE_BYTES)
+    try:
+        columns = _columns(content, _layout(content, LIDAR_FIELDS))
+        points, times_us = _floats(columns, LIDAR_FIELDS[:4]), _times_us(columns["timestamp"])
+        returned = ~np.isnan(points[:, :3]).all(axis=1)
+        if not returned.all():
+            points, times_us = points[returned], times_us[returned]
+        _check_range(points, LIDAR_FIELDS[:4], "lidar")
+        return LidarCloud(points, times_us)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error.__cause__
+
+
+def _check_range(points: Array, fields: tuple[str, ...], sensor: str) -> None:
+    limits = LARGEST[fields]
+    possible = np.abs(points) <= limits  # False for NaN too
     if not possible.all():
         row = int(np.argmin(possible.all(axis=1)))
         finite = np.isfinite(points[row]).all()
-        fault = f"is beyond {LARGEST.tolist()}, more than any radar gives" if finite else "is not finite"
-        raise DataError(f"{path}: point {row} {fault}: {points[row].tolist()}")
-    return points
+        fault = f"is beyond {limits.tolist()}, more than any {sensor} gives" if finite else "is not finite"
+        raise DataError(f"point {row} {fault}: {points[row].tolist()}")
 
 
-def _points(content: bytes, layout: _Layout) -> Array:  # [n, 7] float32
+def _times_us(stamps: Array) -> Array:  # [n] int64
+    """Raises DataError for a time that is none of the Unix epoch in microseconds."""
+    known = (stamps >= 1) & (stamps < LAST_TIME_US)  # False for NaN too
+    if not known.all():
+        row = int(np.argmin(known))
+        raise DataError(f"point {row} has the timestamp {stamps[row]}, expected microseconds since 1970")
+    return stamps.astype(np.int64)
+
+
+def _columns(content: bytes, layout: _Layout) -> dict[str, Array]:  # [n] each
     if layout.encoding == "ascii":
-        return _ascii_points(content[layout.start :], layout.fields, layout.count)
+        table = _ascii_table(content[layout.start :], layout.fields, layout.count)
+        return dict(zip(layout.fields, table.T, strict=True))
+    if layout.encoding == "binary":
+        table = _table(content, layout)
+        return {name: table[name] for name in layout.fields}
+    data, columns, at = _decompressed(content, layout), {}, 0
+    for name in layout.fields:  # one field after another
+        columns[name] = np.frombuffer(data, layout.dtype[name], layout.count, at)
+        at += columns[name].nbytes
+    return columns
+
+
+def _table(content: bytes, layout: _Layout) -> Array:  # [n] of layout.dtype
     expected = layout.start + layout.count * layout.dtype.itemsize
     if len(content) != expected:
         raise DataError(f"{layout.count} points end at byte {expected}, but the file has {len(content)} bytes")
-    if layout.plain:
-        return np.frombuffer(content, "<f4", offset=layout.start).reshape(layout.count, len(RADAR_FIELDS))
-    table = np.frombuffer(content, layout.dtype, layout.count, layout.start)
-    return _as_float32(np.stack([table[name] for name in RADAR_FIELDS], axis=1))
+    return np.frombuffer(content, layout.dtype, layout.count, layout.start)
 
 
-def _layout(content: bytes) -> _Layout:
+def _decompressed(content: bytes, layout: _Layout) -> bytes:
+    """The data of an LZF file; never more than the points that its header states."""
+    start, size = layout.start + 8, layout.count * layout.dtype.itemsize
+    if len(content) < start:
+        raise DataError(f"the sizes of compressed data end at byte {start}, but the file has {len(content)} bytes")
+    packed, unpacked = struct.unpack_from("<II", content, layout.start)
+    if unpacked != size:
+        raise DataError(f"{layout.count} points are {size} bytes, but {unpacked} compressed ones are stated")
+    if len(content) != start + packed:
+        raise DataError(f"the compressed data end at byte {start + packed}, but the file has {len(content)} bytes")
+    if not size:
+        return b""
+    try:
+        data = lzf.decompress(content[start:], size)
+    except ValueError as error:
+        raise DataError(f"the compressed data are damaged ({error})") from error
+    if data is None or len(data) != size:
+        found = "more" if data is None else len(data)
+        raise DataError(f"the compressed data are damaged: {size} bytes expected, but {found} found")
+    return data
+
+
+def _layout(content: bytes, wanted: tuple[str, ...]) -> _Layout:
     """The header's meaning; files differ in little but their number of points, so most headers were met before."""
     data = content.find(b"\nDATA ", 0, MAX_HEADER_BYTES)
     end = content.find(b"\n", data + 1, MAX_HEADER_BYTES) + 1 if data >= 0 else 0
-    return _known_layout(content[:end]) if end else _parse_layout(content)
+    return _known_layout(content[:end], wanted) if end else _parse_layout(content, wanted)
 
 
-def _parse_layout(content: bytes) -> _Layout:
+def _parse_layout(content: bytes, wanted: tuple[str, ...]) -> _Layout:
     header, start = _header(content)
-    names, kinds = _columns(header)
+    names, kinds = _types(header)
     count = _count(header)
-    missing = [name for name in RADAR_FIELDS if name not in names]
+    missing = [name for name in wanted if name not in names]
     if missing:
-        raise DataError(f"a radar file has the fields {list(RADAR_FIELDS)}, but {missing} are not in {names}")
+        sensor = "radar" if wanted == RADAR_FIELDS else "lidar"
+        raise DataError(f"a {sensor} file has the fields {list(wanted)}, but {missing} are not in {names}")
     encoding = header.get("DATA", [""])[0]
-    if encoding not in ("binary", "ascii"):
-        raise DataError(f"DATA must be binary or ascii for a radar file, but got {encoding!r}")
+    if encoding not in ("binary", "ascii", "binary_compressed"):
+        raise DataError(f"DATA must be binary, ascii or binary_compressed, but got {encoding!r}")
     if count * len(names) > MAX_VALUES:
         raise DataError(f"at most {MAX_VALUES} numbers are expected, but got {count} points of {len(names)} fields")
     dtype = np.dtype(list(zip(names, kinds, strict=True)))
-    plain = names == list(RADAR_FIELDS) and set(kinds) == {"<f4"}
+    plain = names == list(wanted) and set(kinds) == {"<f4"}
     return _Layout(tuple(names), dtype, count, encoding, start, plain)
 
 
@@ -117,7 +199,7 @@ def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
     raise DataError(f"not a PCD file: no DATA line in the first {min(len(content), MAX_HEADER_BYTES)} bytes")
 
 
-def _columns(header: dict[str, list[str]]) -> tuple[list[str], list[str]]:
+def _types(header: dict[str, list[str]]) -> tuple[list[str], list[str]]:
     names, sizes, types = (header.get(key, []) for key in ("FIELDS", "SIZE", "TYPE"))
     counts = header.get("COUNT", ["1"] * len(names))
     if not names or len(set(names)) != len(names) or not len(names) == len(sizes) == len(types) == len(counts):
@@ -144,21 +226,18 @@ def _count(header: dict[str, list[str]]) -> int:
     return numbers["POINTS"]
 
 
-def _ascii_points(text: bytes, names: tuple[str, ...], count: int) -> Array:
+def _ascii_table(text: bytes, names: tuple[str, ...], count: int) -> Array:  # [n, F] float64
     expected = count * len(names)
     words = text.split(maxsplit=expected)  # and what is left over as one more
     if len(words) != expected:
         found = f"only {len(words)} numbers" if len(words) < expected else "more numbers"
         raise DataError(f"{count} points of {len(names)} fields expected, but {found} found")
     try:
-        table = np.array(words, dtype=np.float64).reshape(count, len(names))
+        return np.array(words, dtype=np.float64).reshape(count, len(names))
     except ValueError as error:
         raise DataError(f"not a number in the data ({error})") from error
-    return _as_float32(table[:, [names.index(name) for name in RADAR_FIELDS]])
 
 
-def _as_float32(
-    values: Array,  # [n, 7] numbers of any type
-) -> Array:  # [n, 7] float32, infinite beyond its range
+def _floats(columns: dict[str, Array], names: tuple[str, ...]) -> Array:  # [n, F] float32, infinite beyond its range
     with np.errstate(over="ignore", invalid="ignore"):
-        return values.astype(np.float32)
+        return np.stack([columns[name].astype(np.float32) for name in names], axis=1)

@@ -8,27 +8,30 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
 from src.data.augment import AugmentationConfig, draw_bev_transform, draw_crop, frame_generator
+from src.data.deskew import lidar_tensors, place_sweep
 from src.data.images import read_image, width_fit
-from src.data.pcd import read_radar_points
+from src.data.pcd import LidarCloud, read_lidar_points, read_radar_points
 from src.data.schema import CHANNELS, DatasetIndex
 from src.errors import DataError
 from src.geometry.camera import pixels_from_points
 from src.geometry.transforms import invert_rigid, pose_matrix, quaternion_to_matrix, rotation_vector, yaw_of
 from src.structures.batch import MAX_EGO_SPEED_MPS, RADAR_POINT_FIELDS, FrameBatch
 from src.structures.boxes import Boxes3D
-from src.structures.taxonomy import CAMERAS, RADARS
+from src.structures.taxonomy import CAMERAS, LIDARS, RADARS
 
 Array = np.ndarray
 T = TypeVar("T")
 
 VELOCITY_WINDOW_US = 100_000
 """Ego velocity is the pose difference over +- this time; the chassis table reads zero for long stretches."""
+MAX_SCAN_S = 0.3
+"""Points further in time from their sweep are of another clock; a LiDAR takes 0.1 s for a sweep."""
 
 _log = logging.getLogger(__name__)
 
@@ -37,7 +40,7 @@ class OnBadFile(Enum):
     """What an unreadable sensor file does."""
 
     error = "error"
-    skip = "skip"  # counted; a radar file gives no points, an image a masked camera
+    skip = "skip"  # counted; a radar or LiDAR file gives no points, an image a masked camera
 
 
 @dataclass
@@ -55,7 +58,11 @@ class _Skipped:
 class ReaderSettings:
     """What is read of a frame."""
 
-    num_sweeps: int  # past sweeps of each radar, the key frame's included
+    num_sweeps: int  # past sweeps of each radar, the key frame's included; 0: radar is not read
+    num_lidar_sweeps: int  # past sweeps of each LiDAR, the key frame's included; 0: LiDAR is not read
+    lidar_origins: bool  # also where the ray of each LiDAR point began
+    deskew_lidar: bool  # LiDAR points are moved by what was driven between their own times and the sweep's
+    num_future_frames: int  # next key frames of the scene whose LiDAR comes along as supervision
     min_distance_m: float  # points nearer than this in both x and y (sensor frame) are dropped
     propagate_points: bool  # move points by their own radial velocity to the key frame's time
     on_bad_file: OnBadFile
@@ -72,6 +79,7 @@ class FrameReader:
         self._root = os.path.realpath(index.root)
         self._folders: dict[str, str] = {}  # where the folders of files lead to
         self._reported: set[str] = set()
+        self._following = _following(index)  # [N] row of the scene's next sample, -1 for none
 
     def read(
         self,
@@ -94,25 +102,40 @@ class FrameReader:
         aug_from_ego = np.eye(4) if bev is None else draw_bev_transform(bev, rng)
         if bev is not None and clip is not None:
             aug_from_ego = draw_bev_transform(bev, frame_generator(seed, epoch, clip))
-        pose = index.frame_poses[sample]
-        global_from_ego = pose_matrix(index.pose_rotations[pose], index.pose_translations[pose])
+        global_from_ego = self._global_from_ego(sample)
         skipped = _Skipped()
-        points = self._radar_points(sample, global_from_ego, aug_from_ego, skipped)
-        batch = {
-            "tokens": [token],
-            "timestamps_s": torch.tensor([1e-6 * float(index.frame_times_us[sample])], dtype=torch.float64),
-            "global_from_ego": torch.from_numpy(global_from_ego[None]),
-            "aug_from_ego": torch.from_numpy(aug_from_ego[None].astype(np.float32)),
-            "radar_points": torch.from_numpy(points),
-            "radar_batch": torch.zeros(len(points), dtype=torch.int64),
-        }
+        batch = self._key_frame(sample, aug_from_ego)
+        if self.settings.num_sweeps:
+            points = self._radar_points(sample, global_from_ego, aug_from_ego, skipped)
+            batch |= {
+                "radar_points": torch.from_numpy(points),
+                "radar_batch": torch.zeros(len(points), dtype=torch.int64),
+            }
+        if self.settings.num_lidar_sweeps:
+            sweeps, origins = self.settings.num_lidar_sweeps, self.settings.lidar_origins
+            batch |= self._lidar_points(sample, global_from_ego, aug_from_ego, sweeps, origins, skipped)
         if self.settings.image_size_px is not None:
             batch |= self._images(sample, global_from_ego, aug_from_ego, augmentation, rng, skipped)
+        if self.settings.num_future_frames:
+            batch["future"] = self._future(sample, aug_from_ego, skipped)
         if index.annotated:
             batch["boxes"] = [self._boxes(sample, global_from_ego).transform(torch.from_numpy(aug_from_ego))]
         return FrameBatch(**batch, skipped=skipped.channels, bad_files=skipped.files)
 
-    # ---------------------------------------------------------------- radar
+    def _key_frame(self, sample: int, aug_from_ego: Array) -> dict[str, Any]:
+        """What every frame has."""
+        return {
+            "tokens": [str(self.index.sample_tokens[sample])],
+            "timestamps_s": torch.tensor([1e-6 * float(self.index.frame_times_us[sample])], dtype=torch.float64),
+            "global_from_ego": torch.from_numpy(self._global_from_ego(sample)[None]),
+            "aug_from_ego": torch.from_numpy(aug_from_ego[None].astype(np.float32)),
+        }
+
+    def _global_from_ego(self, sample: int) -> Array:  # [4, 4]
+        pose = self.index.frame_poses[sample]
+        return pose_matrix(self.index.pose_rotations[pose], self.index.pose_translations[pose])
+
+    # ---------------------------------------------------------------- radar and LiDAR
 
     def _radar_points(
         self,
@@ -122,19 +145,10 @@ class FrameReader:
         skipped: _Skipped,
     ) -> Array:  # [P, 7] float32, see RADAR_POINT_FIELDS
         """All sweeps, moved to ego(t) and compensated for the ego motion by the full mount (spec section 1.3)."""
-        rows, clouds = [], []
-        for channel in RADARS:
-            row = int(self.index.key_data[sample, CHANNELS.index(channel)])
-            if row < 0:
-                skipped.count(f"{channel} (not recorded)")
-            for _ in range(self.settings.num_sweeps):
-                if row < 0:
-                    break
-                cloud = self._guarded(sample, channel, row, read_radar_points, skipped)
-                if cloud is not None:
-                    rows.append(row)
-                    clouds.append(cloud)
-                row = int(self.index.data_previous[row])
+        read = self._sweeps(
+            sample, RADARS, self.settings.num_sweeps, lambda path, row: read_radar_points(path), skipped
+        )
+        rows, clouds = [row for row, _ in read], [cloud for _, cloud in read]
         if not clouds:
             return np.zeros((0, len(RADAR_POINT_FIELDS)), np.float32)
         compensated = compensate_sweeps(
@@ -144,6 +158,91 @@ class FrameReader:
         compensated[:, :3] = compensated[:, :3] @ linear.T + aug_from_ego[:3, 3]
         compensated[:, 4:6] = compensated[:, 4:6] @ linear[:2, :2].T
         return compensated.astype(np.float32, order="C")
+
+    def _sweeps(
+        self,
+        sample: int,
+        channels: tuple[str, ...],
+        count: int,
+        read: Callable[[str, int], T],  # of the path and the row of the file
+        skipped: _Skipped,
+    ) -> list[tuple[int, T]]:
+        """The key frame's and the sweeps before it of each channel, fewer at a scene's start, with their rows."""
+        sweeps = []
+        for channel in channels:
+            row = int(self.index.key_data[sample, CHANNELS.index(channel)])
+            if row < 0:
+                skipped.count(f"{channel} (not recorded)")
+            for _ in range(count):
+                if row < 0:
+                    break
+                cloud = self._guarded(sample, channel, row, partial(read, row=row), skipped)
+                if cloud is not None:
+                    sweeps.append((row, cloud))
+                row = int(self.index.data_previous[row])
+        return sweeps
+
+    def _lidar_points(
+        self,
+        sample: int,
+        global_from_ego: Array,  # [4, 4]
+        aug_from_ego: Array,  # [4, 4]
+        num_sweeps: int,
+        origins: bool,
+        skipped: _Skipped,
+    ) -> dict[str, torch.Tensor]:
+        """All sweeps in the (augmented) ego frame of the key frame, see LIDAR_POINT_FIELDS."""
+        index, settings = self.index, self.settings
+        read = self._sweeps(sample, LIDARS, num_sweeps, self._lidar_cloud, skipped)
+        rows = np.array([row for row, _ in read], dtype=np.int64)
+        poses, calibrations = index.data_poses[rows], index.data_calibrations[rows]
+        global_from_sweep = pose_matrix(index.pose_rotations[poses], index.pose_translations[poses])
+        aug_from_sweep = aug_from_ego @ invert_rigid(global_from_ego) @ global_from_sweep
+        velocity = rate = np.zeros((len(rows), 3))
+        if settings.deskew_lidar and len(rows):
+            velocity, rate = ego_motion(index, index.pose_times_us[poses], global_from_sweep[:, :3, :3])
+        sweeps = [
+            place_sweep(
+                cloud.points,
+                ages_s=1e-6 * (int(index.frame_times_us[sample]) - cloud.times_us),
+                offsets_s=1e-6 * (cloud.times_us - int(index.pose_times_us[poses[at]])),
+                ego_from_sensor=index.ego_from_sensor[calibrations[at]],
+                aug_from_sweep=aug_from_sweep[at],
+                velocity=velocity[at],
+                rate=rate[at],
+                min_distance_m=settings.min_distance_m,
+                origins=origins,
+            )
+            for at, (_, cloud) in enumerate(read)
+        ]
+        return lidar_tensors(sweeps, origins)
+
+    def _lidar_cloud(self, path: str, row: int) -> LidarCloud:
+        """One file, its points' times checked against the table's."""
+        cloud = read_lidar_points(path)
+        stamp = int(self.index.data_times_us[row])
+        if not self.settings.deskew_lidar:
+            return LidarCloud(cloud.points, np.full_like(cloud.times_us, stamp))
+        away = np.abs(cloud.times_us - stamp)
+        if len(away) and away.max() > 1e6 * MAX_SCAN_S:
+            at = int(np.argmax(away))
+            raise DataError(
+                f"{path}: point {at} was measured at {cloud.times_us[at]} us, more than {MAX_SCAN_S} s from its sweep, "
+                f"{stamp} us; with data.deskew_lidar=false times of points are not used"
+            )
+        return cloud
+
+    def _future(self, sample: int, aug_from_ego: Array, skipped: _Skipped) -> tuple[FrameBatch, ...]:
+        """LiDAR of the next key frames, see `FrameBatch.future`."""
+        frames, row = [], sample
+        for _ in range(self.settings.num_future_frames):
+            row = int(self._following[row]) if row >= 0 else -1
+            if row < 0:
+                points = lidar_tensors([], origins=True)
+            else:
+                points = self._lidar_points(row, self._global_from_ego(row), aug_from_ego, 1, True, skipped)
+            frames.append(FrameBatch(**self._key_frame(sample if row < 0 else row, aug_from_ego), **points))
+        return tuple(frames)
 
     # ---------------------------------------------------------------- cameras
 
@@ -249,6 +348,14 @@ class FrameReader:
             stated = os.path.join(self._root, name)
             raise DataError(f"{stated}: leads to {path}, which is outside the dataset folder")
         return path
+
+
+def _following(index: DatasetIndex) -> Array:  # [N] int64
+    order = np.lexsort((index.frame_times_us, index.sample_scenes))
+    following = np.full(len(order), -1)
+    linked = np.diff(index.sample_scenes[order]) == 0
+    following[order[:-1][linked]] = order[1:][linked]
+    return following
 
 
 def compensate_sweeps(

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
 from PIL import Image
 
+from src.data.deskew import lidar_tensors, place_sweep
 from src.data.images import MAX_PIXELS, resample, width_fit
-from src.data.pcd import RADAR_FIELDS
-from src.data.reader import ReaderSettings, compensate_clouds
+from src.data.pcd import LIDAR_FIELDS, RADAR_FIELDS
+from src.data.reader import MAX_SCAN_S, ReaderSettings, compensate_clouds
 from src.errors import DataError
 from src.geometry.camera import pixels_from_points
 from src.geometry.transforms import invert_rigid
@@ -42,15 +44,33 @@ class Camera:
 
 
 @dataclass(kw_only=True)
-class RadarSweep:
-    """One sweep of one radar as the sensor gives it, Doppler relative to the moving sensor."""
+class _Sweep:
+    """One sweep of a sensor that measures points, and what the vehicle does then."""
 
-    points: Array  # [n, 7] x, y, z (m), vrel_x, vrel_y, vrel_z (m/s, radial), rcs (dB), sensor frame; n may be 0
+    points: Array
     ego_from_sensor: Array  # [4, 4] mount
     timestamp_s: float
     ego_velocity_mps: Array  # [3] velocity of the ego's origin at the sweep, ego axes
     ego_rate_radps: Array = (0.0, 0.0, 0.0)  # [3] rotation rate at the sweep, ego axes
     global_from_ego: Array | None = None  # [4, 4] ego pose at the sweep; None: the frame's, driven back to the sweep
+
+
+@dataclass(kw_only=True)
+class RadarSweep(_Sweep):
+    """One sweep of one radar as the sensor gives it, Doppler relative to the moving sensor.
+
+    `points` is [n, 7]: x, y, z (m), vrel_x, vrel_y, vrel_z (m/s, radial), rcs (dB), sensor frame; n may be 0.
+    """
+
+
+@dataclass(kw_only=True)
+class LidarSweep(_Sweep):
+    """One sweep of one LiDAR as the sensor gives it, not compensated for the vehicle's motion.
+
+    `points` is [n, 4]: x, y, z (m), intensity as in the training data, sensor frame; n may be 0.
+    """
+
+    point_times_s: Array | None = None  # [n] when each was measured, clock of `timestamp_s`; None: all at that time
 
 
 def frame_from_sensors(
@@ -60,30 +80,91 @@ def frame_from_sensors(
     radars: Mapping[str, Sequence[RadarSweep] | None],
     settings: ReaderSettings,
     token: str = "",
+    lidars: Mapping[str, Sequence[LidarSweep] | None] | None = None,
 ) -> FrameBatch:
     """A batch of one frame, without annotations and augmentation, as `FrameReader.read` makes it from a data set.
 
     Ego is x forward, y left, z up, its origin on the ground under the rear axle. `cameras` go by the names in
-    `taxonomy.CAMERAS`; one that is absent or None is masked, and where `settings.image_size_px` is None none is looked
-    at. `radars` go by any name; of each the newest `settings.num_sweeps` sweeps are used, in whatever order they come,
-    and None is as no sweep.
+    `taxonomy.CAMERAS`; one that is absent or None is masked. `radars` and `lidars` go by any name; of each the newest
+    `settings.num_sweeps` or `num_lidar_sweeps` sweeps are used, in whatever order they come, and None is as no sweep.
+    Sensors that the settings leave unread are not used, whatever is given of them.
 
     Raises DataError naming the sensor, what was expected and what was found.
     """
-    timestamp_s = _seconds(timestamp_s, "timestamp_s of the frame")
+    timestamp_s = float(_seconds(timestamp_s, "timestamp_s of the frame"))
     global_from_ego = _rigid(global_from_ego, "global_from_ego of the frame")
-    points = _radar_points(timestamp_s, global_from_ego, radars, settings)
     batch = {
         "tokens": [token or f"{timestamp_s:.6f}"],
         "timestamps_s": torch.tensor([timestamp_s], dtype=torch.float64),
         "global_from_ego": torch.from_numpy(global_from_ego[None]),
         "aug_from_ego": torch.eye(4)[None],
-        "radar_points": torch.from_numpy(points),
-        "radar_batch": torch.zeros(len(points), dtype=torch.int64),
     }
+    if settings.num_sweeps:
+        points = _radar_points(timestamp_s, global_from_ego, radars, settings)
+        owners = torch.zeros(len(points), dtype=torch.int64)
+        batch |= {"radar_points": torch.from_numpy(points), "radar_batch": owners}
+    if settings.num_lidar_sweeps:
+        batch |= _lidar_points(timestamp_s, global_from_ego, lidars or {}, settings)
     if settings.image_size_px is not None:
         batch |= _images(global_from_ego, cameras, settings)
     return FrameBatch(**batch)
+
+
+Sweep = TypeVar("Sweep", RadarSweep, LidarSweep)
+
+
+@dataclass(frozen=True)
+class _Checked:
+    """A sweep whose numbers are sound, in float64."""
+
+    sweep: RadarSweep | LidarSweep
+    where: str  # for messages
+    age_s: float  # frame's time less the sweep's
+    points: Array  # [n, F]
+    ego_from_sensor: Array  # [4, 4]
+    global_from_ego: Array  # [4, 4]
+    velocity: Array  # [3] m/s
+    rate: Array  # [3] rad/s
+
+
+def _newest(
+    kind: type[Sweep],
+    fields: tuple[str, ...],  # of a point
+    count: int,  # of each sensor
+    timestamp_s: float,
+    global_from_ego: Array,  # [4, 4]
+    sensors: Mapping[str, Sequence[Sweep] | None],
+) -> list[_Checked]:
+    """The newest sweeps of each sensor, checked."""
+    sensor, checked = kind.__name__.removesuffix("Sweep").lower(), []
+    for name, sweeps in sensors.items():
+        if not isinstance(sweeps, Sequence | None) or not all(isinstance(sweep, kind) for sweep in sweeps or ()):
+            got = type(sweeps).__name__
+            raise DataError(f"{sensor} {name}: must be a list of {kind.__name__}, or None, but got {got}")
+        timed = [(float(_seconds(sweep.timestamp_s, f"{sensor} {name}: timestamp_s")), sweep) for sweep in sweeps or ()]
+        newest = sorted(timed, key=lambda pair: pair[0], reverse=True)[:count]
+        for number, (time_s, sweep) in enumerate(newest):
+            where = f"{sensor} {name}, sweep {number} (0 is the newest)"
+            age = timestamp_s - time_s
+            if not -MAX_SWEEP_LEAD_S <= age <= MAX_SWEEP_AGE_S:
+                raise DataError(
+                    f"{where}: is {age:g} s older than its frame, expected {-MAX_SWEEP_LEAD_S:g} to "
+                    f"{MAX_SWEEP_AGE_S:g}; give all times in seconds of one clock and leave older sweeps out"
+                )
+            points = _array(sweep.points, (None, len(fields)), f"{where}: points ({', '.join(fields)})")
+            mount = _rigid(sweep.ego_from_sensor, f"{where}: ego_from_sensor")
+            velocity = _array(sweep.ego_velocity_mps, (3,), f"{where}: ego_velocity_mps")
+            speed = np.linalg.norm(velocity)
+            if speed > MAX_EGO_SPEED_MPS:
+                limit = f"below {MAX_EGO_SPEED_MPS:.0f} m/s"
+                raise DataError(f"{where}: ego_velocity_mps must be {limit}, but got {speed:.0f} m/s")
+            rate = _array(sweep.ego_rate_radps, (3,), f"{where}: ego_rate_radps")
+            if sweep.global_from_ego is None:
+                pose = global_from_ego @ _driven(velocity, rate, -age)
+            else:
+                pose = _rigid(sweep.global_from_ego, f"{where}: global_from_ego")
+            checked.append(_Checked(sweep, where, age, points, mount, pose, velocity, rate))
+    return checked
 
 
 def _radar_points(
@@ -92,45 +173,50 @@ def _radar_points(
     radars: Mapping[str, Sequence[RadarSweep] | None],
     settings: ReaderSettings,
 ) -> Array:  # [P, 7] float32, see RADAR_POINT_FIELDS
-    clouds, mounts, poses, velocities, rates, ages = [], [], [], [], [], []
-    for name, sweeps in radars.items():
-        if not isinstance(sweeps, Sequence | None) or not all(isinstance(sweep, RadarSweep) for sweep in sweeps or ()):
-            raise DataError(f"radar {name}: must be a list of RadarSweep, or None, but got {type(sweeps).__name__}")
-        timed = [(_seconds(sweep.timestamp_s, f"radar {name}: timestamp_s"), sweep) for sweep in sweeps or ()]
-        newest = sorted(timed, key=lambda pair: pair[0], reverse=True)[: settings.num_sweeps]
-        for number, (time_s, sweep) in enumerate(newest):
-            where = f"radar {name}, sweep {number} (0 is the newest)"
-            age = timestamp_s - time_s
-            if not -MAX_SWEEP_LEAD_S <= age <= MAX_SWEEP_AGE_S:
-                raise DataError(
-                    f"{where}: is {age:g} s older than its frame, expected {-MAX_SWEEP_LEAD_S:g} to "
-                    f"{MAX_SWEEP_AGE_S:g}; give all times in seconds of one clock and leave older sweeps out"
-                )
-            clouds.append(_points(sweep.points, where))
-            mounts.append(_rigid(sweep.ego_from_sensor, f"{where}: ego_from_sensor"))
-            velocity = _array(sweep.ego_velocity_mps, (3,), f"{where}: ego_velocity_mps")
-            speed = np.linalg.norm(velocity)
-            if speed > MAX_EGO_SPEED_MPS:
-                limit = f"below {MAX_EGO_SPEED_MPS:.0f} m/s"
-                raise DataError(f"{where}: ego_velocity_mps must be {limit}, but got {speed:.0f} m/s")
-            velocities.append(velocity)
-            rates.append(_array(sweep.ego_rate_radps, (3,), f"{where}: ego_rate_radps"))
-            ages.append(age)
-            if sweep.global_from_ego is None:
-                poses.append(global_from_ego @ _driven(velocities[-1], rates[-1], -age))
-            else:
-                poses.append(_rigid(sweep.global_from_ego, f"{where}: global_from_ego"))
-    if not clouds:
+    sweeps = _newest(RadarSweep, RADAR_FIELDS, settings.num_sweeps, timestamp_s, global_from_ego, radars)
+    if not sweeps:
         return np.zeros((0, len(RADAR_POINT_FIELDS)), np.float32)
     return compensate_clouds(
-        clouds,
-        ego_from_sensor=np.stack(mounts),
-        key_from_sweep=invert_rigid(global_from_ego) @ np.stack(poses),
-        velocity=np.stack(velocities),
-        rate=np.stack(rates),
-        elapsed_s=np.array(ages),
+        [sweep.points for sweep in sweeps],
+        ego_from_sensor=np.stack([sweep.ego_from_sensor for sweep in sweeps]),
+        key_from_sweep=invert_rigid(global_from_ego) @ np.stack([sweep.global_from_ego for sweep in sweeps]),
+        velocity=np.stack([sweep.velocity for sweep in sweeps]),
+        rate=np.stack([sweep.rate for sweep in sweeps]),
+        elapsed_s=np.array([sweep.age_s for sweep in sweeps]),
         settings=settings,
     ).astype(np.float32, order="C")
+
+
+def _lidar_points(
+    timestamp_s: float,
+    global_from_ego: Array,  # [4, 4]
+    lidars: Mapping[str, Sequence[LidarSweep] | None],
+    settings: ReaderSettings,
+) -> dict[str, torch.Tensor]:
+    placed = []
+    fields = LIDAR_FIELDS[:4]
+    for sweep in _newest(LidarSweep, fields, settings.num_lidar_sweeps, timestamp_s, global_from_ego, lidars):
+        ages_s = np.full(len(sweep.points), sweep.age_s)
+        if settings.deskew_lidar and sweep.sweep.point_times_s is not None:
+            where = f"{sweep.where}: point_times_s"
+            ages_s = timestamp_s - _seconds(sweep.sweep.point_times_s, where, (len(sweep.points),))
+            away = np.abs(ages_s - sweep.age_s).max(initial=0)
+            if away > MAX_SCAN_S:
+                raise DataError(f"{where} must lie within {MAX_SCAN_S} s of timestamp_s, but one is {away:g} s from it")
+        placed.append(
+            place_sweep(
+                sweep.points.astype(np.float32),
+                ages_s=ages_s,
+                offsets_s=sweep.age_s - ages_s,
+                ego_from_sensor=sweep.ego_from_sensor,
+                aug_from_sweep=invert_rigid(global_from_ego) @ sweep.global_from_ego,
+                velocity=sweep.velocity,
+                rate=sweep.rate,
+                min_distance_m=settings.min_distance_m,
+                origins=settings.lidar_origins,
+            )
+        )
+    return lidar_tensors(placed, settings.lidar_origins)
 
 
 def _driven(
@@ -194,14 +280,12 @@ def _array(value: object, shape: tuple[int | None, ...], name: str) -> Array:
     return array
 
 
-def _seconds(value: object, name: str) -> float:
-    if getattr(value, "dtype", None) == np.float32 and abs(float(value)) > FLOAT32_REACH_S:
-        raise DataError(f"{name} is float32 and {float(value):.0f} s, which rounds times; give float64")
-    return float(_array(value, (), name))
-
-
-def _points(value: object, where: str) -> Array:  # [n, 7]
-    return _array(value, (None, len(RADAR_FIELDS)), f"{where}: points ({', '.join(RADAR_FIELDS)})")
+def _seconds(value: object, name: str, shape: tuple[int, ...] = ()) -> Array:
+    seconds = _array(value, shape, name)
+    largest = np.abs(seconds).max(initial=0)
+    if getattr(value, "dtype", None) == np.float32 and largest > FLOAT32_REACH_S:
+        raise DataError(f"{name} is float32 and {largest:.0f} s, which rounds times; give float64")
+    return seconds
 
 
 def _rigid(value: object, name: str) -> Array:  # [4, 4]

@@ -26,7 +26,7 @@ class ModelConfig(Protocol):
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """What is read and used, of `camera`, `lidar`, `radar`."""
+        """Which of `taxonomy.SENSORS` are read: all that `forward` takes of a batch, and what a submission states."""
 
     @property
     def keys_of_temporal_phase(self) -> tuple[str, ...]:

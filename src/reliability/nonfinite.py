@@ -236,6 +236,7 @@ def read_dump(path: Path) -> tuple[dict[str, Any], FrameBatch]:
         values = dict(step["batch"])
         if values["boxes"] is not None:
             values["boxes"] = [Boxes3D(**boxes) for boxes in values["boxes"]]
+        values["future"] = tuple(FrameBatch(**(frame | {"future": ()})) for frame in values["future"])
         return content, FrameBatch(**values)
     except (TypeError, ValueError, KeyError, AttributeError) as error:
         raise CheckpointError(f"{path}: its batch is not as written ({error})") from error
@@ -247,4 +248,4 @@ def _plain(value: Any) -> Any:
         return value.detach().cpu()
     if isinstance(value, (FrameBatch, Boxes3D)):
         return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
-    return [_plain(item) for item in value] if isinstance(value, list) else value
+    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value

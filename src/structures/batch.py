@@ -12,15 +12,17 @@ from src.structures.boxes import Boxes3D
 MAX_EGO_SPEED_MPS = 100.0
 """Poses further apart than this speed allows are a jump of the localisation, not a drive."""
 RADAR_POINT_FIELDS = ("x", "y", "z", "rcs", "vx", "vy", "dt")
+LIDAR_POINT_FIELDS = ("x", "y", "z", "intensity", "dt")
 
 
 @dataclass
 class FrameBatch:
-    """B key frames with their sensors, calibration and, where known, annotations.
+    """B key frames with the sensors that were read, calibration and, where known, annotations.
 
     Frames: `ego` is the vehicle at the LIDAR_LEFT key frame, `aug` the same after BEV augmentation A_t (spec 9).
     Global coordinates are float64; only ego-relative ones are float32. Images are raw RGB bytes: each model
-    normalises as its backbone was trained.
+    normalises as its backbone was trained. A sensor that was not read is None; one without returns has no points. `dt`
+    is the key frame's time less the point's, above 0 for older points.
 
     Raises ValueError when shapes, types or indices disagree.
     """
@@ -29,33 +31,37 @@ class FrameBatch:
     timestamps_s: Tensor  # [B] float64
     global_from_ego: Tensor  # [B, 4, 4] float64
     aug_from_ego: Tensor  # [B, 4, 4] float32, A_t; identity at test time
-    radar_points: Tensor  # [P, 7] float32: x, y, z (m, aug), rcs (dB), vx, vy (m/s compensated, aug axes), dt (s)
-    radar_batch: Tensor  # [P] int64, sample of each point, ascending
+    radar_points: Tensor | None = None  # [P, 7] float32: x, y, z (m, aug), rcs (dB), vx, vy (m/s over ground), dt (s)
+    radar_batch: Tensor | None = None  # [P] int64, sample of each point, ascending
+    lidar_points: Tensor | None = None  # [L, 5] float32: x, y, z (m, aug), intensity as stored, dt (s)
+    lidar_batch: Tensor | None = None  # [L] int64, sample of each point, ascending
+    lidar_origins: Tensor | None = None  # [L, 3] float32 m, aug: where the sensor was when it measured the point
     images: Tensor | None = None  # [B, N, 3, H, W] uint8 RGB
     image_valid: Tensor | None = None  # [B, N] bool, False where a camera is missing
     pix_from_aug: Tensor | None = None  # [B, N, 4, 4] float32: P_n over (0, 0, 0, 1); (u*d, v*d, d, 1) = P (x, y, z, 1)
     boxes: list[Boxes3D] | None = None  # B, aug frame
-    streams: Tensor | None = (
-        None  # [B] int64, unique: the stream of frames that each row is the next of; None: unordered
-    )
-    starts: Tensor | None = (
-        None  # [B] bool, the row begins a clip: memory of its stream ends here; given with `streams`
-    )
+    streams: Tensor | None = None  # [B] int64, unique: the stream that each row is the next frame of; None: unordered
+    starts: Tensor | None = None  # [B] bool, the row begins a clip: memory of its stream ends; given with `streams`
     skipped: dict[str, int] = field(default_factory=dict)  # unreadable files passed over, by channel
     bad_files: list[str] = field(default_factory=list)  # which these were, relative to the data set's root
+    future: tuple[FrameBatch, ...] = ()
+    """The next key frames of the same scenes, one sweep of each lidar with ray origins: supervision, never an input.
+
+    Each is in its own ego frame, with the A_t of this batch: aug_from_future = A_t inv(G) G_future inv(A_t), G being
+    `global_from_ego`. Where a scene has ended, the row repeats this frame's token, time and pose and has no points.
+    """
 
     def __post_init__(self) -> None:
         b = len(self.tokens)
         self._expect("timestamps_s", (b,), torch.float64)
         self._expect("global_from_ego", (b, 4, 4), torch.float64)
         self._expect("aug_from_ego", (b, 4, 4), torch.float32)
-        self._expect("radar_points", (self.radar_points.shape[0], len(RADAR_POINT_FIELDS)), torch.float32)
-        self._expect("radar_batch", (self.radar_points.shape[0],), torch.int64)
-        owners = self.radar_batch
-        # Values are looked at where the batch is built; on a GPU the look would stall every step.
-        looked_at = owners.device.type == "cpu" and len(owners) > 0
-        if looked_at and not (owners[0] >= 0 and owners[-1] < b and bool((owners.diff() >= 0).all())):
-            raise ValueError(f"FrameBatch.radar_batch must ascend within 0..{b - 1}")
+        self._check_points("radar", len(RADAR_POINT_FIELDS))
+        self._check_points("lidar", len(LIDAR_POINT_FIELDS))
+        if self.lidar_origins is not None:
+            self._expect(
+                "lidar_origins", (0 if self.lidar_points is None else len(self.lidar_points), 3), torch.float32
+            )
         if self.images is not None:
             n, _, h, w = self.images.shape[1:]
             self._expect("images", (b, n, 3, h, w), torch.uint8)
@@ -70,6 +76,20 @@ class FrameBatch:
                 raise ValueError(f"FrameBatch.streams must be unique, but got {self.streams.tolist()}")
         if self.boxes is not None and len(self.boxes) != b:
             raise ValueError(f"FrameBatch.boxes must hold {b} entries, one per sample, but got {len(self.boxes)}")
+        if any(len(frame) != b for frame in self.future):
+            raise ValueError(f"FrameBatch.future must hold batches of {b}, but got {[len(f) for f in self.future]}")
+
+    def _check_points(self, sensor: str, width: int) -> None:
+        points, owners = getattr(self, f"{sensor}_points"), getattr(self, f"{sensor}_batch")
+        if points is None and owners is None:
+            return
+        count = 0 if points is None else len(points)
+        self._expect(f"{sensor}_points", (count, width), torch.float32)
+        self._expect(f"{sensor}_batch", (count,), torch.int64)
+        # Values are looked at where the batch is built; on a GPU the look would stall every step.
+        looked_at = owners.device.type == "cpu" and count > 0
+        if looked_at and not (owners[0] >= 0 and owners[-1] < len(self) and bool((owners.diff() >= 0).all())):
+            raise ValueError(f"FrameBatch.{sensor}_batch must ascend within 0..{len(self) - 1}")
 
     def _expect(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> None:
         value = getattr(self, name)
@@ -83,7 +103,7 @@ class FrameBatch:
     @property
     def device(self) -> torch.device:
         """Where the tensors lie."""
-        return self.radar_points.device
+        return self.timestamps_s.device
 
     def _map(self, function: object) -> FrameBatch:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -92,6 +112,7 @@ class FrameBatch:
                 values[name] = function(value)
         if self.boxes is not None:
             values["boxes"] = [function(boxes) for boxes in self.boxes]
+        values["future"] = tuple(frame._map(function) for frame in self.future)
         return FrameBatch(**values)
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> FrameBatch:

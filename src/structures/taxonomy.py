@@ -87,6 +87,8 @@ IGNORED_CATEGORIES = (
     "vehicle.train",
 )
 
+SENSORS = ("camera", "radar", "lidar")
+"""The kinds of sensors that a model may use."""
 CAMERAS = ("CAMERA_LEFT_FRONT", "CAMERA_RIGHT_FRONT", "CAMERA_RIGHT_BACK", "CAMERA_LEFT_BACK")
 RADARS = (
     "RADAR_LEFT_FRONT",

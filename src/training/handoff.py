@@ -29,7 +29,10 @@ OF_THIS_RUN = ("phase", "resume")
 """Overrides that never concern the run whose weights are taken."""
 OF_STREAMED_DATA = ("data.groups_per_scene", "data.stream_sets", "data.sensor_dropout")
 """Nor do these and the model's `keys_of_temporal_phase`, where that run is of the phase before."""
-INPUT_SETTINGS = ("num_sweeps", "min_distance_m", "propagate_points", "test_resize_offset")
+INPUT_SETTINGS = (
+    *("num_sweeps", "num_lidar_sweeps", "deskew_lidar"),
+    *("min_distance_m", "propagate_points", "test_resize_offset"),
+)
 """Of `data`: what the weights have learnt to see."""
 
 Compose = Callable[[list[str]], tuple[Any, dict[str, Any]]]

@@ -73,7 +73,7 @@ def scene_of(
         grid=PictureGrid(grid.x_min_m, grid.y_min_m, grid.cell_m, grid.rows, grid.cols),
         predictions=_boxes(predictions),
         ground_truth=_boxes(truth),
-        radar_points=_numpy(batch.radar_points),
+        radar_points=_numpy(batch.radar_points) if batch.radar_points is not None else None,
     )
     if evidence.gaussians is not None:
         scene.gaussians = _gaussians(evidence.gaussians)

@@ -28,15 +28,16 @@ def config(**changes):
     values = dict(
         root=None, version=VERSION, train_split="train", split="val", batch_size=2, groups_per_scene=2, stream_sets=1,
         sensor_dropout=0.0, num_workers=0, num_sweeps=2, min_distance_m=1.0, propagate_points=False,
-        on_bad_file=OnBadFile.error, test_resize_offset=0.0,
+        on_bad_file=OnBadFile.error, test_resize_offset=0.0, num_lidar_sweeps=1, lidar_origins=False,
+        deskew_lidar=True, num_future_frames=0,
         augmentation=AugmentationConfig(image=None, bev=BEV),
     )  # fmt: skip
     return DataConfig(**(values | changes))
 
 
-def module(data_set, image_size_px=(32, 80), seed=0, temporal=False, **changes):
+def module(data_set, sensors=("camera", "radar"), seed=0, temporal=False, **changes):
     cache = data_set.root / "cache"
-    return DetectionDataModule(config(**changes), data_set.root, image_size_px, seed, cache, temporal=temporal)
+    return DetectionDataModule(config(**changes), data_set.root, sensors, (32, 80), seed, cache, temporal=temporal)
 
 
 @pytest.fixture
@@ -99,7 +100,7 @@ def test_workers_change_nothing(data_set):
 def test_radar_only_reads_no_image(broken_files):
     for path in broken_files.root.glob("samples/CAMERA*/*.jpg"):
         path.unlink()
-    (batch,) = module(broken_files, image_size_px=None).train_dataloader()
+    (batch,) = module(broken_files, sensors=("radar",)).train_dataloader()
     assert batch.images is None and batch.image_valid is None and batch.pix_from_aug is None
 
 
@@ -198,7 +199,7 @@ def test_identity_holds_no_path(data_set):
 
 
 def test_streamed_batches_mark_lanes_and_clip_starts(drives):
-    data = module(drives, None, temporal=True, batch_size=2)
+    data = module(drives, ("radar",), temporal=True, batch_size=2)
     index = data.index
     last = {}
     batches = list(data.train_dataloader())
@@ -210,22 +211,22 @@ def test_streamed_batches_mark_lanes_and_clip_starts(drives):
             assert start or (row == last[stream] + 1 and index.sample_scenes[row] == index.sample_scenes[last[stream]])
             last[stream] = row
     assert sum(int(batch.starts.sum()) for batch in batches) <= 7
-    for batch in (*module(drives, None).train_dataloader(), *module(drives, None).val_dataloader()):
+    for batch in (*module(drives, ("radar",)).train_dataloader(), *module(drives, ("radar",)).val_dataloader()):
         assert batch.streams is None and batch.starts is None
 
 
 def test_streamed_validation_reads_whole_scenes_and_batches_shrink(drives):
-    batches = list(module(drives, None, temporal=True, batch_size=2).val_dataloader())
+    batches = list(module(drives, ("radar",), temporal=True, batch_size=2).val_dataloader())
     assert [batch.streams.tolist() for batch in batches] == [[0, 1]] * 4
     assert [batch.starts.tolist() for batch in batches] == [[1, 1], [0, 1], [0, 0], [0, 0]]
-    many = list(module(drives, None, temporal=True, batch_size=6).val_dataloader())
+    many = list(module(drives, ("radar",), temporal=True, batch_size=6).val_dataloader())
     assert [len(batch) for batch in many] == [3, 2, 2, 1]  # fewer scenes than streams
     tokens = sorted(name for batch in many for name in batch.tokens)
-    assert tokens == sorted(module(drives, None).evaluation_set().tokens)
+    assert tokens == sorted(module(drives, ("radar",)).evaluation_set().tokens)
 
 
 def test_rigid_augmentation_lasts_for_a_clip(drives):
-    data = module(drives, None, temporal=True, batch_size=1)
+    data = module(drives, ("radar",), temporal=True, batch_size=1)
     matrices, starts = [], []
     for batch in data.train_dataloader():
         matrices.append(batch.aug_from_ego[0])
@@ -283,7 +284,7 @@ def test_silent_frames_are_never_a_clips_first_and_in_validation_always_the_same
 
 
 def test_stream_of_scenes(drives):
-    data = module(drives, None)
+    data = module(drives, ("radar",))
     assert data.scene_names() == ["scene-val-0", "scene-val-1", "scene-val-2"]
     frames = list(data.stream())
     assert [frame.tokens[0] for frame in frames] == data.evaluation_set().tokens
@@ -299,7 +300,7 @@ def test_stream_of_scenes(drives):
 
 
 def test_clips_for_pictures_end_at_spread_frames(drives):
-    data = module(drives, None)
+    data = module(drives, ("radar",))
     order = data.evaluation_set().tokens
     clips = data.validation_clips(2, 3)
     assert [clip[-1].tokens[0] for clip in clips] == [order[2], order[5]]
@@ -316,7 +317,7 @@ def test_dropped_key_frame_is_a_longer_step_of_the_same_clip(drives):
     drives.table("sample").write_text(json.dumps([record for record in samples if record is not lost]))
     files = [record for record in drives.records("sample_data") if record["sample_token"] != lost["token"]]
     drives.table("sample_data").write_text(json.dumps(files))
-    frames = list(module(drives, None, temporal=True).stream(["scene-val-0"]))
+    frames = list(module(drives, ("radar",), temporal=True).stream(["scene-val-0"]))
     times = torch.cat([frame.timestamps_s for frame in frames])
     torch.testing.assert_close(times.diff(), torch.tensor([1.0, 0.5], dtype=torch.float64), rtol=0, atol=1e-5)
     assert [bool(frame.starts) for frame in frames] == [1, 0, 0]
@@ -332,7 +333,7 @@ def test_time_that_stands_still_or_runs_back_within_a_scene(drives, shift_us, fi
     with pytest.raises(
         DataError, match=f"sample.json: sample '{token('sample', 'train-0-1')}'.*{field}=.*(later|earl)"
     ):
-        module(drives, None, temporal=True)
+        module(drives, ("radar",), temporal=True)
 
 
 @pytest.mark.parametrize("split", ["train", "val"])
@@ -340,7 +341,7 @@ def test_poses_that_jump_between_frames(drives, split):
     pose = 2 if split == "train" else 16
     translation = drives.records("ego_pose")[pose]["translation"]
     drives.edit("ego_pose", pose, translation=[translation[0] + 500, *translation[1:]])
-    data = module(drives, None, temporal=True)
+    data = module(drives, ("radar",), temporal=True)
     with pytest.raises(DataError, match=f"{token('sample', f'{split}-0-1')}.*m/s.*damaged"):
         data.train_dataloader() if split == "train" else data.val_dataloader()
 
@@ -348,7 +349,7 @@ def test_poses_that_jump_between_frames(drives, split):
 @pytest.mark.parametrize("temporal", [False, True])
 def test_training_goes_on_where_the_trainer_stands_and_validation_does_not(drives, temporal):
     def read(steps, limit=float("inf"), kind="train"):
-        data = module(drives, None, temporal=temporal, batch_size=3)
+        data = module(drives, ("radar",), temporal=temporal, batch_size=3)
         data.trainer = SimpleNamespace(world_size=1, global_rank=0, global_step=steps, num_training_batches=limit)
         loader = data.train_dataloader() if kind == "train" else data.val_dataloader()
         assert len(loader) == (5 if kind == "train" else 4 if temporal else 3)
@@ -363,7 +364,7 @@ def test_training_goes_on_where_the_trainer_stands_and_validation_does_not(drive
 
 def test_ranks_of_the_module_read_one_process_s_batches(drives):
     def read(rank, world_size, kind):
-        data = module(drives, None, temporal=True, batch_size=4)
+        data = module(drives, ("radar",), temporal=True, batch_size=4)
         data.trainer = SimpleNamespace(
             world_size=world_size, global_rank=rank, global_step=0, num_training_batches=float("inf")
         )
@@ -373,7 +374,7 @@ def test_ranks_of_the_module_read_one_process_s_batches(drives):
     alone, parts = read(0, 1, "train"), [read(rank, 2, "train") for rank in range(2)]
     assert alone == [left + right for left, right in zip(*parts, strict=True)]
     tokens = [entry[1] for rank in range(4) for batch in read(rank, 4, "val") for entry in batch]
-    assert sorted(tokens) == sorted(module(drives, None).evaluation_set().tokens)
+    assert sorted(tokens) == sorted(module(drives, ("radar",)).evaluation_set().tokens)
 
 
 class Recorder(L.LightningModule):
@@ -423,7 +424,7 @@ def fit(data, folder, epochs, checkpoint=None, resume=None, stop_at=None):
 @pytest.mark.parametrize("num_workers", [0, 1])
 def test_lightning_epochs_differ_and_resume_goes_on(data_set, tmp_path, num_workers):
     def make():
-        return module(data_set, None, batch_size=1, num_workers=num_workers)
+        return module(data_set, ("radar",), batch_size=1, num_workers=num_workers)
 
     whole = fit(make(), tmp_path, 3)
     epochs = [[entry for entry in whole if entry[0] == epoch] for epoch in range(3)]
@@ -447,7 +448,7 @@ def test_lightning_resumes_in_the_middle_of_an_epoch(
     """Frames, augmentation, epochs and validations of a run cut in two are those of a run in one piece."""
 
     def make():
-        return module(drives, None, temporal=temporal, batch_size=3, num_workers=num_workers)
+        return module(drives, ("radar",), temporal=temporal, batch_size=3, num_workers=num_workers)
 
     whole = fit(make(), tmp_path, 3)
     assert [entry[:2] for entry in whole if entry[0] != "validation"] == [(e, i) for e in range(3) for i in range(5)]

@@ -65,7 +65,7 @@ def replaced(old, new):
         (replaced(b"SIZE 4 4", b"SIZE 4"), "one entry per field"),
         (replaced(b"SIZE 4", b"SIZE 3"), "SIZE 3, which is not supported"),
         (replaced(b"COUNT 1", b"COUNT 2"), "COUNT 1"),
-        (replaced(b"DATA binary", b"DATA gzip"), "binary or ascii"),
+        (replaced(b"DATA binary", b"DATA gzip"), "binary, ascii or binary_compressed"),
         (pcd_bytes(np.where(POINTS == POINTS[4, 2], np.nan, POINTS)), "point 4 is not finite"),
         (pcd_bytes(np.where(POINTS == POINTS[2, 5], np.inf, POINTS)), "point 2 is not finite"),
         (pcd_bytes(POINTS, data="ascii") + b"7 7", "9 points of 7 fields expected, but more numbers found"),

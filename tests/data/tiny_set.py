@@ -245,5 +245,6 @@ class DataSet:
 
 def reader_settings(**changes: Any) -> ReaderSettings:
     values = dict(num_sweeps=10, min_distance_m=1.0, propagate_points=False, on_bad_file=OnBadFile.error,
-                  image_size_px=(64, 160), test_resize_offset=0.0)  # fmt: skip
+                  image_size_px=(64, 160), test_resize_offset=0.0, num_lidar_sweeps=0, lidar_origins=False,
+                  deskew_lidar=True, num_future_frames=0)  # fmt: skip
     return ReaderSettings(**(values | changes))
