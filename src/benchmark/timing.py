@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from src.config import Accelerator, Config
-from src.ops.tiled_rulebook import release_scratch
+from src.ops.sparse_conv_tiled import release_scratch
 from src.reliability.processes import check_devices
 
 PATIENCE = 4.0  # a first call that takes so many times what a candidate may take is its only one

@@ -1,4 +1,4 @@
-"""Cells under rotated boxes, and the ragged windows of cells that rasters and splats are made from."""
+"""Cells under rotated boxes, and in the windows that rasters and splats test cell by cell."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
+from src.geometry.ragged import enumerate_windows
 from src.geometry.tensor_transforms import rotate_back
 
 # Closed rectangles: a cell centre on the edge counts, whatever the rounding of its coordinates says.
@@ -17,23 +18,16 @@ def window_cells(
     centres: Tensor,  # [n, 2] (x, y) in cells; cell (row, col) has its centre at (col, row)
     half_extents: Tensor,  # [n, 2] (x, y) in cells, not negative
     grid: BEVGrid,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:  # [pairs] int64 each
     """Every cell of the grid whose centre lies in an axis-aligned window, for all windows at once.
 
-    Returns (window, row, col) [pairs] int64, ordered by window and row-major within, and the number of cells of each
-    window [n] int64. Windows outside the grid and NaN windows have no cells that any sensible test would keep.
+    Returns (window, row, col), ordered by window and row-major within. Windows outside the grid and NaN windows have no
+    cells that any sensible test would keep.
     """
     limit = constant((grid.cols, grid.rows), torch.int64, centres.device)
     low = torch.maximum((centres - half_extents).ceil(), torch.zeros_like(centres)).minimum(limit).long()  # [n, 2]
     high = torch.maximum((centres + half_extents).floor(), -torch.ones_like(centres)).minimum(limit - 1).long()
-    widths, heights = (high - low + 1).clamp(min=0).unbind(1)
-    counts = widths * heights
-    window = torch.repeat_interleave(counts)  # [pairs]
-    place = torch.arange(len(window), device=centres.device) - (counts.cumsum(0) - counts).index_select(0, window)
-    width = widths.index_select(0, window)
-    down = torch.div(place, width, rounding_mode="floor")
-    corner = low.index_select(0, window)
-    return window, corner[:, 1] + down, corner[:, 0] + place - down * width, counts
+    return enumerate_windows(low, high)
 
 
 def cells_in_boxes(
@@ -56,7 +50,7 @@ def cells_in_boxes(
         [half[:, 0] * cosine.abs() + half[:, 1] * sine.abs(), half[:, 0] * sine.abs() + half[:, 1] * cosine.abs()], 1
     )
     centres = grid.to_cells(boxes[:, :2]) - 0.5
-    box, row, col, _ = window_cells(centres, reach / grid.cell_m, grid)
+    box, row, col = window_cells(centres, reach / grid.cell_m, grid)
     offset = (torch.stack([col, row], 1) - centres.index_select(0, box)) * grid.cell_m  # [pairs, 2] m
     cosine, sine, half = cosine.index_select(0, box), sine.index_select(0, box), half.index_select(0, box)
     along, across = rotate_back(cosine, sine, *offset.unbind(1))

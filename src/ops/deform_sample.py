@@ -9,7 +9,7 @@ from torch import Tensor
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
 from src.ops.backend import implementation, register
-from src.ops.segment_reduce import weighted_segment_sum
+from src.ops.segment_reduce import inverse_rows, weighted_segment_sum
 from src.ops.sites import Sites
 
 
@@ -164,9 +164,7 @@ def _corners(
 def _row_table(sites: Sites) -> Tensor:  # [B * rows * cols] int64
     """Row of every cell of the grid, -1 where absent; made once per set of sites."""
     if "row_table" not in sites.cache:
-        table = sites.keys.new_full((max(torch.Size(sites.shape).numel(), 1),), -1)
-        table[sites.linear()] = torch.arange(len(sites), device=sites.device)
-        sites.cache["row_table"] = table
+        sites.cache["row_table"] = inverse_rows(sites.linear(), max(torch.Size(sites.shape).numel(), 1))
     return sites.cache["row_table"]
 
 

@@ -147,7 +147,8 @@ def _build_submanifold(sites: Sites, kernel: tuple[int, ...]) -> KernelMap:
         return KernelMap(rows, rows, (num,), num, num, mirrored=True, identity=True)
     starts = sites.keys - sum(size // 2 * step for size, step in zip(kernel, sites.strides[1:], strict=True))
     found, where = _search(sites.keys, starts, sites.strides[1:], kernel, half)
-    inputs, outputs, counts = _pairs(found, where)
+    hits, outputs, counts = _hits(found)
+    inputs = where.reshape(-1).index_select(0, hits).to(torch.int32)
     blocks_in, blocks_out = inputs.split(counts), outputs.split(counts)
     return KernelMap(
         torch.cat([inputs, rows, *blocks_out[::-1]]),
@@ -174,12 +175,9 @@ def _build_strided(
         fits = (coarse * stride[axis] == moved) & (coarse >= 0) & (coarse < shape[axis + 1])
         targets = targets.unsqueeze(-2) + coarse * out.strides[axis + 1]
         valid = valid.unsqueeze(-2) & fits
-    num = len(sites)
-    counts = valid.flatten(0, -2).sum(1).tolist()
-    hits = torch.nonzero_static(valid.reshape(-1), size=sum(counts)).squeeze(1)
+    hits, inputs, counts = _hits(valid.flatten(0, -2))
     out.keys, outputs = torch.unique(targets.reshape(-1).index_select(0, hits), return_inverse=True)
-    inputs = torch.remainder(hits, max(num, 1)).to(torch.int32)
-    return KernelMap(inputs, outputs.to(torch.int32), tuple(counts), num, len(out)), out
+    return KernelMap(inputs, outputs.to(torch.int32), counts, len(sites), len(out)), out
 
 
 def _build_temporal(
@@ -196,8 +194,9 @@ def _build_temporal(
     for axis in range(sites.ndim):
         corner = corner + (cells[:, axis + 1] * stride[axis] - padding[axis]) * sites.strides[axis + 1]
     found, where = _search(sites.keys, corner, sites.strides[1:], kernel, torch.Size(kernel).numel())
-    inputs, outputs, counts = _pairs(found, where)
-    return KernelMap(inputs, outputs, tuple(counts), len(sites), len(out)), out
+    hits, outputs, counts = _hits(found)
+    inputs = where.reshape(-1).index_select(0, hits).to(torch.int32)
+    return KernelMap(inputs, outputs, counts, len(sites), len(out)), out
 
 
 def _search(
@@ -226,13 +225,16 @@ def _search(
     return torch.stack(found), torch.stack(where)
 
 
-def _pairs(found: Tensor, where: Tensor) -> tuple[Tensor, Tensor, list[int]]:
-    """(input rows, output rows, counts) of the taps that met a site, block by block."""
-    counts = found.sum(1).tolist()
-    hits = torch.nonzero_static(found.reshape(-1), size=sum(counts)).squeeze(1)  # a GPU is waited for once, not twice
-    outputs = torch.remainder(hits, max(found.shape[1], 1))
-    inputs = where.reshape(-1).index_select(0, hits)
-    return inputs.to(torch.int32), outputs.to(torch.int32), counts
+def _hits(
+    found: Tensor,  # [K, m] bool
+) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+    """Flat positions [hits] int64 of what was found, offset by offset, its columns [hits] int32, and counts per offset.
+
+    A GPU is waited for once.
+    """
+    counts = tuple(found.sum(1).tolist())
+    hits = torch.nonzero_static(found.reshape(-1), size=sum(counts)).squeeze(1)
+    return hits, torch.remainder(hits, max(found.shape[1], 1)).to(torch.int32), counts
 
 
 def _output_shape(

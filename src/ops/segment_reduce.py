@@ -1,4 +1,7 @@
-"""Sums, means and the best of rows that belong together: deterministic, without a tensor of one row per pair."""
+"""Segment reduce, gather and scatter of rows, per-sample top-k: deterministic, without a tensor of one row per pair.
+
+Pairs name rows of some values and the segment each goes to; a segment is a run of pairs.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ def segments(
     rows: Tensor,  # [pairs] integer
     num_rows: int,
 ) -> tuple[Tensor, Tensor]:
-    """Stable order of the pairs by row [pairs], and the start of each row's segment [num_rows + 1], both int32."""
+    """Stable order of the pairs by row [pairs], and the start of each row's segment [num_rows + 1], int32."""
     ordered, order = torch.sort(rows, stable=True)
     starts = torch.searchsorted(ordered, torch.arange(num_rows + 1, dtype=rows.dtype, device=rows.device))
     return order.to(torch.int32), starts.to(torch.int32)
@@ -28,7 +31,7 @@ def gather_segment_sum(
     starts: Tensor,  # [segments + 1], same type: first pair of each segment
     weights: Tensor | None = None,  # [pairs]
 ) -> Tensor:  # [segments, C]
-    """(Weighted) sum of the picked rows of every segment, 0 for an empty segment. Without gradient."""
+    """Gather the picked rows and sum them, weighted, by segment; 0 for an empty segment. Without gradient."""
     if len(picks) == 0:
         return values.new_zeros(len(starts) - 1, values.shape[1])
     return F.embedding_bag(picks, values, starts, mode="sum", include_last_offset=True, per_sample_weights=weights)
@@ -39,7 +42,7 @@ def segment_sum(
     rows: Tensor,  # [n] int64
     num_rows: int,
 ) -> Tensor:  # [num_rows, C]
-    """Sum of the values that share a row, in their order of appearance; rows nobody names are 0. Differentiable."""
+    """Scatter sum: values that share a row, added in their order of appearance; absent rows are 0. Differentiable."""
     return _SegmentSum.apply(values, rows, num_rows)
 
 
@@ -48,7 +51,7 @@ def segment_mean(
     rows: Tensor,  # [n] int64
     num_rows: int,
 ) -> Tensor:  # [num_rows, C]
-    """Mean of the values that share a row; rows nobody names are 0. Differentiable."""
+    """Scatter mean: values that share a row; absent rows are 0. Differentiable."""
     counts = rows.new_zeros(num_rows).index_add(0, rows, torch.ones_like(rows))  # a GPU would wait for bincount
     return segment_sum(values, rows, num_rows) / counts.clamp(min=1)[:, None].to(values.dtype)
 
@@ -70,7 +73,7 @@ def permute_rows(
     there: Tensor,  # [m] int64, the row of `values` that each result takes, -1 for zeros; none twice
     back: Tensor,  # [n] int64, the inverse: the result that takes each row, -1 for none
 ) -> Tensor:  # [m, C]
-    """Rows in other places. Differentiable; the way back is a gather as well, so nothing is added up."""
+    """Permute, insert and drop rows. Differentiable; the backward pass is a gather as well, so nothing is summed."""
     return _PermuteRows.apply(values, there, back)
 
 
@@ -99,14 +102,31 @@ def topk_per_sample(
     count: int,
 ) -> Tensor:  # [B, count] int64
     """Rows of the highest scores of each sample, best first, ties by row; -1 where a sample has fewer."""
+    order, rank = rank_per_sample(scores, sample)
+    rows = order.new_full((batch_size, count + 1), -1)
+    rows[sample[order], rank.clamp(max=count)] = order  # all beyond the last place meet in one column that is dropped
+    return rows[:, :count]
+
+
+def rank_per_sample(
+    scores: Tensor,  # [M]
+    sample: Tensor,  # [M] int64
+) -> tuple[Tensor, Tensor]:  # [M], [M] int64
+    """Rows sample by sample, best first, ties by row, and the rank 0, 1, ... of each within its sample."""
     order = scores.argsort(descending=True, stable=True)
     order = order[sample[order].argsort(stable=True)]
     owner = sample[order]
-    sizes = torch.bincount(owner, minlength=batch_size)
-    rank = torch.arange(len(order), device=order.device) - (sizes.cumsum(0) - sizes)[owner]
-    rows = order.new_full((batch_size, count + 1), -1)
-    rows[owner, rank.clamp(max=count)] = order  # everything behind the last place meets in one column that is dropped
-    return rows[:, :count]
+    return order, torch.arange(len(order), device=order.device) - torch.searchsorted(owner, owner)
+
+
+def inverse_rows(
+    rows: Tensor,  # [m] int64, distinct, each below `num`
+    num: int,
+) -> Tensor:  # [num] int64
+    """Place of each of `num` rows among the given ones, -1 where it is absent: the inverse permutation of all rows."""
+    places = rows.new_full((num,), -1)
+    places[rows] = torch.arange(len(rows), device=rows.device)
+    return places
 
 
 def weighted_segment_sum(
@@ -117,7 +137,7 @@ def weighted_segment_sum(
     num_segments: int,
     by_pick: Tensor | None = None,  # [pairs] int64, the pairs ordered by `picks`, where the caller knows it
 ) -> Tensor:  # [num_segments, C]
-    """Weighted sum of the picked rows of every segment, differentiable in the values and in the weights."""
+    """Gather, weight and segment sum, differentiable in the values and in the weights."""
     return _WeightedSegmentSum.apply(values, weights, picks, segment, num_segments, by_pick)
 
 

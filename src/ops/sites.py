@@ -128,14 +128,21 @@ class Sites:
         """Row of each cell among the sites, -1 where it is absent or outside the grid."""
         upper = constant(self.shape, torch.int64, indices.device)
         inside = ((indices >= 0) & (indices < upper)).all(1)
-        if len(self) == 0:
-            return torch.full_like(inside, -1, dtype=torch.int64)
-        wanted = self._keys_of(indices)
-        rows = torch.searchsorted(self.keys, wanted).clamp_(max=len(self) - 1)
-        return torch.where(inside & (self.keys[rows] == wanted), rows, -1)
+        return torch.where(inside, rows_of_keys(self.keys, self._keys_of(indices)), -1)
 
     def _keys_of(self, indices: Tensor) -> Tensor:
         return (indices.long() * constant(self.strides, torch.int64, indices.device)).sum(1)
+
+
+def rows_of_keys(
+    keys: Tensor,  # [n] int64, sorted, unique
+    wanted: Tensor,  # [q] int64
+) -> Tensor:  # [q] int64
+    """Row of each wanted key among the sorted keys, -1 where it is absent."""
+    if len(keys) == 0:
+        return torch.full_like(wanted, -1)
+    rows = torch.searchsorted(keys, wanted).clamp_(max=len(keys) - 1)
+    return torch.where(keys[rows] == wanted, rows, -1)
 
 
 def union(a: Sites, b: Sites) -> tuple[Sites, Tensor, Tensor]:

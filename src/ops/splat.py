@@ -11,16 +11,14 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.box_cells import window_cells
 from src.geometry.tensor_transforms import rotate_back
 from src.ops.backend import implementation, register
-from src.ops.segment_reduce import gather_segment_sum, weighted_segment_sum
+from src.ops.gaussian_cells import GaussianCellPairs, gaussian_cells
+from src.ops.segment_reduce import gather_segment_sum, inverse_rows, rank_per_sample, weighted_segment_sum
 from src.ops.sites import Sites
 
 # A contribution is at most 1 - CAP, so that the logarithm of the free probability stays finite.
 CAP = 1e-4
-# Windows are widened by this before the exact test, so that rounding cannot lose a cell.
-WINDOW_SLACK_CELLS = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,73 +107,6 @@ def splat_gaussians(
             support_sigmas,
             smooth_cap,
         )
-
-
-@dataclass(eq=False)
-class GaussianCellPairs:
-    """(Gaussian, cell) pairs in the order of the cells, and the way back to the order of the Gaussians.
-
-    By Gaussian, the pairs of one Gaussian stand in the order of their cells.
-    """
-
-    gaussian: Tensor  # [pairs] int64
-    cell: Tensor  # [pairs] int64, row in the support, ascending
-    delta: Tensor  # [pairs, 2] cell centre - mean, metres
-    q: Tensor  # [pairs] squared Mahalanobis distance
-    in_turn: Tensor  # [pairs] int64, 0, 1, 2, ...
-    cell_starts: Tensor  # [n + 1] int64, first pair of each support cell
-    by_gaussian: Tensor  # [pairs] int64, pairs in the order of the Gaussians
-    gaussian_starts: Tensor  # [G + 1] int64, first place of each Gaussian in by_gaussian
-
-
-@torch.no_grad()
-def gaussian_cells(
-    means: Tensor,
-    scales: Tensor,
-    directions: Tensor,
-    batch: Tensor,
-    grid: BEVGrid,
-    batch_size: int,
-    support_sigmas: float,
-) -> tuple[GaussianCellPairs, Tensor]:
-    """All pairs with q <= support_sigmas^2, and the linear keys [n] of the cells they reach."""
-    squares, turned = scales.square(), directions.square()
-    variances = torch.stack([(turned * squares).sum(1), (turned.flip(1) * squares).sum(1)], 1)  # Sigma_xx, Sigma_yy
-    centres = grid.to_cells(means) - 0.5
-    reach = support_sigmas * variances.sqrt() / grid.cell_m + WINDOW_SLACK_CELLS
-    gaussian, row, col, _ = window_cells(centres, reach, grid)
-    # Offsets are taken from the nearest cell centre: float32 would lose five digits on coordinates of 150 m.
-    nearest = centres.round()
-    rest = (means.double() - grid.centre_of(nearest.flip(1), torch.float64)).to(means.dtype)  # [G, 2] m
-    table = torch.cat([nearest, rest, directions, scales], 1).index_select(0, gaussian)
-    base_x, base_y, rest_x, rest_y, cosine, sine, size_x, size_y = table.unbind(1)  # [candidates] each
-    delta_x, delta_y = (col - base_x) * grid.cell_m - rest_x, (row - base_y) * grid.cell_m - rest_y
-    along, across = rotate_back(cosine, sine, delta_x, delta_y)
-    q = (along / size_x).square() + (across / size_y).square()
-    near = (q <= support_sigmas**2).nonzero().squeeze(1)
-
-    gaussian = gaussian.index_select(0, near)  # ascending
-    linear = (batch.index_select(0, gaussian) * grid.rows + row.index_select(0, near)) * grid.cols
-    linear = linear + col.index_select(0, near)
-    num_cells = batch_size * grid.rows * grid.cols
-    linear, order = torch.sort(linear.to(torch.int32 if num_cells < 2**31 else torch.int64), stable=True)
-    support, cell, sizes = torch.unique_consecutive(linear, return_inverse=True, return_counts=True)
-    by_gaussian = torch.empty_like(order)
-    in_turn = torch.arange(len(order), device=order.device)
-    by_gaussian[order] = in_turn
-    owners = torch.arange(len(means) + 1, device=gaussian.device)
-    near = near.index_select(0, order)
-    pairs = GaussianCellPairs(
-        gaussian=gaussian.index_select(0, order),
-        cell=cell,
-        delta=torch.stack([delta_x.index_select(0, near), delta_y.index_select(0, near)], 1),
-        q=q.index_select(0, near),
-        in_turn=in_turn,
-        cell_starts=F.pad(sizes.cumsum(0), (1, 0)),
-        by_gaussian=by_gaussian,
-        gaussian_starts=torch.searchsorted(gaussian, owners),
-    )
-    return pairs, support.long()
 
 
 class _LogFree(torch.autograd.Function):
@@ -273,9 +204,7 @@ def splat_reference(
     occupied_rows, num_cut = occupied_cells(log_free.detach(), support, threshold, max_cells, grid.rows * grid.cols)
 
     # Pairs of the occupied cells, and their order by Gaussian.
-    place = torch.full_like(support, -1)
-    place[occupied_rows] = torch.arange(len(occupied_rows), device=place.device)
-    cell = place.index_select(0, pairs.cell)
+    cell = inverse_rows(occupied_rows, len(support)).index_select(0, pairs.cell)
     kept = cell >= 0
     chosen = kept.nonzero().squeeze(1)
     gaussian, cell = pairs.gaussian.index_select(0, chosen), cell.index_select(0, chosen)
@@ -309,11 +238,8 @@ def occupied_cells(
     if len(rows) <= max_cells:
         return rows, 0
     sample = torch.div(support.index_select(0, rows), cells_per_sample, rounding_mode="floor")
-    by_occupancy = torch.argsort(log_free.index_select(0, rows), stable=True)
-    by_sample = by_occupancy[torch.argsort(sample[by_occupancy], stable=True)]  # best first within each sample
-    owner = sample[by_sample]
-    best = torch.arange(len(rows), device=rows.device) - torch.searchsorted(owner, owner) < max_cells
-    kept = rows[by_sample[best]].sort().values
+    order, rank = rank_per_sample(-log_free.index_select(0, rows), sample)
+    kept = rows[order[rank < max_cells]].sort().values
     return kept, len(rows) - len(kept)
 
 

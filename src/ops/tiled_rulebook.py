@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import threading
 from dataclasses import dataclass
 
 import torch
@@ -96,34 +95,3 @@ def _cut(kernel_map: KernelMap, backward: bool, rows: int, num: int) -> TiledRul
         starts = torch.searchsorted(by_row, wanted, out_int32=True)
         tiles.append(Tile(first, last, sources, targets, tuple(spans), order.to(torch.int32), starts))
     return TiledRulebook(tuple(tiles), max((len(tile.gathered) for tile in tiles), default=0))
-
-
-class _Scratch(threading.local):
-    """Memory that every convolution of a thread uses again: fresh memory costs a page fault for every 4 KiB."""
-
-    def __init__(self) -> None:
-        self.blocks: dict[tuple[str, torch.device], Tensor] = {}
-
-
-_scratch = _Scratch()
-
-
-def scratch(
-    name: str,
-    rows: int,
-    columns: int,
-    dtype: torch.dtype,
-    device: torch.device,
-) -> Tensor:  # [rows, columns]
-    """Memory with arbitrary content; the same name gives the same memory again."""
-    size = rows * columns * dtype.itemsize
-    block = _scratch.blocks.get((name, device))
-    if block is None or len(block) < size:
-        with torch.inference_mode(False):  # or training could not use it after an evaluation
-            block = _scratch.blocks[name, device] = torch.empty(size, dtype=torch.uint8, device=device)
-    return block[:size].view(dtype).view(rows, columns)
-
-
-def release_scratch() -> None:
-    """Give the calling thread's reused memory back; the next convolution takes it anew."""
-    _scratch.blocks.clear()

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.constants import constant
-from src.ops.segment_reduce import segment_mean
+from src.ops.segment_reduce import inverse_rows, rank_per_sample, segment_mean
 from src.ops.sites import Sites
 
 
@@ -46,9 +46,7 @@ def voxelize(
     values = points.index_select(0, inside)
     if max_voxels is not None and len(sites) > max_voxels:
         kept = _densest(sites, torch.bincount(rows, minlength=len(sites)), max_voxels)
-        place_of = torch.full_like(sites.keys, -1)
-        place_of[kept] = torch.arange(len(kept), device=kept.device)
-        rows = place_of.index_select(0, rows)
+        rows = inverse_rows(kept, len(sites)).index_select(0, rows)
         values, rows = values[rows >= 0], rows[rows >= 0]
         sites = Sites(sites.shape, sites.keys.index_select(0, kept))
     values = values.to(torch.promote_types(values.dtype, torch.float32))
@@ -57,10 +55,5 @@ def voxelize(
 
 def _densest(sites: Sites, counts: Tensor, limit: int) -> Tensor:
     """Ascending rows of the `limit` voxels with the most points of every sample."""
-    sample = sites.indices()[:, 0]
-    by_count = torch.argsort(counts, descending=True, stable=True)
-    best_first = by_count[torch.argsort(sample[by_count], stable=True)]  # sample by sample
-    sizes = sites.batch_counts()
-    first = (sizes.cumsum(0) - sizes).index_select(0, sample[best_first])
-    rank = torch.arange(len(sites), device=sites.device) - first
-    return best_first[rank < limit].sort().values
+    order, rank = rank_per_sample(counts, sites.indices()[:, 0])
+    return order[rank < limit].sort().values

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from src.errors import ConfigError
-from src.targets.pairs import enumerate_pairs
+from src.geometry.ragged import enumerate_windows
 from src.targets.projection import BoxViews
 
 
@@ -79,10 +79,7 @@ def paint_depth(
     limit = seen.hulls_px.new_tensor([cols, rows])
     low = (seen.hulls_px[:, :2] / stride_px).floor().long()
     high = torch.minimum((seen.hulls_px[:, 2:] / stride_px).ceil(), limit).long()
-    width, height = (high - low).clamp(min=0).unbind(1)
-    owners, offsets = enumerate_pairs(width * height)
-    row = low[owners, 1] + torch.div(offsets, width[owners], rounding_mode="floor")
-    col = low[owners, 0] + offsets % width[owners]
+    owners, row, col = enumerate_windows(low, high - 1)
     depths = seen.depths_m.new_full((num_views * rows * cols,), torch.inf)
     depths.scatter_reduce_(0, (seen.views[owners] * rows + row) * cols + col, seen.depths_m[owners], "amin")
     return lid_index(depths, depth_range_m, num_bins).view(num_views, rows, cols)

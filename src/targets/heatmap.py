@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.ragged import enumerate_items
 from src.ops.sites import Sites
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CLASSES
-from src.targets.pairs import enumerate_pairs
 from src.targets.supervision import supervised_boxes
 
 HEAD_GROUPS: tuple[tuple[str, ...], ...] = (
@@ -122,7 +122,7 @@ def _first_of_each_group(boxes: Boxes3D, batch: Tensor) -> tuple[Boxes3D, Tensor
     owner = batch * len(HEAD_GROUPS) + boxes.labels.new_tensor(GROUP_OF_CLASS)[boxes.labels]
     order = owner.argsort(stable=True)
     counts = torch.bincount(owner)
-    kept = order[enumerate_pairs(counts)[1] < MAX_OBJECTS_PER_GROUP].sort().values
+    kept = order[enumerate_items(counts)[1] < MAX_OBJECTS_PER_GROUP].sort().values
     return boxes[kept], batch[kept]
 
 
@@ -142,7 +142,7 @@ def _pairs_in_bands(
     linear = sites.linear()
     start = torch.searchsorted(linear, (batch * height + low) * width)
     stop = torch.searchsorted(linear, (batch * height + high) * width)
-    owners, offsets = enumerate_pairs((stop - start).clamp(min=0))
+    owners, offsets = enumerate_items((stop - start).clamp(min=0))
     rows = start[owners] + offsets
     cells = sites.indices()[:, 1:].to(g.dtype)
     squared = (cells[rows, 1] - g[owners, 0]) ** 2 + (cells[rows, 0] - g[owners, 1]) ** 2

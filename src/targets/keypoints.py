@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from src.targets.pairs import enumerate_pairs
+from src.geometry.ragged import enumerate_windows
 from src.targets.projection import BoxViews
 
 MAX_RADIUS_CELLS = 16
@@ -32,13 +32,11 @@ def keypoint_heatmap(
 
     margin = torch.cat([center - hull[:, :2], hull[:, 2:] - center], dim=1).amin(1)
     radius = (margin / stride_px).ceil().clamp(1, MAX_RADIUS_CELLS).long()
-    side = 2 * radius + 1
-    owners, offsets = enumerate_pairs(side**2)
-    down = torch.div(offsets, side[owners], rounding_mode="floor") - radius[owners]
-    right = offsets % side[owners] - radius[owners]
-    values = torch.exp(-(down**2 + right**2) / (2 * (side[owners] / 6) ** 2))
+    cell = torch.stack([col, row], 1)
+    owners, down, right = enumerate_windows(cell - radius[:, None], cell + radius[:, None])
+    squared = (down - row[owners]) ** 2 + (right - col[owners]) ** 2
+    values = torch.exp(-squared / (2 * ((2 * radius + 1)[owners] / 6) ** 2))
 
-    down, right = down + row[owners], right + col[owners]
     within = (down >= 0) & (down < rows) & (right >= 0) & (right < cols)
     flat = ((view[owners] * rows + down) * cols + right)[within]
     heatmap = center.new_zeros(num_views * rows * cols)

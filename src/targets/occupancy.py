@@ -7,8 +7,8 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import cells_in_boxes
+from src.ops.sites import rows_of_keys
 from src.structures.boxes import Boxes3D
-from src.targets.pairs import find_keys
 from src.targets.supervision import supervised_boxes
 
 
@@ -30,7 +30,7 @@ def cells_are_occupied(
     occupied: Tensor,  # [P] int64, sorted, unique
 ) -> Tensor:  # [M] bool
     """Mask of the cells that lie in a box."""
-    return find_keys(occupied, keys) >= 0
+    return rows_of_keys(occupied, keys) >= 0
 
 
 def box_cell_keys(

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
+from src.ops.sites import rows_of_keys
 from src.structures.boxes import Boxes3D
 from src.targets.occupancy import box_cell_keys
-from src.targets.pairs import find_keys
 from src.targets.supervision import supervised_boxes
 
 
@@ -29,7 +29,7 @@ class VelocityRaster:
 
         At p*_i, the cell where Gaussian i contributes most, in the raster of the enlarged boxes: the target of Eq. 9.
         """
-        rows = find_keys(self.keys, keys)
+        rows = rows_of_keys(self.keys, keys)
         padded = torch.cat([self.velocities, self.velocities.new_full((1, 2), torch.nan)])
         return padded[rows]  # row -1 is the padding
 

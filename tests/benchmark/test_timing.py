@@ -7,7 +7,7 @@ import torch
 
 from src.benchmark import timing
 from src.benchmark.timing import added_bytes, in_turns, interleaved, median_spread, timed_parts
-from src.ops.tiled_rulebook import scratch
+from src.ops.sparse_conv_tiled import scratch
 
 CPU = torch.device("cpu")
 

@@ -61,7 +61,7 @@ def test_the_environment_overrides_and_the_first_call_decides(undecided):
     assert backend.chosen() == "reference"
 
 
-def test_a_wrong_environment_is_told(undecided):
+def test_a_wrong_environment_is_named(undecided):
     undecided.setattr(torch.cuda, "is_available", lambda: False)
     undecided.setenv("HORIZON3D_OPS", "cuda")
     with pytest.raises(ConfigError, match="HORIZON3D_OPS=cuda: expected reference or triton"):

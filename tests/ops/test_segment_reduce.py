@@ -3,21 +3,23 @@ import torch
 from src.ops import segment_mean, segment_sum
 from src.ops.segment_reduce import (
     gather_segment_sum,
+    inverse_rows,
     paired_dot,
     permute_rows,
+    rank_per_sample,
     segments,
     topk_per_sample,
     weighted_segment_sum,
 )
 
 
-def test_bags_keep_the_order_of_their_pairs():
+def test_segments_keep_the_order_of_their_pairs():
     order, starts = segments(torch.tensor([2, 0, 2, 0]), 4)
     assert order.tolist() == [1, 3, 0, 2]
     assert starts.tolist() == [0, 2, 2, 4, 4]
 
 
-def test_bag_sum_by_hand():
+def test_gather_segment_sum_by_hand():
     values = torch.tensor([[1.0], [10.0], [100.0]])
     picks, starts = torch.tensor([0, 2, 1]), torch.tensor([0, 2, 2, 3])
     assert gather_segment_sum(values, picks, starts).tolist() == [[101.0], [0.0], [10.0]]
@@ -35,7 +37,7 @@ def test_segment_sum_and_mean():
     assert torch.autograd.gradcheck(lambda x: segment_mean(x, rows, 3), double)
 
 
-def test_weighted_bag_gradients():
+def test_weighted_segment_sum_gradients():
     torch.manual_seed(0)
     picks, segment = torch.tensor([0, 2, 0, 1, 2]), torch.tensor([0, 0, 2, 2, 2])
     values, weights = torch.randn(3, 2).double().requires_grad_(), torch.randn(5).double().requires_grad_()
@@ -54,13 +56,20 @@ def test_row_products_in_chunks(monkeypatch):
     torch.testing.assert_close(paired_dot(a, rows_a, b, rows_b), (a[rows_a] * b[rows_b]).sum(1))
 
 
-def test_best_rows_by_hand():
+def test_topk_per_sample_by_hand():
     scores, sample = torch.tensor([0.1, 0.9, 0.5, 0.5, 0.7]), torch.tensor([0, 0, 0, 2, 2])
     assert topk_per_sample(scores, sample, 3, 2).tolist() == [[1, 2], [-1, -1], [4, 3]]
     assert topk_per_sample(scores[:0], sample[:0], 2, 2).tolist() == [[-1, -1], [-1, -1]]
+    order, rank = rank_per_sample(scores, sample)
+    assert order.tolist() == [1, 2, 0, 4, 3] and rank.tolist() == [0, 1, 2, 0, 1]
 
 
-def test_exchanged_rows_and_their_gradient():
+def test_inverse_rows_by_hand():
+    assert inverse_rows(torch.tensor([3, 0, 4]), 5).tolist() == [1, -1, -1, 0, 2]
+    assert inverse_rows(torch.zeros(0, dtype=torch.int64), 2).tolist() == [-1, -1]
+
+
+def test_permuted_rows_and_their_gradient():
     values = torch.randn(4, 3, dtype=torch.float64, requires_grad=True)
     there, back = torch.tensor([2, -1, 0, -1, 3]), torch.tensor([2, -1, 0, 4])
     found = permute_rows(values, there, back)

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from src.ops import Sites, union
+from src.ops.sites import rows_of_keys
 
 SHAPE = (2, 4, 5)
 
@@ -20,6 +21,12 @@ def test_look_up_finds_sites_and_nothing_else():
     sites, _ = Sites.from_indices(torch.tensor([[0, 0, 4], [1, 2, 2]]), SHAPE)
     asked = torch.tensor([[1, 2, 2], [0, 0, 4], [0, 1, 0], [0, 0, 5], [0, 1, -1], [2, 2, 2], [0, -1, 0]])
     assert sites.rows_of(asked).tolist() == [1, 0, -1, -1, -1, -1, -1]
+
+
+def test_keys_are_looked_up_among_sorted_ones():
+    keys = torch.tensor([2, 5, 9])
+    assert rows_of_keys(keys, torch.tensor([9, 1, 5, 10, -1, 2])).tolist() == [2, -1, 1, -1, -1, 0]
+    assert rows_of_keys(keys[:0], keys).tolist() == [-1, -1, -1]
 
 
 def test_an_empty_set_answers_too():

@@ -1,6 +1,4 @@
-import itertools
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,17 +7,12 @@ import torch
 import torch.nn.functional as F
 
 from src.ops import Sites, neighbour_sum, sparse_conv, strided_map, submanifold_map, temporal_map
-from src.ops.kernel_maps import KernelMap, stacked_map
-from src.ops.tiled_rulebook import tiled_rulebook
+from src.ops.kernel_maps import stacked_map
+from src.ops.sparse_conv import plain_sparse_conv
+from tests.ops.maps import map_of, random_sites
 
 GOLDEN = np.load(Path(__file__).parents[1] / "golden" / "sparse_conv" / "cases.npz")
 CASES = json.loads(str(GOLDEN["meta_json"]))
-
-
-def random_sites(shape, count, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    picks = torch.randperm(torch.Size(shape).numel(), generator=generator)[:count]
-    return Sites.from_linear(picks.sort().values, shape)
 
 
 def ours(weight):
@@ -114,13 +107,21 @@ def test_gradcheck(mode):
 
 
 @pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal"])
+def test_formula_and_optimised_forms_agree(mode):
+    """Values and all three gradients."""
+    kernel_map = map_of(mode, random_sites((2, 5, 6, 7), 70))
+    torch.manual_seed(0)
+    inputs = [torch.randn(*size).double().requires_grad_() for size in ((70, 3), (27, 3, 4), (4,))]
+    results = []
+    for convolve in (sparse_conv, plain_sparse_conv):
+        out = convolve(inputs[0], inputs[1], kernel_map, inputs[2])
+        results.append((out, *torch.autograd.grad(out.square().sum(), inputs)))
+    torch.testing.assert_close(*results)
+
+
+@pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal"])
 def test_neighbour_sum_is_the_convolution_with_unit_weights(mode):
-    sites = random_sites((2, 6, 7, 8), 60)
-    if mode == "submanifold":
-        kernel_map = submanifold_map(sites, 3)
-    else:
-        build = strided_map if mode == "strided" else temporal_map
-        kernel_map, _ = build(sites, 3, (2, 1, 1), 1)
+    kernel_map = map_of(mode, random_sites((2, 6, 7, 8), 60))
     features = torch.randn(60, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     unit = torch.eye(5, dtype=torch.float64).expand(27, 5, 5)
     assert torch.allclose(neighbour_sum(features, kernel_map), sparse_conv(features, unit, kernel_map), atol=1e-12)
@@ -141,62 +142,6 @@ def test_stacked_parts_equal_the_parts_side_by_side(kernel):
     torch.testing.assert_close(found, expected)
 
 
-@pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal"])
-def test_tiles_change_nothing(mode, monkeypatch):
-    """One tile, and tiles so small that most offsets are missing in each: the same values and gradients."""
-    results = []
-    for least, budget in ((256, 1 << 24), (2, 64)):
-        monkeypatch.setattr("src.ops.tiled_rulebook.LEAST_ROWS", least)
-        monkeypatch.setattr("src.ops.tiled_rulebook.TILE_BYTES", budget)
-        sites = random_sites((2, 5, 6, 7), 70)
-        if mode == "submanifold":
-            kernel_map = submanifold_map(sites, 3)
-        else:
-            kernel_map, _ = (strided_map if mode == "strided" else temporal_map)(sites, 3, (2, 1, 1), 1)
-        torch.manual_seed(0)
-        x, w = torch.randn(70, 3).double().requires_grad_(), torch.randn(27, 3, 4).double().requires_grad_()
-        out = sparse_conv(x, w, kernel_map)
-        (out * torch.randn(out.shape, dtype=torch.float64)).sum().backward()
-        results.append((out.detach(), x.grad, w.grad))
-        assert (len(tiled_rulebook(kernel_map, False, 7, torch.float64).tiles) > 10) == (budget == 64)
-    torch.testing.assert_close(results[0], results[1])
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-@pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal", "empty"])
-def test_one_launch_for_all_offsets_gives_the_same(mode, dtype, monkeypatch):
-    """The form of a GPU without Triton, on a CPU."""
-    sites = random_sites((2, 5, 6, 7), 0 if mode == "empty" else 70)
-    if mode in ("submanifold", "empty"):
-        kernel_map = submanifold_map(sites, 3)
-    else:
-        kernel_map, _ = (strided_map if mode == "strided" else temporal_map)(sites, 3, (2, 1, 1), 1)
-    results = []
-    for grouped in (False, True):
-        monkeypatch.setattr(sys.modules[sparse_conv.__module__], "_is_grouped", lambda rows, grouped=grouped: grouped)
-        torch.manual_seed(0)
-        x = torch.randn(len(sites), 3).to(dtype).requires_grad_()
-        w, b = torch.randn(27, 3, 5).to(dtype).requires_grad_(), torch.randn(5).to(dtype).requires_grad_()
-        out = sparse_conv(x, w, kernel_map, b)
-        (out * torch.randn(out.shape).to(dtype)).sum().backward()
-        results.append((out.detach().float(), x.grad.float(), w.grad.float(), b.grad.float()))
-    tolerance = 1e-5 if dtype == torch.float32 else 0.05
-    for tiled, grouped in zip(*results, strict=True):
-        scale = tiled.abs().max().item() if tiled.numel() else 1.0
-        torch.testing.assert_close(grouped, tiled, rtol=0, atol=tolerance * max(scale, 1.0))
-
-
-def test_training_after_inference_in_the_same_process():
-    """Memory reused between calls must not be bound to inference mode."""
-    kernel_map = submanifold_map(random_sites((1, 9, 9), 30), 3)
-    x, w = torch.randn(30, 3), torch.randn(9, 3, 700, requires_grad=True)
-    with torch.inference_mode():
-        expected = sparse_conv(x, w, kernel_map)
-    out = sparse_conv(x, w, kernel_map)
-    out.sum().backward()
-    assert torch.equal(out, expected) and w.grad.isfinite().all()
-
-
 def test_order_of_the_given_cells_does_not_matter():
     indices = random_sites((1, 6, 6), 15).indices()
     torch.manual_seed(0)
@@ -206,15 +151,6 @@ def test_order_of_the_given_cells_does_not_matter():
         sites, order = Sites.from_indices(indices[shuffle], (1, 6, 6))
         results.append(sparse_conv(features[shuffle][order], weight, submanifold_map(sites, 3)))
     assert torch.equal(*results)
-
-
-def test_samples_do_not_mix():
-    """The last row of sample 0 and the first of sample 1 are no neighbours."""
-    sites, _ = Sites.from_indices(torch.tensor([[0, 3, 2], [1, 0, 2]]), (2, 4, 4))
-    for kernel in (3, 5):
-        assert len(submanifold_map(sites, kernel).inputs) == 2
-    kernel_map, out = strided_map(sites, 3, 1, 1)
-    assert set(out.indices()[kernel_map.outputs[kernel_map.inputs == 0].long(), 0].tolist()) == {0}
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
@@ -260,40 +196,8 @@ def test_nothing_the_size_of_the_pairs_is_kept_for_backward():
     assert sum(kept) == features.numel() + weight.numel()
 
 
-def test_maps_are_made_once_per_set_of_sites():
-    sites = random_sites((1, 6, 6), 10)
-    assert submanifold_map(sites, 3) is submanifold_map(sites, (3, 3))
-    assert strided_map(sites, 3, 2, 1)[1] is strided_map(sites, 3, (2, 2), 1)[1]
-
-
-def test_map_equals_a_search_by_hand():
-    sites = random_sites((2, 3, 4, 5), 30)
-    cells = {tuple(cell): row for row, cell in enumerate(sites.indices().tolist())}
-    expected = []
-    for offset in itertools.product((-1, 0, 1), repeat=3):
-        for cell, row in cells.items():
-            other = (cell[0], *(a + b for a, b in zip(cell[1:], offset, strict=True)))
-            if other in cells:
-                expected.append((cells[other], row))
-    kernel_map: KernelMap = submanifold_map(sites, 3)
-    found = list(zip(kernel_map.inputs.tolist(), kernel_map.outputs.tolist(), strict=True))
-    assert sorted(found) == sorted(expected)
-    assert sum(kernel_map.counts) == len(found)
-
-
 def test_wrong_arguments_are_named():
-    sites = random_sites((1, 6, 6), 10)
-    kernel_map = submanifold_map(sites, 3)
-    with pytest.raises(ValueError, match="must be odd"):
-        submanifold_map(sites, 2)
-    with pytest.raises(ValueError, match="at most 5"):
-        submanifold_map(sites, 7)
-    with pytest.raises(ValueError, match="one per spatial axis"):
-        strided_map(sites, (3, 3, 3), 2, 1)
-    with pytest.raises(ValueError, match="does not fit"):
-        strided_map(sites, 9, 1, 0)
-    with pytest.raises(ValueError, match="the plane would change"):
-        temporal_map(random_sites((1, 4, 4, 4), 5), 3, 2, 1)
+    kernel_map = submanifold_map(random_sites((1, 6, 6), 10), 3)
     with pytest.raises(ValueError, match="got 9 rows and 9 offsets"):
         sparse_conv(torch.zeros(9, 2), torch.zeros(9, 2, 2), kernel_map)
     with pytest.raises(ValueError, match="Cin"):

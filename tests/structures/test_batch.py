@@ -64,7 +64,7 @@ def test_what_does_not_fit_is_named(name, value):
 
 
 @pytest.mark.parametrize("given", STREAM)
-def test_lanes_and_starts_belong_together(given):
+def test_streams_and_starts_belong_together(given):
     assert batch().streams is None and batch().starts is None
     value = {"streams": torch.arange(3), "starts": torch.zeros(3, dtype=torch.bool)}[given]
     with pytest.raises(ValueError, match="streams and FrameBatch.starts must be given together"):

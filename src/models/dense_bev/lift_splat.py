@@ -12,7 +12,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import invert_projection, pixel_centres
 from src.models.backbones.resnet import BasicBlock
 from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
-from src.ops.segment_reduce import weighted_segment_sum
+from src.ops.segment_reduce import inverse_rows, weighted_segment_sum
 from src.targets.depth import lid_centres
 
 
@@ -126,6 +126,4 @@ class LiftSplat(nn.Module):
         sample = torch.div(met, points[0].numel() // 3, rounding_mode="floor")
         keys = (sample * self.grid.rows + cell[:, 0]) * self.grid.cols + cell[:, 1]
         keys, order = torch.sort(keys, stable=True)
-        by_pixel = torch.empty_like(order)
-        by_pixel[order] = torch.arange(len(order), device=order.device)
-        return met[order], keys, by_pixel
+        return met[order], keys, inverse_rows(order, len(order))

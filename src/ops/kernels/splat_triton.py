@@ -13,8 +13,10 @@ from torch.autograd.function import FunctionCtx
 
 from src.geometry.bev_grid import BEVGrid
 from src.ops.backend import REFERENCE, TRITON, implementation, register, runs_kernels
+from src.ops.gaussian_cells import GaussianCellPairs, gaussian_cells
+from src.ops.segment_reduce import inverse_rows
 from src.ops.sites import Sites
-from src.ops.splat import CAP, GaussianCellPairs, Splat, gaussian_cells, occupied_cells
+from src.ops.splat import CAP, Splat, occupied_cells
 
 # Cells a program sums the free probability of, one lane each.
 CELLS = 128
@@ -98,8 +100,7 @@ class _Splat(torch.autograd.Function):
                     enable_fp_fusion=True,
                 )
             occupied_rows, num_cut = occupied_cells(log_free, *choice)
-            place = torch.full_like(support, -1)
-            place[occupied_rows] = torch.arange(len(occupied_rows), device=place.device)
+            place = inverse_rows(occupied_rows, len(support))
             out = features.new_empty(len(occupied_rows), features.shape[1])
             if out.numel() > 0:
                 width = min(triton.next_power_of_2(features.shape[1]), MOST_CHANNELS)

@@ -1,0 +1,81 @@
+"""Which cells each Gaussian reaches: the ragged (Gaussian, cell) pairs that a splat is made from (Eq. 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from src.geometry.bev_grid import BEVGrid
+from src.geometry.box_cells import window_cells
+from src.geometry.tensor_transforms import rotate_back
+from src.ops.segment_reduce import inverse_rows
+
+# Windows are widened by this before the exact test, so that rounding cannot lose a cell.
+WINDOW_SLACK_CELLS = 1e-3
+
+
+@dataclass(eq=False)
+class GaussianCellPairs:
+    """(Gaussian, cell) pairs in the order of the cells, and the way back to the order of the Gaussians.
+
+    By Gaussian, the pairs of one Gaussian stand in the order of their cells.
+    """
+
+    gaussian: Tensor  # [pairs] int64
+    cell: Tensor  # [pairs] int64, row in the support, ascending
+    delta: Tensor  # [pairs, 2] cell centre - mean, metres
+    q: Tensor  # [pairs] squared Mahalanobis distance
+    in_turn: Tensor  # [pairs] int64, 0, 1, 2, ...
+    cell_starts: Tensor  # [n + 1] int64, first pair of each support cell
+    by_gaussian: Tensor  # [pairs] int64, pairs in the order of the Gaussians
+    gaussian_starts: Tensor  # [G + 1] int64, first place of each Gaussian in by_gaussian
+
+
+@torch.no_grad()
+def gaussian_cells(
+    means: Tensor,
+    scales: Tensor,
+    directions: Tensor,
+    batch: Tensor,
+    grid: BEVGrid,
+    batch_size: int,
+    support_sigmas: float,
+) -> tuple[GaussianCellPairs, Tensor]:
+    """All pairs with q <= support_sigmas^2, and the linear keys [n] of the cells they reach."""
+    squares, turned = scales.square(), directions.square()
+    variances = torch.stack([(turned * squares).sum(1), (turned.flip(1) * squares).sum(1)], 1)  # Sigma_xx, Sigma_yy
+    centres = grid.to_cells(means) - 0.5
+    reach = support_sigmas * variances.sqrt() / grid.cell_m + WINDOW_SLACK_CELLS
+    gaussian, row, col = window_cells(centres, reach, grid)
+    # Offsets are taken from the nearest cell centre: float32 would lose five digits on coordinates of 150 m.
+    nearest = centres.round()
+    rest = (means.double() - grid.centre_of(nearest.flip(1), torch.float64)).to(means.dtype)  # [G, 2] m
+    table = torch.cat([nearest, rest, directions, scales], 1).index_select(0, gaussian)
+    base_x, base_y, rest_x, rest_y, cosine, sine, size_x, size_y = table.unbind(1)  # [candidates] each
+    delta_x, delta_y = (col - base_x) * grid.cell_m - rest_x, (row - base_y) * grid.cell_m - rest_y
+    along, across = rotate_back(cosine, sine, delta_x, delta_y)
+    q = (along / size_x).square() + (across / size_y).square()
+    near = (q <= support_sigmas**2).nonzero().squeeze(1)
+
+    gaussian = gaussian.index_select(0, near)  # ascending
+    linear = (batch.index_select(0, gaussian) * grid.rows + row.index_select(0, near)) * grid.cols
+    linear = linear + col.index_select(0, near)
+    num_cells = batch_size * grid.rows * grid.cols
+    linear, order = torch.sort(linear.to(torch.int32 if num_cells < 2**31 else torch.int64), stable=True)
+    support, cell, sizes = torch.unique_consecutive(linear, return_inverse=True, return_counts=True)
+    owners = torch.arange(len(means) + 1, device=gaussian.device)
+    near = near.index_select(0, order)
+    pairs = GaussianCellPairs(
+        gaussian=gaussian.index_select(0, order),
+        cell=cell,
+        delta=torch.stack([delta_x.index_select(0, near), delta_y.index_select(0, near)], 1),
+        q=q.index_select(0, near),
+        in_turn=torch.arange(len(order), device=order.device),
+        cell_starts=F.pad(sizes.cumsum(0), (1, 0)),
+        by_gaussian=inverse_rows(order, len(order)),
+        gaussian_starts=torch.searchsorted(gaussian, owners),
+    )
+    return pairs, support.long()

@@ -1,0 +1,18 @@
+"""Random sites and the three kinds of kernel maps over (t, y, x)."""
+
+import torch
+
+from src.ops import Sites, strided_map, submanifold_map, temporal_map
+
+
+def random_sites(shape, count, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    picks = torch.randperm(torch.Size(shape).numel(), generator=generator)[:count]
+    return Sites.from_linear(picks.sort().values, shape)
+
+
+def map_of(mode, sites):
+    if mode == "submanifold":
+        return submanifold_map(sites, 3)
+    build = strided_map if mode == "strided" else temporal_map
+    return build(sites, 3, (2, 1, 1), 1)[0]

@@ -1,0 +1,52 @@
+import itertools
+
+import pytest
+import torch
+
+from src.ops import Sites, strided_map, submanifold_map, temporal_map
+from src.ops.kernel_maps import KernelMap
+from tests.ops.maps import random_sites
+
+
+def test_map_equals_a_search_by_hand():
+    sites = random_sites((2, 3, 4, 5), 30)
+    cells = {tuple(cell): row for row, cell in enumerate(sites.indices().tolist())}
+    expected = []
+    for offset in itertools.product((-1, 0, 1), repeat=3):
+        for cell, row in cells.items():
+            other = (cell[0], *(a + b for a, b in zip(cell[1:], offset, strict=True)))
+            if other in cells:
+                expected.append((cells[other], row))
+    kernel_map: KernelMap = submanifold_map(sites, 3)
+    found = list(zip(kernel_map.inputs.tolist(), kernel_map.outputs.tolist(), strict=True))
+    assert sorted(found) == sorted(expected)
+    assert sum(kernel_map.counts) == len(found)
+
+
+def test_samples_do_not_mix():
+    """The last row of sample 0 and the first of sample 1 are no neighbours."""
+    sites, _ = Sites.from_indices(torch.tensor([[0, 3, 2], [1, 0, 2]]), (2, 4, 4))
+    for kernel in (3, 5):
+        assert len(submanifold_map(sites, kernel).inputs) == 2
+    kernel_map, out = strided_map(sites, 3, 1, 1)
+    assert set(out.indices()[kernel_map.outputs[kernel_map.inputs == 0].long(), 0].tolist()) == {0}
+
+
+def test_maps_are_made_once_per_set_of_sites():
+    sites = random_sites((1, 6, 6), 10)
+    assert submanifold_map(sites, 3) is submanifold_map(sites, (3, 3))
+    assert strided_map(sites, 3, 2, 1)[1] is strided_map(sites, 3, (2, 2), 1)[1]
+
+
+def test_wrong_kernels_are_named():
+    sites = random_sites((1, 6, 6), 10)
+    with pytest.raises(ValueError, match="must be odd"):
+        submanifold_map(sites, 2)
+    with pytest.raises(ValueError, match="at most 5"):
+        submanifold_map(sites, 7)
+    with pytest.raises(ValueError, match="one per spatial axis"):
+        strided_map(sites, (3, 3, 3), 2, 1)
+    with pytest.raises(ValueError, match="does not fit"):
+        strided_map(sites, 9, 1, 0)
+    with pytest.raises(ValueError, match="the plane would change"):
+        temporal_map(random_sites((1, 4, 4, 4), 5), 3, 2, 1)
