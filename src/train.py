@@ -7,6 +7,7 @@ import platform
 import resource
 import sys
 import time
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from src.data.datamodule import DetectionDataModule
 from src.errors import DataError
 from src.pictures.learning_curves import draw_curves
 from src.reliability.allocator import tune_cpu_allocator
+from src.reliability.checkpoints import OpenCheckpoint, open_checkpoint
 from src.reliability.command import run_command
 from src.reliability.processes import (
     build_strategy,
@@ -37,7 +39,7 @@ from src.reliability.processes import (
 )
 from src.structures.skipped import SHOWN_NAMES, SkippedFiles
 from src.training.fit import build_loggers, build_trainer, fit
-from src.training.handoff import WeightSource, find_source, hand_over, read_source, train_source
+from src.training.handoff import WeightSource, find_source, hand_over, open_source, train_source
 from src.training.identity import run_identity
 from src.training.module import TrainingModule
 from src.training.phases import EVALUATORS
@@ -57,50 +59,70 @@ def main(overrides: list[str]) -> None:
     source = find_source(config, overrides, compose_config, PHASES)
     folder = RunFolder(Path(config.paths.outputs), run_identity(tree, source.identity if source is not None else None))
     if config.trainer.num_processes > 1 and not created_externally():
-        ensure_source(config, folder, source, processes_exist=False)
+        if source is not None and not source.ready and begins(folder, config.resume):
+            train_source(source, config.phase.train_missing, processes_exist=False)
         launch("src.train", overrides, config.trainer.devices)
         return
     with process_group(*where):
-        start = decided_by_main(lambda: prepare(config, tree, folder, source))
+        start = prepare(config, tree, folder, source)
         if start is not None:
             run(config, tree, folder, source, start, started, overrides)
 
 
-def ensure_source(config: Config, folder: RunFolder, source: WeightSource | None, processes_exist: bool) -> None:
-    """Where this run really begins now: train the run whose weights it starts from, if missing, and try to read them.
-
-    Comes before the own folder is touched: what fails here leaves everything as it was.
-    """
-    if source is None or not begins(folder, config.resume):
-        return
-    if not source.ready:
-        train_source(source, config.phase.train_missing, processes_exist)
-    read_source(source)
-
-
 def begins(folder: RunFolder, resume: Resume) -> bool:
-    """Whether the run starts from its source's weights: told to, or with nothing of its own to go on from."""
+    """Whether the run starts from its source's weights: told to, or with no checkpoint of its own."""
     if resume is Resume.never and folder.path.exists():
         return False  # it will be refused
-    return resume is Resume.restart or not (folder.finished or folder.newest_checkpoint() is not None)
+    return resume is Resume.restart or not (folder.finished or folder.has_checkpoint)
+
+
+@dataclass
+class StartingPoint:
+    """What a run starts from; each process has opened its checkpoint once, and no other before the first step."""
+
+    root: Path  # of the data
+    resume: OpenCheckpoint | None = None  # the run's own newest checkpoint
+    weights: OpenCheckpoint | None = None  # its source's, where there is none of its own
 
 
 def prepare(
     config: Config, tree: dict[str, Any], folder: RunFolder, source: WeightSource | None
-) -> dict[str, Any] | None:
-    """What one process decides for all: the checkpoint to go on from and the data folder; None for a finished run."""
-    ensure_source(config, folder, source, processes_exist=config.trainer.num_processes > 1)
-    folder.open(config.resume)
-    if folder.finished:
-        show_finished(config, folder)
+) -> StartingPoint | None:
+    """Decide in the main process what all start from, and open it in each; None for a finished run, which is shown.
+
+    The source's weights are opened before the own folder is touched: where that fails, everything is as it was.
+    """
+    resume = weights = None
+
+    def decide() -> dict[str, Any] | None:
+        nonlocal resume, weights
+        if source is not None and begins(folder, config.resume):
+            if not source.ready:
+                train_source(source, config.phase.train_missing, processes_exist=config.trainer.num_processes > 1)
+            weights = open_source(source)
+        folder.open(config.resume)
+        if folder.finished:
+            show_finished(config, folder)
+            return None
+        resume = folder.newest_checkpoint()
+        start_log(config, tree, folder)
+        return {"resume": resume and str(resume.path), "root": str(data_root(config))}
+
+    decided = decided_by_main(decide)
+    if decided is None:
         return None
-    resume_from = folder.newest_checkpoint()
+    if decided["resume"] is not None:
+        return StartingPoint(Path(decided["root"]), resume=resume or open_checkpoint(Path(decided["resume"])))
+    return StartingPoint(Path(decided["root"]), weights=weights or (source and open_source(source)))
+
+
+def start_log(config: Config, tree: dict[str, Any], folder: RunFolder) -> None:
+    """Write log.txt from here on, and config.yaml."""
     log = logging.FileHandler(folder.log)
     log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logging.getLogger().addHandler(log)
     folder.config.write_text(yaml.safe_dump(tree, sort_keys=False))
     logger.info("run %s in %s", folder.run_id, folder.path)
-    return {"resume_from": resume_from and str(resume_from), "root": str(data_root(config))}
 
 
 def run(
@@ -108,24 +130,23 @@ def run(
     tree: dict[str, Any],
     folder: RunFolder,
     source: WeightSource | None,
-    start: dict[str, Any],  # see `prepare`
+    start: StartingPoint,
     started: float,  # time.monotonic()
     overrides: list[str],
 ) -> None:
     """Train on every process; the main one then leaves results and pictures."""
     tune_cpu_allocator()
     L.seed_everything(config.seed, verbose=False)
-    datamodule = build_datamodule(config, Path(start["root"]))
+    datamodule = build_datamodule(config, start.root)
     module = build_module(config, tree, datamodule)
-    resume_from = Path(start["resume_from"]) if start["resume_from"] else None
-    if resume_from is not None:
-        logger.info("going on from %s", resume_from)
-    elif source is not None:
-        hand_over(module.model, source, tree)
-    loggers = build_loggers(folder, resume_from, config.logger.wandb, tree) if is_main_process() else []
+    if start.resume is not None:
+        logger.info("resuming from %s", start.resume.path)
+    elif start.weights is not None:
+        hand_over(module.model, start.weights, tree)
+    loggers = build_loggers(folder, start.resume, config.logger.wandb, tree) if is_main_process() else []
     trainer = make_trainer(config, folder, loggers)
     training_started = time.monotonic()
-    fit(trainer, module, datamodule, resume_from)
+    fit(trainer, module, datamodule, start.resume)
     seconds = time.monotonic() - training_started
     skipped = SkippedFiles()
     skipped.restore(gather_by_rank(module.skipped.state()))
@@ -149,7 +170,7 @@ def run(
         "epochs": config.phase.epochs,
         "steps": trainer.global_step,
         "parameters": sum(p.numel() for p in module.model.parameters()),
-        "resumed": resume_from is not None,
+        "resumed": start.resume is not None,
         "seconds": {"fit": round(seconds, 1), "all": round(time.monotonic() - started, 1)},
         "peak_memory_mib": peak_memory_mib(),
         "skipped_files": dict(skipped.channels),

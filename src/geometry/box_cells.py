@@ -35,7 +35,7 @@ def cells_in_boxes(
     grid: BEVGrid,
     margin_m: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Cells whose centres the boxes cover, with length and width enlarged by `margin_m` in total (specification 8.2).
+    """Cells whose centres the boxes cover, with length and width enlarged by `margin_m` in total (method 8.2).
 
     The rectangle is closed and each of its dimensions at least one cell. A box that covers no centre gets the one cell
     that contains its own centre, if the grid has it. Returns (box, cell) [pairs] int64 sorted by box and cell, with

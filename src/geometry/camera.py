@@ -1,4 +1,4 @@
-"""Pinhole projection and the image augmentation's 3x3 (spec sections 1.1 and 9). Pixel centres lie at +0.5."""
+"""Pinhole projection and the image augmentation's 3x3 (method 1.1 and 9). Pixel centres lie at +0.5."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def image_transform(
     flip: bool = False,
     rotation_rad: float = 0.0,  # from the x axis towards the y axis (down), about the crop's centre
 ) -> Array:  # [3, 3] float64, augmented pixels from source pixels
-    """M_n of spec section 9: resize, crop, mirror left-right, rotate."""
+    """M_n of method 9: resize, crop, mirror left-right, rotate."""
     height, width = size_px
     matrix = np.array([[resize, 0.0, -offset_px[0]], [0.0, resize, -offset_px[1]], [0.0, 0.0, 1.0]])
     if flip:
@@ -42,7 +42,7 @@ def pixels_from_points(
     cam_from_src: Array,  # [..., 4, 4] x right, y down, z forward
     pix_from_image: Array | None = None,  # [..., 3, 3] M_n, augmented pixels from source pixels
 ) -> Array:  # [..., 4, 4] float64: (u*d, v*d, d, 1) = P (x, y, z, 1)
-    """P_n = M_n K_n E of spec section 1.1 over the row (0, 0, 0, 1), hence invertible."""
+    """P_n = M_n K_n E of method 1.1 over the row (0, 0, 0, 1), hence invertible."""
     projection = intrinsics if pix_from_image is None else pix_from_image @ intrinsics
     result = np.array(np.broadcast_to(np.asarray(cam_from_src, np.float64), cam_from_src.shape))
     result[..., :3, :] = projection @ cam_from_src[..., :3, :]

@@ -1,6 +1,7 @@
-"""Rotations and rigid transforms in float64 numpy: `dst_from_src`, quaternions as (w, x, y, z).
+"""Rotations and rigid transforms in float64 numpy: `dst_from_src`, quaternions as (w, x, y, z); for torch see
+`tensor_transforms`.
 
-Global coordinates are UTM metres near 5e6, where float32 steps are 0.5 m (spec section 1.1): compose here, cast the
+Global coordinates are UTM metres near 5e6, where float32 steps are 0.5 m (method 1.1): compose here, cast the
 ego-relative result.
 """
 

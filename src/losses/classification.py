@@ -1,4 +1,4 @@
-"""Focal losses and the depth loss; all unreduced or summed, for the caller to divide by its normaliser (8.1)."""
+"""Focal losses and the depth loss, unreduced or summed, for the caller to divide by its normaliser (method 8.1)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def penalty_reduced_focal(
     logits: Tensor,  # [...]
     target: Tensor,  # [...] heat map in 0..1, exactly 1 at peaks
 ) -> Tensor:  # [...]
-    """CornerNet's focal loss per element, exponents 2 and 4 (sections 4.3 and 7).
+    """CornerNet's focal loss per element, exponents 2 and 4 (method 4.3 and 7).
 
     Peaks cost -(1 - S)^2 log S, all others -(1 - y)^4 S^2 log(1 - S). S is kept in [1e-4, 1 - 1e-4]; where that binds
     the gradient is 0.
@@ -44,7 +44,7 @@ def depth_cross_entropy(
     logits: Tensor,  # [V, D, h, w] before the softmax over D
     target: Tensor,  # [V, h, w] int64 bin, -1 for background
 ) -> Tensor:  # []
-    """Binary cross-entropy between softmax and one-hot, summed over bins and foreground cells (section 4.3)."""
+    """Binary cross-entropy between softmax and one-hot, summed over bins and foreground cells (method 4.3)."""
     foreground = target >= 0
     score = full_precision(logits.movedim(1, -1)[foreground]).softmax(-1).clamp(DEPTH_CLAMP, 1 - DEPTH_CLAMP)
     wanted = F.one_hot(target[foreground], logits.shape[1]).bool()

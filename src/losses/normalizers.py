@@ -1,4 +1,4 @@
-"""What losses are divided by (spec section 8.1)."""
+"""Normalisers of the losses, averaged over ranks (method 8.1)."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from torch import Tensor
 def mean_over_ranks(
     count: Tensor,  # any shape, on the device of the process
 ) -> Tensor:
-    """Mean of a count over all ranks, whose total counts as at least 1; the specification clamps the mean instead.
+    """Mean of a count over all ranks, with their total clamped to at least 1.
 
-    Gradients are averaged over ranks, so that N ranks divide as one process with the batch of all of them does, also
-    where one object is all there is; a rank without objects neither explodes nor weighs more. Every rank must call it.
+    Gradients are averaged over ranks, so N ranks divide exactly as one process with the batch of all of them, even with
+    a single object in total; a rank without objects neither explodes nor weighs more. Every rank must call it.
     """
     count = count.to(torch.float32, copy=True)
     if not (dist.is_available() and dist.is_initialized()):

@@ -1,4 +1,4 @@
-"""Absolute errors with unknown targets; unreduced, for the caller to weigh and divide (spec section 8.1)."""
+"""Absolute errors with unknown targets; unreduced, for the caller to weigh and divide (method 8.1)."""
 
 from __future__ import annotations
 

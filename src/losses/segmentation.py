@@ -1,4 +1,4 @@
-"""Occupancy losses: focal on a splatted map evaluated sparsely, Dice and Lovasz-Softmax (spec sections 5.6, 8.1)."""
+"""Occupancy losses: focal on a splatted map evaluated sparsely, Dice and Lovasz-Softmax (method 5.6, 8.1)."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def occupancy_losses(
     batch_size: int,
     cells_per_sample: int,
 ) -> tuple[Tensor, Tensor]:  # [], []
-    """Focal loss summed over the whole grid, and Dice loss averaged over samples, of the occupancy alpha (5.6).
+    """Focal loss summed over the whole grid, and Dice loss averaged over samples, of the occupancy alpha (method 5.6).
 
-    Only the support and the positive cells are visited: elsewhere alpha = 0 and the target 0, which costs nothing. The
+    Only the support and the positive cells are evaluated: elsewhere alpha = 0 and the target 0, a loss of 0. The
     focal form is alpha 0.25, gamma 2. A positive cell costs no more than at alpha = 1e-4, without gradient there.
     """
     log_free = full_precision(log_free)

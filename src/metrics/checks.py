@@ -1,4 +1,4 @@
-"""What a table of predictions must be before it is scored or written."""
+"""Validity checks on a table of predictions before it is scored or written."""
 
 from __future__ import annotations
 

@@ -186,7 +186,7 @@ def _score_tag(ranking: Ranking, matching: Matching, tag: str) -> SubsetScores:
 
 
 def _score_speeds(ranking: Ranking, matching: Matching) -> dict[str, SubsetScores]:
-    """Scores by speed class (facts: section 5, speed classes), from the matches of the overall score.
+    """Scores by speed class, from the matches of the overall score.
 
     A ground truth belongs to the class of its own speed, one of unknown velocity (NaN) to none. A prediction follows
     the ground truth it matches at that threshold, whatever speed it states: matched within the class it is a true
@@ -251,7 +251,7 @@ class DetectionMetric(Metric):
             self.blocks.append(torch.tensor(counts, dtype=torch.int64, device=self.device))
 
     def sync(self, *args: object, **kwargs: object) -> None:
-        """Gather from all processes; one that saw nothing still states the shape and type of what it has not."""
+        """Gather from all processes; one that saw nothing contributes empty tensors of the right shape and type."""
         self.boxes.append(torch.zeros(0, _NUM_COLUMNS, dtype=torch.float64, device=self.device))
         self.blocks.append(torch.zeros(0, 2, dtype=torch.int64, device=self.device))
         super().sync(*args, **kwargs)

@@ -75,7 +75,7 @@ def match_greedily(pairs: CandidatePairs, num_ground_truth: int) -> Array:
     """Rows of `pairs` that become matches, ordered by priority of the prediction: [m] int64.
 
     Every unmatched prediction proposes to its nearest ground truth that has not refused it; a ground truth keeps the
-    proposal of highest priority and refuses the others, until nobody has anyone left to ask.
+    proposal of highest priority and refuses the others, until no proposal is left.
     """
     if not len(pairs):
         return np.zeros(0, np.int64)

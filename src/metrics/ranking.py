@@ -1,4 +1,4 @@
-"""Who may match whom, who does, and how far off the matches are."""
+"""Ranked predictions, candidate pairs, matches and their errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two linear layers with a ReLU between them on many rows, without keeping the hidden layer."""
+"""A two-layer perceptron on many rows, checkpointed: the hidden layer is recomputed in the backward pass."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch.autograd.function import FunctionCtx
 
 CPU_ROWS = 1024
 GPU_ROWS = 1 << 18
-"""Rows at a time: on a CPU their hidden layer stays in the cache, on a GPU it bounds the memory."""
+"""Rows of a chunk: on a CPU its hidden layer stays in the cache, on a GPU it bounds the memory."""
 
 
 def checkpointed_mlp(
@@ -18,9 +18,9 @@ def checkpointed_mlp(
     weight: Tensor,  # [H, O]
     bias: Tensor,  # [O]
 ) -> Tensor:  # [n, O]
-    """relu(x W + b) V + c, some rows at a time, differentiable in everything.
+    """relu(x W + b) V + c in chunks of rows, differentiable in all operands.
 
-    The backward pass makes the hidden layer again: one more product against writing and reading [n, H] several times.
+    Recomputing the hidden layer costs one product, keeping it [n, H] of memory, written and read several times.
     Under autocast the operands are cast to its type by hand; gradients of weights are summed in float32 at least.
     """
     operands = (x, hidden_weight, hidden_bias, weight, bias)

@@ -20,7 +20,7 @@ def sample_sparse_bev(
     batch: Tensor,  # [...] int64, sample of each point
     grid: BEVGrid,
 ) -> Tensor:  # [..., C]
-    """Bilinear values at points of a sparse map; absent cells and the outside count as zero (specification 5.2).
+    """Bilinear values at points of a sparse map; absent cells and the outside count as zero (method 5.2).
 
     Equals `grid_sample(align_corners=False, padding_mode="zeros")` on the dense map, without making one. Gradients
     reach the values and the points. Computed in float32 at least, returned in the type of the values.
@@ -46,7 +46,7 @@ def deform_attend_bev(
     weights: Tensor,  # [Q, heads, P]
     grid: BEVGrid,
 ) -> Tensor:  # [Q, C]
-    """Weighted sum over the points of every query and head of a sparse map (specification 5.2).
+    """Weighted sum over the points of every query and head of a sparse map (method 5.2).
 
     Gradients reach the values, the points and the weights. Raises ValueError for shapes that do not fit together.
     """
@@ -62,7 +62,7 @@ def deform_attend_bev(
 def deform_attend_bev_reference(
     values: Tensor, sites: Sites, points: Tensor, batch: Tensor, weights: Tensor, grid: BEVGrid
 ) -> Tensor:
-    """Sample whole rows once, then weigh the heads: wide rows suit segments, one segment per head would not."""
+    """Sample whole rows once, then weigh the heads: fewer, wider segments than one per head."""
     queries, num_points, _ = points.shape
     sampled = sample_sparse_bev(
         values.flatten(1), sites, points, batch[:, None].expand(queries, num_points), grid
@@ -78,7 +78,7 @@ def deform_attend_images(
     weights: Tensor,  # [B, Q, heads, N, L, P]
     visible: Tensor | None = None,  # [B, Q, N, P] bool
 ) -> Tensor:  # [B, Q, heads * c]
-    """Weighted sum over views, levels and points of an image pyramid (specification 5.3).
+    """Weighted sum over views, levels and points of an image pyramid (method 5.3).
 
     Pixel (i, j) of the input covers [j, j + 1) x [i, i + 1), cell (i, j) of a level the block of `stride` pixels from
     (stride * j, stride * i); values are bilinear between cell centres and zero outside. Points that are not `visible`

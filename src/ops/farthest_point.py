@@ -1,4 +1,4 @@
-"""Farthest point sampling: a subset of points that covers the set (specification 6.2)."""
+"""Farthest point sampling: a subset of points that covers the set (method 6.2)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def farthest_points(
 
 @register("farthest_points", "reference")
 def farthest_points_reference(points: Tensor, valid: Tensor, start: Tensor, count: int) -> Tensor:
-    """One round of a loop a pick: of numpy on a CPU, which takes a tenth of torch's time, else of torch."""
+    """One iteration per pick: in numpy on a CPU, a tenth of torch's time, else in torch."""
     if points.device.type != "cpu":
         return pick_on_device(points, valid, start, count)
     picks = [_pick(*sample, count) for sample in zip(points.numpy(), valid.numpy(), start.tolist(), strict=True)]
@@ -39,7 +39,7 @@ def farthest_points_reference(points: Tensor, valid: Tensor, start: Tensor, coun
 
 
 def pick_on_device(points: Tensor, valid: Tensor, start: Tensor, count: int) -> Tensor:
-    """All samples at once, without waiting for a GPU."""
+    """All samples at once, without synchronising with a GPU."""
     b, g = valid.shape
     picks = start.new_full((b, count), -1)
     if g == 0:

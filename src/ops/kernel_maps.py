@@ -1,4 +1,4 @@
-"""Kernel maps: which input site meets which output site under which kernel offset."""
+"""Kernel maps (rulebooks) of sparse convolution: which input site meets which output site at which kernel offset."""
 
 from __future__ import annotations
 
@@ -94,12 +94,13 @@ def strided_map(sites: Sites, kernel_size: Size, stride: Size, padding: Size) ->
 def stacked_map(
     sites: Sites,
     kernel_size: Size,
-    parts: list[Tensor],  # [n_p] int64 each: rows of `sites` that a part has features for, ascending
+    parts: list[Tensor],  # [n_p] int64 each: rows of `sites` that a subset has features for, ascending
 ) -> KernelMap:
-    """Map from several parts of a set of sites, stacked row below row, to all of the sites.
+    """Map from several subsets of the sites, whose features are stacked row below row, to all of the sites.
 
-    Kernel offsets run through the parts one after the other: convolving the stack with the weights of every part equals
-    a submanifold convolution of the parts side by side as channels, zero where a part has no site, without the zeros.
+    Kernel offsets run through the subsets one after the other: convolving the stack with the stacked weights equals a
+    submanifold convolution of the subsets concatenated as channels, zero-filled where a subset lacks a site, without
+    computing with the zeros.
     """
     base = submanifold_map(sites, kernel_size)
     ends = torch.tensor(list(itertools.accumulate(base.counts)), device=sites.device)
@@ -117,7 +118,7 @@ def stacked_map(
 
 
 def temporal_map(sites: Sites, kernel_size: Size, stride: Size, padding: Size) -> tuple[KernelMap, Sites]:
-    """Map over (t, y, x) that shortens time but never spreads over the plane (specification 6.1); cached on the sites.
+    """Map over (t, y, x) that strides over time but never dilates over the plane (method 6.1); cached on the sites.
 
     Output (t', y, x) exists exactly if an input slot in its temporal window has a site at the same (y, x); the weights
     still reach the spatial neighbours. `stride` is (s, 1, 1), the spatial padding half the spatial kernel.
@@ -139,7 +140,7 @@ def temporal_map(sites: Sites, kernel_size: Size, stride: Size, padding: Size) -
 
 
 def _build_submanifold(sites: Sites, kernel: tuple[int, ...]) -> KernelMap:
-    """Search the offsets before the centre only; the ones behind it are their mirror images."""
+    """Search the offsets before the centre only; those behind it are their mirror images."""
     num, device = len(sites), sites.device
     rows = torch.arange(num, dtype=torch.int32, device=device)
     half = torch.Size(kernel).numel() // 2
@@ -230,7 +231,7 @@ def _hits(
 ) -> tuple[Tensor, Tensor, tuple[int, ...]]:
     """Flat positions [hits] int64 of what was found, offset by offset, its columns [hits] int32, and counts per offset.
 
-    A GPU is waited for once.
+    Synchronises with a GPU once.
     """
     counts = tuple(found.sum(1).tolist())
     hits = torch.nonzero_static(found.reshape(-1), size=sum(counts)).squeeze(1)

@@ -1,4 +1,4 @@
-"""Overlap of rotated boxes and the ways to keep one detection per object (specification 7)."""
+"""IoU of rotated boxes and non-maximum suppression: rotated, circle and max-pool (method 7)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def rotated_iou(
 ) -> Tensor:  # [n, m]
     """Intersection over union of rotated rectangles. No gradient; computed in float64 relative to each pair.
 
-    Only pairs whose circumscribed circles overlap are looked at. Raises ValueError for tensors that are not [n, 5].
+    Only pairs whose circumscribed circles overlap are intersected. Raises ValueError for tensors that are not [n, 5].
     """
     for name, boxes in (("boxes_a", boxes_a), ("boxes_b", boxes_b)):
         if boxes.dim() != 2 or boxes.shape[1] != 5:
@@ -37,7 +37,7 @@ def nms_rotated(
     scores: Tensor,  # [n]
     iou_threshold: float,
 ) -> Tensor:  # [kept] int64, by descending score
-    """Greedy suppression: a box goes if its IoU with a better kept one exceeds the threshold; ties keep their order."""
+    """Greedy NMS: a box is dropped if its IoU with a better kept one exceeds the threshold; ties keep their order."""
     order = torch.argsort(scores, descending=True, stable=True)
     return _suppress(boxes.index_select(0, order), order, None, iou_threshold)
 
@@ -47,7 +47,7 @@ def nms_circle(
     scores: Tensor,  # [n]
     radius_m: float,
 ) -> Tensor:  # [kept] int64, by descending score
-    """Greedy suppression: a detection goes if a better kept one lies within `radius_m` metres (not squared)."""
+    """Greedy NMS: a detection is dropped if a better kept one lies within `radius_m` metres (not squared)."""
     order = torch.argsort(scores, descending=True, stable=True)
     return _suppress(F.pad(centers, (0, 3)).index_select(0, order), order, radius_m, 0.0)
 
@@ -65,9 +65,9 @@ def conflicting_pairs(
     radii_m: list[float | None],  # of each block: the distance of a conflict; None: by overlap
     iou_threshold: float,
 ) -> tuple[Tensor, Tensor]:  # [pairs] int64 better row, ascending within its block, and [pairs] int64 worse row
-    """Pairs of one block of which at most one detection may stay: too near, or an IoU above the threshold.
+    """Conflicting pairs within each block: too near each other, or an IoU above the threshold.
 
-    A GPU is waited for three times, however many blocks there are. Computed in float64.
+    Synchronises with a GPU three times, however many blocks there are. Computed in float64.
     """
     boxes = boxes.detach().double()
     by_distance, by_overlap, start = [], [], 0
@@ -114,7 +114,7 @@ def _near_pairs(
 
 
 def _blocks_at_once(count: int, device: torch.device) -> int:
-    """Blocks are padded to the largest, which costs a CPU time; on a GPU each look at a result costs more."""
+    """Blocks are padded to the largest: wasted work on a CPU, cheaper than one synchronisation per block on a GPU."""
     return 1 if device.type == "cpu" else max(count, 1)
 
 
@@ -136,7 +136,7 @@ def maxpool_peaks(
     scores: Tensor,  # [M, c]
     sites: Sites,  # M sites in 2D
 ) -> Tensor:  # [M, c] bool
-    """Where a score equals the maximum of its own 3x3 neighbourhood among the sites, channel by channel."""
+    """Max-pool NMS: where a score is the maximum of its 3x3 neighbourhood among the sites, channel by channel."""
     if len(scores) != len(sites):
         raise ValueError(f"{len(scores)} rows of scores on {len(sites)} sites: expected one row a site")
     if len(sites) == 0:

@@ -52,7 +52,7 @@ def segment_mean(
     num_rows: int,
 ) -> Tensor:  # [num_rows, C]
     """Scatter mean: values that share a row; absent rows are 0. Differentiable."""
-    counts = rows.new_zeros(num_rows).index_add(0, rows, torch.ones_like(rows))  # a GPU would wait for bincount
+    counts = rows.new_zeros(num_rows).index_add(0, rows, torch.ones_like(rows))  # bincount would synchronise with a GPU
     return segment_sum(values, rows, num_rows) / counts.clamp(min=1)[:, None].to(values.dtype)
 
 

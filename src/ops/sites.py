@@ -1,4 +1,4 @@
-"""Sets of active cells: sorted integer keys that support shifts, look-ups and unions without a dense grid."""
+"""Sets of active cells: sorted integer keys with shifts, look-ups and unions, without a dense grid."""
 
 from __future__ import annotations
 

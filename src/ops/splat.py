@@ -74,7 +74,7 @@ def splat_gaussians(
     support_sigmas: float,
     smooth_cap: bool = False,
 ) -> Splat:
-    """Splat Gaussians onto BEV cells (Eq. 4-6, specification 5.6).
+    """Splat Gaussians onto BEV cells (Eq. 4-6, method 5.6).
 
     k_i(p) = exp(-q/2) within `support_sigmas`, else 0; a_i = sigmoid(o_i) k_i, at most 1 - 1e-4; S = sum log(1 - a_i);
     alpha = 1 - exp(S); Omega = {alpha > threshold}; F_G(p) = sum k_i(p) f_i on Omega. At most `max_cells` cells a
@@ -110,7 +110,7 @@ def splat_gaussians(
 
 
 class _LogFree(torch.autograd.Function):
-    """S per support cell (Eq. 5), with the closed-form gradients of specification 5.6."""
+    """S per support cell (Eq. 5), with the closed-form gradients of method 5.6."""
 
     @staticmethod
     def forward(

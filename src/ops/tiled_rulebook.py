@@ -1,4 +1,4 @@
-"""Pairs of a kernel map cut into tiles of outputs that fit the cache, for sparse convolution on a CPU."""
+"""Tiled rulebook: a kernel map's pairs in tiles of output rows that fit the cache, for sparse convolution on a CPU."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torch import Tensor
 from src.ops.kernel_maps import KernelMap
 
 TILE_BYTES = 16 << 20
-"""Rows gathered and multiplied for one tile. Measured: a quarter or four times as much costs 5 to 25 %."""
+"""Bytes gathered and multiplied for one tile. Measured: a quarter or four times as much costs 5 to 25 %."""
 HALF_TILE_BYTES = 64 << 20
-"""The same in half precision, whose products are prepared anew for every number of rows: fewer, larger tiles."""
+"""The same in half precision, where each new matrix shape has a set-up cost: fewer, larger tiles."""
 LEAST_ROWS = 256
 
 
@@ -33,7 +33,7 @@ class Tile:
 
 @dataclass(frozen=True, eq=False)
 class TiledRulebook:
-    """Every pair of a kernel map but those of its centre, where it has one, tile by tile."""
+    """All pairs of a kernel map, except its centre's where it has one, tile by tile."""
 
     tiles: tuple[Tile, ...]
     most_pairs: int  # of any tile
@@ -47,8 +47,8 @@ def tiled_rulebook(
 ) -> TiledRulebook:
     """The map's pairs in tiles of about TILE_BYTES of these values; cached on the map.
 
-    Forward, input rows are gathered and output rows summed; backward the other way round. A submanifold map is its own
-    transpose with the offsets reversed: its tiles serve both ways. Its centre meets every row with itself and is left
+    Forward, input rows are gathered and output rows summed; backward the reverse. A submanifold map is its own
+    transpose with the offsets reversed: its tiles serve both passes. Its centre pairs every row with itself and is left
     out.
     """
     backward = backward and not kernel_map.mirrored
@@ -60,11 +60,11 @@ def tiled_rulebook(
     rows = num if rows >= num else rows
     key = ("tiles", backward, rows)
     if key not in kernel_map.cache:
-        kernel_map.cache[key] = _cut(kernel_map, backward, max(rows, 1), num)
+        kernel_map.cache[key] = _build(kernel_map, backward, max(rows, 1), num)
     return kernel_map.cache[key]
 
 
-def _cut(kernel_map: KernelMap, backward: bool, rows: int, num: int) -> TiledRulebook:
+def _build(kernel_map: KernelMap, backward: bool, rows: int, num: int) -> TiledRulebook:
     gathered, summed = kernel_map.inputs, kernel_map.outputs
     if backward:
         gathered, summed = summed, gathered

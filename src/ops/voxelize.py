@@ -1,4 +1,4 @@
-"""Points to voxels: the sites they occupy and the mean of their features (specification 1.3)."""
+"""Points to voxels: the sites they occupy and the mean of their features (method 1.3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scene from above: forward is up, left is left, in ego metres."""
+"""The bird's-eye view of a scene in ego metres: forward is up, left is left."""
 
 from __future__ import annotations
 
@@ -235,7 +235,7 @@ def paint_detections(
     right_m: tuple[float, float],
     up_m: tuple[float, float],
 ) -> None:
-    """What the model says: radar points, true and predicted boxes with velocities."""
+    """Detections: radar points, true and predicted boxes with velocities."""
     frame_axes(axes, right_m, up_m)
     paint_radar(axes, scene.radar_points)
     ring_missed(axes, scene)
@@ -250,7 +250,7 @@ def paint_evidence(
     right_m: tuple[float, float],
     up_m: tuple[float, float],
 ) -> None:
-    """What it rests on: splatted occupancy and Gaussians by source, with the true boxes."""
+    """Evidence: splatted occupancy and Gaussians by source, with the true boxes."""
     frame_axes(axes, right_m, up_m)
     paint_occupancy(axes, scene)
     paint_gaussians(axes, scene.gaussians)

@@ -50,7 +50,7 @@ class PictureViews:
         return len(self.images)
 
     def order(self) -> list[int]:
-        """Cameras as a person sits among them: front before back, left before right."""
+        """Cameras in the order of the sheet: front before back, left before right."""
         return sorted(range(len(self)), key=lambda i: ("FRONT" not in self.names[i], "LEFT" not in self.names[i]))
 
     @property

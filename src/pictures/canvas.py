@@ -1,4 +1,4 @@
-"""A sheet of picture pixels: where things go, how legends are set, how the PNG is written."""
+"""A sheet measured in pixels: placement of axes, text and legends, and the PNG."""
 
 from __future__ import annotations
 

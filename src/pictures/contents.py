@@ -1,4 +1,4 @@
-"""What a picture shows: boxes, Gaussians, memory and a grid as plain numpy arrays, and the colours of each."""
+"""Contents of pictures as plain numpy arrays (boxes, Gaussians, memory, grid), and the colours of each."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class Film:
         self._times_s.append(time_s)
 
     def write_animation(self, path: Path) -> None:
-        """Write a GIF that runs as fast as the frames were taken, again and again; whole or not at all."""
+        """Write a looping GIF at the frames' own rate; atomically."""
         steps = np.diff(self._times_s) * 1000
         steps = np.append(steps, steps[-1] if len(steps) else MAX_STEP_MS).clip(MIN_STEP_MS, MAX_STEP_MS)
         first, *others = self._pictures
@@ -54,7 +54,7 @@ class Film:
         _write(path, first, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
 
     def write_strip(self, path: Path, count: int) -> None:
-        """Write a PNG of up to `count` frames side by side, spread over the film; whole or not at all."""
+        """Write a PNG of up to `count` frames side by side, spread over the film; atomically."""
         picks = np.unique(np.linspace(0, len(self) - 1, count).round().astype(int))
         width, height = self._pictures[0].size
         strip = Image.new("RGB", (width * len(picks), height), "white")

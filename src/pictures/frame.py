@@ -1,4 +1,4 @@
-"""One frame on one sheet: what the cameras see, what the model says, what it rests on."""
+"""One frame on one sheet: camera images, detections, and the Gaussians and occupancy behind them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Window = tuple[tuple[float, float], tuple[float, float]]
 
 
 def counts_line(scene: BevScene, score_threshold: float) -> str:
-    """How many boxes there are and how many of them agree; only predictions are named where there is no truth."""
+    """Numbers of boxes, matches, misses and false positives; of predictions alone where there is no ground truth."""
     predictions, truth = scene.predictions, scene.ground_truth
     line = f"{len(predictions)} predictions (score ≥ {score_threshold:.2f})"
     if len(truth) == 0:

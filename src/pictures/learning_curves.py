@@ -1,4 +1,4 @@
-"""How training went and what it reached: curves over epochs, bars by class and by distance."""
+"""Training curves over epochs, and bars of AP by class and of mAP by distance."""
 
 from __future__ import annotations
 

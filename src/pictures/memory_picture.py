@@ -1,4 +1,4 @@
-"""What a temporal model remembers: history Gaussians and BEV cells, by ego motion alone and with velocity (Fig. 4)."""
+"""A temporal model's memory: history Gaussians and BEV cells, by ego motion alone and with velocity (Fig. 4)."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ CAPTION_PX = 48
 CLOSE_PX = 720
 CLOSE_PX_PER_M = 7.0
 TRAIL_S = 2.0
-"""The close-up shows the way that the fastest objects came in this time: what the Gaussian path reaches back."""
+"""The close-up shows the trails of the fastest objects over this time, the reach of the Gaussian path's memory."""
 EDGE_M = 6.0
 """Room between an object or its trail and the border of the close-up."""
 REMEMBERED_M = 4.0
-"""Something remembered this near to an object's trail is taken for a memory of it."""
+"""Anything remembered this near to an object's trail counts as a memory of it."""
 ARROW_BLOCK_M = 3.2
 """What moves within a block of this edge shares one arrow: the mean velocity of the freshest there."""
 

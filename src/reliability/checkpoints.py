@@ -14,6 +14,7 @@ import time
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -54,6 +55,19 @@ _BROKEN = (
 """How torch fails at a damaged pickle of plain values."""
 
 
+@dataclass
+class OpenCheckpoint:
+    """A checkpoint that was read and found whole."""
+
+    path: Path
+    content: dict[str, Any] | None  # None once taken
+
+    def take(self) -> dict[str, Any]:
+        """Hand the content to its one consumer, so that no second copy of the weights stays in memory."""
+        content, self.content = self.content, None
+        return content
+
+
 class AtomicCheckpointIO(TorchCheckpointIO):
     """Writes beside the target, syncs, reads back, and only then renames: no crash costs the checkpoint before.
 
@@ -71,6 +85,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         super().__init__()
         self._check_folder, self._hurried = check_folder, hurried
         self._proven: set[Path] = set()
+        self.opened: OpenCheckpoint | None = None
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None) -> None:
         """Write `checkpoint` to `path`, waiting for a disk that is full or away.
@@ -94,10 +109,12 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             time.sleep(RETRY_EVERY_S)
 
     def load_checkpoint(self, path: str | Path, *_: Any, **__: Any) -> dict[str, Any]:
-        """As `read_checkpoint`."""
-        content = read_checkpoint(Path(path))
-        self._proven.add(Path(path))
-        return content
+        """The content of `opened` where that is this file, else as `read_checkpoint`."""
+        opened, self.opened = self.opened, None
+        if opened is None or opened.path != Path(path):
+            opened = open_checkpoint(Path(path))
+        self._proven.add(opened.path)
+        return opened.take()
 
     def _write(self, checkpoint: dict[str, Any], target: Path) -> None:
         self._check_folder()
@@ -196,6 +213,11 @@ def _refusal(target: Path, error: Exception) -> str:
     return f"{target} could not be written ({reason}); {free:.0f} MiB are free there; the checkpoint before it is kept"
 
 
+def open_checkpoint(path: Path) -> OpenCheckpoint:
+    """As `read_checkpoint`, with the path."""
+    return OpenCheckpoint(path, read_checkpoint(path))
+
+
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Load one of our checkpoints; tensors and plain values only, nothing in the file is executed.
 
@@ -269,7 +291,7 @@ def _digests(file: BinaryIO) -> tuple[str, str] | None:
 
 
 def _is_ours(content: object) -> bool:
-    """Whether a file holds what `DetectionModule` and Lightning write: weights by name and the run's configuration."""
+    """Whether a file holds what `TrainingModule` and Lightning write: weights by name and the run's configuration."""
     if not isinstance(content, dict):
         return False
     about, state = content.get("horizon3d"), content.get("state_dict")

@@ -81,7 +81,7 @@ class Boxes3D:
     ) -> Boxes3D:
         """The boxes seen in another frame whose z axis stays vertical; velocities and sizes take the linear part.
 
-        Spec section 9: sizes are scaled, a heading becomes the direction of its transformed unit vector.
+        Method 9: sizes are scaled, a heading becomes the direction of its transformed unit vector.
         """
         matrix = dst_from_src.to(self.centers.dtype)
         linear, planar = matrix[:3, :3], matrix[:2, :2]

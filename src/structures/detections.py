@@ -1,4 +1,4 @@
-"""Boxes of many samples as columns, in the global frame: what the metric compares and a submission holds."""
+"""Boxes of many samples as columns, in the global frame: the metric's input and a submission's content."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Array = np.ndarray
 
 @dataclass
 class DetectionTable:
-    """n boxes of many samples; row order is file order, which decides ties (facts: devkit section 5).
+    """n boxes of many samples; row order is file order, which decides ties as in the devkit.
 
     Raises ValueError when the columns' lengths or widths disagree.
     """

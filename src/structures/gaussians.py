@@ -65,7 +65,7 @@ class GaussianSet:
         self,
         dst_from_src: Tensor,  # [B, 4, 4] rotation, reflection and uniform scale, with translation
     ) -> GaussianSet:
-        """The Gaussians seen in another frame; the z = 0 plane is kept (specification 6.2, 9).
+        """The Gaussians seen in another frame; the z = 0 plane is kept (method 6.2, 9).
 
         Directions become those of their transformed unit vectors, scales and velocities take the scale along.
         """

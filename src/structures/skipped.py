@@ -1,4 +1,4 @@
-"""Sensor files that were not read, counted over many frames and told at the end."""
+"""Sensor files that could not be read, counted over many frames and reported at the end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MAX_NAMES, SHOWN_NAMES = 1000, 10
 
 
 class SkippedFiles:
-    """How often a sensor's file was passed over, by channel, and which files these were."""
+    """How many of each channel's files were skipped, and which."""
 
     def __init__(self) -> None:
         self.channels: Counter[str] = Counter()
@@ -23,7 +23,7 @@ class SkippedFiles:
         return bool(self.channels)
 
     def add(self, batch: FrameBatch) -> None:
-        """Count what a batch had to do without."""
+        """Count the skipped files of a batch."""
         self.channels.update(batch.skipped)
         self.files.update(batch.bad_files)
 
@@ -37,7 +37,7 @@ class SkippedFiles:
         return {"channels": dict(self.channels), "files": dict(self.files)}
 
     def restore(self, states: Iterable[dict[str, Any]]) -> None:
-        """Add what `state` gave, on this rank before or on several."""
+        """Add the counts of earlier `state` calls, of this rank or of several."""
         for state in states:
             self.channels.update(state["channels"])
             self.files.update(state["files"])
@@ -47,7 +47,7 @@ class SkippedFiles:
         return sorted(self.files)[:MAX_NAMES]
 
     def text(self) -> str:
-        """All of it on one line."""
+        """Counts and first names on one line."""
         counts = ", ".join(f"{count} of {channel}" for channel, count in sorted(self.channels.items()))
         names, more = sorted(self.files)[:SHOWN_NAMES], len(self.files) - SHOWN_NAMES
         listed = f": {', '.join(names)}{f' and {more} more' if more > 0 else ''}" if names else ""

@@ -1,4 +1,4 @@
-"""Features on a set of active cells: sparse maps of any dimension, and the BEV map that the model's parts exchange."""
+"""Features on a set of active cells: sparse maps of any dimension, and the BEV map passed between the model's parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Linear-increasing depth bins and the painted depth target of the camera branch (spec sections 4.2 and 4.3)."""
+"""Linear-increasing depth bins and the painted depth target of the camera branch (method 4.2, 4.3)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def lid_edges(
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
 ) -> Tensor:  # [num_bins + 1] m
-    """Bin edges e_i = low + delta i (i + 1) / 2 with delta = 2 (high - low) / (n (n + 1)) (section 4.2)."""
+    """Bin edges e_i = low + delta i (i + 1) / 2 with delta = 2 (high - low) / (n (n + 1)) (method 4.2)."""
     low, high = depth_range_m
     number = torch.arange(num_bins + 1, dtype=torch.float64)
     edges = low + (high - low) * number * (number + 1) / (num_bins * (num_bins + 1))
@@ -71,7 +71,7 @@ def paint_depth(
     num_bins: int,
     stride_px: int,
 ) -> Tensor:  # [B * N, H / stride, W / stride] int64
-    """Depth bin of the nearest box whose clipped 2D hull covers each cell, -1 for background (section 4.3).
+    """Depth bin of the nearest box whose clipped 2D hull covers each cell, -1 for background (method 4.3).
 
     Boxes out of the depth range are painted, too, and leave background: what stands before an object hides it.
     """

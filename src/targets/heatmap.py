@@ -1,4 +1,4 @@
-"""Targets of the sparse CenterPoint head: Gaussians over non-empty cells and box codes at the nearest ones (7)."""
+"""Targets of the sparse CenterPoint head: Gaussians over active cells and box codes at the nearest ones (method 7)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HEAD_GROUPS: tuple[tuple[str, ...], ...] = (
     ("pedestrian", "traffic_cone", "animal"),
     ("traffic_sign",),
 )
-"""Classes that share one set of regression branches and one NMS (table of section 7)."""
+"""Classes that share one set of regression branches and one NMS (table of method 7)."""
 
 GROUP_OF_CLASS: tuple[int, ...] = tuple(
     next(number for number, group in enumerate(HEAD_GROUPS) if name in group) for name in CLASSES
@@ -81,7 +81,7 @@ def head_targets(
     sites: Sites,  # non-empty cells, shape (B, rows, cols)
     grid: BEVGrid,
 ) -> HeadTargets:
-    """Heat map and box codes of a batch (section 7; VoxelNeXt's assignment with our guard).
+    """Heat map and box codes of a batch (method 7; VoxelNeXt's assignment with our guard).
 
     With g = (xy - lower corner) / cell, an object belongs to the non-empty cell j that minimises |(col, row) - g|: a
     cell stands for its lower corner, as in the public heads. Ties go to the lowest key. The heat map is the maximum of

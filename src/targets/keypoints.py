@@ -1,4 +1,4 @@
-"""Target of the 2D keypoint head: a Gaussian at every visible projected box centre (spec section 4.3)."""
+"""Target of the 2D keypoint head: a Gaussian at every visible projected box centre (method 4.3)."""
 
 from __future__ import annotations
 

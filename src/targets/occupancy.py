@@ -1,4 +1,4 @@
-"""Occupancy supervision: the cells that annotated boxes cover (spec sections 5.6, 6.1 and 8.2)."""
+"""Occupancy supervision: the cells that annotated boxes cover (method 5.6, 6.1, 8.2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Boxes seen by the cameras: projected centres and clipped 2D hulls, the geometry of the camera targets (4.3)."""
+"""Boxes seen by the cameras: projected centres and clipped 2D hulls, for the camera targets (method 4.3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which annotations supervise the model (spec sections 4.3, 7 and 8.2)."""
+"""Which annotations supervise the model (method 4.3, 7, 8.2)."""
 
 from __future__ import annotations
 

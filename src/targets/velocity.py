@@ -1,4 +1,4 @@
-"""Velocity supervision: rasters of box velocities, and what Gaussians and cells read from them (Eq. 9; 6.2, 8.2)."""
+"""Velocity supervision: rasters of box velocities, read by Gaussians and cells (Eq. 9; method 6.2, 8.2)."""
 
 from __future__ import annotations
 

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, TQDMProgressBar, WeightAveraging
 from lightning.pytorch.loggers.logger import Logger
 from lightning.pytorch.strategies import Strategy
 
 from src.data.datamodule import DetectionDataModule, dead_workers_named
 from src.errors import InterruptedRunError
-from src.reliability.checkpoints import BEST, LAST, AtomicCheckpointIO, load_model_weights, read_checkpoint
+from src.reliability.checkpoints import BEST, LAST, AtomicCheckpointIO, OpenCheckpoint
 from src.reliability.interruption import Interruption
 from src.reliability.metrics_csv import MetricsCSV
 from src.reliability.processes import SharedBuffers
@@ -97,21 +97,23 @@ def build_trainer(
 
 def build_loggers(
     folder: RunFolder,
-    resume_from: Path | None,
+    resume: OpenCheckpoint | None,
     wandb: WandbConfig | None,
     tree: dict[str, Any] | None = None,  # the run's configuration, for W&B
 ) -> list[Logger]:
     """metrics.csv always; Weights & Biases where asked for and able to start."""
-    step = -1 if resume_from is None else int(read_checkpoint(resume_from)["global_step"])
+    step = -1 if resume is None else int(resume.content["global_step"])
     metrics = MetricsCSV(folder.metrics_csv, resume_step=step)
     run = start_wandb(wandb, folder, tree or {}, metrics.rows) if wandb is not None else None
     return [metrics] if run is None else [metrics, run]
 
 
-def fit(trainer: L.Trainer, module: TrainingModule, datamodule: DetectionDataModule, resume_from: Path | None) -> None:
-    """Train to the last epoch, from `resume_from` where given, then validate the final weights into `module.evaluator`.
+def fit(
+    trainer: L.Trainer, module: TrainingModule, datamodule: DetectionDataModule, resume: OpenCheckpoint | None
+) -> None:
+    """Train to the last epoch, from `resume` where given, then validate the final weights into `module.evaluator`.
 
-    Raises InterruptedRunError when stopped from outside; the same command then goes on.
+    Raises InterruptedRunError when stopped from outside; the same command then resumes.
     """
     interruption = next(callback for callback in trainer.callbacks if isinstance(callback, Interruption))
     module.skipped.clear()
@@ -119,16 +121,19 @@ def fit(trainer: L.Trainer, module: TrainingModule, datamodule: DetectionDataMod
         with interruption.listening(), dead_workers_named(), warnings.catch_warnings():
             for expected in EXPECTED_WARNINGS:
                 warnings.filterwarnings("ignore", message=expected)
-            trainer.fit(module, datamodule=datamodule, ckpt_path=resume_from, weights_only=True)
+            trainer.strategy.checkpoint_io.opened = resume
+            ckpt_path = None if resume is None else resume.path
+            trainer.fit(module, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=True)
             if not interruption.began:  # only the results were missing
-                # Lightning restores the weights of the last step; the checkpoint states the moving average, if any.
-                load_model_weights(module.model, read_checkpoint(resume_from), resume_from)
+                for callback in trainer.callbacks:  # Lightning has restored the weights of the last step
+                    if isinstance(callback, WeightAveraging):
+                        callback.on_train_end(trainer, module)  # puts the moving average in their place
                 if trainer.max_epochs % trainer.check_val_every_n_epoch == 0:
                     trainer.loggers = []  # they have the scores of the last epoch already
             if module.evaluated_step != trainer.global_step:
                 trainer.validate(module, datamodule=datamodule, verbose=False)  # the last epoch was not to be validated
     except SystemExit as error:  # Lightning's way to end on a KeyboardInterrupt
-        raise InterruptedRunError("training was stopped; the same command goes on from the last checkpoint") from error
+        raise InterruptedRunError("training was stopped; the same command resumes from the last checkpoint") from error
     if interruption.requested:
         raise InterruptedRunError("stopped after the last step; the same command scores and writes the results")
 

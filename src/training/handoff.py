@@ -18,7 +18,7 @@ from typing import Any
 
 from src.errors import CheckpointError, ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
 from src.models.detector import Detector
-from src.reliability.checkpoints import load_model_weights, read_checkpoint
+from src.reliability.checkpoints import OpenCheckpoint, load_model_weights, open_checkpoint
 from src.reliability.processes import die_with_parent
 from src.training.identity import is_of, run_identity
 from src.training.run_folder import RunFolder
@@ -126,29 +126,28 @@ def train_source(source: WeightSource, train_missing: bool, processes_exist: boo
         )
 
 
-def read_source(source: WeightSource) -> dict[str, Any]:
+def open_source(source: WeightSource) -> OpenCheckpoint:
     """The source's checkpoint. Raises CheckpointError with the remedy when it is damaged."""
     try:
-        return read_checkpoint(source.checkpoint)
+        return open_checkpoint(source.checkpoint)
     except CheckpointError as error:
         if source.overrides is None:
             raise
         raise CheckpointError(f"{error}; make it anew with\n    {source.command} resume=restart") from error
 
 
-def hand_over(model: Detector, source: WeightSource, tree: dict[str, Any]) -> None:
-    """Give `model` the source's weights; what the new phase adds keeps its own. Settings that differ are logged.
+def hand_over(model: Detector, weights: OpenCheckpoint, tree: dict[str, Any]) -> None:
+    """Take the earlier phase's `weights` into `model`; what the new phase adds keeps its own.
 
-    Raises CheckpointError naming every key that does not fit.
+    Settings that differ are logged. Raises CheckpointError naming every key that does not fit.
     """
-    checkpoint = read_source(source)
+    checkpoint = weights.take()
     added = model.config.new_in_temporal_phase
-    new = load_model_weights(model, checkpoint, source.checkpoint, re.compile(added) if added else None)
+    new = load_model_weights(model, checkpoint, weights.path, re.compile(added) if added else None)
     parts = sorted({key.partition(".")[0] for key in new})
-    logger.info("weights from %s; new: %d tensors in %s", source.checkpoint, len(new), ", ".join(parts) or "nothing")
-    for key, (old, now) in differing_settings(
-        checkpoint["horizon3d"]["config"], tree, model.config.temporal_part
-    ).items():
+    logger.info("weights from %s; new: %d tensors in %s", weights.path, len(new), ", ".join(parts) or "nothing")
+    stored = checkpoint["horizon3d"]["config"]
+    for key, (old, now) in differing_settings(stored, tree, model.config.temporal_part).items():
         logger.warning("%s was %s in the run these weights come from and is %s now", key, old, now)
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from src.errors import BusyError, CheckpointError, ConfigError, DataError
-from src.reliability.checkpoints import BEST, LAST, PREVIOUS, read_checkpoint, sync_folder
+from src.reliability.checkpoints import BEST, LAST, PREVIOUS, OpenCheckpoint, open_checkpoint, sync_folder
 
 logger = logging.getLogger(__name__)
 
@@ -111,8 +111,13 @@ class RunFolder:
         self._lock.close()
         self._lock = None
 
-    def newest_checkpoint(self) -> Path | None:
-        """The checkpoint an unfinished run goes on from: the last one, or where it is damaged the next older whole one.
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether there is a checkpoint to resume from, be it damaged."""
+        return any((self.checkpoints / name).is_file() for name in (LAST, PREVIOUS, BEST))
+
+    def newest_checkpoint(self) -> OpenCheckpoint | None:
+        """The checkpoint an unfinished run resumes from: the last one, or where it is damaged the next older whole one.
 
         Raises CheckpointError when there are some and none can be read: training would silently start anew.
         """
@@ -122,13 +127,13 @@ class RunFolder:
             if not path.is_file():
                 continue
             try:
-                read_checkpoint(path)
+                opened = open_checkpoint(path)
             except CheckpointError as error:
                 damage.append(str(error))
                 continue
             if damage:
-                logger.warning("%s; going on from %s instead", "; ".join(damage), path)
-            return path
+                logger.warning("%s; resuming from %s instead", "; ".join(damage), path)
+            return opened
         if damage:
             raise CheckpointError(f"{'; '.join(damage)}; resume=restart moves the run aside and trains anew")
         return None

@@ -73,7 +73,7 @@ def test_a_kill_inside_a_write_and_a_torn_file_cost_nothing(context, tiny, tmp_p
     stop = InWrite(signal.SIGTERM, save=1, point="synced", after_bytes=0)
     assert wait(start(context, command, log, stop), log, timeout=GRACE_S + 240) == 6
     said = log.read_text()
-    assert f"{LAST} is truncated" in said and f"going on from {checkpoints / PREVIOUS} instead" in said
+    assert f"{LAST} is truncated" in said and f"resuming from {checkpoints / PREVIOUS} instead" in said
     steps = read_checkpoint(checkpoints / LAST)["global_step"]
     assert steps >= first and f"stopped after {steps} steps" in said and rows(outputs) >= steps
 

@@ -280,7 +280,7 @@ def test_torchrun_starts_again_after_a_killed_rank_and_nothing_is_lost(place, un
         os.kill(process_of_rank(running, 1), signal.SIGKILL)
         output, _ = running.communicate(timeout=DEADLINE_S)
         assert running.returncode == 0, output[-3000:]
-        assert output.count("going on from") == 2 and "failed (exitcode: -9) local_rank: 1" in output, output[-3000:]
+        assert output.count("resuming from") == 2 and "failed (exitcode: -9) local_rank: 1" in output, output[-3000:]
         assert outcome(run_folder(place, "torchrun")) == undisturbed
     finally:
         running.kill()

@@ -21,7 +21,7 @@ def test_golden_lovasz(name: str) -> None:
         p = torch.from_numpy(CASES[f"{name}/p"]).to(dtype).requires_grad_()
         loss = lovasz_foreground(p, y, torch.zeros(len(y), dtype=torch.int64), 1)
         loss.backward()
-        # Without foreground the specification asks for 0 where the authors' list form takes the largest score.
+        # Without foreground ours is 0 where the authors' list form takes the largest score.
         expected = CASES[f"{name}/loss"] if y.any() else 0.0
         np.testing.assert_allclose(loss.item(), expected, rtol=0, atol=tolerance)
         if name != "ties":

@@ -77,7 +77,7 @@ def train(path, fault=None, bad_steps=(BAD_STEP,), skip=True, stop_after=None, e
     module.guard.skip = skip
     resume_from = folder.newest_checkpoint()
     trainer = build_trainer(
-        folder, epochs=EPOCHS, validate_every=1, precision="32-true", accelerator="cpu", devices=ranks,
+        folder, epochs=EPOCHS, validate_every=1, monitor="val/mAP", precision="32-true", accelerator="cpu", devices=ranks,
         log_every_steps=1, ema_decay=None, checkpoint_every_steps=every_steps, strategy=build_strategy("cpu", ranks),
         loggers=build_loggers(folder, resume_from, None) if is_main_process() else [],
     )  # fmt: skip

@@ -371,7 +371,7 @@ def phase1(outputs):
     (output,) = finish(running, expect=6)
     assert "the same command goes on" in output
     (output,) = finish(start("torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", *command), expect=0)
-    assert "going on from" in output
+    assert "resuming from" in output
     return last_checkpoint(outputs, "phase1")().parents[1]
 
 

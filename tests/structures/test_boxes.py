@@ -60,7 +60,7 @@ def test_transformed_boxes_fill_the_transformed_space(flip_x, flip_y, angle, sca
 
 
 def test_flips_by_hand():
-    """Spec section 9: flip y gives -yaw, flip x gives pi - yaw."""
+    """method 9: flip y gives -yaw, flip x gives pi - yaw."""
     before = boxes()
     down = before.transform(augmentation(False, True, 0.0, 1.0))
     torch.testing.assert_close(down.yaws, -before.yaws)

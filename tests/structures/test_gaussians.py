@@ -72,7 +72,7 @@ def covariance(of):
 @pytest.mark.parametrize("flip_y", [False, True])
 @pytest.mark.parametrize("angle, scale", [(0.0, 1.0), (0.39, 1.05), (-2.0, 0.95)])
 def test_transformed_gaussians_cover_the_transformed_plane(flip_x, flip_y, angle, scale):
-    """Sigma' = Lam Sigma Lam^T, reflections included; means as points, velocities as their differences (spec 9)."""
+    """Sigma' = Lam Sigma Lam^T, reflections included; means as points, velocities as their differences (method 9)."""
     before, matrix = physical(), augmentation(flip_x, flip_y, angle, scale)
     after, linear = before.transform(matrix.expand(2, -1, -1)), matrix[0, :2, :2]
     torch.testing.assert_close(covariance(after), linear @ covariance(before) @ linear.T, atol=1e-4, rtol=1e-4)

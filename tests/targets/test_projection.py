@@ -74,7 +74,7 @@ def test_nothing_visible(boxes: Boxes3D) -> None:
 
 
 def test_augmented_frame_gives_the_same_image_targets() -> None:
-    """P_n A^-1 with boxes moved by A (section 9): what the camera sees does not change."""
+    """P_n A^-1 with boxes moved by A (method 9): what the camera sees does not change."""
     boxes = boxes_at((20, 1, 0.5, 4, 2, 1, 0.3), (12, -4, 0, 8, 2.5, 3, 2.0))
     aug = torch.eye(4)
     aug[:2, :2] = (

@@ -27,8 +27,9 @@ from src.errors import (
     InterruptedRunError,
 )
 from src.models.horizon3d.model import Horizon3DConfig
+from src.reliability.checkpoints import open_checkpoint
 from src.training import handoff
-from src.training.handoff import WeightSource, find_source, hand_over, train_source
+from src.training.handoff import find_source, hand_over, train_source
 from src.training.identity import run_identity
 from src.training.run_folder import RunFolder
 from tests.untrained import write_checkpoint
@@ -264,7 +265,7 @@ def give(path, *overrides):
     model = build_model(config)
     before = {key: value.clone() for key, value in model.state_dict().items()}
     try:
-        hand_over(model, WeightSource("x", path, None, None), tree)
+        hand_over(model, open_checkpoint(path), tree)
     except CheckpointError:
         assert all(torch.equal(value, before[key]) for key, value in model.state_dict().items())  # no part either
         raise
@@ -463,6 +464,16 @@ def test_restarting_phase_2_leaves_phase_1_alone(handed_over, trained_in_process
     assert (second / "run.json").stat().st_mtime_ns > record_of
     assert len(list(outputs.glob(f"{second.name}.before-*"))) == 1
     assert (second / "metrics.json").read_text() == scores  # from the same weights, with the same seed
+
+
+@pytest.mark.slow
+def test_the_weights_of_phase_1_are_read_once(handed_over, trained_in_process, monkeypatch):
+    outputs, first, _, _ = handed_over
+    load, loads = torch.load, []
+    monkeypatch.setattr(torch, "load", lambda file, **options: loads.append(Path(file.name)) or load(file, **options))
+    overrides = ("phase=phase2", "scale=debug", f"paths.outputs={outputs}", "seed=1", "trainer.num_pictures=0")
+    trained_in_process(*overrides, f"phase.init_from={first / 'checkpoints' / 'last.ckpt'}")
+    assert loads == [first / "checkpoints" / "last.ckpt"]
 
 
 @pytest.mark.slow

@@ -167,6 +167,17 @@ def test_only_the_results_were_missing(run, validate_every, ema):
     assert module.seen == [] and found == expected
 
 
+@STOPPED_OFTEN
+def test_the_checkpoint_is_read_once(run, monkeypatch):
+    with pytest.raises(InterruptedRunError):
+        run("stopped", fault=terminate, at_step=4, ema=0.9)
+    load, loads = torch.load, []
+    monkeypatch.setattr(torch, "load", lambda file, **options: loads.append(file.name) or load(file, **options))
+    fault = lambda: loads.append("step 5")  # noqa: E731
+    _, module = run("stopped", fault=fault, at_step=5, ema=0.9)
+    assert module.seen[0] == 5 and [Path(name).name for name in loads[:2]] == ["last.ckpt", "step 5"]
+
+
 def killed_at_save(monkeypatch, number, after):
     """Make the process end at one of its writes of a checkpoint, before or after it."""
     write, saves = AtomicCheckpointIO._write, []

@@ -68,7 +68,7 @@ def test_a_damaged_last_checkpoint_gives_way_to_the_best(tmp_path):
     last, best = (folder.checkpoints / f"{name}.ckpt" for name in ("last", "best"))
     AtomicCheckpointIO().save_checkpoint({"state_dict": {}, "horizon3d": {"config": {}}}, best)
     last.write_bytes(best.read_bytes()[:-40])
-    assert folder.newest_checkpoint() == best
+    assert folder.newest_checkpoint().path == best
     best.write_bytes(b"")
     with pytest.raises(CheckpointError, match=r"last\.ckpt.*best\.ckpt.*resume=restart"):
         folder.newest_checkpoint()
@@ -95,11 +95,11 @@ def test_a_damaged_last_checkpoint_gives_way_to_the_one_before(tmp_path, caplog)
     folder.open(Resume.auto)
     for name in ("last.ckpt", "previous.ckpt", "best.ckpt"):
         write_checkpoint(folder, name)
-    assert folder.newest_checkpoint().name == "last.ckpt" and not caplog.records
+    assert folder.newest_checkpoint().path.name == "last.ckpt" and not caplog.records
     (folder.checkpoints / "last.ckpt").write_bytes(b"")
-    assert folder.newest_checkpoint().name == "previous.ckpt"
+    assert folder.newest_checkpoint().path.name == "previous.ckpt"
     (told,) = [record.getMessage() for record in caplog.records]
-    assert "last.ckpt is truncated" in told and f"going on from {folder.checkpoints / 'previous.ckpt'} instead" in told
+    assert "last.ckpt is truncated" in told and f"resuming from {folder.checkpoints / 'previous.ckpt'} instead" in told
 
 
 def test_what_a_killed_process_was_writing_goes_and_so_does_what_only_resuming_needs(tmp_path):

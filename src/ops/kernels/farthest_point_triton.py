@@ -1,4 +1,4 @@
-"""Farthest point sampling as one Triton program a sample (specification 6.2)."""
+"""Farthest point sampling as one Triton program a sample (method 6.2)."""
 
 from __future__ import annotations
 

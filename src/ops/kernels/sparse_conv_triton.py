@@ -1,4 +1,4 @@
-"""Sparse convolution as implicit matrix products in Triton: rows are gathered straight into the product."""
+"""Sparse convolution as implicit GEMM in Triton: rows are gathered straight into the product."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ORDERING_TAPS = 62
 
 @dataclass(frozen=True, eq=False)
 class Neighbours:
-    """Which row every row of the other side sees through each tap (kernel offset), arranged for blocks of ROWS rows.
+    """The rulebook as a table: which row each row sees through each tap (kernel offset), in blocks of ROWS rows.
 
     Rows that see through the same taps stand together, so that a block has few taps to walk: on the maps of a radar
     backbone a product takes 1.0 to 1.9 rows a pair, where blocks of the rows as they come take 1.0 to 25.
@@ -232,7 +232,7 @@ def _span_product(  # noqa: ANN202
 
 
 def _neighbours(kernel_map: KernelMap, backward: bool) -> Neighbours:
-    """The map's tables, forward or backward, made without waiting for the device; cached on the map."""
+    """The map's tables, forward or backward, made without synchronising with the device; cached on the map."""
     key = ("neighbours", backward)
     if key not in kernel_map.cache:
         sides = (kernel_map.outputs, kernel_map.num_outputs), (kernel_map.inputs, kernel_map.num_inputs)
@@ -302,5 +302,5 @@ def _upcast(rows: Tensor) -> bool:
 
 
 def _precision() -> str:
-    """How float32 operands are multiplied: as torch is told to multiply its matrices."""
+    """Precision of float32 products, as set by `torch.set_float32_matmul_precision`."""
     return "ieee" if torch.get_float32_matmul_precision() == "highest" else "tf32"

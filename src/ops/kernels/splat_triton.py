@@ -252,7 +252,7 @@ def _gaussian_gradient(  # noqa: ANN202
     channels, extra, least,  # noqa: ANN001
     BLOCK_PAIRS: tl.constexpr, BLOCK_CHANNELS: tl.constexpr,
 ):  # fmt: skip
-    """All gradients of one Gaussian, in closed form (specification 5.6)."""
+    """All gradients of one Gaussian, in closed form (method 5.6)."""
     gaussian = tl.program_id(0).to(tl.int64)
     channel = tl.arange(0, BLOCK_CHANNELS)
     wide = channel < channels
