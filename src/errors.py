@@ -1,4 +1,4 @@
-"""Errors that a user can act on; each knows the exit code of the command that ends with it."""
+"""Errors that a user can act on; each has the exit code of the command that ends with it."""
 
 
 class HorizonError(Exception):
@@ -36,6 +36,6 @@ class DivergedError(HorizonError):
 
 
 class InterruptedRunError(HorizonError):
-    """The run was stopped from outside after a checkpoint; the same command goes on."""
+    """The run was stopped from outside after a checkpoint; the same command resumes it."""
 
     exit_code = 6

@@ -80,7 +80,7 @@ def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[Evalu
     )
     written = module.evaluator.write(out, partial(save_submission, config))
     if module.skipped:
-        print(f"sensor files passed over: {module.skipped.text()}")
+        print(f"skipped sensor files: {module.skipped.text()}")
     return module.evaluator, written
 
 

@@ -31,7 +31,7 @@ from src.training.identity import digest_of_changes
 from src.training.run_folder import make_writable
 from src.training.snapshots import SHOWN_SCORE, scene_of, views_of
 
-# What the detector said of one frame: its boxes and where its ego frame lay.
+# The boxes of one frame and its global_from_ego.
 Prediction = tuple[Boxes3D, np.ndarray]
 
 
@@ -69,7 +69,7 @@ def main(overrides: list[str]) -> None:
     print(f"{len(tokens)} frames, {sum(len(boxes) for boxes, _ in found.values())} boxes, written into {out}: ", end="")
     print(", ".join(["submission.json"] * written + ["scene.gif", "strip.png"] * bool(film)))
     if skipped:
-        print(f"sensor files passed over: {skipped.text()}")
+        print(f"skipped sensor files: {skipped.text()}")
     if command.scene is not None:
         print(
             f"submission.json holds {command.scene} only; an evaluation wants all {len(split)} samples of the split "
@@ -96,7 +96,7 @@ def chosen_device(config: Config) -> str:
 def predict(
     detector: StreamingDetector, frames: Iterable[FrameBatch], film: Film | None
 ) -> tuple[dict[str, Prediction], SkippedFiles]:
-    """What is detected in each frame by token, and the sensor files passed over; the first scene goes into the film."""
+    """What is detected in each frame by token, and the skipped sensor files; the first scene goes into the film."""
     found: dict[str, Prediction] = {}
     skipped = SkippedFiles()
     scenes = 0

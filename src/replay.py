@@ -66,7 +66,7 @@ def main(overrides: list[str]) -> None:
 
 @dataclass
 class Step:
-    """A step of a training, to be run as often as one likes."""
+    """A step of a training, that can be run any number of times."""
 
     path: Path
     config: Config
@@ -97,22 +97,22 @@ class Step:
     def stop_at_first(self, seen: Watch) -> None:
         """Run up to the first number that is not finite, and raise DivergedError there.
 
-        `seen` is what a run to the end has found: the modules are held to it, since some may rightly give infinities.
+        `seen` holds the findings of a complete run, which alone stop this one: modules may rightly give infinities.
         """
         module = self.build()
-        with warnings.catch_warnings(record=True) as told, torch.autograd.set_detect_anomaly(True):
-            warnings.simplefilter("always")  # autograd tells the line of the forward pass in a warning
+        with warnings.catch_warnings(record=True) as caught, torch.autograd.set_detect_anomaly(True):
+            warnings.simplefilter("always")  # autograd names the line of the forward pass in a warning
             try:
                 with Watch(stop_at=seen.first).over(module.model):
                     self.forward(module)["total"].backward()
             except RuntimeError as error:  # anomaly detection knows NaN only
-                trace = next((str(w.message) for w in told if "forward call" in str(w.message)), "")
+                trace = next((str(w.message) for w in caught if "forward call" in str(w.message)), "")
                 raise DivergedError(f"{error} {_own_line(trace)}") from error
-        raise DivergedError("no module to blame: the loss terms themselves, or their weights, are not finite")
+        raise DivergedError("the loss terms themselves, or their weights, are not finite")
 
 
 class Watch:
-    """Notes modules whose output is not finite, and those where the gradient at the output is not."""
+    """Records modules whose output is not finite, and those where the gradient at the output is not."""
 
     def __init__(self, stop_at: str | None = None) -> None:
         self.stop_at = stop_at  # raise DivergedError at this finding
@@ -133,24 +133,24 @@ class Watch:
 
     @contextmanager
     def over(self, model: nn.Module) -> Iterator[None]:
-        """Look at every module's outputs and their gradients for the time within."""
+        """Hook every module's outputs and their gradients for the time within."""
 
-        def look(name: str, module: nn.Module, output: Any) -> None:
+        def check(name: str, module: nn.Module, output: Any) -> None:
             what = f"{name} ({type(module).__name__})"
             values = [value for value in _tensors(output) if value.is_floating_point()]
             if not all(bool(torch.isfinite(value).all()) for value in values):
                 self._note(self.outputs, f"the output of {what}")
 
-            def look_back(gradient: Tensor) -> None:
+            def check_gradient(gradient: Tensor) -> None:
                 if not torch.isfinite(gradient).all():
                     self._note(self.gradients, f"the gradient at the output of {what}")
 
             for value in values:
                 if value.requires_grad:
-                    value.register_hook(look_back)
+                    value.register_hook(check_gradient)
 
         handles = [
-            module.register_forward_hook(lambda module, _, output, name=name: look(name, module, output))
+            module.register_forward_hook(lambda module, _, output, name=name: check(name, module, output))
             for name, module in model.named_modules()
             if name
         ]

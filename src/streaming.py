@@ -1,4 +1,4 @@
-"""Detection one frame at a time with memory, for whoever brings frames: a data set's or one's own sensors'."""
+"""Detection one frame at a time with memory, for frames of a data set or of one's own sensors."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from src.structures.taxonomy import CAMERAS
 class StreamingDetector:
     """A trained detector of either phase that takes consecutive frames of one vehicle and remembers them.
 
-    What a frame may use of the past is decided frame by frame, by its time and pose (specification 6.4):
+    What a frame may use of the past is decided frame by frame, by its time and pose (method 6.4):
 
     - On the first frame, after `reset`, and on a frame that says so (`FrameBatch.starts`) nothing is remembered.
     - Frames older than `model.dptf.max_age_s` are not used, so a long gap is as a first frame.
     - Frames that are not in the past of the present one are forgotten. So a frame given again replaces itself, less
-      what lay at the far end of a full memory, and a clock that jumps back goes on from where it lands; call `reset`
-      when another recording begins.
+      what lay at the far end of a full memory, and a clock that jumps back continues from there; call `reset` when
+      another recording begins.
     - Frames from which the vehicle could not have come at 100 m/s are not used: the localisation has jumped.
 
     Any number of frames may be given; only the last few are kept. The memory lives here, as `memory`, never in the

@@ -70,7 +70,7 @@ def main(overrides: list[str]) -> None:
 
 
 def begins(folder: RunFolder, resume: Resume) -> bool:
-    """Whether the run starts from its source's weights: told to, or with no checkpoint of its own."""
+    """Whether the run starts from its source's weights: asked to restart, or with no checkpoint of its own."""
     if resume is Resume.never and folder.path.exists():
         return False  # it will be refused
     return resume is Resume.restart or not (folder.finished or folder.has_checkpoint)
@@ -188,7 +188,7 @@ def run(
     }
     folder.finish(record)
     if skipped:
-        logger.warning("sensor files passed over: %s", skipped.text())
+        logger.warning("skipped sensor files: %s", skipped.text())
     logger.info("finished in %.0f s", record["seconds"]["all"])
     print_result(config, folder, record, scores)
     for tracked in [own for own in loggers if isinstance(own, WandbRun)]:
@@ -263,7 +263,7 @@ def print_result(config: Config, folder: RunFolder, record: dict[str, Any], scor
     if record["skipped_files"]:
         names = record.get("skipped_names", [])  # older records have none
         shown = f": {', '.join(names[:SHOWN_NAMES])}{' ...' if len(names) > SHOWN_NAMES else ''}" if names else ""
-        print(f"sensor files passed over: {record['skipped_files']}{shown} (names in run.json)")
+        print(f"skipped sensor files: {record['skipped_files']}{shown} (names in run.json)")
     print(f"run folder: {folder.path}  (metrics.json, metrics.csv, config.yaml, log.txt, pictures/, submission.json)")
 
 

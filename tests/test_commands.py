@@ -85,7 +85,7 @@ def test_evaluate_refuses_what_it_cannot_score(trained, outputs, tmp_path):
     assert "nowhere" in command("evaluate", f"predictions={wrong}", *other, f"out={tmp_path}", expect=4).stderr
 
 
-def test_a_killed_run_goes_on_and_ends_with_the_same_weights(trained, outputs, tmp_path):
+def test_a_killed_run_resumes_and_ends_with_the_same_weights(trained, outputs, tmp_path):
     import torch
 
     changes = ("scale=debug", "phase.epochs=3", "trainer.num_pictures=0", "model.kggi=null", "model.ocsf=null")

@@ -1,4 +1,4 @@
-"""Image augmentation per frame and view (IDA) and BEV augmentation per frame or clip (BDA), spec sections 6.4, 9."""
+"""Image augmentation per frame and view (IDA) and BEV augmentation per frame or clip (BDA) (method 6.4, 9)."""
 
 from __future__ import annotations
 

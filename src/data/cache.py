@@ -45,7 +45,7 @@ _WIDE = {"key_data": (len(CHANNELS),), "data_sizes": (2,)}
 def load_index(root: str | Path, version: str, cache_folder: str | Path | None) -> DatasetIndex:
     """The checked tables of `root/version`, from the cache where the table files have not changed.
 
-    A cache that cannot be read is built again, one that cannot be written is done without; the log says so.
+    A cache that cannot be read is built again, without one that cannot be written it works too; both are logged.
     Raises DataError as `build_index`.
     """
     root = Path(root).absolute()
@@ -56,7 +56,7 @@ def load_index(root: str | Path, version: str, cache_folder: str | Path | None) 
     if path.is_file():
         try:
             return _read(path, root, version)
-        except Exception as error:  # whatever is wrong with it, the tables have it all
+        except Exception as error:  # whatever is wrong with it, the tables hold everything
             _log.warning("%s: the table cache is broken (%s); building it again", path, error)
     index = build_index(root, version)
     try:

@@ -1,4 +1,4 @@
-"""Which frames each step reads: shuffled single frames, or streams of consecutive frames (spec section 6.4).
+"""Which frames each step reads: shuffled single frames, or streams of consecutive frames (method 6.4).
 
 A stream is one row of the batch over time. A clip is a run of consecutive key frames of one scene in one stream; memory
 begins empty where a clip starts. Streams are numbered over all ranks; rank r of W serves the r-th of W equal blocks, so
@@ -22,7 +22,7 @@ Array = np.ndarray
 
 
 class FrameKey(NamedTuple):
-    """What a data set is asked for."""
+    """Key of one frame in `FrameDataset`."""
 
     epoch: int
     sample: int  # row of the sample table
@@ -140,8 +140,8 @@ class ScheduleSampler(Sampler[list[FrameKey]]):
     """Batches of one rank, for a loader's `batch_sampler`.
 
     `schedule` gives an epoch's frames, the same number of steps in each epoch. `position` is asked whenever an
-    iteration begins; it gets the steps of an epoch and returns (epoch, steps of it already done), from which the
-    iteration goes on. Nothing is counted here, so frames that workers fetched ahead of an interruption are not lost.
+    iteration begins; it gets the steps of an epoch and returns (epoch, steps of it already done), where the
+    iteration continues. Nothing is counted here, so frames that workers fetched ahead of an interruption are not lost.
     """
 
     def __init__(

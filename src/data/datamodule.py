@@ -1,4 +1,4 @@
-"""Frames into batches: data sets, order, workers. It knows no model."""
+"""Frames into batches: data sets, order, workers. Independent of the model."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ class DataConfig:
     train_split: str
     split: str  # what validation and evaluation read
     batch_size: int  # total over all devices; the streams when clips are streamed
-    groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; spec section 6.4
+    groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; method 6.4
     stream_sets: int  # at most so many sets of streams take turns when clips are streamed; 1: all streams at every step
-    sensor_dropout: float  # share of streamed frames, never a clip's first, from which all sensor data are taken away
+    sensor_dropout: float  # share of streamed frames, never a clip's first, that come without any sensor data
     num_workers: int  # loader processes per device
     num_sweeps: int  # past sweeps of each radar
     num_lidar_sweeps: int  # past sweeps of each LiDAR
@@ -178,7 +178,7 @@ def dead_workers_named() -> Iterator[None]:
     except RuntimeError as error:
         if "DataLoader worker" not in str(error):
             raise
-        remedy = "the usual cause is too little memory: lower data.num_workers, then give the same command to go on"
+        remedy = "the usual cause is too little memory: lower data.num_workers; the same command then resumes"
         raise DataError(f"{str(error).splitlines()[0]}; {remedy}") from error
 
 
@@ -214,7 +214,7 @@ class DetectionDataModule(L.LightningDataModule):
         return evaluation_set(self.index, self.config.split)
 
     def identity(self) -> dict[str, Any]:
-        """What data these are, without machine paths."""
+        """Name, version and splits of the data, without machine paths."""
         return {
             "name": self.name,
             "version": self.config.version,
@@ -271,7 +271,7 @@ class DetectionDataModule(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader:
         """Augmented batches of the training split, shuffled frames or clips.
 
-        It starts where the trainer stands: after `global_step` steps, in the middle of an epoch if need be. One
+        It starts at the trainer's `global_step`, inside an epoch if need be. One
         optimiser step per batch is assumed. Raises DataError when there are too few frames for one batch.
         """
         config, seed, index = self.config, self.seed, self.index
@@ -328,7 +328,7 @@ class DetectionDataModule(L.LightningDataModule):
             pin_memory=torch.cuda.is_available(),
             persistent_workers=workers > 0,
             prefetch_factor=4 if workers else None,
-            worker_init_fn=_as_helper,
+            worker_init_fn=_init_worker,
         )
 
     def transfer_batch_to_device(self, batch: FrameBatch, device: torch.device, dataloader_idx: int) -> FrameBatch:
@@ -376,8 +376,8 @@ def _evenly_spread(samples: np.ndarray, count: int) -> np.ndarray:
     return samples[np.unique(picks)]
 
 
-def _as_helper(worker: int) -> None:
-    """Loader processes share the cores with the training process, and outlive a signal to the whole group for a while.
+def _init_worker(worker: int) -> None:
+    """One thread, since loader processes share the cores; and a delayed end on a signal to the whole process group.
 
     The training process finishes its step on such a signal and needs their batches; it ends them itself afterwards.
     """

@@ -1,4 +1,4 @@
-"""Camera files: one decode, one resampling of the part that is used (spec section 3, section 9)."""
+"""Camera files: one decode, one resampling of the part that is used (method 3, 9)."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def width_fit(
     flip: bool = False,
     rotation_rad: float = 0.0,
 ) -> ImageCrop:
-    """Scale so that the width fits (plus an offset), keep the bottom, crop or pad the top (spec sections 3, 9).
+    """Scale so that the width fits (plus an offset), keep the bottom, crop or pad the top (method 3, 9).
 
     Raises ConfigError when the offset leaves no positive scale.
     """
@@ -118,7 +118,7 @@ def decode_by_pillow(
             return image if image.mode == "RGB" else image.convert("RGB")
     except (DataError, MemoryError):
         raise
-    except Exception as error:  # Pillow promises no set of them: damaged metadata fails in its parsers in many ways
+    except Exception as error:  # damaged metadata fails in Pillow's parsers with many types
         # Its message may hold an address in memory: the same fault always reads the same.
         reason = "no JPEG file" if isinstance(error, UnidentifiedImageError) else str(error)
         raise DataError(f"{path}: not a readable image ({reason})") from error

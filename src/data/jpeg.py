@@ -1,7 +1,7 @@
 """A faster decoder for JPEG files, used where it is installed and gives Pillow's pixels to the last bit.
 
 `pip install horizon3d[fast]` brings simplejpeg. Training and evaluation cannot differ by it: the first use in a process
-compares both decoders at every scale, and one that differs, fails or is not there leaves the work to Pillow.
+compares both decoders at every scale, and where it differs, fails or is not installed, Pillow decodes.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def damage_of(content: bytes) -> str | None:
         return f"at most {MAX_SCANS} scans are expected, but it has {scans}"
     if first_symbols and not any(first_symbols):
         return None  # tables made for an image of hardly more than one colour, where zeros may be many equal pixels
-    end = content.find(b"\xff\xd9", start)  # what comes after the image is not looked at
+    end = content.find(b"\xff\xd9", start)  # what comes after the image is not checked
     hole = content.find(bytes(HOLE_BYTES), start, end if end >= 0 else len(content))
     return f"{HOLE_BYTES} bytes from byte {hole} are zero, a block of the file that was lost" if hole >= 0 else None
 

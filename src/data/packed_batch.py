@@ -1,4 +1,4 @@
-"""A batch on its way from a loader's worker to the training process."""
+"""A batch packed for the transfer from a loader's worker to the training process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from src.structures.batch import FrameBatch
 
 LARGE_BYTES = 2**18
-"""From here on sharing memory is cheaper than sending bytes."""
+"""From this size on shared memory is cheaper than sending bytes."""
 
 
 @dataclass
@@ -29,7 +29,7 @@ class PackedBatch:
 
     @classmethod
     def pack(cls, batch: FrameBatch) -> PackedBatch:
-        """A parcel that `unpack` makes the same batch of."""
+        """Pack a batch; `unpack` restores it."""
         buffer = io.BytesIO()
         pickler = _Pickler(buffer, protocol=pickle.HIGHEST_PROTOCOL)
         pickler.dump(batch)

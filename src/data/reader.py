@@ -1,4 +1,4 @@
-"""One key frame with its sensors, as one batch of one (spec sections 1.1 to 1.3, facts on TruckScenes)."""
+"""One key frame with its sensors, as one batch of one (method 1.1 to 1.3)."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class FrameReader:
         """The frame at row `sample` of the sample table; random draws depend on (seed, epoch, token) alone.
 
         `clip` is the token of the first frame of the clip that this frame is part of: A_t is then that frame's, so
-        that it stays the same throughout the clip (spec section 6.4).
+        that it stays the same throughout the clip (method 6.4).
         Raises DataError for an unreadable file (unless skipped) and for poses that jump.
         """
         index = self.index
@@ -144,7 +144,7 @@ class FrameReader:
         aug_from_ego: Array,  # [4, 4]
         skipped: _Skipped,
     ) -> Array:  # [P, 7] float32, see RADAR_POINT_FIELDS
-        """All sweeps, moved to ego(t) and compensated for the ego motion by the full mount (spec section 1.3)."""
+        """All sweeps, moved to ego(t) and compensated for the ego motion by the full mount (method 1.3)."""
         read = self._sweeps(
             sample, RADARS, self.settings.num_sweeps, lambda path, row: read_radar_points(path), skipped
         )
@@ -324,7 +324,7 @@ class FrameReader:
             return read(self._inside(name))
         except DataError as error:
             if self.settings.on_bad_file is OnBadFile.error:
-                remedy = "restore the file, or count and pass over such files with data.on_bad_file=skip"
+                remedy = "restore the file, or skip and count such files with data.on_bad_file=skip"
                 raise DataError(f"{error} (sample {self.index.sample_tokens[sample]}); {remedy}") from error
             skipped.count(channel)
             skipped.files.append(name)
@@ -390,7 +390,7 @@ def compensate_clouds(
     elapsed_s: Array,  # [S] key frame minus sweep
     settings: ReaderSettings,
 ) -> Array:  # [P, 7] float64: x, y, z (m, ego(t)), rcs, vx, vy (m/s over ground, radial, ego(t) axes), dt (s)
-    """Move sweeps to ego(t) and turn relative radial velocities into velocities over ground (spec section 1.3).
+    """Move sweeps to ego(t) and turn relative radial velocities into velocities over ground (method 1.3).
 
     r_hat points from the sensor to the target, v_s is the sensor's own velocity, lever arm included:
     v_r = vrel . r_hat + v_s . r_hat, zero for whatever stands still.

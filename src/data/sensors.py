@@ -28,7 +28,7 @@ MAX_SWEEP_LEAD_S = 0.1
 """Sensors are triggered some milliseconds apart; a sweep further ahead of its frame has another clock."""
 RIGID_TOLERANCE = 1e-3
 FLOAT32_REACH_M = 1e5
-"""Beyond, float32 coordinates are wrong by centimetres and soon by half a metre (spec section 1.1)."""
+"""Beyond, float32 coordinates are wrong by centimetres and soon by half a metre (method 1.1)."""
 FLOAT32_REACH_S = 1e4
 """Beyond, float32 times are wrong by a millisecond and soon by the half second between frames."""
 

@@ -26,6 +26,21 @@ def quaternion_to_matrix(
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def rotation_zyx(
+    yaw: Array | float,  # [...] rad
+    pitch: Array | float,
+    roll: Array | float,
+) -> Array:  # [..., 3, 3]
+    """Rz(yaw) Ry(pitch) Rx(roll); a positive pitch lowers the nose."""
+    cy, sy, cp, sp, cr, sr = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
 def matrix_to_quaternion(
     matrix: Array,  # [..., 3, 3] rotation
 ) -> Array:  # [..., 4] (w, x, y, z), w >= 0

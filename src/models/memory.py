@@ -1,4 +1,4 @@
-"""The past of a detector's streams: when and where each remembered frame was made, and its way to the present (6)."""
+"""The past of a detector's streams: time and pose of remembered frames, and their motion to the present (method 6)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Motion:
 
 @dataclass
 class RememberedFrame:
-    """Time and place of one remembered key frame of each of B streams; models add what they remember of it."""
+    """Time and pose of one remembered key frame of each of B streams; models add what they remember of it."""
 
     timestamps_s: Tensor  # [B] float64
     global_from_ego: Tensor  # [B, 4, 4] float64
@@ -35,7 +35,7 @@ class RememberedFrame:
 
         Not usable: an absent stream, a frame that is not in the past or older than `max_age_s`, a pose that jumped.
         """
-        ego_from_past, elapsed, driven = self._way_to(batch)
+        ego_from_past, elapsed, driven = self._relative_pose(batch)
         usable = self.present & driven & (elapsed <= max_age_s)
         matrix = batch.aug_from_ego.double() @ ego_from_past
         # What is not usable must not carry NaN or huge numbers into arithmetic that is masked afterwards.
@@ -44,10 +44,10 @@ class RememberedFrame:
 
     def jumped(self, batch: FrameBatch) -> Tensor:  # [B] bool
         """Streams whose pose jumped between this frame and the batch's, which is later."""
-        _, elapsed, driven = self._way_to(batch)
+        _, elapsed, driven = self._relative_pose(batch)
         return self.present & (elapsed > 0) & ~driven
 
-    def _way_to(self, batch: FrameBatch) -> tuple[Tensor, Tensor, Tensor]:
+    def _relative_pose(self, batch: FrameBatch) -> tuple[Tensor, Tensor, Tensor]:
         """[B, 4, 4] and [B] s from here to the batch, float64, and whether a vehicle can drive it in that time [B]."""
         ego_from_past = invert_rigid(batch.global_from_ego) @ self.global_from_ego
         elapsed = batch.timestamps_s - self.timestamps_s
@@ -101,8 +101,8 @@ class FrameMemory(Generic[Frame]):
     def before(self, batch: FrameBatch) -> Self:
         """What of the memory is in the past of the batch, stream by stream; the rest is forgotten for good.
 
-        Gone are frames that are not older than the batch's, and, where the pose jumped since a stream's last frame, all
-        that lies before the jump. Only neighbouring frames tell: over several seconds the same jump could pass for a
+        Dropped are frames that are not older than the batch's, and, where the pose jumped since a stream's last frame,
+        all before the jump. Only consecutive frames are compared: over several seconds the same jump could pass for a
         drive.
         """
         if not self.frames:
@@ -127,9 +127,9 @@ class FrameMemory(Generic[Frame]):
 
     @classmethod
     def _shared(cls, frames: Iterable[Frame]) -> Self:
-        """A memory without the frames that no stream has any more, so that they take no place of others."""
+        """A memory without the frames that no stream has any more, so that they take no other's slot."""
         frames = tuple(frames)
         if not frames:
             return cls(())
-        kept = torch.stack([frame.present.any() for frame in frames]).tolist()  # one look, since a GPU waits for it
+        kept = torch.stack([frame.present.any() for frame in frames]).tolist()  # one transfer, which synchronises
         return cls(tuple(frame for frame, wanted in zip(frames, kept, strict=True) if wanted))

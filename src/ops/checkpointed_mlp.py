@@ -29,6 +29,17 @@ def checkpointed_mlp(
     return _CheckpointedMLP.apply(*operands)
 
 
+def projected_statistics(
+    x: Tensor,  # [n, C], n > 0
+    weight: Tensor,  # [H, C]
+) -> tuple[Tensor, Tensor]:  # [H], [H]
+    """Mean and variance (divided by n) of the columns of x W^T, from mean and covariance of x alone."""
+    centre = x.mean(0)
+    x = x - centre
+    covariance = x.t() @ x / len(x)  # [C, C]
+    return weight @ centre, (weight @ covariance * weight).sum(1).clamp(min=0)
+
+
 class _CheckpointedMLP(torch.autograd.Function):
     @staticmethod
     def forward(

@@ -1,4 +1,4 @@
-"""Checkpoint files: written whole or not at all, proven before they replace another, read with a reason when broken."""
+"""Checkpoint files: written atomically, verified before they replace another, refused with a reason when broken."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 WAIT_S = 240.0
 """How long a save waits for a disk: less than the other processes of a training wait for this one."""
 RETRY_EVERY_S = 5.0
-PASSING = {errno.ENOSPC, errno.EDQUOT, errno.ENOENT, errno.ESTALE, errno.EIO}
-"""Full, or away, or failing: others make room and mounts come back. A forbidden or read-only folder stays so."""
+TRANSIENT = {errno.ENOSPC, errno.EDQUOT, errno.ENOENT, errno.ESTALE, errno.EIO}
+"""Disk full, unmounted or failing: others make room and mounts come back. A read-only folder stays so."""
 
 _MARK = b"horizon3d sha256 "
 _COMMENT_BYTES = len(_MARK) + hashlib.sha256().digest_size * 2
 _COMMENT_LENGTH = struct.pack("<H", _COMMENT_BYTES)
 _END = b"PK\5\6" + bytes(18)
 """The last record of an archive: its signature first, the length of a comment last."""
-_PIECE_BYTES = 2**20
+_CHUNK_BYTES = 2**20
 _BROKEN = (
     RuntimeError,
     EOFError,
@@ -69,7 +69,7 @@ class OpenCheckpoint:
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes beside the target, syncs, reads back, and only then renames: no crash costs the checkpoint before.
+    """Writes beside the target, syncs, reads back, and only then renames: no crash costs the previous checkpoint.
 
     The file ends with the SHA-256 of itself, as the comment that a zip archive may have, so a copy keeps it. The
     `last.ckpt` that is replaced stays as `previous.ckpt`, provided that it was whole.
@@ -79,33 +79,33 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """
 
     def __init__(
-        self, check_folder: Callable[[], None] = lambda: None, hurried: Callable[[], bool] = lambda: False
+        self, check_folder: Callable[[], None] = lambda: None, fail_fast: Callable[[], bool] = lambda: False
     ) -> None:
-        """`check_folder` raises where nothing may be written; while `hurried`, a save does not wait for a disk."""
+        """`check_folder` raises where nothing may be written; while `fail_fast()`, a save does not wait for a disk."""
         super().__init__()
-        self._check_folder, self._hurried = check_folder, hurried
-        self._proven: set[Path] = set()
+        self._check_folder, self._fail_fast = check_folder, fail_fast
+        self._verified: set[Path] = set()
         self.opened: OpenCheckpoint | None = None
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any | None = None) -> None:
         """Write `checkpoint` to `path`, waiting for a disk that is full or away.
 
-        Raises CheckpointError with the path, the reason and the free space when the disk goes on refusing.
+        Raises CheckpointError with the path, the reason and the free space when the disk keeps refusing.
         """
         target = Path(path)
         deadline = time.monotonic() + WAIT_S
-        told = False
+        warned = False
         while True:
             try:
                 return self._write(checkpoint, target)
             except (OSError, RuntimeError) as error:
                 refusal = _refusal(target, error)
-                passing = isinstance(error, OSError) and error.errno in PASSING
-                if not passing or self._hurried() or time.monotonic() > deadline:
+                transient = isinstance(error, OSError) and error.errno in TRANSIENT
+                if not transient or self._fail_fast() or time.monotonic() > deadline:
                     raise CheckpointError(refusal) from error
-            if not told:
+            if not warned:
                 logger.warning("%s; trying again for %.0f s before the run ends", refusal, WAIT_S)
-                told = True
+                warned = True
             time.sleep(RETRY_EVERY_S)
 
     def load_checkpoint(self, path: str | Path, *_: Any, **__: Any) -> dict[str, Any]:
@@ -113,7 +113,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         opened, self.opened = self.opened, None
         if opened is None or opened.path != Path(path):
             opened = open_checkpoint(Path(path))
-        self._proven.add(opened.path)
+        self._verified.add(opened.path)
         return opened.take()
 
     def _write(self, checkpoint: dict[str, Any], target: Path) -> None:
@@ -121,25 +121,25 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         temporary = target.with_name(target.name + ".tmp")
         try:
             digest = _write_digested(checkpoint, temporary)
-            _prove(temporary, digest)
-            if target.name == LAST and target in self._proven and target.is_file():
+            _verify_written(temporary, digest)
+            if target.name == LAST and target in self._verified and target.is_file():
                 _keep(target, target.with_name(PREVIOUS))
             os.replace(temporary, target)
         except BaseException:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
             raise
-        self._proven.add(target)
+        self._verified.add(target)
         sync_folder(target.parent)
 
 
 class _DigestedFile:
-    """Passes bytes on to a file and digests them as they were meant, whatever the disk makes of them."""
+    """Writes bytes to a file and digests them as they were meant, whatever reaches the disk."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
         self.digest = hashlib.sha256()
-        self.refusal: OSError | None = None  # torch makes another error of it
+        self.refusal: OSError | None = None  # torch raises another error in its place
 
     def write(self, data: memoryview) -> int:
         """Write all of it."""
@@ -152,7 +152,7 @@ class _DigestedFile:
         return len(data)
 
     def flush(self) -> None:
-        """What torch calls at the end."""
+        """Torch calls it at the end."""
         self._file.flush()
 
 
@@ -172,13 +172,13 @@ def _write_digested(checkpoint: dict[str, Any], path: Path) -> str:
     return digest
 
 
-def _prove(path: Path, digest: str) -> None:
+def _verify_written(path: Path, digest: str) -> None:
     """Read a file back, from the disk where the system allows it. Raises OSError when it is not what was written."""
     with open(path, "rb") as file:
         if hasattr(os, "posix_fadvise"):
             os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
         if _digests(file) != (digest, digest):
-            raise OSError(errno.EIO, "it reads back otherwise than it was written", str(path))
+            raise OSError(errno.EIO, "it does not read back as it was written", str(path))
 
 
 def _keep(path: Path, kept: Path) -> None:
@@ -195,7 +195,7 @@ def _keep(path: Path, kept: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Put the names in a folder onto the disk, where its file system can."""
+    """Sync a folder's entries to disk, where its file system can."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -282,9 +282,9 @@ def _digests(file: BinaryIO) -> tuple[str, str] | None:
     digest = hashlib.sha256()
     file.seek(0)
     left = size - _COMMENT_BYTES - 2
-    while left > 0 and (piece := file.read(min(left, _PIECE_BYTES))):
-        digest.update(piece)
-        left -= len(piece)
+    while left > 0 and (chunk := file.read(min(left, _CHUNK_BYTES))):
+        digest.update(chunk)
+        left -= len(chunk)
     length = file.read(2)  # of the comment; it was 0 before there was one
     digest.update(bytes(2) if length == _COMMENT_LENGTH else length)
     return comment[len(_MARK) :].decode("ascii", "replace"), digest.hexdigest()

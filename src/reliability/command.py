@@ -1,4 +1,4 @@
-"""What every entry point does around its work: logging, messages instead of tracebacks, exit codes."""
+"""What every entry point does around its work: logging, messages instead of tracebacks, exit status."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from types import FrameType
 
 from src.errors import ConfigError, HorizonError, InterruptedRunError
 
-# What the system says when it refuses to write; the path and the free space are then all a user needs.
+# errno of a refused write; the path and the free space are then all a user needs.
 DISK_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
 
-REPEATED_WITHIN_S = 2.0
-"""Launchers, and a process that shares its parent's terminal, get the same signal several times within milliseconds."""
+INTERRUPT_GRACE_S = 2.0
+"""Signals this soon after the first repeat it: launchers and a shared terminal send it again within milliseconds."""
 
 
 def run_command(main: Callable[[list[str]], None]) -> None:
@@ -33,20 +33,20 @@ def run_command(main: Callable[[list[str]], None]) -> None:
     logging.basicConfig(level=logging.INFO, format=line, datefmt="%H:%M:%S")
     for noisy in ("matplotlib", "PIL", "lightning.pytorch.utilities.rank_zero"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
-    interruptions = _listen()
+    interruptions = _handle_signals()
     try:
         main(sys.argv[1:])
     except HorizonError as error:
         print(f"\n{type(error).__name__}: {error}", file=sys.stderr)  # a progress bar may stand on the line
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        print("\nInterrupted; the same command goes on from a checkpoint where it writes any.", file=sys.stderr)
+        print("\nInterrupted; the same command resumes from its last checkpoint, if it writes any.", file=sys.stderr)
         sys.exit(InterruptedRunError.exit_code)
     except Exception as error:
-        if isinstance(error, BrokenPipeError) and _reader_has_gone():
-            sys.exit(128 + signal.SIGPIPE)  # what a shell says of a command whose output `head` has had enough of
-        if interruptions:  # it struck inside a library's compiled code, which made another error of it
-            what = f"Interrupted ({error}); the same command goes on from a checkpoint where it writes any."
+        if isinstance(error, BrokenPipeError) and _stdout_closed():
+            sys.exit(128 + signal.SIGPIPE)  # the exit status that a shell gives to a command cut short by `head`
+        if interruptions:  # inside a library's compiled code, which turned it into another error
+            what = f"Interrupted ({error}); the same command resumes from its last checkpoint, if it writes any."
             print(f"\n{what}", file=sys.stderr)
             sys.exit(InterruptedRunError.exit_code)
         known = _machine_fault(error)
@@ -58,33 +58,33 @@ def run_command(main: Callable[[list[str]], None]) -> None:
         sys.exit(1)
 
 
-def _listen() -> list[int]:
-    """Let SIGTERM end the command as Ctrl-C does, so that temporary files are removed; returns when signals came."""
-    came: list[float] = []
+def _handle_signals() -> list[float]:
+    """Let SIGTERM end the command as Ctrl-C does, so that temporary files are removed; returns the signals' times."""
+    times: list[float] = []
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        came.append(time.monotonic())
-        if len(came) == 1 or came[-1] - came[0] > REPEATED_WITHIN_S:
+        times.append(time.monotonic())
+        if len(times) == 1 or times[-1] - times[0] > INTERRUPT_GRACE_S:
             raise KeyboardInterrupt
 
     signal.signal(signal.SIGTERM, interrupt)
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # a shell's background job, or one rank of several
         signal.signal(signal.SIGINT, interrupt)
-    return came
+    return times
 
 
-def _reader_has_gone() -> bool:
-    """Whether nobody reads what is printed any more; then nothing more is."""
+def _stdout_closed() -> bool:
+    """Whether the reader of stdout is gone; what is printed from then on is discarded."""
     poll = select.poll()
-    poll.register(sys.stdout.fileno(), 0)  # whatever is asked for, a broken pipe is told
+    poll.register(sys.stdout.fileno(), 0)  # POLLERR is reported whatever the mask
     if not any(event & select.POLLERR for _, event in poll.poll(0)):
         return False
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter complains at its end
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter reports an error at exit
     return True
 
 
 def _machine_fault(error: Exception) -> tuple[str, int] | None:
-    """Message and exit code where the machine is at fault: a full or locked disk, too little memory."""
+    """Message and exit status of a fault of the machine: a full or locked disk, too little memory."""
     if isinstance(error, OSError) and error.errno in DISK_FAULTS:
         place = Path(str(error.filename or "")).absolute().parent
         place = place if place.is_dir() else Path.cwd()

@@ -14,10 +14,8 @@ import lightning as L
 from lightning.pytorch.trainer.states import TrainerFn
 
 from src.errors import InterruptedRunError
+from src.reliability.command import INTERRUPT_GRACE_S
 from src.reliability.metrics_csv import MetricsCSV
-
-IMPATIENT_AFTER_S = 2.0
-"""A second Ctrl-C this long after the first ends the run at once. Launchers repeat a signal within milliseconds."""
 
 
 class Interruption(L.Callback):
@@ -25,7 +23,7 @@ class Interruption(L.Callback):
 
     A request takes effect before the next step (or validation batch) and on all ranks together, whichever of them got
     the signal; then InterruptedRunError ends the run. Validation batches differ in number between ranks, so that
-    several ranks finish theirs first.
+    several ranks finish theirs first. A second Ctrl-C after the grace period ends the run at once.
 
     Checkpoints are written before a step rather than after one, because the log's row of a step is written last.
     """
@@ -33,7 +31,7 @@ class Interruption(L.Callback):
     def __init__(self, last: Path, every_steps: int | None) -> None:
         self.last, self.every_steps = last, every_steps
         self.requested = False
-        self.began = False  # whether there was anything left to train
+        self.began = False  # whether there were steps left to train
         self._signals: tuple[signal.Signals, ...] = ()
         self._first_signal_s = 0.0
         self._saving = False
@@ -63,13 +61,13 @@ class Interruption(L.Callback):
         now = time.monotonic()
         if not self.requested:
             self.requested, self._first_signal_s = True, now
-        elif number == signal.SIGINT and now - self._first_signal_s > IMPATIENT_AFTER_S:
+        elif number == signal.SIGINT and now - self._first_signal_s > INTERRUPT_GRACE_S:
             raise KeyboardInterrupt
 
     # ---------------------------------------------------------------- hooks
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Where this run begins, a checkpoint exists already, or none is needed."""
+        """Note that steps are left to train; where the run starts, a checkpoint exists or none is needed."""
         self.began = True
         self._listen()
         self._saved_step = trainer.global_step
@@ -77,7 +75,7 @@ class Interruption(L.Callback):
     def on_train_batch_start(
         self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
     ) -> None:
-        """Save and stop where due. Before an epoch's first step the checkpoint of the epoch before says it all."""
+        """Save and stop where due. Before an epoch's first step the last epoch's checkpoint holds everything."""
         stop = self._agreed(trainer)
         due = self.every_steps is not None and trainer.global_step % self.every_steps == 0
         if batch_idx > 0 and (stop or due):
@@ -101,11 +99,11 @@ class Interruption(L.Callback):
             self._stop(trainer)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Let all ranks know of a request that came too late for a step."""
+        """Share a stop request that came after the last step with all ranks."""
         self.requested = self._agreed(trainer)
 
     def on_save_checkpoint(self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
-        """State the loops' progress in a way from which Lightning goes on exactly here; first the log is made safe."""
+        """State the loops' progress so that Lightning resumes exactly here; first sync the log to disk."""
         for own in trainer.loggers:
             if isinstance(own, MetricsCSV):
                 if not self._saving and not trainer.validating:
@@ -132,7 +130,7 @@ class Interruption(L.Callback):
     # ---------------------------------------------------------------- parts
 
     def _log_epoch(self, trainer: L.Trainer, log: MetricsCSV) -> None:
-        """Write the epoch's row before the checkpoint of its end, behind which a run goes on; Lightning does after."""
+        """Write the epoch's row before the checkpoint of its end, from which a run resumes; Lightning does after."""
         metrics = trainer._logger_connector.metrics["log"]
         step = trainer.fit_loop.epoch_loop._batches_that_stepped - 1
         log.log_metrics(metrics | {"epoch": trainer.current_epoch}, step)
@@ -152,5 +150,5 @@ class Interruption(L.Callback):
 
     def _stop(self, trainer: L.Trainer) -> None:
         raise InterruptedRunError(
-            f"training was stopped after {trainer.global_step} steps; the same command goes on from there"
+            f"training was stopped after {trainer.global_step} steps; the same command resumes from there"
         )

@@ -1,4 +1,4 @@
-"""metrics.csv: one row per logged step or epoch, continued rather than replaced when a run goes on."""
+"""metrics.csv: one row per logged step or epoch, continued rather than replaced when a run resumes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class MetricsCSV(Logger):
 
     Lightning's own deletes the file of an earlier start; this one keeps the rows of the `resume_step` steps (counted
     from 0) that the checkpoint has behind it, so the file of an interrupted run equals that of an uninterrupted one. A
-    row that comes again, because what it tells of was done again, takes the place of the first.
+    row of a step or epoch that is repeated takes the place of the first.
 
     Rows that a full or vanished disk refuses end no training: they are written with the first that it takes.
     """
@@ -36,7 +36,7 @@ class MetricsCSV(Logger):
             self._read(resume_step)
 
     def _read(self, resume_step: int) -> None:
-        """The rows to go on from; where the file is damaged, those before that place, and the log says so."""
+        """The rows to continue; where the file is damaged, those before the damage, with a warning."""
         try:
             with self._path.open(newline="") as file:
                 for row in csv.DictReader(file):
@@ -44,7 +44,7 @@ class MetricsCSV(Logger):
                     if step.isascii() and step.isdigit() and int(step) < resume_step:
                         self._add({key: value for key, value in row.items() if key and value})
         except (OSError, ValueError, csv.Error) as error:
-            kept = f"going on from the {len(self._rows)} rows before"
+            kept = f"resuming from the {len(self._rows)} rows before that"
             logger.warning("%s: damaged (%s: %s); %s", self._path, type(error).__name__, error, kept)
 
     def _add(self, row: dict[str, str]) -> None:
@@ -67,7 +67,7 @@ class MetricsCSV(Logger):
 
     @property
     def rows(self) -> list[dict[str, str]]:
-        """What the file holds and goes on from, oldest first, without empty cells."""
+        """The rows of the file, oldest first, without empty cells."""
         return list(self._rows)
 
     @property

@@ -1,4 +1,4 @@
-"""Steps whose loss or gradients are not finite: found at once, named, kept to be run again, passed over if wanted."""
+"""Steps whose loss or gradients are not finite: detected at once, reported, dumped for a replay, skipped if wanted."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from src.structures.boxes import Boxes3D
 logger = logging.getLogger(__name__)
 
 MAX_IN_A_ROW = 50
-"""Steps passed over one after the other before training gives up.
+"""Steps skipped in a row before training gives up.
 
-More than the 40 key frames of a scene, which follow one another in phase 2, so that one broken recording is outlived;
-beyond that it is the weights or the settings, and since a passed-over step changes neither, waiting does not help.
+More than the 40 key frames of a scene, which follow one another in phase 2, so that one broken recording is survived;
+beyond that it is the weights or the settings, and since a skipped step changes neither, waiting does not help.
 """
 MAX_DUMPS = 3
 """Dumps kept per rank: each is as large as a checkpoint, and the newest are about the code and settings of now."""
@@ -37,7 +37,7 @@ class StepGuard:
     """What a step must not leave behind when its numbers are not finite, and how many such steps there were.
 
     Until the optimiser steps, a training step changes nothing of a model but its running statistics, of which `begin`
-    keeps a copy. The counts are the same on every rank, since all ranks pass over a step together.
+    keeps a copy. The counts are the same on every rank, since all ranks skip a step together.
     """
 
     def __init__(self, skip: bool) -> None:
@@ -48,7 +48,7 @@ class StepGuard:
         self._before: list[list[Tensor]] = []
 
     def watch(self, model: nn.Module) -> None:
-        """Look up the running statistics of a model, which is where it will be trained."""
+        """Take the running statistics of a model that lies on the device it is trained on."""
         stored = model.state_dict().keys()
         by_type: dict[torch.dtype, list[Tensor]] = {}
         for name, buffer in model.named_buffers():
@@ -119,7 +119,7 @@ class StepGuard:
         return [self.skipped_steps, self.in_a_row]
 
     def restore_counts(self, state: list[int]) -> None:
-        """Go on from what `state` gave."""
+        """Restore what `state` gave."""
         self.skipped_steps, self.in_a_row = state
 
 
@@ -131,7 +131,7 @@ def step_seed(seed: int, step: int, rank: int) -> int:
 def finite_everywhere(*values: Tensor) -> bool:
     """Whether these scalars are finite on every rank; all ranks must call it, and all get the same answer.
 
-    The one place where a step waits for its GPU: the values, and among several ranks one flag, are looked at together.
+    The one place where a step waits for its GPU: the values, and among several ranks one flag, are read together.
     """
     broken = (~torch.stack([value.detach().float() for value in values]).isfinite()).any().float()
     if dist.is_available() and dist.is_initialized():
@@ -202,8 +202,8 @@ def write_dump(
 ) -> Path | None:
     """Write `nonfinite-step000123-rank0.pt`, a checkpoint with all that `src.replay` needs to run the step again.
 
-    The newest `MAX_DUMPS` of the rank are kept. None, with a warning, where the disk refuses: what went wrong with the
-    numbers must not be lost over it.
+    The newest `MAX_DUMPS` of the rank are kept. None, with a warning, where the disk refuses: what is not finite is
+    reported all the same.
     """
     rank = step["rank"]
     path = folder / f"nonfinite-step{step['global_step']:06d}-rank{rank}.pt"
@@ -212,7 +212,7 @@ def write_dump(
         "horizon3d": {"config": config, "step": step | {"batch": _plain(batch)}},
     }
     try:
-        AtomicCheckpointIO(hurried=lambda: True).save_checkpoint(content, path)  # the other ranks wait
+        AtomicCheckpointIO(fail_fast=lambda: True).save_checkpoint(content, path)  # the other ranks wait
         of_rank = [old for old in folder.iterdir() if re.fullmatch(rf"nonfinite-step\d+-rank{rank}\.pt", old.name)]
         for old in sorted(of_rank, key=lambda old: old.stat().st_mtime)[:-MAX_DUMPS]:
             old.unlink()

@@ -1,4 +1,4 @@
-"""Passwords in addresses and overrides: told, hidden in texts, and in the list of processes."""
+"""Passwords in addresses and overrides: recognised, masked in texts and in the process list."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 from src.errors import ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
-from src.reliability.interruption import IMPATIENT_AFTER_S
+from src.reliability.command import INTERRUPT_GRACE_S
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -45,10 +45,10 @@ STEP_TIMEOUT = timedelta(minutes=5)
 """How long a process waits for the others within a step before it calls them hung."""
 DECISION_TIMEOUT = timedelta(hours=12)
 """How long the others wait for the main process, which may be writing a data set."""
-GRACE_S = 20.0
+TERMINATION_GRACE_S = 20.0
 """What the other processes get to end by themselves once one has failed."""
-QUIET_S = 10.0
-"""How long a process that lost another says nothing: first the user shall read why that one ended, and its rank."""
+REPORT_DELAY_S = 10.0
+"""How long a process that lost another waits before its own message: the failing rank's message comes first."""
 _SETTLE_S = 0.5  # processes that end this close together end for one reason, which is that of the lowest rank
 _LOST_PEER = ("gloo/", "NCCL", "TCPStore", "closed by peer", "reset by peer")
 _SET_PDEATHSIG = 1  # of Linux' prctl: a signal to the child when the thread that started it dies
@@ -117,7 +117,7 @@ def _cluster() -> ClusterEnvironment:
         return TorchElasticEnvironment()
     if SLURMEnvironment.detect():
         try:
-            return SLURMEnvironment(auto_requeue=False)  # runs go on from their own checkpoints
+            return SLURMEnvironment(auto_requeue=False)  # runs resume from their own checkpoints
         except RuntimeError as error:
             raise ConfigError(f"SLURM: {error}") from None
     return LightningEnvironment()
@@ -146,7 +146,7 @@ def launch(module: str, overrides: Sequence[str], devices: int) -> None:
 
     def stop(number: int, frame: FrameType | None) -> None:
         stops.append(time.monotonic())
-        again = number == signal.SIGINT and stops[-1] - stops[0] > IMPATIENT_AFTER_S
+        again = number == signal.SIGINT and stops[-1] - stops[0] > INTERRUPT_GRACE_S
         _signal_all(ranks, signal.SIGKILL if again else signal.SIGTERM)
 
     # The processes inherit an ignored SIGINT: Ctrl-C in a terminal reaches them once, as the SIGTERM from here.
@@ -154,13 +154,13 @@ def launch(module: str, overrides: Sequence[str], devices: int) -> None:
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        meeting = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(_free_port()), "WORLD_SIZE": str(devices)}
+        rendezvous = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(_free_port()), "WORLD_SIZE": str(devices)}
         # Below errors torch's C++ would advise against looking for unused parameters, see `build_strategy`.
-        meeting["TORCH_CPP_LOG_LEVEL"] = os.environ.get("TORCH_CPP_LOG_LEVEL", "ERROR")
+        rendezvous["TORCH_CPP_LOG_LEVEL"] = os.environ.get("TORCH_CPP_LOG_LEVEL", "ERROR")
         for rank in range(devices):
-            who = {"NODE_RANK": "0", "LOCAL_RANK": str(rank), "RANK": str(rank)}
+            identity = {"NODE_RANK": "0", "LOCAL_RANK": str(rank), "RANK": str(rank)}
             command = [sys.executable, "-m", module, *overrides]
-            ranks.append(subprocess.Popen(command, env=os.environ | meeting | who, preexec_fn=die_with_parent))
+            ranks.append(subprocess.Popen(command, env=os.environ | rendezvous | identity, preexec_fn=die_with_parent))
         signal.signal(signal.SIGINT, stop)
         if stops:
             _signal_all(ranks, signal.SIGTERM)
@@ -174,7 +174,7 @@ def launch(module: str, overrides: Sequence[str], devices: int) -> None:
 
 
 def _wait_for_all(ranks: list[subprocess.Popen], stops: list[float]) -> int:
-    """Wait until all have ended, not for ever once one has failed; the exit code that tells most."""
+    """Wait until all have ended, with a time limit once one has failed; returns the most specific exit code."""
     while (states := [process.poll() for process in ranks]).count(None) and not any(states):
         time.sleep(0.1)
     interrupted = InterruptedRunError.exit_code
@@ -183,11 +183,11 @@ def _wait_for_all(ranks: list[subprocess.Popen], stops: list[float]) -> int:
         failed, code = next((rank, code) for rank, process in enumerate(ranks) if (code := process.poll()))
         if code != interrupted and not stops:
             logger.warning("process %d of %d %s; ending the others", failed, len(ranks), _how_it_ended(code))
-        _end_within(GRACE_S, ranks)
+        _end_within(TERMINATION_GRACE_S, ranks)
     codes = [process.returncode for process in ranks]
-    told = [code for code in codes if code in (ConfigError.exit_code, DataError.exit_code, DivergedError.exit_code)]
-    if not any(codes) or told:
-        return told[0] if told else 0
+    specific = [code for code in codes if code in (ConfigError.exit_code, DataError.exit_code, DivergedError.exit_code)]
+    if not any(codes) or specific:
+        return specific[0] if specific else 0
     return interrupted if interrupted in codes or stops else 1
 
 
@@ -236,7 +236,7 @@ def process_group(accelerator: str, devices: int, num_nodes: int = 1) -> Iterato
     """Connect the processes for the time within; nothing happens for a single one.
 
     Only the main process logs below warnings. Raises HorizonError instead of torch's errors when another process was
-    lost or did not come in time, some seconds after it noticed: the reason is that process's to tell.
+    lost or late, after `REPORT_DELAY_S`: the failing rank reports the reason itself.
     """
     if devices * num_nodes == 1:
         yield
@@ -252,31 +252,31 @@ def process_group(accelerator: str, devices: int, num_nodes: int = 1) -> Iterato
     try:
         dist.init_process_group(
             backend,
-            store=_meeting_place(cluster),
+            store=_rendezvous_store(cluster),
             rank=cluster.global_rank(),
             world_size=cluster.world_size(),
             timeout=STEP_TIMEOUT,
             device_id=torch.device("cuda", cluster.local_rank()) if backend == "nccl" else None,
         )
-        _connect_decisions()
+        _decision_group()
         yield
     except RuntimeError as error:
         if not any(word in str(error) for word in _LOST_PEER):
             raise
         reason = str(error).splitlines()[0]
         late = "timed out" in reason.lower() or "timeout" in reason.lower()
-        if not late:  # otherwise nobody else has anything to say
-            _keep_quiet()
+        if not late:  # a hanging rank has no message of its own
+            _let_failing_rank_report()
         what = "hangs or is cut off" if late else "ended, its message says why"
         raise HorizonError(
-            f"another process of this run {what} ({reason}); the same command goes on from the last checkpoint"
+            f"another process of this run {what} ({reason}); the same command resumes from the last checkpoint"
         ) from error
     finally:
         end_processes()
 
 
-def _meeting_place(cluster: ClusterEnvironment) -> dist.Store:
-    """Where the processes leave their addresses for each other, apart from those of an earlier attempt.
+def _rendezvous_store(cluster: ClusterEnvironment) -> dist.Store:
+    """The store in which the processes exchange addresses, under a prefix of its own for each attempt.
 
     torchrun keeps one store for all its restarts, and there the addresses of ended processes would still stand. Agents
     of several nodes count restarts each for themselves, so there the count cannot tell attempts apart.
@@ -287,10 +287,10 @@ def _meeting_place(cluster: ClusterEnvironment) -> dist.Store:
     return dist.PrefixStore(f"attempt {attempt}", where[0])
 
 
-def _keep_quiet() -> None:
-    """Give the process that failed the time to say why; whoever ends this one meanwhile need not wait."""
+def _let_failing_rank_report() -> None:
+    """Wait for the failing rank's own message; whoever ends this process meanwhile need not wait."""
     with suppress(KeyboardInterrupt):
-        time.sleep(QUIET_S)
+        time.sleep(REPORT_DELAY_S)
 
 
 def end_processes() -> None:
@@ -320,7 +320,7 @@ def decided_by_main(decide: Callable[[], T]) -> T:
         except BaseException as error:
             failure = error
             answer[0] = (error.exit_code if isinstance(error, HorizonError) else 1, None)
-    dist.broadcast_object_list(answer, src=0, group=_connect_decisions())
+    dist.broadcast_object_list(answer, src=0, group=_decision_group())
     if failure is not None:
         raise failure
     code, value = answer[0]
@@ -333,8 +333,8 @@ def _several() -> bool:
     return dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
 
 
-def _connect_decisions() -> dist.ProcessGroup:
-    """A group of the same processes with more patience, on the CPU, so that no GPU waits in a kernel."""
+def _decision_group() -> dist.ProcessGroup:
+    """A group of the same processes with a longer timeout, on the CPU, so that no GPU waits in a kernel."""
     global _decisions
     if _decisions is None:
         _decisions = dist.new_group(backend="gloo", timeout=DECISION_TIMEOUT)

@@ -1,4 +1,4 @@
-"""What a checkpoint of unknown origin may hold: its archive, looked at before torch unpacks it, and its configuration.
+"""What a checkpoint of unknown origin may hold: its archive, checked before torch unpacks it, and its configuration.
 
 `weights_only` keeps code out. It does not keep a file of a few kilobytes from asking for more memory than there is, and
 it allows more constructors than our files need.
@@ -27,7 +27,7 @@ def fault_of_archive(file: BinaryIO) -> str | None:
     """What no file that `torch.save` wrote has, from a zip archive open for reading; None for a sound one.
 
     torch stores entries uncompressed and each once, so together they are never larger than the file. Compressed or
-    overlapping entries are how a small file becomes gigabytes. The pickle is read through without being carried out.
+    overlapping entries are how a small file becomes gigabytes. The pickle is scanned without being executed.
 
     Raises zipfile.BadZipFile for what is no archive, ValueError for what is no pickle.
     """

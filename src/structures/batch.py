@@ -42,7 +42,7 @@ class FrameBatch:
     boxes: list[Boxes3D] | None = None  # B, aug frame
     streams: Tensor | None = None  # [B] int64, unique: the stream that each row is the next frame of; None: unordered
     starts: Tensor | None = None  # [B] bool, the row begins a clip: memory of its stream ends; given with `streams`
-    skipped: dict[str, int] = field(default_factory=dict)  # unreadable files passed over, by channel
+    skipped: dict[str, int] = field(default_factory=dict)  # unreadable files skipped, by channel
     bad_files: list[str] = field(default_factory=list)  # which these were, relative to the data set's root
     future: tuple[FrameBatch, ...] = ()
     """The next key frames of the same scenes, one sweep of each lidar with ray origins: supervision, never an input.

@@ -18,6 +18,7 @@ from typing import TypeVar
 from optuna.trial import Trial
 
 from src.errors import HorizonError
+from src.reliability.command import INTERRUPT_GRACE_S
 from src.report.sweep_record import SweepRecord
 from src.sweep.launcher import ExitStatus, Launcher, StopRequest
 from src.sweep.plan import Plan, RunSpec
@@ -37,8 +38,6 @@ RECORD_EVERY_S = 20.0
 DATABASE_TIMEOUT_S = 900.0
 """How long a running sweep waits for its database while its runs train; at the start it does not wait."""
 DATABASE_RETRY_S = 5.0
-INTERRUPT_GRACE_S = 2.0
-"""A second Ctrl-C this long after the first kills all runs; launchers repeat a signal within milliseconds."""
 MOST_INTERRUPTIONS = 3
 """A run that ends this often as if interrupted, while nobody stopped the sweep, has failed."""
 

@@ -85,7 +85,7 @@ def build_trainer(
         strategy=strategy,
         logger=loggers,
         callbacks=callbacks,
-        plugins=[AtomicCheckpointIO(folder.check_held, hurried=lambda: interruption.requested)],
+        plugins=[AtomicCheckpointIO(folder.check_held, fail_fast=lambda: interruption.requested)],
         log_every_n_steps=log_every_steps,
         deterministic=deterministic,
         num_sanity_val_steps=0,

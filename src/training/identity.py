@@ -1,4 +1,4 @@
-"""What tells runs apart: their overrides, `key=value`, and digests of all that can change a result (no torch here)."""
+"""What identifies a run: its overrides, `key=value`, and digests of all that can change a result (no torch here)."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ OUTSIDE_IDENTITY = (
     "data.root",
     "data.world.num_workers",
 )
-"""Keys that cannot change the result of a run: where and how it computes, and what other commands are told.
+"""Keys that cannot change the result of a run: where and how it computes, and options of other commands.
 
-They are left out of its identity, of its result, and of what a sweep notes of it.
+They are left out of its identity, of its result, and of what a sweep records of it.
 """
 
 
@@ -42,7 +42,7 @@ def is_of(override: str, keys: Iterable[str]) -> bool:
 
 
 def digest_of(changes: list[str]) -> str:
-    """8 hex that tell sets of overrides apart, in whatever order they are given."""
+    """8 hex digits of a set of overrides, in whatever order they are given."""
     return hashlib.sha256(json.dumps(sorted(changes)).encode()).hexdigest()[:8]
 
 
@@ -60,9 +60,9 @@ def without_keys(tree: dict[str, Any], keys: Iterable[str]) -> dict[str, Any]:
 
 
 def digest_of_changes(overrides: list[str]) -> str:
-    """`-` and 8 hex that tell apart results of one checkpoint by what the command line changes; empty for no change.
+    """`-` and 8 hex digits of what the command line changes of a checkpoint's configuration; empty for no change.
 
-    What only says where from, where to and on what machine does not count.
+    Paths and where it computes do not count.
     """
     besides = ("checkpoint", "predictions", "out", "scene", "paths", "trainer", "logger", "data.num_workers")
     changes = [change for change in overrides if not is_of(change, besides)]

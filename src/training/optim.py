@@ -1,4 +1,4 @@
-"""AdamW on the right parameters and the cyclic schedule (Table 10, spec section 10)."""
+"""AdamW on the right parameters and the cyclic schedule (Table 10, method 10)."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 class Resume(Enum):
     """What happens when the folder of the run exists (the values of `resume`)."""
 
-    auto = "auto"  # go on with an unfinished run, show a finished one
+    auto = "auto"  # resume an unfinished run, show a finished one
     never = "never"  # refuse
     restart = "restart"  # move the old folder aside
 
@@ -57,7 +57,7 @@ class RunFolder:
         moment, or when the folder cannot be written.
         """
         if self.path.exists() and resume is Resume.never:
-            raise ConfigError(f"{self.path} exists and resume=never; use resume=auto to go on or resume=restart")
+            raise ConfigError(f"{self.path} exists and resume=never; use resume=auto to resume or resume=restart")
         if self.path.exists() and resume is Resume.restart:
             self._acquire()
             aside = self._aside()

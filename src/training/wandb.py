@@ -42,7 +42,7 @@ class WandbConfig:
 
 
 class WandbRun(Logger):
-    """A Lightning logger over one W&B run, which it gives up with a warning at the first fault."""
+    """A Lightning logger over one W&B run, which it drops with a warning at the first error."""
 
     def __init__(self, run: Any, folder: RunFolder) -> None:
         super().__init__()
@@ -61,7 +61,7 @@ class WandbRun(Logger):
     @property
     @rank_zero_experiment
     def experiment(self) -> Any:
-        """W&B's run, None once it was given up."""
+        """W&B's run, None once it was dropped."""
         return self._run
 
     def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
@@ -81,7 +81,7 @@ class WandbRun(Logger):
     def finish(self, scores: dict[str, Any], pictures: Path) -> str | None:
         """Send the score tables and the pictures, and end the run.
 
-        Returns where it can be seen, or the command that sends an offline run; None where W&B was given up.
+        Returns where it can be seen, or the command that sends an offline run; None where W&B was dropped.
         """
         place: list[str] = []
 
@@ -120,18 +120,18 @@ def start_wandb(
     config: WandbConfig,
     folder: RunFolder,
     tree: dict[str, Any],  # configuration of the run as plain values
-    earlier: Iterable[dict[str, str]],  # rows of metrics.csv that the run goes on from
+    earlier: Iterable[dict[str, str]],  # rows of metrics.csv that the run resumes from
 ) -> WandbRun | None:
     """A W&B run named as the run folder, written below it; offline where the service cannot be reached.
 
-    A run that goes on tells W&B again what came before: offline runs cannot be continued, so a new one of the same
+    A resumed run logs the earlier rows again: offline runs cannot be continued, so a new one of the same
     name replaces those of earlier starts; online, what the service has already is left out. None, with a warning,
     where W&B is not installed or does not start.
     """
     try:
         import wandb
     except ImportError as error:
-        logger.warning("W&B is not installed (%s; pip install wandb); the run goes on with metrics.csv alone", error)
+        logger.warning("W&B is not installed (%s; pip install wandb); the run continues with metrics.csv alone", error)
         return None
     run = None
     for mode in ("offline",) if config.offline else ("online", "offline"):
@@ -139,7 +139,7 @@ def start_wandb(
             run = _init(wandb, mode, config, folder, tree)
             break
         except Exception as error:  # W&B raises its own, varying types; the run must not depend on a web service
-            remedy = "it is written offline instead" if mode == "online" else "the run goes on with metrics.csv alone"
+            remedy = "it is written offline instead" if mode == "online" else "the run continues with metrics.csv alone"
             logger.warning("W&B could not start %s (%s); %s", mode, _reason(error), remedy)
             wandb.teardown()  # the failed attempt would still hold the run's name
     if run is None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from src.geometry.transforms import rotation_zyx
 from src.world.road import Road
 from src.world.traffic import STEP_S
 
@@ -49,17 +50,6 @@ class Tracks:
             [forward * cos - d_rate * sin, forward * sin + d_rate * cos, s_rate * self.road.slope_at(s)], 1
         )
         return self.road.place(s, d), velocity, heading + turn
-
-
-def rotation_zyx(yaw: Array | float, pitch: Array | float, roll: Array | float) -> Array:
-    """Rz(yaw) Ry(pitch) Rx(roll), [..., 3, 3]; a positive pitch lowers the nose."""
-    cy, sy, cp, sp, cr, sr = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
 @dataclass(kw_only=True)

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from src.errors import DataError
+from src.geometry.transforms import pose_matrix, quaternion_to_matrix, yaw_of
 from src.structures.taxonomy import CAMERAS, CATEGORY_TO_CLASS, CLASSES, RADARS, REFERENCE_CHANNEL
 from src.world.table_rows import Row
 from src.world.write import VERSION
@@ -36,22 +37,8 @@ class PreviewFrame:
     radar_points: Array  # [P, 7] x, y, z (m), rcs (dB), vx, vy (m/s, compensated, radial), dt (s)
 
 
-def rotation_of(quaternion: list[float]) -> Array:
-    """[3, 3] matrix of a unit quaternion (w, x, y, z)."""
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def _matrix(row: Row) -> Array:
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation_of(row["rotation"]), row["translation"]  # type: ignore[arg-type]
-    return result
+    return pose_matrix(row["rotation"], row["translation"])
 
 
 class WorldPreview:
@@ -100,7 +87,7 @@ class WorldPreview:
         ego_from_global = np.linalg.inv(self._pose(reference))
         projections = [self._projection(files[name]) @ np.linalg.inv(ego_from_global) for name in CAMERAS]
         boxes = [row for row in self.annotations[sample["token"]] if self._label(row) is not None]
-        turns = [ego_from_global[:3, :3] @ rotation_of(row["rotation"]) for row in boxes]
+        turns = [ego_from_global[:3, :3] @ quaternion_to_matrix(row["rotation"]) for row in boxes]
         centres = np.array([row["translation"] for row in boxes]).reshape(-1, 3)
         velocities = np.array([self._velocity(row) for row in boxes]).reshape(-1, 3)
         width, length, height = np.array([row["size"] for row in boxes]).reshape(-1, 3).T
@@ -116,7 +103,7 @@ class WorldPreview:
             pix_from_ego=np.stack(projections),
             centers=centres @ ego_from_global[:3, :3].T + ego_from_global[:3, 3],
             sizes=np.stack([length, width, height], 1),
-            yaws=np.array([np.arctan2(turn[1, 0], turn[0, 0]) for turn in turns]),
+            yaws=np.array([yaw_of(turn) for turn in turns]),
             velocities=(velocities @ ego_from_global[:3, :3].T)[:, :2],
             labels=np.array([self._label(row) for row in boxes], dtype=np.int64),
             radar_points=np.concatenate(sweeps) if sweeps else np.zeros((0, 7)),

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from src.geometry.transforms import rotation_zyx
 from src.structures.taxonomy import CAMERAS, LIDARS, RADARS
-from src.world.motion import rotation_zyx
 from src.world.world_config import WorldConfig
 
 Array = np.ndarray

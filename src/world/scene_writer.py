@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from src.geometry.transforms import matrix_to_quaternion, yaw_of
 from src.structures.taxonomy import CAMERAS, LIDARS, RADARS, REFERENCE_CHANNEL
 from src.world.camera_render import Studio
 from src.world.catalogue import attribute_of
@@ -27,7 +28,7 @@ from src.world.radar import simulate_sweeps
 from src.world.rig import Mount, sensor_rig
 from src.world.scenery import make_scenery
 from src.world.simulate import Scene, make_scene, scene_rng
-from src.world.table_rows import Row, Tables, link_by, link_chain, quaternions, rounded, token
+from src.world.table_rows import Row, Tables, link_by, link_chain, rounded, token
 from src.world.world_config import CAMERA_RATE_HZ, KEY_FRAME_RATE_HZ, RADAR_RATE_HZ, WorldConfig
 
 Array = np.ndarray
@@ -271,7 +272,7 @@ class SceneWriter:
                 "translation": rounded(place, 6),
             }
             for time, rotation, place in zip(
-                times, quaternions(rotations), translations + scene.utm_offset, strict=True
+                times, matrix_to_quaternion(rotations), translations + scene.utm_offset, strict=True
             )
         ]
         sky = scene.conditions
@@ -315,7 +316,7 @@ class SceneWriter:
         rotations, _ = self.scene.ego.poses(np.array(times))
         angles = np.stack(
             [
-                np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]),
+                yaw_of(rotations),
                 -np.arcsin(rotations[:, 2, 0]),
                 np.arctan2(rotations[:, 2, 1], rotations[:, 2, 2]),
             ],

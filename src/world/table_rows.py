@@ -7,6 +7,7 @@ from collections import defaultdict
 
 import numpy as np
 
+from src.geometry.transforms import matrix_to_quaternion
 from src.structures.taxonomy import ATTRIBUTES
 from src.world.catalogue import ALL_CATEGORIES
 from src.world.rig import Mount
@@ -19,35 +20,6 @@ Tables = dict[str, list[Row]]
 def token(*parts: object) -> str:
     """32 hexadecimal digits that depend on the parts alone."""
     return hashlib.blake2b("/".join(map(str, parts)).encode(), digest_size=16).hexdigest()
-
-
-def quaternions(rotations: Array) -> Array:
-    """(w, x, y, z) with w >= 0 of rotation matrices [T, 3, 3] whose angle is below 180 degrees or exactly there."""
-    m = np.asarray(rotations)
-    squares = np.stack(
-        [
-            1 + m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2],
-            1 + m[:, 0, 0] - m[:, 1, 1] - m[:, 2, 2],
-            1 - m[:, 0, 0] + m[:, 1, 1] - m[:, 2, 2],
-            1 - m[:, 0, 0] - m[:, 1, 1] + m[:, 2, 2],
-        ],
-        1,
-    )
-    # Row k of this symmetric matrix is 4 q_k q; the row with the largest diagonal is the best conditioned.
-    products = np.zeros((len(m), 4, 4))
-    products[:, range(4), range(4)] = squares
-    for a, b, value in (
-        (0, 1, m[:, 2, 1] - m[:, 1, 2]),
-        (0, 2, m[:, 0, 2] - m[:, 2, 0]),
-        (0, 3, m[:, 1, 0] - m[:, 0, 1]),
-        (1, 2, m[:, 1, 0] + m[:, 0, 1]),
-        (1, 3, m[:, 0, 2] + m[:, 2, 0]),
-        (2, 3, m[:, 2, 1] + m[:, 1, 2]),
-    ):
-        products[:, a, b] = products[:, b, a] = value
-    best = products[np.arange(len(m)), squares.argmax(1)]
-    best = best / np.linalg.norm(best, axis=1, keepdims=True)
-    return np.where(best[:, :1] < 0, -best, best)
 
 
 def rounded(values: Array, digits: int) -> list[float]:
@@ -84,7 +56,7 @@ def shared_tables(seed: int, rig: dict[str, Mount]) -> Tables:
                 "token": token(seed, "calibration", name),
                 "sensor_token": token(seed, "sensor", name),
                 "translation": rounded(mount.translation, 6),
-                "rotation": rounded(quaternions(mount.rotation[None])[0], 12),
+                "rotation": rounded(matrix_to_quaternion(mount.rotation), 12),
                 "camera_intrinsic": [] if mount.intrinsic is None else [rounded(row, 9) for row in mount.intrinsic],
             }
             for name, mount in rig.items()

@@ -31,7 +31,7 @@ def follows(row, before):
 
 @pytest.mark.parametrize(("lengths", "groups", "streams"), CASES)
 @pytest.mark.parametrize("epoch", [0, 1])
-def test_training_lanes_hold_consecutive_frames_between_starts(lengths, groups, streams, epoch):
+def test_training_streams_hold_consecutive_frames_between_starts(lengths, groups, streams, epoch):
     schedule = streamed_groups(scenes(lengths), groups, streams, 1, 3, epoch)
     total = sum(lengths)
     assert schedule.samples.shape == schedule.clips.shape == (total // streams, streams)  # the same in every epoch
@@ -54,14 +54,14 @@ def test_a_scene_is_cut_into_groups_of_nearly_equal_length():
     assert dict(zip(*np.unique(clips, return_counts=True), strict=True)) == {1000: 3, 1009: 2, 1015: 2}
 
 
-def test_a_group_cut_by_the_end_of_a_lane_becomes_two_clips():
+def test_a_group_cut_by_the_end_of_a_stream_becomes_two_clips():
     schedule = streamed_groups(scenes([7]), 1, 3, 1, 0, 0)
     assert schedule.samples.T.tolist() == [[1000, 1003], [1006, 1009], [1012, 1015]]
     assert schedule.clips.T.tolist() == [[1000] * 2, [1006] * 2, [1012] * 2]
 
 
 @pytest.mark.parametrize("world_size", [1, 2])
-def test_sets_of_lanes_take_turns(world_size):
+def test_sets_of_streams_take_turns(world_size):
     def schedule(stream_sets):
         return lambda epoch: streamed_groups(scenes([8, 8, 8]), 2, 2 * 3 // stream_sets, stream_sets, 0, epoch)
 
@@ -74,7 +74,7 @@ def test_sets_of_lanes_take_turns(world_size):
 
 
 @pytest.mark.parametrize(("streams", "sets"), [(2, 12), (4, 6), (8, 3), (9, 2), (13, 1), (40, 1)])
-def test_there_are_no_more_sets_of_lanes_than_groups_fill(streams, sets):
+def test_there_are_no_more_sets_of_streams_than_groups_fill(streams, sets):
     """24 groups of ten frames: more sets would tear them into shorter clips."""
     schedule = streamed_groups(scenes([20] * 12), 2, streams, 12, 0, 0)
     assert schedule.stream_sets == sets and schedule.samples.shape == (240 // (streams * sets) * sets, streams)
@@ -91,7 +91,7 @@ def test_order_follows_seed_and_epoch():
         assert len(set(orders(make).values())) == 4 and orders(make) == orders(make)
 
 
-def test_validation_lanes_are_filled_longest_scene_first():
+def test_validation_streams_are_filled_longest_scene_first():
     schedule = whole_scenes(scenes([2, 4, 1, 3]), 2, 1)
     # Placed: 4 frames in stream 0, 3 in stream 1, 2 in stream 1, 1 in stream 0; read in the order of the table.
     assert schedule.samples.T.tolist() == [[2000, 2003, 2006, 2009, 3000], [1000, 1003, 4000, 4003, 4006]]
@@ -146,7 +146,7 @@ def test_ranks_together_read_the_batches_of_one_process(world_size, temporal):
     assert streams == [[0, 1, 2, 3] if temporal else [None] * 4] * 7
 
 
-def test_iteration_goes_on_from_the_position_asked_for_when_it_begins():
+def test_iteration_starts_at_the_position_that_is_asked_for_when_it_begins():
     at = [(0, 0)]
     sampler = ScheduleSampler(
         lambda epoch: streamed_groups(scenes([8, 8]), 2, 2, 1, 0, epoch), 0, 1, lambda steps: at[0]
@@ -205,7 +205,7 @@ def test_jump_between_two_frames_of_a_scene(x_m):
     assert len(scenes_of(index_of([0, 0, 1], [1.0, 1.5, 2.0], [0.0, 10.0, 70.0]), np.arange(3))) == 2
 
 
-def test_schedule_is_split_into_blocks_of_lanes():
+def test_schedule_is_split_into_blocks_of_streams():
     table = np.arange(12).reshape(3, 4)
     samplers = [ScheduleSampler(lambda epoch: Schedule(table, table), rank, 2) for rank in range(2)]
     assert [[key.stream for key in next(iter(sampler))] for sampler in samplers] == [[0, 1], [2, 3]]

@@ -198,7 +198,7 @@ def test_identity_holds_no_path(data_set):
     assert str(data_set.root.parent) not in str(module(data_set).identity())
 
 
-def test_streamed_batches_mark_lanes_and_clip_starts(drives):
+def test_streamed_batches_mark_streams_and_clip_starts(drives):
     data = module(drives, ("radar",), temporal=True, batch_size=2)
     index = data.index
     last = {}
@@ -261,8 +261,8 @@ def test_images_are_augmented_frame_by_frame_within_a_clip(data_set):
     torch.testing.assert_close(second.global_from_ego, plain.global_from_ego)  # memory lives here, unaugmented
 
 
-def test_silent_frames_are_never_a_clips_first_and_in_validation_always_the_same(data_set):
-    def silent(loader):
+def test_sensor_dropout_spares_a_clips_first_frame_and_is_always_the_same_in_validation(data_set):
+    def dropped(loader):
         batches = list(loader)
         for batch in batches:
             for row, starts in enumerate(batch.starts):
@@ -276,11 +276,11 @@ def test_silent_frames_are_never_a_clips_first_and_in_validation_always_the_same
 
     streamed = {"temporal": True, "batch_size": 1, "groups_per_scene": 1, "split": "train"}
     made = [module(data_set, seed=seed, sensor_dropout=0.8, **streamed) for seed in (0, 1)]
-    in_validation = [silent(one.val_dataloader()) for one in made]
-    assert in_validation[0] == in_validation[1] == silent(made[0].val_dataloader())
+    in_validation = [dropped(one.val_dataloader()) for one in made]
+    assert in_validation[0] == in_validation[1] == dropped(made[0].val_dataloader())
     frames = [frame.tokens[0] for frame in made[0].stream() if len(frame.radar_points) == 0]
     assert sorted(frames) == sorted(in_validation[0]) and len(frames) > 0
-    assert silent(made[0].train_dataloader()) and not silent(module(data_set, **streamed).train_dataloader())
+    assert dropped(made[0].train_dataloader()) and not dropped(module(data_set, **streamed).train_dataloader())
 
 
 def test_stream_of_scenes(drives):
@@ -347,7 +347,7 @@ def test_poses_that_jump_between_frames(drives, split):
 
 
 @pytest.mark.parametrize("temporal", [False, True])
-def test_training_goes_on_where_the_trainer_stands_and_validation_does_not(drives, temporal):
+def test_training_resumes_at_the_trainers_step_and_validation_does_not(drives, temporal):
     def read(steps, limit=float("inf"), kind="train"):
         data = module(drives, ("radar",), temporal=temporal, batch_size=3)
         data.trainer = SimpleNamespace(world_size=1, global_rank=0, global_step=steps, num_training_batches=limit)
@@ -422,7 +422,7 @@ def fit(data, folder, epochs, checkpoint=None, resume=None, stop_at=None):
 
 
 @pytest.mark.parametrize("num_workers", [0, 1])
-def test_lightning_epochs_differ_and_resume_goes_on(data_set, tmp_path, num_workers):
+def test_lightning_epochs_differ_and_resume(data_set, tmp_path, num_workers):
     def make():
         return module(data_set, ("radar",), batch_size=1, num_workers=num_workers)
 

@@ -269,7 +269,7 @@ def test_bad_files_stop_or_are_counted(broken_files, caplog):
         assert frame.bad_files == [str(path.relative_to(broken_files.root)) for path in (radar, camera)]
         assert frame.image_valid.tolist() == [[True, True, False, True]] and not frame.images[0, 2].any()
         assert len(frame.radar_points) == (60 - 1) * 21
-    assert caplog.text.count(radar.name) == 1  # told once
+    assert caplog.text.count(radar.name) == 1  # reported once
 
 
 def test_link_out_of_the_data_set_is_refused(broken_files, tmp_path_factory):

@@ -268,7 +268,7 @@ def saved(content: Any, **options: Any) -> bytes:
 
 
 def check_weights(module: nn.Module) -> None:
-    """Any finite number can be a weight: a stranger's own cannot be told from others."""
+    """Any finite number can be a weight: a foreign one looks like any other."""
     for name, value in module.state_dict().items():
         assert torch.isfinite(value).all(), f"{name} is not finite"
 

@@ -63,23 +63,23 @@ def damaged_file(kind: Kind, seed: int, case: int, strangers: list[bytes]) -> tu
 
 
 def run_cases(kind: Kind, seed: int, cases: range, folder: Path, strangers: list[bytes]) -> Outcome:
-    """Read each case's file in a child. A child that dies or hangs is a fault of its case, and the next one goes on."""
+    """Read each case's file in a child. A child that dies or hangs is a fault of its case; the next is read."""
     outcome = Outcome()
     shared = mmap.mmap(-1, 24)  # case, refused, accepted: outlives a child that dies
     at = cases.start
     while at < cases.stop and len(outcome.faults) < MOST_FAULTS:
-        report, told = os.pipe()
+        report, pipe = os.pipe()
         child = os.fork()
         if child == 0:
             os.close(report)
             try:
-                _read_all(kind, seed, range(at, cases.stop), folder, strangers, shared, told)
+                _read_all(kind, seed, range(at, cases.stop), folder, strangers, shared, pipe)
             except BaseException:  # of the fuzzing itself
                 reached = int.from_bytes(shared[:8], "little")
-                _tell(told, kind, seed, reached, "no file was made", traceback.format_exc()[-800:])
+                _report(pipe, kind, seed, reached, "no file was made", traceback.format_exc()[-800:])
             finally:
                 os._exit(0)
-        os.close(told)
+        os.close(pipe)
         with os.fdopen(report) as lines:
             said = [json.loads(line) for line in lines if line.endswith("\n")]
         _, status = os.waitpid(child, 0)
@@ -97,11 +97,11 @@ def run_cases(kind: Kind, seed: int, cases: range, folder: Path, strangers: list
 
 
 def _read_all(
-    kind: Kind, seed: int, cases: range, folder: Path, strangers: list[bytes], shared: mmap.mmap, told: int
+    kind: Kind, seed: int, cases: range, folder: Path, strangers: list[bytes], shared: mmap.mmap, pipe: int
 ) -> None:
     """In the child: every case, with the case at hand in shared memory and faults as lines of a pipe."""
     logging.disable(logging.CRITICAL)
-    faulthandler.disable()  # pytest's; a death is told with its case instead
+    faulthandler.disable()  # pytest's; a death is reported with its case instead
     warnings.simplefilter("error", RuntimeWarning)  # numpy's overflows: a number that cannot be, on its way
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * resource.getpagesize() + MEMORY_BYTES
@@ -126,11 +126,11 @@ def _read_all(
         except kind.errors as error:
             refused += 1
             if path.name not in str(error) and path.parent.name not in str(error):
-                faults += _tell(told, kind, seed, case, said, f"the error does not name the file: {error!s:.300}")
+                faults += _report(pipe, kind, seed, case, said, f"the error does not name the file: {error!s:.300}")
         except BaseException as error:
             where = traceback.extract_tb(error.__traceback__)[-1]
             what = f"{type(error).__name__} from {Path(where.filename).name}:{where.lineno}: {error!s:.300}"
-            faults += _tell(told, kind, seed, case, said, what)
+            faults += _report(pipe, kind, seed, case, said, what)
         signal.setitimer(signal.ITIMER_PROF, 0)
         if whole is not None:
             path.write_bytes(whole)
@@ -139,8 +139,8 @@ def _read_all(
             break
 
 
-def _tell(told: int, kind: Kind, seed: int, case: int, said: str, fault: str) -> int:
-    os.write(told, (json.dumps(_line(kind, seed, case, said, fault)) + "\n").encode())
+def _report(pipe: int, kind: Kind, seed: int, case: int, said: str, fault: str) -> int:
+    os.write(pipe, (json.dumps(_line(kind, seed, case, said, fault)) + "\n").encode())
     return 1
 
 

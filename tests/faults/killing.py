@@ -117,7 +117,7 @@ def arm(fault):
 
     module.AtomicCheckpointIO._write, module._DigestedFile.write = save, write
     around(os, "fsync", before="written", after="synced")
-    around(module, "_prove", after="proven")
+    around(module, "_verify_written", after="verified")
     around(os, "link", after="linked")
     around(os, "replace", after=lambda args: "kept" if Path(args[1]).name == PREVIOUS else "replaced")
 
@@ -258,7 +258,7 @@ def jump_clock(folder, rng):
 
 
 class Chain:
-    """One run that is killed again and again, each time gone on with by the same command."""
+    """One run that is killed again and again, each time resumed by the same command."""
 
     def __init__(self, context, folder, overrides, reference, seed):
         self.context, self.outputs, self.overrides = context, folder, [*overrides, f"paths.outputs={folder}"]

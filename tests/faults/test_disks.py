@@ -92,7 +92,7 @@ def test_a_disk_that_is_full_for_a_while_only_costs_time(small_disk, training):
 
 
 @pytest.mark.faults
-def test_a_disk_that_stays_full_ends_the_run_and_the_same_command_goes_on(small_disk, training):
+def test_a_disk_that_stays_full_ends_the_run_and_the_same_command_resumes(small_disk, training):
     process = training.start(killing.impatient)
     training.wait_for(lambda: training.last, process)
     fill(small_disk)
@@ -155,7 +155,7 @@ def test_a_folder_that_becomes_read_only_ends_the_run_at_once(training):
         assert LAST in message and "Permission denied" in message and "trying again" not in training.said()
         read_checkpoint(training.last)
         again = training.start(killing.bound_by_permissions)
-        assert killing.wait(again, training.log) == 3  # told before anything is trained
+        assert killing.wait(again, training.log) == 3  # reported before anything is trained
         assert "choose another paths.outputs=FOLDER" in training.said() and "Epoch" not in training.said()
     finally:
         folder.chmod(0o755)

@@ -120,7 +120,7 @@ def test_a_reader_that_hangs_is_ended(tmp_path, monkeypatch):
     assert "waits for" in fault
 
 
-def test_a_reader_that_takes_all_memory_or_names_no_file_is_told(tmp_path):
+def test_a_reader_that_takes_all_memory_or_names_no_file_is_reported(tmp_path):
     def takes(path, number):
         bytearray(2**31)
 
@@ -135,7 +135,7 @@ def test_a_reader_that_takes_all_memory_or_names_no_file_is_told(tmp_path):
     assert "does not name the file" in fault
 
 
-def test_a_value_that_cannot_be_is_told_and_others_are_counted(tmp_path):
+def test_an_impossible_value_is_reported_and_others_are_counted(tmp_path):
     def read(path, number):
         assert len(path.read_bytes()) <= 90, "too long"
 

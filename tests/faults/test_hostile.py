@@ -1,4 +1,4 @@
-"""Files and words of strangers: checkpoints, tables, configurations, submissions; none of them is carried out."""
+"""Files and words of strangers: checkpoints, tables, configurations, submissions; none of them is executed."""
 
 import ast
 import io
@@ -69,7 +69,7 @@ PARCELS = "data/parcel.py"
 
 
 def offences(source, name):
-    """Calls in a file by which content could be carried out."""
+    """Calls in a file by which content could be executed."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import | ast.ImportFrom):
@@ -109,7 +109,7 @@ def test_the_search_finds_what_it_looks_for(line):
     assert offences(line, "x.py")
 
 
-def test_nothing_that_is_read_is_carried_out():
+def test_nothing_that_is_read_is_executed():
     names = {str(path.relative_to(SRC)): path.read_text() for path in SRC.rglob("*.py")}
     found = {name: offences(source, name) for name, source in names.items()}
     assert len(found) > 150 and {name: what for name, what in found.items() if what} == {}
@@ -155,7 +155,7 @@ def planted(where, thing, config):
 @pytest.mark.parametrize(
     "where", ["state_dict", "a weight", "the configuration", "a key", "optimizer_states", "callbacks", "loops"]
 )
-def test_code_anywhere_in_a_checkpoint_is_not_carried_out(tmp_path, canary, tree, where, layout):
+def test_code_anywhere_in_a_checkpoint_is_not_executed(tmp_path, canary, tree, where, layout):
     path = tmp_path / "x.ckpt"
     whole = planted(where, canary, tree)
     if layout == "plain pickle":
@@ -168,7 +168,7 @@ def test_code_anywhere_in_a_checkpoint_is_not_carried_out(tmp_path, canary, tree
         load_backbone_weights(torch.nn.Linear(2, 2), path, BackboneName.resnet50)
 
 
-def test_code_in_a_checkpoint_whose_digest_is_right_is_not_carried_out(tmp_path, canary, tree):
+def test_code_in_a_checkpoint_whose_digest_is_right_is_not_executed(tmp_path, canary, tree):
     """The digest says that a file is whole, not who wrote it."""
     path = tmp_path / "x.ckpt"
     torch.save(planted("a weight", canary, tree), path)
@@ -192,7 +192,7 @@ def test_code_in_a_checkpoint_whose_digest_is_right_is_not_carried_out(tmp_path,
     ],
     ids=["evaluate", "predict", "export", "streaming", "train"],
 )
-def test_no_command_carries_out_a_checkpoint(tmp_path, canary, tree, command):
+def test_no_command_executes_a_checkpoint(tmp_path, canary, tree, command):
     path = tmp_path / "x.ckpt"
     torch.save(planted("optimizer_states", canary, tree), path)
     with pytest.raises(CheckpointError, match="nothing in it was executed"):

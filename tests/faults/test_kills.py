@@ -1,4 +1,4 @@
-"""Killed anywhere, a training goes on from its newest whole checkpoint and ends as if nothing had happened."""
+"""Killed anywhere, a training resumes from its newest whole checkpoint and ends as if nothing had happened."""
 
 import signal
 from collections import Counter

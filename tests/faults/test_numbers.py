@@ -86,7 +86,7 @@ def spoil_a_point(batch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("phase", PHASES)
-def test_training_goes_on_without_a_broken_radar_point(world, tmp_path, monkeypatch, phase):
+def test_training_continues_without_a_broken_radar_point(world, tmp_path, monkeypatch, phase):
     """One step of a whole command meets a point that is not a number; the step is replayed from what it left."""
 
     def poisoned(self, batch, batch_idx, original=TrainingModule.training_step):
@@ -162,14 +162,14 @@ def replayed(path, capsys, *overrides):
     return capsys.readouterr().out, str(caught.value)
 
 
-def test_a_broken_input_is_told_and_the_first_module_that_meets_it(dump, capsys):
+def test_a_broken_input_is_reported_and_the_first_module_that_meets_it(dump, capsys):
     printed, error = replayed(dump(spoil_a_point), capsys)
     assert "input: radar point " in printed and "rcs nan" in printed and "step 1: as the test wants it" in printed
     assert "total                nan   <- not finite" in printed
     assert error.startswith("the first that is not finite: the output of radar_encoder"), error
 
 
-def test_an_infinite_gradient_of_a_finite_loss_is_told(dump, capsys, monkeypatch):
+def test_an_infinite_gradient_of_a_finite_loss_is_reported(dump, capsys, monkeypatch):
     """The root of zero adds nothing to the loss, and its derivative is infinite."""
 
     def loss(self, output, batch, original=Horizon3D.loss):

@@ -1,6 +1,6 @@
 """Two processes train, one of them fails in every way there is: what the user reads, how soon, and what is lost.
 
-All faults but torchrun's strike one run in turn, which goes on after each. In the end it has to be the run that nothing
+All faults but torchrun's strike one run in turn, which resumes after each. In the end it has to be the run that nothing
 ever happened to. Its seven training frames make three steps on two ranks, and its only validation scene leaves the
 second rank without a frame.
 """
@@ -160,7 +160,7 @@ def faulty(place, monkeypatch, capfd):
             step, at = struck.read_text().split()
             noticed = handler.records[0].created - float(at) if handler.records else None
             assert fault == "hang" or ended - float(at) < NOTICED_WITHIN_S, text
-            told = "" if noticed is None else f"told of after {noticed:.2f} s, "
+            told = "" if noticed is None else f"reported after {noticed:.2f} s, "
             with capfd.disabled():
                 print(f"\n{fault} of rank {rank} at step {step}: {told}all ended after {ended - float(at):.2f} s")
         return code, text
@@ -212,7 +212,7 @@ def test_a_broken_file_on_one_rank_is_what_the_user_reads(faulty, place, undistu
 @pytest.mark.parametrize("rank", [0, 1])
 def test_a_rank_that_hangs_ends_the_job_after_the_time_for_a_step(faulty, rank, monkeypatch):
     """Twenty seconds instead of five minutes; the rest is as it is."""
-    monkeypatch.setattr(processes, "GRACE_S", 5.0)
+    monkeypatch.setattr(processes, "TERMINATION_GRACE_S", 5.0)
     code, text = faulty("hang", rank, STEP_TIMEOUT_S=20)
     assert code == 1, text
     in_this_order(

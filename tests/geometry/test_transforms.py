@@ -50,3 +50,15 @@ def test_inverse_keeps_precision_at_utm_size():
     point = np.array([12.345678, -3.2, 1.0, 1.0])
     back = invert_rigid(pose) @ (pose @ point)[..., None]
     np.testing.assert_allclose(back[..., 0], np.tile(point, (3, 1)), atol=1e-8)
+
+
+def test_quaternions_turn_vectors_as_their_matrices_do():
+    rng = np.random.default_rng(0)
+    turns, _ = np.linalg.qr(rng.standard_normal((50, 3, 3)))
+    turns *= np.sign(np.linalg.det(turns))[:, None, None]
+    turns = np.concatenate([turns, [np.eye(3), np.diag([1.0, -1, -1]), np.diag([-1.0, -1, 1]), np.diag([-1.0, 1, -1])]])
+    for (w, *axis), turn in zip(matrix_to_quaternion(turns), turns, strict=True):
+        vector = rng.standard_normal(3)
+        cross = np.cross(axis, vector)
+        np.testing.assert_allclose(vector + 2 * w * cross + 2 * np.cross(axis, cross), turn @ vector, atol=1e-9)
+        assert w >= 0

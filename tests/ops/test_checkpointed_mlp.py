@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from src.ops.checkpointed_mlp import checkpointed_mlp
+from src.ops.checkpointed_mlp import checkpointed_mlp, projected_statistics
 
 
 def operands(rows, dtype=torch.float64):
@@ -36,3 +36,16 @@ def test_autocast_computes_in_its_type():
     assert out.dtype == torch.bfloat16
     out.float().sum().backward()
     assert values[0].grad.dtype == torch.float32
+
+
+def test_statistics_of_a_projection_never_made():
+    torch.manual_seed(0)
+    x, weight = (torch.randn(*size, dtype=torch.float64, requires_grad=True) for size in ((9, 5), (7, 5)))
+    projected = x @ weight.t()
+    expected = torch.cat([projected.mean(0), projected.var(0, correction=0)])
+    found = torch.cat(projected_statistics(x, weight))
+    torch.testing.assert_close(found, expected)
+    pull = torch.randn(14, dtype=torch.float64)
+    torch.testing.assert_close(
+        torch.autograd.grad(found, (x, weight), pull), torch.autograd.grad(expected, (x, weight), pull)
+    )

@@ -171,7 +171,7 @@ def test_the_one_before_is_kept_only_where_it_was_whole(tmp_path):
     assert (number_of(previous), number_of(last)) == (2, 3)
 
     last.write_bytes(last.read_bytes()[:-500])
-    again = AtomicCheckpointIO()  # of the next process, which goes on from the older one
+    again = AtomicCheckpointIO()  # of the next process, which resumes from the older one
     again.load_checkpoint(previous)
     again.save_checkpoint(numbered(4), last)
     assert (number_of(previous), number_of(last)) == (2, 4)
@@ -226,7 +226,7 @@ def test_what_reads_back_otherwise_never_replaces_the_one_before(tmp_path, monke
             os.pwrite(number, bytes(100), 300)
 
     monkeypatch.setattr(os, "fsync", lose_a_page)
-    with pytest.raises(CheckpointError, match="reads back otherwise"):
+    with pytest.raises(CheckpointError, match="does not read back"):
         io.save_checkpoint(numbered(2), tmp_path / LAST)
     assert number_of(tmp_path / LAST) == 1 and sum(naps) >= WAIT_S
     broken[0] = False
@@ -254,8 +254,8 @@ def test_a_disk_that_is_full_or_away_for_a_while_is_waited_for(tmp_path, monkeyp
     AtomicCheckpointIO().save_checkpoint(numbered(1), tmp_path / LAST)
     assert number_of(tmp_path / LAST) == 1 and len(naps) == 3
     assert [path.name for path in tmp_path.iterdir()] == [LAST]
-    (told,) = [record.getMessage() for record in caplog.records]  # once, not at every try
-    assert os.strerror(number) in told and "MiB are free" in told and "trying again" in told
+    (message,) = [record.getMessage() for record in caplog.records]  # once, not at every try
+    assert os.strerror(number) in message and "MiB are free" in message and "trying again" in message
 
 
 def test_a_disk_that_stays_full_ends_the_run_in_time(tmp_path, monkeypatch, naps):
@@ -276,7 +276,7 @@ def test_what_does_not_pass_is_not_waited_for(tmp_path, monkeypatch, naps, numbe
 def test_nor_is_anything_while_the_run_is_asked_to_end(tmp_path, monkeypatch, naps):
     refusing(monkeypatch, errno.ENOSPC, 1)
     with pytest.raises(CheckpointError, match="No space left"):
-        AtomicCheckpointIO(hurried=lambda: True).save_checkpoint(numbered(1), tmp_path / LAST)
+        AtomicCheckpointIO(fail_fast=lambda: True).save_checkpoint(numbered(1), tmp_path / LAST)
     assert not naps
 
 

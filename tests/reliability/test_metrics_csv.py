@@ -57,7 +57,7 @@ def test_rows_that_a_disk_refuses_are_written_later(tmp_path, caplog):
     assert (folder / "metrics.csv").read_text().split()[1:] == ["0,,1", "1,,2", "2,,2", "3,,3"]
 
 
-def test_what_is_done_again_is_told_once(tmp_path):
+def test_a_repeated_row_is_logged_once(tmp_path):
     path = tmp_path / "metrics.csv"
     log = MetricsCSV(path, resume_step=-1)
     log.log_metrics({"a": 1.0}, 0)
@@ -74,7 +74,7 @@ def test_what_is_done_again_is_told_once(tmp_path):
 
 
 @pytest.mark.parametrize("damage", [b"\xff\xfe\xfa,1\n", b"x" * 200_000 + b"\n", b"9" * 5000 + b",0,1\n"])
-def test_a_damaged_log_is_gone_on_with_from_the_rows_before(tmp_path, caplog, damage):
+def test_a_damaged_log_is_resumed_from_the_rows_before(tmp_path, caplog, damage):
     path = tmp_path / "m.csv"
     path.write_bytes(b"step,epoch,loss\n0,0,1\n1,0,2\n" + damage + b"2,0,3\n")
     log = MetricsCSV(path, resume_step=3)

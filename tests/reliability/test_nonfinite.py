@@ -1,4 +1,4 @@
-"""Steps whose numbers are not finite: found, named, kept, passed over, on a model of a few parameters."""
+"""Steps whose numbers are not finite: detected, reported, dumped, skipped, on a model of a few parameters."""
 
 import copy
 import csv
@@ -118,11 +118,11 @@ WORDS = {
 def test_the_training_stops_at_the_step_and_says_why(tmp_path, fault):
     module, folder, error = train(tmp_path / "run", fault, skip=False)
     assert isinstance(error, DivergedError)
-    told = str(error)
-    assert told.startswith("step 4, epoch 1: ") and "samples of rank 0: frame 11 0, frame 11 1" in told
-    assert re.search(WORDS[fault], told), told
+    message = str(error)
+    assert message.startswith("step 4, epoch 1: ") and "samples of rank 0: frame 11 0, frame 11 1" in message
+    assert re.search(WORDS[fault], message), message
     (name,) = dumps(folder)
-    assert f"python -m src.replay checkpoint={folder.path / name}" in told
+    assert f"python -m src.replay checkpoint={folder.path / name}" in message
     # The weights, running statistics and optimiser are those before the step.
     assert same(module.everything(), module.states[-1])
 
@@ -148,13 +148,13 @@ def test_the_dump_holds_the_step(tmp_path, fault):
     again.restore_rank({"means": {}, "memories": step["memories"]})
     torch.manual_seed(step["seed"])
     terms = again.model.loss(again.train().run(batch), batch).terms
-    if fault == "gradient":  # the loss that was told is the loss of the same memory and dropout
+    if fault == "gradient":  # the loss that was reported is the loss of the same memory and dropout
         assert f"{float(terms['total'].detach()):.4g}" in step["found"]
     assert torch.isfinite(terms["total"]) == (fault != "point")
 
 
 @pytest.mark.parametrize("fault", WORDS)
-def test_a_passed_over_step_leaves_nothing_behind(tmp_path, fault, caplog):
+def test_a_skipped_step_leaves_nothing_behind(tmp_path, fault, caplog):
     with caplog.at_level(logging.WARNING):
         module, folder, error = train(tmp_path / "run", fault)
     assert error is None and module.guard.skipped_steps == 1 and module.guard.in_a_row == 0
@@ -173,7 +173,7 @@ def test_a_passed_over_step_leaves_nothing_behind(tmp_path, fault, caplog):
 
 
 def test_the_steps_behind_are_seeded_and_scheduled_as_without_the_fault(tmp_path):
-    """A step passed over counts: the learning rate, the draws and the data go on as if it had been made."""
+    """A skipped step counts: learning rate, draws and data continue as if it had been made."""
     whole, *_ = train(tmp_path / "whole")
     skipping, *_ = train(tmp_path / "skipping", "weight", bad_steps=(0,))
     assert skipping.trainer.global_step == whole.trainer.global_step == EPOCHS * STEPS
@@ -181,7 +181,7 @@ def test_the_steps_behind_are_seeded_and_scheduled_as_without_the_fault(tmp_path
     assert not same(whole.everything()[0], skipping.everything()[0])
 
 
-def test_lanes_begin_anew_after_a_step_that_was_passed_over():
+def test_streams_begin_anew_after_a_skipped_step():
     module = toy_module()
     module.run(toy_batch([5, 3], [True] * 2))
     module.run(toy_batch([1, 2], [True] * 2))
@@ -202,7 +202,7 @@ def test_training_gives_up_after_too_many_in_a_row(tmp_path, monkeypatch):
 
 @pytest.mark.filterwarnings("ignore:Checkpoint directory")
 @pytest.mark.parametrize("stop_after", [2, 4, 5])
-def test_a_resumed_run_passes_over_the_same_steps(tmp_path, stop_after):
+def test_a_resumed_run_skips_the_same_steps(tmp_path, stop_after):
     options = {"fault": "point", "bad_steps": (1, 3, 4), "every_steps": 1}
     whole, folder, _ = train(tmp_path / "whole", **options)
     train(tmp_path / "stopped", stop_after=stop_after, **options)
@@ -291,25 +291,25 @@ def as_rank(rank, port, path, fault, skip):
         bad_steps = (BAD_STEP,) if rank == 1 else ()
         module, _, error = train(path / "run", fault, bad_steps, skip, ranks=2)
     weights = module.model.layer.state_dict()
-    torch.save({"told": str(error), "weights": weights, "counts": module.guard.state()}, path / f"{rank}.pt")
+    torch.save({"message": str(error), "weights": weights, "counts": module.guard.state()}, path / f"{rank}.pt")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("fault", "skip"), [("point", False), ("gradient", False), ("constant", True)])
 def test_ranks_agree(tmp_path, fault, skip):
-    """What one of two ranks meets, both stop at with the same words, or both pass over; nobody waits for the other."""
+    """What one of two ranks meets, both stop at with the same words, or both skip; nobody waits for the other."""
     spawn_two(as_rank, tmp_path, fault, skip)
     first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2))
-    assert first["told"] == second["told"] and same(first["weights"], second["weights"])
+    assert first["message"] == second["message"] and same(first["weights"], second["weights"])
     folder = tmp_path / "run"
     names = sorted(path.name for path in folder.glob("nonfinite*"))
     if fault == "gradient":  # a mean over the ranks: nobody can tell whose it was
         assert names == [f"nonfinite-step000004-rank{rank}.pt" for rank in range(2)]
-        assert "the gradients of 1 of 4" in first["told"] and "rank 0: frame" in first["told"]
+        assert "the gradients of 1 of 4" in first["message"] and "rank 0: frame" in first["message"]
     else:
         assert names == ["nonfinite-step000004-rank1.pt"]
     if skip:
-        assert first["told"] == "None" and first["counts"] == second["counts"] == [1, 0]
+        assert first["message"] == "None" and first["counts"] == second["counts"] == [1, 0]
         assert all(bool(torch.isfinite(value).all()) for value in first["weights"].values())
     elif fault == "point":
-        assert "of rank 1 are not finite; samples of rank 1: frame 1011 0, frame 1011 1" in first["told"]
+        assert "of rank 1 are not finite; samples of rank 1: frame 1011 0, frame 1011 1" in first["message"]

@@ -122,7 +122,7 @@ def command(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), str(ROOT)]))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(processes, "GRACE_S", 1.0)
+    monkeypatch.setattr(processes, "TERMINATION_GRACE_S", 1.0)
 
     def run(code):
         (tmp_path / "some_command.py").write_text(
@@ -162,7 +162,7 @@ def test_the_exit_code_is_that_of_the_cause_and_nobody_is_left_waiting(code, exp
 
 
 @pytest.mark.parametrize(
-    ("code", "told"),
+    ("code", "warning"),
     [
         ("sys.exit(0)", []),
         ("sys.exit(6)", []),  # stopped from outside is no failure
@@ -183,9 +183,9 @@ def test_the_exit_code_is_that_of_the_cause_and_nobody_is_left_waiting(code, exp
         ),
     ],
 )
-def test_the_launcher_says_which_process_failed_and_how(code, told, command, caplog):
+def test_the_launcher_says_which_process_failed_and_how(code, warning, command, caplog):
     command(code)
-    assert [record.message for record in caplog.records if record.levelname == "WARNING"] == told
+    assert [record.message for record in caplog.records if record.levelname == "WARNING"] == warning
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -219,7 +219,7 @@ def main(overrides):
         value = decided_by_main(decide)
         open(f'answer{rank}', 'w').write(repr(value))
         decided_by_main(refuse)
-        open('went on', 'w')
+        open('continued', 'w')
 
 run_command(main)
 """
@@ -230,7 +230,7 @@ def test_the_main_process_decides_for_all_and_what_it_refuses_ends_all(command, 
     assert command(DECIDE) == 3
     assert (tmp_path / "decided").read_text() == "0"
     assert {(tmp_path / f"answer{rank}").read_text() for rank in (0, 1)} == {"{'resume_from': None, 'step': 7}"}
-    assert not (tmp_path / "went on").exists()
+    assert not (tmp_path / "continued").exists()
     assert capfd.readouterr().err.count("ConfigError: such a folder is taken") == 1
 
 
@@ -261,7 +261,7 @@ run_command(main)
 )
 def test_what_ended_a_process_is_read_before_what_the_others_say(fault, code, cause, command, monkeypatch, capfd):
     """`tests/faults/test_ranks.py` does it to real training."""
-    monkeypatch.setattr(processes, "GRACE_S", 30.0)
+    monkeypatch.setattr(processes, "TERMINATION_GRACE_S", 30.0)
     # The launcher's lines come in between those of the processes.
     monkeypatch.setattr(processes.logger, "warning", lambda text, *values: os.write(2, (text % values).encode()))
     assert command(MEET.format(fault=fault)) == code
@@ -369,7 +369,7 @@ def phase1(outputs):
     wait_for(last_checkpoint(outputs, "phase1"), running)
     os.kill(process_of_rank(running, 1), signal.SIGTERM)
     (output,) = finish(running, expect=6)
-    assert "the same command goes on" in output
+    assert "the same command resumes" in output
     (output,) = finish(start("torch.distributed.run", "--standalone", "--nproc-per-node=2", "-m", *command), expect=0)
     assert "resuming from" in output
     return last_checkpoint(outputs, "phase1")().parents[1]
@@ -377,7 +377,7 @@ def phase1(outputs):
 
 @needs_proc
 @pytest.mark.slow
-def test_a_stopped_run_goes_on_under_torchrun_and_scores_as_one_process_does(phase1, outputs, tmp_path):
+def test_a_stopped_run_resumes_under_torchrun_and_scores_as_one_process_does(phase1, outputs, tmp_path):
     record = json.loads((phase1 / "run.json").read_text())
     assert record["resumed"] and record["processes"] == 2 and record["steps"] == EPOCHS
     checkpoint = phase1 / "checkpoints" / "last.ckpt"

@@ -1,8 +1,13 @@
-"""Every promise of docs/reliability.md names a test that exists."""
+"""Every promise of docs/reliability.md names a test that exists; the room names the Lightning it is written for."""
 
 import ast
 import re
+import tomllib
 from pathlib import Path
+
+from packaging.requirements import Requirement
+
+from src import reliability
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -33,3 +38,12 @@ def test_every_promise_names_a_test_that_exists():
 def test_every_row_of_a_table_names_a_test():
     rows = [line for line in (ROOT / "docs" / "reliability.md").read_text().splitlines() if line.startswith("| ")]
     assert not [row for row in rows if "::" not in row and row != "| fault | what happens | test |"]
+
+
+def test_the_room_names_the_one_lightning_that_it_is_pinned_to():
+    (version,) = re.findall(r"Pinned to Lightning (\d+\.\d+) ", reliability.__doc__)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    (bound,) = [wanted for wanted in map(Requirement, project["dependencies"]) if wanted.name == "lightning"]
+    major, minor = map(int, version.split("."))
+    assert f"{version}.99" in bound.specifier
+    assert f"{major}.{minor - 1}.99" not in bound.specifier and f"{major}.{minor + 1}.0" not in bound.specifier

@@ -382,7 +382,7 @@ def test_weights_that_are_not_finite_are_refused(phase_1, tmp_path, value):
         give(path, "phase=phase2")
 
 
-def test_settings_without_weights_that_differ_are_told(phase_1, caplog):
+def test_settings_without_weights_that_differ_are_logged(phase_1, caplog):
     """A margin or a threshold is no tensor: it fits, but the phases then mean different things."""
     harmless = ("model.loss.ocsf_weight=2", "model.dptf.max_age_s=0.55", "data.num_workers=0")
     give(phase_1, "phase=phase2", "model.ocsf.margin_m=1.6", "data.num_sweeps=1", *harmless)

@@ -1,7 +1,9 @@
 """Which overrides make another run, and which results of a checkpoint lie apart."""
 
+import pytest
+
 from src.config import compose_config
-from src.training.identity import digest_of_changes, run_identity
+from src.training.identity import digest_of_changes, is_of, key_of, run_identity, without_keys
 
 
 def test_run_identity_ignores_what_cannot_change_the_result():
@@ -65,3 +67,30 @@ def test_what_changes_no_result_of_a_checkpoint_makes_no_other_place():
     assert len({"", *changed}) == 4
     pair = ["data.split=test", "data.root=d"]
     assert digest_of_changes(pair) == digest_of_changes(pair[::-1]) != ""
+
+
+@pytest.mark.parametrize(
+    ("override", "key"),
+    [
+        ("optim.lr=2e-4", "optim.lr"),
+        ("+model.x=a=b", "model.x"),
+        ("++phase=phase1", "phase"),
+        ("model.dptf", "model.dptf"),
+    ],
+)
+def test_key_of(override, key):
+    assert key_of(override) == key
+
+
+def test_a_key_holds_what_is_below_it_and_nothing_that_only_begins_like_it():
+    assert is_of("paths.outputs=/o", ("paths",)) and is_of("+trainer=cpu", ("resume", "trainer"))
+    assert not is_of("pathsandmore=1", ("paths",)) and not is_of("data.roots=1", ("data.root",))
+    assert not is_of("data=synthetic", ("data.root",))
+
+
+def test_without_keys_copies_and_takes_missing_and_null_parts_as_they_are():
+    tree = {"paths": {"outputs": "/o"}, "data": {"root": "/d", "world": None, "batch_size": 2}}
+    assert without_keys(tree, ("paths", "data.root", "data.world.num_workers", "out")) == {
+        "data": {"world": None, "batch_size": 2}
+    }
+    assert tree["data"]["root"] == "/d"

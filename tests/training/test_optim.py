@@ -42,7 +42,7 @@ def test_constant_betas_stay():
         assert optimizer.param_groups[0]["betas"] == (0.85, 0.95)
 
 
-def test_a_resumed_schedule_goes_on_where_it_was():
+def test_a_resumed_schedule_continues_where_it_was():
     def make():
         optimizer = torch.optim.AdamW(nn.Linear(2, 2).parameters(), lr=1e-4, betas=(0.95, 0.99))
         return optimizer, CyclicSchedule(optimizer, config(), total_steps=50)

@@ -98,8 +98,9 @@ def test_a_damaged_last_checkpoint_gives_way_to_the_one_before(tmp_path, caplog)
     assert folder.newest_checkpoint().path.name == "last.ckpt" and not caplog.records
     (folder.checkpoints / "last.ckpt").write_bytes(b"")
     assert folder.newest_checkpoint().path.name == "previous.ckpt"
-    (told,) = [record.getMessage() for record in caplog.records]
-    assert "last.ckpt is truncated" in told and f"resuming from {folder.checkpoints / 'previous.ckpt'} instead" in told
+    (message,) = [record.getMessage() for record in caplog.records]
+    assert "last.ckpt is truncated" in message
+    assert f"resuming from {folder.checkpoints / 'previous.ckpt'} instead" in message
 
 
 def test_what_a_killed_process_was_writing_goes_and_so_does_what_only_resuming_needs(tmp_path):

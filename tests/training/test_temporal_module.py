@@ -36,22 +36,22 @@ def test_the_first_batch_has_no_memory():
     assert streams.tolist() == [0, 1] and torch.equal(memory.values, output) and not memory.values.requires_grad
 
 
-def test_rows_follow_their_lanes(module):
+def test_rows_follow_their_streams(module):
     assert past(module, toy_batch([8, 5, 3], [False] * 3)) == [80, 50, 30]
 
 
-def test_a_start_ends_the_memory_of_its_lane_alone(module):
+def test_a_start_ends_the_memory_of_its_stream_alone(module):
     assert past(module, toy_batch([5, 3, 8], [False, True, False])) == [50, 0, 80]
 
 
-def test_vanished_and_new_lanes(module):
+def test_vanished_and_new_streams(module):
     assert past(module, toy_batch([8, 3], [False] * 2)) == [80, 30]
     assert past(module, toy_batch([4, 8], [False] * 2)) == [0, 80]
     module.run(toy_batch([8], [False]))
     assert past(module, toy_batch([5, 3], [False] * 2)) is None  # missed a batch, so they begin anew
 
 
-def test_sets_of_lanes_take_turns(module):
+def test_sets_of_streams_take_turns(module):
     module.run(toy_batch([1, 2], [True, True]))
     assert len(module.memories) == 2 and past(module, toy_batch([3, 5, 8], [False] * 3)) == [30, 50, 80]
     module.run(toy_batch([5, 3, 8], [False] * 3, number=1))
@@ -70,7 +70,7 @@ def test_the_output_uses_the_memory(module):
     assert torch.allclose(module.run(batch) - alone, torch.tensor([50.0, 0.0, 80.0]), atol=1e-4)
 
 
-def test_batches_without_lanes_are_refused(module):
+def test_batches_without_streams_are_refused(module):
     with pytest.raises(ValueError, match="FrameBatch.streams"):
         module.run(toy_batch(None, None))
 
@@ -89,7 +89,7 @@ def test_memory_ends_between_training_and_validation(module):
         assert not module.memories
 
 
-def test_state_is_restored_for_the_same_lanes(module, tmp_path):
+def test_state_is_restored_for_the_same_streams(module, tmp_path):
     module.means.update("loss/near", 0.1, 3)
     torch.save(module.rank_state(), tmp_path / "state")
     other = toy_module(seed=0).eval()

@@ -1,4 +1,4 @@
-"""W&B beside metrics.csv: what it is told, and that nothing it does stops, slows or empties a run."""
+"""W&B beside metrics.csv: what is sent to it, and that nothing it does stops, slows or empties a run."""
 
 import json
 import logging
@@ -86,10 +86,10 @@ def wandb(monkeypatch, folder):
 
 def test_runs_are_grouped_by_sweep_and_row(wandb, folder):
     start_wandb(settings(group="epsilon-mini", row="4.8 m"), folder, TREE, [])
-    told = wandb.arguments
-    assert (told["group"], told["job_type"], told["name"]) == ("epsilon-mini", "4.8 m", "4.8 m, seed 3")
-    assert told["id"] == folder.run_id and told["config"] is TREE and told["dir"] == str(folder.path)
-    assert told["tags"] == ["phase1", "debug", "seed 3"] and told["mode"] == "offline"
+    given = wandb.arguments
+    assert (given["group"], given["job_type"], given["name"]) == ("epsilon-mini", "4.8 m", "4.8 m, seed 3")
+    assert given["id"] == folder.run_id and given["config"] is TREE and given["dir"] == str(folder.path)
+    assert given["tags"] == ["phase1", "debug", "seed 3"] and given["mode"] == "offline"
     start_wandb(settings(), folder, TREE, [])
     assert wandb.arguments["name"] == folder.run_id and wandb.arguments["group"] is None
 
@@ -157,7 +157,7 @@ def test_a_wandb_that_dies_is_given_up_with_one_warning(wandb, folder, caplog):
     assert len(caplog.records) == 1 and "Connection lost" in caplog.text and str(folder.path) in caplog.text
 
 
-def test_a_run_that_goes_on_loses_nothing_and_sends_nothing_twice(wandb, folder):
+def test_a_resumed_run_loses_nothing_and_sends_nothing_twice(wandb, folder):
     """Online, the service has some steps already; the checkpoint may lie before them or behind."""
     rows = [{"step": str(step), "epoch": "0", "loss/total": str(step / 2)} for step in (9, 19, 29)]
     wandb.step = 20
@@ -204,14 +204,14 @@ from src.training.run_folder import RunFolder
 ours.INIT_LIMIT_S = 3.0
 folder = RunFolder(Path(sys.argv[1]), "run-0")
 folder.pictures.mkdir(parents=True, exist_ok=True)
-told = json.loads(sys.argv[2])
-config = ours.WandbConfig(project="p", offline=told["offline"], group="g", row="r")
-run = ours.start_wandb(config, folder, {"phase": {"name": "phase1"}, "scale": "debug", "seed": 0}, told["earlier"])
-for step in told["steps"]:
+given = json.loads(sys.argv[2])
+config = ours.WandbConfig(project="p", offline=given["offline"], group="g", row="r")
+run = ours.start_wandb(config, folder, {"phase": {"name": "phase1"}, "scale": "debug", "seed": 0}, given["earlier"])
+for step in given["steps"]:
     run.log_metrics({"loss/total": step / 2}, step)
-if told["killed"]:
+if given["killed"]:
     os.kill(os.getpid(), signal.SIGKILL)
-print(run.finish(told["scores"], folder.pictures))
+print(run.finish(given["scores"], folder.pictures))
 """
 
 
@@ -222,8 +222,8 @@ def apart(tmp_path):
 
 
 def start_real(tmp_path, environment=(), *, offline=True, earlier=(), steps=(), killed=False):
-    told = {"offline": offline, "earlier": list(earlier), "steps": list(steps), "killed": killed, "scores": SCORES}
-    command = [sys.executable, "-c", SCRIPT, str(tmp_path / "outputs"), json.dumps(told)]
+    given = {"offline": offline, "earlier": list(earlier), "steps": list(steps), "killed": killed, "scores": SCORES}
+    command = [sys.executable, "-c", SCRIPT, str(tmp_path / "outputs"), json.dumps(given)]
     surroundings = apart(tmp_path) | dict(environment)
     return subprocess.run(command, capture_output=True, text=True, timeout=180, env=surroundings, cwd=REPOSITORY)
 
@@ -252,7 +252,7 @@ def history_of(path):
 
 
 @pytest.mark.slow
-def test_a_killed_offline_run_goes_on_as_one(tmp_path):
+def test_a_killed_offline_run_resumes_as_one(tmp_path):
     pytest.importorskip("wandb")
     killed = start_real(tmp_path, steps=(9, 19), killed=True)
     assert killed.returncode == -signal.SIGKILL, killed.stderr

@@ -8,7 +8,6 @@ from src.world.labels import FrameTruth, count_inside, visibility_level
 from src.world.road import LANE_M, make_road
 from src.world.shapes import build_mesh
 from src.world.simulate import make_scene
-from src.world.table_rows import quaternions
 from src.world.traffic import STEP_S, Vehicle, simulate_traffic
 from src.world.world_config import WorldConfig
 
@@ -120,18 +119,6 @@ def test_visibility_levels(seen, level):
 
 def test_places_outside_every_image_have_no_visibility():
     assert visibility_level(0, 0) is None
-
-
-def test_quaternions_turn_vectors_as_their_matrices_do():
-    rng = np.random.default_rng(0)
-    turns, _ = np.linalg.qr(rng.standard_normal((50, 3, 3)))
-    turns *= np.sign(np.linalg.det(turns))[:, None, None]
-    turns = np.concatenate([turns, [np.eye(3), np.diag([1.0, -1, -1]), np.diag([-1.0, -1, 1]), np.diag([-1.0, 1, -1])]])
-    for (w, *axis), turn in zip(quaternions(turns), turns, strict=True):
-        vector = rng.standard_normal(3)
-        cross = np.cross(axis, vector)
-        np.testing.assert_allclose(vector + 2 * w * cross + 2 * np.cross(axis, cross), turn @ vector, atol=1e-9)
-        assert w >= 0
 
 
 @pytest.mark.parametrize(

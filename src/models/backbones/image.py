@@ -1,4 +1,4 @@
-"""Image encoder: backbone and neck, raw camera bytes in, a feature pyramid out (spec section 3)."""
+"""Image encoder: backbone and neck, raw camera bytes in, a feature pyramid out (method 3)."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class ImageEncoderConfig:
 class FPN(nn.Module):
     """Feature pyramid at strides 8, 16 and 32: 1x1 laterals, nearest upsampling, 3x3 output convolutions, no norm.
 
-    Of `strides` fewer, ascending, may be asked for; what no wanted level needs is not built.
+    `strides` may list fewer, in ascending order; laterals that no output level needs are not built.
     """
 
     offered = (8, 16, 32)
@@ -129,10 +129,10 @@ class SecondFPN16(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """Backbone and neck over all cameras of all samples (spec section 3).
+    """Backbone and neck over all cameras of all samples (method 3).
 
     Feature row r of a level with stride s covers pixel rows r * s to (r + 1) * s of the input image, whether or not
-    padding is trimmed. `strides` and `channels` describe the output, all levels of the neck unless fewer are asked for;
+    padding is trimmed. `strides` and `channels` describe the output, by default all levels of the neck;
     `lr_multiplier` is meant for the parameters of `backbone`. Loads `config.weights` when given: raises CheckpointError
     for a file that does not fit, and ConfigError for a stride that the neck does not offer.
     """
@@ -187,7 +187,7 @@ class ImageEncoder(nn.Module):
 
 
 def build_backbone(config: ImageEncoderConfig) -> ResNet | VoVNet99:
-    """The network that `config.name` stands for, from scratch."""
+    """The backbone named by `config.name`, from scratch."""
     if config.name is BackboneName.vovnet99:
         return VoVNet99()
     if config.name is BackboneName.resnet50:
@@ -201,7 +201,7 @@ def count_black_rows(
     """Rows on top that are black in every view, as a whole number of stride-32 rows; at least one of those is kept.
 
     640 x 960 holds 183 padded rows at the test-time resize of a 1980 x 943 camera: 160 are skipped, 480 x 960 remain.
-    Training resizes move that edge, hence the look at the images themselves; a batch keeps what its fullest view needs.
+    Training resizes move that edge, so it is read off the images; a batch keeps what its fullest view needs.
     """
     height = views.shape[2]
     lit = views.amax(dim=(0, 1, 3)).nonzero()[:, 0]  # rows with any light

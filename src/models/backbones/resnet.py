@@ -66,7 +66,7 @@ def _projection(in_channels: int, out_channels: int, stride: int) -> nn.Module:
 
 
 class ResNet(nn.Module):
-    """Four stages at strides 4, 8, 16 and 32 behind a 7x7 stem; no classifier (spec section 3).
+    """Four stages at strides 4, 8, 16 and 32 behind a 7x7 stem; no classifier (method 3).
 
     `widths` and `blocks` state the inner width and the number of blocks of each stage; ResNet-50 is
     `ResNet(Bottleneck, [64, 128, 256, 512], [3, 4, 6, 3])`.

@@ -20,7 +20,7 @@ from src.ops.sites import Sites
 from src.ops.voxelize import voxelize
 from src.structures.sparse_bev import SparseBEV, SparseMap
 
-# x, y, z (m), rcs (dB), vx, vy (m/s), dt (s) divided by these (spec section 1.3)
+# x, y, z (m), rcs (dB), vx, vy (m/s), dt (s) divided by these (method 1.3)
 POINT_SCALES = (150.0, 150.0, 5.0, 20.0, 20.0, 20.0, 0.5)
 BACKBONE_NORM_EPS = 1e-3
 SHARED_NORM = {"eps": 1e-5, "momentum": 0.1}  # the public code leaves torch's defaults here
@@ -206,7 +206,7 @@ class RadarEncoder(VoxelEncoder):
 
 
 def _stage(in_channels: int | None, channels: int, blocks: int, ndim: int, norm: dict[str, float]) -> nn.Sequential:
-    """Residual blocks, behind a convolution of stride 2 unless the stage is the first (`in_channels` None)."""
+    """Residual blocks, after a convolution of stride 2 unless the stage is the first (`in_channels` None)."""
     layers: list[nn.Module] = []
     if in_channels is not None:
         conv = SparseConv(in_channels, channels, 3, ndim, bias=False, stride=2, padding=1)

@@ -1,4 +1,4 @@
-"""VoVNet V2-99-eSE, the image encoder of the FCOS3D and DD3D checkpoints (spec section 3)."""
+"""VoVNet V2-99-eSE, the image encoder of the FCOS3D and DD3D checkpoints (method 3)."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Stage(nn.Module):
 class VoVNet99(nn.Module):
     """V2-99-eSE: stages at strides 4, 8, 16 and 32; its input is BGR with Caffe statistics.
 
-    Batch norm always uses its running statistics, also in training; scale and shift are learned (spec section 3).
+    Batch norm always uses its running statistics, also in training; scale and shift are learned (method 3).
     """
 
     def __init__(self) -> None:

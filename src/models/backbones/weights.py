@@ -1,4 +1,4 @@
-"""Pretrained image backbones: published files into our modules, completely or not at all (spec section 3)."""
+"""Pretrained image backbones: published files loaded into our modules, completely or not at all (method 3)."""
 
 from __future__ import annotations
 
@@ -108,9 +108,9 @@ def _is_sound(value: Tensor) -> bool:
 
 
 def _checked_file(path: Path) -> Path | io.BytesIO:
-    """What to load from. Raises ValueError for an archive with damage that torch reads over, or larger than its file.
+    """What to load from. Raises ValueError for an archive with damage that torch would ignore, or larger than its file.
 
-    A file of the older format is read as a whole: torch would ask a file for as many bytes as a damaged length says.
+    A file of the older format is read as a whole: torch would read as many bytes as a damaged length says.
     """
     if not zipfile.is_zipfile(path):
         return io.BytesIO(path.read_bytes())

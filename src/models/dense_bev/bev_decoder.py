@@ -1,4 +1,4 @@
-"""The dense BEV trunk: fusion of the two maps, residual stages, and a neck back to full resolution (spec 13)."""
+"""The dense BEV trunk: fusion of the two maps, residual stages, and a neck back to full resolution (method 13)."""
 
 from __future__ import annotations
 

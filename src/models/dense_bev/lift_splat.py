@@ -1,4 +1,4 @@
-"""Lift-splat: pixels spread along their rays by a predicted depth, summed into BEV cells (specification 13)."""
+"""Lift-splat: pixels spread along their rays by a predicted depth, summed into BEV cells (method 13)."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ class LiftedViews:
 
     bev: Tensor  # [B, C, rows, cols] float32, channels last
     depth_logits: Tensor  # [B, N, D, h, w], softmax over D gives the depth distribution
-    num_lifted: int  # (pixel, bin) pairs that met a cell, of all samples
+    num_lifted: int  # (pixel, bin) pairs that fell into a cell, of all samples
 
 
 class LiftSplat(nn.Module):
-    """Depth distribution times context features of every pixel, pooled into cells as one weighted segment.
+    """Depth distribution times context features of every pixel, pooled into cells by one weighted segment sum.
 
-    The frustum tensor [N, D, C, h, w] of the published formulation is never made: a cell is the sum over its
-    (pixel, bin) pairs, weights the probabilities, values the rows of the pixels.
+    The frustum tensor [N, D, C, h, w] of the published formulation is never built: a cell sums its (pixel, bin) pairs,
+    the pixels' context features weighted by the bins' probabilities.
     """
 
     def __init__(self, config: LiftSplatConfig, in_channels: int, grid: BEVGrid) -> None:
@@ -115,15 +115,15 @@ class LiftSplat(nn.Module):
         points: Tensor,  # [B, N, h, w, D, 3] aug metres
         valid: Tensor,  # [B, N] bool
     ) -> tuple[Tensor, Tensor, Tensor]:  # [pairs] int64 each
-        """(pixel, bin) pairs that meet a cell as pixel * D + bin, in the order of cells; the linear key of each one's
-        cell, ascending; and where in this order the pairs lie when they are taken pixel by pixel.
+        """(pixel, bin) pairs that fall into a cell as pixel * D + bin, in the order of cells; the linear key of each
+        pair's cell, ascending; and where in this order the pairs lie when they are taken pixel by pixel.
         """
         low, high = self.config.z_range_m
         inside = self.grid.contains(points[..., :2]) & (points[..., 2] >= low) & (points[..., 2] < high)
         inside &= valid[:, :, None, None, None]
-        met = inside.flatten().nonzero().squeeze(1)  # a GPU waits here
-        cell = self.grid.cell_of(points.view(-1, 3).index_select(0, met)[:, :2])
-        sample = torch.div(met, points[0].numel() // 3, rounding_mode="floor")
+        hits = inside.flatten().nonzero().squeeze(1)  # synchronises a GPU
+        cell = self.grid.cell_of(points.view(-1, 3).index_select(0, hits)[:, :2])
+        sample = torch.div(hits, points[0].numel() // 3, rounding_mode="floor")
         keys = (sample * self.grid.rows + cell[:, 0]) * self.grid.cols + cell[:, 1]
         keys, order = torch.sort(keys, stable=True)
-        return met[order], keys, inverse_rows(order, len(order))
+        return hits[order], keys, inverse_rows(order, len(order))

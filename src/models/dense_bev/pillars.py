@@ -1,4 +1,4 @@
-"""Radar points to a dense BEV map: pillars of one cell, encoded point by point (PointPillars; specification 13)."""
+"""Radar points to a dense BEV map: pillars of one cell, encoded point by point (PointPillars; method 13)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EXTRA_FEATURES = 6
 class PillarConfig:
     """Settings of the radar encoder (`model.radar_encoder`). Raises ConfigError for values that cannot work."""
 
-    channels: int  # width of the map; the layers before the last are half as wide and see their pillar's maximum
+    channels: int  # width of the map; the layers before the last are half as wide and append their pillar's maximum
     num_layers: int  # of the point network
 
     def __post_init__(self) -> None:
@@ -36,7 +36,7 @@ class PillarConfig:
 class PillarEncoder(nn.Module):
     """Radar points to a map of `config.channels` over the whole grid, zero where no point fell.
 
-    Runs in float32 whatever autocast says: it is small, and its inputs are positions.
+    Runs in float32 also under autocast: it is small, and its inputs are positions.
     """
 
     full_precision_parts = ("",)

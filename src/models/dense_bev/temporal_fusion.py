@@ -1,7 +1,8 @@
-"""Memory of whole BEV maps: past maps moved by ego motion, joined with the current one (BEVDet4D; spec 13)."""
+"""Memory of whole BEV maps: past maps warped by ego motion, fused with the current one (BEVDet4D; method 13)."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -14,10 +15,11 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.layers.dense import DenseConvNormReLU
 from src.models.memory import FrameMemory, Motion, RememberedFrame
+from src.ops.concat_conv import concat_conv2d
 from src.structures.batch import FrameBatch
 
 STORED = torch.bfloat16
-"""Type of remembered maps: half the room, and 0.4 % is far below what normalised features tell apart."""
+"""Type of remembered maps: half the memory, and 0.4 % is far below what normalised features resolve."""
 
 
 @dataclass(kw_only=True)
@@ -40,8 +42,8 @@ class TemporalConfig:
 class MapFrame(RememberedFrame):
     """The fused map of one key frame of each of B streams, detached.
 
-    Its cells are those of the frame's own augmented ego frame, and `aug_from_ego` says how to find a point of the ego
-    frame in them: a map is resampled once, from there to the present.
+    Its cells lie in the frame's own augmented ego frame, to which `aug_from_ego` leads from the ego frame: a map is
+    resampled once, from there to the current frame.
     """
 
     aug_from_ego: Tensor  # [B, 4, 4] float32, A of its own time
@@ -78,24 +80,24 @@ class MapMemory(FrameMemory[MapFrame]):
 
 @dataclass
 class WarpedMaps:
-    """Past maps and their way to the current augmented frame, newest first; not yet moved there."""
+    """Past maps and their motion to the current augmented frame, newest first; `TemporalFusion.maps` resamples them."""
 
-    frames: tuple[MapFrame, ...]  # as many as are remembered
+    frames: tuple[MapFrame, ...]  # at most as many as configured
     motions: list[Motion]
     usable: Tensor  # [frames of the configuration, B] bool
 
 
 class TemporalFusion(nn.Module):
-    """Past maps, aligned by ego motion and stacked behind the current one, change it by two convolutions.
+    """Past maps, aligned by ego motion and concatenated with the current one, change it by two convolutions.
 
-    Moving objects stay where they were then: telling their motion is left to the convolutions, as in BEVDet4D.
+    Moving objects stay where they were: their motion is left to the convolutions, as in BEVDet4D.
     """
 
     norm_pairs = (("refine", "norm"),)
 
     def __init__(self, config: TemporalConfig, channels: int, grid: BEVGrid) -> None:
         super().__init__()
-        self.config, self.grid, self.channels = config, grid, channels
+        self.config, self.grid = config, grid
         self.reduce = DenseConvNormReLU((config.num_frames + 1) * channels, channels, 1)
         self.refine = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
         self.norm = nn.BatchNorm2d(channels)
@@ -105,7 +107,7 @@ class TemporalFusion(nn.Module):
 
     @torch.no_grad()
     def recall(self, memory: MapMemory | None, batch: FrameBatch) -> WarpedMaps:
-        """Find every remembered map's way to the batch's time and augmented frame."""
+        """The remembered maps with their motion to the batch's time and augmented frame."""
         frames = memory.before(batch).frames[: self.config.num_frames] if memory is not None else ()
         motions = [frame.motion(batch, self.config.max_age_s) for frame in frames]
         usable = torch.zeros(self.config.num_frames, len(batch), dtype=torch.bool, device=batch.device)
@@ -114,7 +116,7 @@ class TemporalFusion(nn.Module):
         return WarpedMaps(frames, motions, usable)
 
     def maps(self, warped_maps: WarpedMaps) -> Iterator[Tensor]:  # of [B, C, rows, cols] float32
-        """Past maps as they look in the current augmented frame, newest first; zero where nothing is known."""
+        """Past maps resampled into the current augmented frame, newest first; zero where nothing is known."""
         for frame, motion in zip(warped_maps.frames, warped_maps.motions, strict=True):
             yield self.align(frame, motion.aug_from_past, motion.usable)
 
@@ -125,16 +127,16 @@ class TemporalFusion(nn.Module):
         aug_from_past: Tensor,  # [B, 4, 4] float32, from the ego frame of the past
         usable: Tensor,  # [B] bool
     ) -> Tensor:  # [B, C, rows, cols] float32, channels last
-        """The map as the present sees it: bilinear samples at the places where today's cells were, zero outside."""
+        """The map in the current frame: bilinear samples where the current cells were then, zero outside."""
         with torch.autocast(aug_from_past.device.type, enabled=False):
             past_from_aug = torch.linalg.inv_ex(aug_from_past.double())[0]
             then_from_now = (frame.aug_from_ego.double() @ past_from_aug).float()  # augmented frame to augmented frame
-            turn, shift = then_from_now[:, None, None, :2, :2], then_from_now[:, None, None, :2, 3]
-            xy = turn[..., 0] * self.centres_m[..., :1] + turn[..., 1] * self.centres_m[..., 1:] + shift
+            rotation, translation = then_from_now[:, None, None, :2, :2], then_from_now[:, None, None, :2, 3]
+            xy = rotation[..., 0] * self.centres_m[..., :1] + rotation[..., 1] * self.centres_m[..., 1:] + translation
             size = xy.new_tensor([self.grid.cols, self.grid.rows])
-            places = self.grid.to_cells(xy) * (2 / size) - 1  # [B, rows, cols, 2], edges of the map at -1 and 1
+            samples = self.grid.to_cells(xy) * (2 / size) - 1  # [B, rows, cols, 2], edges of the map at -1 and 1
             maps = frame.cells.permute(0, 3, 1, 2).float()
-            aligned = F.grid_sample(maps, places, mode="bilinear", padding_mode="zeros", align_corners=False)
+            aligned = F.grid_sample(maps, samples, mode="bilinear", padding_mode="zeros", align_corners=False)
             return torch.where(usable[:, None, None, None], aligned, 0.0)
 
     def aggregate(
@@ -142,16 +144,10 @@ class TemporalFusion(nn.Module):
         fused: Tensor,  # [B, C, rows, cols]
         warped_maps: WarpedMaps,
     ) -> Tensor:  # [B, C, rows, cols]
-        """The current map, changed by what is remembered.
-
-        `reduce` of all maps side by side is the sum of its slices of the single maps: no stack of them is ever held,
-        and a map that is not remembered, zero, costs nothing.
-        """
-        current, *slices = self.reduce.conv.weight.split(self.channels, dim=1)
-        total = F.conv2d(fused, current, self.reduce.conv.bias)
-        for past, weight in zip(self.maps(warped_maps), slices, strict=False):  # younger clips remember fewer
-            total = total + F.conv2d(past.to(fused.dtype), weight)
-        return fused + self.norm(self.refine(F.relu(self.reduce.norm(total))))
+        """F + norm(refine(reduce([F, M_1, ..., M_T]))): the current map F, changed by the warped past maps M."""
+        maps = itertools.chain([fused], self.maps(warped_maps))  # younger clips remember fewer, the others are zero
+        x = concat_conv2d(maps, self.reduce.conv.weight, self.reduce.conv.bias)  # of torch.cat(maps, dim=1)
+        return fused + self.norm(self.refine(F.relu(self.reduce.norm(x))))
 
     @torch.no_grad()
     def remember(

@@ -20,7 +20,8 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from src.losses.normalizers import full_precision
 from src.models.detector import Detector
-from src.models.heads.center_head import Branches, CenterHead
+from src.models.heads.branches import Branches
+from src.models.heads.center_head import CenterHead
 from src.models.layers.merging import block_diagonal, joined_linear
 from src.models.layers.sparse import SparseKernel
 

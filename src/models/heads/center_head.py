@@ -1,8 +1,7 @@
-"""The sparse CenterPoint head: heat maps and box codes on active cells, its loss and its decoding (spec section 7)."""
+"""The sparse CenterPoint head: heat maps and box codes on active cells, its loss and its decoding (method 7)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -16,6 +15,7 @@ from src.losses.classification import penalty_reduced_focal
 from src.losses.normalizers import full_precision, mean_over_ranks
 from src.losses.regression import masked_l1
 from src.models.detector import Objective
+from src.models.heads.branches import Branches, checkpointed_branches
 from src.models.heads.decode import (
     AttributeSource,
     Suppression,
@@ -27,8 +27,7 @@ from src.models.heads.decode import (
     top_candidates,
 )
 from src.models.layers.dense import AllCells, DenseConvNormReLU
-from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv
-from src.ops.checkpointed_mlp import checkpointed_mlp
+from src.models.layers.sparse import ConvNormReLU, SubmanifoldConv
 from src.ops.nms import maxpool_peaks
 from src.structures.boxes import Boxes3D
 from src.structures.sparse_bev import SparseBEV
@@ -61,7 +60,7 @@ class TrainRegression(Enum):
 class HeadConfig:
     """Settings of the head (`model.head`). Raises ConfigError for impossible values."""
 
-    nms: Suppression  # per_group: the table of section 7
+    nms: Suppression  # per_group: the table of method 7
     score_threshold: float  # boxes at or below are dropped
     max_boxes: int  # per sample, best scores
     attributes: AttributeSource
@@ -98,72 +97,10 @@ class HeadOutput:
     codes: Tensor | None  # [M, 7, CODE_SIZE (+ 11 attributes)] in training with `all`, else evaluated where needed
 
 
-class Branches(nn.Module):
-    """Branches of two kernel-1 layers with the same input, their hidden layers evaluated as one."""
-
-    norm_pairs = (("hidden", "norm"),)
-
-    def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
-        super().__init__()
-        self.hidden = nn.Linear(channels, len(widths) * channels, bias=False)
-        self.norm = RowNorm(len(widths) * channels)
-        self.outputs = nn.ModuleList(nn.Linear(channels, width) for width in widths)
-
-    def forward(
-        self,
-        x: Tensor,  # [n, C]
-    ) -> Tensor:  # [n, sum of widths] float32
-        """Outputs of all branches side by side."""
-        return evaluate_branches([self], x)
-
-
-def evaluate_branches(
-    parts: Sequence[Branches],
-    x: Tensor,  # [n, C]
-) -> Tensor:  # [n, sum of all widths] float32
-    """Outputs of several sets of branches side by side, as one network of two layers.
-
-    A batch norm behind a linear layer is a linear layer once its statistics are known, and those of every hidden
-    channel follow from mean and covariance of the input: no hidden layer is ever stored, normalised or read again.
-    """
-    with torch.autocast(x.device.type, enabled=False):
-        weight = torch.cat([part.hidden.weight for part in parts])  # [H, C]
-        mean, variance = _hidden_statistics(parts, x, weight)
-        scale = torch.cat([part.norm.weight for part in parts]) * (variance + parts[0].norm.eps).rsqrt()
-        shift = torch.cat([part.norm.bias for part in parts]) - mean * scale
-        outputs = [output for part in parts for output in part.outputs]
-        out_weight, out_bias = torch.block_diag(*(out.weight for out in outputs)), torch.cat([o.bias for o in outputs])
-    return full_precision(checkpointed_mlp(x, (weight * scale[:, None]).t(), shift, out_weight.t(), out_bias))
-
-
-def _hidden_statistics(
-    parts: Sequence[Branches],
-    x: Tensor,  # [n, C]
-    weight: Tensor,  # [H, C]
-) -> tuple[Tensor, Tensor]:  # [H], [H]
-    """Mean and variance that the norms divide by: the batch's in training, where the running ones learn from them."""
-    if not parts[0].training or len(x) < 2:
-        return torch.cat([p.norm.running_mean for p in parts]), torch.cat([p.norm.running_var for p in parts])
-    x = full_precision(x)
-    centre = x.mean(0)
-    x = x - centre
-    covariance = x.t() @ x / len(x)  # [C, C]
-    mean, variance = weight @ centre, (weight @ covariance * weight).sum(1).clamp(min=0)
-    with torch.no_grad():
-        widths = [len(part.norm.running_mean) for part in parts]
-        unbiased = variance * (len(x) / (len(x) - 1))
-        for part, its_mean, its_variance in zip(parts, mean.split(widths), unbiased.split(widths), strict=True):
-            part.norm.running_mean.lerp_(its_mean, part.norm.momentum)
-            part.norm.running_var.lerp_(its_variance, part.norm.momentum)
-            part.norm.num_batches_tracked.add_(1)
-    return mean, variance
-
-
 class CenterHead(nn.Module):
     """CenterPoint head on sparse cells (VoxelNeXt's nuScenes head, seven groups); 0.86 M parameters at C = 128.
 
-    With `dense` it reads a whole map [B, C, rows, cols] and every cell is a site; all behind the shared convolution is
-    the same.
+    With `dense` it reads a whole map [B, C, rows, cols] and every cell is a site; the rest is the same.
     """
 
     def __init__(
@@ -192,13 +129,13 @@ class CenterHead(nn.Module):
         """Heat maps of all cells; box codes only where training needs them everywhere."""
         bev = self.shared(bev)
         if isinstance(self.heatmaps[0], Branches):
-            logits = evaluate_branches(list(self.heatmaps), bev.features)
+            logits = checkpointed_branches(list(self.heatmaps), bev.features)
         else:  # prepared for inference
             logits = self.heatmaps[0](bev.features)
         logits = logits[:, self.class_columns]
         codes = None
         if self.training and self.config.train_regression is TrainRegression.all:
-            codes = torch.stack([branches(bev.features) for branches in self.regressions], dim=1)
+            codes = torch.stack([checkpointed_branches([part], bev.features) for part in self.regressions], dim=1)
         return HeadOutput(bev, logits, codes)
 
     def regress(
@@ -226,18 +163,18 @@ class CenterHead(nn.Module):
     ) -> Tensor:  # [n, CODE_SIZE (+ 11)]
         features = output.bev.features
         step = max(1, len(features) // SAMPLED_CELLS)
-        spread = features[::step] if self.training else features[:0]
+        sampled = features[::step] if self.training else features[:0]
         codes = []
-        for branches, mine in zip(self.regressions, rows.split(counts), strict=True):
-            chosen = torch.cat([features[mine], spread])
+        for branches, own in zip(self.regressions, rows.split(counts), strict=True):
+            chosen = torch.cat([features[own], sampled])
             if not torch.is_autocast_enabled(chosen.device.type):
                 chosen = chosen.to(branches.hidden.weight.dtype)
             if len(chosen) or self.training or len(rows) == 0:  # otherwise a group without cells costs nothing
-                codes.append(branches(chosen)[: len(mine)])
+                codes.append(branches(chosen)[: len(own)])
         return torch.cat(codes)
 
     def targets(self, output: HeadOutput, boxes: list[Boxes3D]) -> HeadTargets:
-        """What the head should predict on its cells, with the counts of objects that cannot be met."""
+        """What the head should predict on its cells, with the counts of objects that it cannot represent."""
         return head_targets(boxes, output.bev.sites, self.grid)
 
     def loss(
@@ -252,7 +189,7 @@ class CenterHead(nn.Module):
         Diagnostics are the objects per frame: those the head learns, those without a cell near enough, and those that
         share their cell with another of their group, so that the head cannot meet both.
 
-        Focal loss per group over its positive cells, L1 per group over its objects (section 8.1). Without objects the
+        Focal loss per group over its positive cells, L1 per group over its objects (method 8.1). Without objects the
         box term is 0 with zero gradients.
         """
         targets = self.targets(output, boxes)
@@ -266,20 +203,20 @@ class CenterHead(nn.Module):
             for name, count in counts.items()
         }
         group_of_class = targets.labels.new_tensor(GROUP_OF_CLASS)
-        none = output.logits.new_zeros(len(HEAD_GROUPS))
+        zeros = output.logits.new_zeros(len(HEAD_GROUPS))
         terms: dict[str, Tensor] = {}
         if heatmap_weight is not None:
             focal = penalty_reduced_focal(output.logits, targets.heatmap).sum(0)  # [12]
-            positives = (targets.heatmap == 1).sum(0).to(none.dtype)
-            normalizer = mean_over_ranks(none.index_add(0, group_of_class, positives))
-            terms["heatmap"] = heatmap_weight * (none.index_add(0, group_of_class, focal) / normalizer).sum()
+            positives = (targets.heatmap == 1).sum(0).to(zeros.dtype)
+            normalizer = mean_over_ranks(zeros.index_add(0, group_of_class, positives))
+            terms["heatmap"] = heatmap_weight * (zeros.index_add(0, group_of_class, focal) / normalizer).sum()
         if box_weight is None and not self.learned:
             return Objective(terms, diagnostics)
         predicted = self.regress(output, targets.rows, targets.groups)
         if box_weight is not None:
-            errors = masked_l1(predicted[:, :CODE_SIZE], targets.codes) * none.new_tensor(self.code_weights)
+            errors = masked_l1(predicted[:, :CODE_SIZE], targets.codes) * zeros.new_tensor(self.code_weights)
             objects = torch.bincount(targets.groups, minlength=len(HEAD_GROUPS))
-            sums = none.index_add(0, targets.groups, errors.sum(1))
+            sums = zeros.index_add(0, targets.groups, errors.sum(1))
             terms["box"] = box_weight * (sums / mean_over_ranks(objects)).sum()
         if self.learned:
             terms["attribute"] = ATTRIBUTE_WEIGHT * _attribute_loss(predicted[:, CODE_SIZE:], targets)

@@ -1,4 +1,4 @@
-"""From head predictions to boxes: candidates, box codes, suppression, attributes, limits (spec section 7)."""
+"""From head predictions to boxes: candidates, box codes, suppression, attributes, limits (method 7)."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def top_candidates(
 ) -> Candidates:
     """Per group and sample the `limit` best scores above the threshold, in descending order, ties by cell and class.
 
-    A GPU is waited for once.
+    Synchronises with a GPU once.
     """
     columns, groups = constant((GROUP_COLUMNS, COLUMN_GROUPS), torch.int64, scores.device)  # [12] each, by group
     passing = scores.index_select(1, columns) > threshold
@@ -100,9 +100,9 @@ def top_candidates(
         by_column = columns.new_zeros(batch_size, len(columns)).index_add(0, samples, passing.long())
     found = columns.new_zeros(len(HEAD_GROUPS), batch_size).index_add(0, groups, by_column.t()).tolist()
 
-    places = torch.nonzero_static(passing.flatten(), size=sum(map(sum, found))).squeeze(1)
-    rows = torch.div(places, len(columns), rounding_mode="floor")
-    column = places - rows * len(columns)
+    hits = torch.nonzero_static(passing.flatten(), size=sum(map(sum, found))).squeeze(1)
+    rows = torch.div(hits, len(columns), rounding_mode="floor")
+    column = hits - rows * len(columns)
     labels = columns[column]
     best = scores[rows, labels]
     order = best.argsort(descending=True, stable=True)
@@ -143,7 +143,7 @@ def suppress(
     method: Suppression,
     max_boxes: int,
 ) -> list[Boxes3D]:  # one of each sample, best first
-    """Thin out overlapping boxes of a group, whatever their classes, and keep the best MAX_BOXES_PER_GROUP of them.
+    """Thin out overlapping boxes of a group, of any class, and keep the best MAX_BOXES_PER_GROUP of them.
 
     Then drop those beyond their class's evaluation range (xy distance to the ego origin) and keep the `max_boxes` best
     of a sample. `maxpool` has thinned the cells before and only applies the limits.
@@ -158,7 +158,7 @@ def suppress(
     ranges = constant(RANGES_M, boxes.centers.dtype, boxes.centers.device)
     near = boxes.centers[:, :2].norm(dim=1) < ranges[boxes.labels]
 
-    # One transfer of all that the choice depends on, since a GPU is waited for; float64 holds every value of it.
+    # One transfer of all that the choice depends on, since each synchronises a GPU; float64 holds every value exactly.
     parts = (better, worse, near, boxes.scores)
     values = torch.cat([part.double() for part in parts]).cpu().split([len(part) for part in parts])
     better, worse = values[0].long().tolist(), values[1].long().tolist()
@@ -166,11 +166,11 @@ def suppress(
     survivors = iter(greedy_survivors(better, worse, len(boxes)))
     row, chosen = next(survivors, None), [[] for _ in counts[0]]
     for block, end in enumerate(itertools.accumulate(blocks)):
-        mine = []
+        kept = []
         while row is not None and row < end:
-            mine.append(row)
+            kept.append(row)
             row = next(survivors, None)
-        chosen[block % len(chosen)] += [row for row in mine[:MAX_BOXES_PER_GROUP] if near[row]]
+        chosen[block % len(chosen)] += [row for row in kept[:MAX_BOXES_PER_GROUP] if near[row]]
     best = [sorted(rows, key=lambda row: -scores[row])[:max_boxes] for rows in chosen]  # stable: ties by group
     return [boxes[torch.tensor(rows, dtype=torch.int64, device=boxes.labels.device)] for rows in best]
 
@@ -178,7 +178,7 @@ def suppress(
 def rule_attributes(
     boxes: Boxes3D,
 ) -> Tensor:  # [K] int64, -1 for none
-    """Attributes from the speed (table of section 7); signs are overhanging where their lower edge is above 3.5 m."""
+    """Attributes from the speed (table of method 7); signs are overhanging where their lower edge is above 3.5 m."""
     labels = boxes.labels
     moving, still = constant((MOVING_ATTRIBUTES, STILL_ATTRIBUTES), labels.dtype, labels.device)
     chosen = torch.where(boxes.velocities.norm(dim=1) > MOVING_MPS, moving[labels], still[labels])

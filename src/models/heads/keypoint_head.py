@@ -1,4 +1,4 @@
-"""Where objects are in the images and how deep: the camera heads of KGGI (specification 4.2)."""
+"""Camera heads of KGGI: where objects are in the images, and their depth (method 4.2)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class CameraKeypointHead(nn.Module):
         self,
         level: Tensor,  # [B, N, C_I, h, w] finest level of the image pyramid
     ) -> CameraMaps:
-        """Both maps, every view on its own."""
+        """Both maps, each view independently."""
         b, n = level.shape[:2]
         features = self.shared(level.flatten(0, 1))  # [B*N, C, h, w]
         return CameraMaps(

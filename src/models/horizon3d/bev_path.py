@@ -1,4 +1,4 @@
-"""BEV path of DPTF: remember occupied cells, move them to the present, aggregate over time (Eq. 7-8, Fig. 5; 6.1)."""
+"""BEV path of DPTF: remember occupied cells, warp them to the present, aggregate them (Eq. 7-8, Fig. 5; method 6.1)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from src.structures.batch import FrameBatch
 from src.structures.sparse_bev import SparseBEV, SparseMap
 
 OCCUPANCY_BIAS = -4.6
-"""An untrained cell is occupied with probability 0.01, well below the memory threshold (specification 6.1)."""
+"""An untrained cell is occupied with probability 0.01, well below the memory threshold (method 6.1)."""
 TIME_CHANNELS = 32
 VELOCITY_UNIT_MPS = 10.0
 """The velocity head is linear in this unit: its targets are ten times those of its neighbours, which one learning rate
@@ -38,7 +38,7 @@ class BEVPathConfig:
 
     num_frames: int  # remembered key frames
     memory_threshold: float  # tau_mem, occupancy from which a cell is remembered
-    max_cells_per_frame: int  # guard: the best cells of a frame
+    max_cells_per_frame: int  # guard: the most occupied cells of a frame
     velocity_compensation: bool  # move cells by their own velocity; off: by the ego motion alone (Table 6)
     spatial_dilation: bool  # literal strided convolutions, which spread every cell to its neighbours
 
@@ -57,7 +57,7 @@ class BEVPathConfig:
 
 @dataclass
 class CellPrediction:
-    """What the two heads say about the cells of F_fuse (Eq. 7)."""
+    """Predictions of the two heads for the cells of F_fuse (Eq. 7)."""
 
     occupancy_logits: Tensor  # [M] float32, delta before its sigmoid
     velocities: Tensor  # [M, 2] float32, u in m/s over ground, augmented axes
@@ -65,7 +65,7 @@ class CellPrediction:
 
 @dataclass
 class WarpedCells:
-    """Remembered cells at their place in the current augmented frame, inside the grid; several may share a cell."""
+    """Remembered cells at their position in the current augmented frame, inside the grid; several may share a cell."""
 
     indices: Tensor  # [n, 4] int64 (batch, slot, row, col), the oldest slot first, the current frame's last
     xy: Tensor  # [n, 2] m, before quantisation
@@ -88,7 +88,7 @@ class TemporalConv(SparseKernel):
 
 
 class BEVPath(nn.Module):
-    """Sparse memory of occupied BEV cells (specification 6.1)."""
+    """Sparse memory of occupied BEV cells (method 6.1)."""
 
     full_precision_parts = ("occupancy.1",)
 
@@ -106,7 +106,7 @@ class BEVPath(nn.Module):
             self.convs.append(TemporalConv(width, channels, config.spatial_dilation))
             self.norms.append(RowNorm(channels, **NORM))
             slots, width = (slots + 1) // 2, channels
-        # Untrained, the path adds exactly zero. A ReLU behind this norm would sit at 0 and never pass a gradient.
+        # Untrained, the path adds exactly zero. A ReLU after this norm would sit at 0 and never pass a gradient.
         nn.init.zeros_(self.norms[-1].weight)
 
     @property
@@ -142,18 +142,18 @@ class BEVPath(nn.Module):
     def store(self, fused: SparseBEV, cells: CellPrediction, batch: FrameBatch) -> StoredCells:
         """Cells above the memory threshold, detached, in the unaugmented ego frame."""
         score = cells.occupancy_logits.sigmoid()
-        worth = (score > self.config.memory_threshold).nonzero().squeeze(1)
-        indices = fused.indices[worth]
-        best = topk_per_sample(score[worth], indices[:, 0], len(batch), self.config.max_cells_per_frame).flatten()
-        best = best[best >= 0]  # sample by sample, so the owners ascend
-        worth, indices = worth[best], indices[best]
+        kept = (score > self.config.memory_threshold).nonzero().squeeze(1)
+        indices = fused.indices[kept]
+        best = topk_per_sample(score[kept], indices[:, 0], len(batch), self.config.max_cells_per_frame).flatten()
+        best = best[best >= 0]  # sample by sample, so their rows ascend
+        kept, indices = kept[best], indices[best]
         ego_from_aug = torch.linalg.inv_ex(batch.aug_from_ego).inverse[indices[:, 0]]  # [n, 4, 4]
-        features = fused.features.detach()[worth]
+        features = fused.features.detach()[kept]
         if torch.is_autocast_enabled(features.device.type):
             features = features.to(torch.get_autocast_dtype(features.device.type))
         return StoredCells(
             xy=transform_points_xy(ego_from_aug, self.grid.centre_of(indices[:, 1:])),
-            velocities=transform_vectors_xy(ego_from_aug, cells.velocities.detach()[worth]),
+            velocities=transform_vectors_xy(ego_from_aug, cells.velocities.detach()[kept]),
             features=features,
             rows=indices[:, 0],
         )
@@ -167,21 +167,21 @@ class BEVPath(nn.Module):
         ages = [age for age, frame in enumerate(memory.frames) if frame.cells is not None]
         if not ages:
             return None
-        # All frames at once: the work is small, its operations are many.
+        # All frames in one batch: launches cost more than the arithmetic.
         motion = motions([memory.frames[age] for age in ages], batch, max_age_s)
         cells = [memory.frames[age].cells for age in ages]
         slots = [
             torch.full_like(past.rows, self.config.num_frames - 1 - age) for age, past in zip(ages, cells, strict=True)
         ]
-        way = torch.cat([number * len(batch) + past.rows for number, past in enumerate(cells)])  # [n] row in [T * B]
-        matrix, elapsed = motion.aug_from_past.flatten(0, 1)[way], motion.elapsed_s.flatten()[way]
+        frame = torch.cat([number * len(batch) + past.rows for number, past in enumerate(cells)])  # [n] row in [T * B]
+        matrix, elapsed = motion.aug_from_past.flatten(0, 1)[frame], motion.elapsed_s.flatten()[frame]
         xy, velocities, features, rows = (
             torch.cat([getattr(past, name) for past in cells]) for name in ("xy", "velocities", "features", "rows")
         )
         if self.config.velocity_compensation:
             xy = xy + velocities * elapsed[:, None]
         xy = transform_points_xy(matrix, xy)
-        kept = (motion.usable.flatten()[way] & self.grid.contains(xy)).nonzero().squeeze(1)
+        kept = (motion.usable.flatten()[frame] & self.grid.contains(xy)).nonzero().squeeze(1)
         indices = torch.cat([rows[:, None], torch.cat(slots)[:, None], self.grid.cell_of(xy)], dim=1)
         values = (indices, xy, transform_vectors_xy(matrix, velocities), elapsed, features)
         return WarpedCells(*(value[kept] for value in values))
@@ -193,7 +193,7 @@ class BEVPath(nn.Module):
         cell = fused.indices
         now = torch.full_like(cell[:, :1], self.config.num_frames)
         indices = torch.cat([cell[:, :1], now, cell[:, 1:]], dim=1)
-        # Every slot of a sample has one age, 0 where nobody reads it: embedded once and looked up.
+        # All cells of a slot have one age: embed it once per (sample, slot) and look it up; unused slots hold 0.
         ages, features = self.time.mlp[0].bias.new_zeros(b * self.num_slots), fused.features
         if warped is not None:
             ages[warped.indices[:, 0] * self.num_slots + warped.indices[:, 1]] = warped.elapsed_s
@@ -207,7 +207,7 @@ class BEVPath(nn.Module):
             x = conv(x)
             y = norm(x.features)
             x = x.with_features(y if number == len(self.convs) - 1 else F.relu(y))
-        if len(x.sites) == len(fused.sites):  # nothing but the current cells: keep their kernel maps
+        if len(x.sites) == len(fused.sites):  # only the current cells: keep their kernel maps
             return fused.with_features(fused.features + x.features)
         sites = Sites.from_linear(x.sites.linear(), (b, rows, cols))
         spread = fused.features.new_zeros(x.features.shape).index_copy(0, sites.rows_of(cell), fused.features)

@@ -1,4 +1,4 @@
-"""Deformable attention from Gaussians to the sparse radar map and to the images (Eq. 2, specification 5.2-5.3)."""
+"""Deformable attention from Gaussians to the sparse radar map and to the images (Eq. 2, method 5.2-5.3)."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class ImageCrossAttention(nn.Module):
         weights = self._weights(query, views.pix_from_aug, visible)
         gathered = deform_attend_images(values, pixels, views.image_size_px, weights, visible)
         if not gathered.requires_grad:
-            # Nothing visible at all: zero gradients rather than none, which DDP expects on every rank.
+            # Nothing visible: zero gradients rather than none, since DDP expects one per parameter on every rank.
             gathered = gathered + 0.0 * (weights.sum() + pixels.sum() + sum(level.float().sum() for level in values))
         return self.output(gathered.to(values[0].dtype))
 

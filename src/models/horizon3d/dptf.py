@@ -1,4 +1,4 @@
-"""DPTF, dual-path temporal fusion: a memory of BEV cells and one of Gaussians (Sec. 3.3; specification 6)."""
+"""DPTF, dual-path temporal fusion: a memory of BEV cells and one of Gaussians (Sec. 3.3; method 6)."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class DPTFConfig:
 
 @dataclass
 class WarpedMemory:
-    """The memory as it looks in the current frame."""
+    """The memory warped into the current frame."""
 
     past: Memory  # less what is not in the frame's past (`Memory.before`)
     history: GaussianSet | None  # None: nothing remembered, or the path is off

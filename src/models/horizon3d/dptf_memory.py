@@ -1,4 +1,4 @@
-"""What phase 2 remembers of past key frames, stream by stream: cells and Gaussians (specification 6)."""
+"""What phase 2 remembers of past key frames, stream by stream: cells and Gaussians (method 6)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from src.structures.gaussians import GaussianSet
 
 @dataclass
 class StoredCells:
-    """BEV cells worth remembering of one key frame of every stream: rows of all streams, one after the other."""
+    """Remembered BEV cells of one key frame of every stream: rows of all streams, one after the other."""
 
     xy: Tensor  # [n, 2] m, cell centres in the ego frame of their own time
     velocities: Tensor  # [n, 2] m/s over ground, same axes
@@ -68,7 +68,7 @@ class Memory(FrameMemory[MemoryFrame]):
     """The last key frames of each of B streams, newest first. A value: pushing makes a new one."""
 
     def push(self, frame: MemoryFrame, num_cell_frames: int, num_gaussian_frames: int) -> Memory:
-        """Put the current frame first and forget what no path looks at any more, so memory never grows."""
+        """Put the current frame first and drop what no path reads any more, so that memory stays bounded."""
         frames = [frame, *self.frames][: max(num_cell_frames, num_gaussian_frames)]
         return Memory(
             tuple(

@@ -1,4 +1,4 @@
-"""The encoder that moves Gaussians to the objects (Eq. 2-3): cross-attention, self-encoding, refinement."""
+"""Gaussian encoder: cross-attention, self-encoding and refinement, which moves Gaussians to objects (Eq. 2-3)."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ DROPOUT = 0.1
 SELF_ENCODING_KERNEL = 5
 FIXED_POINTS = ((0.0, 0.0), (0.45, 0.0), (-0.45, 0.0), (0.0, 0.45), (0.0, -0.45))
 LEARNABLE_REACH = 6.0
-"""Learnable points lie within half of this many standard deviations (specification 5.2)."""
+"""Learnable points lie within half of this many standard deviations (method 5.2)."""
 INITIAL_OPACITY = 0.25
 RAW_ATTRIBUTES = (0.0, 0.0, 1.0, 0.0, math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY)), 0.0, 0.0)
-"""Raw scale 2, rotation 2, opacity 1, velocity 2 of an untrained Gaussian (specification 4.4)."""
+"""Raw scale 2, rotation 2, opacity 1, velocity 2 of an untrained Gaussian (method 4.4)."""
 REFINEMENT_STD = 0.01
 
 
 @dataclass(frozen=True)
 class GaussianBounds:
-    """Ranges of the attributes; the activations keep to them (specification 5.4)."""
+    """Ranges of the attributes; the activations keep to them (method 5.4)."""
 
     scale_range_m: tuple[float, float]
     max_mean_shift_m: float
@@ -94,7 +94,7 @@ class AnchorEncoder(nn.Module):
 
 
 class SelfEncoding(nn.Module):
-    """Let neighbouring Gaussians talk: mean per occupied cell, two sparse 5x5 convolutions, back to the Gaussians."""
+    """Exchange features among neighbouring Gaussians: mean per occupied cell, two sparse 5x5 convolutions, gather."""
 
     def __init__(self, channels: int, grid: BEVGrid) -> None:
         super().__init__()
@@ -137,7 +137,7 @@ class Refinement(nn.Module):
         self.trunk = linear_relu_norm(channels, channels)
         self.output = nn.Linear(channels, 2 + len(RAW_ATTRIBUTES))
         self.output_scale = nn.Parameter(torch.ones(2 + len(RAW_ATTRIBUTES)))
-        # Untrained, a Gaussian keeps the place and the attributes that KGGI gives it.
+        # Untrained, a Gaussian keeps the position and the attributes that KGGI gives it.
         nn.init.normal_(self.output.weight, std=REFINEMENT_STD)
         with torch.no_grad():
             self.output.bias.copy_(torch.tensor((0.0, 0.0, *RAW_ATTRIBUTES)))
@@ -161,7 +161,7 @@ class Refinement(nn.Module):
 
 
 class EncoderLayer(nn.Module):
-    """One round of attention, self-encoding and refinement (specification 5.1, Eq. 2-3)."""
+    """One round of attention, self-encoding and refinement (method 5.1, Eq. 2-3)."""
 
     static_parts = ("feed_forward.0", "feed_forward.1")
 

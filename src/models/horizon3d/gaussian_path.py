@@ -1,4 +1,4 @@
-"""Gaussian path of DPTF: which Gaussians are remembered, and how they return as history (specification 6.2)."""
+"""Gaussian path of DPTF: which Gaussians are remembered, and how they return as history (method 6.2)."""
 
 from __future__ import annotations
 
@@ -67,14 +67,14 @@ class GaussianPathConfig:
 
 
 class GaussianPath(nn.Module):
-    """Remembers a covering subset of the active Gaussians and brings it back as history (specification 6.2)."""
+    """Remembers a covering subset of the active Gaussians and brings it back as history (method 6.2)."""
 
     def __init__(self, config: GaussianPathConfig, channels: int, grid: BEVGrid) -> None:
         super().__init__()
         self.config, self.channels, self.grid = config, channels, grid
         self.time = TimeEmbedding(channels)
         self.register_buffer("centre_m", torch.tensor(grid.centre_m), persistent=False)
-        self.fixed_capacity = False  # always K_hist places, padding where less is remembered: shapes that never change
+        self.fixed_capacity = False  # pad history to K_hist, so that shapes are static
 
     def merge_for_inference(self) -> None:
         """History keeps a fixed number of places."""
@@ -87,14 +87,14 @@ class GaussianPath(nn.Module):
         m' = A_t T (m + v dt); what is too old, not in the past or outside the grid is padding.
         """
         frames = [frame for frame in memory.frames if frame.gaussians is not None]
-        parts = [self._moved(frames, batch, max_age_s)] if frames else []
+        parts = [self._warp(frames, batch, max_age_s)] if frames else []
         missing = self.config.num_history_gaussians - sum(map(len, parts))
         if self.fixed_capacity and missing > 0:
             parts.append(self._padding(len(batch), missing))
         return GaussianSet.concatenate(parts) if parts else None
 
-    def _moved(self, frames: list[MemoryFrame], batch: FrameBatch, max_age_s: float) -> GaussianSet:
-        """The Gaussians of T frames at once: the work is small, its operations are many."""
+    def _warp(self, frames: list[MemoryFrame], batch: FrameBatch, max_age_s: float) -> GaussianSet:
+        """The Gaussians of T frames in one batch: launches cost more than the arithmetic."""
         motion = motions(frames, batch, max_age_s)
         sets = [frame.gaussians for frame in frames]
         past = GaussianSet(
@@ -138,7 +138,7 @@ class GaussianPath(nn.Module):
         active: Tensor,  # [B, G] bool, the Gaussian reaches an occupied cell
         batch: FrameBatch,
     ) -> GaussianSet:  # [B, gaussians_per_frame] in the unaugmented ego frame
-        """A subset of the active Gaussians of any source; what exists where fewer are active."""
+        """A subset of the active Gaussians of any source; padding where fewer are active."""
         picks = self._sample(gaussians, active & gaussians.valid, batch)  # [B, K], -1 for none
         rows = picks.clamp(min=0)
         chosen = gaussians.map(lambda value: _gather(value.detach(), rows))
@@ -154,7 +154,7 @@ class GaussianPath(nn.Module):
         if self.config.sampling is Sampling.farthest_point:
             start = torch.where(active, opacity, -torch.inf).argmax(dim=1)
             return farthest_points(gaussians.means.detach(), active, start, count)
-        score = opacity if self.config.sampling is Sampling.top_opacity else _draws(batch, active)
+        score = opacity if self.config.sampling is Sampling.top_opacity else _random_scores(batch, active)
         score, picks = torch.where(active, score, -torch.inf).topk(min(count, active.shape[1]), dim=1)
         picks = torch.where(score > -torch.inf, picks, -1)
         return F.pad(picks, (0, count - picks.shape[1]), value=-1)
@@ -168,8 +168,8 @@ def _gather(
     return value.gather(1, index)
 
 
-def _draws(batch: FrameBatch, active: Tensor) -> Tensor:  # [B, G] in 0..1
-    """Numbers drawn from each frame's own time stamp, so that an evaluation can be repeated."""
+def _random_scores(batch: FrameBatch, active: Tensor) -> Tensor:  # [B, G] in 0..1
+    """Random numbers seeded by each frame's time stamp, so that an evaluation is repeatable."""
     rows = []
     for stamp in batch.timestamps_s.tolist():
         generator = torch.Generator().manual_seed(round(1e6 * stamp) % 2**63)

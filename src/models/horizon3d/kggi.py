@@ -1,4 +1,4 @@
-"""KGGI, keypoint-guided Gaussian initialisation: where the Gaussians start (Sec. 3.1 of the paper)."""
+"""KGGI, keypoint-guided Gaussian initialisation: where the Gaussians start (Sec. 3.1)."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class GaussianSlots(nn.Module):
 
 
 class KGGI(nn.Module):
-    """Gaussians at radar keypoints, at lifted camera keypoints and at learnable places (specification section 4)."""
+    """Gaussians at radar keypoints, at lifted camera keypoints and at learnable positions (method 4)."""
 
     def __init__(
         self, config: KGGIConfig, channels: int, image_channels: int, grid: BEVGrid, bounds: GaussianBounds
@@ -147,7 +147,7 @@ class KGGI(nn.Module):
         return ("property_heads",) if hasattr(self, "property_heads") else ()
 
     def forward(self, radar_bev: SparseBEV, views: CameraViews, history: GaussianSet | None = None) -> KGGIOutput:
-        """G_0: radar, camera, random, then history Gaussians, which bring their own attributes and features (4.4)."""
+        """G_0: radar, camera, random, then history Gaussians with their own attributes and features (method 4.4)."""
         parts: list[GaussianSet] = []
         logits = camera = None
         if self.config.uses_keypoints:
@@ -170,7 +170,7 @@ class KGGI(nn.Module):
     ) -> GaussianSet:
         rows = topk_per_sample(scores, radar_bev.indices[:, 0], radar_bev.batch_size, self.config.num_radar_keypoints)
         valid = rows >= 0
-        cells = F.pad(radar_bev.indices, (0, 0, 0, 1))  # one more row for padding to point at
+        cells = F.pad(radar_bev.indices, (0, 0, 0, 1))  # one more row, which padding reads
         features = F.pad(radar_bev.features, (0, 0, 0, 1))
         picks = torch.where(valid, rows, len(radar_bev))  # [B, K]
         means = self.grid.centre_of(cells[picks][..., 1:])  # [B, K, 2]
@@ -221,7 +221,7 @@ def most_likely_depth(
     logits: Tensor,  # [B, N, D, h, w]
     centres_m: Tensor,  # [D]
 ) -> tuple[Tensor, Tensor]:  # [B, N, h, w] m, [B, N, h, w] in 0..1
-    """Mean depth over the most likely bin and its two neighbours, and the probability of the three (4.2)."""
+    """Mean depth over the most likely bin and its two neighbours, and the probability of the three (method 4.2)."""
     probabilities = logits.float().softmax(2)
     last = len(centres_m) - 1
     window = probabilities.argmax(2, keepdim=True) + torch.arange(-1, 2, device=logits.device).view(3, 1, 1)

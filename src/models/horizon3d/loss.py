@@ -63,7 +63,7 @@ def kggi_losses(
     settings: KGGIConfig,
     config: Horizon3DLossConfig,
 ) -> dict[str, Tensor]:
-    """2D keypoints, depth and radar objectness (specification 4.1, 4.3), weighted; {} without keypoint heads."""
+    """2D keypoints, depth and radar objectness (method 4.1, 4.3), weighted; {} without keypoint heads."""
     terms: dict[str, Tensor] = {}
     if kggi.camera is None or kggi.objectness_logits is None:
         return terms
@@ -94,7 +94,7 @@ def ocsf_losses(
     margin_m: float,
     config: Horizon3DLossConfig,
 ) -> dict[str, Tensor]:
-    """Occupancy of the splat against the enlarged boxes (specification 5.6), weighted."""
+    """Occupancy of the splat against the enlarged boxes (method 5.6), weighted."""
     terms: dict[str, Tensor] = {}
     if config.occupancy_focal_weight is not None or config.occupancy_dice_weight is not None:
         cells = ocsf.splat.cells
@@ -131,7 +131,7 @@ def cell_losses(
     grid: BEVGrid,
     config: Horizon3DLossConfig,
 ) -> dict[str, Tensor]:
-    """Occupancy and velocity of the cells of F_fuse against the tight boxes (specification 6.1, 8.1), weighted."""
+    """Occupancy and velocity of the cells of F_fuse against the tight boxes (method 6.1, 8.1), weighted."""
     terms: dict[str, Tensor] = {}
     keys, sample = fused.sites.linear(), fused.indices[:, 0]
     target = cells_are_occupied(keys, occupied_cells(boxes, grid, 0.0))  # [M]

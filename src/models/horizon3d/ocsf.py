@@ -25,7 +25,7 @@ class CrossAttention(Enum):
 
 
 class RefineFrom(Enum):
-    """Which features the refinement reads: Fig. 2 those behind the self-encoding, Eq. 3 those before it."""
+    """Which features the refinement reads: Fig. 2 those after the self-encoding, Eq. 3 those before it."""
 
     self_encoding = "self_encoding"
     cross_attention = "cross_attention"
@@ -85,7 +85,7 @@ class OCSFOutput:
 
 
 class OCSF(nn.Module):
-    """Gaussian encoder, splatting and sparse fusion (specification section 5)."""
+    """Gaussian encoder, splatting and sparse fusion (method 5)."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""From a set of Gaussians to the sparse BEV map they open (Eq. 4-6)."""
+"""From a set of Gaussians to the sparse BEV map they occupy (Eq. 4-6)."""
 
 from __future__ import annotations
 

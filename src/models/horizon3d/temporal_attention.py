@@ -1,4 +1,4 @@
-"""Temporal self-attention: current and history Gaussians look at one another (specification 6.3)."""
+"""Temporal self-attention: current and history Gaussians attend to one another (method 6.3)."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class TemporalSelfAttention(nn.Module):
         query, key = self.query_key(position).chunk(2, dim=-1)
         split = (self.num_heads, -1)
         heads = [part.unflatten(-1, split).transpose(1, 2) for part in (query, key, self.value(x))]  # [B, H, G, C/H]
-        # A sample without any valid Gaussian attends to padding, which nobody reads: a softmax over nothing is NaN.
+        # A sample without valid Gaussians attends to padding, whose result is unused: a softmax over nothing is NaN.
         keys = gaussians.valid | ~gaussians.valid.any(dim=1, keepdim=True)
         attended = F.scaled_dot_product_attention(*heads, attn_mask=keys[:, None, None, :])
         return self.output(attended.transpose(1, 2).flatten(2))

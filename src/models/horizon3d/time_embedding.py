@@ -1,4 +1,4 @@
-"""How long ago something was seen, as a feature vector (specification 6.1 to 6.3)."""
+"""Embedding of the age of a remembered observation (method 6.1 to 6.3)."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from src.geometry.tensor_transforms import invert_projection, pixel_centres
 
 MIN_DEPTH_M = 0.5
-"""Points nearer to the image plane count as invisible (specification 5.3)."""
+"""Points nearer to the image plane count as invisible (method 5.3)."""
 
 
 @dataclass

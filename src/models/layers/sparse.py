@@ -94,7 +94,7 @@ class ConvNormReLU(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Two submanifold convolutions with bias and norm around an identity (spec section 2)."""
+    """Two submanifold convolutions with bias and norm around an identity (method 2)."""
 
     norm_pairs = (("conv1", "bn1"), ("conv2", "bn2"))
 

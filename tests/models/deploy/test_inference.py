@@ -11,7 +11,7 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.deploy.inference import MergedBranches, fold_norm, prepare_for_inference
 from src.models.deploy.static_parts import GraphReplay, ImageNetwork
-from src.models.heads.center_head import Branches
+from src.models.heads.branches import Branches
 from src.models.horizon3d.sparse_fusion import SparseFusion
 from src.models.layers.sparse import RowNorm, SparseConv, SubmanifoldConv
 from src.ops.sites import Sites

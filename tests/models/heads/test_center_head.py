@@ -1,6 +1,5 @@
 """The head as a module: parameters, evaluation at chosen cells, loss, and decoding of its own targets."""
 
-import copy
 from dataclasses import replace
 
 import pytest
@@ -8,14 +7,7 @@ import torch
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.heads.center_head import (
-    Branches,
-    CenterHead,
-    HeadConfig,
-    HeadOutput,
-    TrainRegression,
-    evaluate_branches,
-)
+from src.models.heads.center_head import CenterHead, HeadConfig, HeadOutput, TrainRegression
 from src.models.heads.decode import AttributeSource, Suppression
 from src.ops.sites import Sites
 from src.structures.boxes import Boxes3D
@@ -252,31 +244,3 @@ def test_autocast_changes_little(regression: TrainRegression) -> None:
 def test_impossible_settings(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=f"model.head.{next(iter(wrong))}"):
         replace(CONFIG, **wrong)
-
-
-@pytest.mark.parametrize("training", [True, False])
-@pytest.mark.parametrize("rows", [0, 1, 2, 700])
-def test_branches_equal_their_layers_one_by_one(rows, training):
-    """Linear, batch norm, ReLU, linear as modules: values, gradients and running statistics."""
-    torch.manual_seed(0)
-    parts = [Branches(8, widths).double().train(training) for widths in ((2,), (3, 1), (2, 1, 3))]
-    for part in parts:
-        torch.nn.init.uniform_(part.norm.weight, 0.5, 2.0)
-        torch.nn.init.uniform_(part.norm.bias, -1.0, 1.0)
-    literal = copy.deepcopy(parts)
-    results = []
-    for number, branches in enumerate((parts, literal)):
-        x = (torch.randn(rows, 8, generator=torch.Generator().manual_seed(1)).double() + 2.0).requires_grad_()
-        if number == 0:
-            out = evaluate_branches(branches, x)
-        else:
-            outputs = []
-            for part in branches:
-                hidden = part.norm(part.hidden(x)).relu().split(8, dim=1)
-                outputs += [layer(h) for layer, h in zip(part.outputs, hidden, strict=True)]
-            out = torch.cat(outputs, dim=1)
-        leaves = [x, *(p for part in branches for p in part.parameters())]
-        pull = torch.randn(out.shape, generator=torch.Generator().manual_seed(2)).double()
-        grads = torch.autograd.grad((out * pull).sum(), leaves)
-        results.append((out, *grads, *(b.double() for part in branches for b in part.buffers())))
-    torch.testing.assert_close(results[0], results[1])

@@ -1,5 +1,7 @@
 """Gated fusion on the union of two sets of cells."""
 
+import copy
+
 import pytest
 import torch
 
@@ -16,9 +18,11 @@ def make_map(cells, channels=8):
     return SparseBEV(sites, torch.randn(len(sites), channels))
 
 
-def test_equations_11_and_12_on_one_cell_by_hand():
+@pytest.mark.parametrize("skip_zeros", [False, True])
+def test_equations_11_and_12_on_one_cell_by_hand(skip_zeros):
     torch.manual_seed(0)
     fusion = SparseFusion(8, 1).eval()
+    fusion.skip_zeros = skip_zeros
     gaussian, radar = make_map([[0, 3, 3]]), make_map([[0, 3, 3]])
     f_g = gaussian.features[0] / (1 + 1e-5) ** 0.5  # batch norm with its initial running statistics
     f_r = radar.features[0] / (1 + 1e-5) ** 0.5
@@ -51,32 +55,27 @@ def test_empty_branches(cells):
     assert out.features.isfinite().all() and len(out) == len(cells[0]) + len(cells[1])
 
 
+@pytest.mark.parametrize("training", [True, False])
 @pytest.mark.parametrize("kernel", [1, 3])
-def test_equals_the_branches_side_by_side(kernel):
-    """The literal form: zeros where a branch has no site, every layer on all cells; values and all gradients."""
+def test_skipping_zeros_agrees_with_the_equations(kernel, training):
+    """Values, gradients and running statistics."""
     torch.manual_seed(0)
-    fusion = SparseFusion(8, kernel).double().train()
+    fast = SparseFusion(8, kernel).double().train(training)
+    for norm in (fast.norm_gaussian, fast.norm_radar, fast.norm1, fast.norm2):
+        torch.nn.init.uniform_(norm.weight, 0.5, 2.0)
+        torch.nn.init.uniform_(norm.bias, -1.0, 1.0)
+    literal = copy.deepcopy(fast)
+    literal.skip_zeros = False
     cells = torch.randperm(2 * 20 * 20, generator=torch.Generator().manual_seed(1))
     maps = []
     for part in (cells[:150], cells[100:300]):
         sites = Sites.from_linear(part.sort().values, SHAPE)
         maps.append(SparseBEV(sites, torch.randn(len(sites), 8, dtype=torch.float64, requires_grad=True)))
-    gaussian, radar = (
-        part.with_features(norm(part.features))
-        for part, norm in zip(maps, (fusion.norm_gaussian, fusion.norm_radar), strict=True)
-    )
-    gaussian, radar = gaussian.union(radar)
-    joined = gaussian.with_features(torch.cat([gaussian.features, radar.features], dim=1))
-    gates = torch.cat([fusion.gate_gaussian(joined).features, fusion.gate_radar(joined).features], dim=1).sigmoid()
-    gated = joined.with_features(gates * joined.features)
-    x = fusion.conv1(gated)
-    x = fusion.conv2(x.with_features(torch.relu(fusion.norm1(x.features))))
-    expected = torch.relu(fusion.norm2(x.features) + fusion.shortcut(gated).features)
-
-    leaves = [part.features for part in maps] + list(fusion.parameters())
-    found = fusion(*maps)
-    assert torch.equal(found.indices, joined.indices)
-    torch.testing.assert_close(found.features, expected)
-    weight = torch.randn(expected.shape, dtype=torch.float64)
-    wanted = torch.autograd.grad((expected * weight).sum(), leaves)
-    torch.testing.assert_close(torch.autograd.grad((found.features * weight).sum(), leaves), wanted)
+    weight = torch.randn(300, 8, dtype=torch.float64)
+    results = []
+    for fusion in (fast, literal):
+        out = fusion(*maps)
+        leaves = [part.features for part in maps] + list(fusion.parameters())
+        grads = torch.autograd.grad((out.features * weight).sum(), leaves)
+        results.append((out.indices, out.features, *grads, *fusion.buffers()))
+    torch.testing.assert_close(*results)

@@ -212,7 +212,7 @@ def test_killed_around_every_write(run, monkeypatch, tmp_path, lost):
                 run(name)
             checkpoints = tmp_path / name / "checkpoints"
             torn = [checkpoints / file for file in lost if (checkpoints / file).is_file()]
-            if len(torn) < len(list(checkpoints.glob("*.ckpt"))):  # with none left, the run does not go on unasked
+            if len(torn) < len(list(checkpoints.glob("*.ckpt"))):  # with none left, the run does not start anew unasked
                 for path in torn:
                     path.write_bytes(path.read_bytes()[:1000])
             found, _ = run(name)
@@ -319,7 +319,7 @@ def outcome(outputs):
 
 
 @pytest.mark.slow
-def test_commands_go_on_as_if_nothing_had_happened(tmp_path):
+def test_commands_resume_as_if_nothing_had_happened(tmp_path):
     """The full model on clips: stopped inside either epoch, by Ctrl-C with loader processes, killed, and not at all."""
     world = tmp_path / "world"
     finish(command(tmp_path / "whole", world))

@@ -247,14 +247,14 @@ def test_two_processes_score_as_one_does_their_checkpoint(work):
             assert name == same_name and same == (None if value is None else pytest.approx(value, abs=1e-6)), name
 
 
-# ---------------------------------------------------------------- going on with another number of processes
+# ---------------------------------------------------------------- resuming with another number of processes
 
 STOP_AT = TOY_STEPS + 1  # in the middle of the second epoch
 PROBLEM = 7, 20, 40, 3  # samples, which two ranks share as five and two; annotations, boxes, seed
 
 
 class Single(TrainingModule):
-    """Trains on single frames, stops where told to, and validates with boxes that are given."""
+    """Trains on single frames, stops where asked to, and validates with boxes that are given."""
 
     stop_at = None
 
@@ -338,7 +338,7 @@ def epochs_of(path):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Checkpoint directory")
-def test_a_run_goes_on_with_another_number_of_processes(tmp_path):
+def test_a_run_resumes_with_another_number_of_processes(tmp_path):
     """From one to two and from two to one in the middle of an epoch: its means are those of one process all along."""
     scores = train_single(tmp_path / "one", 1)
     train_single(tmp_path / "one, then two", 1, stop_at=STOP_AT)

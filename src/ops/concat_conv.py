@@ -1,0 +1,29 @@
+"""Convolution of several maps side by side as channels, without their concatenation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def concat_conv2d(
+    maps: Iterable[Tensor],  # of [B, C, h, w], at most n
+    weight: Tensor,  # [C', n * C, 1, 1]
+    bias: Tensor | None,  # [C']
+) -> Tensor:  # [B, C', h, w] of the first map's type
+    """F.conv2d(torch.cat(maps, dim=1), weight, bias), maps that are missing at the end counting as zeros.
+
+    It is the sum of the convolutions of the single maps with their slices of the weight: one map is held at a time, and
+    a missing one costs nothing. Raises ValueError without a map.
+    """
+    maps = iter(maps)
+    first = next(maps, None)
+    if first is None:
+        raise ValueError("maps: expected at least one")
+    own, *slices = weight.split(first.shape[1], dim=1)
+    total = F.conv2d(first, own, bias)
+    for part, weight_slice in zip(maps, slices, strict=False):
+        total = total + F.conv2d(part.to(first.dtype), weight_slice)
+    return total
