@@ -1,4 +1,4 @@
-"""Phase 2: a detector with memory, trained and validated on streams of consecutive key frames (specification 6)."""
+"""Phase 2: a detector with memory, trained and validated on streams of consecutive key frames (method 6)."""
 
 from __future__ import annotations
 

@@ -77,8 +77,9 @@ def train(path, fault=None, bad_steps=(BAD_STEP,), skip=True, stop_after=None, e
     module.guard.skip = skip
     resume_from = folder.newest_checkpoint()
     trainer = build_trainer(
-        folder, epochs=EPOCHS, validate_every=1, monitor="val/mAP", precision="32-true", accelerator="cpu", devices=ranks,
-        log_every_steps=1, ema_decay=None, checkpoint_every_steps=every_steps, strategy=build_strategy("cpu", ranks),
+        folder, epochs=EPOCHS, validate_every=1, monitor="val/mAP", precision="32-true", accelerator="cpu",
+        devices=ranks, log_every_steps=1, ema_decay=None, checkpoint_every_steps=every_steps,
+        strategy=build_strategy("cpu", ranks),
         loggers=build_loggers(folder, resume_from, None) if is_main_process() else [],
     )  # fmt: skip
     trainer.progress_bar_callback.disable()
@@ -158,7 +159,7 @@ def test_a_skipped_step_leaves_nothing_behind(tmp_path, fault, caplog):
     with caplog.at_level(logging.WARNING):
         module, folder, error = train(tmp_path / "run", fault)
     assert error is None and module.guard.skipped_steps == 1 and module.guard.in_a_row == 0
-    assert "passed over (1 so far): step 4, epoch 1" in caplog.text
+    assert "skipped (1 so far): step 4, epoch 1" in caplog.text
     for step in range(EPOCHS * STEPS):
         before, after = module.states[2 * step : 2 * step + 2]
         assert same(before, after) == (step == BAD_STEP), step

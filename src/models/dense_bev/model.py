@@ -1,4 +1,4 @@
-"""Dense peer: radar-camera fusion on a whole BEV map, in the way of BEVFusion (specification 13)."""
+"""Dense baseline: radar-camera fusion on a whole BEV map, in the way of BEVFusion (method 13)."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ class DenseBEV(Detector):
         logits: Tensor,  # [B, N, D, h, w]
         batch: FrameBatch,
     ) -> Tensor:  # []
-        """Cross-entropy at the pixels of annotated boxes, as Horizon3D's camera branch (specification 4.3)."""
+        """Cross-entropy at the pixels of annotated boxes, as Horizon3D's camera branch (method 4.3)."""
         settings, size = self.config.view_transform, self.image_encoder.image_size_px
         joined, sample = supervised_boxes(batch.boxes, self.grid)
         seen = view_boxes(joined, sample, batch.pix_from_aug, batch.image_valid, size)

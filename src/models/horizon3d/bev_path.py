@@ -14,12 +14,10 @@ from src.geometry.tensor_transforms import transform_points_xy, transform_vector
 from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.layers.merging import block_diagonal, joined_convs
-from src.models.layers.sparse import ConvNormReLU, RowNorm, SparseKernel, SubmanifoldConv
+from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv, TemporalConv
 from src.models.memory import motions
-from src.ops.kernel_maps import strided_map, temporal_map
 from src.ops.segment_reduce import segment_mean, topk_per_sample
 from src.ops.sites import Sites
-from src.ops.sparse_conv import sparse_conv
 from src.structures.batch import FrameBatch
 from src.structures.sparse_bev import SparseBEV, SparseMap
 
@@ -72,19 +70,6 @@ class WarpedCells:
     velocities: Tensor  # [n, 2] m/s over ground, augmented axes
     elapsed_s: Tensor  # [n]
     features: Tensor  # [n, C]
-
-
-class TemporalConv(SparseKernel):
-    """3x3x3 convolution over (t, y, x) that halves the time axis and, unless dilating, keeps to occupied columns."""
-
-    def __init__(self, in_channels: int, out_channels: int, dilating: bool) -> None:
-        super().__init__(in_channels, out_channels, kernel_size=3, ndim=3, bias=False)
-        self.dilating = dilating
-
-    def forward(self, x: SparseMap) -> SparseMap:
-        build = strided_map if self.dilating else temporal_map
-        kernel_map, sites = build(x.sites, self.kernel_size, (2, 1, 1), 1)
-        return SparseMap(sites, sparse_conv(x.features, self.weight, kernel_map, self.bias))
 
 
 class BEVPath(nn.Module):

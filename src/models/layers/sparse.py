@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.ops.kernel_maps import strided_map, submanifold_map
+from src.ops.kernel_maps import strided_map, submanifold_map, temporal_map
 from src.ops.sparse_conv import sparse_conv
 from src.structures.sparse_bev import SparseMap
 
@@ -62,6 +62,19 @@ class SparseConv(SparseKernel):
     def forward(self, x: SparseMap) -> SparseMap:
         kernel_map, sites = strided_map(x.sites, self.kernel_size, self.stride, self.padding)
         return type(x)(sites, sparse_conv(x.features, self.weight, kernel_map, self.bias))
+
+
+class TemporalConv(SparseKernel):
+    """3x3x3 convolution over (t, y, x) that halves the time axis and, unless dilating, keeps to occupied columns."""
+
+    def __init__(self, in_channels: int, out_channels: int, dilating: bool) -> None:
+        super().__init__(in_channels, out_channels, kernel_size=3, ndim=3, bias=False)
+        self.dilating = dilating
+
+    def forward(self, x: SparseMap) -> SparseMap:
+        build = strided_map if self.dilating else temporal_map
+        kernel_map, sites = build(x.sites, self.kernel_size, (2, 1, 1), 1)
+        return SparseMap(sites, sparse_conv(x.features, self.weight, kernel_map, self.bias))
 
 
 class RowNorm(nn.BatchNorm1d):
