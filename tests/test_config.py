@@ -44,7 +44,7 @@ def test_phase_2_composes_at_every_scale(scale):
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
-def test_the_dense_peer_composes_at_every_scale(scale, phase):
+def test_the_dense_baseline_composes_at_every_scale(scale, phase):
     """At the same range and cell; phase 1 drops what its settings name as temporal."""
     config, tree = compose_config([f"scale={scale}", "data.root=x", "model=dense_bev", f"phase={phase}"])
     model = config.model
@@ -281,7 +281,7 @@ def test_a_stored_phase_2_comes_back_with_its_memory():
         restore_config(single, ["model.dptf.max_age_s=0.55"])
 
 
-def test_a_stored_dense_peer_comes_back_as_such():
+def test_a_stored_dense_baseline_comes_back_as_such():
     """Also where the command line says nothing of the model, whose default is another."""
     _, tree = compose_config(["scale=debug", "phase=phase2", "model=dense_bev", "model.temporal.num_frames=3"])
     for named in ([], ["model=dense_bev"]):  # commands compose their line by itself, and then need to be told

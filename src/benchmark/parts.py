@@ -13,7 +13,6 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from src.benchmark.timing import replaced_methods
 from src.models.detector import Detector
 
 Paths = Mapping[str, tuple[str, ...]]
@@ -47,30 +46,22 @@ def is_within(name: str) -> bool:
 
 @contextmanager
 def wrapped_parts(
-    model: Detector,
+    model: torch.nn.Module,
     parts: Paths,
     wrap: Callable[[str, str, Callable[..., Any]], Callable[..., Any]],  # of part, path and the function
 ) -> Iterator[None]:
-    """Within the context every method and function that is a part is wrapped."""
-    functions = {name: tuple(path for path in paths if ":" in path) for name, paths in parts.items()}
-    methods: dict[str, list[str]] = {}
-    for name, paths in parts.items():
-        for path in paths:
-            if ":" not in path:
-                methods.setdefault(path, []).append(name)
+    """Within the context every method and function that is a part is wrapped, for each part that it belongs to.
 
-    def wrap_method(_: str, path: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        for name in methods[path]:  # a method may be a part and lie within another
-            function = wrap(name, path, function)
-        return function
-
+    A method that the model lacks is left out.
+    """
+    modules = dict(model.named_modules())
     with ExitStack() as stack:
-        for name, paths in functions.items():
+        for name, paths in parts.items():
             for path in paths:
-                module, _, function = path.partition(":")
-                owner = importlib.import_module(module)
-                stack.enter_context(patch.object(owner, function, wrap(name, path, getattr(owner, function))))
-        stack.enter_context(replaced_methods(model, {path: (path,) for path in methods}, wrap_method))
+                place, colon, function = path.rpartition(":" if ":" in path else ".")
+                owner = importlib.import_module(place) if colon == ":" else modules.get(place)
+                if colon == ":" or hasattr(owner, function):
+                    stack.enter_context(patch.object(owner, function, wrap(name, path, getattr(owner, function))))
         yield
 
 
@@ -150,8 +141,8 @@ def tensors_in(value: Any, seen: set[int] | None = None) -> list[Tensor]:
     return []
 
 
-def derive(result: Any) -> bool:
-    """Backward from everything in a part's result that depends on weights or inputs; False where nothing does."""
+def backward_from(result: Any) -> bool:
+    """Backward, with gradients of one, from every tensor of a result that has a history; False where none has."""
     roots = [x for x in tensors_in(result) if x.grad_fn is not None]
     if roots:
         torch.autograd.backward(roots, [torch.ones_like(x) for x in roots])

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from src.benchmark.parts import derive, fresh, is_within, parts_of, record_calls, tensors_in
+from src.benchmark.parts import backward_from, fresh, is_within, parts_of, record_calls, tensors_in
 
 
 @dataclass
@@ -61,12 +61,12 @@ def test_a_recorded_call_is_made_again_with_the_caches_of_the_first_time():
     again = call.prepare()()
     torch.testing.assert_close(again[0], call.result[0])
     assert bundle.cache == {}
-    assert derive(again) and model.second.layer.weight.grad is not None
+    assert backward_from(again) and model.second.layer.weight.grad is not None
     assert model.first.weight.grad is None  # no history beyond the part's inputs
 
 
-def test_what_depends_on_nothing_is_not_derived():
-    assert not derive([torch.zeros(2), "text", None])
+def test_a_result_without_history_has_no_backward():
+    assert not backward_from([torch.zeros(2), "text", None])
 
 
 def test_tensors_are_found_outside_caches():

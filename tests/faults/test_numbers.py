@@ -241,7 +241,7 @@ def steps(module, batches, bf16):
         yield {name: float(value.detach()) for name, value in terms.items()}, joined.clone()
 
 
-MODELS = PHASES | {"peer": ("model=dense_bev", *PHASES["phase2"])}
+MODELS = PHASES | {"dense": ("model=dense_bev", *PHASES["phase2"])}
 
 
 @pytest.mark.parametrize("name", MODELS)

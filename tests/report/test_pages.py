@@ -161,7 +161,7 @@ def test_what_is_broken_is_named_after_the_rest(both_phases, write_run, tmp_path
     with pytest.raises(DataError) as raised:
         report("phase2")
     assert raised.value.exit_code == 4
-    for name in ("broken/metrics.json", "horizon3d-phase1-mini-old.json: format must be 1", "torn_mini.json"):
+    for name in ("broken/metrics.json", "horizon3d-phase1-mini-old.json: format must be", "torn_mini.json"):
         assert name in str(raised.value)
     assert "phase 2" in (reports / "phase2_mini.md").read_text()
 

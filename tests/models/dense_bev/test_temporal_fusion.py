@@ -78,7 +78,7 @@ def test_whole_cells_move_without_loss():
 
 
 @pytest.mark.parametrize(("elapsed_s", "metres"), [(0.0, 0.0), (-0.5, 5.0), (6.5, 5.0), (0.5, 80.0)])
-def test_what_is_not_a_usable_past_is_zero_and_only_in_its_lane(elapsed_s, metres):
+def test_what_is_not_a_usable_past_is_zero_and_only_in_its_stream(elapsed_s, metres):
     fusion = make_fusion()
     past = bare_frame(10.0, [pose(), pose()])
     memory = fusion.remember(None, past, map_of(past) + 3.0)
@@ -89,7 +89,7 @@ def test_what_is_not_a_usable_past_is_zero_and_only_in_its_lane(elapsed_s, metre
     assert not found[0].any() and found[1].any()
 
 
-def test_the_newest_frames_stay_and_lanes_come_and_go():
+def test_the_newest_frames_stay_and_streams_come_and_go():
     fusion = make_fusion(num_frames=2)
     memory = None
     for step in range(4):
@@ -195,7 +195,7 @@ def test_untrained_memory_leaves_phase_1_to_the_last_bit(pair, training, steps):
     assert first(batch)[1] is None
 
 
-def test_trained_memory_changes_the_output_and_lanes_do_not_mix(pair):
+def test_trained_memory_changes_the_output_and_streams_do_not_mix(pair):
     _, model = pair
     model.eval()
     torch.nn.init.normal_(model.temporal.norm.weight)
@@ -227,7 +227,7 @@ def test_every_parameter_of_the_memory_learns(pair, steps):
     assert len(new.frames) == min(steps + 1, 3) and not any(f.cells.requires_grad for f in new.frames)
 
 
-def test_a_memory_of_other_lanes_is_refused(pair):
+def test_a_memory_of_other_streams_is_refused(pair):
     model = pair[1].eval()
     memory = fill(model, 1)
     with pytest.raises(ValueError, match="2 streams, but the batch 1 frames"):

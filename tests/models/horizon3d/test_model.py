@@ -296,9 +296,9 @@ def test_parameters_of_the_full_size_agree_with_the_budget():
     found = {name: sum(p.numel() for p in part.parameters()) / 1e6 for name, part in model.named_children()}
     attention = [layer.temporal_attention for layer in model.ocsf.encoder.layers]
     attention = sum(p.numel() for part in attention for p in part.parameters()) / 1e6
-    found["ocsf"] -= attention  # the specification books it under DPTF
+    found["ocsf"] -= attention  # method 0.3 books it under DPTF
     found["dptf"] += attention
-    # Budget of specification 0.3, millions.
+    # Budget of method 0.3, millions.
     budget = {"image_encoder": 26.2, "radar_encoder": 7.37, "kggi": 0.78, "ocsf": 3.25, "dptf": 2.18, "head": 0.86}
     assert found == {name: pytest.approx(value, rel=0.02) for name, value in budget.items()}
     assert sum(found.values()) == pytest.approx(40.6, rel=0.02)

@@ -225,7 +225,7 @@ def test_no_visible_gaussian_and_no_radar_now_or_before(make_model, make_dptf, d
     assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
 
 
-def test_lanes_with_memory_equal_single_lanes(pair, drive):
+def test_streams_with_memory_equal_single_streams(pair, drive):
     _, model = pair({}, {})
     memory, batch = fill(model.eval(), drive, 2)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Velocity compensation beats none on fast synthetic traffic in phase 2 (specification section 15 point 10)."""
+"""Velocity compensation beats none on fast synthetic traffic in phase 2 (method 15.10)."""
 
 from dataclasses import replace
 
