@@ -6,6 +6,7 @@ import logging
 import math
 import os
 import re
+from dataclasses import replace
 
 import pytest
 import torch
@@ -234,6 +235,22 @@ def test_a_disk_that_refuses_the_dump_does_not_hide_the_fault(tmp_path, monkeypa
         _, folder, error = train(tmp_path / "run", "point", bad_steps=(0,), skip=False)
     assert isinstance(error, DivergedError) and "src.replay" not in str(error) and "near" in str(error)
     assert "no space left" in caplog.text and not dumps(folder)
+
+
+def test_a_dump_keeps_lidar_and_future_frames(tmp_path):
+    def cloud(count):
+        points, owners = torch.randn(count, 5), torch.arange(count) % 2
+        return {"lidar_points": points, "lidar_batch": owners.sort()[0], "lidar_origins": torch.randn(count, 3)}
+
+    bare = replace(toy_batch([3, 7], [True, False]), radar_points=None, radar_batch=None)
+    future = replace(bare, streams=None, starts=None, **cloud(3))
+    batch = replace(bare, **cloud(4), future=(future, replace(future, **cloud(0))))
+    named = {"global_step": 1, "rank": 0, "epoch": 0, "world_size": 1, "seed": 1, "memories": [], "found": ""}
+    _, found = read_dump(write_dump(tmp_path, toy_module().model, {}, batch, **named))
+    assert found.radar_points is None and [len(frame.lidar_points) for frame in found.future] == [3, 0]
+    for one, other in ((found, batch), (found.future[0], future)):
+        for name in ("lidar_points", "lidar_batch", "lidar_origins", "global_from_ego"):
+            assert torch.equal(getattr(one, name), getattr(other, name))
 
 
 def test_other_files_are_no_dumps(tmp_path):
