@@ -55,7 +55,7 @@ class Case:
         """Forward, losses and backward; the weights' gradients are dropped."""
         with self.precision():
             output, _ = self.model(self.batch, self.memory)
-            total = self.model.loss(output, self.batch)["total"]
+            total = self.model.loss(output, self.batch).terms["total"]
         total.backward()
         self.model.zero_grad(set_to_none=True)
         return total.detach()

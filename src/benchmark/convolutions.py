@@ -30,8 +30,7 @@ from src.benchmark.spconv_baseline import (
 from src.benchmark.timing import MODES, clock, interleaved, milliseconds, status_bytes, without_gradient
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.sparse_voxel import RadarEncoder, RadarEncoderConfig
-from src.models.horizon3d.bev_path import TemporalConv
-from src.models.layers.sparse import SparseConv, SparseKernel, SubmanifoldConv
+from src.models.layers.sparse import SparseConv, SparseKernel, SubmanifoldConv, TemporalConv
 from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
 from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv

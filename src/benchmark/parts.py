@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import importlib
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -21,32 +20,15 @@ Paths = Mapping[str, tuple[str, ...]]
 
 PART_METHODS = ("forward", "recall", "aggregate", "remember", "decode")
 """What a detector calls its parts by; a memory is not a function of one input, so it has no forward."""
-PARTS_WITHIN: dict[str, Paths] = {
-    "Horizon3D": {
-        "ocsf": ("ocsf.forward",),
-        "ocsf: gaussian encoder": ("ocsf.encoder.forward",),
-        "ocsf: splat": ("src.models.horizon3d.ocsf:splat_set",),
-        "ocsf: gated fusion": ("ocsf.fusion.forward",),
-        "dptf": ("dptf.recall", "dptf.aggregate", "dptf.remember"),
-        "dptf: recall": ("dptf.recall",),
-        "dptf: aggregate": ("dptf.aggregate",),
-        "dptf: remember": ("dptf.remember",),
-    }
-}
-"""By model the parts worth looking into; `part: inner` lies within `part`. A part is otherwise what a child does."""
 
 
 def parts_of(model: Detector) -> Paths:
-    """The parts in the order of the model's children; the module of a model may name its own as `BENCHMARK_PARTS`."""
-    own = getattr(sys.modules[type(model).__module__], "BENCHMARK_PARTS", None)
-    if own is not None:
-        return own
-    within = PARTS_WITHIN.get(type(model).__name__, {})
+    """What each child of the model does, in their order, with the parts within that the model declares."""
     parts: dict[str, tuple[str, ...]] = {}
     for child, module in model.named_children():
-        listed = {name: paths for name, paths in within.items() if name.partition(":")[0] == child}
         methods = [method for method in PART_METHODS if method != "decode" and _defines(module, method)]
-        parts |= listed or {child: tuple(f"{child}.{method}" for method in methods)}
+        parts[child] = tuple(f"{child}.{method}" for method in methods)
+        parts |= {name: paths for name, paths in model.benchmark_parts.items() if name.partition(":")[0] == child}
         if _defines(module, "decode"):
             parts[f"{child}: decode"] = (f"{child}.decode",)
     return {name: paths for name, paths in parts.items() if paths}

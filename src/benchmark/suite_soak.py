@@ -189,6 +189,7 @@ def soak_training(
             folder,
             epochs=epochs,
             validate_every=config.phase.validate_every,
+            monitor=config.phase.monitor,
             precision=config.precision,
             accelerator=config.trainer.accelerator.value,
             devices=1,

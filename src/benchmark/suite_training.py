@@ -18,7 +18,7 @@ from src.benchmark.operation_table import OPERATIONS_NOTE, operation_table
 from src.benchmark.timing import chosen_device, clock, milliseconds, peak_bytes, timed_parts
 from src.config import Config
 from src.structures.batch import FrameBatch
-from src.training.module import DetectionModule
+from src.training.module import TrainingModule
 from src.training.optim import CyclicSchedule, build_optimizer
 
 WARM_UP_STEPS = 5  # first calls choose algorithms, fill the allocator and the loader's queue
@@ -72,7 +72,7 @@ def benchmark_training(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def run_steps(
-    module: DetectionModule, source: Iterator[FrameBatch], device: torch.device, autocast: bool
+    module: TrainingModule, source: Iterator[FrameBatch], device: torch.device, autocast: bool
 ) -> tuple[tuple[dict[str, list[float]], list[int]], list[FrameBatch]]:
     """Seconds of each stage of the measured steps with the frames of each, and all batches that came."""
     now, step_on = clock(device), make_stepper(module, WARM_UP_STEPS + MEASURED_STEPS, device, autocast)
@@ -93,7 +93,7 @@ def run_steps(
 
 
 def make_stepper(
-    module: DetectionModule, num_steps: int, device: torch.device, autocast: bool
+    module: TrainingModule, num_steps: int, device: torch.device, autocast: bool
 ) -> Callable[[FrameBatch], dict[str, float]]:
     """`timed_step` with a fresh optimiser."""
     optimizer, schedule = build_optimizer(
@@ -103,7 +103,7 @@ def make_stepper(
 
 
 def timed_step(
-    module: DetectionModule,
+    module: TrainingModule,
     optimizer: torch.optim.Optimizer,
     schedule: CyclicSchedule,
     device: torch.device,
@@ -117,12 +117,12 @@ def timed_step(
         warnings.filterwarnings("ignore", message=".*self.trainer.*")  # nothing is logged without a trainer
         begin = now()
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=autocast):
-            total = module.training_step(batch, 0)
+            objective = module.objective(batch)
         computed = now()
         optimizer.zero_grad(set_to_none=True)
-        total.backward()
+        objective.terms["total"].backward()
         went_back = now()
-        module.configure_gradient_clipping(optimizer)
+        module.clip_gradients_or_skip(batch, objective)
         optimizer.step()
         schedule.step()
         end = now()

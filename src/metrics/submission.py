@@ -1,4 +1,4 @@
-"""The official submission file: read it with every fault named, write it whole or not at all (facts: section 6)."""
+"""The official submission file: read it with every fault named, write it whole or not at all."""
 
 from __future__ import annotations
 

@@ -30,6 +30,8 @@ class Part(nn.Module):
 
 
 class Whole(nn.Module):
+    benchmark_parts = {"second: itself": ("second.forward",)}
+
     def __init__(self):
         super().__init__()
         self.first, self.second = nn.Linear(3, 3), Part()
@@ -41,7 +43,8 @@ class Whole(nn.Module):
 
 def test_parts_are_children_by_the_methods_they_have():
     assert parts_of(Whole()) == {
-        "first": ("first.forward",), "second": ("second.forward",), "second: decode": ("second.decode",)
+        "first": ("first.forward",), "second": ("second.forward",), "second: itself": ("second.forward",),
+        "second: decode": ("second.decode",)
     }  # fmt: skip
     assert is_within("ocsf: splat") and not is_within("ocsf") and not is_within("head: decode")
 

@@ -94,6 +94,8 @@ class TemporalFusion(nn.Module):
     Moving objects stay where they were: their motion is left to the convolutions, as in BEVDet4D.
     """
 
+    norm_pairs = (("refine", "norm"),)
+
     def __init__(self, config: TemporalConfig, channels: int, grid: BEVGrid) -> None:
         super().__init__()
         self.config, self.grid = config, grid

@@ -1,6 +1,7 @@
 """Memory of maps: alignment under ego motion and augmentation, what is usable, streams, storage, the first step."""
 
 import io
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +11,13 @@ from torch import nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.models.dense_bev.model import DenseBEVConfig
 from src.models.dense_bev.temporal_fusion import MapMemory, TemporalFusion
 from src.reliability.checkpoints import load_model_weights
-from src.training.handoff import MAY_BE_NEW
 from tests.models.dense_bev.dense_frames import GRID, dense_model, drive, memory_config, pose
 from tests.models.moving import bare_frame, bda
+
+ADDED = re.compile(DenseBEVConfig.new_in_temporal_phase)
 
 WIDE = BEVGrid(cells=(96, 96), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
 
@@ -161,9 +164,9 @@ def pair():
                 value.add_(0.05 * torch.rand(value.shape, generator=generator))
     second = dense_model(seed=3, temporal=memory_config())
     state = {f"model.{key}": value.clone() for key, value in first.state_dict().items()}
-    new = load_model_weights(second, {"state_dict": state}, Path("phase1.ckpt"), MAY_BE_NEW)
+    new = load_model_weights(second, {"state_dict": state}, Path("phase1.ckpt"), ADDED)
     assert set(new) == second.state_dict().keys() - first.state_dict().keys() and new
-    assert not [key for key in first.state_dict() if MAY_BE_NEW.match(key)]  # none of phase 1 may be missing
+    assert not [key for key in first.state_dict() if ADDED.match(key)]  # none of phase 1 may be missing
     return first, second
 
 
@@ -187,7 +190,7 @@ def test_untrained_memory_leaves_phase_1_to_the_last_bit(pair, training, steps):
     one, two = first(batch)[0], second(batch, memory)[0]
     assert torch.equal(one.fused_bev, two.fused_bev) and torch.equal(one.head.logits, two.head.logits)
     if not training:
-        terms, more = first.loss(one, batch), second.loss(two, batch)
+        terms, more = first.loss(one, batch).terms, second.loss(two, batch).terms
         assert all(torch.equal(terms[name], more[name]) for name in terms)
     assert first(batch)[1] is None
 
@@ -216,7 +219,7 @@ def test_every_parameter_of_the_memory_learns(pair, steps):
     for _ in range(2):
         model.zero_grad()
         output, new = model(batch, memory)
-        model.loss(output, batch)["total"].backward()
+        model.loss(output, batch).terms["total"].backward()
         assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
         moved |= {name for name, p in model.temporal.named_parameters() if p.grad.any()}
         optimizer.step()

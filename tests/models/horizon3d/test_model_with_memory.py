@@ -139,7 +139,7 @@ def two_steps(model, first, second):
     memory = None
     for batch in (first, second):
         output, memory = model(batch, memory)
-        terms = model.loss(output, batch)
+        terms = model.loss(output, batch).terms
         optimizer.zero_grad()
         terms["total"].backward()
         assert terms["total"].isfinite()
