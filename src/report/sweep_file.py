@@ -115,12 +115,9 @@ class SweepConfig:
                 raise ConfigError(
                     f"{where}: the name {name!r} must be of letters, digits, _ and -, and begin with a letter or digit"
                 )
-        given = [
-            *self.overrides,
-            *(o for own in self.scale_overrides.values() for o in own),
-            *(override for row in self.rows for override in row.overrides),
-            *self.space,
-        ]
+        given = [*self.overrides, *self.space]
+        for overrides in (*self.scale_overrides.values(), *(row.overrides for row in self.rows)):
+            given += overrides
         if any(key_of(override) == "seed" for override in given):
             raise ConfigError(f"{where}: seed=... is no part of a sweep; seed= and seeds= of its command say them")
         labels = [row.label for row in self.rows] + [row.label for row in self.paper_rows]
@@ -168,7 +165,7 @@ class SweepConfig:
         return next((row.baseline for row in self.rows if row.label == label and row.baseline), self.baseline)
 
     def at_scale(self, scale: str) -> SweepConfig:
-        """The same question at one scale, with its overrides; a row that is not for it becomes one that only the paper has."""
+        """The same question with the overrides of one scale; a row not for it becomes one that only the paper has."""
         rows = [row for row in self.rows if row.scales is None or scale in row.scales]
         others = [PaperRowConfig(label=row.label, paper=row.paper) for row in self.rows if row not in rows]
         overrides = [*self.overrides, *self.scale_overrides.get(scale, [])]
