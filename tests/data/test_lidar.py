@@ -6,7 +6,7 @@ import torch
 
 from src.data.augment import AugmentationConfig, BevAugmentationConfig
 from src.data.cache import load_index
-from src.data.deskew import deskew
+from src.data.compensation import deskew
 from src.data.pcd import read_lidar_points
 from src.data.reader import FrameReader, OnBadFile
 from src.data.schema import CHANNELS
