@@ -104,7 +104,7 @@ def _rotate(
     matrices: Array,  # [n, 3, P], or [n, 3, 1] for all points
     vectors: Array,  # [3, P]
 ) -> Array:  # [n, P]
-    """A matrix of its own for every point; without BLAS, whose threads fight for the cores of other loader processes."""
+    """A matrix of its own for every point; without BLAS, whose threads fight over the cores of loader processes."""
     # The order of the sum is that of numpy's einsum on x86, to the last bit.
     return matrices[:, 0] * vectors[0] + matrices[:, 2] * vectors[2] + matrices[:, 1] * vectors[1]
 
