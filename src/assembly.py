@@ -15,8 +15,8 @@ from src.models import build_model as build_model_of
 from src.models.detector import Detector
 from src.structures.detections import DetectionTable
 from src.structures.taxonomy import SENSORS
-from src.training.module import DetectionModule
-from src.training.temporal_module import TemporalModule
+from src.training.module import TrainingModule
+from src.training.phases import EVALUATORS, MODULES
 from src.world.write import ensure_world, world_digest
 
 logger = logging.getLogger(__name__)
@@ -62,12 +62,10 @@ def build_datamodule(config: Config, root: Path) -> DetectionDataModule:
 
 def build_model(config: Config) -> Detector:
     """The configured detector with fresh weights (and pretrained backbone weights where given)."""
-    return build_model_of(
-        config.model, config.grid.build(), config.backbone, velocity_code_weight=config.phase.velocity_code_weight
-    )
+    return build_model_of(config.model, config.grid.build(), config.backbone, config.phase.options)
 
 
-def save_submission(path: Path, tokens: list[str], table: DetectionTable, config: Config) -> bool:
+def save_submission(config: Config, path: Path, tokens: list[str], table: DetectionTable) -> bool:
     """Write boxes of these samples as a submission; False, with a warning and no file, when there is none."""
     if not len(table):
         path.unlink(missing_ok=True)  # of an earlier command, whose boxes these are not
@@ -84,14 +82,13 @@ def save_submission(path: Path, tokens: list[str], table: DetectionTable, config
     return True
 
 
-def build_module(config: Config, tree: dict[str, Any], datamodule: DetectionDataModule) -> DetectionModule:
+def build_module(config: Config, tree: dict[str, Any], datamodule: DetectionDataModule) -> TrainingModule:
     """The LightningModule of a run; `tree` is the configuration as plain values."""
-    kind = TemporalModule if config.phase.temporal else DetectionModule
-    return kind(
+    return MODULES[config.phase.module](
         build_model(config),
         optim=config.optim,
         backbone_lr_multiplier=config.backbone.lr_multiplier,
-        evaluation_set=datamodule.evaluation_set(),
+        evaluator=EVALUATORS[config.phase.task].of(datamodule),
         seed=config.seed,
         config=tree,
         skip_nonfinite=config.trainer.on_nonfinite is OnNonfinite.skip,

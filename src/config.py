@@ -24,12 +24,13 @@ from omegaconf.errors import OmegaConfBaseException
 from src.data.datamodule import DataConfig
 from src.errors import CheckpointError, ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models import MODEL_CONFIGS
+from src.models import FAMILIES, read_phase_options
 from src.models.backbones.image import ImageEncoderConfig
 from src.reliability.passwords import masked
 from src.reliability.untrusted import fault_of_tree
 from src.training.identity import key_of
 from src.training.optim import OptimConfig
+from src.training.phases import EVALUATORS, MODULES
 from src.training.run_folder import Resume
 from src.training.wandb import WandbConfig
 from src.world.world_config import WorldConfig
@@ -79,19 +80,28 @@ class PhaseConfig:
     """One training phase."""
 
     name: str
+    module: str  # what trains it, of src/training/phases.py
+    task: str  # what a validation scores, of src/training/phases.py
+    monitor: str  # logged number that best.ckpt is chosen by, larger being better
     temporal: bool  # clips in order with memory; false: shuffled single frames, and the model has no temporal part
     init_from: str | None  # a phase, that is the run of the same command in that phase; or the path of a checkpoint
     train_missing: bool  # train the run that init_from names when it has not finished yet
     epochs: int
     validate_every: int  # epochs
-    velocity_code_weight: float  # weight of velocity in the box loss
+    options: dict[str, Any]  # what the phase says to the model's family
 
     def __post_init__(self) -> None:
         if self.name not in PHASES:
             raise ConfigError(f"phase.name={self.name}: must be one of {', '.join(PHASES)}; choose with phase=...")
         _refuse_empty("phase.init_from", self.init_from)
-        if not self.velocity_code_weight >= 0:
-            raise ConfigError(f"phase.velocity_code_weight must be at least 0, but got {self.velocity_code_weight}")
+        for key, known in (("module", MODULES), ("task", EVALUATORS)):
+            if getattr(self, key) not in known:
+                raise ConfigError(f"phase.{key}={getattr(self, key)}: must be one of {', '.join(known)}")
+        if MODULES[self.module].temporal is not self.temporal:
+            raise ConfigError(
+                f"phase.temporal={self.temporal} does not go with phase.module={self.module}, which is for "
+                f"{'streamed clips' if MODULES[self.module].temporal else 'single frames'}"
+            )
         for name in ("epochs", "validate_every"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"phase.{name} must be at least 1, but got {getattr(self, name)}")
@@ -182,7 +192,7 @@ class Config:
     """Everything a run is made of."""
 
     grid: GridConfig
-    model: Any  # the chosen model's own dataclass, see MODEL_CONFIGS
+    model: Any  # the chosen model's own dataclass, see FAMILIES
     backbone: ImageEncoderConfig
     data: RunDataConfig
     phase: PhaseConfig
@@ -206,8 +216,9 @@ class Config:
             raise ConfigError(f"precision must be one of {[p.value for p in Precision]}, but got {self.precision!r}")
         if not 0 <= self.seed < 2**32:
             raise ConfigError(f"seed must be at least 0 and below 2**32, but got {self.seed}")
-        if self.model.name not in MODEL_CONFIGS:
-            raise ConfigError(f"model.name={self.model.name}: must be one of {', '.join(MODEL_CONFIGS)}")
+        if self.model.name not in FAMILIES:
+            raise ConfigError(f"model.name={self.model.name}: must be one of {', '.join(FAMILIES)}")
+        read_phase_options(self.model.name, self.phase.options)
         for name in ("checkpoint", "predictions", "out", "scene"):
             _refuse_empty(name, getattr(self, name))
         _refuse_empty("data.root", self.data.root)
@@ -236,7 +247,7 @@ def _register() -> None:
     """Tell Hydra the types: the root as `run`, each model's as `model/schema_<name>`."""
     store = ConfigStore.instance()
     store.store(name="run", node=Config)
-    for name, schema in MODEL_CONFIGS.items():
+    for name, (schema, _) in FAMILIES.items():
         store.store(group="model", name=f"schema_{name}", node=schema)
 
 
@@ -320,8 +331,8 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     model, phase = (
         stored[key].get("name") if isinstance(stored.get(key), dict) else None for key in ("model", "phase")
     )
-    if not isinstance(model, str) or model not in MODEL_CONFIGS:
-        raise CheckpointError(f"the checkpoint is of model {model!r:.80}; this version knows {sorted(MODEL_CONFIGS)}")
+    if not isinstance(model, str) or model not in FAMILIES:
+        raise CheckpointError(f"the checkpoint is of model {model!r:.80}; this version knows {sorted(FAMILIES)}")
     if phase not in PHASES:
         raise CheckpointError(f"the checkpoint is of phase {phase!r:.80}; this version knows {PHASES}")
     scale = stored.get("scale")
@@ -343,7 +354,7 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
         OmegaConf.update(tree, key, OmegaConf.select(fresh, key), merge=False)
     schema = OmegaConf.structured(Config)
     try:
-        schema.model = OmegaConf.structured(MODEL_CONFIGS[model])
+        schema.model = OmegaConf.structured(FAMILIES[model][0])
         return build_config(OmegaConf.merge(schema, {"trainer": fresh.trainer}, tree))
     except (OmegaConfBaseException, ConfigError, OverflowError) as error:  # the last: a whole number beyond every float
         raise CheckpointError(f"the checkpoint's configuration does not fit this code: {error}") from None
@@ -398,5 +409,8 @@ def _check_tree(value: Any, node: Any, path: str) -> None:
     elif isinstance(value, list):
         for index, item in enumerate(value):
             _check_tree(item, node[index], f"{path}[{index}]")
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            _check_tree(item, node[key], f"{path}.{key}")
     elif isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f"{path} must be a finite number, but got {value}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from pathlib import Path
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
@@ -16,6 +17,7 @@ from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.checkpoints import load_model_weights, read_checkpoint
 from src.reliability.command import run_command
 from src.reliability.processes import check_devices
+from src.training.evaluator import Evaluator
 from src.training.fit import build_evaluation_trainer
 from src.training.identity import digest_of_changes
 from src.training.run_folder import make_writable, write_json
@@ -36,12 +38,14 @@ def main(overrides: list[str]) -> None:
     make_writable(out, "out")
     written = ["metrics.json"]
     if config.checkpoint:
-        scores, has_boxes = score_checkpoint(source, overrides, out)
-        written += ["submission.json"] * has_boxes
+        evaluator, files = score_checkpoint(source, overrides, out)
+        written += files
+        metrics, text = evaluator.as_dict(), evaluator.describe(evaluator.as_dict())
     else:
-        scores = score_file(source, config)
-    write_json(out / "metrics.json", scores.as_dict())
-    print(format_scores(scores.as_dict()))
+        metrics = score_file(source, config).as_dict()
+        text = format_scores(metrics)
+    write_json(out / "metrics.json", metrics)
+    print(text)
     print(f"\nwritten into {out}: {', '.join(written)}")
 
 
@@ -58,10 +62,10 @@ def score_file(path: Path, config: Config) -> DetectionScores:
     return score_detections(evaluation_set, load_submission(path, evaluation_set.tokens))
 
 
-def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[DetectionScores, bool]:
+def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[Evaluator, list[str]]:
     """Rebuild the checkpoint's own model, run it over the split and score it; the command line may change its data.
 
-    The second value tells whether there was any box, and so a submission.
+    Also the names of the files that it left in `out`, a submission where there was any box.
     """
     tune_cpu_allocator()
     checkpoint = read_checkpoint(path)
@@ -74,11 +78,10 @@ def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[Detec
     build_evaluation_trainer(config.precision, config.trainer.accelerator.value).validate(
         module, datamodule=datamodule, verbose=False
     )
-    tokens = module.metric.evaluation_set.tokens
-    written = save_submission(out / "submission.json", tokens, module.detections, config)
+    written = module.evaluator.write(out, partial(save_submission, config))
     if module.skipped:
         print(f"skipped sensor files: {module.skipped.text()}")
-    return module.scores, written
+    return module.evaluator, written
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -34,9 +33,8 @@ from src.reliability.checkpoints import load_model_weights
 from src.reliability.command import run_command
 from src.reliability.nonfinite import describe_gradients, gradient_norm, read_dump
 from src.structures.batch import LIDAR_POINT_FIELDS, RADAR_POINT_FIELDS, FrameBatch
-from src.structures.detections import DetectionTable, EvaluationSet
-from src.training.module import DetectionModule
-from src.training.temporal_module import TemporalModule
+from src.training.module import TrainingModule
+from src.training.phases import MODULES
 
 MAX_SHOWN = 8
 
@@ -76,26 +74,25 @@ class Step:
     batch: FrameBatch
     device: str
 
-    def build(self) -> DetectionModule:
+    def build(self) -> TrainingModule:
         """The module as it was when the step began. Raises CheckpointError when the weights do not fit."""
         config, step = self.config, self.content["horizon3d"]["step"]
         model = build_model(replace(config, backbone=replace(config.backbone, weights=None)))
         load_model_weights(model, self.content, self.path)
-        kind = TemporalModule if config.phase.temporal else DetectionModule
-        nothing = EvaluationSet([], np.zeros((0, 3)), [], DetectionTable.empty(), DetectionTable.empty())
-        module = kind(model, config.optim, config.backbone.lr_multiplier, nothing, config.seed, {})
+        kind = MODULES[config.phase.module]
+        module = kind(model, config.optim, config.backbone.lr_multiplier, None, config.seed, {})
         module.restore_rank({"means": {}, "memories": step["memories"]})
         module.to(self.device)
         module.on_fit_start()
         return module.train()
 
-    def forward(self, module: DetectionModule) -> dict[str, Tensor]:
+    def forward(self, module: TrainingModule) -> dict[str, Tensor]:
         """The loss terms, drawn from the step's own seed."""
         torch.manual_seed(self.content["horizon3d"]["step"]["seed"])
         bf16 = self.config.precision == Precision.bf16.value
         batch = self.batch.to(self.device)
         with torch.autocast(self.device, torch.bfloat16, enabled=bf16):
-            return module.model.loss(module.run(batch), batch)
+            return module.model.loss(module.run(batch), batch).terms
 
     def stop_at_first(self, seen: Watch) -> None:
         """Run up to the first number that is not finite, and raise DivergedError there.

@@ -8,6 +8,7 @@ import resource
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,7 @@ from src.assembly import build_datamodule, build_module, data_root, save_submiss
 from src.config import PHASES, Config, compose_config
 from src.data.datamodule import DetectionDataModule
 from src.errors import DataError
-from src.metrics.score_text import format_scores
-from src.pictures.learning_curves import draw_curves, draw_scores
+from src.pictures.learning_curves import draw_curves
 from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.checkpoints import OpenCheckpoint, open_checkpoint
 from src.reliability.command import run_command
@@ -32,6 +32,7 @@ from src.reliability.processes import (
     created_externally,
     decided_by_main,
     end_processes,
+    gather_by_rank,
     is_main_process,
     launch,
     process_group,
@@ -40,7 +41,8 @@ from src.structures.skipped import SHOWN_NAMES, SkippedFiles
 from src.training.fit import build_loggers, build_trainer, fit
 from src.training.handoff import WeightSource, find_source, hand_over, open_source, train_source
 from src.training.identity import run_identity
-from src.training.module import DetectionModule, gather_by_rank
+from src.training.module import TrainingModule
+from src.training.phases import EVALUATORS
 from src.training.run_folder import Resume, RunFolder, current_commit, write_json
 from src.training.snapshots import draw_frames
 from src.training.wandb import WandbRun
@@ -100,7 +102,7 @@ def prepare(
             weights = open_source(source)
         folder.open(config.resume)
         if folder.finished:
-            show_finished(folder)
+            show_finished(config, folder)
             return None
         resume = folder.newest_checkpoint()
         start_log(config, tree, folder)
@@ -153,10 +155,10 @@ def run(
         return
 
     module.to(trainer.strategy.root_device)  # Lightning leaves it on the CPU
-    scores = module.scores.as_dict()
+    scores = module.evaluator.as_dict()
     write_json(folder.metrics_json, scores)  # what took long is safe; run.json, the last file, marks the run finished
-    draw_pictures(config, module, datamodule, folder, scores)
-    save_submission(folder.path / "submission.json", module.metric.evaluation_set.tokens, module.detections, config)
+    draw_pictures(config, module, datamodule, folder)
+    module.evaluator.write(folder.path, partial(save_submission, config))
     record = {
         "run_id": folder.run_id,
         "overrides": overrides,
@@ -188,27 +190,16 @@ def run(
     if skipped:
         logger.warning("skipped sensor files: %s", skipped.text())
     logger.info("finished in %.0f s", record["seconds"]["all"])
-    print_result(folder, record, scores)
+    print_result(config, folder, record, scores)
     for tracked in [own for own in loggers if isinstance(own, WandbRun)]:
         print(f"W&B: {tracked.finish(scores, folder.pictures) or 'not complete, see the warning above'}")
 
 
-def draw_pictures(
-    config: Config,
-    module: DetectionModule,
-    datamodule: DetectionDataModule,
-    folder: RunFolder,
-    scores: dict[str, Any],
-) -> None:
-    """Learning curves, bars by class and distance, and some validation frames spread over the split."""
+def draw_pictures(config: Config, module: TrainingModule, datamodule: DetectionDataModule, folder: RunFolder) -> None:
+    """Learning curves, the evaluator's pictures, and some validation frames spread over the split."""
     folder.pictures.mkdir(exist_ok=True)
     draw_curves(folder.pictures / "curves.png", folder.metrics_csv, folder.run_id)
-    draw_scores(
-        folder.pictures / "scores.png",
-        {name: values["AP"] for name, values in scores["classes"].items()},
-        {name: values["mAP"] for name, values in scores["ranges"].items()},
-        folder.run_id,
-    )
+    module.evaluator.draw(folder.pictures, folder.run_id)
     length = config.model.memory_frames + 1 if config.phase.temporal else 1
     clips = datamodule.validation_clips(config.trainer.num_pictures, length)
     draw_frames(module.model, clips, config.grid.build(), folder.pictures)
@@ -221,6 +212,7 @@ def make_trainer(config: Config, folder: RunFolder, loggers: list[Logger]) -> L.
         folder,
         epochs=config.phase.epochs,
         validate_every=config.phase.validate_every,
+        monitor=config.phase.monitor,
         precision=config.precision,
         accelerator=config.trainer.accelerator.value,
         devices=config.trainer.devices,
@@ -243,7 +235,7 @@ def peak_memory_mib() -> dict[str, int]:
     }
 
 
-def show_finished(folder: RunFolder) -> None:
+def show_finished(config: Config, folder: RunFolder) -> None:
     """Print a finished run, and say when other code than today's made it. Raises DataError for edited results."""
     record, scores = folder.read_result()
     try:
@@ -253,7 +245,7 @@ def show_finished(folder: RunFolder) -> None:
                 record["commit"],
                 current_commit(),
             )
-        print_result(folder, record, scores)
+        print_result(config, folder, record, scores)
     except (KeyError, TypeError, ValueError) as error:
         reason = f"{type(error).__name__}: {error}"
         raise DataError(
@@ -261,9 +253,9 @@ def show_finished(folder: RunFolder) -> None:
         ) from error
 
 
-def print_result(folder: RunFolder, record: dict[str, Any], scores: dict[str, Any]) -> None:
+def print_result(config: Config, folder: RunFolder, record: dict[str, Any], scores: dict[str, Any]) -> None:
     """The table people wait for, and where everything lies."""
-    print(format_scores(scores))
+    print(EVALUATORS[config.phase.task].describe(scores))
     print(
         f"\n{folder.run_id}: {record['epochs']} epochs, {record['steps']} steps, {record['parameters'] / 1e6:.2f} M "
         f"parameters, {record['seconds']['all']:.0f} s, {record['peak_memory_mib']['process']} MiB"

@@ -81,10 +81,9 @@ def test_imports_go_down_and_frameworks_stay_in_their_rooms():
                     faults.append(f"{place} imports {module}")
             if first in FRAMEWORKS and not place.startswith(FRAMEWORKS[first]):
                 faults.append(f"{place} imports {module}")
-            if room == "models" and module.startswith("src.models."):
-                family, other = place.split("/")[1], module.split(".")[2]
-                if family in FAMILIES and other in FAMILIES and family != other:
-                    faults.append(f"{place} imports {module}")
+            family = module.split(".")[2] if module.startswith("src.models.") else None
+            if family in FAMILIES and not place.startswith(f"models/{family}/") and place != "models/__init__.py":
+                faults.append(f"{place} imports {module}: a family is named in the table of families alone")
     for room in LIGHT:
         faults += [f"src/{room} leads to {chain}" for chain in heavy_chains(room)]
     assert not faults, "\n".join(faults)

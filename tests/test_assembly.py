@@ -2,7 +2,8 @@
 
 import pytest
 
-from src.assembly import build_datamodule, data_root
+from src import assembly
+from src.assembly import build_datamodule, data_root, save_submission
 from src.config import compose_config
 from src.errors import ConfigError, DataError
 from src.reliability.processes import check_devices
@@ -36,3 +37,23 @@ def test_devices_that_are_not_there_are_named(monkeypatch):
     check_devices("cpu", 1)
     with pytest.raises(ConfigError, match="sees no GPU.*trainer.accelerator=cpu"):
         check_devices("gpu", 1)
+
+
+@pytest.mark.parametrize("sensors", [("radar",), ("camera", "radar"), ("lidar",)])
+def test_a_submission_states_the_sensors_that_the_model_reads(tmp_path, monkeypatch, sensors):
+    config, _ = compose_config(["scale=debug"])
+    monkeypatch.setattr(type(config.model), "sensors", sensors)
+    written = []
+    monkeypatch.setattr(assembly, "write_submission", lambda path, tokens, table, meta: written.append(meta))
+    assert save_submission(tmp_path / "submission.json", ["a"], [None], config)
+    stated = {name.removeprefix("use_") for name, used in written[0].items() if name.startswith("use_") and used}
+    assert stated == set(sensors)
+
+
+def test_a_world_without_lidar_is_refused_for_a_model_that_reads_it(monkeypatch):
+    config, _ = compose_config(["scale=debug"])
+    monkeypatch.setattr(type(config.model), "sensors", ("lidar",))
+    with pytest.raises(ConfigError, match="data.world.lidar=true"):
+        compose_config(["scale=debug"])
+    compose_config(["scale=debug", "data.world.lidar=true"])
+    compose_config(["scale=debug", "data=truckscenes", "data.root=x"])

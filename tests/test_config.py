@@ -44,7 +44,7 @@ def test_phase_2_composes_at_every_scale(scale):
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
-def test_the_dense_peer_composes_at_every_scale(scale, phase):
+def test_the_dense_baseline_composes_at_every_scale(scale, phase):
     """At the same range and cell; phase 1 drops what its settings name as temporal."""
     config, tree = compose_config([f"scale={scale}", "data.root=x", "model=dense_bev", f"phase={phase}"])
     model = config.model
@@ -133,7 +133,11 @@ FULL_SIZE = {
         "dptf_weight": 1.0, "cell_focal_weight": 1.0, "cell_dice_weight": 1.0, "cell_lovasz_weight": 1.0,
         "cell_velocity_weight": 0.25,
     },
-    "phase": {"epochs": 24, "velocity_code_weight": 0.2, "init_from": None, "train_missing": True},
+    "phase": {
+        "epochs": 24, "module": "TrainingModule", "task": "detection", "monitor": "val/mAP", "init_from": None,
+        "train_missing": True,
+    },
+    "phase.options": {"velocity_code_weight": 0.2},
     "optim": {
         "lr": 1e-4, "weight_decay": 0.01, "clip_norm": 35.0, "peak_lr_ratio": 10.0, "final_lr_ratio": 1e-4,
         "rise_fraction": 0.4, "betas": [0.95, 0.99], "cycled_beta1": [0.95, 0.85], "ema_decay": None,
@@ -157,8 +161,10 @@ FULL_SIZE = {
 # The same for what phase 2 adds or changes.
 FULL_SIZE_PHASE_2 = {
     "phase": {
-        "epochs": 24, "velocity_code_weight": 1.0, "init_from": "phase1", "train_missing": True, "temporal": True,
+        "epochs": 24, "module": "TemporalModule", "task": "detection", "monitor": "val/mAP", "init_from": "phase1",
+        "train_missing": True, "temporal": True,
     },
+    "phase.options": {"velocity_code_weight": 1.0},
     "model.dptf": {"max_age_s": 6.0},
     "model.dptf.bev_path": {
         "num_frames": 8, "memory_threshold": 0.1, "max_cells_per_frame": 4096, "velocity_compensation": True,
@@ -224,7 +230,7 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["model=dense_bev", "model.view_transform.image_stride_px=0"], "image_stride_px=0"),
         (["model=dense_bev", "phase=phase2", "model.temporal.num_frames=0"], "num_frames=0.*model.temporal=null"),
         (["phase=phase2", "phase.name=phase1"], "phase.name=phase1.*phase=\\.\\.\\."),
-        (["phase.velocity_code_weight=-1"], "velocity_code_weight"),
+        (["phase.options.velocity_code_weight=-1"], "velocity_code_weight"),
         (["optim.final_lr_ratio=-1"], "final_lr_ratio"),
         (["trainer.accelerator=cuda9"], "accelerator.*gpu"),
         (["trainer.num_pictures=-1"], "num_pictures"),
@@ -275,7 +281,7 @@ def test_a_stored_phase_2_comes_back_with_its_memory():
         restore_config(single, ["model.dptf.max_age_s=0.55"])
 
 
-def test_a_stored_dense_peer_comes_back_as_such():
+def test_a_stored_dense_baseline_comes_back_as_such():
     """Also where the command line says nothing of the model, whose default is another."""
     _, tree = compose_config(["scale=debug", "phase=phase2", "model=dense_bev", "model.temporal.num_frames=3"])
     for named in ([], ["model=dense_bev"]):  # commands compose their line by itself, and then need to be told

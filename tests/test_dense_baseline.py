@@ -1,4 +1,4 @@
-"""The dense peer by the commands that people type, at debug scale: phase 1, phase 2, evaluation, streaming."""
+"""The dense baseline by the commands that people type, at debug scale: phase 1, phase 2, evaluation, streaming."""
 
 import json
 

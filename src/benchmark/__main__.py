@@ -1,11 +1,11 @@
 """`python -m src.benchmark [suite=...] [scale=...] [out=DIR]`: what things cost, as Markdown and JSON in DIR.
 
 suite=model     the configured model part by part: time forward and with backward, arithmetic, memory traffic, share of
-                what this machine can do at most, peak memory. With phase=phase2 the memory is full, but an untrained
+                the roofline bound on this machine, peak memory. With phase=phase2 the memory is full, but an untrained
                 model holds no cell worth remembering: model.dptf.bev_path.memory_threshold=0 keeps all. The weights
                 are random unless checkpoint=PATH (of the same configuration) is given
-suite=ops       each heavy operation against its floor and its peers, in turns
-suite=scaling   cost against range, objects, radar points, Gaussians and memory, ours beside the dense peer
+suite=ops       each heavy operation beside GEMM, other libraries and naive implementations, in turns
+suite=scaling   cost against range, objects, radar points, Gaussians and memory, ours beside the dense baseline
 suite=training  frames per second of the phase's training step, with its loader and without
 suite=latency   a frame of the trained model checkpoint=PATH, part by part, with full memory in phase 2, over the frames
                 that it was validated on; into DIR/latency.json, where DIR is the run's folder if tables are to show it

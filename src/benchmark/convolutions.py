@@ -1,22 +1,23 @@
-"""Sparse convolutions layer by layer, and the whole radar backbone, against their floor, dense ones and spconv."""
+"""Sparse convolutions layer by layer, and the whole radar backbone, beside GEMM, dense convolution and spconv."""
 
 from __future__ import annotations
 
 import logging
 import multiprocessing
+import statistics
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.utils.benchmark import set_torch_threads
 
 from src.benchmark.counting import counted_work
-from src.benchmark.machine import Product
+from src.benchmark.machine import Gemm
 from src.benchmark.operation_table import operation_table
 from src.benchmark.spconv_baseline import (
     SpconvEncoder,
@@ -24,14 +25,12 @@ from src.benchmark.spconv_baseline import (
     largest_difference,
     load_spconv,
     sparse_tensor,
-    torch_threads,
     uncached,
 )
-from src.benchmark.timing import in_turns, median_spread, with_gradient, without_gradient
+from src.benchmark.timing import MODES, clock, interleaved, milliseconds, status_bytes, without_gradient
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.sparse_voxel import RadarEncoder, RadarEncoderConfig
-from src.models.horizon3d.bev_path import TemporalConv
-from src.models.layers.sparse import SparseConv, SparseKernel, SubmanifoldConv
+from src.models.layers.sparse import SparseConv, SparseKernel, SubmanifoldConv, TemporalConv
 from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
 from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv
@@ -42,10 +41,10 @@ logger = logging.getLogger(__name__)
 
 ROUNDS = 7
 LAYER_BUDGET_S, BACKBONE_BUDGET_S = 4.0, 20.0  # of each candidate; what takes longer has fewer rounds
-DENSE_LIMIT_BYTES = 2**31  # of the dense input and output together; larger grids have no dense peer
+DENSE_LIMIT_BYTES = 2**31  # of the dense input and output together; larger grids have no dense baseline
 DENSE_LIMIT_FLOPS = 1.5e12  # a quarter of a minute on two cores
 AGREEMENT = 1e-5  # of outputs and gradients, relative to the largest; float32 sums in another order
-SPCONV_TRIALS = 6  # runs on several threads that are looked at for spconv's fault
+SPCONV_TRIALS = 6  # runs on several threads that are checked for spconv's race
 
 
 @dataclass
@@ -60,7 +59,7 @@ class Layer:
 
     @property
     def temporal(self) -> bool:
-        """Whether time shortens without spreading over the plane, which no peer offers."""
+        """Whether time shortens without spreading over the plane, which no baseline offers."""
         return isinstance(self.kernel, TemporalConv)
 
     def map(self, sites: Sites) -> tuple[KernelMap, Sites]:
@@ -107,19 +106,19 @@ def layers_of(
 
 def measure_layers(layers: list[Layer], device: torch.device, threads: list[int]) -> list[dict[str, Any]]:
     """Rows of all layers at every number of threads."""
-    spconv, product = load_spconv(device), Product(device)
+    spconv, gemm = load_spconv(device), Gemm(device)
     rows = []
     for layer in layers:
         logger.info("%s", layer.name)
         layer.kernel.to(device)
         for number in threads:
-            with torch_threads(number):
-                rows += measure_layer(layer, spconv, device, product, number)
+            with set_torch_threads(number):
+                rows += measure_layer(layer, spconv, device, gemm, number)
     return rows
 
 
 def measure_layer(
-    layer: Layer, spconv: ModuleType | None, device: torch.device, product: Product, threads: int
+    layer: Layer, spconv: ModuleType | None, device: torch.device, gemm: Gemm, threads: int
 ) -> list[dict[str, Any]]:
     """Forward, and forward with both gradients; kernel maps of all are made before, ours timed by themselves."""
     kernel_map, out_sites = layer.map(layer.sites)
@@ -129,12 +128,12 @@ def measure_layer(
     functions: dict[str, Callable[[], Tensor]] = {"ours": lambda: sparse_conv(features, weight, kernel_map)}
     leaves: dict[str, list[Tensor]] = {"ours": [features, weight]}
     if spconv is not None and not layer.temporal:
-        peer = build_layer(spconv, layer.kernel, layer.stride, layer.padding, "pairs").to(device)
+        baseline = build_layer(spconv, layer.kernel, layer.stride, layer.padding, "pairs").to(device)
         empty = sparse_tensor(spconv, SparseMap(layer.sites, features))
-        peer(empty)  # fills the tensor's table of pairs
-        order = Sites.from_indices(peer(empty).indices.long(), out_sites.shape)[1]
-        functions["spconv"] = lambda: peer(empty.replace_feature(features)).features
-        leaves["spconv"] = [features, peer.weight]
+        baseline(empty)  # fills the tensor's rulebook
+        order = Sites.from_indices(baseline(empty).indices.long(), out_sites.shape)[1]
+        functions["spconv"] = lambda: baseline(empty.replace_feature(features)).features
+        leaves["spconv"] = [features, baseline.weight]
     if fits_dense(layer, out_sites):
         functions["dense"] = lambda: dense_convolution(layer, features, out_sites)
         leaves["dense"] = [features, weight]
@@ -154,39 +153,30 @@ def measure_layer(
             runs = (functions["spconv"]().detach().index_select(0, order) for _ in range(SPCONV_TRIALS))
             wrong = sum(largest_difference([reference], [run]) > AGREEMENT for run in runs)
             agreement["spconv wrong"] = f"{wrong} of {SPCONV_TRIALS}"
-
-    def inferred(function: Callable[[], Tensor]) -> Callable[[], Tensor]:
-        def call() -> Tensor:
-            with torch.no_grad():
-                return function()
-
-        return call
-
-    forward = {name: inferred(function) for name, function in functions.items()}
+    forward = {name: without_gradient(function) for name, function in functions.items()}
     forward["map"] = lambda: layer.map(Sites(layer.sites.shape, layer.sites.keys))
     rows = []
     for mode, candidates, times in (("forward", forward, 1), ("f+b", both, 3)):
-        seconds = in_turns(candidates | {"product": product}, device, ROUNDS, LAYER_BUDGET_S)
+        seconds = interleaved(candidates | {"GEMM": gemm}, clock(device), ROUNDS, LAYER_BUDGET_S)
         sizes = {"sites": len(layer.sites), "outputs": len(out_sites), "pairs": len(kernel_map.inputs)}
         row = {"layer": layer.name, "mode": mode, "threads": threads}
-        row |= ratio_columns(seconds, times * flops, product)
+        row |= ratio_columns(seconds, times * flops, gemm)
         if mode == "forward":
-            row["map ms"] = 1e3 * median_spread(seconds["map"])[0]
+            row["map ms"] = 1e3 * statistics.median(seconds["map"])
         rows.append(row | agreement | sizes)
     return rows
 
 
-def ratio_columns(seconds: dict[str, list[float]], flops: float, product: Product) -> dict[str, Any]:
-    """How many times faster ours is than its peers, its share of the product's rate beside it, then times."""
-    middle = {name: median_spread(values)[0] for name, values in seconds.items()}
+def ratio_columns(seconds: dict[str, list[float]], flops: float, gemm: Gemm) -> dict[str, Any]:
+    """How many times faster ours is than its baselines, its share of the GEMM rate beside it, then times."""
+    middle = {name: statistics.median(values) for name, values in seconds.items()}
     row: dict[str, Any] = {
         f"x faster than {name}": middle[name] / middle["ours"] for name in ("dense", "spconv") if name in middle
     }
-    rate = product.flops / middle["product"]
-    row |= {"% of products": 100 * flops / middle["ours"] / rate, "ms": 1e3 * middle["ours"]}
-    row["± ms"] = 1e3 * median_spread(seconds["ours"])[1]
+    rate = gemm.flops / middle["GEMM"]
+    row |= {"% of GEMM": 100 * flops / middle["ours"] / rate, **milliseconds(seconds["ours"])}
     row |= {f"{name} ms": 1e3 * middle[name] for name in ("dense", "spconv") if name in middle}
-    return row | {"products GFLOP/s": rate / 1e9}
+    return row | {"GEMM GFLOP/s": rate / 1e9}
 
 
 def spconv_difference(
@@ -196,14 +186,14 @@ def spconv_difference(
     order: Tensor,
 ) -> float:
     """Largest relative difference of outputs and of both gradients."""
-    ours, peer = both["ours"](), both["spconv"]()
-    cube = peer[1].permute(*range(1, peer[1].dim()), 0)  # [out, *k, in] -> [*k, in, out]
+    ours, theirs = both["ours"](), both["spconv"]()
+    cube = theirs[1].permute(*range(1, theirs[1].dim()), 0)  # [out, *k, in] -> [*k, in, out]
     outputs = functions["ours"](), functions["spconv"]().index_select(0, order)
-    return largest_difference([outputs[0], *ours], [outputs[1], peer[0], cube.reshape(ours[1].shape)])
+    return largest_difference([outputs[0], *ours], [outputs[1], theirs[0], cube.reshape(ours[1].shape)])
 
 
 def fits_dense(layer: Layer, out_sites: Sites) -> bool:
-    """Whether the dense peer has room and ends in time."""
+    """Whether the dense convolution has room and ends in time."""
     cells = [torch.Size(sites.shape).numel() for sites in (layer.sites, out_sites)]
     kernel = layer.kernel
     room = 4 * (cells[0] * kernel.in_channels + cells[1] * kernel.out_channels)
@@ -246,7 +236,7 @@ def measure_backbone(
     threads: list[int],
 ) -> list[dict[str, Any]]:
     """Rows by scene, mode and threads; kernel maps are made anew every time, batch norm uses the batch."""
-    spconv, product = load_spconv(device), Product(device)
+    spconv, gemm = load_spconv(device), Gemm(device)
     encoder = backbone.build().to(device)
     encoder.local_means = None  # spconv has no counterpart, and it is not part of the backbone
     rows = []
@@ -260,10 +250,10 @@ def measure_backbone(
             twin = SpconvEncoder(spconv, encoder).to(device).train()
             functions["spconv"] = lambda v=voxels, twin=twin: twin(v)[1]
         for count in threads:
-            with torch_threads(count):
+            with set_torch_threads(count):
                 # A process each, so only of the first scene and with all threads.
                 with_memory = device.type == "cpu" and number == 0 and count == max(threads)
-                rows += _backbone_rows(name, backbone, points, voxels, functions, device, product, count, with_memory)
+                rows += _backbone_rows(name, backbone, points, voxels, functions, device, gemm, count, with_memory)
     return rows
 
 
@@ -274,7 +264,7 @@ def _backbone_rows(
     voxels: SparseMap,
     functions: dict[str, Callable[[], Tensor]],
     device: torch.device,
-    product: Product,
+    gemm: Gemm,
     threads: int,
     with_memory: bool,
 ) -> list[dict[str, Any]]:
@@ -282,18 +272,17 @@ def _backbone_rows(
     if "spconv" in functions and threads == 1:
         with torch.no_grad():
             agreement["spconv differs by"] = largest_difference([functions["ours"]()], [functions["spconv"]()])
-    forward = {kind: without_gradient(function) for kind, function in functions.items()}
-    both = {kind: with_gradient(function) for kind, function in functions.items()}
     rows = []
-    for mode, candidates in (("forward", forward), ("f+b", both)):
+    for mode, wrap in MODES.items():
+        candidates = {kind: wrap(function) for kind, function in functions.items()}
         with counted_work() as work:
             candidates["ours"]()
-        seconds = in_turns(candidates | {"product": product}, device, ROUNDS, BACKBONE_BUDGET_S)
-        row = {"scene": name, "mode": mode, "threads": threads} | ratio_columns(seconds, work.flops, product)
+        seconds = interleaved(candidates | {"GEMM": gemm}, clock(device), ROUNDS, BACKBONE_BUDGET_S)
+        row = {"scene": name, "mode": mode, "threads": threads} | ratio_columns(seconds, work.flops, gemm)
         row |= {"GFLOP": work.flops / 1e9}
         if with_memory:
             for kind in functions:
-                held = memory_of(backbone, points, kind, mode == "f+b", threads)
+                held = memory_of(backbone, points, kind, mode, threads)
                 if held is not None:
                     row |= {f"{kind} peak MiB": held[1], f"{kind} MiB before": held[0]}
         rows.append(row | agreement | {"voxels": len(voxels)})
@@ -309,22 +298,19 @@ def backbone_operations(backbone: Backbone, points: Tensor) -> dict[str, list[di
         return encoder(points, owners, 1).features
 
     return {
-        f"operations of the backbone, {mode}": operation_table(wrap(run), points.device)
-        for mode, wrap in (("forward", without_gradient), ("f+b", with_gradient))
+        f"operations of the backbone, {mode}": operation_table(wrap(run), points.device) for mode, wrap in MODES.items()
     }
 
 
-def memory_of(
-    backbone: Backbone, points: Tensor, kind: str, backward: bool, threads: int
-) -> tuple[float, float] | None:
-    """MiB that a process of its own holds before and at most, None where the system does not tell."""
-    if not Path("/proc/self/status").is_file():
+def memory_of(backbone: Backbone, points: Tensor, kind: str, mode: str, threads: int) -> tuple[float, float] | None:
+    """MiB that a process of its own holds before and at most, None where the system does not report it."""
+    if status_bytes("VmRSS") is None:
         return None
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(_run_alone, backbone, points, kind, backward, threads).result()
+        return pool.submit(_run_alone, backbone, points, kind, mode, threads).result()
 
 
-def _run_alone(backbone: Backbone, points: Tensor, kind: str, backward: bool, threads: int) -> tuple[float, float]:
+def _run_alone(backbone: Backbone, points: Tensor, kind: str, mode: str, threads: int) -> tuple[float, float]:
     tune_cpu_allocator()
     torch.set_num_threads(threads)
     encoder = backbone.build()
@@ -336,14 +322,9 @@ def _run_alone(backbone: Backbone, points: Tensor, kind: str, backward: bool, th
     else:
         twin = SpconvEncoder(load_spconv(torch.device("cpu")), encoder).train()
         run = lambda: twin(voxels)[1]  # noqa: E731
-    before = _status_mib("VmRSS")
-    (with_gradient if backward else without_gradient)(run)()
-    return before, _status_mib("VmHWM")
-
-
-def _status_mib(key: str) -> float:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(key + ":"))
+    before = status_bytes("VmRSS") / 2**20
+    MODES[mode](run)()
+    return before, status_bytes("VmHWM") / 2**20
 
 
 def remembered_sites(grid: BEVGrid, bev: Sites, frames: int) -> Sites:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
-from torch.utils.flop_counter import flop_registry
+from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
 
 from src.ops import backend
 
@@ -20,6 +20,38 @@ aten = torch.ops.aten
 
 # Operations that give out memory without writing it, or names for memory that exists.
 FREE = {aten.detach, aten.alias, aten.empty, aten.empty_strided, aten.empty_like, aten.new_empty, aten.resize_}
+
+Shape = tuple[int, ...]
+
+
+def _product(left: Shape, right: Shape, *_: Any, **__: Any) -> int:
+    """Grouped too: rows of `left` meet one matrix each; two matrices are cut along the inner axis."""
+    return 2 * math.prod(left) * right[-1]
+
+
+def _added_product(self: Shape, left: Shape, right: Shape, *_: Any, **__: Any) -> int:
+    return _product(left, right)
+
+
+def _attention(query: Shape, key: Shape, value: Shape, *_: Any, **__: Any) -> int:
+    return sdpa_flop_count(query, key, value)
+
+
+def _attention_backward(grad: Shape, query: Shape, key: Shape, value: Shape, *_: Any, **__: Any) -> int:
+    return sdpa_backward_flop_count(grad, query, key, value)
+
+
+FORMULAS: dict[Any, Callable[..., int]] = {
+    aten._grouped_mm: _product,
+    aten.addmm_: _added_product,
+    aten.baddbmm_: _added_product,
+    aten._scaled_dot_product_flash_attention_for_cpu: _attention,
+    aten._scaled_dot_product_flash_attention_for_cpu_backward: _attention_backward,
+}
+"""What torch's own table lacks."""
+
+# Its table without its context: the hooks of its module tracker add copies of gradients, which would count as traffic.
+FLOPS = FlopCounterMode(display=False, custom_mapping=FORMULAS).flop_registry
 
 
 @dataclass
@@ -59,44 +91,9 @@ class _Counter(TorchDispatchMode):
         if not func.is_view and packet not in FREE:
             inputs = [args, {name: value for name, value in kwargs.items() if name != "out"}]
             self.work.bytes += sum(x.nbytes for x in tree_leaves([inputs, result]) if isinstance(x, Tensor))
-        if packet in FORMULAS:
-            self.work.flops += FORMULAS[packet](*args, **kwargs)
-        elif packet in flop_registry:
-            self.work.flops += flop_registry[packet](*args, **kwargs, out_val=result)
+        if packet in FLOPS:
+            self.work.flops += FLOPS[packet](*args, **kwargs, out_val=result)
         return result
-
-
-def product_flops(rows: int, inner: int, cols: int) -> int:
-    """Of one matrix product."""
-    return 2 * rows * inner * cols
-
-
-def _grouped(left: Tensor, right: Tensor, *_: Any, **__: Any) -> int:
-    """Rows of `left` meet one matrix each; two plain matrices are cut along the inner axis, and each part counts."""
-    return product_flops(math.prod(left.shape[:-1]), left.shape[-1], right.shape[-1])
-
-
-def _added(self: Tensor, left: Tensor, right: Tensor, *_: Any, **__: Any) -> int:
-    return math.prod(left.shape[:-2]) * product_flops(left.shape[-2], left.shape[-1], right.shape[-1])
-
-
-def _attention(query: Tensor, key: Tensor, value: Tensor, *_: Any, **__: Any) -> int:
-    return math.prod(query.shape[:-1]) * key.shape[-2] * 2 * (query.shape[-1] + value.shape[-1])
-
-
-def _attention_gradient(grad: Tensor, query: Tensor, key: Tensor, value: Tensor, *_: Any, **__: Any) -> int:
-    """Scores anew, and four products: of values, probabilities, queries and keys."""
-    return math.prod(query.shape[:-1]) * key.shape[-2] * 2 * (3 * query.shape[-1] + 2 * value.shape[-1])
-
-
-FORMULAS: dict[Any, Callable[..., int]] = {
-    aten._grouped_mm: _grouped,
-    aten.addmm_: _added,
-    aten.baddbmm_: _added,
-    aten._scaled_dot_product_flash_attention_for_cpu: _attention,
-    aten._scaled_dot_product_flash_attention_for_cpu_backward: _attention_gradient,
-}
-"""What torch's own table lacks."""
 
 
 def distinct_bytes(tensors: list[Tensor]) -> int:

@@ -1,4 +1,4 @@
-"""What the numbers were measured on, and what that machine can do at most."""
+"""What the numbers were measured on, and that machine's roofline."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.benchmark.timing import interleaved
+from src.benchmark.timing import clock, interleaved
 from src.report.sweep_text import is_busy
 
 # Square products large enough to reach the highest rate, small enough for seconds on two cores.
@@ -38,12 +38,12 @@ def describe_machine() -> dict[str, Any]:
 
 
 def busy_warning(machine: dict[str, Any]) -> str | None:
-    """What to say of numbers that were taken beside other work; None on a quiet machine."""
+    """A warning for numbers that were measured beside other work; None on a quiet machine."""
     if not is_busy(machine["load"], machine["cores"]):
         return None
     return (
         f"warning: {machine['load']:.1f} of {machine['cores']} cores were at work when this began: the machine is "
-        "busy, so times are too long; ratios of what was measured in turns still tell; measure again when nothing "
+        "busy, so times are too long; ratios of what was measured in turns still hold; measure again when nothing "
         "else runs"
     )
 
@@ -51,7 +51,7 @@ def busy_warning(machine: dict[str, Any]) -> str | None:
 def busy_cores() -> float:
     """How many cores were at work during one second in which this process waits.
 
-    Where the system does not count that (Linux does), its load, which still holds what ended a minute ago.
+    Where the system does not count that (Linux does), its load average, which still holds what ended a minute ago.
     """
     before = _core_seconds()
     if before is None:
@@ -73,14 +73,14 @@ def _core_seconds() -> tuple[int, int] | None:
 
 
 def processor() -> str:
-    """Name of the CPU where the system tells it."""
+    """Name of the CPU where the system reports it, else its architecture."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
     return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def memory_gib() -> float | None:
-    """Memory of the machine where the system tells it."""
+    """Memory of the machine where the system reports it."""
     try:
         return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
     except (AttributeError, ValueError, OSError):
@@ -91,21 +91,21 @@ def measure_roofline(device: torch.device) -> dict[str, float]:
     """Measured ceilings: GFLOP/s of matrix products by type and GB/s of a copy (bytes read plus bytes written).
 
     With torch's number of threads, each the fastest of some rounds. `bf16` is absent where the processor has no
-    arithmetic of its own for it, which the rate tells: below that of fp32 nobody would choose it.
+    instructions of its own for it, which shows in a rate below that of fp32.
     """
-    products = {name: Product(device, dtype) for name, dtype in (("fp32", torch.float32), ("bf16", torch.bfloat16))}
-    timed = interleaved(products, device, ROUNDS)
-    rates = {f"{name}_gflops": product.flops / min(timed[name]) / 1e9 for name, product in products.items()}
+    products = {name: Gemm(device, dtype) for name, dtype in (("fp32", torch.float32), ("bf16", torch.bfloat16))}
+    timed = interleaved(products, clock(device), ROUNDS)
+    rates = {f"{name}_gflops": gemm.flops / min(timed[name]) / 1e9 for name, gemm in products.items()}
     if rates["bf16_gflops"] < rates["fp32_gflops"]:
         del rates["bf16_gflops"]
     size = COPY_BYTES[device.type]
     source = torch.ones(size // 4, device=device)
     target = torch.empty_like(source)
-    seconds = interleaved({"copy": lambda: target.copy_(source)}, device, ROUNDS)["copy"]
+    seconds = interleaved({"copy": lambda: target.copy_(source)}, clock(device), ROUNDS)["copy"]
     return rates | {"copy_gbps": 2 * size / min(seconds) / 1e9}
 
 
-class Product:
+class Gemm:
     """A matrix product large enough to reach the machine's rate; a call makes it, `flops` of arithmetic."""
 
     def __init__(self, device: torch.device, dtype: torch.dtype = torch.float32) -> None:

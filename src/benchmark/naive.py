@@ -1,8 +1,9 @@
-"""Splatting and the smaller operations beside the formulation that one would write first."""
+"""Splatting and the smaller operations beside their naive implementations."""
 
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.benchmark.parts import tensors_in
-from src.benchmark.timing import added_bytes, in_turns, median_spread, with_gradient, without_gradient
+from src.benchmark.scenes import ROADS, Highway
+from src.benchmark.timing import MODES, added_bytes, clock, interleaved, milliseconds
 from src.config import Config
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import cells_in_boxes
@@ -37,8 +39,7 @@ VIEWS, HEADS, LEVEL_STRIDES = 4, 4, (8, 16, 32)
 class NaiveSizes:
     """How large the operations are; the channels are the model's."""
 
-    background: int  # radar points of the made-up scene beside those of vehicles
-    points_per_vehicle: int
+    road: Highway
     cells: int  # of a sparse BEV map, and per remembered frame a quarter of it
     frames: int
     gaussians: int
@@ -51,9 +52,9 @@ class NaiveSizes:
 
 SIZES = {
     # The sizes at which formulations were chosen: 19 thousand voxels, 8 thousand cells, 2560 Gaussians.
-    "paper": NaiveSizes(12_700, 113, 8000, 8, 2560, 2560, 256, 80, 60_000, 160),
-    "mini": NaiveSizes(2600, 23, 2000, 4, 640, 640, 64, 40, 15_000, 160),
-    "debug": NaiveSizes(200, 2, 200, 2, 32, 32, 8, 5, 500, 16),
+    "paper": NaiveSizes(ROADS["paper"], 8000, 8, 2560, 2560, 256, 80, 60_000, 160),
+    "mini": NaiveSizes(ROADS["mini"], 2000, 4, 640, 640, 64, 40, 15_000, 160),
+    "debug": NaiveSizes(Highway(200, 60, 2, 150.0), 200, 2, 32, 32, 8, 5, 500, 16),
 }
 
 
@@ -62,7 +63,7 @@ SIZES = {
 Gaussians = dict[str, Tensor]
 
 
-def made_up_gaussians(number: int, channels: int, grid: BEVGrid, device: torch.device) -> Gaussians:
+def random_gaussians(number: int, channels: int, grid: BEVGrid, device: torch.device) -> Gaussians:
     """Gaussians of all sizes, three fifths of them in clusters; what `splat_gaussians` takes."""
     draw = torch.Generator().manual_seed(0)
     half = torch.tensor(grid.half_extent_m)
@@ -104,27 +105,24 @@ def measure_splat(gaussians: Gaussians, grid: BEVGrid, subset: int, device: torc
         return dense_splat(few, occupied, grid, options["support_sigmas"])
 
     rows = []
-    for mode, wrap in (("forward", without_gradient), ("f+b", with_gradient)):
+    for mode, wrap in MODES.items():
         candidates = {"ours": wrap(ours), "dense": wrap(dense)}
-        seconds = in_turns(candidates, device, ROUNDS, BUDGET_S)
-        middle = {name: median_spread(values)[0] for name, values in seconds.items()}
+        seconds = interleaved(candidates, clock(device), ROUNDS, BUDGET_S)
+        middle = {name: statistics.median(values) for name, values in seconds.items()}
         added = {name: added_bytes(function, device) for name, function in candidates.items()}
         row = {"mode": mode, "x faster than dense": factor * middle["dense"] / middle["ours"]}
         if None not in added.values():
-            row["x leaner than dense"] = factor * added["dense"] / max(added["ours"], 1)
+            row["x less memory than dense"] = factor * added["dense"] / max(added["ours"], 1)
             row |= {f"{name} added MiB": value / 2**20 for name, value in added.items()}
             row["dense added MiB"] *= factor
-        row |= {"ms": 1e3 * middle["ours"], "± ms": 1e3 * median_spread(seconds["ours"])[1]}
-        row |= {"dense ms": 1e3 * factor * middle["dense"]}
+        row |= milliseconds(seconds["ours"]) | {"dense ms": 1e3 * factor * middle["dense"]}
         rows.append(row | {"gaussians": number, "pairs": pairs, "cells": len(whole.support), "occupied": len(occupied)})
     return rows
 
 
 def dense_splat(gaussians: Gaussians, occupied: Tensor, grid: BEVGrid, support_sigmas: float) -> tuple[Tensor, Tensor]:
     """Eq. 4-6 as they are written: every Gaussian against every cell, features at the occupied ones."""
-    cells = torch.arange(grid.rows * grid.cols, device=occupied.device)
-    centres = grid.centre_of(torch.stack([torch.div(cells, grid.cols, rounding_mode="floor"), cells % grid.cols], 1))
-    offset = centres - gaussians["means"][:, None]  # [G, cells, 2]
+    offset = all_centres(grid, occupied.device) - gaussians["means"][:, None]  # [G, cells, 2]
     cosine, sine = gaussians["directions"][:, None].unbind(-1)
     along = (cosine * offset[..., 0] + sine * offset[..., 1]) / gaussians["scales"][:, :1]
     across = (cosine * offset[..., 1] - sine * offset[..., 0]) / gaussians["scales"][:, 1:]
@@ -134,13 +132,19 @@ def dense_splat(gaussians: Gaussians, occupied: Tensor, grid: BEVGrid, support_s
     return torch.log1p(-contribution).sum(0), kernel.index_select(1, occupied).t() @ gaussians["features"]
 
 
+def all_centres(grid: BEVGrid, device: torch.device) -> Tensor:  # [rows * cols, 2] m
+    """Of every cell, row by row."""
+    cells = torch.cartesian_prod(torch.arange(grid.rows, device=device), torch.arange(grid.cols, device=device))
+    return grid.centre_of(cells)
+
+
 # ---------------------------------------------------------------- everything else
 
 
 def measure_rest(
     config: Config, sizes: NaiveSizes, grid: BEVGrid, points: Tensor, bev: Sites, device: torch.device
 ) -> list[dict[str, Any]]:
-    """Rows of operations whose floor is not a product: ours against the formulation one would write first."""
+    """Rows of operations that are not bound by matrix products: ours against the naive implementation."""
     draw, channels = torch.Generator(device=device).manual_seed(1), config.model.channels
     rows = compare("segment sum", *segment_candidates(sizes, channels, draw, device), "index_add", device)
     sampling = sampling_candidates(sizes, channels, grid, bev, draw)
@@ -154,7 +158,7 @@ def measure_rest(
     rows += compare(
         "farthest points",
         lambda: farthest_points(spots[None], valid, start, sizes.picks),
-        lambda: plain_farthest_points(spots, sizes.picks),
+        lambda: naive_farthest_points(spots, sizes.picks),
         "plain loop",
         device,
     )
@@ -173,7 +177,7 @@ def measure_rest(
     rows += compare(
         "voxels",
         lambda: voxelize(points, points[:, :3], owners, lower, size, shape, 1)[1],
-        lambda: plain_voxels(points, lower, size),
+        lambda: naive_voxels(points, lower, size),
         "unique rows + index_add",
         device,
     )
@@ -181,27 +185,17 @@ def measure_rest(
 
 
 def compare(
-    name: str, ours: Callable[[], Any], peer: Callable[[], Any], peer_name: str, device: torch.device
+    operation: str, ours: Callable[[], Any], naive: Callable[[], Any], naive_name: str, device: torch.device
 ) -> list[dict[str, Any]]:
-    """Ours and the peer in turns, forward and, where something can be derived, with backward."""
-    modes = {"forward": without_gradient}
-    if any(x.requires_grad for x in tensors_in(ours())):
-        modes["f+b"] = with_gradient
+    """Both in turns, forward and, where the result has a gradient, with backward."""
+    trained = any(x.requires_grad for x in tensors_in(ours()))
     rows = []
-    for mode, wrap in modes.items():
-        seconds = in_turns({"ours": wrap(ours), "peer": wrap(peer)}, device, ROUNDS, BUDGET_S)
-        middle, spread = median_spread(seconds["ours"])
-        rows.append(
-            {
-                "operation": name,
-                "mode": mode,
-                "x faster": median_spread(seconds["peer"])[0] / middle,
-                "peer": peer_name,
-                "ms": 1e3 * middle,
-                "± ms": 1e3 * spread,
-                "peer ms": 1e3 * median_spread(seconds["peer"])[0],
-            }
-        )
+    for mode, wrap in MODES.items():
+        if mode == "forward" or trained:
+            seconds = interleaved({"ours": wrap(ours), "naive": wrap(naive)}, clock(device), ROUNDS, BUDGET_S)
+            naive_ms, times = 1e3 * statistics.median(seconds["naive"]), milliseconds(seconds["ours"])
+            row = {"operation": operation, "mode": mode, "x faster": naive_ms / times["ms"]}
+            rows.append(row | {"naive implementation": naive_name, **times, "naive ms": naive_ms})
     return rows
 
 
@@ -283,8 +277,8 @@ def attend_everywhere(
     return total.flatten(2)
 
 
-def plain_farthest_points(points: Tensor, count: int) -> Tensor:
-    """The loop one writes first: distances to the last pick, minimum, argmax."""
+def naive_farthest_points(points: Tensor, count: int) -> Tensor:
+    """A loop over picks: distances to the last one, minimum, argmax."""
     picks = points.new_zeros(count, dtype=torch.int64)
     gap = points.new_full((len(points),), math.inf)
     for step in range(1, count):
@@ -295,16 +289,14 @@ def plain_farthest_points(points: Tensor, count: int) -> Tensor:
 
 def dense_raster(boxes: Tensor, grid: BEVGrid, margin_m: float) -> Tensor:
     """Every box against every cell centre."""
-    cells = torch.arange(grid.rows * grid.cols, device=boxes.device)
-    centres = grid.centre_of(torch.stack([torch.div(cells, grid.cols, rounding_mode="floor"), cells % grid.cols], 1))
-    offset = centres.double() - boxes[:, None, :2].double()
+    offset = all_centres(grid, boxes.device).double() - boxes[:, None, :2].double()
     cosine, sine = boxes[:, 4:].double().cos(), boxes[:, 4:].double().sin()
     along = (cosine * offset[..., 0] + sine * offset[..., 1]).abs() <= 0.5 * (boxes[:, 2:3] + margin_m)
     across = (cosine * offset[..., 1] - sine * offset[..., 0]).abs() <= 0.5 * (boxes[:, 3:4] + margin_m)
     return (along & across).nonzero()
 
 
-def plain_voxels(points: Tensor, lower_m: Sequence[float], size_m: Sequence[float]) -> Tensor:
+def naive_voxels(points: Tensor, lower_m: Sequence[float], size_m: Sequence[float]) -> Tensor:
     """Distinct rows of voxel indices, and means by scattered addition."""
     cells = ((points[:, :3] - points.new_tensor(lower_m)) / points.new_tensor(size_m)).floor().long()
     voxels, owners = torch.unique(cells, dim=0, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Where the time of a call goes, operation by operation: what a gap to the floor is made of."""
+"""Where the time of a call goes, operation by operation: what a gap to the roofline bound is made of."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from typing import Any
 import torch
 from torch.profiler import ProfilerActivity, profile
 
-NOTE = (
-    "Operations: one call watched by torch's profiler, longest own time first, what an operation calls not counted. "
-    "Operations of ours are named by their classes, and their own time is the interpreter's."
+OPERATIONS_NOTE = (
+    "Operations: one call under torch's profiler, longest self time first. Operations of ours are named by their "
+    "classes, and their self time is the interpreter's."
 )
 PRODUCTS = ("aten::mm", "aten::addmm", "aten::bmm", "aten::baddbmm")
 NUM_ROWS = 16  # the rest is one row: it would be a long list of thousandths
 
 
 def operation_table(function: Callable[[], Any], device: torch.device) -> list[dict[str, Any]]:
-    """Rows of the operations that take longest themselves, without what they call, in one call after one to warm up.
+    """Rows of the operations with the longest self time in one call, after one to warm up.
 
-    `GFLOP/s` stands at matrix products. Watching costs some time of its own, most where operations are short.
+    `GFLOP/s` stands at matrix products. Profiling costs some time of its own, most where operations are short.
     """
     function()
     on_gpu = device.type == "cuda"
     activities = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if on_gpu else [])]
-    with profile(activities=activities, with_flops=True) as watched:
+    with profile(activities=activities, with_flops=True) as profiled:
         function()
-    events = watched.key_averages()
+    events = profiled.key_averages()
     time_of = "self_device_time_total" if on_gpu else "self_cpu_time_total"
     events = sorted(events, key=lambda event: getattr(event, time_of), reverse=True)
     total_us = sum(getattr(event, time_of) for event in events)

@@ -5,14 +5,23 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from src.benchmark.machine import busy_warning
 from src.benchmark.timing import chosen_device
 from src.config import BenchmarkSuite, Config
 from src.training.run_folder import current_commit, write_json
 
+GPU_NOTE = "Measured without a GPU. On one: the command above with `trainer.accelerator=gpu precision=bf16-mixed`."
+
+
+def gpu_notes(device: torch.device) -> list[str]:
+    """Of a suite that measures on GPUs too: how, where this was not one."""
+    return [] if device.type == "cuda" else [GPU_NOTE]
+
 
 def page_of(suite: str, overrides: list[str], machine: dict[str, Any], result: dict[str, Any]) -> dict[str, Any]:
-    """Everything a page tells, as it stands in the JSON file."""
+    """The content of a page, as it stands in the JSON file."""
     return {"suite": suite, "overrides": overrides, "commit": current_commit(), "machine": machine, "result": result}
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import importlib
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -14,7 +13,6 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from src.benchmark.timing import replaced_methods
 from src.models.detector import Detector
 
 Paths = Mapping[str, tuple[str, ...]]
@@ -22,32 +20,15 @@ Paths = Mapping[str, tuple[str, ...]]
 
 PART_METHODS = ("forward", "recall", "aggregate", "remember", "decode")
 """What a detector calls its parts by; a memory is not a function of one input, so it has no forward."""
-PARTS_WITHIN: dict[str, Paths] = {
-    "Horizon3D": {
-        "ocsf": ("ocsf.forward",),
-        "ocsf: gaussian encoder": ("ocsf.encoder.forward",),
-        "ocsf: splat": ("src.models.horizon3d.ocsf:splat_set",),
-        "ocsf: gated fusion": ("ocsf.fusion.forward",),
-        "dptf": ("dptf.recall", "dptf.aggregate", "dptf.remember"),
-        "dptf: recall": ("dptf.recall",),
-        "dptf: aggregate": ("dptf.aggregate",),
-        "dptf: remember": ("dptf.remember",),
-    }
-}
-"""By model the parts worth looking into; `part: inner` lies within `part`. A part is otherwise what a child does."""
 
 
 def parts_of(model: Detector) -> Paths:
-    """The parts in the order of the model's children; the module of a model may name its own as `BENCHMARK_PARTS`."""
-    own = getattr(sys.modules[type(model).__module__], "BENCHMARK_PARTS", None)
-    if own is not None:
-        return own
-    within = PARTS_WITHIN.get(type(model).__name__, {})
+    """What each child of the model does, in their order, with the parts within that the model declares."""
     parts: dict[str, tuple[str, ...]] = {}
     for child, module in model.named_children():
-        listed = {name: paths for name, paths in within.items() if name.partition(":")[0] == child}
         methods = [method for method in PART_METHODS if method != "decode" and _defines(module, method)]
-        parts |= listed or {child: tuple(f"{child}.{method}" for method in methods)}
+        parts[child] = tuple(f"{child}.{method}" for method in methods)
+        parts |= {name: paths for name, paths in model.benchmark_parts.items() if name.partition(":")[0] == child}
         if _defines(module, "decode"):
             parts[f"{child}: decode"] = (f"{child}.decode",)
     return {name: paths for name, paths in parts.items() if paths}
@@ -65,30 +46,22 @@ def is_within(name: str) -> bool:
 
 @contextmanager
 def wrapped_parts(
-    model: Detector,
+    model: torch.nn.Module,
     parts: Paths,
     wrap: Callable[[str, str, Callable[..., Any]], Callable[..., Any]],  # of part, path and the function
 ) -> Iterator[None]:
-    """Within the context every method and function that is a part is wrapped."""
-    functions = {name: tuple(path for path in paths if ":" in path) for name, paths in parts.items()}
-    methods: dict[str, list[str]] = {}
-    for name, paths in parts.items():
-        for path in paths:
-            if ":" not in path:
-                methods.setdefault(path, []).append(name)
+    """Within the context every method and function that is a part is wrapped, for each part that it belongs to.
 
-    def wrap_method(_: str, path: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        for name in methods[path]:  # a method may be a part and lie within another
-            function = wrap(name, path, function)
-        return function
-
+    A method that the model lacks is left out.
+    """
+    modules = dict(model.named_modules())
     with ExitStack() as stack:
-        for name, paths in functions.items():
+        for name, paths in parts.items():
             for path in paths:
-                module, _, function = path.partition(":")
-                owner = importlib.import_module(module)
-                stack.enter_context(patch.object(owner, function, wrap(name, path, getattr(owner, function))))
-        stack.enter_context(replaced_methods(model, {path: (path,) for path in methods}, wrap_method))
+                place, colon, function = path.rpartition(":" if ":" in path else ".")
+                owner = importlib.import_module(place) if colon == ":" else modules.get(place)
+                if colon == ":" or hasattr(owner, function):
+                    stack.enter_context(patch.object(owner, function, wrap(name, path, getattr(owner, function))))
         yield
 
 
@@ -168,8 +141,8 @@ def tensors_in(value: Any, seen: set[int] | None = None) -> list[Tensor]:
     return []
 
 
-def derive(result: Any) -> bool:
-    """Backward from everything in a part's result that depends on weights or inputs; False where nothing does."""
+def backward_from(result: Any) -> bool:
+    """Backward, with gradients of one, from every tensor of a result that has a history; False where none has."""
     roots = [x for x in tensors_in(result) if x.grad_fn is not None]
     if roots:
         torch.autograd.backward(roots, [torch.ones_like(x) for x in roots])

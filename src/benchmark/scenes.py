@@ -1,6 +1,6 @@
-"""Frames made up for measuring: a straight highway in radar points and cameras, as far as wanted, the same every time.
+"""Synthetic frames to measure on: a straight highway in radar points and cameras, of any length, always the same.
 
-Nothing here resembles a measurement in detail; what matters is how many cells are occupied and how they cluster.
+Nothing here resembles a recording in detail; what matters is how many cells are occupied and how they cluster.
 """
 
 from __future__ import annotations
@@ -40,6 +40,14 @@ class Highway:
     def rings(self) -> list[tuple[float, float]]:
         """The rings that the road covers."""
         return [(low, min(high, self.reach_m)) for low, high in RINGS_M if low < self.reach_m]
+
+
+ROADS = {
+    "paper": Highway(12_700, 60, 113, 150.0),
+    "mini": Highway(2600, 60, 23, 150.0),
+    "debug": Highway(200, 20, 5, 150.0),
+}
+"""The road of 150 m at a scale."""
 
 
 def highway_points(road: Highway, seed: int = 0) -> Tensor:  # [P, 7] x, y, z (m), rcs (dB), vx, vy (m/s), dt (s)
@@ -131,7 +139,7 @@ def highway_frame(
     """One frame of these points with four black images; the truck stands at the origin."""
     height, width = image_size_px
     return FrameBatch(
-        tokens=["made up"],
+        tokens=["synthetic"],
         timestamps_s=torch.zeros(1, dtype=torch.float64),
         global_from_ego=torch.eye(4, dtype=torch.float64)[None],
         aug_from_ego=torch.eye(4)[None],

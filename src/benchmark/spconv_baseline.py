@@ -1,11 +1,9 @@
-"""The same sparse networks from layers of the public library spconv, where it is installed: an optional yardstick."""
+"""The same sparse networks from layers of the public library spconv, where it is installed: an optional baseline."""
 
 from __future__ import annotations
 
 import copy
 import importlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
@@ -126,20 +124,9 @@ def uncached(x: SparseMap) -> SparseMap:
     return kind(Sites(x.sites.shape, x.sites.keys), x.features)
 
 
-@contextmanager
-def torch_threads(number: int) -> Iterator[None]:
-    """Within the context torch computes on so many threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(number)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-def largest_difference(ours: list[Tensor], peer: list[Tensor]) -> float:
+def largest_difference(ours: list[Tensor], theirs: list[Tensor]) -> float:
     """Of any two numbers, relative to the largest of ours."""
     return max(
         float((a.detach() - b.detach()).abs().max() / a.detach().abs().max().clamp(min=1e-30))
-        for a, b in zip(ours, peer, strict=True)
+        for a, b in zip(ours, theirs, strict=True)
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import statistics
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import torch
 from src.assembly import build_datamodule, data_root
 from src.benchmark.machine import busy_cores, describe_machine, processor
 from src.benchmark.page import page_of
-from src.benchmark.timing import chosen_device, clock, peak_bytes, timed_parts
+from src.benchmark.timing import chosen_device, clock, median_iqr, peak_bytes, timed_parts
 from src.config import Config, restore_config
 from src.data.clips import scenes_of
 from src.data.datamodule import DetectionDataModule
@@ -31,7 +30,7 @@ LATENCY_PARTS = {
     "image_encoder": ("image_encoder.forward",),
     "radar_encoder": ("radar_encoder.forward",),
     "view_transform": ("view_transform.forward", "fuser.forward"),
-    # The dense peer's way from the fused map to the head; where the paper books its decoder is not known.
+    # The dense baseline's way from the fused map to the head; where the paper books its decoder is not known.
     "temporal_fusion": ("temporal.recall", "temporal.aggregate", "temporal.remember", "decoder.forward"),
     "kggi": ("kggi.forward",),
     "ocsf": ("ocsf.forward",),
@@ -57,10 +56,7 @@ def measure_latency(command: Config, overrides: list[str]) -> dict[str, Any]:
 
 def latency_page(content: dict[str, Any], overrides: list[str]) -> dict[str, Any]:
     """The content of `latency.json` as a page."""
-    rows = [
-        {"part": part, "ms (median)": value, "± ms": content["spread_ms"][part]}
-        for part, value in content["ms"].items()
-    ]
+    rows = [{"part": part, "ms": value, "± ms": content["spread_ms"][part]} for part, value in content["ms"].items()]
     rest = {name: value for name, value in content.items() if name not in ("format", "ms", "spread_ms")}
     machine = describe_machine() | {"load": content["load"]}
     return page_of("latency", overrides, machine, {"a frame by part": rows} | rest)
@@ -73,8 +69,8 @@ def benchmark_latency(
 
     The clocks of the parts run meanwhile, and on a GPU each of them waits for it.
 
-    The spread is the range of the middle half. Frames count once the memory is full, or as full as scenes are long.
-    `load` is how many processes wanted a core over the minute before, of `cores`.
+    The spread is the interquartile range. Frames count once the memory is full, or as full as scenes are long.
+    `load` is how many of the `cores` were at work when this began.
     `memory_gb` is the largest that torch held on a GPU, or the process with its libraries on a CPU, in 1e9 bytes.
     """
     device, now, load = detector.device, clock(detector.device), busy_cores()
@@ -94,11 +90,11 @@ def benchmark_latency(
         if seen > WARM_UP_FRAMES and number >= full:
             measured.append({name: 1e3 * sum(calls) for name, calls in timings.items()} | {"total": 1e3 * total})
     columns = {name: [row[name] for row in measured] for name in (*LATENCY_PARTS, "total") if name in measured[0]}
-    quartiles = {name: statistics.quantiles(values, n=4) for name, values in columns.items()}
+    medians = {name: median_iqr(values) for name, values in columns.items()}
     return {
-        "ms": {name: middle for name, (_, middle, _) in quartiles.items()},
-        "spread_ms": {name: high - low for name, (low, _, high) in quartiles.items()},
-        "fps": 1e3 / quartiles["total"][1],
+        "ms": {name: middle for name, (middle, _) in medians.items()},
+        "spread_ms": {name: iqr for name, (_, iqr) in medians.items()},
+        "fps": 1e3 / medians["total"][0],
         "memory_gb": peak_bytes(device) / 1e9,
         "frames": len(measured),
         "device": str(device),

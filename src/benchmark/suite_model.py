@@ -1,74 +1,38 @@
-"""suite=model: time, arithmetic, memory traffic and memory of a model's parts, each against what the machine can do."""
+"""suite=model: time, arithmetic, memory traffic and memory of a model's parts, each against its roofline bound."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from pathlib import Path
+import statistics
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from src.assembly import build_datamodule, build_model, data_root
+from src.assembly import build_datamodule, data_root
+from src.benchmark.cases import CANDIDATES, KEY_FRAME_S, Case, build_case, expect_trained_scores
 from src.benchmark.counting import counted_work, distinct_bytes
 from src.benchmark.machine import gemm_rate, measure_roofline
-from src.benchmark.operation_table import NOTE as OPERATIONS_NOTE
-from src.benchmark.operation_table import operation_table
-from src.benchmark.parts import Call, derive, is_within, parts_of, record_calls, tensors_in
-from src.benchmark.timing import added_bytes, chosen_device, interleaved, median_spread, peak_bytes
+from src.benchmark.operation_table import OPERATIONS_NOTE, operation_table
+from src.benchmark.page import gpu_notes
+from src.benchmark.parts import Call, backward_from, is_within, parts_of, record_calls, tensors_in
+from src.benchmark.timing import (
+    added_bytes,
+    chosen_device,
+    clock,
+    interleaved,
+    milliseconds,
+    peak_bytes,
+    seconds_of,
+)
 from src.config import Config
-from src.models.deploy.inference import prepare_for_inference
-from src.models.detector import Detector
-from src.reliability.checkpoints import load_model_weights, read_checkpoint
-from src.structures.batch import FrameBatch
 
 logger = logging.getLogger(__name__)
 
-ROUNDS = 5  # all parts in turns; a round of the full size takes ten seconds on two cores
-KEY_FRAME_S = 0.5
-CANDIDATES = 300  # cells above the score threshold: what traffic lights up in a trained model, within its 500 boxes
+ROUNDS = 5  # of all parts; a round of the full size takes ten seconds on two cores
 BACKWARD_PASSES = 3  # of inputs, outputs and weights: forward, and once more each for gradients to be read and written
-
-
-@dataclass
-class Case:
-    """A model, as trained and as prediction prepares it, with a batch and, in phase 2, a full memory."""
-
-    model: Detector
-    prepared: Detector
-    batch: FrameBatch
-    memory: Any
-    device: torch.device
-    autocast: bool  # bfloat16
-
-    @contextmanager
-    def precision(self) -> Iterator[None]:
-        """As training and prediction compute."""
-        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.autocast):
-            yield
-
-    def infer(self) -> tuple[Any, Any]:
-        """Forward and decode, without gradients."""
-        with torch.no_grad(), self.precision():
-            output, _ = self.prepared(self.batch, self.memory)
-            return output, self.prepared.decode(output)
-
-    def run(self) -> tuple[Any, Any]:
-        """Forward, for gradients."""
-        with self.precision():
-            return self.model(self.batch, self.memory)
-
-    def step(self) -> Tensor:
-        """Forward, losses and backward; the weights' gradients are dropped."""
-        with self.precision():
-            output, _ = self.model(self.batch, self.memory)
-            total = self.model.loss(output, self.batch)["total"]
-        total.backward()
-        self.model.zero_grad(set_to_none=True)
-        return total.detach()
+WHOLE = "whole: frame to boxes, step to gradients"
 
 
 def benchmark_model(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
@@ -79,23 +43,23 @@ def benchmark_model(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     roofline = measure_roofline(device)
     rate = gemm_rate(roofline, config.precision)
     tables = measure_parts(case, rate, roofline["copy_gbps"])
-    losses = case.step()
+    loss = case.step()
     with torch.no_grad():
         state = case.model.diagnostics(case.run()[0])
     return {
         "notes": [
             f"{config.model.name}, scale {config.scale}, {config.phase.name}, batch {len(case.batch)}, "
-            f"{config.precision} on {device}. Medians of {ROUNDS} rounds in which every part has its turn, alone, with "
-            "the inputs that it has within the model; ± is the range of the middle half. Forward is the model as "
+            f"{config.precision} on {device}. Medians of {ROUNDS} rounds in which every part is called in turn, alone, "
+            "on the inputs that it has within the model; ± is the interquartile range. Forward is the model as "
             "prediction prepares it, f+b forward and backward of the model as it is trained. "
             + ("" if config.checkpoint else f"Fresh weights; {CANDIDATES} cells pass the score threshold."),
-            "GFLOP are those of matrix products, convolutions and attention. The floor is the longer of GFLOP over the "
-            "measured product rate and bytes over the measured copy rate, bytes being inputs, outputs and weights once "
-            f"({BACKWARD_PASSES} times with backward). Traffic is what all operations read and write without fusion "
-            "and cache. Added memory is the most that a call takes beyond its inputs and weights.",
+            "GFLOP are those of matrix products, convolutions and attention. The roofline bound is the longer of GFLOP "
+            "over the measured GEMM rate and bytes over the measured copy rate, bytes being inputs, outputs and "
+            f"weights once ({BACKWARD_PASSES} times with backward). Traffic is what all operations read and write "
+            "without fusion and cache. Added memory is the most that a call takes beyond its inputs and weights.",
             OPERATIONS_NOTE,
-        ]
-        + ([] if device.type == "cuda" else [gpu_note(config)]),
+            *gpu_notes(device),
+        ],
         **tables,
         "operations of a frame": operation_table(case.infer, device),
         "operations of forward, loss and backward": operation_table(case.step, device),
@@ -105,18 +69,9 @@ def benchmark_model(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
         "peak_memory_mib": int(peak_bytes(device) / 2**20),
         "parameters": {n: sum(p.numel() for p in part.parameters()) for n, part in case.model.named_children()},
         "radar_points": len(case.batch.radar_points),
-        "loss": float(losses),
+        "loss": float(loss),
         "state": {name: float(value) for name, value in state.items()},
     }
-
-
-def gpu_note(config: Config) -> str:
-    """The command that measures the same on a GPU."""
-    return (
-        "Measured without a GPU. There: `python -m src.benchmark suite=model "
-        f"model={config.model.name} phase={config.phase.name} scale={config.scale} precision=bf16-mixed "
-        "trainer.accelerator=gpu out=DIR`, with the data of the command above."
-    )
 
 
 def make_case(config: Config, device: torch.device) -> Case:
@@ -124,39 +79,14 @@ def make_case(config: Config, device: torch.device) -> Case:
     config.data.num_workers = 0
     datamodule = build_datamodule(config, data_root(config))
     batch = next(iter(datamodule.train_dataloader())).to(device)
-    model = build_model(config)
-    if config.checkpoint:
-        load_model_weights(model, read_checkpoint(Path(config.checkpoint)), Path(config.checkpoint))
-    bf16 = config.precision == "bf16-mixed"
-    case = Case(model.to(device).train(), prepare_for_inference(model, bf16), batch, None, device, bf16)
-    case = fill_memory(case, config.model.memory_frames)
+    case = build_case(config, batch, device)
+    with torch.no_grad():
+        for _ in range(config.model.memory_frames):
+            _, case.memory = case.run()
+            case.batch = replace(case.batch, timestamps_s=case.batch.timestamps_s + KEY_FRAME_S)
     if not config.checkpoint:
         expect_trained_scores(case)
     return case
-
-
-def fill_memory(case: Case, frames: int) -> Case:
-    """The same case after so many frames of the same place."""
-    with torch.no_grad():
-        for _ in range(frames):
-            _, case.memory = case.run()
-            case.batch = replace(case.batch, timestamps_s=case.batch.timestamps_s + KEY_FRAME_S)
-    return case
-
-
-def expect_trained_scores(case: Case) -> Any:
-    """Set the score threshold of the prepared model so that decoding has the work that it has in a trained one.
-
-    Fresh weights give every cell about the threshold of the configuration, and boxes would be made of half of them.
-    Returns the memory after the frame that told the scores.
-    """
-    with torch.no_grad(), case.precision():
-        output, memory = case.prepared(case.batch, case.memory)
-    scores = output.head.logits.float().sigmoid().flatten()
-    if len(scores) > CANDIDATES:
-        head = case.prepared.head
-        head.config = replace(head.config, score_threshold=float(scores.topk(CANDIDATES).values[-1]))
-    return memory
 
 
 def measure_parts(
@@ -183,30 +113,23 @@ def measure_parts(
     rest: dict[str, Any] = {"part": "sum without the image encoder"}
     for mode, found in modes.items():
         counted = [values for name, values in found.items() if not is_within(name) and name != "image_encoder"]
-        rest[f"{mode} ms"] = 1e3 * sum(median_spread(values["seconds"])[0] for values in counted)
-    whole = measure_whole(case)
-    label = {"part": "whole: frame to boxes, step to gradients"}
-    for mode, found in whole.items():
-        label |= {f"{mode} ms": 1e3 * median_spread(found["seconds"])[0]}
-        label |= {f"± {mode}": 1e3 * median_spread(found["seconds"])[1]}
-    times += [rest, label]
-    works.append(
-        {"part": label["part"]} | work_columns("forward", whole["forward"]) | work_columns("f+b", whole["f+b"])
-    )
-    return {"time by part": times, "work by part": works}
+        rest[f"{mode} ms"] = 1e3 * sum(statistics.median(values["seconds"]) for values in counted)
+    time_row, work_row = {"part": WHOLE}, {"part": WHOLE}
+    for mode, found in measure_whole(case).items():
+        time_row |= milliseconds(found["seconds"], f"{mode} ")
+        work_row |= work_columns(mode, found)
+    return {"time by part": [*times, rest, time_row], "work by part": [*works, work_row]}
 
 
 def time_columns(mode: str, found: dict[str, Any], rate: float, bandwidth: float) -> dict[str, Any]:
-    """How long a part takes, and how much of that the machine would need at least."""
-    middle, spread = median_spread(found["seconds"])
+    """How long a part takes, and its roofline bound."""
     by_rate, by_bandwidth = found["flops"] / rate / 1e9, found["compulsory_bytes"] / bandwidth / 1e9
-    floor = max(by_rate, by_bandwidth)
+    bound_s = max(by_rate, by_bandwidth)
     return {
-        f"{mode} % of floor": 100 * floor / middle,
-        f"{mode} ms": 1e3 * middle,
-        f"± {mode}": 1e3 * spread,
-        f"{mode} floor ms": 1e3 * floor,
-        f"{mode} bound by": "products" if by_rate >= by_bandwidth else "bytes",
+        f"{mode} % of roofline": 100 * bound_s / statistics.median(found["seconds"]),
+        **milliseconds(found["seconds"], f"{mode} "),
+        f"{mode} roofline ms": 1e3 * bound_s,
+        f"{mode} bound by": "compute" if by_rate >= by_bandwidth else "memory",
     }
 
 
@@ -222,7 +145,7 @@ def work_columns(mode: str, found: dict[str, Any]) -> dict[str, Any]:
 
 
 def measure_mode(case: Case, calls: dict[str, list[Call]], backward: bool) -> dict[str, dict[str, Any]]:
-    """Seconds, arithmetic and bytes of every part; a part without anything to derive counts as its forward."""
+    """Seconds, arithmetic and bytes of every part; a part whose results have no history counts as its forward."""
 
     def prepared(name: str) -> Callable[[], bool]:
         ready = [call.prepare() for call in calls[name]]
@@ -230,18 +153,18 @@ def measure_mode(case: Case, calls: dict[str, list[Call]], backward: bool) -> di
         def run() -> bool:
             with torch.set_grad_enabled(backward), case.precision():
                 results = [call() for call in ready]
-            return backward and any([derive(result) for result in results])
+            return backward and any([backward_from(result) for result in results])
 
         return run
 
     found: dict[str, dict[str, Any]] = {}
     for name in calls:
         with counted_work() as work:
-            derived = prepared(name)()
+            went_back = prepared(name)()
         found[name] = {
             "flops": work.flops,
             "traffic_bytes": work.bytes,
-            "compulsory_bytes": (BACKWARD_PASSES if derived else 1) * compulsory_bytes(calls[name]),
+            "compulsory_bytes": (BACKWARD_PASSES if went_back else 1) * compulsory_bytes(calls[name]),
             "added_bytes": added_bytes(prepared(name), case.device),
             "seconds": [],
         }
@@ -249,9 +172,9 @@ def measure_mode(case: Case, calls: dict[str, list[Call]], backward: bool) -> di
     for number in range(1 + ROUNDS):
         logger.info("%s, round %d of %d", "f+b" if backward else "forward", number, ROUNDS)
         for name in calls:
-            seconds = interleaved({name: prepared(name)}, case.device, 1, warm_up=0)[name]
+            seconds = seconds_of(prepared(name), clock(case.device))
             case.model.zero_grad(set_to_none=True)
-            found[name]["seconds"] += seconds if number else []
+            found[name]["seconds"] += [seconds] if number else []
     return found
 
 
@@ -273,6 +196,6 @@ def measure_whole(case: Case) -> dict[str, dict[str, Any]]:
             "flops": work.flops,
             "traffic_bytes": work.bytes,
             "added_bytes": added_bytes(function, case.device),
-            "seconds": interleaved({mode: function}, case.device, ROUNDS)[mode],
+            "seconds": interleaved({mode: function}, clock(case.device), ROUNDS)[mode],
         }
     return found

@@ -1,4 +1,4 @@
-"""suite=ops: each heavy operation against its floor and its peers, all in turns in one run."""
+"""suite=ops: each heavy operation beside GEMM, other libraries and naive implementations, timed in turns."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ from src.benchmark.convolutions import (
     remembered_sites,
 )
 from src.benchmark.machine import measure_roofline
-from src.benchmark.naive import SIZES, made_up_gaussians, measure_rest, measure_splat
-from src.benchmark.operation_table import NOTE as OPERATIONS_NOTE
-from src.benchmark.scenes import Highway, highway_points
+from src.benchmark.naive import SIZES, measure_rest, measure_splat, random_gaussians
+from src.benchmark.operation_table import OPERATIONS_NOTE
+from src.benchmark.page import gpu_notes
+from src.benchmark.scenes import highway_points
 from src.benchmark.spconv_baseline import load_spconv
 from src.benchmark.timing import chosen_device
 from src.config import Config
 from src.geometry.bev_grid import BEVGrid
 from src.ops.sites import Sites
-
-NUM_VEHICLES = 60
 
 
 def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
@@ -35,7 +34,7 @@ def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     device, sizes, grid = chosen_device(config), SIZES[config.scale], config.grid.build()
     every = torch.get_num_threads()
     threads = sorted({1, every}) if device.type == "cpu" else [every]
-    points = highway_points(Highway(sizes.background, NUM_VEHICLES, sizes.points_per_vehicle, 150.0)).to(device)
+    points = highway_points(sizes.road).to(device)
     backbone = Backbone(config.model.radar_encoder, grid, config.model.channels, config.seed)
     encoder = backbone.build().to(device)
     with torch.no_grad():
@@ -43,24 +42,24 @@ def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     bev = bev_sites(points, grid, sizes.cells)
     past = remembered_sites(grid, Sites(bev.shape, bev.keys[::4]), sizes.frames)
     layers = layers_of(encoder, voxels, config.model.channels, bev, past)
-    scenes = {"highway, made up": points.cpu()} | recorded_scene(config)
-    gaussians = made_up_gaussians(sizes.gaussians, config.model.channels, grid, device)
-    peer = load_spconv(device)
+    scenes = {"synthetic highway": points.cpu()} | recorded_scene(config)
+    gaussians = random_gaussians(sizes.gaussians, config.model.channels, grid, device)
+    spconv = load_spconv(device)
     return {
         "notes": [
             f"Scale {config.scale}, float32 on {device}; everything but the convolutions on {every} threads. A row's "
-            "candidates take turns in one run. Ratios above 1: ours is faster. % of products: the arithmetic's rate "
-            "as a share of that of one large matrix product, which takes its turns too. ± is the range of the middle "
-            "half.",
+            "candidates are timed in turns in one run. Ratios above 1: ours is faster. % of GEMM: the arithmetic's "
+            "rate as a share of that of one large matrix product, timed in the same turns. ± is the interquartile "
+            "range.",
             "Dense convolution: scatter to the whole grid, torch's convolution, gather; left blank where it does not "
             "fit. Kernel maps are cached on the sites by all (made once for all layers of a stage): `map ms` is ours. "
             "The backbone makes its maps anew.",
-            "spconv: " + ("not installed, so its columns are absent." if peer is None else spconv_note(device)),
+            "spconv: " + ("not installed, so its columns are absent." if spconv is None else spconv_note(device)),
             f"Dense splat: {sizes.splat_subset} of {sizes.gaussians} Gaussians against every cell, time and memory "
             "multiplied; all of them would not fit.",
             OPERATIONS_NOTE,
-        ]
-        + ([] if device.type == "cuda" else [gpu_note(config)]),
+            *gpu_notes(device),
+        ],
         "sparse convolution": measure_layers(layers, device, threads),
         "radar backbone": measure_backbone(backbone, scenes, device, threads),
         **backbone_operations(backbone, points),
@@ -71,21 +70,13 @@ def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def spconv_note(device: torch.device) -> str:
-    """What is to be known of the peer's numbers."""
+    """What a reader of spconv's numbers must know."""
     if device.type == "cuda":
         return "its own choice of algorithm, float32."
     return (
         "CPU build, `ConvAlgo.Native`. `differs by` is the largest relative difference of outputs and gradients at one "
         "thread. On several threads its gathering shares buffers between threads, so results are wrong at random: "
         "`wrong` counts runs; its times there are of such runs."
-    )
-
-
-def gpu_note(config: Config) -> str:
-    """The command that measures the same on a GPU."""
-    return (
-        "Measured without a GPU. There: `python -m src.benchmark suite=ops "
-        f"scale={config.scale} trainer.accelerator=gpu out=DIR`, with the data of the command above."
     )
 
 

@@ -1,4 +1,4 @@
-"""suite=reader: frames per second of the reader on one core, stage by stage, against the plain ways to read."""
+"""suite=reader: frames per second of the reader on one core, stage by stage, beside naive implementations."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ import resource
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
-from itertools import cycle, islice
+from itertools import chain, cycle, islice, repeat
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
 from PIL import Image
-from torch.utils.data import DataLoader
 
 from src.assembly import build_datamodule, data_root
-from src.benchmark.timing import median_spread
+from src.benchmark.timing import interleaved, milliseconds
 from src.config import Config
 from src.data import images, reader
 from src.data.augment import AugmentationConfig
@@ -36,7 +36,7 @@ Array = np.ndarray
 READER_FRAMES = 60
 WARM_UP_FRAMES = 4
 LOADER_FRAMES = 60
-PEER_ROUNDS = 8
+COMPARISON_ROUNDS = 8
 STAGES = {
     "JPEG decode": (images, "decode"),
     "resample": (images, "resample"),
@@ -71,13 +71,13 @@ def benchmark_reader(config: Config) -> dict[str, Any]:
         "radar_files": len(radar_paths(datamodule, samples[0])),
         "frames with and without augmentation": [frame_row(name, columns) for name, columns in measured.items()],
         "stages": [stage_row(stage, measured) for stage in measured["training"] if stage not in ("all", "wall")],
-        "images of one frame": image_peers(datamodule, samples[0]) if datamodule.settings.image_size_px else [],
-        "radar files of one frame": radar_peers(datamodule, samples[0]),
+        "images of one frame": compare_decoding(datamodule, samples[0]) if datamodule.settings.image_size_px else [],
+        "radar files of one frame": compare_parsing(datamodule, samples[0]),
         "loader": [loader_row(config)],
         "notes": [
-            "CPU time of one thread, medians and the range of the middle half over frames; files come from the "
-            "system's cache. A loader's worker also sends its batches: the row `loader` is a training epoch through "
-            "one worker, its start included."
+            "CPU time of one thread, medians over frames; ± is the interquartile range; files come from the system's "
+            "cache. A loader's worker also sends its batches: the row `loader` is a training epoch through one worker, "
+            "its start included."
         ],
     }
 
@@ -130,14 +130,10 @@ class StageClock:
 @contextmanager
 def timed_stages(clock: StageClock) -> Iterator[None]:
     """Within the context the reader's stages count on the clock."""
-    kept = {(module, name): getattr(module, name) for module, name in STAGES.values()}
-    for stage, (module, name) in STAGES.items():
-        setattr(module, name, clock.timed(stage, kept[module, name]))
-    try:
+    with ExitStack() as stack:
+        for stage, (module, name) in STAGES.items():
+            stack.enter_context(patch.object(module, name, clock.timed(stage, getattr(module, name))))
         yield
-    finally:
-        for (module, name), function in kept.items():
-            setattr(module, name, function)
 
 
 def time_frames(
@@ -167,13 +163,11 @@ def time_frames(
 
 def frame_row(name: str, columns: dict[str, list[float]]) -> dict[str, Any]:
     """One line: how fast frames come, with or without augmentation."""
-    middle, spread = median_spread(columns["all"])
     return {
-        "as in": name,
+        "pipeline": name,
         "frames/s (CPU)": len(columns["all"]) / sum(columns["all"]),
         "frames/s (wall)": len(columns["wall"]) / sum(columns["wall"]),
-        "ms (median)": 1e3 * middle,
-        "spread ms": 1e3 * spread,
+        **milliseconds(columns["all"]),
     }
 
 
@@ -181,35 +175,27 @@ def stage_row(stage: str, measured: dict[str, dict[str, list[float]]]) -> dict[s
     """One line: a stage's milliseconds in a frame."""
     row: dict[str, Any] = {"stage": stage}
     for name, columns in measured.items():
-        middle, spread = median_spread(columns[stage])
-        row |= {f"{name} ms": 1e3 * middle, f"{name} spread ms": 1e3 * spread}
+        row |= milliseconds(columns[stage], f"{name} ")
         row |= {f"{name} share": sum(columns[stage]) / sum(columns["all"])}
     return row
 
 
-# -------------------------------------------------------------------- peers
+# -------------------------------------------------------------------- naive implementations
 
 
-def peers(candidates: dict[str, Callable[[], Any]], column: str) -> list[dict[str, Any]]:
-    """CPU milliseconds of each candidate, taken in turns, and its share of the first one's in the same round."""
-    seconds: dict[str, list[float]] = {name: [] for name in candidates}
-    for number in range(1 + PEER_ROUNDS):
-        for name, function in candidates.items():
-            begin = time.process_time()
-            function()
-            if number:
-                seconds[name].append(time.process_time() - begin)
+def compare(candidates: dict[str, Callable[[], Any]]) -> list[dict[str, Any]]:
+    """CPU milliseconds of each candidate, timed in turns, and its share of the first one's in the same round."""
+    seconds = interleaved(candidates, time.process_time, COMPARISON_ROUNDS)
     first = next(iter(seconds.values()))
-    rows = []
-    for name, values in seconds.items():
-        middle, spread = median_spread(values)
-        ratio = statistics.median(b / a for a, b in zip(first, values, strict=True))
-        rows.append({column: name, "ms": 1e3 * middle, "spread ms": 1e3 * spread, "ratio": ratio})
-    return rows
+    return [
+        {"path": name, **milliseconds(values)}
+        | {"ratio": statistics.median(b / a for a, b in zip(first, values, strict=True))}
+        for name, values in seconds.items()
+    ]
 
 
-def image_peers(datamodule: DetectionDataModule, sample: int) -> list[dict[str, Any]]:
-    """The frame's images without augmentation: plain Pillow, the reader with Pillow, the reader as it is."""
+def compare_decoding(datamodule: DetectionDataModule, sample: int) -> list[dict[str, Any]]:
+    """The frame's images without augmentation: naively by Pillow, the reader with Pillow, the reader as it is."""
     index, size_px = datamodule.index, datamodule.settings.image_size_px
     rows = [int(row) for row in index.key_data[sample, [CHANNELS.index(channel) for channel in CAMERAS]] if row >= 0]
     files = [(str(index.root / index.filename(row)), tuple(map(int, index.data_sizes[row]))) for row in rows]
@@ -220,19 +206,19 @@ def image_peers(datamodule: DetectionDataModule, sample: int) -> list[dict[str, 
             images.resample(decode(path, source_px, images.reduction_for(source_px, crop)), crop, source_px)
 
     candidates: dict[str, Callable[[], Any]] = {
-        "decode, resize, crop": lambda: [plain_image(path, size_px) for path, _ in files],
+        "decode, resize, crop": lambda: [naive_image(path, size_px) for path, _ in files],
         "decode at 1/2^n, resize the crop: Pillow": partial(with_decoder, images.decode_by_pillow),
     }
     if decode_fast(*files[0], 1) is not None:
         candidates[f"the same: {decoder_name()}"] = partial(with_decoder, images.decode)
-    return peers(candidates, "path")
+    return compare(candidates)
 
 
-def plain_image(
+def naive_image(
     path: str,
     size_px: tuple[int, int],  # (height, width)
 ) -> Array:  # [3, H, W] uint8
-    """What one writes first: everything decoded and resized, then the bottom kept."""
+    """Everything decoded and resized, then the bottom kept."""
     with Image.open(path) as image:
         scale = size_px[1] / image.width
         whole = image.convert("RGB").resize((size_px[1], math.floor(scale * image.height)), Image.Resampling.BILINEAR)
@@ -240,14 +226,14 @@ def plain_image(
     return np.ascontiguousarray(np.asarray(part).transpose(2, 0, 1))
 
 
-def radar_peers(datamodule: DetectionDataModule, sample: int) -> list[dict[str, Any]]:
+def compare_parsing(datamodule: DetectionDataModule, sample: int) -> list[dict[str, Any]]:
     """The frame's radar files: field by field, as general readers do, and as one view."""
     paths = radar_paths(datamodule, sample)
     candidates = {
         "header and fields one by one": lambda: [fields_one_by_one(path) for path in paths],
         "known headers, one view": lambda: [read_radar_points(path) for path in paths],
     }
-    return peers(candidates, "path")
+    return compare(candidates)
 
 
 def fields_one_by_one(path: str) -> Array:  # [n, 7] float32
@@ -269,13 +255,13 @@ def fields_one_by_one(path: str) -> Array:  # [n, 7] float32
 def loader_row(config: Config) -> dict[str, Any]:
     """One worker beside this process: the CPU milliseconds of either for a frame."""
     config.data.num_workers = 1
-    loader = build_datamodule(config, data_root(config)).train_dataloader()
+    batches = chain.from_iterable(repeat(build_datamodule(config, data_root(config)).train_dataloader()))
     counts, wall = [], time.perf_counter()
     own, workers = time.process_time(), children_seconds()
-    for batch in islice(endless(loader), max(1, LOADER_FRAMES // config.data.batch_size)):
+    for batch in islice(batches, max(1, LOADER_FRAMES // config.data.batch_size)):
         counts.append(len(batch))
     own, wall = time.process_time() - own, time.perf_counter() - wall
-    del loader  # its worker ends, and its time is known
+    del batches  # the loader's worker ends, and its time is known
     frames = sum(counts)
     return {
         "batch": config.data.batch_size,
@@ -284,12 +270,6 @@ def loader_row(config: Config) -> dict[str, Any]:
         "training process CPU ms/frame": 1e3 * own / frames,
         "wall ms/frame": 1e3 * wall / frames,
     }
-
-
-def endless(loader: DataLoader) -> Iterator[Any]:
-    """Its batches, epoch after epoch."""
-    while True:
-        yield from loader
 
 
 def children_seconds() -> float:

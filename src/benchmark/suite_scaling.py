@@ -1,9 +1,8 @@
-"""suite=scaling: what a frame costs as range, traffic, radar, Gaussians and memory grow, ours beside the dense peer."""
+"""suite=scaling: cost of a frame as range, traffic, radar, Gaussians and memory grow, for both models."""
 
 from __future__ import annotations
 
 import copy
-import dataclasses
 import logging
 import math
 import statistics
@@ -14,17 +13,22 @@ from typing import Any
 
 import torch
 
+from src.benchmark.cases import (
+    CANDIDATES,
+    CELLS_PER_VEHICLE,
+    KEY_FRAME_S,
+    Case,
+    build_case,
+    expect_trained_scores,
+    remember_traffic,
+)
 from src.benchmark.counting import counted_work
-from src.benchmark.page import page_name
+from src.benchmark.page import gpu_notes, page_name
 from src.benchmark.parts import is_within, parts_of, tensors_in
 from src.benchmark.plots import draw_scaling
-from src.benchmark.scenes import Highway, highway_frame, highway_points
-from src.benchmark.suite_model import CANDIDATES, KEY_FRAME_S, Case, expect_trained_scores
-from src.benchmark.timing import added_bytes, chosen_device, in_turns, median_spread, timed_parts
+from src.benchmark.scenes import ROADS, Highway, highway_frame, highway_points
+from src.benchmark.timing import added_bytes, chosen_device, clock, interleaved, milliseconds, timed_parts
 from src.config import Config, compose_config
-from src.geometry.bev_grid import BEVGrid
-from src.models import build_model
-from src.models.deploy.inference import prepare_for_inference
 
 logger = logging.getLogger(__name__)
 
@@ -39,23 +43,10 @@ FACTORS = {
     "gaussians": (0.25, 0.5, 1.0, 2.0),
 }
 MEMORY_FRAMES = (0, 1, 2, 4, 8)
-
-
-@dataclass(frozen=True)
-class ScalingSizes:
-    """The scene and the ranges at a scale."""
-
-    road: Highway  # at the nominal range
-    cells_per_object: int  # remembered in each frame
-    ranges_m: tuple[float, ...]
-
-
-SIZES = {
-    "paper": ScalingSizes(
-        Highway(12_700, 60, 113, 150.0), 17, (75.0, 150.0, 300.0, 600.0)
-    ),  # 8000 cells in eight frames
-    "mini": ScalingSizes(Highway(2600, 60, 23, 150.0), 6, (75.0, 150.0, 300.0, 600.0)),
-    "debug": ScalingSizes(Highway(200, 20, 5, 150.0), 2, (75.0, 150.0, 300.0)),
+RANGES_M = {
+    "paper": (75.0, 150.0, 300.0, 600.0),
+    "mini": (75.0, 150.0, 300.0, 600.0),
+    "debug": (75.0, 150.0, 300.0),
 }
 
 
@@ -73,22 +64,22 @@ class Point:
 def benchmark_scaling(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """Time and memory of a frame without its image encoder, at every point of every sweep; growth first."""
     device = chosen_device(config)
-    configs = {name: config if config.model.name == name else peer_of(config, name) for name in (OURS, DENSE)}
-    sweeps = sweeps_of(SIZES[config.scale], config.phase.temporal)
+    configs = {name: config_of(config, name) for name in (OURS, DENSE)}
+    sweeps = sweeps_of(ROADS[config.scale], RANGES_M[config.scale], config.phase.temporal)
     measured = {name: measure_sweep(name, points, configs, device) for name, points in sweeps.items()}
     result = {
         "notes": [
             f"Scale {config.scale}, {config.phase.name}, {config.precision} on {device}, batch 1, both models as "
             "prediction prepares them, with fresh weights, from features that the image encoder has made already. The "
-            "cell stays 0.8 m, so a longer range has more cells. Medians; ± is the range of the middle half. `added` "
+            "cell stays 0.8 m, so a longer range has more cells. Medians; ± is the interquartile range. `added` "
             "is the most memory that a frame takes beyond inputs and weights, `remembered` waits for the next one. "
             f"{CANDIDATES} cells pass the score threshold, as of trained models; fresh weights alone would pass half.",
             "range, equal density: the road goes on to the end of the range. range, fixed scene: the road ends at "
             f"{FIXED_REACH_M:g} m. Only these two have anything beyond {NOMINAL_M:g} m. Each remembered frame of "
-            f"{OURS} holds {SIZES[config.scale].cells_per_object} cells an object and the Gaussians it is configured "
+            f"{OURS} holds {CELLS_PER_VEHICLE[config.scale]} cells a vehicle and the Gaussians it is configured "
             f"for; {DENSE} remembers whole maps.",
-        ]
-        + ([] if device.type == "cuda" else [gpu_note(config)]),
+            *gpu_notes(device),
+        ],
         "picture": None,
         "growth": growth_rows(measured),
     }
@@ -101,23 +92,22 @@ def benchmark_scaling(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     return result | measured
 
 
-def gpu_note(config: Config) -> str:
-    """The command that measures the same on a GPU."""
-    return (
-        f"Measured without a GPU. There: `python -m src.benchmark suite=scaling phase={config.phase.name} "
-        f"scale={config.scale} data=synthetic_full precision=bf16-mixed trainer.accelerator=gpu out=DIR`."
+def config_of(config: Config, name: str) -> Config:
+    """That of a model with fresh weights: as configured, or the other one at the same scale, phase, grid, backbone."""
+    if config.model.name == name:
+        return replace(config, checkpoint=None)
+    other, _ = compose_config(
+        [f"model={name}", f"scale={config.scale}", f"phase={config.phase.name}", "data=synthetic"]
     )
+    return replace(other, grid=config.grid, backbone=config.backbone, precision=config.precision, seed=config.seed)
 
 
-def peer_of(config: Config, name: str) -> Config:
-    """The other model at the same scale, phase, grid and backbone."""
-    peer, _ = compose_config([f"model={name}", f"scale={config.scale}", f"phase={config.phase.name}", "data=synthetic"])
-    return replace(peer, grid=config.grid, backbone=config.backbone, precision=config.precision, seed=config.seed)
-
-
-def sweeps_of(sizes: ScalingSizes, temporal: bool) -> dict[str, list[Point]]:
+def sweeps_of(
+    road: Highway,  # at the nominal range
+    ranges_m: tuple[float, ...],
+    temporal: bool,
+) -> dict[str, list[Point]]:
     """The points of every sweep; what is nominal in several of them is measured in each."""
-    road = sizes.road
     fixed = replace(road, reach_m=FIXED_REACH_M)
 
     def vehicles(factor: float) -> Highway:
@@ -132,8 +122,8 @@ def sweeps_of(sizes: ScalingSizes, temporal: bool) -> dict[str, list[Point]]:
 
     returned = [returns(factor) for factor in FACTORS["radar points"]]
     sweeps = {
-        "range, equal density": [Point(r, r, replace(road, reach_m=r)) for r in sizes.ranges_m],
-        "range, fixed scene": [Point(r, r, fixed) for r in sizes.ranges_m],
+        "range, equal density": [Point(r, r, replace(road, reach_m=r)) for r in ranges_m],
+        "range, fixed scene": [Point(r, r, fixed) for r in ranges_m],
         "objects": [Point(vehicles(f).num_vehicles, NOMINAL_M, vehicles(f)) for f in FACTORS["objects"]],
         "radar points": [Point(len(highway_points(scene)), NOMINAL_M, scene) for scene in returned],
         "gaussians": [Point(f, NOMINAL_M, road, gaussians=f) for f in FACTORS["gaussians"]],
@@ -155,9 +145,8 @@ def measure_sweep(
         x = counts[OURS] if name == "gaussians" else point.x
         seconds, parts = measure_cases(cases)
         for model, case in cases.items():
-            middle, spread = median_spread(seconds[model])
             added = added_bytes(case.infer, device)
-            row = {name: int(x), "model": model, "ms": 1e3 * middle, "± ms": 1e3 * spread}
+            row = {name: int(x), "model": model, **milliseconds(seconds[model])}
             row["added MiB"] = None if added is None else added / 2**20
             row["remembered MiB"] = sum(x.nbytes for x in tensors_in(case.memory)) / 2**20
             with counted_work() as work:
@@ -189,32 +178,23 @@ def measure_cases(cases: dict[str, Case]) -> tuple[dict[str, list[float]], dict[
 
         return run
 
-    return in_turns({model: timed(model, case) for model, case in cases.items()}, device, ROUNDS, BUDGET_S), parts
+    candidates = {model: timed(model, case) for model, case in cases.items()}
+    return interleaved(candidates, clock(device), ROUNDS, BUDGET_S), parts
 
 
 def make_case(config: Config, point: Point, device: torch.device) -> Case:
     """A model on a grid of this range, with a full memory of frames that saw the same road a little behind."""
     torch.manual_seed(config.seed)
-    grid = grid_of(config, point.range_m)
     settings = model_settings(config, point)
-    model = build_model(settings, grid, config.backbone, velocity_code_weight=config.phase.velocity_code_weight)
-    bf16 = config.precision == "bf16-mixed"
-    prepared = prepare_for_inference(model.to(device), bf16)
+    cells = [round(number * point.range_m / NOMINAL_M) for number in config.grid.cells]
     batch = highway_frame(highway_points(point.road), tuple(config.backbone.image_size_px)).to(device)
-    case = Case(model, prepared, batch, None, device, bf16)
+    case = build_case(replace(config, model=settings, grid=replace(config.grid, cells=cells)), batch, device)
     cache_images(case)
     memory = expect_trained_scores(case)
     if settings.memory_frames:
         case.memory = aged(memory, settings)
         case.batch = replace(batch, timestamps_s=batch.timestamps_s + KEY_FRAME_S)
     return case
-
-
-def grid_of(config: Config, range_m: float) -> BEVGrid:
-    """The configured grid with more or fewer cells of the same size."""
-    factor = range_m / NOMINAL_M
-    cells = [round(number * factor) for number in config.grid.cells]
-    return replace(config.grid.build(), cells=tuple(cells))
 
 
 def model_settings(config: Config, point: Point) -> Any:
@@ -237,10 +217,8 @@ def model_settings(config: Config, point: Point) -> Any:
             path.num_frames = (
                 min(frames, path.num_frames) if path is getattr(temporal, "gaussian_path", None) else frames
             )
-    if settings.name == OURS and temporal.bev_path is not None:
-        objects = max(1, round(point.road.num_vehicles * point.road.reach_m / NOMINAL_M))
-        temporal.bev_path.memory_threshold = 0.0
-        temporal.bev_path.max_cells_per_frame = objects * SIZES[config.scale].cells_per_object
+    vehicles = max(1, round(point.road.num_vehicles * point.road.reach_m / NOMINAL_M))
+    remember_traffic(settings, config.scale, vehicles)
     return settings
 
 
@@ -267,21 +245,12 @@ def aged(memory: Any, settings: Any) -> Any:
         pose = frame.global_from_ego.clone()
         pose[:, 0, 3] -= EGO_STEP_M * (age + 1)
         own = {"global_from_ego": pose, "timestamps_s": frame.timestamps_s - KEY_FRAME_S * age}
-        frames.append(replace(_copied(frame), **own))
+        frames.append(replace(copy.deepcopy(frame), **own))
     if settings.name == OURS:
         for name, path in (("cells", settings.dptf.bev_path), ("gaussians", settings.dptf.gaussian_path)):
             kept = path.num_frames if path is not None else 0
             frames = [replace(old, **{name: None}) if age >= kept else old for age, old in enumerate(frames)]
     return type(memory)(tuple(frames))
-
-
-def _copied(value: Any) -> Any:
-    """Memory of its own for every tensor in nested dataclasses."""
-    if isinstance(value, torch.Tensor):
-        return value.clone()
-    if dataclasses.is_dataclass(value):
-        return replace(value, **{f.name: _copied(getattr(value, f.name)) for f in dataclasses.fields(value)})
-    return value
 
 
 def growth_rows(measured: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:

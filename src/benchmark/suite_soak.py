@@ -22,19 +22,16 @@ import torch
 from torch import Tensor
 
 from src.assembly import build_datamodule, build_model, build_module, data_root
+from src.benchmark.cases import KEY_FRAME_S, Case, expect_trained_scores, load_weights, remember_traffic
 from src.benchmark.page import page_name
-from src.benchmark.parts import tensors_in
+from src.benchmark.parts import tensors_in, wrapped_parts
 from src.benchmark.plots import draw_soak
-from src.benchmark.suite_latency import endless_stream
-from src.benchmark.suite_model import KEY_FRAME_S, Case, expect_trained_scores
-from src.benchmark.suite_scaling import SIZES
-from src.benchmark.timing import chosen_device, clock, median_spread, replaced_methods
+from src.benchmark.scenes import ROADS
+from src.benchmark.timing import chosen_device, clock, median_iqr, status_bytes, trim_heap
 from src.config import Config
 from src.data.datamodule import DetectionDataModule
 from src.errors import ConfigError
 from src.geometry.tensor_transforms import invert_rigid
-from src.models.detector import Detector
-from src.reliability.checkpoints import load_model_weights, read_checkpoint
 from src.streaming import StreamingDetector
 from src.structures.batch import FrameBatch
 from src.training.fit import build_loggers, build_trainer, fit
@@ -51,7 +48,7 @@ Row = dict[str, Any]
 
 
 def benchmark_soak(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
-    """Curves over three long passes, after how much each quantity grows; see `Curve` for what is looked at.
+    """Curves over three long passes, after how much each quantity grows; see `Curve` for what is measured.
 
     Raises ConfigError for a phase without memory.
     """
@@ -60,7 +57,7 @@ def benchmark_soak(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     device = chosen_device(config)
     config = replace(config, optim=replace(config.optim, lr=UNLEARNED))
     if config.checkpoint is None:
-        fill_memory(config)
+        remember_traffic(config.model, config.scale, ROADS[config.scale].num_vehicles)
     datamodule = build_datamodule(config, data_root(config))
     frames, curves = FRAMES[config.scale], {}
     for name in (DRIVE, CLIPS):
@@ -100,14 +97,6 @@ def benchmark_soak(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     return result | curves
 
 
-def fill_memory(config: Config) -> None:
-    """Fresh weights call no cell occupied: let them remember as many of a frame as traffic fills."""
-    path = getattr(getattr(config.model, "dptf", None), "bev_path", None)
-    if path is not None:
-        size = SIZES[config.scale]
-        path.memory_threshold, path.max_cells_per_frame = 0.0, size.road.num_vehicles * size.cells_per_object
-
-
 # ---------------------------------------------------------------- the three passes
 
 
@@ -123,17 +112,11 @@ def make_detector(config: Config, datamodule: DetectionDataModule, device: torch
     return detector
 
 
-def load_weights(config: Config, model: Detector) -> None:
-    """Weights of `checkpoint=PATH`, if given; it must be of this configuration."""
-    if config.checkpoint is not None:
-        load_model_weights(model, read_checkpoint(Path(config.checkpoint)), Path(config.checkpoint))
-
-
 def soak_inference(
     detector: StreamingDetector, datamodule: DetectionDataModule, frames: int, one_drive: bool
 ) -> list[Row]:
     """The curve of so many validation frames, read and detected one by one."""
-    source = (frame for frame, _ in endless_stream(datamodule))
+    source = itertools.chain.from_iterable(datamodule.stream() for _ in itertools.count())
     if one_drive:
         source = joined(source)
     curve = Curve(frames, detector.device, lambda: detector.memory)
@@ -147,7 +130,7 @@ def soak_inference(
 def joined(
     frames: Iterator[FrameBatch],  # clip after clip, batches of one
 ) -> Iterator[FrameBatch]:
-    """The clips as one drive: each goes on where the one before would have gone, at its last speed."""
+    """The clips as one drive: each starts where the one before would have arrived at its last speed."""
     onward = torch.eye(4, dtype=torch.float64)[None]  # joined from own global frame
     later_s, step, step_s = 0.0, onward, KEY_FRAME_S
     before: FrameBatch | None = None
@@ -206,6 +189,7 @@ def soak_training(
             folder,
             epochs=epochs,
             validate_every=config.phase.validate_every,
+            monitor=config.phase.monitor,
             precision=config.precision,
             accelerator=config.trainer.accelerator.value,
             devices=1,
@@ -215,7 +199,7 @@ def soak_training(
             checkpoint_every_steps=config.trainer.checkpoint_every_steps,
         )
         hooks = {"epoch": ("on_train_epoch_start",), "step": ("on_train_batch_end",)}
-        with replaced_methods(module, hooks, watched):
+        with wrapped_parts(module, hooks, watched):
             fit(trainer, module, datamodule, None)
     return curve.rows
 
@@ -225,14 +209,14 @@ def epoch_frames(config: Config, datamodule: DetectionDataModule) -> int:
     return len(datamodule.train_dataloader()) * config.data.batch_size
 
 
-# ---------------------------------------------------------------- what is looked at
+# ---------------------------------------------------------------- what is measured
 
 
 class Curve:
-    """What the process holds and how long a frame takes, looked at `POINTS` times over so many frames.
+    """What the process holds and how long a frame takes, measured `POINTS` times over so many frames.
 
-    A row has `frames` passed so far, `ms` a frame, the median since the row before (± the range of its middle half),
-    then what `held` tells. Neither looking nor what lies between `passed` and the next `begin` is in the times.
+    A row has `frames` passed so far, `ms` a frame, the median since the row before (± its interquartile range), then
+    what `held` gives. Neither that measurement nor what lies between `passed` and the next `begin` is in the times.
     """
 
     def __init__(self, frames: int, device: torch.device, memory: Callable[[], Any]) -> None:
@@ -240,7 +224,11 @@ class Curve:
         self._every, self._device, self._memory = frames / POINTS, device, memory
         self._now, self._since, self._frames = clock(device), 0.0, 0
         self._times: list[float] = []
-        release_kept_memory()
+        # Where a leak could hide for long: what earlier work left to the allocators.
+        gc.collect()
+        if torch.cuda.is_available():
+            torch.cuda.empty_cache()
+        trim_heap()
 
     def begin(self) -> None:
         """A frame begins now."""
@@ -251,31 +239,22 @@ class Curve:
         self._times.append(1e3 * (self._now() - self._since) / frames)
         self._frames += frames
         if self._frames >= self._every * (len(self.rows) + 1) - 1e-6:
-            middle, spread = median_spread(self._times)
+            middle, iqr = median_iqr(self._times)
             self._times.clear()
-            row = {"frames": self._frames, "ms": middle, "± ms": spread}
+            row = {"frames": self._frames, "ms": middle, "± ms": iqr}
             self.rows.append(row | held(self._device, self._memory()))
         self.begin()
 
 
-def release_kept_memory() -> None:
-    """Give back what earlier work left to the allocators, where a leak could hide for long."""
-    gc.collect()
-    if torch.cuda.is_available():
-        torch.cuda.empty_cache()
-    try:
-        ctypes.CDLL(None).malloc_trim(0)
-    except (OSError, AttributeError):  # a C library without it
-        return
-
-
 def held(device: torch.device, memory: Any) -> Row:
-    """What the process holds now, MiB and numbers; without what this system does not tell."""
+    """What the process holds now, MiB and numbers; without what this system does not report."""
     objects = gc.get_objects()
+    resident = status_bytes("VmRSS")
+    workers = [status_bytes("VmRSS", worker.pid) for worker in multiprocessing.active_children()]
     row = {
-        "RSS MiB": resident_mib("self"),
+        "RSS MiB": None if resident is None else resident / 2**20,
         "heap MiB": heap_mib(),
-        "workers MiB": None,
+        "workers MiB": sum(workers) / 2**20 if workers and None not in workers else None,
         "CUDA MiB": torch.cuda.memory_allocated() / 2**20 if device.type == "cuda" else None,
         "CUDA reserved MiB": torch.cuda.memory_reserved() / 2**20 if device.type == "cuda" else None,
         "remembered MiB": kept_alive_mib(tensors_in(memory)),
@@ -284,9 +263,6 @@ def held(device: torch.device, memory: Any) -> Row:
         "descriptors": number_in("/proc/self/fd"),
         "threads": number_in("/proc/self/task"),
     }
-    workers = [resident_mib(str(worker.pid)) for worker in multiprocessing.active_children()]
-    if workers and None not in workers:
-        row["workers MiB"] = sum(workers)
     return {name: value for name, value in row.items() if value is not None}
 
 
@@ -294,15 +270,6 @@ def kept_alive_mib(tensors: list[Tensor]) -> float:
     """What the tensors keep from being freed: a small view can hold a large tensor."""
     storages = [tensor.untyped_storage() for tensor in tensors]
     return sum({storage.data_ptr(): storage.nbytes() for storage in storages}.values()) / 2**20
-
-
-def resident_mib(process: str) -> float | None:
-    """Resident memory of a process (Linux)."""
-    try:
-        pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    except OSError:
-        return None
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 class _Mallinfo(ctypes.Structure):
@@ -332,7 +299,7 @@ def number_in(folder: str) -> int | None:
     return len(os.listdir(folder)) if os.path.isdir(folder) else None
 
 
-# ---------------------------------------------------------------- what it comes to
+# ---------------------------------------------------------------- growth
 
 
 def growth_row(
@@ -343,7 +310,7 @@ def growth_row(
 ) -> Row:
     """How much everything grows in a thousand frames once it has settled, and the times of two quarters.
 
-    Within a training epoch the clips' memories fill, so only points at the same place of two epochs tell of growth.
+    Within a training epoch the clips' memories fill, so only points at the same place of two epochs show growth.
     """
     last_frame = rows[-1]["frames"]
     settled = [row for row in rows if row["frames"] > max(SETTLED * last_frame, settled_after)]

@@ -6,19 +6,19 @@ import math
 import os
 import statistics
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import chain, repeat
 from typing import Any
 
 import torch
 
 from src.assembly import build_datamodule, build_module, data_root
-from src.benchmark.operation_table import NOTE as OPERATIONS_NOTE
-from src.benchmark.operation_table import operation_table
-from src.benchmark.timing import chosen_device, clock, median_spread, peak_bytes, timed_parts
+from src.benchmark.operation_table import OPERATIONS_NOTE, operation_table
+from src.benchmark.timing import chosen_device, clock, milliseconds, peak_bytes, timed_parts
 from src.config import Config
-from src.data.datamodule import DetectionDataModule
 from src.structures.batch import FrameBatch
-from src.training.module import DetectionModule
+from src.training.module import TrainingModule
 from src.training.optim import CyclicSchedule, build_optimizer
 
 WARM_UP_STEPS = 5  # first calls choose algorithms, fill the allocator and the loader's queue
@@ -36,40 +36,29 @@ def benchmark_training(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """
     device = chosen_device(config)
     datamodule = build_datamodule(config, data_root(config))
+    autocast = config.precision == "bf16-mixed"
     batches: list[FrameBatch] = []
     passes = {}
     for name in ("with loader", "loaded"):
         torch.manual_seed(config.seed)
         module = build_module(config, tree, datamodule).to(device).train()
-        source = endless_batches(datamodule) if name == "with loader" else iter(batches)
-        passes[name], taken = run_steps(module, source, device, config.precision == "bf16-mixed")
-        batches = taken
+        loading = name == "with loader"
+        source = chain.from_iterable(repeat(datamodule.train_dataloader())) if loading else iter(batches)
+        passes[name], batches = run_steps(module, source, device, autocast)
     rows = []
     for name, (stages, frames) in passes.items():
         step = [sum(values) for values in zip(*stages.values(), strict=True)]
-        middle, spread = median_spread(step)
-        rows.append(
-            {
-                "batches": name,
-                "frames/s": sum(frames) / math.fsum(step),
-                "frames/s (median step)": statistics.mean(frames) / middle,
-                "step ms": 1e3 * middle,
-                "± ms": 1e3 * spread,
-            }
-            | {f"{stage} ms": 1e3 * statistics.median(values) for stage, values in stages.items()}
-        )
-    optimizer, schedule = build_optimizer(
-        module.model, module.optim, PROFILED_STEPS, module.model.image_backbone, module.backbone_lr_multiplier
-    )
-    last = batches[-1].to(device)
-    operations = operation_table(
-        lambda: timed_step(module, last, optimizer, schedule, device, config.precision == "bf16-mixed"), device
-    )
+        row = {"batches": name, "frames/s": sum(frames) / math.fsum(step)}
+        row["frames/s (median step)"] = statistics.mean(frames) / statistics.median(step)
+        row |= milliseconds(step, "step ")
+        rows.append(row | {f"{stage} ms": 1e3 * statistics.median(values) for stage, values in stages.items()})
+    last, step_on = batches[-1].to(device), make_stepper(module, PROFILED_STEPS, device, autocast)
+    operations = operation_table(lambda: step_on(last), device)
     return {
         "notes": [
             f"{MEASURED_STEPS} steps of {config.data.batch_size} frames after {WARM_UP_STEPS}, {config.phase.name}, "
             f"scale {config.scale}, {config.precision}, {config.data.num_workers} loader workers, fresh weights. "
-            "Medians, after ± the range of the middle half; frames/s counts the whole time.",
+            "Medians; ± is the interquartile range; frames/s counts the whole time.",
             OPERATIONS_NOTE,
         ],
         "training step": rows,
@@ -82,21 +71,11 @@ def benchmark_training(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def endless_batches(datamodule: DetectionDataModule) -> Iterator[FrameBatch]:
-    """Training batches, epoch after epoch."""
-    loader = datamodule.train_dataloader()
-    while True:
-        yield from loader
-
-
 def run_steps(
-    module: DetectionModule, source: Iterator[FrameBatch], device: torch.device, autocast: bool
+    module: TrainingModule, source: Iterator[FrameBatch], device: torch.device, autocast: bool
 ) -> tuple[tuple[dict[str, list[float]], list[int]], list[FrameBatch]]:
     """Seconds of each stage of the measured steps with the frames of each, and all batches that came."""
-    now, model = clock(device), module.model
-    optimizer, schedule = build_optimizer(
-        model, module.optim, WARM_UP_STEPS + MEASURED_STEPS, model.image_backbone, module.backbone_lr_multiplier
-    )
+    now, step_on = clock(device), make_stepper(module, WARM_UP_STEPS + MEASURED_STEPS, device, autocast)
     stages: dict[str, list[float]] = {}
     frames, taken = [], []
     for number in range(WARM_UP_STEPS + MEASURED_STEPS):
@@ -104,7 +83,7 @@ def run_steps(
         batch = next(source)
         moved = batch.to(device, non_blocking=True)
         arrived = now()
-        seconds = {"wait": arrived - begin} | timed_step(module, moved, optimizer, schedule, device, autocast)
+        seconds = {"wait": arrived - begin} | step_on(moved)
         taken.append(batch)
         if number >= WARM_UP_STEPS:
             frames.append(len(batch))
@@ -113,13 +92,23 @@ def run_steps(
     return (stages, frames), taken
 
 
+def make_stepper(
+    module: TrainingModule, num_steps: int, device: torch.device, autocast: bool
+) -> Callable[[FrameBatch], dict[str, float]]:
+    """`timed_step` with a fresh optimiser."""
+    optimizer, schedule = build_optimizer(
+        module.model, module.optim, num_steps, module.model.image_backbone, module.backbone_lr_multiplier
+    )
+    return partial(timed_step, module, optimizer, schedule, device, autocast)
+
+
 def timed_step(
-    module: DetectionModule,
-    batch: FrameBatch,
+    module: TrainingModule,
     optimizer: torch.optim.Optimizer,
     schedule: CyclicSchedule,
     device: torch.device,
     autocast: bool,
+    batch: FrameBatch,
 ) -> dict[str, float]:
     """One optimiser step as the trainer makes it; seconds by stage."""
     now = clock(device)
@@ -128,12 +117,12 @@ def timed_step(
         warnings.filterwarnings("ignore", message=".*self.trainer.*")  # nothing is logged without a trainer
         begin = now()
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=autocast):
-            total = module.training_step(batch, 0)
+            objective = module.objective(batch)
         computed = now()
         optimizer.zero_grad(set_to_none=True)
-        total.backward()
-        derived = now()
-        module.configure_gradient_clipping(optimizer)
+        objective.terms["total"].backward()
+        went_back = now()
+        module.clip_gradients_or_skip(batch, objective)
         optimizer.step()
         schedule.step()
         end = now()
@@ -141,7 +130,7 @@ def timed_step(
     return {
         "forward": forward,
         "loss": loss,
-        "backward": derived - computed,
-        "optimiser": end - derived,
+        "backward": went_back - computed,
+        "optimiser": end - went_back,
         "bookkeeping": computed - begin - forward - loss,  # the module's checks and means
     }

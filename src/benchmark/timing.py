@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import math
 import resource
 import statistics
 import time
@@ -13,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
+from src.benchmark.parts import Paths, backward_from, wrapped_parts
 from src.config import Accelerator, Config
 from src.ops.sparse_conv_tiled import release_scratch
 from src.reliability.processes import check_devices
@@ -29,8 +31,9 @@ def chosen_device(config: Config) -> torch.device:
     return torch.device("cuda" if on_gpu else "cpu")
 
 
+# torch.utils.benchmark's clock waits for any GPU there is, and so gives a CPU's process the memory of a CUDA context.
 def clock(device: torch.device) -> Callable[[], float]:
-    """Seconds, read when everything queued on a GPU is done."""
+    """Wall seconds, read when everything queued on a GPU is done."""
 
     def now() -> float:
         if device.type == "cuda":
@@ -40,55 +43,48 @@ def clock(device: torch.device) -> Callable[[], float]:
     return now
 
 
-def median_spread(values: list[float]) -> tuple[float, float]:
-    """The median and the range of the middle half; with fewer than four values their whole range."""
+def median_iqr(values: list[float]) -> tuple[float, float]:
+    """The median and the interquartile range; with fewer than four values their whole range."""
     if len(values) < 4:
         return statistics.median(values), max(values) - min(values)
     low, middle, high = statistics.quantiles(values, n=4)
     return middle, high - low
 
 
+def milliseconds(seconds: list[float], prefix: str = "") -> dict[str, float]:
+    """Columns of a row: the median and, after ±, the interquartile range."""
+    middle, iqr = median_iqr(seconds)
+    return {f"{prefix}ms": 1e3 * middle, f"{prefix}± ms": 1e3 * iqr}
+
+
+def seconds_of(function: Callable[[], Any], now: Callable[[], float]) -> float:
+    """Of one call, whose result is freed: its memory would else be fresh instead of reused in the next."""
+    begin = now()
+    result = function()
+    elapsed = now() - begin
+    del result
+    return elapsed
+
+
+# torch.utils.benchmark.Timer measures one candidate after the other, and warms each up by two calls of it.
 def interleaved(
     candidates: Mapping[str, Callable[[], Any]],
-    device: torch.device,
+    now: Callable[[], float],
     rounds: int,
-    warm_up: int = 1,  # rounds that do not count
+    budget_s: float = math.inf,  # of each candidate
 ) -> dict[str, list[float]]:
-    """Seconds of every candidate, taken in turns: what else the machine does then strikes all of them alike."""
-    now = clock(device)
-    seconds: dict[str, list[float]] = {name: [] for name in candidates}
-    for number in range(warm_up + rounds):
-        for name, function in candidates.items():
-            begin = now()
-            result = function()
-            elapsed = now() - begin
-            del result  # before the next candidate: its memory would else be fresh instead of reused
-            if number >= warm_up:
-                seconds[name].append(elapsed)
-    return seconds
+    """Seconds of every candidate, called in turns: what else the machine does then slows all of them alike.
 
-
-def in_turns(
-    candidates: Mapping[str, Callable[[], Any]],
-    device: torch.device,
-    rounds: int,
-    budget_s: float,  # of each candidate
-) -> dict[str, list[float]]:
-    """As `interleaved`, with fewer rounds for what is slow.
-
-    The first call of each tells how slow it is and does not count, unless it alone takes several times the budget.
+    The first call of each does not count: it warms up and sets how many rounds fit into the budget, at least one. If
+    it alone takes several times the budget, it is the only one and counts.
     """
-    first = {name: values[0] for name, values in interleaved(candidates, device, 1, warm_up=0).items()}
+    first = {name: seconds_of(function, now) for name, function in candidates.items()}
     endless = [name for name in candidates if first[name] > PATIENCE * budget_s]
-    seconds: dict[str, list[float]] = {name: [first[name]] if name in endless else [] for name in candidates}
+    seconds = {name: [first[name]] if name in endless else [] for name in candidates}
     for number in range(rounds):
-        due = {
-            name: function
-            for name, function in candidates.items()
-            if name not in endless and number < max(1, budget_s // max(first[name], 1e-9))
-        }
-        for name, values in interleaved(due, device, 1, warm_up=0).items():
-            seconds[name] += values
+        for name, function in candidates.items():
+            if name not in endless and (number == 0 or (number + 1) * first[name] <= budget_s):
+                seconds[name].append(seconds_of(function, now))
     return seconds
 
 
@@ -106,46 +102,20 @@ def with_gradient(function: Callable[[], Any]) -> Callable[[], None]:
     """The function and, from gradients of one, its backward pass."""
 
     def call() -> None:
-        result = function()
-        outputs = [result] if isinstance(result, Tensor) else [x for x in result if isinstance(x, Tensor)]
-        outputs = [x for x in outputs if x.requires_grad]
-        torch.autograd.backward(outputs, [torch.ones_like(x) for x in outputs])
+        backward_from(function())
 
     return call
 
 
-@contextmanager
-def replaced_methods(
-    model: nn.Module,
-    parts: Mapping[str, tuple[str, ...]],  # by name the methods to wrap, as in `module.method`
-    wrap: Callable[[str, str, Callable[..., Any]], Callable[..., Any]],  # of part, path and the method
-) -> Iterator[None]:
-    """Within the context these methods of the model are wrapped; one that the model lacks is left out."""
-    modules, replaced = dict(model.named_modules()), []
-    for name, paths in parts.items():
-        for path in paths:
-            owner, _, method = path.rpartition(".")
-            if hasattr(modules.get(owner), method):
-                setattr(modules[owner], method, wrap(name, path, getattr(modules[owner], method)))
-                replaced.append((modules[owner], method))
-    try:
-        yield
-    finally:
-        for module, method in replaced:
-            delattr(module, method)
+MODES = {"forward": without_gradient, "f+b": with_gradient}
+"""How an operation is called, by the names that pages use."""
 
 
 @contextmanager
 def timed_parts(
-    model: nn.Module,
-    parts: Mapping[str, tuple[str, ...]],  # by name the methods to time, as in `module.method`
-    timings: dict[str, list[float]],
-    device: torch.device,
+    model: nn.Module, parts: Paths, timings: dict[str, list[float]], device: torch.device
 ) -> Iterator[None]:
-    """Within the context every call of these methods appends its seconds to `timings` under the part's name.
-
-    A method that the model lacks is left out.
-    """
+    """Within the context every call of these parts appends its seconds to `timings` under the part's name."""
     now = clock(device)
 
     def timed(name: str, path: str, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -157,8 +127,11 @@ def timed_parts(
 
         return call
 
-    with replaced_methods(model, parts, timed):
+    with wrapped_parts(model, parts, timed):
         yield
+
+
+# ---------------------------------------------------------------- bytes
 
 
 def peak_bytes(device: torch.device) -> int:
@@ -169,7 +142,7 @@ def peak_bytes(device: torch.device) -> int:
 
 
 def added_bytes(function: Callable[[], Any], device: torch.device) -> int | None:
-    """The most that a call takes beyond what was held before it; None where the system does not tell.
+    """The most that a call takes beyond what was held before it; None where the system does not report it.
 
     On a GPU what torch allocates; on a CPU pages of the process (Linux), after the allocator has given back what it
     kept of earlier calls. Memory that convolutions use again is part of the call.
@@ -183,16 +156,30 @@ def added_bytes(function: Callable[[], Any], device: torch.device) -> int | None
         function()
         torch.cuda.synchronize()
         return torch.cuda.max_memory_allocated() - before
+    if not trim_heap():
+        return None
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
+    except OSError:
+        return None
+    before = status_bytes("VmRSS")
+    function()
+    return max(0, status_bytes("VmHWM") - before)
+
+
+def trim_heap() -> bool:
+    """Give freed memory that the C allocator keeps back to the system; False with a C library that cannot."""
     try:
         ctypes.CDLL(None).malloc_trim(0)
-        Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
     except (OSError, AttributeError):
+        return False
+    return True
+
+
+def status_bytes(key: str, process: int | str = "self") -> int | None:
+    """A line of a process's /proc/PID/status (Linux), None where there is none."""
+    try:
+        lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    except OSError:
         return None
-    before = _status_bytes("VmRSS")
-    function()
-    return max(0, _status_bytes("VmHWM") - before)
-
-
-def _status_bytes(key: str) -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(key + ":"))
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(key + ":")), None)

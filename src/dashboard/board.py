@@ -22,8 +22,6 @@ from src.report.time_left import seconds_left
 logger = logging.getLogger(__name__)
 STALLED_S = 120.0
 """A runner whose runs write neither log nor metrics for this long has probably been killed."""
-LARGEST_BYTES = 64_000_000
-"""Of a record or a result; those of the largest sweeps have a hundredth of it."""
 SCALES = ("paper", "mini", "debug")
 Stamp = tuple[int, int]  # of a file: time of change and size
 
@@ -249,7 +247,7 @@ class BoardReader:
         if known is not None and known[0] == stamp:
             return known[1]
         try:
-            self._refuse(path, stamp)
+            self._refuse(path)
             content = read_record(path) if path.parent.name == "sweeps" else read_result(path)
         except DataError as error:
             content = error
@@ -259,14 +257,12 @@ class BoardReader:
         self._files[path] = (stamp, content)
         return content
 
-    def _refuse(self, path: Path, stamp: Stamp) -> None:
+    def _refuse(self, path: Path) -> None:
         """Raises DataError for a file that is not read."""
         if not path.resolve().is_relative_to(self.reports.resolve()):
             raise DataError(f"{path}: a link that leads out of the reports folder, which is not followed; delete it")
         if not path.is_file():
             raise DataError(f"{path}: not a file; delete it")
-        if stamp[1] > LARGEST_BYTES:
-            raise DataError(f"{path}: {stamp[1]} bytes, more than {LARGEST_BYTES}; delete it")
 
 
 def _kind(run: Run) -> tuple[Any, ...]:

@@ -1,17 +1,19 @@
-"""The official submission file: read it with every fault named, write it whole or not at all (facts: section 6)."""
+"""The official submission file: read it with every fault named, write it whole or not at all."""
 
 from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
+from typing import Annotated, Any, Literal, NotRequired
 
 import numpy as np
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, with_config
+from typing_extensions import TypedDict
 
 from src.errors import DataError
 from src.geometry.transforms import matrix_to_quaternion
@@ -25,10 +27,62 @@ META_TEXTS = ("method_name", "authors", "affiliation", "description", "code_url"
 
 _LABELS = {name: row for row, name in enumerate(CLASSES)}
 _ATTRIBUTES = {name: row for row, name in enumerate(ATTRIBUTES)} | {"": -1}
+MAX_FAULTS = 10_000
+"""More wrong samples than these are only counted: naming them takes much memory."""
 _WIDTHS = {"translation": 3, "size": 3, "rotation": 4, "velocity": 2}
-_NUMBERS = {int, float}
 
 Array = np.ndarray
+
+
+def _not_all_zero(values: list[float]) -> list[float]:
+    if max(map(abs, values)) < SMALLEST_ROTATION:
+        raise ValueError
+    return values
+
+
+def _bounded_or_unknown(values: list[float | None]) -> list[float | None]:
+    if any(value is not None and abs(value) > LARGEST for value in values):
+        raise ValueError
+    return values
+
+
+_Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]  # refuses NaN too
+_Length = Annotated[float, Field(gt=0, le=LARGEST)]
+
+
+@with_config(ConfigDict(strict=True))
+class _Box(TypedDict):
+    """One box; further fields do not matter."""
+
+    sample_token: str
+    translation: Annotated[list[_Number], Field(min_length=3, max_length=3)]
+    size: Annotated[list[_Length], Field(min_length=3, max_length=3)]
+    rotation: Annotated[list[_Number], Field(min_length=4, max_length=4), AfterValidator(_not_all_zero)]
+    velocity: Annotated[list[float | None], Field(min_length=2, max_length=2), AfterValidator(_bounded_or_unknown)]
+    detection_name: Literal[CLASSES]
+    detection_score: Annotated[float, Field(ge=0, le=LARGEST)]
+    attribute_name: Literal[(*ATTRIBUTES, "")]
+    num_pts: NotRequired[_Number]
+
+
+@with_config(ConfigDict(strict=True))
+class _Submission(TypedDict):
+    meta: dict[str, Any]
+    results: dict[str, Annotated[list[_Box], Field(max_length=MAX_BOXES_PER_SAMPLE, fail_fast=True)]]
+
+
+_SUBMISSION = TypeAdapter(_Submission)
+_EXPECTED = {
+    "sample_token": "the sample it is listed under",
+    "translation": f"a list of 3 finite numbers of at most {LARGEST:g} in size",
+    "size": f"a list of 3 positive numbers of at most {LARGEST:g}",
+    "rotation": f"a quaternion (w, x, y, z), not all 0, of finite numbers of at most {LARGEST:g} in size",
+    "velocity": f"a list of 2 numbers of at most {LARGEST:g} in size, NaN or null where unknown",
+    "detection_name": f"one of {', '.join(CLASSES)}",
+    "detection_score": f"a finite number of at least 0 and at most {LARGEST:g}",
+    "attribute_name": f"one of {', '.join(ATTRIBUTES)}, '' (none)",
+    "num_pts": "a number of points",
+}
 
 
 def load_submission(path: Path | str, tokens: Sequence[str]) -> DetectionTable:
@@ -43,46 +97,60 @@ def load_submission(path: Path | str, tokens: Sequence[str]) -> DetectionTable:
 
     Raises DataError naming file, sample, box index and field, with what was found and what was expected.
     """
-    results = _read_results(Path(path))
-    _check_samples(Path(path), results, tokens)
     try:
-        table = _columns(results, tokens)
-    except (KeyError, TypeError, ValueError, OverflowError):
-        table = None
-    if table is not None:
-        try:
-            check_predictions(table, tokens)
-            return table
-        except DataError:
-            pass  # said again below, with the box's place in the file
-    for token, boxes in results.items():
-        for index, box in enumerate(boxes):
-            fault = _fault_of(token, box)
-            if fault:
-                raise DataError(f"{path}: sample {token}, box {index}: {fault}")
-    raise DataError(f"{path}: the boxes are not in the submission format")
-
-
-def _read_results(path: Path) -> dict[str, list[object]]:
-    try:
-        with open(path, encoding="utf-8") as file:
-            content = json.load(file)
+        results = _SUBMISSION.validate_json(Path(path).read_bytes())["results"]
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from error
-    except json.JSONDecodeError as error:
-        raise DataError(f"{path}: not valid JSON: {error.msg} in line {error.lineno}, column {error.colno}") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: not valid JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise DataError(f"{path}: must be an object with 'meta' and 'results', but got {_short(content)}")
-    for name in ("results", "meta"):
-        if not isinstance(content.get(name), dict):
-            found = _short(content[name]) if name in content else "nothing"
-            raise DataError(f"{path}: '{name}' must be an object, but got {found}")
-    return content["results"]
+    except ValidationError as error:
+        raise DataError(f"{path}: {_first_fault(error)}") from None
+    _check_samples(Path(path), results, tokens)
+    boxes = list(chain.from_iterable(results.values()))
+
+    def column(name: str) -> list[Any]:
+        return list(map(itemgetter(name), boxes))
+
+    arrays = {  # None becomes NaN
+        name: np.array(list(chain.from_iterable(column(name))), dtype=np.float64).reshape(-1, width)
+        for name, width in _WIDTHS.items()
+    }
+    index_of = {token: row for row, token in enumerate(tokens)}
+    return DetectionTable(
+        samples=np.array([index_of[token] for token in column("sample_token")]),
+        labels=np.array([_LABELS[name] for name in column("detection_name")]),
+        centers=arrays["translation"],
+        sizes=arrays["size"],
+        rotations=arrays["rotation"],
+        velocities=arrays["velocity"],
+        attributes=np.array([_ATTRIBUTES[name] for name in column("attribute_name")]),
+        scores=np.array(column("detection_score")),
+        num_points=np.array([int(box.get("num_pts", -1)) for box in boxes]),
+    )
 
 
-def _check_samples(path: Path, results: dict[str, list[object]], tokens: Sequence[str]) -> None:
+def _first_fault(error: ValidationError) -> str:
+    if error.error_count() > MAX_FAULTS:
+        return f"{error.error_count()} samples are not lists of boxes"
+    fault = error.errors(include_url=False, include_context=False)[0]
+    part, token, box, field, *_ = (*fault["loc"], None, None, None, None)
+    found = "nothing" if fault["type"] == "missing" else _short(fault["input"])
+    if fault["type"] == "json_invalid":
+        return f"not valid JSON: {fault['msg'].removeprefix('Invalid JSON: ')}"
+    if part is None:
+        return f"must be an object with 'meta' and 'results', but got {found}"
+    if token is None:
+        return f"'{part}' must be an object, but got {found}"
+    if fault["type"] == "too_long" and box is None:
+        most = f"at most {MAX_BOXES_PER_SAMPLE} boxes are allowed"
+        return f"sample {token}: {most}, but got {len(fault['input'])}"
+    if box is None:
+        return f"sample {token}: must be a list of boxes, but got {found}"
+    if field is None:
+        return f"sample {token}, box {box}: must be an object, but got {found}"
+    wrong = "is missing" if fault["type"] == "missing" else f"must be {_EXPECTED[field]}, but got {found}"
+    return f"sample {token}, box {box}: '{field}' {wrong}"
+
+
+def _check_samples(path: Path, results: dict[str, list[_Box]], tokens: Sequence[str]) -> None:
     missing = [token for token in tokens if token not in results]
     known = set(tokens)
     unknown = [token for token in results if token not in known]
@@ -97,90 +165,12 @@ def _check_samples(path: Path, results: dict[str, list[object]], tokens: Sequenc
             f"{', '.join(parts)}"
         )
     for token, boxes in results.items():
-        if not isinstance(boxes, list):
-            raise DataError(f"{path}: sample {token}: must be a list of boxes, but got {_short(boxes)}")
-        if len(boxes) > MAX_BOXES_PER_SAMPLE:
-            raise DataError(
-                f"{path}: sample {token}: at most {MAX_BOXES_PER_SAMPLE} boxes are allowed, but got {len(boxes)}"
-            )
+        for index, box in enumerate(boxes):
+            if box["sample_token"] != token:
+                wrong = f"must be {_EXPECTED['sample_token']}, but got {_short(box['sample_token'])}"
+                raise DataError(f"{path}: sample {token}, box {index}: 'sample_token' {wrong}")
     if not any(results.values()):
         raise DataError(f"{path}: no sample has a box; the official evaluator refuses such a file")
-
-
-def _columns(results: dict[str, list[dict]], tokens: Sequence[str]) -> DetectionTable | None:
-    """All boxes at once, checked column by column; None, or the exception of a conversion, where one is wrong."""
-    boxes = list(chain.from_iterable(results.values()))
-    counts = [len(of_sample) for of_sample in results.values()]
-    if list(map(itemgetter("sample_token"), boxes)) != list(
-        chain.from_iterable([token] * count for token, count in zip(results, counts, strict=True))
-    ):
-        return None
-    arrays = {}
-    for name, width in _WIDTHS.items():
-        values = list(map(itemgetter(name), boxes))
-        flat = list(chain.from_iterable(values))
-        allowed = _NUMBERS | {type(None)} if name == "velocity" else _NUMBERS
-        if set(map(type, values)) != {list} or set(map(len, values)) != {width} or not set(map(type, flat)) <= allowed:
-            return None
-        arrays[name] = np.array(flat, dtype=np.float64).reshape(-1, width)  # None becomes NaN
-    scores = list(map(itemgetter("detection_score"), boxes))
-    points = [box.get("num_pts", -1) for box in boxes]
-    if not set(map(type, scores)) <= _NUMBERS or not set(map(type, points)) <= _NUMBERS:
-        return None
-    index_of = {token: row for row, token in enumerate(tokens)}
-    return DetectionTable(
-        samples=np.repeat(np.array([index_of[token] for token in results]), counts),
-        labels=np.array([_LABELS[box["detection_name"]] for box in boxes]),
-        centers=arrays["translation"],
-        sizes=arrays["size"],
-        rotations=arrays["rotation"],
-        velocities=arrays["velocity"],
-        attributes=np.array([_ATTRIBUTES[box["attribute_name"]] for box in boxes]),
-        scores=np.array(scores, dtype=np.float64),
-        num_points=np.array([int(value) for value in points], dtype=np.int64),
-    )
-
-
-def _fault_of(token: str, box: object) -> str | None:
-    """What is wrong with one box of the file, or None."""
-    if not isinstance(box, dict):
-        return f"must be an object, but got {_short(box)}"
-    for name in ("sample_token", *_WIDTHS, "detection_name", "detection_score", "attribute_name"):
-        if name not in box:
-            return f"'{name}' is missing"
-    if box["sample_token"] != token:
-        return f"'sample_token' must be the sample it is listed under, but got {_short(box['sample_token'])}"
-    for name, width in _WIDTHS.items():
-        values = box[name]
-        if not isinstance(values, list) or len(values) != width:
-            return f"'{name}' must be a list of {width} numbers, but got {_short(values)}"
-        for value in values:
-            unknown = name == "velocity" and (value is None or _is_nan(value))
-            if not unknown and not _is_finite(value):
-                return f"'{name}' must hold finite numbers of at most {LARGEST:g} in size, but got {_short(value)}"
-    if min(box["size"]) <= 0:
-        return f"'size' must be positive, but got {_short(box['size'])}"
-    if max(map(abs, box["rotation"])) < SMALLEST_ROTATION:
-        return f"'rotation' must be a quaternion (w, x, y, z), but got {_short(box['rotation'])}"
-    for name, known in (("detection_name", _LABELS), ("attribute_name", _ATTRIBUTES)):
-        if not isinstance(box[name], str) or box[name] not in known:
-            names = ", ".join(key or "'' (none)" for key in known)
-            return f"'{name}' must be one of {names}, but got {_short(box[name])}"
-    if not _is_finite(box["detection_score"]) or box["detection_score"] < 0:
-        return f"'detection_score' must be a finite number of at least 0, but got {_short(box['detection_score'])}"
-    if "num_pts" in box and not (_is_finite(box["num_pts"]) and abs(box["num_pts"]) < 2**63):
-        return f"'num_pts' must be a number of points, but got {_short(box['num_pts'])}"
-    return None
-
-
-def _is_finite(value: object) -> bool:
-    if type(value) not in _NUMBERS:
-        return False
-    return abs(value) <= LARGEST  # False for NaN; exact for integers beyond every float
-
-
-def _is_nan(value: object) -> bool:
-    return isinstance(value, float) and math.isnan(value)
 
 
 def _short(value: object) -> str:

@@ -1,22 +1,42 @@
-"""Detectors. The one table: a model's name in the configuration, its settings, its class."""
+"""Detectors. The one table of families: a model's name in the configuration, its settings, its class."""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig
 from src.models.detector import Detector, ModelConfig
 from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
 
-MODEL_CONFIGS: dict[str, type[ModelConfig]] = {"horizon3d": Horizon3DConfig, "dense_bev": DenseBEVConfig}
-MODELS: dict[type[ModelConfig], type[Detector]] = {Horizon3DConfig: Horizon3D, DenseBEVConfig: DenseBEV}
+FAMILIES: dict[str, tuple[type[ModelConfig], type[Detector]]] = {
+    "horizon3d": (Horizon3DConfig, Horizon3D),
+    "dense_bev": (DenseBEVConfig, DenseBEV),
+}
 
 
 def build_model(
-    config: ModelConfig,  # an instance of one of MODEL_CONFIGS
+    config: ModelConfig,  # of one of FAMILIES
     grid: BEVGrid,
     backbone: ImageEncoderConfig | None,
-    velocity_code_weight: float,
+    options: Mapping[str, Any],  # of the phase
 ) -> Detector:
     """The detector that a configuration asks for, with fresh weights. Raises ConfigError when its parts do not fit."""
-    return MODELS[type(config)](config, grid, backbone, velocity_code_weight)
+    _, family = FAMILIES[config.name]
+    return family(config, grid, backbone, read_phase_options(config.name, options))
+
+
+def read_phase_options(name: str, options: Mapping[str, Any]) -> Any:
+    """`phase.options` as a family's own dataclass. Raises ConfigError for others than it takes."""
+    _, family = FAMILIES[name]
+    known = [field.name for field in dataclasses.fields(family.phase_options)]
+    if set(options) != set(known):
+        raise ConfigError(
+            f"phase.options has {', '.join(sorted(options)) or 'nothing'}, but model={name} takes "
+            f"{', '.join(known) or 'nothing'}"
+        )
+    return family.phase_options(**options)

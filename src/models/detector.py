@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Protocol, Self
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import torch
 from torch import Tensor, nn
 
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
+from src.structures.evidence import Evidence
 
 
 class ModelConfig(Protocol):
@@ -17,11 +19,18 @@ class ModelConfig(Protocol):
 
     name: str
     temporal_part: ClassVar[str]
-    """The key of all that is temporal; phase 1 sets it to null."""
+    """The key of all that is temporal; a phase of single frames sets it to null. Empty for a model without."""
+    new_in_temporal_phase: ClassVar[str]
+    """Regular expression: names of the parameters that the temporal phase adds, and no checkpoint of the phase before
+    holds. Empty for a model without."""
 
     @property
     def sensors(self) -> tuple[str, ...]:
         """Which of `taxonomy.SENSORS` are read: all that `forward` takes of a batch, and what a submission states."""
+
+    @property
+    def keys_of_temporal_phase(self) -> tuple[str, ...]:
+        """Dotted keys that change nothing of a run of the phase before, `model.dptf` for example."""
 
     @property
     def memory_frames(self) -> int:
@@ -49,9 +58,25 @@ class TemporalMemory(Protocol):
         """Tensors and plain containers, for a checkpoint; `Detector.restore_memory` reads them."""
 
 
-class Detector(nn.Module, ABC):
-    """One frame in, boxes out. State between frames never lives on the module; the output is the model's own type."""
+class Objective(NamedTuple):
+    """What a training step minimises, and what it shows besides."""
 
+    terms: dict[str, Tensor]  # weighted, each a scalar; `total` is their sum
+    diagnostics: dict[str, Tensor]  # scalars worth a curve that are no losses
+
+
+class Detector(nn.Module, ABC):
+    """One frame in, boxes out. State between frames never lives on the module; the output is the model's own type.
+
+    What else others want to know of a model it declares by the optional members below and, where inference is
+    concerned, by those of its modules (`deploy/inference.py`).
+    """
+
+    phase_options: ClassVar[type]
+    """Dataclass of what a phase says to this family, `phase.options`; an instance is the constructor's last."""
+    benchmark_parts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    """Parts worth looking into, beside the model's children: by name the methods, `ocsf.encoder.forward`, or functions,
+    `package.module:function`, that each is; `part: inner` lies within `part`."""
     prepared_bf16: bool | None = None
     """Whether `prepare_for_inference` made this copy for bfloat16 or for float32; None: as trained."""
 
@@ -75,13 +100,17 @@ class Detector(nn.Module, ABC):
         raise NotImplementedError(f"{type(self).__name__} has no memory")
 
     @abstractmethod
-    def loss(self, output: Any, batch: FrameBatch) -> dict[str, Tensor]:
-        """Weighted loss terms by name, each a scalar, and their sum as `total`; needs `batch.boxes`."""
+    def loss(self, output: Any, batch: FrameBatch) -> Objective:
+        """Weighted loss terms by name, and what comparing with the truth shows besides; needs `batch.boxes`."""
 
     @abstractmethod
     def decode(self, output: Any) -> list[Boxes3D]:
         """Predicted boxes with scores, one entry per sample, in the (augmented) ego frame."""
 
     def diagnostics(self, output: Any) -> dict[str, Tensor]:
-        """Scalars worth a curve that are no losses."""
+        """Scalars of the output that are worth a curve."""
         return {}
+
+    def evidence(self, output: Any) -> Evidence:
+        """What pictures of a frame can show beside its boxes."""
+        return Evidence()

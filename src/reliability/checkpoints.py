@@ -291,7 +291,7 @@ def _digests(file: BinaryIO) -> tuple[str, str] | None:
 
 
 def _is_ours(content: object) -> bool:
-    """Whether a file holds what `DetectionModule` and Lightning write: weights by name and the run's configuration."""
+    """Whether a file holds what `TrainingModule` and Lightning write: weights by name and the run's configuration."""
     if not isinstance(content, dict):
         return False
     about, state = content.get("horizon3d"), content.get("state_dict")

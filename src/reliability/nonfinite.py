@@ -7,14 +7,16 @@ import logging
 import re
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
+import lightning as L
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from src.errors import CheckpointError
+from src.errors import CheckpointError, DivergedError
 from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
+from src.reliability.processes import gather_by_rank
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 
@@ -67,6 +69,51 @@ class StepGuard:
         for before, now in zip(self._before, self._statistics, strict=True):
             torch._foreach_copy_(now, before)
 
+    def refuse(self, module: GuardedModule, batch: FrameBatch, terms: dict[str, Tensor]) -> None:
+        """Take back what the step did, keep it for a replay, and skip it where that is wanted.
+
+        The weights have not changed yet; gradients are dropped, so that the optimiser does nothing. All ranks come here
+        together. Raises DivergedError on all of them, with the same words, or when too many steps were skipped.
+        """
+        bad = {name: float(value) for name, value in terms.items() if not torch.isfinite(value)}
+        ranks = gather_by_rank({"bad": bad, "total": float(terms["total"]), "tokens": batch.tokens})
+        failing_ranks = [rank for rank, own in enumerate(ranks) if own["bad"]]
+        # Gradients are means over the ranks by now: where every loss is finite, none can be told from the others.
+        named_ranks = failing_ranks or range(len(ranks))
+        if failing_ranks:
+            found = "; ".join(
+                f"loss terms {ranks[rank]['bad']} of rank {rank} are not finite" for rank in failing_ranks
+            )
+        else:
+            totals = ", ".join(f"{own['total']:.4g}" for own in ranks)
+            found = f"the loss ({totals}) is finite, but {describe_gradients(module.model)}"
+        samples = "; ".join(f"rank {rank}: {', '.join(ranks[rank]['tokens'])}" for rank in named_ranks)
+        trainer = module.trainer
+        text = f"step {trainer.global_step}, epoch {trainer.current_epoch}: {found}; samples of {samples}"
+
+        self.restore()
+        if self.in_a_row == 0:  # the next ones in a row have the same weights
+            path = dump_step(module, batch, text) if trainer.global_rank in named_ranks else None
+            kept = [path for path in gather_by_rank(path and str(path)) if path]
+            text += f"; run it again with: python -m src.replay checkpoint={kept[0]}" if kept else ""
+        module.forget_step(batch)
+        self.in_a_row += 1
+        if not self.skip:
+            raise DivergedError(
+                f"{text}\nThe last checkpoint, if there is one yet, holds earlier weights. Look for broken data, try a "
+                "smaller optim.lr or optim.peak_lr_ratio, or skip such steps with trainer.on_nonfinite=skip"
+            )
+        if self.in_a_row > MAX_IN_A_ROW:
+            raise DivergedError(
+                f"{text}\nMore than {MAX_IN_A_ROW} steps in a row were like this, so it is not one bad batch: the dump "
+                "of the first of them tells more"
+            )
+        self.skipped_steps += 1
+        if trainer.is_global_zero:
+            logger.warning("skipped (%d so far): %s", self.skipped_steps, text)
+        for parameter in module.model.parameters():
+            parameter.grad = None
+
     def state(self) -> list[int]:
         """The counts, for a checkpoint."""
         return [self.skipped_steps, self.in_a_row]
@@ -110,6 +157,40 @@ def describe_gradients(model: nn.Module) -> str:
 
 
 # ---------------------------------------------------------------- dumps
+
+
+class GuardedModule(Protocol):
+    """The LightningModule whose steps are guarded, as far as a guard needs it."""
+
+    model: nn.Module
+    config: dict[str, Any]
+    seed: int
+    trainer: L.Trainer
+
+    def memories_before_step(self) -> list[dict[str, Any]]:
+        """What the model remembered before the step, as plain values."""
+
+    def forget_step(self, batch: FrameBatch) -> None:
+        """Drop what a skipped step has left to be remembered."""
+
+
+def dump_step(module: GuardedModule, batch: FrameBatch, found: str) -> Path | None:
+    """Write what `src.replay` needs of the running step; see `write_dump`."""
+    trainer = module.trainer
+    step, rank = trainer.global_step, trainer.global_rank
+    return write_dump(
+        Path(trainer.default_root_dir),
+        module.model,
+        module.config,
+        batch,
+        global_step=step,
+        epoch=trainer.current_epoch,
+        rank=rank,
+        world_size=trainer.world_size,
+        seed=step_seed(module.seed, step, rank),
+        memories=module.memories_before_step(),
+        found=found,
+    )
 
 
 def write_dump(

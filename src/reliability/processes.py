@@ -395,3 +395,12 @@ def share_buffers(module: nn.Module) -> None:
         dist.broadcast(joined, src=0)
         for buffer, part in zip(buffers, joined.split([buffer.numel() for buffer in buffers]), strict=True):
             buffer.copy_(part.view_as(buffer))
+
+
+def gather_by_rank(value: Any) -> list[Any]:
+    """The `value`s of all ranks in their order; every rank must call it. One value without a process group."""
+    if not (dist.is_available() and dist.is_initialized()):
+        return [value]
+    values: list[Any] = [None] * dist.get_world_size()
+    dist.all_gather_object(values, value)
+    return values

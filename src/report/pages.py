@@ -131,7 +131,7 @@ def compared_experiments(runs: list[RunResult]) -> list[Experiment]:
     epochs = {run.epochs for run in runs if (run.phase, *run.settings) == ("phase2",)}
 
     def name(run: RunResult) -> str | None:
-        free = ("phase.epochs=", "phase.velocity_code_weight=")
+        free = ("phase.epochs=", "phase.options.velocity_code_weight=")
         if f"{INIT_FROM}phase1" in run.settings and all(s.startswith((INIT_FROM, *free)) for s in run.settings):
             return CONTINUED if {run.epochs} == epochs else f"phase 1, {run.epochs} further epochs"
         dropout = [setting for setting in run.settings if setting.startswith(DROPOUT)]

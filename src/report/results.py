@@ -6,16 +6,19 @@ import csv
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, NotRequired, TypeVar
 
 import yaml
+from pydantic import Field, with_config
+from pydantic_core import from_json
+from typing_extensions import TypedDict
 
 from src.errors import DataError
 from src.report.atomic_write import write_whole
-from src.report.json_object import LARGEST, NONE, NUMBER, JsonObject
+from src.report.json_format import ANY_KEYS, OPEN, Count, Many, Measure, read_as
 from src.report.metric_names import METRICS
 from src.report.plain_yaml import load_plain_yaml
 from src.training.identity import OUTSIDE_IDENTITY, is_of, key_of, without_keys
@@ -24,6 +27,8 @@ FORMAT = 1
 RUN_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 MAX_POINTS = 200
 """Of a learning curve."""
+LARGEST_LOSS = 1e15
+"""One beyond it is left out of a learning curve."""
 
 NOT_A_SETTING = ("seed", "scale", "phase")
 """Keys that do not make another experiment within a phase and a scale."""
@@ -34,50 +39,149 @@ KEPT_OF_A_CLASS = ("AP", "AVE", "num_gt")
 """Within a range or a speed class; the run's metrics.json has the rest."""
 
 Point = TypeVar("Point")
-RECORD = {
-    "run_id": (str,), "scale": (str,), "seed": (int,), "overrides": (list,), "data": (dict,), "commit": (str,),
-    "versions": (dict,), "device": (str,), "processes": (int,), "threads": (int,), "initialized_from": (str, NONE),
-    "epochs": (int,), "steps": (int,), "parameters": (int,), "resumed": (bool,), "seconds": (dict,),
-    "peak_memory_mib": (dict,), "skipped_files": (dict,),
-}  # fmt: skip
-"""What a result takes from run.json as it is, and the types."""
-INSIDE_RECORD = {
-    ("data", "name"): (str,), ("data", "root"): (str,), ("seconds", "all"): NUMBER,
-    ("peak_memory_mib", "process"): (int,),
-}  # fmt: skip
+Share = Annotated[float, Field(ge=0, le=1 + 1e-12)]
+"""From 0 to 1; a mean of ones may be 1.0000000000000002."""
+Score = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
+@with_config(OPEN)
+class Errors(TypedDict):
+    """Mean errors of true positives; absent where the run was not scored by them, null without ground truth."""
+
+    mATE: NotRequired[Score | None]
+    mASE: NotRequired[Score | None]
+    mAOE: NotRequired[Score | None]
+    mAAE: NotRequired[Score | None]
+
+
+@with_config(OPEN)
+class ClassScores(TypedDict):
+    """Scores of one class."""
+
+    AP: Share
+    AVE: NotRequired[Score | None]
+
+
+class RangeScores(Errors):
+    """Scores of one range."""
+
+    mAP: Share
+    NDS: NotRequired[Share | None]
+    mAVE: NotRequired[Score | None]
+    classes: dict[str, dict[str, Any]]
+
+
+@with_config(OPEN)
+class ClassCount(TypedDict):
+    """One class within a speed class."""
+
+    num_gt: Count
+
+
+class CarScores(ClassCount):
+    """The car within a speed class."""
+
+    AP: Share
+    AVE: Score
+
+
+@with_config(OPEN)
+class SpeedClasses(TypedDict, extra_items=ClassCount):
+    """The classes within a speed class, by name."""
+
+    car: CarScores
+
+
+@with_config(OPEN)
+class SpeedScores(TypedDict):
+    """Scores of one speed class."""
+
+    mAP_present: Share | None
+    mAVE_present: Score | None
+    classes: SpeedClasses
+
+
+class Scores(Errors):
+    """What tables read of metrics.json."""
+
+    mAP: Share
+    NDS: Share
+    mAVE: Score
+    classes: dict[str, ClassScores]
+    ranges: dict[str, RangeScores]
+    speeds: NotRequired[dict[str, SpeedScores]]  # older runs have none
+
+
+@with_config(ANY_KEYS)
+class Latency(TypedDict):
+    """What tables read of latency.json; the rest is kept as it is."""
+
+    ms: dict[str, Score]
+    fps: Score
+    memory_gb: Score
+    spread_ms: NotRequired[dict[str, Score]]
+    load: NotRequired[Score]  # older files have neither this nor the next
+    cores: NotRequired[Score]
+
+
+class DataNames(TypedDict, extra_items=str):
+    """What a run was trained and scored on: also version, train_split, split."""
+
+    name: str
+    root: str  # the folder's name: of a world its digest
+
+
+class Seconds(TypedDict, extra_items=Measure):
+    """Durations: also fit."""
+
+    all: Measure
+
+
+class PeakMemory(TypedDict, extra_items=Count):
+    """MiB: also largest_worker."""
+
+    process: Count
+
+
+@with_config(OPEN)
 @dataclass(kw_only=True)
-class RunResult:
-    """One finished run: what it was, and its numbers."""
+class RunRecord:
+    """What run.json says of a finished run."""
 
     run_id: str
-    model: str
-    phase: str
     scale: str
-    seed: int
-    overrides: list[str]  # as typed, without those outside its identity
-    data: dict[str, str]  # name, version, train_split, split, root (the folder's name: of a world its digest)
+    seed: Count
+    overrides: Many[str]  # as typed, in a result without those outside its identity
+    data: DataNames
     commit: str
     versions: dict[str, str]
     device: str
-    processes: int
-    threads: int
+    processes: Count
+    threads: Count
     initialized_from: str | None  # run id, or digest of a checkpoint
-    epochs: int  # of this phase
-    steps: int
-    parameters: int
+    epochs: Count  # of this phase
+    steps: Count
+    parameters: Count
     resumed: bool
-    seconds: dict[str, float]  # fit, all
-    peak_memory_mib: dict[str, int]  # process, largest_worker
-    skipped_files: dict[str, int]
+    seconds: Seconds
+    peak_memory_mib: PeakMemory
+    skipped_files: dict[str, Count]
+
+
+@dataclass(kw_only=True)
+class RunResult(RunRecord):
+    """One finished run: what it was, and its numbers."""
+
+    model: str
+    phase: str
     config: dict[str, Any]  # tree of config.yaml, without keys outside its identity
     metrics: dict[str, float | None]
     """By the names of src/report/metric_names.py, as measured: fractions of 1, m/s, ms; None where there is no such
     ground truth; a name is absent where the run was not scored by it. Also speeds.<class>.<boxes | car.boxes>, how
     much ground truth there is."""
-    curves: dict[str, list[list[float]]]  # [step, value] by column of metrics.csv: loss/*, val/*
-    latency: dict[str, Any] | None  # content of latency.json
+    curves: dict[str, Many[Annotated[list[Measure], Field(min_length=2, max_length=2)]]]
+    """[step, value] by column of metrics.csv: loss/*, val/*."""
+    latency: Latency | None
 
     @property
     def settings(self) -> tuple[str, ...]:
@@ -88,6 +192,14 @@ class RunResult:
     def dataset(self) -> str:
         """Name of the data and digest of the world."""
         return f"{self.data['name']} {self.data['root']}"
+
+
+@dataclass(kw_only=True)
+class ResultFile(RunResult):
+    """A result as `reports/results/<run_id>.json` holds it: the metrics as in metrics.json."""
+
+    format: Annotated[int, Field(ge=FORMAT, le=FORMAT)]
+    metrics: Scores
 
 
 def settings_of(overrides: Iterable[str]) -> tuple[str, ...]:
@@ -114,39 +226,31 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
     Raises DataError naming file and key of a run folder that is not as a run leaves it, OSError naming the result for
     a disk that does not take it: the older one stays.
     """
-    try:
-        return _publish(run_folder, reports)
-    except RecursionError as error:
-        raise DataError(
-            f"{run_folder}: a file of this run is nested too deeply; give the run's command again"
-        ) from error
-
-
-def _publish(run_folder: Path, reports: Path) -> Path:
     remedy = "delete run.json and metrics.json there and give the run's command again"
-    record, scores = JsonObject(run_folder / "run.json", remedy), JsonObject(run_folder / "metrics.json", remedy)
+    record = read_as(RunRecord, run_folder / "run.json", remedy)
+    read_as(Scores, run_folder / "metrics.json", remedy)
+    scores = from_json((run_folder / "metrics.json").read_bytes())
     config = _read_config(run_folder / "config.yaml")
     latency_path = run_folder / "latency.json"
-    latency = JsonObject(latency_path, "delete it and measure again") if latency_path.is_file() else None
-    fields = _record(record)
-    overrides = [_without_local_path(o) for o in fields["overrides"] if not is_of(o, OUTSIDE_IDENTITY)]
-    _metrics(scores, latency)
+    latency = read_as(Latency, latency_path, "delete it and measure again") if latency_path.is_file() else None
+    if not RUN_ID.fullmatch(record.run_id):
+        name = f"{run_folder / 'run.json'}: run_id"
+        raise DataError(f"{name} must be the name of a folder, but is {record.run_id!r:.80}; {remedy}")
+    overrides = [_without_local_path(o) for o in record.overrides if not is_of(o, OUTSIDE_IDENTITY)]
     content = {
         "format": FORMAT,
         "model": config["model"]["name"],
         "phase": config["phase"]["name"],
-        **fields,
+        **vars(record),
         "overrides": overrides,
         "config": without_local_paths(config),
-        "metrics": _slim(scores.content),
+        "metrics": _slim(scores),
         "curves": _read_curves(run_folder / "metrics.csv"),
-        "latency": latency.content if latency is not None else None,
+        "latency": latency,
     }
-    lines = (f"{json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in content.items())
+    lines = (f"{json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
     text = "{\n" + ",\n".join(lines) + "\n}\n"  # a line per key: compact, and a change is seen where it is
-    if not RUN_ID.fullmatch(fields["run_id"]):
-        raise record.refusal(("run_id",), f"must be the name of a folder, but is {fields['run_id']!r:.80}")
-    path = result_path(reports, fields["run_id"])
+    path = result_path(reports, record.run_id)
     if not path.is_file() or path.read_bytes() != text.encode():
         write_whole(path, text)
     return path
@@ -154,36 +258,12 @@ def _publish(run_folder: Path, reports: Path) -> Path:
 
 def read_result(path: Path) -> RunResult:
     """Read one result. Raises DataError naming file, key, what was expected and found, and the remedy."""
-    file = JsonObject(path, "delete it and run python -m src.report, which writes it anew from the run's folder")
-    try:
-        return _result(file)
-    except RecursionError as error:  # just not too deep to be read, but too deep to be walked through
-        raise file.too_deep() from error
-
-
-def _result(file: JsonObject) -> RunResult:
-    found = file.content.get("format")
-    if found != FORMAT or type(found) is not int:
-        raise file.refusal(("format",), f"must be {FORMAT}, the one that this version reads, but is {found!r:.80}")
-    if file.get("run_id", str) != file.path.stem:
-        raise file.refusal(
-            ("run_id",), f"must be {file.path.stem}, as the file is named, but is {file.get('run_id', str)}"
-        )
-    scores = file.below("metrics")
-    latency = file.below("latency") if file.get("latency", dict, NONE) is not None else None
-    curves = file.get("curves", dict)
-    for name, points in curves.items():
-        if type(points) is not list or not all(map(_is_point, points)):
-            raise file.refusal(("curves", name), f"must be a list of [step, value], but is {points!r:.80}")
-    return RunResult(
-        model=file.get("model", str),
-        phase=file.get("phase", str),
-        **_record(file),
-        config=file.get("config", dict),
-        metrics=_metrics(scores, latency),
-        curves=curves,
-        latency=latency.content if latency is not None else None,
-    )
+    remedy = "delete it and run python -m src.report, which writes it anew from the run's folder"
+    fields = vars(read_as(ResultFile, path, remedy))
+    del fields["format"]
+    if fields["run_id"] != path.stem:
+        raise DataError(f"{path}: run_id must be {path.stem}, the file's name, but is {fields['run_id']}; {remedy}")
+    return RunResult(**fields | {"metrics": _flat_metrics(fields["metrics"], fields["latency"])})
 
 
 def read_results(reports: Path, scale: str | None = None) -> tuple[dict[str, RunResult], dict[Path, DataError]]:
@@ -201,49 +281,23 @@ def read_results(reports: Path, scale: str | None = None) -> tuple[dict[str, Run
     return results, broken
 
 
-def _record(file: JsonObject) -> dict[str, Any]:
-    fields = {name: file.get(name, *kinds) for name, kinds in RECORD.items()}
-    for names, kinds in INSIDE_RECORD.items():
-        file.get(names, *kinds)
-    for index, override in enumerate(fields["overrides"]):
-        if type(override) is not str:
-            raise file.refusal(("overrides", str(index)), f"must be str, but is {override!r:.80}")
-    return fields
-
-
-def _metrics(scores: JsonObject, latency: JsonObject | None) -> dict[str, float | None]:
+def _flat_metrics(scores: Scores, latency: Latency | None) -> dict[str, float | None]:
     """See RunResult.metrics."""
-    values: dict[str, float | None] = {}
-    for name in ("mAP", "NDS", "mAVE"):
-        values[name] = scores.score(name)
-    for name in scores.get("classes", dict):
-        values[f"classes.{name}.AP"] = scores.score(("classes", name, "AP"))
-    for name in scores.get("ranges", dict):
-        values[f"ranges.{name}.mAP"] = scores.score(("ranges", name, "mAP"))
-        for of in scores.get(("ranges", name, "classes"), dict):
-            scores.get(("ranges", name, "classes", of), dict)
-    for name in METRICS:
-        path = name.split(".")
-        if name not in values and path[0] not in ("speeds", "latency") and _has(scores.content, path):
-            values[name] = scores.score(path, NONE)
-    for name in scores.get("speeds", dict) if "speeds" in scores.content else ():  # older runs have no speed classes
-        for key in ("mAP_present", "mAVE_present"):
-            values[f"speeds.{name}.{key}"] = scores.score(("speeds", name, key), NONE)
-        classes = ("speeds", name, "classes")
-        boxes = [scores.get((*classes, of, "num_gt"), int) for of in scores.get(classes, dict)]
-        cars = scores.get((*classes, "car", "num_gt"), int)
-        values |= {f"speeds.{name}.boxes": sum(boxes), f"speeds.{name}.car.boxes": cars}
+    groups = {"": scores}
+    groups |= {f"classes.{name}.": part for name, part in scores["classes"].items()}
+    groups |= {f"ranges.{name}.": part for name, part in scores["ranges"].items()}
+    values = {prefix + key: value for prefix, part in groups.items() for key, value in part.items()}
+    values = {name: value for name, value in values.items() if name in METRICS}
+    for name, part in scores.get("speeds", {}).items():
+        car, prefix = part["classes"]["car"], f"speeds.{name}."
+        values |= {prefix + key: part[key] for key in ("mAP_present", "mAVE_present")}
+        values[prefix + "boxes"] = sum(of_class["num_gt"] for of_class in part["classes"].values())
+        values[prefix + "car.boxes"] = car["num_gt"]
         for key in ("AP", "AVE"):  # the official numbers of a class without ground truth are 0 and 1, and say nothing
-            value = scores.score((*classes, "car", key))
-            values[f"speeds.{name}.car.{key}"] = value if cars else None
+            values[f"{prefix}car.{key}"] = car[key] if car["num_gt"] else None
     if latency is not None:
-        values |= {f"latency.{part}": latency.score(("ms", part)) for part in latency.get("ms", dict)}
-        values |= {f"latency.{name}": latency.score(name) for name in ("fps", "memory_gb")}
-        for part in latency.get("spread_ms", dict) if "spread_ms" in latency.content else ():
-            latency.score(("spread_ms", part))
-        for name in ("load", "cores"):  # older files have neither
-            if name in latency.content:
-                latency.score(name)
+        values |= {f"latency.{part}": value for part, value in latency["ms"].items()}
+        values |= {f"latency.{name}": latency[name] for name in ("fps", "memory_gb")}
     return values
 
 
@@ -262,18 +316,6 @@ def _slim(scores: dict[str, Any]) -> dict[str, Any]:
         if split in slim:
             slim[split] = {name: shortened(part) for name, part in slim[split].items()}
     return slim
-
-
-def _has(content: Any, path: Sequence[str]) -> bool:
-    for name in path:
-        if not isinstance(content, dict) or name not in content:
-            return False
-        content = content[name]
-    return True
-
-
-def _is_point(point: Any) -> bool:
-    return type(point) is list and len(point) == 2 and type(point[0]) is int and type(point[1]) in NUMBER
 
 
 def _read_config(path: Path) -> dict[str, Any]:
@@ -297,7 +339,7 @@ def _read_curves(path: Path) -> dict[str, list[list[float]]]:
         with path.open(newline="") as file:
             for row in csv.DictReader(file):
                 for name, value in row.items():
-                    if name and name.startswith(("loss/", "val/")) and value and abs(float(value)) <= LARGEST:
+                    if name and name.startswith(("loss/", "val/")) and value and abs(float(value)) <= LARGEST_LOSS:
                         curves.setdefault(name, []).append([int(row["step"]), float(value)])
     except (OSError, ValueError, TypeError, KeyError, csv.Error) as error:
         raise DataError(f"{path}: not a run's learning curves ({type(error).__name__}: {error}); delete it") from error

@@ -1,16 +1,18 @@
 """What a file of sweeps/ may say: one question, its rows or its search space, the paper's numbers, and the tables.
 
-The dataclasses are the schema that src/sweep/compose.py checks each file against; nothing here knows Hydra.
+The dataclasses are the schema that each file, and the record of its sweep, is checked against.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from pydantic import with_config
+
 from src.errors import ConfigError
+from src.report.json_format import CLOSED, Count, Many
 from src.report.metric_names import find_metric
 from src.training.identity import key_of
 
@@ -18,28 +20,31 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """Of sweeps and tables: they are file names, parts of addresses and names of studies."""
 
 
+@with_config(CLOSED)
 @dataclass(kw_only=True)
 class RowConfig:
     """One row of the question: a change of configuration, trained and scored."""
 
     label: str
-    overrides: list[str] = field(default_factory=list)  # as after `python -m src.train`
+    overrides: Many[str] = field(default_factory=list)  # as after `python -m src.train`
     paper: dict[str, float] = field(default_factory=dict)  # the paper's numbers by metric, in the paper's units
     x: float | None = None  # place on the plot's horizontal axis
     baseline: str | None = None  # label of the row this one is compared with, where it is not the file's
-    scales: list[str] | None = None  # trained at these scales only, elsewhere the paper's numbers stand alone
+    scales: Many[str] | None = None  # trained at these scales only, elsewhere the paper's numbers stand alone
 
 
+@with_config(CLOSED)
 @dataclass(kw_only=True)
 class TableConfig:
     """One table over the rows: a choice of columns, and of rows where not all have something to say."""
 
     name: str  # file name under reports/tables, without scale
     title: str
-    columns: list[str]  # names of src/report/metric_names.py
-    rows: list[str] | None = None  # labels, the paper's own rows included; null: all
+    columns: Many[str]  # names of src/report/metric_names.py
+    rows: Many[str] | None = None  # labels, the paper's own rows included; null: all
 
 
+@with_config(CLOSED)
 @dataclass(kw_only=True)
 class PlotConfig:
     """One figure over the rows that have an `x`, or bars by label when they have none."""
@@ -48,6 +53,7 @@ class PlotConfig:
     label: str  # of the horizontal axis
 
 
+@with_config(CLOSED)
 @dataclass(kw_only=True)
 class PaperRowConfig:
     """A row that only the paper has: another method, printed beside ours and never trained."""
@@ -56,6 +62,7 @@ class PaperRowConfig:
     paper: dict[str, float]
 
 
+@with_config(CLOSED)
 @dataclass(kw_only=True)
 class DimensionConfig:
     """What a search may try for one key: a range or a list of choices."""
@@ -63,7 +70,7 @@ class DimensionConfig:
     low: float | None = None
     high: float | None = None
     log: bool = False
-    choices: list[Any] | None = None
+    choices: Many[Any] | None = None
 
     def check(self, where: str) -> None:
         """Raises ConfigError for neither or both, and for an empty or reversed range."""
@@ -78,6 +85,7 @@ class DimensionConfig:
             raise ConfigError(f"{where}: choices must be at least two, but got {self.choices}")
 
 
+@with_config(CLOSED)
 @dataclass(kw_only=True)
 class SweepConfig:
     """One question of the paper, or of ours."""
@@ -86,16 +94,16 @@ class SweepConfig:
     question: str  # what the rows tell, one sentence
     name: str = ""  # the file's; filled in when it is read
     source: str | None = None  # the paper's table(s), as in `Table 12`
-    overrides: list[str] = field(default_factory=list)  # of every row
+    overrides: Many[str] = field(default_factory=list)  # of every row
     baseline: str | None = None  # label of the row that differences are taken to
     latency: bool = False  # measure the latency of every finished row, one after the other
-    tables: list[TableConfig] = field(default_factory=list)
-    plots: list[PlotConfig] = field(default_factory=list)
-    rows: list[RowConfig] = field(default_factory=list)
-    paper_rows: list[PaperRowConfig] = field(default_factory=list)
+    tables: Many[TableConfig] = field(default_factory=list)
+    plots: Many[PlotConfig] = field(default_factory=list)
+    rows: Many[RowConfig] = field(default_factory=list)
+    paper_rows: Many[PaperRowConfig] = field(default_factory=list)
     space: dict[str, DimensionConfig] = field(default_factory=dict)  # a search instead of rows
     objective: str = "NDS"  # of a search, larger is better
-    trials: int = 0  # of a search
+    trials: Count = 0  # of a search
 
     def __post_init__(self) -> None:
         where = f"sweeps/{self.name or '?'}.yaml"
@@ -122,10 +130,8 @@ class SweepConfig:
             if any(row.label == baseline and row.scales is not None for row in self.rows):
                 raise ConfigError(f"{where}: baseline {baseline!r} must be for every scale; leave its scales out")
         for row in [*self.rows, *self.paper_rows]:
-            for metric, value in row.paper.items():
+            for metric in row.paper:
                 find_metric(metric, f"{where}, row {row.label!r}, paper")
-                if not math.isfinite(value):
-                    raise ConfigError(f"{where}, row {row.label!r}: {metric}={value} is not a finite number")
         names = [table.name for table in self.tables]
         if len(set(names)) < len(names):
             raise ConfigError(f"{where}: two tables have one name ({', '.join(names)})")

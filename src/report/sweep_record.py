@@ -6,44 +6,46 @@ The runner writes it whenever something changes; tables and the dashboard read i
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import NoneType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Literal
+
+from pydantic import Field, with_config
 
 from src.errors import DataError, HorizonError
 from src.report.atomic_write import write_whole
+from src.report.json_format import CLOSED, Count, Many, parse_as, read_json
 from src.report.sweep_file import SweepConfig
 from src.training.identity import digest_of
 
 FORMAT = 1
-LAST_MOMENT = 1e11
-"""Seconds since 1970, three thousand years on; a calendar goes no further than three times that."""
-STATES = ("waiting", "running", "done", "failed", "pruned")
+State = Literal["waiting", "running", "done", "failed", "pruned"]
+Moment = Annotated[float, Field(ge=0, le=1e11)]
+"""Seconds since 1970, for three thousand years; a calendar goes no further than three times that."""
 
 
+@with_config(CLOSED)
 @dataclass(kw_only=True)
 class RunState:
     """The state of one planned run."""
 
     run_id: str
-    overrides: list[str]  # after `python -m src.train`; paths, devices and loggers of the machine are not among them
-    seed: int
+    overrides: Many[str]  # after `python -m src.train`; paths, devices and loggers of the machine are not among them
+    seed: Count
     label: str  # of its first row; for a run that others only start from: what it is
     needs: str | None = None  # run whose weights it starts from
-    state: str = "waiting"  # one of STATES
+    state: State = "waiting"
     reason: str | None = None  # of a failure, in a line
     log: str | None = None  # relative to paths.outputs
     worker: str | None = None  # host and process that has it, while it runs
-    started: float | None = None  # seconds since 1970
-    ended: float | None = None
+    started: Moment | None = None
+    ended: Moment | None = None
     value: float | None = None  # of a search: the objective
 
 
+@with_config(CLOSED)
 @dataclass(kw_only=True)
 class SweepRecord:
     """A sweep at one scale."""
@@ -51,14 +53,14 @@ class SweepRecord:
     sweep: SweepConfig
     scale: str
     command: str  # that resumes it
-    seeds: list[int]
-    rows: dict[str, dict[int, str]]  # run id by label and seed, in the order of the file; empty for a search
+    seeds: Many[Count]
+    rows: dict[str, dict[Count, str]]  # run id by label and seed, in the order of the file; empty for a search
     runs: dict[str, RunState]  # by run id, in the order they are trained
     study: str  # Optuna's name of it
     storage: str  # the study's database, passwords masked
-    changes: list[str] = field(default_factory=list)  # by the command line, of every run: it is another experiment
-    trials: int = 0  # of a search: begun so far, each once; two that draw the same values share a run
-    updated: float = 0.0  # when the runner last wrote this, seconds since 1970
+    changes: Many[str] = field(default_factory=list)  # by the command line, of every run: it is another experiment
+    trials: Count = 0  # of a search: begun so far, each once; two that draw the same values share a run
+    updated: Moment = 0.0  # when the runner last wrote this
 
     @property
     def name(self) -> str:
@@ -90,6 +92,13 @@ class SweepRecord:
         return sum(run.state == state for run in self.runs.values())
 
 
+@dataclass(kw_only=True)
+class RecordFile(SweepRecord):
+    """A record as its file holds it."""
+
+    format: Annotated[int, Field(ge=FORMAT, le=FORMAT)]
+
+
 def suffix_of(changes: Sequence[str]) -> str:
     """`-` and 8 hex of what a command line changes of a sweep's file; empty for no change."""
     return f"-{digest_of(list(changes))}" if changes else ""
@@ -108,20 +117,14 @@ def write_record(path: Path, record: SweepRecord) -> None:
 def read_record(path: Path) -> SweepRecord:
     """Raises DataError naming the file for anything that is not a record of this format."""
     remedy = "delete it and give the sweep's command again: finished runs are found and not trained anew"
+    content = read_json(path, remedy)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        json.dumps(content, ensure_ascii=False).encode()  # half of a surrogate pair is nothing a page can hold
-        if not isinstance(content, dict):
-            raise TypeError(f"must hold an object, but holds a {type(content).__name__}")
-        found = content.pop("format", None)
-        if found != FORMAT:
-            raise ValueError(f"format is {found!r}, this version reads {FORMAT}")
-        record = _built(SweepRecord, content, "")
+        fields = vars(parse_as(RecordFile, content))
+        del fields["format"]
+        record = SweepRecord(**fields)
         _check(record, path.stem)
-    except (OSError, ValueError, TypeError, ArithmeticError, RecursionError, HorizonError) as error:
-        raise DataError(
-            f"{path}: not a readable record of a sweep ({type(error).__name__}: {error}); {remedy}"
-        ) from error
+    except (ValueError, HorizonError) as error:
+        raise DataError(f"{path}: not a readable record of a sweep ({error}); {remedy}") from error
     return record
 
 
@@ -143,60 +146,10 @@ def _check(record: SweepRecord, stem: str) -> None:
     """Raises ValueError for parts that do not fit each other."""
     if record.stem != stem:
         raise ValueError(f"it is the record of {record.stem}, whose file is {record.stem}.json")
-    moments = {f"runs.{run_id}.{name}": getattr(run, name)
-               for run_id, run in record.runs.items() for name in ("started", "ended")}  # fmt: skip
-    for name, moment in (moments | {"updated": record.updated}).items():
-        if moment is not None and not 0 <= moment <= LAST_MOMENT:
-            raise ValueError(f"{name} is {moment!r:.80}, must be seconds from 0 to {LAST_MOMENT:g}")
     for run_id, run in record.runs.items():
         if run.run_id != run_id:
             raise ValueError(f"runs.{run_id}.run_id is {run.run_id!r}, must be {run_id!r}")
-        if run.state not in STATES:
-            raise ValueError(f"runs.{run_id}.state is {run.state!r}, must be one of {', '.join(STATES)}")
     for label, runs in record.rows.items():
         for seed, run_id in runs.items():
             if run_id not in record.runs:
                 raise ValueError(f"rows.{label}.{seed} is {run_id!r}, which is not among runs")
-
-
-def _built(kind: Any, value: Any, where: str) -> Any:
-    """A JSON value as its annotation says, dataclasses built. Raises TypeError and ValueError naming the place."""
-    options = get_args(kind)
-    if kind is Any:
-        return value
-    if NoneType in options:
-        (other,) = set(options) - {NoneType}
-        return None if value is None else _built(other, value, where)
-    if dataclasses.is_dataclass(kind):
-        found, types = _of(dict, value, where), _types_of(kind)
-        unknown = sorted(found.keys() - types.keys())
-        missing = [f.name for f in dataclasses.fields(kind) if f.name not in found and _is_required(f)]
-        if unknown or missing:
-            raise ValueError(f"{where or 'it'} lacks {missing}, and has {unknown}, which this version does not know")
-        prefix = f"{where}." if where else ""
-        return kind(**{name: _built(types[name], inner, f"{prefix}{name}") for name, inner in found.items()})
-    if get_origin(kind) is list:
-        return [_built(options[0], inner, f"{where}.{index}") for index, inner in enumerate(_of(list, value, where))]
-    if get_origin(kind) is dict:
-        read = int if options[0] is int else str  # the keys of a JSON object are words
-        items = _of(dict, value, where).items()
-        return {read(key): _built(options[1], inner, f"{where}.{key}") for key, inner in items}
-    if kind is float and type(value) in (int, float) and math.isfinite(value):
-        return value
-    return _of(kind, value, where)
-
-
-def _of(kind: type, value: Any, where: str) -> Any:
-    if type(value) is not kind or (kind is float and not math.isfinite(value)):
-        names = {dict: "an object", float: "a finite number", int: "a whole number", str: "a text"}
-        raise TypeError(f"{where} must be {names.get(kind, kind.__name__)}, but is {value!r:.80}")
-    return value
-
-
-@functools.cache
-def _types_of(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind)
-
-
-def _is_required(entry: dataclasses.Field) -> bool:
-    return entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING

@@ -66,7 +66,7 @@ class SweepRow:
 
     label: str
     cells: list[TableCell]  # one per column
-    state: str  # of sweep_record.STATES: what is left of its runs; or PAPER
+    state: str  # a sweep_record.State: what is left of its runs; or PAPER
     note: str = ""  # why numbers are missing
     planned: int = 0  # seeds
     done: int = 0

@@ -83,6 +83,14 @@ class GaussianSet:
         """The set with `function` applied to every tensor."""
         return GaussianSet(**{field.name: function(getattr(self, field.name)) for field in fields(self)})
 
+    @classmethod
+    def empty(cls) -> GaussianSet:
+        """No Gaussian of one sample, without features."""
+        pairs = {name: torch.zeros(1, 0, 2) for name in ("means", "scales", "directions", "velocities")}
+        single = {name: torch.zeros(1, 0) for name in ("opacity_logits", "elapsed_s")}
+        sources, valid = torch.zeros(1, 0, dtype=torch.int64), torch.zeros(1, 0, dtype=torch.bool)
+        return cls(**pairs, **single, features=torch.zeros(1, 0, 0), sources=sources, valid=valid)
+
     @staticmethod
     def concatenate(parts: list[GaussianSet]) -> GaussianSet:
         """Join sets of the same samples along G."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from yaml import YAMLError
 from src.config import CONF, GROUPS, SCALES, Config, hydra_message
 from src.errors import ConfigError
 from src.reliability.passwords import masked
+from src.report.json_format import parse_as
 from src.report.plain_yaml import check_plain_yaml
 from src.report.sweep_file import (
     DimensionConfig,
@@ -37,13 +39,13 @@ SWEEPS = CONF.parent / "sweeps"
 OWN_KEYS = ("sweep", "seeds", "workers", "storage", "dry_run", "trials")
 MOST_SEEDS = 1000
 FILE_PARTS = (SweepConfig, RowConfig, TableConfig, PlotConfig, PaperRowConfig, DimensionConfig)
+FILE_KEYS = [field.name for part in FILE_PARTS for field in dataclasses.fields(part)]
 
 
 @dataclass(kw_only=True)
-class SweepCommand:
+class RunnerOptions:
     """Options of the runner itself; the rest of the command line goes to every run."""
 
-    sweep: SweepConfig | None = None  # `+sweep=<file of sweeps/>`
     seeds: int
     workers: int
     storage: str | None
@@ -54,12 +56,22 @@ class SweepCommand:
         for name in ("seeds", "workers"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1, but got {getattr(self, name)}")
-        if self.trials is not None:
-            if self.sweep is None or not self.sweep.is_search:
-                raise ConfigError(f"trials={self.trials} is for searches; a sweep of rows trains each of them")
-            self.sweep = dataclasses.replace(self.sweep, trials=self.trials)
         if self.seeds > MOST_SEEDS:
             raise ConfigError(f"seeds must be at most {MOST_SEEDS}, but got {self.seeds}; seed=... says the first one")
+
+
+@dataclass(kw_only=True)
+class SweepCommand(RunnerOptions):
+    """The runner's options and the sweep."""
+
+    sweep: SweepConfig
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.trials is not None:
+            if not self.sweep.is_search:
+                raise ConfigError(f"trials={self.trials} is for searches; a sweep of rows trains each of them")
+            self.sweep = dataclasses.replace(self.sweep, trials=self.trials)
 
 
 def sweep_files() -> dict[str, Path]:
@@ -79,7 +91,7 @@ def compose_sweep(overrides: list[str]) -> tuple[SweepCommand, list[str]]:
     chosen = [name for name in chosen if name]  # `make sweep` without SWEEP says `+sweep=`
     if len(chosen) != 1:
         raise ConfigError(f"give one +sweep=NAME of {', '.join(sweep_files())}; got {' '.join(chosen) or 'none'}")
-    # Taken as it is: an address may lock `=`, and Hydra's messages would show a password.
+    # Taken as it is: an address may hold `=`, and Hydra's messages would show a password.
     storages = [override.partition("=")[2].strip("'\"") for override in own if key_of(override) == "storage"]
     own = [override for override in own if key_of(override) not in ("sweep", "storage")]
     try:
@@ -116,32 +128,24 @@ def load_sweep(name: str) -> SweepConfig:
         near = difflib.get_close_matches(name, files, n=1)
         hint = f"did you mean {near[0]}? " if near else ""
         raise ConfigError(f"sweep={name}: there is no sweeps/{name}.yaml; {hint}there are {', '.join(files)}")
+    where = f"sweeps/{name}.yaml"
     try:
         check_plain_yaml(files[name].read_text(encoding="utf-8"))
-        stated = OmegaConf.load(files[name])
-        _refuse_interpolation(OmegaConf.to_container(stated, resolve=False))
-        content = OmegaConf.merge(OmegaConf.structured(SweepConfig), stated, {"name": name})
-        sweep = OmegaConf.to_object(content)
+        content = OmegaConf.to_container(OmegaConf.load(files[name]), resolve=False)  # reads 1e-3 as YAML 1.2 does
+        _refuse_interpolation(content)
+        content = content | {"name": name} if isinstance(content, dict) else content
+        sweep = parse_as(SweepConfig, json.dumps(content), known=FILE_KEYS)
     except ConfigError as error:
-        said = str(error)
-        raise ConfigError(said if said.startswith("sweeps/") else f"sweeps/{name}.yaml: {said}") from error
+        raise ConfigError(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
     except OmegaConfBaseException as error:
-        known = [field.name for kind in FILE_PARTS for field in dataclasses.fields(kind)]
-        key = getattr(error, "full_key", None)
-        where = f"sweeps/{name}.yaml" + (f", {key}" if key else "")
-        raise ConfigError(f"{where}: {hydra_message(error, known)}") from error
+        raise ConfigError(f"{where}: {hydra_message(error, FILE_KEYS)}") from error
     except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, OSError) as error:
-        raise ConfigError(f"sweeps/{name}.yaml: {' '.join(str(error).split())}") from error
-    for row in [*stated.get("rows", []), *stated.get("paper_rows", [])]:
-        if isinstance(row.label, bool):
-            raise ConfigError(
-                f"sweeps/{name}.yaml: YAML reads a label as {row.label}; write on, off, yes and no in quotes"
-            )
-    strange = sorted({scale for row in sweep.rows for scale in row.scales or ()} - set(SCALES))
-    if strange:
-        raise ConfigError(
-            f"sweeps/{name}.yaml: scales: there is no scale {', '.join(strange)}; there are {', '.join(SCALES)}"
-        )
+        words = " ".join(str(error).split())
+        hint = "; write on, off, yes and no in quotes" if words.endswith(("is True", "is False")) else ""
+        raise ConfigError(f"{where}: {words}{hint}") from error
+    unknown = sorted({scale for row in sweep.rows for scale in row.scales or ()} - set(SCALES))
+    if unknown:
+        raise ConfigError(f"{where}: scales: there is no scale {', '.join(unknown)}; there are {', '.join(SCALES)}")
     return sweep
 
 
@@ -151,15 +155,14 @@ def _refuse_interpolation(content: Any, where: str = "") -> None:
         for key, value in content.items() if isinstance(content, dict) else enumerate(content):
             _refuse_interpolation(value, f"{where}.{key}" if where else str(key))
     elif isinstance(content, str) and "${" in content:
-        raise ConfigError(f"{where}: must not lock ${{, but is {content!r}")
+        raise ConfigError(f"{where}: must not hold ${{, but is {content!r}")
 
 
 def _compose(sweep: SweepConfig, overrides: list[str]) -> SweepCommand:
-    ConfigStore.instance().store(name="sweep_command", node=SweepCommand)
+    ConfigStore.instance().store(name="runner_options", node=RunnerOptions)
     with initialize_config_dir(str(CONF), version_base="1.3"):
         tree = compose("sweep", overrides=overrides)
     missing = OmegaConf.missing_keys(tree)
     if missing:
         raise ConfigError(f"{min(missing)} has no value")
-    tree.sweep = sweep
-    return OmegaConf.to_object(tree)
+    return SweepCommand(**vars(OmegaConf.to_object(tree)), sweep=sweep)

@@ -33,7 +33,7 @@ def read_score(folder: Path, metric: str) -> float | None:
 
 
 def _find(node: Any, name: str) -> Any:
-    """Follow a dotted name through nested objects; keys such as `0-0.5` lock dots themselves."""
+    """Follow a dotted name through nested objects; keys such as `0-0.5` hold dots themselves."""
     if not isinstance(node, dict):
         return None
     if name in node:

@@ -17,7 +17,7 @@ from src.reliability.checkpoints import BEST, LAST, AtomicCheckpointIO, OpenChec
 from src.reliability.interruption import Interruption
 from src.reliability.metrics_csv import MetricsCSV
 from src.reliability.processes import SharedBuffers
-from src.training.module import DetectionModule
+from src.training.module import TrainingModule
 from src.training.run_folder import RunFolder
 from src.training.wandb import WandbConfig, start_wandb
 
@@ -45,6 +45,7 @@ def build_trainer(
     *,
     epochs: int,
     validate_every: int,
+    monitor: str,  # logged number that `best.ckpt` is chosen by, larger being better
     precision: str,
     accelerator: str,
     devices: int,
@@ -56,7 +57,7 @@ def build_trainer(
     num_nodes: int = 1,
     deterministic: bool = False,
 ) -> L.Trainer:
-    """A Trainer that keeps `last.ckpt` of every epoch and `best.ckpt` by validation mAP in the run's folder.
+    """A Trainer that keeps `last.ckpt` of every epoch and `best.ckpt` by `monitor` in the run's folder.
 
     The last but one stays as `previous.ckpt`. With `checkpoint_every_steps`, `last.ckpt` is written inside epochs too.
     `devices` counts those of one node.
@@ -66,7 +67,7 @@ def build_trainer(
     best, last = Path(BEST).stem, Path(LAST).stem
     interruption = Interruption(folder.checkpoints / LAST, checkpoint_every_steps)
     callbacks: list[L.Callback] = [
-        ModelCheckpoint(filename=best, monitor="val/mAP", mode="max", save_top_k=1, **fixed_name),
+        ModelCheckpoint(filename=best, monitor=monitor, mode="max", save_top_k=1, **fixed_name),
         ModelCheckpoint(filename=last, save_top_k=1, save_on_train_epoch_end=True, **fixed_name),
         interruption,
         LossProgressBar(refresh_rate=10),
@@ -108,9 +109,9 @@ def build_loggers(
 
 
 def fit(
-    trainer: L.Trainer, module: DetectionModule, datamodule: DetectionDataModule, resume: OpenCheckpoint | None
+    trainer: L.Trainer, module: TrainingModule, datamodule: DetectionDataModule, resume: OpenCheckpoint | None
 ) -> None:
-    """Train to the last epoch, from `resume` where given, then validate the final weights into `module.scores`.
+    """Train to the last epoch, from `resume` where given, then validate the final weights into `module.evaluator`.
 
     Raises InterruptedRunError when stopped from outside; the same command then resumes.
     """
@@ -129,7 +130,7 @@ def fit(
                         callback.on_train_end(trainer, module)  # puts the moving average in their place
                 if trainer.max_epochs % trainer.check_val_every_n_epoch == 0:
                     trainer.loggers = []  # they have the scores of the last epoch already
-            if module.scored_step != trainer.global_step:
+            if module.evaluated_step != trainer.global_step:
                 trainer.validate(module, datamodule=datamodule, verbose=False)  # the last epoch was not to be validated
     except SystemExit as error:  # Lightning's way to end on a KeyboardInterrupt
         raise InterruptedRunError("training was stopped; the same command resumes from the last checkpoint") from error

@@ -16,9 +16,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from torch import nn
-
 from src.errors import CheckpointError, ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
+from src.models.detector import Detector
 from src.reliability.checkpoints import OpenCheckpoint, load_model_weights, open_checkpoint
 from src.reliability.processes import die_with_parent
 from src.training.identity import is_of, run_identity
@@ -26,17 +25,10 @@ from src.training.run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
 
-MAY_BE_NEW = re.compile(r"(dptf|temporal)\.|ocsf\.encoder\.layers\.\d+\.temporal_attention\.")
-"""Parameters that a later phase adds; every other one must come from the checkpoint."""
 OF_THIS_RUN = ("phase", "resume")
 """Overrides that never concern the run whose weights are taken."""
-OF_THE_LATER_PHASE = (
-    *("model.dptf", "model.temporal", "data.groups_per_scene", "data.stream_sets", "data.sensor_dropout"),
-    *(f"model.loss.cell_{term}_weight" for term in ("focal", "dice", "lovasz", "velocity")),
-)
-"""Nor do these, where that run is of the phase before."""
-WEIGHTS_OF_GAUSSIAN_VELOCITY = ("model.loss.dptf_weight", "model.loss.gaussian_velocity_weight")
-"""Nor these, unless `model.loss.gaussian_velocity_in_phase1`."""
+OF_STREAMED_DATA = ("data.groups_per_scene", "data.stream_sets", "data.sensor_dropout")
+"""Nor do these and the model's `keys_of_temporal_phase`, where that run is of the phase before."""
 INPUT_SETTINGS = (
     *("num_sweeps", "num_lidar_sweeps", "deskew_lidar"),
     *("min_distance_m", "propagate_points", "test_resize_offset"),
@@ -90,9 +82,7 @@ def find_source(
         return WeightSource(hashlib.sha256(path.read_bytes()).hexdigest()[:16], path, None, None)
     others = OF_THIS_RUN
     if name != config.phase.name:
-        others += OF_THE_LATER_PHASE
-        if not getattr(config.model.loss, "gaussian_velocity_in_phase1", False):
-            others += WEIGHTS_OF_GAUSSIAN_VELOCITY
+        others += (*OF_STREAMED_DATA, *config.model.keys_of_temporal_phase)
     kept = [override for override in overrides if not is_of(override, others)]
     wanted = [f"phase={name}", *kept]
     its_config, tree = compose(wanted)
@@ -146,21 +136,30 @@ def open_source(source: WeightSource) -> OpenCheckpoint:
         raise CheckpointError(f"{error}; make it anew with\n    {source.command} resume=restart") from error
 
 
-def hand_over(model: nn.Module, weights: OpenCheckpoint, tree: dict[str, Any]) -> None:
+def hand_over(model: Detector, weights: OpenCheckpoint, tree: dict[str, Any]) -> None:
     """Take the earlier phase's `weights` into `model`; what the new phase adds keeps its own.
 
     Settings that differ are logged. Raises CheckpointError naming every key that does not fit.
     """
     checkpoint = weights.take()
-    new = load_model_weights(model, checkpoint, weights.path, MAY_BE_NEW)
-    parts = sorted({key.split(".temporal_attention.")[0].split(".")[0] for key in new})
+    added = model.config.new_in_temporal_phase
+    new = load_model_weights(model, checkpoint, weights.path, re.compile(added) if added else None)
+    parts = sorted({key.partition(".")[0] for key in new})
     logger.info("weights from %s; new: %d tensors in %s", weights.path, len(new), ", ".join(parts) or "nothing")
-    for key, (old, now) in differing_settings(checkpoint["horizon3d"]["config"], tree).items():
+    stored = checkpoint["horizon3d"]["config"]
+    for key, (old, now) in differing_settings(stored, tree, model.config.temporal_part).items():
         logger.warning("%s was %s in the run these weights come from and is %s now", key, old, now)
 
 
-def differing_settings(old: dict[str, Any], new: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Dotted keys of the model, the backbone, the grid and of what is read that both have and whose values differ."""
+def differing_settings(
+    old: dict[str, Any],
+    new: dict[str, Any],
+    temporal_part: str,  # of the model
+) -> dict[str, tuple[Any, Any]]:
+    """Dotted keys of the model, the backbone, the grid and of what is read that both have and whose values differ.
+
+    Loss weights and the temporal part are the new phase's own.
+    """
 
     def flat(node: Any, prefix: str) -> dict[str, Any]:
         if not isinstance(node, dict):
@@ -173,10 +172,11 @@ def differing_settings(old: dict[str, Any], new: dict[str, Any]) -> dict[str, tu
         return {key: value for name, part in parts.items() for key, value in flat(part, name).items()}
 
     before, after = settings(old), settings(new)
+    own = ("model.loss.", f"model.{temporal_part}.") if temporal_part else ("model.loss.",)
     return {
         key: (before[key], after[key])
         for key in before.keys() & after.keys()
-        if before[key] != after[key] and not key.startswith(("model.loss.", "model.dptf", "model.temporal"))
+        if before[key] != after[key] and not f"{key}.".startswith(own)
     }
 
 

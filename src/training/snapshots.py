@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +12,6 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.models.detector import Detector
-from src.models.horizon3d.dptf import DPTFConfig
 from src.pictures.bev import BevScene
 from src.pictures.cameras import PictureViews
 from src.pictures.contents import PictureBoxes, PictureGaussians, PictureGrid, PictureMemory
@@ -21,6 +19,7 @@ from src.pictures.frame import draw_frame
 from src.pictures.memory_picture import MemoryScene, draw_memory
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
+from src.structures.evidence import Evidence, WarpedPoints
 from src.structures.gaussians import GaussianSet
 from src.structures.taxonomy import CAMERAS, CLASS_RANGE_M, CLASSES
 
@@ -45,11 +44,12 @@ def draw_frames(model: Detector, clips: Iterable[list[FrameBatch]], grid: BEVGri
             output, memory = model(batch, memory)
         (predictions,) = model.decode(output)
         name = f"{number}_{re.sub('[^0-9A-Za-z_-]', '_', batch.tokens[0])[:12]}.png"
-        scene = scene_of(batch, predictions, output, grid)
+        evidence = model.evidence(output)
+        scene = scene_of(batch, predictions, evidence, grid)
         title = f"Sample {batch.tokens[0][:12]}"
         paths.append(folder / f"frame_{name}")
         draw_frame(paths[-1], scene, views_of(batch), title, SHOWN_SCORE)
-        remembered = memory_of(model, output, scene)
+        remembered = memory_of(evidence, scene)
         if remembered is not None:
             paths.append(folder / f"memory_{name}")
             draw_memory(paths[-1], remembered, f"{title}: what was remembered")
@@ -60,7 +60,7 @@ def draw_frames(model: Detector, clips: Iterable[list[FrameBatch]], grid: BEVGri
 def scene_of(
     batch: FrameBatch,  # of one frame
     predictions: Boxes3D,
-    output: Any,  # the model's own output; Gaussians are drawn where it has some
+    evidence: Evidence,
     grid: BEVGrid,
 ) -> BevScene:
     """What the BEV panels show. Ground truth is what the evaluation counts: with points, within the class range."""
@@ -75,44 +75,33 @@ def scene_of(
         ground_truth=_boxes(truth),
         radar_points=_numpy(batch.radar_points) if batch.radar_points is not None else None,
     )
-    ocsf = getattr(output, "ocsf", None)
-    if ocsf is not None:
-        scene.gaussians = _gaussians(ocsf.gaussians)
-        cells = ocsf.splat.cells
-        rows = _numpy(cells.support % (grid.rows * grid.cols))
-        scene.occupancy = (np.stack([rows // grid.cols, rows % grid.cols], axis=1), _numpy(cells.occupancy))
+    if evidence.gaussians is not None:
+        scene.gaussians = _gaussians(evidence.gaussians)
+    if evidence.occupied_cells is not None:
+        scene.occupancy = (_numpy(evidence.occupied_cells), _numpy(evidence.occupancy))
     return scene
 
 
 def memory_of(
-    model: Detector,
-    output: Any,  # the model's own output for one frame
+    evidence: Evidence,
     scene: BevScene,  # of the same frame
 ) -> MemoryScene | None:
     """What the memory picture shows; None for a model without memory, empty memories where it remembers nothing yet."""
-    config, dptf = _memory_config(model), getattr(output, "dptf", None)
-    if config is None or dptf is None:
+    if evidence.warped_gaussians is None and evidence.warped_cells is None:
         return None
     remembered = MemoryScene(scene.grid, scene.ground_truth)
-    if config.gaussian_path is not None:
-        gaussians, velocities, elapsed_s = PictureGaussians.empty(), np.zeros((0, 2)), np.zeros(0)
-        if dptf.history is not None:
-            keep, gaussians = dptf.history.valid[0], _gaussians(dptf.history)
-            velocities, elapsed_s = _numpy(dptf.history.velocities[0][keep]), _numpy(dptf.history.elapsed_s[0][keep])
-        compensated = config.gaussian_path.velocity_compensation
-        remembered.gaussians = PictureMemory.read_at(gaussians.means, velocities, elapsed_s, compensated, gaussians)
-    if config.bev_path is not None:
-        xy, velocities, elapsed_s = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
-        if dptf.warped is not None:
-            cells = dptf.warped
-            xy, velocities, elapsed_s = _numpy(cells.xy), _numpy(cells.velocities), _numpy(cells.elapsed_s)
-        compensated = config.bev_path.velocity_compensation
-        remembered.cells = PictureMemory.read_at(xy, velocities, elapsed_s, compensated)
+    if evidence.warped_gaussians is not None:
+        remembered.gaussians = _memory(evidence.warped_gaussians)
+    if evidence.warped_cells is not None:
+        remembered.cells = _memory(evidence.warped_cells)
     return remembered
 
 
-def _memory_config(model: Detector) -> DPTFConfig | None:
-    return getattr(getattr(model, "config", None), "dptf", None)
+def _memory(points: WarpedPoints) -> PictureMemory:
+    gaussians = None if points.gaussians is None else _gaussians(points.gaussians)
+    return PictureMemory.read_at(
+        _numpy(points.xy), _numpy(points.velocities), _numpy(points.elapsed_s), points.compensated, gaussians
+    )
 
 
 def views_of(batch: FrameBatch) -> PictureViews | None:

@@ -1,4 +1,4 @@
-"""Phase 2: a detector with memory, trained and validated on streams of consecutive key frames (specification 6)."""
+"""Phase 2: a detector with memory, trained and validated on streams of consecutive key frames (method 6)."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from torch import Tensor
 
 from src.models.detector import TemporalMemory
 from src.structures.batch import FrameBatch
-from src.training.module import DetectionModule
+from src.training.module import TrainingModule
 
 logger = logging.getLogger(__name__)
 
 
-class TemporalModule(DetectionModule):
+class TemporalModule(TrainingModule):
     """Keeps the memory of its streams between steps; the model itself stays without state.
 
     A stream's memory ends where a clip starts, where the stream is missing from its set's next batch, and between
     passes: each epoch of training and each validation begins without memory. A checkpoint inside an epoch carries it.
     """
+
+    temporal = True
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from src.world.camera_render import Studio
@@ -21,6 +23,16 @@ REACH_M = 180.0
 RANGE_NOISE_M = 0.02
 
 
+@dataclass
+class _Boxes:
+    """The actors near the truck at the scan's middle, local coordinates."""
+
+    middles: Array  # [N, 3] m
+    velocities: Array  # [N, 3] m/s
+    sizes: Array  # [N, 3] m, length, width, height
+    yaws: Array  # [N] rad
+
+
 def scan_lidars(
     config: WorldConfig,
     scene: Scene,
@@ -30,25 +42,26 @@ def scan_lidars(
     stamp_us: int,
     rng: np.random.Generator,
 ) -> dict[str, Array]:
-    """One cloud of LIDAR_TYPE per lidar in its sensor frame, not motion compensated beyond the scan's middle.
+    """One cloud of LIDAR_TYPE per lidar in its sensor frame, not compensated for what moves during the scan.
 
-    Rays meet the boxes of the actors (their footprint over their height) and the road plane under the truck.
+    Rays meet the boxes of the actors (their footprint over their height) and the road plane under the truck, each at
+    the ray's own time; `time_s` and `stamp_us` are those of the scan's middle.
     """
-    rotation, translation = scene.ego.pose(time_s)
-    ground, _, yaw = scene.tracks.state(time_s)
-    near = np.flatnonzero(np.hypot(*(ground - translation)[:, :2].T) < REACH_M + 10)
-    sizes = scene.sizes[near]
-    middle = ground[near] + np.stack(
-        [np.zeros(len(near)), np.zeros(len(near)), studio.floors[near] + 0.5 * sizes[:, 2]], 1
-    )
+    ground, velocity, yaw = scene.tracks.state(time_s)
+    near = np.flatnonzero(np.hypot(*(ground - scene.ego.pose(time_s)[1])[:, :2].T) < REACH_M + 10)
+    boxes = _Boxes(ground[near], velocity[near], scene.sizes[near], yaw[near])
+    boxes.middles[:, 2] += studio.floors[near] + 0.5 * boxes.sizes[:, 2]
     azimuths = np.arange(-HALF_WIDTH_RAD, HALF_WIDTH_RAD, np.radians(config.lidar_step_deg))
+    after_s = azimuths / (2 * HALF_WIDTH_RAD) * SCAN_S
+    rotations, translations = scene.ego.poses(time_s + after_s)  # [A, 3, 3], [A, 3]
     a, e = (grid.ravel() for grid in np.meshgrid(azimuths, ELEVATIONS_RAD, indexing="ij"))
     rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], 1)
+    of_ray = np.repeat(np.arange(len(azimuths)), len(ELEVATIONS_RAD))
     clouds = {}
     for mount in mounts:
-        origin = rotation @ mount.translation + translation
-        local = rays @ (rotation @ mount.rotation).T
-        distance, bright = _nearest_hit(origin, local, middle, sizes, yaw[near], float(translation[2]))
+        local = np.einsum("rij,rj->ri", (rotations @ mount.rotation)[of_ray], rays)
+        origins = (rotations @ mount.translation + translations)[of_ray]
+        distance, bright = _nearest_hit(origins, local, after_s[of_ray], boxes, translations[of_ray, 2])
         chance = np.exp(-((distance / 130.0) ** 2))
         hit = np.flatnonzero((distance < REACH_M) & (rng.random(len(distance)) < chance))
         reach = distance[hit] + RANGE_NOISE_M * rng.standard_normal(len(hit))
@@ -56,28 +69,34 @@ def scan_lidars(
         for axis, name in enumerate(("x", "y", "z")):
             cloud[name] = rays[hit, axis] * reach
         cloud["intensity"] = np.clip(bright[hit] + rng.normal(0, 4, len(hit)), 0, 255)
-        phase = (a[hit] + HALF_WIDTH_RAD) / (2 * HALF_WIDTH_RAD) - 0.5
-        cloud["timestamp"] = stamp_us + np.round(phase * SCAN_S * 1e6).astype(np.int64)
+        cloud["timestamp"] = stamp_us + np.round(1e6 * after_s[of_ray[hit]]).astype(np.int64)
         clouds[mount.channel] = cloud
     return clouds
 
 
 def _nearest_hit(
-    origin: Array, rays: Array, centres: Array, sizes: Array, yaws: Array, ground_z: float
-) -> tuple[Array, Array]:
+    origins: Array,  # [R, 3]
+    rays: Array,  # [R, 3]
+    after_s: Array,  # [R] since the scan's middle
+    boxes: _Boxes,
+    ground_z: Array,  # [R]
+) -> tuple[Array, Array]:  # [R] each
     """Distance to the nearest box or to the ground along each ray (inf if none) and its brightness."""
     down = np.minimum(rays[:, 2], -1e-9)
-    best = np.where(rays[:, 2] < -1e-3, (ground_z - origin[2]) / down, np.inf)
+    best = np.where(rays[:, 2] < -1e-3, (ground_z - origins[:, 2]) / down, np.inf)
     bright = np.full(len(rays), 18.0)
     bearing = np.arctan2(rays[:, 1], rays[:, 0])
-    for centre, size, yaw in zip(centres, sizes, yaws, strict=True):
-        offset = centre - origin
+    middle, drift = origins.mean(0), 0.5 * np.linalg.norm(np.ptp(origins, axis=0))
+    for centre, velocity, size, yaw in zip(boxes.middles, boxes.velocities, boxes.sizes, boxes.yaws, strict=True):
+        offset = centre - middle
         distance = np.hypot(offset[0], offset[1])
-        spread = np.arcsin(min(1.0, 0.6 * np.hypot(size[0], size[1]) / max(distance, 0.1)))
+        reach = 0.6 * np.hypot(size[0], size[1]) + drift + 0.5 * SCAN_S * np.linalg.norm(velocity)
+        spread = np.arcsin(min(1.0, reach / max(distance, 0.1)))
         away = np.abs((bearing - np.arctan2(offset[1], offset[0]) + np.pi) % (2 * np.pi) - np.pi)
         some = np.flatnonzero(away <= spread)
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-        start, heading = -offset @ turn, rays[some] @ turn
+        start = (origins[some] - centre - after_s[some, None] * velocity) @ turn
+        heading = rays[some] @ turn
         heading = np.where(np.abs(heading) < 1e-9, 1e-9, heading)
         one, two = (-0.5 * size - start) / heading, (0.5 * size - start) / heading
         enter, leave = np.minimum(one, two).max(1), np.maximum(one, two).min(1)

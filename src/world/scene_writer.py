@@ -29,7 +29,13 @@ from src.world.rig import Mount, sensor_rig
 from src.world.scenery import make_scenery
 from src.world.simulate import Scene, make_scene, scene_rng
 from src.world.table_rows import Row, Tables, link_by, link_chain, rounded, token
-from src.world.world_config import CAMERA_RATE_HZ, KEY_FRAME_RATE_HZ, RADAR_RATE_HZ, WorldConfig
+from src.world.world_config import (
+    CAMERA_RATE_HZ,
+    KEY_FRAME_RATE_HZ,
+    LIDAR_RATE_HZ,
+    RADAR_RATE_HZ,
+    WorldConfig,
+)
 
 Array = np.ndarray
 
@@ -153,25 +159,32 @@ class SceneWriter:
         return shots, pixels
 
     def _write_lidars(self) -> tuple[list[tuple[_Shot, int]], list[Array] | None]:
-        """Key-frame clouds, six or an empty LIDAR_LEFT; returns shots and, if scanned, local points per frame."""
+        """All sweeps of six lidars, or empty key frames of LIDAR_LEFT; returns shots and, if scanned, per key frame its
+        points in local coordinates.
+        """
         rng = scene_rng(self.config, self.index, 6)
-        channels = LIDARS if self.config.lidar else (REFERENCE_CHANNEL,)
+        mounts = [self.rig[name] for name in LIDARS]
+        per_frame = LIDAR_RATE_HZ // KEY_FRAME_RATE_HZ
         shots, points = [], []
         for frame, key_time in enumerate(self.key_times):
-            time = self._quantised(key_time + self.rig[REFERENCE_CHANNEL].delay_s)
-            clouds = {REFERENCE_CHANNEL: np.zeros(0, dtype=LIDAR_TYPE)}
-            if self.config.lidar:
-                mounts = [self.rig[name] for name in LIDARS]
-                clouds = scan_lidars(self.config, self.scene, self.studio, mounts, time, self._stamp(time), rng)
-            here = []
-            for name in channels:
-                shot = _Shot(channel=name, frame=frame, time_s=time, is_key=True)
-                cloud = clouds[name]
-                self._store(shot, lidar_pcd(cloud))
-                shots.append((shot, len(cloud)))
-                here.append(self._to_local(self.rig[name], time, np.stack([cloud["x"], cloud["y"], cloud["z"]], 1)))
-            points.append(np.concatenate(here))
+            for back in range(self.config.lidar_sweeps_per_key_frame - 1 if self.config.lidar else 0, -1, -1):
+                base = key_time if back == 0 else frame / KEY_FRAME_RATE_HZ - back / per_frame / KEY_FRAME_RATE_HZ
+                time = self._quantised(base + self.rig[REFERENCE_CHANNEL].delay_s)
+                clouds = {REFERENCE_CHANNEL: np.zeros(0, dtype=LIDAR_TYPE)}
+                if self.config.lidar:
+                    clouds = scan_lidars(self.config, self.scene, self.studio, mounts, time, self._stamp(time), rng)
+                for name, cloud in clouds.items():
+                    shot = _Shot(channel=name, frame=frame, time_s=time, is_key=back == 0)
+                    self._store(shot, lidar_pcd(cloud))
+                    shots.append((shot, len(cloud)))
+            points.append(np.concatenate([self._scan_to_local(self.rig[name], clouds[name]) for name in clouds]))
         return shots, points if self.config.lidar else None
+
+    def _scan_to_local(self, mount: Mount, cloud: Array) -> Array:
+        """Each point by the ego pose at its own time."""
+        rotations, translations = self.scene.ego.poses(1e-6 * (cloud["timestamp"].astype(np.int64) - self.start_us))
+        in_ego = np.stack([cloud["x"], cloud["y"], cloud["z"]], 1) @ mount.rotation.T + mount.translation
+        return np.einsum("pij,pj->pi", rotations, in_ego) + translations
 
     def _truths(
         self, pixels: list[tuple[Array, Array]], radar: list[Array], lidar: list[Array] | None

@@ -14,6 +14,7 @@ GENERATOR = "highway-1"
 
 RADAR_RATE_HZ = 20
 CAMERA_RATE_HZ = 10
+LIDAR_RATE_HZ = 10
 KEY_FRAME_RATE_HZ = 2
 
 
@@ -47,6 +48,7 @@ class WorldConfig:
     rare_objects: float  # scales how many of the rare classes a scene gets
     annotation_range_m: float  # objects farther away are not labelled
     lidar: bool  # ray-cast six lidars; otherwise only the empty LIDAR_LEFT key frames
+    lidar_sweeps_per_key_frame: int  # sweeps written up to and including a key frame, 5 = all of the 10 Hz
     lidar_step_deg: float  # azimuth step of the ray-cast lidars
     ego_rate_hz: int  # ego_pose and ego_motion rows per second besides those of the sensors
 
@@ -73,12 +75,14 @@ class WorldConfig:
             "rare_objects": 0.0,
             "annotation_range_m": 1.0,
             "camera_fov_deg": 10.0,
+            "lidar_sweeps_per_key_frame": 1,
             "lidar_step_deg": 0.05,
             "ego_rate_hz": 1,
         }
         at_most = {
             "jpeg_quality": 95,
             "radar_sweeps_per_key_frame": RADAR_RATE_HZ // KEY_FRAME_RATE_HZ,
+            "lidar_sweeps_per_key_frame": LIDAR_RATE_HZ // KEY_FRAME_RATE_HZ,
             "camera_fov_deg": 150.0,
             "annotation_range_m": 250.0,
             "vehicles_per_lane_km": 40.0,

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from src.data.schema import TABLES
 from src.errors import ConfigError, DataError
-from src.structures.taxonomy import CAMERAS, LIDARS, RADARS
+from src.structures.taxonomy import CAMERAS, LIDARS, RADARS, REFERENCE_CHANNEL
 from src.world.rig import sensor_rig
 from src.world.scene_writer import write_scene
 from src.world.table_rows import Tables, shared_tables
@@ -98,10 +98,9 @@ def _read_stored(root: Path) -> dict[str, object]:
 
 def _fill(config: WorldConfig, folder: Path, progress: bool) -> None:
     """Write every file of the world below `folder`; the config comes last."""
-    lidars = LIDARS if config.lidar else LIDARS[:1]
-    for channel in (*CAMERAS, *RADARS, *lidars):
+    for channel in (*CAMERAS, *RADARS, *(LIDARS if config.lidar else (REFERENCE_CHANNEL,))):
         (folder / "samples" / channel).mkdir(parents=True)
-        if channel not in lidars:
+        if channel not in LIDARS or (config.lidar and config.lidar_sweeps_per_key_frame > 1):
             (folder / "sweeps" / channel).mkdir(parents=True)
     tables: Tables = {name: [] for name in TABLES} | shared_tables(config.seed, sensor_rig(config))
     names = []

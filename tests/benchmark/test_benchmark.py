@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from src.benchmark import __main__ as benchmark
-from src.benchmark import convolutions, machine
-from src.benchmark import naive as plain_peers
+from src.benchmark import convolutions, machine, naive
 from src.benchmark import operation_table as operations
 from src.benchmark import suite_model as model
 from src.benchmark import suite_scaling as scaling
@@ -28,7 +27,7 @@ def in_a_hurry(monkeypatch):
     """Few rounds and a small roofline; what is measured stays the same. All operations are rows, not the longest."""
     monkeypatch.setattr(machine, "GEMM_SIZE", {"cpu": 128, "cuda": 128})
     monkeypatch.setattr(machine, "COPY_BYTES", {"cpu": 2**20, "cuda": 2**20})
-    for module in (model, plain_peers, scaling, convolutions):
+    for module in (model, naive, scaling, convolutions):
         monkeypatch.setattr(module, "ROUNDS", 1)
     monkeypatch.setattr(operations, "NUM_ROWS", 1000)
     monkeypatch.setattr(training, "WARM_UP_STEPS", 1)
@@ -83,7 +82,7 @@ def test_parts_that_a_model_lacks_are_left_out(outputs, tmp_path, own, absent):
 
 
 @pytest.mark.slow
-def test_model_of_the_dense_peer(outputs, tmp_path):
+def test_model_of_the_dense_baseline(outputs, tmp_path):
     own = ["suite=model", "model=dense_bev", "phase=phase2"]
     result = measured("model_dense_bev_phase2_debug", outputs, tmp_path, *own)
     parts = column(result["time by part"], "part", "f+b ms")
@@ -101,7 +100,7 @@ def test_training(outputs, tmp_path, phase):
         assert all(row[f"{stage} ms"] >= 0 for stage in stages)
         # Medians of three steps each: their sum is near the median of the sum.
         assert sum(row[f"{stage} ms"] for stage in stages) == pytest.approx(row["step ms"], rel=0.8)
-    assert "_SparseConvBackward" in column(result["operations of a step"], "operation", "ms")
+    assert "_TiledSparseConvBackward" in column(result["operations of a step"], "operation", "ms")
 
 
 def test_ops(outputs, tmp_path, monkeypatch):
@@ -109,23 +108,23 @@ def test_ops(outputs, tmp_path, monkeypatch):
     monkeypatch.setattr(convolutions, "DENSE_LIMIT_FLOPS", 1e9)
     result = measured("ops_debug", outputs, tmp_path, "suite=ops")
     layers = result["sparse convolution"]
-    assert {row["mode"] for row in layers} == {"forward", "f+b"} and all(row["% of products"] > 0 for row in layers)
+    assert {row["mode"] for row in layers} == {"forward", "f+b"} and all(row["% of GEMM"] > 0 for row in layers)
     assert any(row.get("x faster than dense") for row in layers)
     assert any("x faster than dense" not in row for row in layers)  # too large
     for row in [*layers, *result["radar backbone"]]:
         assert row.get("spconv differs by", 0.0) < 1e-5
     assert {row["mode"] for row in result["splat"]} == {"forward", "f+b"}
     backward = column(result["operations of the backbone, f+b"], "operation", "ms")
-    assert "_SparseConvBackward" in backward
-    assert "_SparseConvBackward" not in column(result["operations of the backbone, forward"], "operation", "ms")
+    assert "_TiledSparseConvBackward" in backward
+    assert "_TiledSparseConvBackward" not in column(result["operations of the backbone, forward"], "operation", "ms")
     others = {row["operation"] for row in result["other operations"]}
     assert {"segment sum", "bilinear sampling", "image attention", "farthest points", "box raster", "voxels"} == others
 
 
 @pytest.mark.slow
 def test_scaling(outputs, tmp_path, monkeypatch):
-    small = scaling.Sizes(Highway(100, 10, 5, 150.0), 2, (37.5, 75.0, 150.0))
-    monkeypatch.setattr(scaling, "SIZES", {"debug": small})
+    monkeypatch.setattr(scaling, "ROADS", {"debug": Highway(100, 10, 5, 150.0)})
+    monkeypatch.setattr(scaling, "RANGES_M", {"debug": (37.5, 75.0, 150.0)})
     monkeypatch.setattr(scaling, "NOMINAL_M", 75.0)
     monkeypatch.setattr(scaling, "MEMORY_FRAMES", (0, 2))
     monkeypatch.setattr(scaling, "FACTORS", {name: (0.5, 1.0) for name in scaling.FACTORS})
@@ -155,7 +154,7 @@ def test_a_disagreement_of_the_metric_is_an_error_after_the_page(tmp_path, monke
     assert "max_difference 0.5" in (tmp_path / "metric.md").read_text()
 
 
-def test_a_folder_that_cannot_be_written_is_told_first(tmp_path):
+def test_a_folder_that_cannot_be_written_is_reported_first(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="out"):
         main(["suite=model", f"out={tmp_path / 'file'}"])

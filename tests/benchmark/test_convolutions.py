@@ -1,7 +1,8 @@
-"""The peers of sparse convolution compute what ours computes; memory is that of a process of its own."""
+"""The baselines of sparse convolution compute what ours computes; memory is that of a process of its own."""
 
 import pytest
 import torch
+from torch.utils.benchmark import set_torch_threads
 
 from src.benchmark.convolutions import (
     Backbone,
@@ -20,7 +21,6 @@ from src.benchmark.spconv_baseline import (
     load_spconv,
     sorted_map,
     sparse_tensor,
-    torch_threads,
 )
 from src.config import compose_config
 from src.models.layers.sparse import SparseConv, SubmanifoldConv
@@ -29,7 +29,7 @@ from src.structures.sparse_bev import SparseMap
 
 CPU = torch.device("cpu")
 SPCONV = load_spconv(CPU)
-needs_spconv = pytest.mark.skipif(SPCONV is None, reason="spconv is not installed: an optional yardstick")
+needs_spconv = pytest.mark.skipif(SPCONV is None, reason="spconv is not installed: an optional baseline")
 
 
 def sites_on(shape, number, seed=0):
@@ -49,7 +49,7 @@ def layers():
 
 
 @pytest.mark.parametrize("layer", layers(), ids=lambda layer: layer.name)
-def test_the_dense_peer_computes_the_same(layer):
+def test_the_dense_convolution_computes_the_same(layer):
     features = torch.randn(len(layer.sites), 4, requires_grad=True)
     kernel_map, out_sites = layer.map(layer.sites)
     ours = sparse_conv(features, layer.kernel.weight, kernel_map)
@@ -63,11 +63,11 @@ def test_the_dense_peer_computes_the_same(layer):
 @needs_spconv
 @pytest.mark.parametrize("layer", layers(), ids=lambda layer: layer.name)
 def test_spconv_computes_the_same_at_one_thread(layer):
-    with torch_threads(1):
+    with set_torch_threads(1):
         features = torch.randn(len(layer.sites), 4, requires_grad=True)
         kernel_map, out_sites = layer.map(layer.sites)
-        peer = build_layer(SPCONV, layer.kernel, layer.stride, layer.padding, "pairs")
-        sites, theirs = sorted_map(peer(sparse_tensor(SPCONV, SparseMap(layer.sites, features))), out_sites.shape)
+        baseline = build_layer(SPCONV, layer.kernel, layer.stride, layer.padding, "pairs")
+        sites, theirs = sorted_map(baseline(sparse_tensor(SPCONV, SparseMap(layer.sites, features))), out_sites.shape)
         ours = sparse_conv(features, layer.kernel.weight, kernel_map)
     assert torch.equal(sites.keys, out_sites.keys)
     assert largest_difference([ours], [theirs]) < 1e-5
@@ -87,7 +87,7 @@ def encoder_of(scale):
 @pytest.mark.parametrize("scale", ["mini", "paper"])
 def test_the_whole_backbone_in_spconv_computes_the_same(scale):
     """Two and three dimensions, with submanifold and with dilating output."""
-    with torch_threads(1):
+    with set_torch_threads(1):
         _, encoder, _, voxels = encoder_of(scale)
         sites, theirs = SpconvEncoder(SPCONV, encoder).train()(voxels)
         ours = encoder.encode(voxels)
@@ -103,7 +103,7 @@ def test_layers_are_those_of_the_backbone_and_of_the_memory():
     found = layers_of(encoder, voxels, 16, bev, past)
     assert [layer.kernel.ndim for layer in found] == [2, 2, 2, 3, 3, 3]
     assert [layer.temporal for layer in found] == [False] * 5 + [True]
-    assert not fits_dense(found[-1], past)  # no dense peer keeps to occupied columns
+    assert not fits_dense(found[-1], past)  # no dense convolution keeps to occupied columns
     wide = Sites((1, 64, 3072, 3072), past.keys[:0])
     assert not fits_dense(Layer("wide", wide, SubmanifoldConv(64, 64, 3, 3, False), (1, 1, 1), (1, 1, 1)), wide)
 
@@ -111,8 +111,8 @@ def test_layers_are_those_of_the_backbone_and_of_the_memory():
 @pytest.mark.slow
 def test_memory_of_a_process_of_its_own():
     backbone, _, points, _ = encoder_of("debug")
-    held = memory_of(backbone, points, "ours", backward=True, threads=1)
+    held = memory_of(backbone, points, "ours", "f+b", threads=1)
     if held is None:
-        pytest.skip("the system does not tell what a process holds")
+        pytest.skip("the system does not report what a process holds")
     before, most = held
     assert 50 < before <= most < 4000

@@ -35,7 +35,7 @@ def test_numbers():
     assert table([{"a": 1}, {"b": None}]) == ["| a | b |", "|---|---|", "| 1 |  |", "|  |  |"]
 
 
-def test_a_busy_machine_is_told():
+def test_a_busy_machine_is_warned_of():
     assert busy_warning(MACHINE | {"load": 2.0}) is None  # half of it is not
     warning = busy_warning(MACHINE | {"load": 2.1})
     assert "2.1 of 4 cores were at work" in warning

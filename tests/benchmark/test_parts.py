@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from src.benchmark.parts import derive, fresh, is_within, parts_of, record_calls, tensors_in
+from src.benchmark.parts import backward_from, fresh, is_within, parts_of, record_calls, tensors_in
 
 
 @dataclass
@@ -30,6 +30,8 @@ class Part(nn.Module):
 
 
 class Whole(nn.Module):
+    benchmark_parts = {"second: itself": ("second.forward",)}
+
     def __init__(self):
         super().__init__()
         self.first, self.second = nn.Linear(3, 3), Part()
@@ -41,7 +43,8 @@ class Whole(nn.Module):
 
 def test_parts_are_children_by_the_methods_they_have():
     assert parts_of(Whole()) == {
-        "first": ("first.forward",), "second": ("second.forward",), "second: decode": ("second.decode",)
+        "first": ("first.forward",), "second": ("second.forward",), "second: itself": ("second.forward",),
+        "second: decode": ("second.decode",)
     }  # fmt: skip
     assert is_within("ocsf: splat") and not is_within("ocsf") and not is_within("head: decode")
 
@@ -58,12 +61,12 @@ def test_a_recorded_call_is_made_again_with_the_caches_of_the_first_time():
     again = call.prepare()()
     torch.testing.assert_close(again[0], call.result[0])
     assert bundle.cache == {}
-    assert derive(again) and model.second.layer.weight.grad is not None
+    assert backward_from(again) and model.second.layer.weight.grad is not None
     assert model.first.weight.grad is None  # no history beyond the part's inputs
 
 
-def test_what_depends_on_nothing_is_not_derived():
-    assert not derive([torch.zeros(2), "text", None])
+def test_a_result_without_history_has_no_backward():
+    assert not backward_from([torch.zeros(2), "text", None])
 
 
 def test_tensors_are_found_outside_caches():

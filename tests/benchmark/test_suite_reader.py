@@ -1,4 +1,4 @@
-"""suite=reader: every stage is measured where the reader does it, and the peers read the same."""
+"""suite=reader: every stage is measured where the reader does it, and naive implementations read the same."""
 
 import time
 import types
@@ -14,7 +14,7 @@ from src.benchmark.suite_reader import (
     benchmark_reader,
     fields_one_by_one,
     loader_row,
-    plain_image,
+    naive_image,
     time_frames,
     timed_stages,
 )
@@ -34,7 +34,7 @@ def config(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch):
-    for name in ("READER_FRAMES", "LOADER_FRAMES", "PEER_ROUNDS"):
+    for name in ("READER_FRAMES", "LOADER_FRAMES", "COMPARISON_ROUNDS"):
         monkeypatch.setattr(suite, name, 4)
 
 
@@ -86,14 +86,14 @@ def test_measuring_leaves_the_reader_as_it_was(config):
     assert [getattr(module, name) for module, name in STAGES.values()] == before
 
 
-def test_the_peers_read_what_the_reader_reads(config):
+def test_naive_implementations_read_what_the_reader_reads(config):
     datamodule = suite.build_datamodule(config, suite.data_root(config))
     sample = suite.full_samples(datamodule)[0]
     for path in suite.radar_paths(datamodule, sample):
         np.testing.assert_array_equal(fields_one_by_one(path), read_radar_points(path))
     row = datamodule.index.key_data[sample, 0]
     path = datamodule.index.root / datamodule.index.filename(row)
-    found = plain_image(str(path), (96, 320))
+    found = naive_image(str(path), (96, 320))
     with Image.open(path) as image:
         source_px = image.size[::-1]
     expected = read_image(path, source_px, width_fit(source_px, (96, 320)))

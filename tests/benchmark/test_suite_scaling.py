@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import torch
 
-from src.benchmark.scenes import Highway, highway_frame, highway_points
-from src.benchmark.suite_scaling import NOMINAL_M, SIZES, Point, growth_rows, model_settings, peer_of, sweeps_of
+from src.benchmark.cases import CELLS_PER_VEHICLE
+from src.benchmark.scenes import ROADS, Highway, highway_frame, highway_points
+from src.benchmark.suite_scaling import NOMINAL_M, RANGES_M, Point, config_of, growth_rows, model_settings, sweeps_of
 from src.config import compose_config
 
 ROAD = Highway(background=400, num_vehicles=20, points_per_vehicle=10, reach_m=150.0)
@@ -64,10 +65,10 @@ def test_a_point_ahead_of_a_camera_is_seen_where_it_should_be():
 
 
 def test_only_the_ranges_reach_beyond_the_nominal_one():
-    for name, points in sweeps_of(SIZES["paper"], temporal=True).items():
+    for name, points in sweeps_of(ROADS["paper"], RANGES_M["paper"], temporal=True).items():
         beyond = [point for point in points if max(point.range_m, point.road.reach_m) > NOMINAL_M]
         assert bool(beyond) == name.startswith("range"), name
-    assert "memory frames" not in sweeps_of(SIZES["paper"], temporal=False)
+    assert "memory frames" not in sweeps_of(ROADS["paper"], RANGES_M["paper"], temporal=False)
 
 
 def test_a_point_changes_what_it_names():
@@ -76,14 +77,12 @@ def test_a_point_changes_what_it_names():
     settings = model_settings(config, point)
     assert (settings.kggi.num_radar_keypoints, settings.kggi.num_camera_keypoints) == (16, 8)
     assert settings.dptf.bev_path.num_frames == 5 and settings.dptf.gaussian_path.num_frames == 2
-    assert settings.dptf.bev_path.max_cells_per_frame == 20 * SIZES["debug"].cells_per_object
+    assert settings.dptf.bev_path.max_cells_per_frame == 20 * CELLS_PER_VEHICLE["debug"]
     twice_as_far = replace(point, road=replace(ROAD, reach_m=300.0))
-    assert (
-        model_settings(config, twice_as_far).dptf.bev_path.max_cells_per_frame == 40 * SIZES["debug"].cells_per_object
-    )
+    assert model_settings(config, twice_as_far).dptf.bev_path.max_cells_per_frame == 40 * CELLS_PER_VEHICLE["debug"]
     assert model_settings(config, replace(point, memory_frames=0)).dptf is None
     assert config.model.kggi.num_radar_keypoints == 32 and config.model.dptf.bev_path.num_frames == 2
 
-    peer = peer_of(config, "dense_bev")
-    assert model_settings(peer, point).temporal.num_frames == 5 and peer.grid == config.grid
-    assert model_settings(peer, replace(point, memory_frames=0)).temporal is None
+    dense = config_of(config, "dense_bev")
+    assert model_settings(dense, point).temporal.num_frames == 5 and dense.grid == config.grid
+    assert model_settings(dense, replace(point, memory_frames=0)).temporal is None

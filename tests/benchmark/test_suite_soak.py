@@ -38,8 +38,8 @@ def test_growth_in_training_is_that_from_epoch_to_epoch(leak):
         for n in range(30, 961, 30)
     ]
     assert growth_row("training", rows, 240, 480)["MiB / 1000 frames"] == pytest.approx(1e3 * leak / 240)
-    assert growth_row("training", rows)["MiB / 1000 frames"] > 50.0  # what does not tell
-    assert "MiB / 1000 frames" not in growth_row("training", rows[:16], 240, 240)  # one epoch tells nothing
+    assert growth_row("training", rows)["MiB / 1000 frames"] > 50.0  # within epochs
+    assert "MiB / 1000 frames" not in growth_row("training", rows[:16], 240, 240)  # one epoch shows nothing
 
 
 def test_growth_is_that_behind_the_first_quarter():
@@ -63,7 +63,7 @@ def test_growth_is_that_behind_the_first_quarter():
     }
 
 
-def test_what_a_system_tells_only_at_times_has_no_growth():
+def test_what_a_system_reports_only_at_times_has_no_growth():
     """The workers of a loader can be between two epochs when a row is taken."""
     rows = [{"frames": n, "ms": 1.0, "± ms": 0.0} | ({"workers MiB": 5.0} if n % 2 else {}) for n in range(1, 17)]
     assert "workers MiB / 1000 frames" not in growth_row("some", rows)

@@ -1,63 +1,57 @@
-"""Turns, spreads and memory of what is measured."""
+"""Turns, interquartile ranges and memory of what is measured."""
 
 from pathlib import Path
 
 import pytest
 import torch
 
-from src.benchmark import timing
-from src.benchmark.timing import added_bytes, in_turns, interleaved, median_spread, timed_parts
+from src.benchmark.timing import added_bytes, interleaved, median_iqr, milliseconds, timed_parts
 from src.ops.sparse_conv_tiled import scratch
 
 CPU = torch.device("cpu")
 
 
-@pytest.fixture
-def ticking(monkeypatch):
-    """A clock that candidates push on."""
-    now = {"s": 0.0}
-    monkeypatch.setattr(timing, "clock", lambda device: lambda: now["s"])
-    return now
+class Ticking:
+    """A clock that candidates push on, and the order in which they do."""
 
+    def __init__(self):
+        self.seconds, self.order = 0.0, []
 
-def test_median_and_spread():
-    assert median_spread([5.0]) == (5.0, 0.0)
-    assert median_spread([1.0, 9.0, 2.0]) == (2.0, 8.0)  # the whole range of so few
-    assert median_spread([1.0, 2.0, 3.0, 4.0, 100.0]) == (3.0, 52.0 - 1.5)  # the middle half
+    def now(self):
+        return self.seconds
 
-
-def test_candidates_take_turns_and_warm_up(ticking):
-    order = []
-
-    def candidate(name, seconds):
+    def candidate(self, name, seconds):
         def run():
-            order.append(name)
-            ticking["s"] += seconds
+            self.order.append(name)
+            self.seconds += seconds
 
         return run
 
-    seconds = interleaved({"a": candidate("a", 1.0), "b": candidate("b", 2.0)}, CPU, 2)
+
+def test_median_and_interquartile_range():
+    assert median_iqr([5.0]) == (5.0, 0.0)
+    assert median_iqr([1.0, 9.0, 2.0]) == (2.0, 8.0)  # the whole range of so few
+    assert median_iqr([1.0, 2.0, 3.0, 4.0, 100.0]) == (3.0, 52.0 - 1.5)
+    assert milliseconds([1.0, 9.0, 2.0], "step ") == {"step ms": 2000.0, "step ± ms": 8000.0}
+
+
+def test_candidates_take_turns_and_warm_up():
+    clock = Ticking()
+    seconds = interleaved({"a": clock.candidate("a", 1.0), "b": clock.candidate("b", 2.0)}, clock.now, 2)
+    order = clock.order
     assert order == ["a", "b"] * 3 and seconds == {"a": [1.0, 1.0], "b": [2.0, 2.0]}
 
 
-def test_what_is_slow_has_fewer_rounds(ticking):
-    calls = {"quick": 0, "slow": 0, "slower": 0, "endless": 0}
-
-    def candidate(name, seconds):
-        def run():
-            calls[name] += 1
-            ticking["s"] += seconds
-
-        return run
-
-    made = {"quick": candidate("quick", 0.1), "slow": candidate("slow", 2.0)}
-    made |= {"slower": candidate("slower", 10.0), "endless": candidate("endless", 50.0)}
-    seconds = in_turns(made, CPU, rounds=6, budget_s=5.0)
-    assert calls == {"quick": 7, "slow": 3, "slower": 2, "endless": 1}  # the first call of each tells how slow it is
+def test_what_is_slow_has_fewer_rounds():
+    clock, each = Ticking(), {"quick": 0.1, "slow": 2.0, "slower": 10.0, "endless": 50.0}
+    made = {name: clock.candidate(name, seconds) for name, seconds in each.items()}
+    seconds = interleaved(made, clock.now, rounds=6, budget_s=5.0)
+    calls = {name: clock.order.count(name) for name in each}
+    assert calls == {"quick": 7, "slow": 3, "slower": 2, "endless": 1}  # the first call of each shows how slow it is
     assert [len(values) for values in seconds.values()] == [6, 2, 1, 1]
 
 
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="the peak of a process is told by Linux only")
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux reports the peak of a process")
 def test_added_memory_is_that_of_the_call():
     held = torch.ones(8 * 2**20)  # 32 MiB that were there before
 

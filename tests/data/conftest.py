@@ -18,6 +18,21 @@ def data_set(tmp_path_factory: pytest.TempPathFactory) -> DataSet:
     return DataSet(root)
 
 
+@pytest.fixture(scope="session")
+def lidar_set(tmp_path_factory: pytest.TempPathFactory) -> DataSet:
+    """The intact data set with the sweeps of two LiDARs; tests must not change it."""
+    root = tmp_path_factory.mktemp("truckscenes-lidar")
+    write_data_set(root, lidar=True)
+    return DataSet(root)
+
+
+@pytest.fixture
+def broken_lidar(lidar_set: DataSet, tmp_path: Path) -> DataSet:
+    """A copy of it."""
+    shutil.copytree(lidar_set.root, tmp_path, dirs_exist_ok=True)
+    return DataSet(tmp_path)
+
+
 @pytest.fixture
 def broken_tables(data_set: DataSet, tmp_path: Path) -> DataSet:
     """A copy of the tables alone."""

@@ -113,6 +113,41 @@ def test_empty_and_full_frames_share_a_batch(data_set):
 
 
 @pytest.mark.parametrize("num_workers", [0, 1])
+def test_what_is_read_follows_from_the_sensors(lidar_set, num_workers, quick_end):
+    chosen = {"num_lidar_sweeps": 2, "num_future_frames": 1, "lidar_origins": True, "num_workers": num_workers}
+    data = module(lidar_set, sensors=("lidar",), **chosen)
+    first, second = data.val_dataloader()
+    assert first.radar_points is None and first.radar_batch is None and first.images is None
+    assert first.lidar_batch.bincount().tolist() == [80, 80] and second.lidar_batch.bincount().tolist() == [80]
+    assert len(first.lidar_origins) == 160
+    (future,) = first.future
+    assert future.tokens == [first.tokens[1], second.tokens[0]] and future.lidar_batch.bincount().tolist() == [40, 40]
+    assert len(second.future[0].lidar_points) == 0  # the scene has ended
+    alone = data.reader.read(4, None)
+    rows = first.lidar_batch == 1
+    assert torch.equal(first.lidar_points[rows], alone.lidar_points)
+    assert torch.equal(first.lidar_origins[rows], alone.lidar_origins)
+    every = next(iter(module(lidar_set, sensors=("lidar", "camera", "radar")).val_dataloader()))
+    assert every.images is not None and len(every.radar_points) and len(every.lidar_points) and every.future == ()
+
+
+@pytest.mark.parametrize("sensors", [(), ("sonar",), ("radar", "sonar")])
+def test_sensors_that_are_none(data_set, sensors):
+    with pytest.raises(ValueError, match="sensors must be some of .*'lidar'"):
+        module(data_set, sensors=sensors)
+
+
+def test_lidar_is_dropped_with_the_other_sensors(lidar_set):
+    chosen = {"sensor_dropout": 0.99, "num_future_frames": 1, "lidar_origins": True}
+    data = module(lidar_set, ("lidar", "radar"), temporal=True, **chosen)
+    first, second, _ = data.stream()
+    assert len(first.lidar_points) and len(first.radar_points)
+    assert second.lidar_points.shape == (0, 5) and second.radar_points.shape == (0, 7)
+    assert second.lidar_origins.shape == (0, 3) and len(second.lidar_batch) == 0
+    assert len(second.future[0].lidar_points)  # what is to be predicted stays
+
+
+@pytest.mark.parametrize("num_workers", [0, 1])
 def test_faults_of_workers_keep_their_message(broken_files, num_workers, quick_end):
     index = load_index(broken_files.root, VERSION, None)
     name = index.filename(index.key_data[4, 4])
@@ -155,6 +190,7 @@ def test_errors_travel_between_processes():
 @pytest.mark.parametrize(
     "change",
     [{"batch_size": 0}, {"groups_per_scene": 0}, {"stream_sets": 0}, {"num_sweeps": 0}, {"num_workers": -1},
+     {"num_lidar_sweeps": 0}, {"num_future_frames": -1},
      {"sensor_dropout": 1.0}, {"sensor_dropout": -0.1}, {"min_distance_m": float("nan")},
      {"test_resize_offset": float("nan")}],
     ids=str,

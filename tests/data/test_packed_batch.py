@@ -9,6 +9,7 @@ from torch import Tensor
 
 from src.data.datamodule import collate, in_stream
 from src.data.packed_batch import LARGE_BYTES, PackedBatch
+from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 
 
@@ -21,8 +22,8 @@ def batch(data_set):
 def pieces(value):
     for field in fields(value):
         item = getattr(value, field.name)
-        for entry in item if isinstance(item, list) else [item]:
-            yield from pieces(entry) if isinstance(entry, Boxes3D) else [entry]
+        for entry in item if isinstance(item, (list, tuple)) else [item]:
+            yield from pieces(entry) if isinstance(entry, (Boxes3D, FrameBatch)) else [entry]
 
 
 def assert_same(found, expected):
@@ -40,6 +41,20 @@ def test_what_is_packed_is_unpacked(batch):
         warnings.simplefilter("error")
         for one in (batch, without_images, empty):
             assert_same(PackedBatch.pack(one).unpack(), one)
+
+
+def test_lidar_and_future_frames_are_packed_too(lidar_set):
+    reader = lidar_set.reader(
+        image_size_px=None, num_sweeps=0, num_lidar_sweeps=2, lidar_origins=True, num_future_frames=2
+    )
+    one = collate([reader.read(row, None) for row in (0, 1)])
+    assert [len(frame.lidar_points) for frame in one.future] == [80, 40] and one.radar_points is None
+    assert_same(PackedBatch.pack(one).unpack(), one)
+    points, owners = one.lidar_points.repeat(1000, 1), one.lidar_batch.repeat(1000).sort()[0]
+    large = replace(one, lidar_points=points, lidar_batch=owners, lidar_origins=None)
+    packed = PackedBatch.pack(large)
+    assert packed.large[0] is large.lidar_points and len(packed.large) == 2
+    assert_same(pickle.loads(pickle.dumps(packed)).unpack(), large)
 
 
 def test_only_large_tensors_are_sent_one_by_one(batch):

@@ -8,13 +8,13 @@ import torch
 from PIL import Image
 
 from src.data.cache import load_index
-from src.data.pcd import read_radar_points
+from src.data.pcd import read_lidar_points, read_radar_points
 from src.data.reader import ego_motion
 from src.data.schema import CHANNELS
-from src.data.sensors import Camera, RadarSweep, frame_from_sensors
+from src.data.sensors import Camera, LidarSweep, RadarSweep, frame_from_sensors
 from src.errors import DataError
 from src.structures.taxonomy import CAMERAS, RADARS
-from tests.data.tiny_set import INTRINSICS, VERSION, ego_pose, mount, reader_settings
+from tests.data.tiny_set import INTRINSICS, LIDAR_CHANNELS, VERSION, ego_pose, mount, reader_settings
 
 SAMPLE = 1
 
@@ -177,3 +177,85 @@ def test_a_bad_frame_is_named(raw):
         frame_from_sensors(**(raw | {"global_from_ego": np.zeros((4, 4))}), settings=reader_settings())
     with pytest.raises(DataError, match="timestamp_s of the frame must be finite"):
         frame_from_sensors(**(raw | {"timestamp_s": float("nan")}), settings=reader_settings())
+
+
+# -------------------------------------------------------------------- LiDAR
+
+
+@pytest.fixture(scope="module")
+def lidars(lidar_set):
+    """Time, pose and LiDAR sweeps of one frame, straight from the files and the analytic world."""
+    index, lidars = load_index(lidar_set.root, VERSION, None), {}
+    for channel in LIDAR_CHANNELS:
+        row = int(index.key_data[SAMPLE, CHANNELS.index(channel)])
+        while row >= 0:
+            time_us = index.data_times_us[row : row + 1]
+            pose = ego_pose(1e-6 * time_us[0])
+            velocity, rate = ego_motion(index, time_us, pose[None, :3, :3])
+            cloud = read_lidar_points(index.root / index.filename(row))
+            lidars.setdefault(channel, []).append(
+                LidarSweep(
+                    points=cloud.points, point_times_s=1e-6 * cloud.times_us, ego_from_sensor=mount(channel),
+                    timestamp_s=1e-6 * time_us[0], ego_velocity_mps=velocity[0], ego_rate_radps=rate[0],
+                    global_from_ego=pose,
+                )
+            )  # fmt: skip
+            row = int(index.data_previous[row])
+    time_s = 1e-6 * index.frame_times_us[SAMPLE]
+    return {"timestamp_s": time_s, "global_from_ego": ego_pose(time_s), "cameras": {}, "radars": {}, "lidars": lidars}
+
+
+ONLY_LIDAR = {"image_size_px": None, "num_sweeps": 0, "num_lidar_sweeps": 3, "lidar_origins": True}
+
+
+@pytest.mark.parametrize("changes", [{}, {"num_lidar_sweeps": 1, "deskew_lidar": False}, {"lidar_origins": False}])
+def test_a_lidar_frame_equals_what_the_reader_makes_of_the_same_files(lidar_set, lidars, changes):
+    expected = lidar_set.reader(**(ONLY_LIDAR | changes)).read(SAMPLE, None)
+    made = frame_from_sensors(**lidars, settings=reader_settings(**(ONLY_LIDAR | changes)))
+    assert made.radar_points is None and made.images is None and len(made.lidar_points) >= 40
+    for name in ("lidar_points", "lidar_origins", "lidar_batch"):
+        found, wanted = getattr(made, name), getattr(expected, name)
+        if wanted is None:
+            assert found is None
+        else:
+            torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-3)
+
+
+def test_a_lidar_without_times_of_points_is_taken_as_one_moment(lidars):
+    (newest, *_) = lidars["lidars"]["LIDAR_LEFT"]
+    own = {"lidars": {"roof": [replace(newest, point_times_s=None)], "rear": None, "left": []}}
+    frame = frame_from_sensors(**(lidars | own), settings=reader_settings(**ONLY_LIDAR))
+    ego = newest.points[:, :3] @ mount("LIDAR_LEFT")[:3, :3].T + mount("LIDAR_LEFT")[:3, 3]
+    np.testing.assert_allclose(frame.lidar_points[:, :3], ego, atol=1e-3)
+    assert (frame.lidar_points[:, 4] == 0).all() and len(frame.lidar_points) == len(newest.points)
+    nothing = frame_from_sensors(**(lidars | {"lidars": None}), settings=reader_settings(**ONLY_LIDAR))
+    assert nothing.lidar_points.shape == (0, 5) and nothing.lidar_origins.shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"points": np.zeros((4, 3))}, r"points \(x, y, z, intensity\) must have the shape \['n', 4\], but got"),
+        ({"points": np.full((1, 4), np.nan)}, "points .* must be finite"),
+        ({"point_times_s": np.zeros(3)}, r"point_times_s must have the shape \[20\], but got \[3\]"),
+        ({"point_times_s": np.zeros(20)}, "point_times_s must lie within 0.3 s of timestamp_s, but one is"),
+        ({"point_times_s": np.full(20, 1.7e9, np.float32)}, "point_times_s is float32"),
+        ({"ego_velocity_mps": [200.0, 0, 0]}, "ego_velocity_mps must be below 100 m/s"),
+        ({"ego_from_sensor": np.zeros((4, 4))}, "ego_from_sensor must be a rotation"),
+        ({"timestamp_s": 5.0}, "older than its frame"),
+    ],
+)
+def test_wrong_lidar_input_is_named(lidars, change, words):
+    (newest, *_) = lidars["lidars"]["LIDAR_LEFT"]
+    wrong = lidars | {"lidars": {"roof": [replace(newest, **change)]}}
+    with pytest.raises(DataError, match=f"lidar roof.*{words}"):
+        frame_from_sensors(**wrong, settings=reader_settings(**ONLY_LIDAR))
+    unread = frame_from_sensors(**wrong, settings=reader_settings(image_size_px=None))
+    assert unread.lidar_points is None
+
+
+def test_a_lidar_is_no_radar(lidars):
+    settings = reader_settings(**(ONLY_LIDAR | {"num_sweeps": 1}))
+    for name, kind in (("lidars", "LidarSweep"), ("radars", "RadarSweep")):
+        with pytest.raises(DataError, match=f"{name[:-1]} roof: must be a list of {kind}, or None, but got list"):
+            frame_from_sensors(**(lidars | {name: {"roof": [object()]}}), settings=settings)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import lzf
 import numpy as np
 from PIL import Image
 
@@ -60,6 +62,36 @@ def mount(channel: str) -> np.ndarray:
     return rigid(rotation(2, yaw) @ turned, [5.1, side * 1.3, 2.0])
 
 
+LIDAR_CHANNELS = ("LIDAR_LEFT", "LIDAR_REAR")
+LIDAR_STEP_US = 5_000
+"""Between two points of a sweep, whose tenth is measured at the sweep's own time."""
+
+
+def lidar_cloud(time_us: int, channel: str) -> tuple[np.ndarray, np.ndarray]:  # [20, 4], [20] us
+    """Every static point where a LiDAR sees it that has driven on since the point before."""
+    times_us = time_us + LIDAR_STEP_US * np.arange(-10, len(STATIC) - 10)
+    points = []
+    for number, (place, stamp) in enumerate(zip(STATIC, times_us, strict=True)):
+        sensor_from_global = invert_rigid(ego_pose(1e-6 * stamp) @ mount(channel))
+        points.append([*(sensor_from_global[:3, :3] @ place + sensor_from_global[:3, 3]), number])
+    return np.array(points), times_us
+
+
+def lidar_bytes(points: np.ndarray, times_us: np.ndarray) -> bytes:
+    """A compressed LiDAR file, by the compressor that other writers use."""
+    kind = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "intensity")), ("timestamp", "<u8")])
+    columns = [*np.asarray(points, dtype="<f4").T, np.asarray(times_us).astype("<u8")]
+    data = b"".join(column.tobytes() for column in columns)
+    packed = lzf.compress(data, 2 * len(data) + 100) if data else b""
+    sizes = " ".join(str(kind[name].itemsize) for name in kind.names)
+    n = len(points)
+    header = (
+        f"VERSION 0.7\nFIELDS {' '.join(kind.names)}\nSIZE {sizes}\nTYPE F F F F U\nCOUNT 1 1 1 1 1\nWIDTH {n}\n"
+        f"HEIGHT 1\nVIEWPOINT 0.0 0.0 0.0 1.0 0.0 0.0 0.0\nPOINTS {n}\nDATA binary_compressed\n"
+    )
+    return header.encode() + struct.pack("<II", len(packed), len(data)) + packed
+
+
 INTRINSICS = np.array([[130.0, 0.0, 121.0], [0.0, 130.0, 60.0], [0.0, 0.0, 1.0]])
 
 
@@ -106,7 +138,7 @@ class Writer:
     """Collects tables and writes sensor files."""
 
     def __init__(self, root: Path) -> None:
-        self.root, self.tables = root, {}
+        self.root, self.tables, self.lidars = root, {}, ()
 
     def add(self, table: str, key: str, **fields: Any) -> str:
         self.tables.setdefault(table, []).append({"token": token(table, key), **fields})
@@ -121,9 +153,13 @@ class Writer:
                         rotation=matrix_to_quaternion(matrix[:3, :3]).tolist())  # fmt: skip
 
 
-def write_data_set(root: Path) -> None:
-    """Two scenes (train, val) of three key frames, ten radar sweeps between them, four cameras."""
+def write_data_set(root: Path, lidar: bool = False) -> None:
+    """Two scenes (train, val) of three key frames, ten radar sweeps between them, four cameras, perhaps two LiDARs.
+
+    Without LiDAR there are the records of the key frames of LIDAR_LEFT, which place the frames.
+    """
     writer = Writer(root)
+    writer.lidars = LIDAR_CHANNELS if lidar else ()
     add = writer.add
     for name in ATTRIBUTES:
         add("attribute", name, name=name, description="")
@@ -131,7 +167,7 @@ def write_data_set(root: Path) -> None:
         add("category", name, name=name, description="", index=index)
     for level in range(1, 5):
         add("visibility", level, level=level, description="")
-    for channel in (*CAMERAS, *RADARS, "LIDAR_LEFT"):
+    for channel in (*CAMERAS, *RADARS, *(writer.lidars or ("LIDAR_LEFT",))):
         matrix = mount(channel)
         sensor = add("sensor", channel, channel=channel, modality=channel.split("_")[0].lower())
         add("calibrated_sensor", channel, sensor_token=sensor, translation=matrix[:3, 3].tolist(),
@@ -161,12 +197,12 @@ def write_scene(writer: Writer, number: int, split: str) -> None:
                weather_annotation_token="")  # fmt: skip
     for step in range(-60, 115, 5):  # 100 Hz would be finer; 20 Hz keeps the fixture small
         writer.pose(base + step * 10_000)
-    for order, channel in enumerate((*CAMERAS, *RADARS, "LIDAR_LEFT")):
-        radar = channel in RADARS
+    for order, channel in enumerate((*CAMERAS, *RADARS, *(writer.lidars or ("LIDAR_LEFT",)))):
+        radar, swept = channel in RADARS, channel in writer.lidars
         # Radar key frames lie up to 7 ms beside the sample, the first one after it.
         shift = 0 if channel == "LIDAR_LEFT" else 19_000 - 3_000 * order
-        stamps = [base + 50_000 * j + shift for j in range(-10 if radar else 0, 21)]
-        stamps = [t for t in stamps if radar or (t - base - shift) % 500_000 == 0]
+        stamps = [base + 50_000 * j + shift for j in range(-10 if radar or swept else 0, 21)]
+        stamps = [t for t in stamps if radar or (t - base - shift) % (100_000 if swept else 500_000) == 0]
         tokens = ["", *(token("sample_data", channel, t) for t in stamps), ""]
         for j, stamp in enumerate(stamps):
             key = stamp >= base + shift and (stamp - base - shift) % 500_000 == 0
@@ -185,6 +221,8 @@ def write_file(writer: Writer, channel: str, stamp: int, key: bool, prev: str, f
         camera_image(1e-6 * stamp, channel).save(path, quality=95)
     elif channel in RADARS:
         path.write_bytes(pcd_bytes(radar_cloud(1e-6 * stamp, channel)))
+    elif channel in writer.lidars:
+        path.write_bytes(lidar_bytes(*lidar_cloud(stamp, channel)))
     writer.tables.setdefault("sample_data", []).append(
         {
             "token": token("sample_data", channel, stamp), "sample_token": token("sample", sample),

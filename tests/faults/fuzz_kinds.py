@@ -29,7 +29,7 @@ from src.data import jpeg
 from src.data.cache import load_index
 from src.data.evaluation_set import evaluation_set
 from src.data.images import read_image, width_fit
-from src.data.pcd import RADAR_FIELDS, read_radar_points
+from src.data.pcd import RADAR_FIELDS, read_lidar_points, read_radar_points
 from src.data.reader import FrameReader, OnBadFile
 from src.data.schema import CHANNELS, TABLES, DatasetIndex, build_index
 from src.data.splits import split_samples
@@ -45,8 +45,9 @@ from src.report.sweep_record import RunState, SweepRecord, read_record, write_re
 from src.sweep.compose import load_sweep
 from src.sweep.run_status import read_score, read_seconds, read_validations
 from src.training.run_folder import RunFolder
+from src.world.pcd_writer import LIDAR_TYPE, lidar_pcd
 from src.world.write import _read_stored
-from tests.data.tiny_set import VERSION, pcd_bytes, reader_settings, write_data_set
+from tests.data.tiny_set import VERSION, lidar_bytes, pcd_bytes, reader_settings, write_data_set
 from tests.faults.fuzzing import Kind
 from tests.faults.mutations import archive, changed_csv, changed_json, changed_yaml, damaged, either
 
@@ -124,6 +125,22 @@ def read_radar(path: Path, number: int) -> None:
     assert points.shape[1:] == (7,) and points.dtype == np.float32 and len(points) <= 1_000_000
     assert not np.isnan(points).any()
     check_finite(points, FURTHEST_M, "a point")
+
+
+def lidar_examples() -> list[bytes]:
+    """Compressed by a compressor, in runs of literals as the synthetic world's, and not at all."""
+    points = np.random.default_rng(0).normal(0, 20, (30, 4)).round().astype(np.float32)
+    times = 1_695_473_000_000_000 + np.arange(30)
+    table = np.rec.fromarrays([*points.T, times.astype(np.uint64)], dtype=LIDAR_TYPE)
+    plain = lidar_pcd(table).partition(b"_compressed\n")[0] + b"\n" + table.tobytes()
+    return [lidar_bytes(points, times), lidar_pcd(table), lidar_pcd(table[:0]), plain]
+
+
+def read_lidar(path: Path, number: int) -> None:
+    points, times = read_lidar_points(path)
+    assert points.shape[1:] == (4,) and points.dtype == np.float32 and len(points) == len(times) <= 1_000_000
+    assert times.dtype == np.int64 and ((times > 0) & (times < 1e17)).all()
+    check_finite(points, 20 * FURTHEST_M, "a point")
 
 
 # -------------------------------------------------------------------- tables
@@ -499,6 +516,7 @@ def kinds() -> list[Kind]:
     plain = [
         Kind(name="JPEG image", examples=jpeg_examples(), mutate=damaged, read=read_jpeg, place=lambda _: "image.jpg"),
         Kind(name="radar PCD", examples=radar_examples(), mutate=damaged, read=read_radar, place=lambda _: "radar.pcd"),
+        Kind(name="lidar PCD", examples=lidar_examples(), mutate=damaged, read=read_lidar, place=lambda _: "lidar.pcd"),
         *(table_kind(table) for table in TABLES),
         Kind(
             name="splits.json", examples=[(tiny_root() / "splits.json").read_bytes()], mutate=either(changed_json),

@@ -64,7 +64,7 @@ FORBIDDEN_CALLS = {
 }  # fmt: skip
 FORBIDDEN_MODULES = {"joblib", "shelve", "marshal", "dill", "cloudpickle", "hydra.utils", "torch.hub", "xmlrpc"}
 SAFE_LOADERS = {"_LOADER", "yaml.SafeLoader", "yaml.CSafeLoader"}
-PARCELS = "data/parcel.py"
+PACKED = "data/packed_batch.py"
 """Bytes between the processes of one training, through memory: multiprocessing itself pickles there."""
 
 
@@ -94,7 +94,7 @@ def offences(source, name):
             found.append("yaml.load with another loader")
         if keywords.get("shell", "False") != "False":
             found.append("a shell")
-    return [] if name == PARCELS and set(found) == {"pickle.Unpickler"} else found
+    return [] if name == PACKED and set(found) == {"pickle.Unpickler"} else found
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from src.errors import CheckpointError, ConfigError, DivergedError
 from src.models.horizon3d.model import Horizon3D
 from src.reliability.checkpoints import read_checkpoint
 from src.reliability.nonfinite import step_seed, write_dump
-from src.training.module import DetectionModule
+from src.training.module import TrainingModule
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = (
@@ -89,12 +89,12 @@ def spoil_a_point(batch):
 def test_training_continues_without_a_broken_radar_point(world, tmp_path, monkeypatch, phase):
     """One step of a whole command meets a point that is not a number; the step is replayed from what it left."""
 
-    def poisoned(self, batch, batch_idx, original=DetectionModule.training_step):
+    def poisoned(self, batch, batch_idx, original=TrainingModule.training_step):
         if self.trainer.global_step == 1:
             spoil_a_point(batch)
         return original(self, batch, batch_idx)
 
-    monkeypatch.setattr(DetectionModule, "training_step", poisoned)
+    monkeypatch.setattr(TrainingModule, "training_step", poisoned)
     overrides = [*SMALL, *PHASES[phase], f"data.root={world}", "phase.epochs=2"]
     with pytest.raises(DivergedError, match=r"step 1, epoch \d: loss terms .*nan.*run it again"):
         train.main([*overrides, f"paths.outputs={tmp_path / 'stopped'}"])
@@ -234,14 +234,14 @@ def steps(module, batches, bf16):
         module.zero_grad()
         torch.manual_seed(7 + number)
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            terms = module.model.loss(module.run(batch), batch)
+            terms = module.model.loss(module.run(batch), batch).terms
         terms["total"].backward()
         gradients = [p.new_zeros(p.shape) if p.grad is None else p.grad for p in module.model.parameters()]
         joined = torch.cat([gradient.flatten() for gradient in gradients])
         yield {name: float(value.detach()) for name, value in terms.items()}, joined.clone()
 
 
-MODELS = PHASES | {"peer": ("model=dense_bev", *PHASES["phase2"])}
+MODELS = PHASES | {"dense": ("model=dense_bev", *PHASES["phase2"])}
 
 
 @pytest.mark.parametrize("name", MODELS)

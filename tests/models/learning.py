@@ -5,7 +5,7 @@ import torch
 
 def train_step(model, batch):
     output = model(batch)[0]
-    terms = model.loss(output, batch)
+    terms = model.loss(output, batch).terms
     model.zero_grad()
     terms["total"].backward()
     return output, terms

@@ -22,7 +22,7 @@ def pose(x=0.0, y=0.0, yaw=0.0, origin=(0.0, 0.0), pitch=0.0):
 
 
 def bda(rotation=0.0, scale=1.0, flip_x=False, flip_y=False):
-    """aug_from_ego [4, 4] float32 as A = S R F (specification 9)."""
+    """aug_from_ego [4, 4] float32 as A = S R F (method 9)."""
     c, s = scale * math.cos(rotation), scale * math.sin(rotation)
     a, b = -1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0
     return torch.tensor([[c * a, -s * b, 0, 0], [s * a, c * b, 0, 0], [0, 0, scale, 0], [0, 0, 0, 1]])

@@ -6,18 +6,20 @@ import logging
 import math
 import os
 import re
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import nn
 
 from src.errors import CheckpointError, DivergedError, InterruptedRunError
+from src.models.detector import Objective
 from src.reliability import nonfinite
 from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
 from src.reliability.nonfinite import describe_gradients, finite_everywhere, gradient_norm, read_dump, write_dump
 from src.reliability.processes import build_strategy, is_main_process, process_group
 from src.training.fit import build_loggers, build_trainer, fit
-from src.training.module import DetectionModule
+from src.training.module import TrainingModule
 from src.training.run_folder import Resume, RunFolder
 from src.training.temporal_module import TemporalModule
 from tests.training.toys import STEPS, ToyData, toy_batch, toy_module
@@ -45,20 +47,19 @@ class Faulty(TemporalModule):
         super().on_train_batch_start(batch, batch_idx)
         self.states.append(self.everything())
 
-    def training_step(self, batch, batch_idx):
-        total = super().training_step(batch, batch_idx)
+    def objective(self, batch):
+        terms, diagnostics = super().objective(batch)
         if self.trainer.global_step in self.bad_steps:
             bias = self.model.layer.bias
             if self.fault == "weight":  # a term that explodes
-                self._step[1].update(near=self._step[1]["near"] * 1e39, total=total.detach() * 1e39)
-                return total * 1e39
+                terms |= {name: terms[name] * 1e39 for name in ("near", "total")}
             if self.fault == "constant":  # infinite, with gradients that know nothing of it
-                self._step[1].update(total=total.detach() + math.inf)
+                terms["total"] = terms["total"] + math.inf
             if self.fault == "gradient":  # the root of zero: nothing is added to the loss, its derivative is infinite
-                return total + (bias - bias.detach()).sqrt().sum()
+                terms["total"] = terms["total"] + (bias - bias.detach()).sqrt().sum()
             if self.fault == "overflow":  # every gradient is finite, the sum of their squares is not
-                return total + 1e30 * (bias - bias.detach()).sum()
-        return total
+                terms["total"] = terms["total"] + 1e30 * (bias - bias.detach()).sum()
+        return Objective(terms, diagnostics)
 
     def on_train_batch_end(self, outputs, batch, batch_idx):
         self.states.append(self.everything())
@@ -77,8 +78,9 @@ def train(path, fault=None, bad_steps=(BAD_STEP,), skip=True, stop_after=None, e
     module.guard.skip = skip
     resume_from = folder.newest_checkpoint()
     trainer = build_trainer(
-        folder, epochs=EPOCHS, validate_every=1, precision="32-true", accelerator="cpu", devices=ranks,
-        log_every_steps=1, ema_decay=None, checkpoint_every_steps=every_steps, strategy=build_strategy("cpu", ranks),
+        folder, epochs=EPOCHS, validate_every=1, monitor="val/mAP", precision="32-true", accelerator="cpu",
+        devices=ranks, log_every_steps=1, ema_decay=None, checkpoint_every_steps=every_steps,
+        strategy=build_strategy("cpu", ranks),
         loggers=build_loggers(folder, resume_from, None) if is_main_process() else [],
     )  # fmt: skip
     trainer.progress_bar_callback.disable()
@@ -147,7 +149,7 @@ def test_the_dump_holds_the_step(tmp_path, fault):
     again.model.load_state_dict(weights)
     again.restore_rank({"means": {}, "memories": step["memories"]})
     torch.manual_seed(step["seed"])
-    terms = again.model.loss(again.train().run(batch), batch)
+    terms = again.model.loss(again.train().run(batch), batch).terms
     if fault == "gradient":  # the loss that was reported is the loss of the same memory and dropout
         assert f"{float(terms['total'].detach()):.4g}" in step["found"]
     assert torch.isfinite(terms["total"]) == (fault != "point")
@@ -158,7 +160,7 @@ def test_a_skipped_step_leaves_nothing_behind(tmp_path, fault, caplog):
     with caplog.at_level(logging.WARNING):
         module, folder, error = train(tmp_path / "run", fault)
     assert error is None and module.guard.skipped_steps == 1 and module.guard.in_a_row == 0
-    assert "passed over (1 so far): step 4, epoch 1" in caplog.text
+    assert "skipped (1 so far): step 4, epoch 1" in caplog.text
     for step in range(EPOCHS * STEPS):
         before, after = module.states[2 * step : 2 * step + 2]
         assert same(before, after) == (step == BAD_STEP), step
@@ -191,7 +193,7 @@ def test_streams_begin_anew_after_a_skipped_step():
 
 
 def test_training_gives_up_after_too_many_in_a_row(tmp_path, monkeypatch):
-    monkeypatch.setattr("src.training.module.MAX_IN_A_ROW", 2)
+    monkeypatch.setattr("src.reliability.nonfinite.MAX_IN_A_ROW", 2)
     module, folder, error = train(tmp_path / "alternating", "point", bad_steps=(0, 1, 3, 4))
     assert error is None and module.guard.skipped_steps == 4
     assert dumps(folder) == ["nonfinite-step000000-rank0.pt", "nonfinite-step000003-rank0.pt"]  # the first of each row
@@ -235,6 +237,22 @@ def test_a_disk_that_refuses_the_dump_does_not_hide_the_fault(tmp_path, monkeypa
     assert "no space left" in caplog.text and not dumps(folder)
 
 
+def test_a_dump_keeps_lidar_and_future_frames(tmp_path):
+    def cloud(count):
+        points, owners = torch.randn(count, 5), torch.arange(count) % 2
+        return {"lidar_points": points, "lidar_batch": owners.sort()[0], "lidar_origins": torch.randn(count, 3)}
+
+    bare = replace(toy_batch([3, 7], [True, False]), radar_points=None, radar_batch=None)
+    future = replace(bare, streams=None, starts=None, **cloud(3))
+    batch = replace(bare, **cloud(4), future=(future, replace(future, **cloud(0))))
+    named = {"global_step": 1, "rank": 0, "epoch": 0, "world_size": 1, "seed": 1, "memories": [], "found": ""}
+    _, found = read_dump(write_dump(tmp_path, toy_module().model, {}, batch, **named))
+    assert found.radar_points is None and [len(frame.lidar_points) for frame in found.future] == [3, 0]
+    for one, other in ((found, batch), (found.future[0], future)):
+        for name in ("lidar_points", "lidar_batch", "lidar_origins", "global_from_ego"):
+            assert torch.equal(getattr(one, name), getattr(other, name))
+
+
 def test_other_files_are_no_dumps(tmp_path):
     path = tmp_path / "last.ckpt"
     content = {"state_dict": {"model.a": torch.zeros(1)}, "horizon3d": {"config": {}}}
@@ -262,13 +280,12 @@ def test_clipping_is_that_of_torch():
     for model in models:
         (100 * model(x)).square().sum().backward()
     expected = torch.nn.utils.clip_grad_norm_(models[0].parameters(), 35.0)
-    module = toy_module(DetectionModule)
+    module = toy_module(TrainingModule)
     module.model = models[1]
-    module._step = (toy_batch([0, 1], [True] * 2), {"total": torch.tensor(1.0)}, {})
-    module.configure_gradient_clipping(None)
+    module.clip_gradients_or_skip(toy_batch([0, 1], [True] * 2), Objective({"total": torch.tensor(1.0)}, {}))
     for one, other in zip(models[0].parameters(), models[1].parameters(), strict=True):
         assert torch.equal(one.grad, other.grad)
-    assert float(module._mean("state/gradient_norm").compute()) == float(expected) > 35.0
+    assert float(module.means.compute()["state/gradient_norm"]) == float(expected) > 35.0
 
 
 def test_parameters_are_named():

@@ -14,7 +14,7 @@ NO_VELOCITY = [
     "model.dptf.gaussian_path.velocity_compensation=false",
     "model.dptf.bev_path.velocity_compensation=false",
 ]
-FURTHER = ["phase=phase1", "phase.init_from=phase1", "phase.velocity_code_weight=1.0"]
+FURTHER = ["phase=phase1", "phase.init_from=phase1", "phase.options.velocity_code_weight=1.0"]
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def test_phase_2_is_held_against_phase_1(both_phases, report, tmp_path):
     assert "| 2 | +5.0 ± 0.0 |" in gain["phase 1, as many further epochs"]
     fast = rows(text, "| phase 2 over | seeds | mAVE 0-0.5 m/s |")["phase 2, no velocity compensation"]
     assert fast.endswith("| -0.03 ± 0.00 |")
-    for command in ("phase=phase1 scale=mini phase.init_from=phase1 phase.velocity_code_weight=1.0 seed=1",
+    for command in ("phase=phase1 scale=mini phase.init_from=phase1 phase.options.velocity_code_weight=1.0 seed=1",
                     "phase=phase2 scale=mini seed=0"):  # fmt: skip
         assert f"python -m src.train {command}\n" in text
     assert Image.open(tmp_path / "reports" / "pictures" / "phase2_mini.png").width == 1600
@@ -84,7 +84,7 @@ def test_further_epochs_must_be_as_many(both_phases, write_run, report):
     write_run("weight", ["phase.init_from=phase1"], 0, 0.3)
     summary = rows(report("phase2"), "| experiment | mAP | NDS | mAVE, m/s |")
     assert [name for name in summary if "further" in name] == [
-        "phase 1, as many further epochs (`phase.init_from=phase1 phase.velocity_code_weight=1.0`)",
+        "phase 1, as many further epochs (`phase.init_from=phase1 phase.options.velocity_code_weight=1.0`)",
         "phase 1, as many further epochs (`phase.init_from=phase1`)",
         "phase 1, 9 further epochs",
     ]
@@ -161,7 +161,7 @@ def test_what_is_broken_is_named_after_the_rest(both_phases, write_run, tmp_path
     with pytest.raises(DataError) as raised:
         report("phase2")
     assert raised.value.exit_code == 4
-    for name in ("broken/metrics.json", "horizon3d-phase1-mini-old.json: format must be 1", "torn_mini.json"):
+    for name in ("broken/metrics.json", "horizon3d-phase1-mini-old.json: format must be", "torn_mini.json"):
         assert name in str(raised.value)
     assert "phase 2" in (reports / "phase2_mini.md").read_text()
 

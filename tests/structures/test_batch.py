@@ -25,6 +25,38 @@ def batch(**changes):
     return FrameBatch(**(values | changes))
 
 
+LIDAR = {
+    "lidar_points": torch.arange(25.0).reshape(5, 5),
+    "lidar_batch": torch.tensor([0, 1, 1, 2, 2]),
+    "lidar_origins": torch.arange(15.0).reshape(5, 3),
+}
+NO_RADAR = {"radar_points": None, "radar_batch": None}
+NO_CAMERA = {"images": None, "image_valid": None, "pix_from_aug": None}
+
+
+def test_every_sensor_may_be_missing():
+    alone = batch(**NO_RADAR, **NO_CAMERA, **LIDAR)
+    assert len(alone) == 3 and alone.radar_points is None and alone.images is None and alone.device.type == "cpu"
+    assert batch(**NO_RADAR).to("cpu").images is not None
+    assert len(batch(**NO_RADAR, **NO_CAMERA)) == 3
+    assert batch(**(LIDAR | {"lidar_origins": None})).lidar_origins is None
+
+
+def test_future_frames_move_with_the_batch_and_have_its_length():
+    future = batch(**NO_RADAR, **NO_CAMERA, **LIDAR, boxes=None)
+    present = batch(future=(future, future))
+    moved = present.to("meta")
+    assert [frame.device.type for frame in moved.future] == ["meta", "meta"]
+    assert moved.future[1].lidar_points.is_meta and moved.future[1].lidar_origins.shape == (5, 3)
+    assert present.future[0] is future
+    with pytest.raises(ValueError, match="FrameBatch.future must hold batches of 3, but got .3, 1."):
+        one = batch(
+            tokens=["a"], timestamps_s=torch.zeros(1, dtype=torch.float64), aug_from_ego=torch.eye(4)[None],
+            global_from_ego=torch.eye(4, dtype=torch.float64)[None], boxes=None, **NO_RADAR, **NO_CAMERA,
+        )  # fmt: skip
+        batch(future=(future, one))
+
+
 def test_a_sample_may_lack_points_boxes_and_images():
     assert len(batch()) == 3
     bare = batch(images=None, image_valid=None, pix_from_aug=None, boxes=None)
@@ -44,6 +76,15 @@ def test_a_sample_may_lack_points_boxes_and_images():
         ("radar_batch", torch.tensor([0, 2, 0, 2])),
         ("radar_batch", torch.tensor([0, 0, 2, 3])),
         ("radar_batch", torch.tensor([-1, 0, 0, 2])),
+        ("radar_batch", None),
+        ("radar_points", None),
+        ("lidar_points", torch.zeros(5, 4)),
+        ("lidar_points", torch.zeros(5, 5, dtype=torch.float64)),
+        ("lidar_points", None),
+        ("lidar_batch", None),
+        ("lidar_batch", torch.tensor([0, 1, 0, 2, 2])),
+        ("lidar_batch", torch.tensor([0, 1, 1, 2, 3])),
+        ("lidar_origins", torch.zeros(4, 3)),
         ("images", torch.zeros(3, 4, 3, 8, 16)),
         ("images", torch.zeros(2, 4, 3, 8, 16, dtype=torch.uint8)),
         ("image_valid", None),
@@ -59,8 +100,9 @@ def test_a_sample_may_lack_points_boxes_and_images():
 )
 def test_what_does_not_fit_is_named(name, value):
     streamed = {"streams": torch.arange(3), "starts": torch.zeros(3, dtype=torch.bool)} if name in STREAM else {}
+    lidar = LIDAR if name.startswith("lidar") else {}
     with pytest.raises(ValueError, match=f"FrameBatch.{name} must"):
-        batch(**streamed | {name: value})
+        batch(**streamed | lidar | {name: value})
 
 
 @pytest.mark.parametrize("given", STREAM)
@@ -73,6 +115,7 @@ def test_streams_and_starts_belong_together(given):
 
 def test_moving_keeps_every_value():
     original = batch(
+        **LIDAR,
         skipped={"RADAR_LEFT_SIDE": 2},
         streams=torch.tensor([4, 0, 9]),
         starts=torch.tensor([True, False, True]),
@@ -88,6 +131,7 @@ def test_moving_keeps_every_value():
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_page_locked():
-    pinned = batch().pin_memory()
+    pinned = batch(**LIDAR, future=(batch(**LIDAR),)).pin_memory()
     assert pinned.radar_points.is_pinned() and pinned.boxes[0].centers.is_pinned()
+    assert pinned.lidar_origins.is_pinned() and pinned.future[0].lidar_points.is_pinned()
     assert torch.equal(pinned.to("cuda", non_blocking=True).radar_points.cpu(), batch().radar_points)

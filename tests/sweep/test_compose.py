@@ -78,16 +78,22 @@ def test_a_misplaced_password_is_refused_and_not_shown(sweeps, override):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (GOOD + "titel: x\n", r"titel: Key 'titel' not in 'SweepConfig' \| did you mean title"),
+        (GOOD + "titel: x\n", r"titel is not a known key; did you mean title\?"),
         ("title: t\nquestion: q\nrows: [{label: a, overide: [x]}]\n", r"did you mean overrides"),
         ("title: t\nquestion: q\nrows: [{label: a}, {label: a}]\n", "label a stands more than once"),
         (
             "title: t\nquestion: q\nrows: [{label: a, paper: {mAPP: 3}}]\n",
             "row 'a', paper: mAPP is not a metric; did you",
         ),
-        ("title: t\nquestion: q\nrows: [{label: a, paper: {mAP: .nan}}]\n", "mAP=nan is not a finite number"),
-        ("title: t\nquestion: q\nrows: [{label: a, x: abc}]\n", "x: Value 'abc' of type 'str'"),
-        ("title: t\nquestion: q\nrows: [{label: off}]\n", "YAML reads a label as False"),
+        (
+            "title: t\nquestion: q\nrows: [{label: a, paper: {mAP: .nan}}]\n",
+            r"rows\.0\.paper\.mAP must be a finite number, but is nan",
+        ),
+        ("title: t\nquestion: q\nrows: [{label: a, x: abc}]\n", r"rows\.0\.x must be a valid number, but is 'abc'"),
+        (
+            "title: t\nquestion: q\nrows: [{label: off}]\n",
+            r"rows\.0\.label must be a valid string, but is False; write on, off, yes and no in quotes",
+        ),
         (GOOD.replace("label: a", "label: a, scales: [papr]"), "no scale papr; there are debug, mini, paper"),
         (GOOD.replace("label: a", "label: a, overrides: [seed=3]"), "seed=... is no part of a sweep"),
         (GOOD + "overrides: [+seed=3]\n", "seed=... is no part of a sweep"),
@@ -95,14 +101,14 @@ def test_a_misplaced_password_is_refused_and_not_shown(sweeps, override):
         (GOOD + "tables: [{name: t, title: T, columns: []}]\n", "table t: columns is empty"),
         (GOOD + "tables: [{name: a/b, title: T, columns: [mAP]}]\n", "name 'a/b' must be of letters"),
         (GOOD + "tables: [{name: ../b, title: T, columns: [mAP]}]\n", "name '../b' must be of letters"),
-        (GOOD.replace("label: a", "label: '${title}'"), r"rows.0.label: must not lock \$\{"),
-        ("title: t ${x}\nquestion: q\nrows: [{label: a}]\n", r"title: must not lock \$\{"),
+        (GOOD.replace("label: a", "label: '${title}'"), r"rows.0.label: must not hold \$\{"),
+        ("title: t ${x}\nquestion: q\nrows: [{label: a}]\n", r"title: must not hold \$\{"),
         ("title: t\nquestion: q\nrows: []\n", "give either rows or space"),
         ("title: t\nquestion: q\nrows: [{label: a\n", "while parsing"),
         ("title: t\nquestion: q\nspace: {optim.lr: {low: 3, high: 2}}\n", "low must be below high"),
         ("title: t\nquestion: q\nspace: {optim.lr: {low: 1, high: 2}}\n", "trials must be at least 1"),
         ("", "title"),
-        ("- a\n", "ListConfig"),
+        ("- a\n", r"the file must be an object, but is \['a'\]"),
     ],
 )
 def test_bad_files_are_named(sweeps, content, said):

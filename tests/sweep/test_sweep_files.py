@@ -267,7 +267,7 @@ def test_what_the_mistakes_are_made_from_is_right(written):
         (GOOD | {"rows": [{"label": "a", "override": []}]}, "override"),
         (GOOD | {"rows": [{"overrides": []}]}, "label"),
         (GOOD | {"rows": [{"label": "a", "paper": {"mAP": "much"}}]}, "much"),
-        (GOOD | {"rows": [{"label": "a", "paper": {"mAP": float("nan")}}]}, "row 'a': mAP=nan is not a finite"),
+        (GOOD | {"rows": [{"label": "a", "paper": {"mAP": float("nan")}}]}, "mAP must be a valid number, but is 'NaN'"),
         (GOOD | {"baseline": "c"}, r"baseline 'c' is not the label of a row \(a, b\)"),
         (GOOD | {"rows": [{"label": "a"}, {"label": "b", "baseline": "c"}]}, "baseline 'c' is not the label"),
         (GOOD | {"rows": [{"label": "a", "scales": ["paper"]}]}, "baseline 'a' must be for every scale"),

@@ -17,12 +17,13 @@ from torch.utils.data import DataLoader
 from src.benchmark.suite_metric import random_problem
 from src.data.datamodule import collate, in_stream
 from src.errors import InterruptedRunError
-from src.metrics.detection import DetectionMetric, score_detections
+from src.metrics.detection import score_detections
 from src.models.horizon3d.kggi import Initialization
 from src.reliability.processes import SharedBuffers, build_strategy, is_main_process, process_group
 from src.structures.detections import DetectionTable, EvaluationSet
+from src.training.evaluator import DetectionEvaluator
 from src.training.fit import build_loggers, build_trainer, fit
-from src.training.module import DetectionModule
+from src.training.module import TrainingModule
 from src.training.optim import OptimConfig
 from src.training.run_folder import Resume, RunFolder
 from src.training.temporal_module import TemporalModule
@@ -72,13 +73,15 @@ class Module(TemporalModule):
         if self.eval_norms:
             self.model.eval()
 
-    def training_step(self, batch, batch_idx):
-        total = super().training_step(batch, batch_idx)
-        self.totals = [*self.totals, float(total.detach())]
-        return total
+    def objective(self, batch):
+        objective = super().objective(batch)
+        self.totals = [*self.totals, float(objective.terms["total"].detach())]
+        return objective
 
     def configure_optimizers(self):
-        return torch.optim.SGD(self.model.parameters(), lr=1e-3)
+        optimizer = torch.optim.SGD(self.model.parameters(), lr=1e-3)
+        constant = torch.optim.lr_scheduler.ConstantLR(optimizer, factor=1.0)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": constant, "interval": "step"}}
 
 
 def become(rank, world_size, port):
@@ -98,7 +101,7 @@ def work_as(rank, port, world_size, work):
         betas=[0.9, 0.99], cycled_beta1=None, ema_decay=None,
     )  # fmt: skip
     # Tensors travel to a process as shared memory, in which the other would see them trained.
-    module = Module(copy.deepcopy(work.model), optim, 1.0, work.truth, 0, {})
+    module = Module(copy.deepcopy(work.model), optim, 1.0, DetectionEvaluator(work.truth), 0, {})
     module.eval_norms = work.eval_norms
     streams = (FIRST_RANK, SECOND_RANK)[rank] if world_size > 1 else range(STREAMS)
     train = [collate([frames[stream] for stream in streams]) for frames in work.train]
@@ -117,7 +120,7 @@ def work_as(rank, port, world_size, work):
     result = {
         "totals": module.totals,
         "state": module.model.state_dict(),
-        "detections": {name: torch.from_numpy(getattr(module.detections, name)) for name in COLUMNS},
+        "detections": {name: torch.from_numpy(getattr(module.evaluator.detections, name)) for name in COLUMNS},
     }
     torch.save(result, work.folder / f"{world_size}-{rank}.pt")
 
@@ -159,6 +162,8 @@ def work(make_model, frames, tmp_path):
     with torch.no_grad():
         for parameter in model.parameters():  # what starts at zero would hide the parts behind it
             parameter += 0.03 * torch.randn(parameter.shape, generator=generator)
+        for head in (model.kggi.objectness, model.kggi.camera_head.keypoint):
+            head[-1].weight *= 20.0  # scores so far apart that rounding never changes which keypoints are the best
     nothing = {"points": 0, "cameras": False}  # no keypoint, hence no Gaussian at all
     lacking = [
         {stream: {"boxes": 0} for stream in SECOND_RANK},
@@ -248,7 +253,7 @@ STOP_AT = TOY_STEPS + 1  # in the middle of the second epoch
 PROBLEM = 7, 20, 40, 3  # samples, which two ranks share as five and two; annotations, boxes, seed
 
 
-class Single(DetectionModule):
+class Single(TrainingModule):
     """Trains on single frames, stops where asked to, and validates with boxes that are given."""
 
     stop_at = None
@@ -261,7 +266,7 @@ class Single(DetectionModule):
     def validation_step(self, batch, batch_idx):
         evaluation_set, boxes = random_problem(*PROBLEM)
         sample = int(batch.tokens[0].split()[1])
-        self.metric.update([evaluation_set.tokens[sample]], boxes[boxes.samples == sample])
+        self.evaluator.metric.update([evaluation_set.tokens[sample]], boxes[boxes.samples == sample])
 
 
 class Shared:
@@ -298,10 +303,10 @@ def train_single(path, world_size, stop_at=None):
     resume_from = folder.newest_checkpoint()
     module = toy_module(Single)
     module.model.dropout.p = 0.0  # its draws are a rank's own
-    module.metric, module.stop_at = DetectionMetric(random_problem(*PROBLEM)[0]), stop_at
+    module.evaluator, module.stop_at = DetectionEvaluator(random_problem(*PROBLEM)[0]), stop_at
     trainer = build_trainer(
-        folder, epochs=3, validate_every=1, precision="32-true", accelerator="cpu", devices=world_size,
-        log_every_steps=1, ema_decay=None, strategy=build_strategy("cpu", world_size),
+        folder, epochs=3, validate_every=1, monitor="val/mAP", precision="32-true", accelerator="cpu",
+        devices=world_size, log_every_steps=1, ema_decay=None, strategy=build_strategy("cpu", world_size),
         loggers=build_loggers(folder, resume_from, None) if is_main_process() else [],
     )  # fmt: skip
     trainer.progress_bar_callback.disable()
@@ -312,7 +317,7 @@ def train_single(path, world_size, stop_at=None):
     finally:
         if is_main_process():
             folder._release()
-    return module.scores and module.scores.as_dict()
+    return module.evaluator.scores and module.evaluator.as_dict()
 
 
 def go_on_as(rank, port, world_size, folder):

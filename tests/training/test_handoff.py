@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -25,12 +26,15 @@ from src.errors import (
     HorizonError,
     InterruptedRunError,
 )
+from src.models.horizon3d.model import Horizon3DConfig
 from src.reliability.checkpoints import open_checkpoint
 from src.training import handoff
-from src.training.handoff import MAY_BE_NEW, find_source, hand_over, train_source
+from src.training.handoff import find_source, hand_over, train_source
 from src.training.identity import run_identity
 from src.training.run_folder import RunFolder
 from tests.untrained import write_checkpoint
+
+ADDED = re.compile(Horizon3DConfig.new_in_temporal_phase)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -69,7 +73,7 @@ def test_phase_1_starts_from_fresh_weights():
         [],
         ["model.dptf.max_age_s=0.55"],
         ["model.dptf.bev_path=null"],
-        ["phase.epochs=7", "phase.velocity_code_weight=0.5", "phase.train_missing=false"],
+        ["phase.epochs=7", "phase.options.velocity_code_weight=0.5", "phase.train_missing=false"],
         ["data.groups_per_scene=1"],
         ["model.loss.cell_focal_weight=null", "model.loss.dptf_weight=2", "model.loss.gaussian_velocity_weight=1"],
         ["resume=restart"],
@@ -285,9 +289,9 @@ def test_every_weight_of_phase_1_arrives_and_what_is_new_keeps_its_own(phase_1, 
         expected = before[key] if f"model.{key}" not in given else given[f"model.{key}"]
         assert torch.equal(value, expected), key
     new = [key for key in after if f"model.{key}" not in given]
-    assert new and all(MAY_BE_NEW.match(key) for key in new) and f"new: {len(new)} tensors in dptf" in caplog.text
+    assert new and all(ADDED.match(key) for key in new) and f"new: {len(new)} tensors in dptf" in caplog.text
     assert len(after) - len(new) == len(given)
-    assert not [key for key in given if MAY_BE_NEW.match(key.removeprefix("model."))]  # none of phase 1 may be missing
+    assert not [key for key in given if ADDED.match(key.removeprefix("model."))]  # none of phase 1 may be missing
 
 
 def test_step_0_without_memory_is_phase_1(phase_1):

@@ -59,7 +59,7 @@ def test_ten_frames_are_overfitted(ten_frames):
     random = torch.Generator().manual_seed(0)
     for _ in range(EPOCHS):
         for batch in batches(frames, torch.randperm(len(frames), generator=random)):
-            terms = module.model.loss(module.run(batch), batch)
+            terms = module.model.loss(module.run(batch), batch).terms
             optimizer.zero_grad()
             terms["total"].backward()
             torch.nn.utils.clip_grad_norm_(module.model.parameters(), 35.0)

@@ -13,12 +13,13 @@ import torch
 from torch import nn
 
 from src.geometry.bev_grid import BEVGrid
-from src.models.detector import Detector
+from src.models.detector import Detector, Objective
 from src.models.horizon3d.bev_path import BEVPathConfig, WarpedCells
-from src.models.horizon3d.dptf import DPTFConfig, DPTFOutput
+from src.models.horizon3d.dptf import DPTFConfig, DPTFOutput, warped_evidence
 from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
+from src.structures.evidence import Evidence
 from src.structures.gaussians import GaussianSet
 from src.training.snapshots import draw_frames, memory_of, scene_of
 
@@ -96,11 +97,18 @@ class Recorder(Detector):
         history, cells = recollection(True) if memory else (None, None)
         return Output(DPTFOutput(history, cells, None, None)), [*(memory or []), batch.tokens[0]]
 
-    def loss(self, output: Any, batch: FrameBatch) -> dict[str, torch.Tensor]:
+    def loss(self, output: Any, batch: FrameBatch) -> Objective:
         raise NotImplementedError
+
+    def evidence(self, output: Output) -> Evidence:
+        return evidence_of(self.config.dptf, output.dptf)
 
     def decode(self, output: Any) -> list[Boxes3D]:
         return [Boxes3D.empty()]
+
+
+def evidence_of(settings: DPTFConfig | None, dptf: DPTFOutput | None) -> Evidence:
+    return Evidence(**warped_evidence(settings, dptf)) if settings is not None and dptf is not None else Evidence()
 
 
 def config(bev: bool = True, gaussians: bool = True, compensated: bool = True) -> DPTFConfig:
@@ -139,9 +147,8 @@ def test_a_model_without_memory_gives_the_frame_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize("compensated", [True, False])
 def test_both_places_whichever_the_model_used(compensated: bool) -> None:
     history, cells = recollection(compensated)
-    output = Output(DPTFOutput(history, cells, None, None))
-    scene = scene_of(frame(0), Boxes3D.empty(), output, GRID)
-    shown = memory_of(Recorder(config(compensated=compensated)), output, scene)
+    evidence = evidence_of(config(compensated=compensated), DPTFOutput(history, cells, None, None))
+    shown = memory_of(evidence, scene_of(frame(0), Boxes3D.empty(), evidence, GRID))
     assert len(shown.ground_truth) == 1
     for memory in (shown.gaussians, shown.cells):
         assert len(memory) == 1  # padding is not shown
@@ -152,11 +159,15 @@ def test_both_places_whichever_the_model_used(compensated: bool) -> None:
 
 def test_paths_that_are_off_or_have_nothing_yet() -> None:
     history, cells = recollection(True)
-    scene = scene_of(frame(0), Boxes3D.empty(), Output(None), GRID)
-    no_cells = memory_of(Recorder(config(bev=False)), Output(DPTFOutput(history, None, None, None)), scene)
+    scene = scene_of(frame(0), Boxes3D.empty(), Evidence(), GRID)
+
+    def shown(settings: DPTFConfig | None, history: GaussianSet | None, cells: WarpedCells | None) -> Any:
+        return memory_of(evidence_of(settings, DPTFOutput(history, cells, None, None)), scene)
+
+    no_cells = shown(config(bev=False), history, None)
     assert no_cells.cells is None and len(no_cells.gaussians) == 1
-    no_history = memory_of(Recorder(config(gaussians=False)), Output(DPTFOutput(None, cells, None, None)), scene)
+    no_history = shown(config(gaussians=False), None, cells)
     assert no_history.gaussians is None and len(no_history.cells) == 1
-    first = memory_of(Recorder(config()), Output(DPTFOutput(None, None, None, None)), scene)
+    first = shown(config(), None, None)
     assert len(first.gaussians) == 0 and len(first.cells) == 0
-    assert memory_of(Recorder(None), Output(None), scene) is None
+    assert shown(None, history, cells) is None

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from src.models.detector import Detector
-from src.training.module import DetectionModule
+from src.training.module import TrainingModule
 from tests.training.toys import toy_batch, toy_module
 
 
@@ -76,7 +76,7 @@ def test_batches_without_streams_are_refused(module):
 
 
 def test_single_frames_have_no_memory():
-    module = toy_module(DetectionModule).eval()
+    module = toy_module(TrainingModule).eval()
     batch = toy_batch([0, 1], [False, False])
     assert torch.equal(module.run(batch), module.run(batch))
     assert "memories" not in module.rank_state()
@@ -90,7 +90,7 @@ def test_memory_ends_between_training_and_validation(module):
 
 
 def test_state_is_restored_for_the_same_streams(module, tmp_path):
-    module._mean("loss/near").update(0.1, 3)
+    module.means.update("loss/near", 0.1, 3)
     torch.save(module.rank_state(), tmp_path / "state")
     other = toy_module(seed=0).eval()
     other.restore_rank(torch.load(tmp_path / "state", weights_only=True))

@@ -8,10 +8,11 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader, Sampler
 
-from src.models.detector import Detector
+from src.models.detector import Detector, Objective
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable, EvaluationSet
+from src.training.evaluator import DetectionEvaluator
 from src.training.optim import OptimConfig
 from src.training.temporal_module import TemporalModule
 
@@ -52,13 +53,11 @@ class ToyDetector(Detector):
 
     def loss(self, output, batch):
         terms = {"near": (output - 1.0).square().mean(), "small": output.abs().mean()}
-        return terms | {"total": terms["near"] + terms["small"]}
+        diagnostics = {"spread": output.detach().std()}
+        return Objective(terms | {"total": terms["near"] + terms["small"]}, diagnostics)
 
     def decode(self, output):
         return [Boxes3D.empty() for _ in output]
-
-    def diagnostics(self, output):
-        return {"spread": output.detach().std()}
 
 
 def toy_batch(streams, starts, number=0):
@@ -138,7 +137,7 @@ def toy_module(module_class=TemporalModule, seed=0):
         ToyDetector(),
         optim=optim,
         backbone_lr_multiplier=1.0,
-        evaluation_set=toy_evaluation_set(),
+        evaluator=DetectionEvaluator(toy_evaluation_set()),
         seed=seed,
         config={"model": {"name": "toy"}},
     )

@@ -129,6 +129,7 @@ def test_places_outside_every_image_have_no_visibility():
         ("returns_density", -1.0),
         ("doppler_noise_mps", float("nan")),
         ("radar_sweeps_per_key_frame", 11),
+        ("lidar_sweeps_per_key_frame", 6),
         ("image_width_px", 8),
         ("jpeg_quality", 100),
     ],

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from src.errors import ConfigError, DataError
-from src.structures.taxonomy import CAMERAS, CATEGORY_TO_CLASS, CLASSES, RADARS
+from src.structures.taxonomy import CAMERAS, CATEGORY_TO_CLASS, CLASSES, LIDARS, RADARS
 from src.world import write
 from src.world.scene_writer import SceneWriter
 from src.world.simulate import make_scene
@@ -247,3 +247,34 @@ def test_camera_sweeps_fill_the_time_between_key_frames(tmp_path, make_config, s
     rows = [row for row in world["sample_data"] if world.channel(row) == CAMERAS[0]]
     assert [row["is_key_frame"] for row in rows] == [False, False, False, False, True] * 2
     np.testing.assert_allclose(np.diff([row["timestamp"] for row in rows]) * 1e-6, 0.1, atol=0.02)
+
+
+def test_lidar_sweeps_are_a_tenth_of_a_second_apart(make_config, stored_world, tmp_path):
+    changes = {"num_train_scenes": 1, "num_val_scenes": 0, "key_frames_per_scene": 2, "radar_sweeps_per_key_frame": 1}
+    config = make_config(**changes, lidar=True, lidar_sweeps_per_key_frame=5, lidar_step_deg=4.0)
+    world = stored_world(write_world(config, tmp_path / "lidar", progress=False))
+    chains = defaultdict(list)
+    for row in world["sample_data"]:
+        if world.channel(row) in LIDARS:
+            chains[world.channel(row)].append(row)
+            folder = "samples" if row["is_key_frame"] else "sweeps"
+            assert row["filename"].startswith(folder) and (world.root / row["filename"]).is_file()
+    assert sorted(chains) == sorted(LIDARS)
+    for rows in chains.values():
+        rows.sort(key=lambda row: row["timestamp"])
+        assert [row["is_key_frame"] for row in rows] == 2 * [False, False, False, False, True]
+        assert [row["prev"] for row in rows] == ["", *(row["token"] for row in rows[:-1])]
+        np.testing.assert_allclose(np.diff([row["timestamp"] for row in rows]), 100_000, atol=5_000)
+        assert all(row["width"] > 50 for row in rows)
+    alone = make_config(**changes, lidar=True, lidar_step_deg=4.0)
+    keys = stored_world(write_world(alone, tmp_path / "keys", progress=False))
+    assert not any((keys.root / "sweeps").glob("LIDAR*")) and len(keys["sample"]) == 2
+
+
+def test_lidar_does_not_change_what_other_sensors_see(make_config, tmp_path):
+    changes = {"num_train_scenes": 1, "num_val_scenes": 0, "key_frames_per_scene": 1, "radar_sweeps_per_key_frame": 1}
+    with_lidar = write_world(make_config(**changes, lidar=True, lidar_step_deg=8.0), tmp_path / "a", progress=False)
+    without = write_world(make_config(**changes), tmp_path / "b", progress=False)
+    seen = [{name: made for name, made in fingerprint(root).items() if "CAMERA" in name or "RADAR" in name}
+            for root in (with_lidar, without)]  # fmt: skip
+    assert seen[0] == seen[1] and len(seen[0]) == 10

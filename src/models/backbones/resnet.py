@@ -10,6 +10,7 @@ class BasicBlock(nn.Module):
     """Two 3x3 convolutions around an identity (He et al. 2016, Fig. 5 left)."""
 
     expansion = 1
+    norm_pairs = (("conv1", "bn1"), ("conv2", "bn2"))
 
     def __init__(self, in_channels: int, width: int, stride: int) -> None:
         super().__init__()
@@ -32,6 +33,7 @@ class Bottleneck(nn.Module):
     """1x1, 3x3, 1x1 convolutions around an identity; the 3x3 one carries the stride, as in the published weights."""
 
     expansion = 4
+    norm_pairs = (("conv1", "bn1"), ("conv2", "bn2"), ("conv3", "bn3"))
 
     def __init__(self, in_channels: int, width: int, stride: int) -> None:
         super().__init__()
@@ -69,6 +71,8 @@ class ResNet(nn.Module):
     `widths` and `blocks` state the inner width and the number of blocks of each stage; ResNet-50 is
     `ResNet(Bottleneck, [64, 128, 256, 512], [3, 4, 6, 3])`.
     """
+
+    norm_pairs = (("conv1", "bn1"),)
 
     def __init__(self, block: type[BasicBlock] | type[Bottleneck], widths: list[int], blocks: list[int]) -> None:
         super().__init__()

@@ -1,10 +1,12 @@
-"""Radar encoder: points to voxels to a sparse BEV map (VoxelNeXt; method 2)."""
+"""Points to voxels to a sparse BEV map (VoxelNeXt, method 2), for radar and for any other point sensor."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -32,11 +34,14 @@ class ConvOut(Enum):
 
 
 @dataclass(kw_only=True)
-class RadarEncoderConfig:
-    """Settings of the radar encoder (`model.radar_encoder` in the configuration).
+class VoxelEncoderConfig:
+    """Settings of an encoder of points.
 
     Raises ConfigError for values that cannot work on any grid; what depends on the grid is checked by the encoder.
     """
+
+    key: ClassVar[str] = "model.encoder"
+    """Where the configuration holds it, for messages."""
 
     voxel_size_m: list[float]  # [x, y, z]; x = y = cell_m / a power of two; z as high as the grid gives pillars
     stage_channels: list[int]  # width of the stage at stride 1, 2, 4 ... voxels
@@ -45,27 +50,24 @@ class RadarEncoderConfig:
     conv_out: ConvOut
     norm_momentum: float  # weight of a new batch in the running statistics; few steps need a large one
     point_count_channel: bool  # log of the number of points as one more input channel
-    local_means: bool  # mean of the points around a cell, added to F_R
 
     def __post_init__(self) -> None:
         size = self.voxel_size_m
         if len(size) != 3 or min(size) <= 0 or size[0] != size[1]:
             raise ConfigError(
-                f"model.radar_encoder.voxel_size_m={size}: must be three positive numbers [x, y, z] with x equal to y"
+                f"{self.key}.voxel_size_m={size}: must be three positive numbers [x, y, z] with x equal to y"
             )
         if not self.stage_channels or min(self.stage_channels) < 1:
-            raise ConfigError(
-                f"model.radar_encoder.stage_channels={self.stage_channels}: must list at least one positive width"
-            )
+            raise ConfigError(f"{self.key}.stage_channels={self.stage_channels}: must list at least one positive width")
         for key, value, least in (("blocks_per_stage", self.blocks_per_stage, 0), ("max_voxels", self.max_voxels, 1)):
             if value < least:
-                raise ConfigError(f"model.radar_encoder.{key}={value}: must be at least {least}")
+                raise ConfigError(f"{self.key}.{key}={value}: must be at least {least}")
         if not 0 < self.norm_momentum <= 1:
-            raise ConfigError(f"model.radar_encoder.norm_momentum={self.norm_momentum}: must lie in (0, 1]")
+            raise ConfigError(f"{self.key}.norm_momentum={self.norm_momentum}: must lie in (0, 1]")
 
 
-class RadarEncoder(nn.Module):
-    """Radar points to F_R, a sparse map of `channels` on the BEV grid (method 2).
+class VoxelEncoder(nn.Module):
+    """Points to a sparse map of `channels` on the BEV grid (method 2).
 
     Stages of submanifold residual blocks run at strides 1, 2, 4 ... voxels; those from the BEV cell on are summed over
     height and stride into one map. A single layer of voxels (pillars) runs the same network in two dimensions.
@@ -73,7 +75,13 @@ class RadarEncoder(nn.Module):
     Raises ConfigError when voxels, stages and grid do not fit together.
     """
 
-    def __init__(self, config: RadarEncoderConfig, grid: BEVGrid, channels: int) -> None:
+    def __init__(
+        self,
+        config: VoxelEncoderConfig,
+        grid: BEVGrid,
+        channels: int,
+        point_scales: Sequence[float],  # of the F columns of a point, of which x, y, z (m) come first
+    ) -> None:
         super().__init__()
         self.voxel_size_m = tuple(config.voxel_size_m)
         self.lower_m = (grid.x_min_m, grid.y_min_m, grid.z_range_m[0])
@@ -87,10 +95,10 @@ class RadarEncoder(nn.Module):
         self.voxel_shape = (layers, *plane)  # z, y, x of the height band
         # One layer more than the band holds, so that 41 halve to 21, 11, 6, 3 and 2 as in the public code.
         self.input_shape = plane if self.ndim == 2 else (layers + 1, *plane)
-        self.register_buffer("point_scales", torch.tensor(POINT_SCALES), persistent=False)
+        self.register_buffer("point_scales", torch.tensor(point_scales), persistent=False)
 
         norm = {"eps": BACKBONE_NORM_EPS, "momentum": config.norm_momentum}
-        inputs = len(POINT_SCALES) + config.point_count_channel
+        inputs = len(point_scales) + config.point_count_channel
         self.conv_input = ConvNormReLU(SubmanifoldConv(inputs, widths[0], 3, self.ndim, bias=False), **norm)
         self.stages = nn.ModuleList(
             _stage(widths[index - 1] if index else None, width, config.blocks_per_stage, self.ndim, norm)
@@ -102,30 +110,28 @@ class RadarEncoder(nn.Module):
             conv_out = SubmanifoldConv(widths[-1], channels, 3, 2, bias=False)
         self.conv_out = ConvNormReLU(conv_out, **norm)
         self.shared_conv = ConvNormReLU(SubmanifoldConv(channels, channels, 3, 2, bias=True), **SHARED_NORM)
-        self.local_means = LocalMeans(self.point_scales, grid, channels) if config.local_means else None
 
     def forward(
         self,
-        radar_points: Tensor,  # [P, 7] x, y, z (m, aug frame), rcs (dB), vx, vy (m/s), dt (s)
-        radar_batch: Tensor,  # [P] int64 sample of each point
+        points: Tensor,  # [P, F] x, y, z (m, aug frame), then what the sensor measures
+        batch: Tensor,  # [P] int64 sample of each point
         batch_size: int,
     ) -> SparseBEV:
-        """F_R; points outside the grid are left out, and no point at all gives a map without sites."""
-        bev = self.encode(self.voxelise(radar_points, radar_batch, batch_size))
-        return bev if self.local_means is None else self.local_means(bev, radar_points, radar_batch)
+        """The map; points outside the grid are left out, and no point at all gives a map without sites."""
+        return self.encode(self.voxelise(points, batch, batch_size))
 
     def voxelise(
         self,
-        radar_points: Tensor,  # [P, 7]
-        radar_batch: Tensor,  # [P] int64
+        points: Tensor,  # [P, F]
+        batch: Tensor,  # [P] int64
         batch_size: int,
     ) -> SparseMap:
         """Means of the normalised points of every voxel, on (B, z, y, x), or (B, y, x) for pillars; in float32."""
-        points = radar_points.float()
+        points = points.float()
         sites, features, counts = voxelize(
             points / self.point_scales,
             points[:, :3],
-            radar_batch,
+            batch,
             self.lower_m,
             self.voxel_size_m,
             self.voxel_shape,
@@ -139,7 +145,7 @@ class RadarEncoder(nn.Module):
         return SparseMap(sites, features)
 
     def encode(self, voxels: SparseMap) -> SparseBEV:
-        """Voxel features to F_R."""
+        """Voxel features to the map."""
         stages = self.run_stages(voxels)
         return self.shared_conv(self.conv_out(self.compress(stages[self.bev_stage :])))
 
@@ -172,6 +178,33 @@ class RadarEncoder(nn.Module):
         return SparseBEV(sites, features)
 
 
+@dataclass(kw_only=True)
+class RadarEncoderConfig(VoxelEncoderConfig):
+    """Settings of the radar encoder (`model.radar_encoder`)."""
+
+    key: ClassVar[str] = "model.radar_encoder"
+
+    local_means: bool  # mean of the points around a cell, added to F_R
+
+
+class RadarEncoder(VoxelEncoder):
+    """Radar points to F_R."""
+
+    def __init__(self, config: RadarEncoderConfig, grid: BEVGrid, channels: int) -> None:
+        super().__init__(config, grid, channels, POINT_SCALES)
+        self.local_means = LocalMeans(self.point_scales, grid, channels) if config.local_means else None
+
+    def forward(
+        self,
+        points: Tensor,  # [P, 7] x, y, z (m, aug frame), rcs (dB), vx, vy (m/s), dt (s)
+        batch: Tensor,  # [P] int64 sample of each point
+        batch_size: int,
+    ) -> SparseBEV:
+        """F_R, with the local means of the points where they are wanted."""
+        bev = super().forward(points, batch, batch_size)
+        return bev if self.local_means is None else self.local_means(bev, points, batch)
+
+
 def _stage(in_channels: int | None, channels: int, blocks: int, ndim: int, norm: dict[str, float]) -> nn.Sequential:
     """Residual blocks, after a convolution of stride 2 unless the stage is the first (`in_channels` None)."""
     layers: list[nn.Module] = []
@@ -182,42 +215,42 @@ def _stage(in_channels: int | None, channels: int, blocks: int, ndim: int, norm:
     return nn.Sequential(*layers)
 
 
-def _bev_stage(config: RadarEncoderConfig, grid: BEVGrid) -> int:
+def _bev_stage(config: VoxelEncoderConfig, grid: BEVGrid) -> int:
     """Index of the stage whose sites are BEV cells; checks the relations between voxels, stages and grid."""
     ratio = grid.cell_m / config.voxel_size_m[0]
     stage = round(math.log2(ratio))
     if stage < 0 or not math.isclose(ratio, 2**stage, rel_tol=1e-6):
         raise ConfigError(
-            f"model.radar_encoder.voxel_size_m={config.voxel_size_m}: x and y must be grid.cell_m={grid.cell_m} "
+            f"{config.key}.voxel_size_m={config.voxel_size_m}: x and y must be grid.cell_m={grid.cell_m} "
             f"divided by a power of two, but the quotient is {ratio:g}"
         )
     widths = config.stage_channels
     if len(widths) <= stage:
         raise ConfigError(
-            f"model.radar_encoder.stage_channels={widths}: must list at least {stage + 1} stages, since a cell of "
+            f"{config.key}.stage_channels={widths}: must list at least {stage + 1} stages, since a cell of "
             f"{grid.cell_m} m is 2^{stage} voxels of {config.voxel_size_m[0]} m"
         )
     if len(set(widths[stage:])) > 1:
         raise ConfigError(
-            f"model.radar_encoder.stage_channels={widths}: must be equal from stage {stage + 1} on, where stages are "
+            f"{config.key}.stage_channels={widths}: must be equal from stage {stage + 1} on, where stages are "
             f"summed, but got {widths[stage:]}"
         )
     coarsest = 2 ** (len(widths) - 1 - stage)
     if any(cells % coarsest for cells in grid.cells):
         raise ConfigError(
             f"grid.cells={list(grid.cells)}: each must be a multiple of {coarsest}, "
-            "the radar encoder's coarsest stride in cells"
+            f"the coarsest stride of {config.key} in cells"
         )
     return stage
 
 
-def _height_layers(config: RadarEncoderConfig, grid: BEVGrid) -> int:
+def _height_layers(config: VoxelEncoderConfig, grid: BEVGrid) -> int:
     """Number of voxel layers in the grid's height band; 1 means pillars."""
     height = grid.z_range_m[1] - grid.z_range_m[0]
     layers = round(height / config.voxel_size_m[2])
     if layers < 1 or not math.isclose(layers * config.voxel_size_m[2], height, rel_tol=1e-6):
         raise ConfigError(
-            f"model.radar_encoder.voxel_size_m={config.voxel_size_m}: z must divide the height {height:g} m of "
+            f"{config.key}.voxel_size_m={config.voxel_size_m}: z must divide the height {height:g} m of "
             f"grid.z_range_m={list(grid.z_range_m)} into whole layers"
         )
     return layers

@@ -16,6 +16,8 @@ CONVS_PER_BLOCK = 5
 class ConvNorm(nn.Module):
     """Convolution without bias, batch norm, ReLU; keeps the resolution at stride 1."""
 
+    norm_pairs = (("conv", "bn"),)
+
     def __init__(self, in_channels: int, out_channels: int, kernel_size: int, stride: int = 1) -> None:
         super().__init__()
         self.conv = nn.Conv2d(in_channels, out_channels, kernel_size, stride, kernel_size // 2, bias=False)

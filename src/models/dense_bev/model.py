@@ -1,4 +1,4 @@
-"""Dense peer: radar-camera fusion on a whole BEV map, in the way of BEVFusion (specification 13)."""
+"""Dense baseline: radar-camera fusion on a whole BEV map, in the way of BEVFusion (method 13)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from src.models.dense_bev.bev_decoder import MIN_CHANNELS, BEVDecoder, BEVDecode
 from src.models.dense_bev.lift_splat import LiftedViews, LiftSplat, LiftSplatConfig
 from src.models.dense_bev.pillars import PillarConfig, PillarEncoder
 from src.models.dense_bev.temporal_fusion import MapMemory, TemporalConfig, TemporalFusion, WarpedMaps
-from src.models.detector import Detector
-from src.models.heads.center_head import CenterHead, HeadConfig, HeadOutput
+from src.models.detector import Detector, Objective
+from src.models.heads.center_head import BoxOptions, CenterHead, HeadConfig, HeadOutput
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.targets.depth import paint_depth
@@ -46,6 +46,7 @@ class DenseBEVConfig:
     """Settings of the model (`model`). Raises ConfigError for parts that do not go together."""
 
     temporal_part: ClassVar[str] = "temporal"
+    new_in_temporal_phase: ClassVar[str] = r"temporal\."
 
     name: str
     channels: int  # C, width of the map that the head reads
@@ -64,8 +65,13 @@ class DenseBEVConfig:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Always both: without cameras there is nothing to fuse."""
+        """Both always: without cameras there is nothing to fuse."""
         return ("camera", "radar")
+
+    @property
+    def keys_of_temporal_phase(self) -> tuple[str, ...]:
+        """The part that aligns and fuses past maps."""
+        return ("model.temporal",)
 
     @property
     def memory_frames(self) -> int:
@@ -95,12 +101,14 @@ class DenseBEV(Detector):
     Raises ConfigError when parts, grid and backbone do not fit.
     """
 
+    phase_options = BoxOptions
+
     def __init__(
         self,
         config: DenseBEVConfig,
         grid: BEVGrid,
         backbone: ImageEncoderConfig | None,
-        velocity_code_weight: float,
+        options: BoxOptions,
     ) -> None:
         super().__init__()
         if backbone is None:
@@ -115,7 +123,7 @@ class DenseBEV(Detector):
             TemporalFusion(config.temporal, config.fused_channels, grid) if config.temporal is not None else None
         )
         self.decoder = BEVDecoder(config.decoder, config.fused_channels, config.channels, grid)
-        self.head = CenterHead(config.head, config.channels, grid, velocity_code_weight, dense=True)
+        self.head = CenterHead(config.head, config.channels, grid, options.velocity_code_weight, dense=True)
         self.to(memory_format=torch.channels_last)
 
     @property
@@ -146,24 +154,24 @@ class DenseBEV(Detector):
         """The memory that `MapMemory.state` described."""
         return MapMemory.from_state(state)
 
-    def loss(self, output: DenseBEVOutput, batch: FrameBatch) -> dict[str, Tensor]:
+    def loss(self, output: DenseBEVOutput, batch: FrameBatch) -> Objective:
         """Weighted terms `heatmap`, `box` and `depth`, and their sum `total`; ValueError without annotations."""
         if batch.boxes is None:
             raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
         weights = self.config.loss
         with torch.autocast(batch.device.type, enabled=False):
-            terms = self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
+            terms, counts = self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
             if weights.depth_weight is not None:
                 terms["depth"] = weights.depth_weight * self._depth_loss(output.views.depth_logits, batch)
         zero = torch.zeros((), device=batch.device)
-        return terms | {"total": sum(terms.values(), zero)}
+        return Objective(terms | {"total": sum(terms.values(), zero)}, self.diagnostics(output) | counts)
 
     def _depth_loss(
         self,
         logits: Tensor,  # [B, N, D, h, w]
         batch: FrameBatch,
     ) -> Tensor:  # []
-        """Cross-entropy at the pixels of annotated boxes, as Horizon3D's camera branch (specification 4.3)."""
+        """Cross-entropy at the pixels of annotated boxes, as Horizon3D's camera branch (method 4.3)."""
         settings, size = self.config.view_transform, self.image_encoder.image_size_px
         joined, sample = supervised_boxes(batch.boxes, self.grid)
         seen = view_boxes(joined, sample, batch.pix_from_aug, batch.image_valid, size)
@@ -178,7 +186,7 @@ class DenseBEV(Detector):
 
     @torch.no_grad()
     def diagnostics(self, output: DenseBEVOutput) -> dict[str, Tensor]:
-        """Pillars and lifted pairs per frame, how sure depth is, past maps in use; after a loss the head's objects."""
+        """Pillars and lifted pairs per frame, how sure depth is, past maps in use."""
         frames = len(output.radar_bev)
         probabilities = output.views.depth_logits.float().softmax(2)  # [B, N, D, h, w]
         values: dict[str, Tensor | float] = {
@@ -188,9 +196,5 @@ class DenseBEV(Detector):
         }
         if output.warped_maps is not None:
             values["remembered_frames"] = output.warped_maps.usable.sum() / frames
-        targets = output.head.targets
-        if targets is not None:
-            values["objects"] = len(targets.rows) / frames
-            values["shared_objects"] = targets.num_shared / frames
         device = output.radar_bev.device
         return {name: torch.as_tensor(value, dtype=torch.float32, device=device) for name, value in values.items()}

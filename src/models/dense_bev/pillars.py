@@ -39,6 +39,8 @@ class PillarEncoder(nn.Module):
     Runs in float32 also under autocast: it is small, and its inputs are positions.
     """
 
+    full_precision_parts = ("",)
+
     def __init__(self, config: PillarConfig, grid: BEVGrid) -> None:
         super().__init__()
         self.grid = grid
@@ -50,6 +52,11 @@ class PillarEncoder(nn.Module):
             self.layers.append(nn.Linear(inputs, width, bias=False))
             self.norms.append(RowNorm(width))
             inputs = config.channels
+
+    @property
+    def norm_pairs(self) -> list[tuple[str, str]]:
+        """Each layer has its norm."""
+        return [(f"layers.{number}", f"norms.{number}") for number in range(len(self.layers))]
 
     def forward(
         self,

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.tensor_transforms import transform_points_xy
 from src.models.layers.dense import DenseConvNormReLU
 from src.models.memory import FrameMemory, Motion, RememberedFrame
 from src.ops.concat_conv import concat_conv2d
@@ -93,6 +94,8 @@ class TemporalFusion(nn.Module):
     Moving objects stay where they were: their motion is left to the convolutions, as in BEVDet4D.
     """
 
+    norm_pairs = (("refine", "norm"),)
+
     def __init__(self, config: TemporalConfig, channels: int, grid: BEVGrid) -> None:
         super().__init__()
         self.config, self.grid = config, grid
@@ -129,8 +132,7 @@ class TemporalFusion(nn.Module):
         with torch.autocast(aug_from_past.device.type, enabled=False):
             past_from_aug = torch.linalg.inv_ex(aug_from_past.double())[0]
             then_from_now = (frame.aug_from_ego.double() @ past_from_aug).float()  # augmented frame to augmented frame
-            rotation, translation = then_from_now[:, None, None, :2, :2], then_from_now[:, None, None, :2, 3]
-            xy = rotation[..., 0] * self.centres_m[..., :1] + rotation[..., 1] * self.centres_m[..., 1:] + translation
+            xy = transform_points_xy(then_from_now[:, None, None], self.centres_m)
             size = xy.new_tensor([self.grid.cols, self.grid.rows])
             samples = self.grid.to_cells(xy) * (2 / size) - 1  # [B, rows, cols, 2], edges of the map at -1 and 1
             maps = frame.cells.permute(0, 3, 1, 2).float()

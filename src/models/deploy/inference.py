@@ -1,54 +1,35 @@
 """A trained detector made ready for inference: the same function up to rounding, with fewer and larger operations.
 
 Batch norms go into the convolutions and linear layers before them, parallel branches become one product, history keeps
-a fixed number of places, and nothing records gradients.
+a fixed number of places, and nothing records gradients. What only a module knows of itself it declares, each optional:
+
+- `norm_pairs`: pairs of names of its submodules, a layer and the batch norm that directly follows it;
+- `merge_for_inference()`: merges what lies side by side, once norms are folded;
+- `full_precision_parts`: names of submodules ("" for itself) that compute in float32 whatever autocast says;
+- `static_parts`: names of submodules whose shapes never change (see `deploy/static_parts.py`).
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from src.losses.normalizers import full_precision
-from src.models.backbones.resnet import BasicBlock, Bottleneck, ResNet
-from src.models.backbones.vovnet import ConvNorm
-from src.models.dense_bev.pillars import PillarEncoder
-from src.models.dense_bev.temporal_fusion import TemporalFusion
 from src.models.detector import Detector
 from src.models.heads.branches import Branches
 from src.models.heads.center_head import CenterHead
-from src.models.horizon3d.bev_path import BEVPath
-from src.models.horizon3d.gaussian_encoder import AnchorEncoder, Refinement
-from src.models.horizon3d.gaussian_path import GaussianPath
-from src.models.horizon3d.kggi import KGGI
-from src.models.horizon3d.sparse_fusion import SparseFusion
-from src.models.horizon3d.time_embedding import TimeEmbedding
-from src.models.layers.dense import DenseConvNormReLU
-from src.models.layers.sparse import ConvNormReLU, ResidualBlock, SparseKernel, SubmanifoldConv
+from src.models.layers.merging import block_diagonal, joined_linear
+from src.models.layers.sparse import SparseKernel
 
 CPU_CHUNK = 512
 """Rows at a time through a wide hidden layer, so that it stays in the cache."""
 
 Linear = nn.Conv2d | nn.ConvTranspose2d | nn.Linear | SparseKernel
 """Layers that a norm behind them can go into."""
-
-PAIRS: dict[type[nn.Module], tuple[tuple[str, str], ...]] = {
-    ConvNorm: (("conv", "bn"),),
-    ResNet: (("conv1", "bn1"),),
-    BasicBlock: (("conv1", "bn1"), ("conv2", "bn2")),
-    Bottleneck: (("conv1", "bn1"), ("conv2", "bn2"), ("conv3", "bn3")),
-    ConvNormReLU: (("conv", "norm"),),
-    ResidualBlock: (("conv1", "bn1"), ("conv2", "bn2")),
-    DenseConvNormReLU: (("conv", "norm"),),
-    TemporalFusion: (("refine", "norm"),),
-    SparseFusion: (("conv1", "norm1"), ("conv2", "norm2")),
-    Branches: (("hidden", "norm"),),
-}
-"""Where a norm directly follows a layer, by the names of both. Others, as the norms before a union, stay."""
 
 
 def prepare_for_inference(model: Detector, bf16: bool = False) -> Detector:
@@ -68,10 +49,8 @@ def prepare_for_inference(model: Detector, bf16: bool = False) -> Detector:
         for module in list(model.modules()):
             if isinstance(module, CenterHead):
                 _merge_head(module)
-            elif isinstance(module, BEVPath):
-                _merge_cell_heads(module)
-            elif isinstance(module, GaussianPath):
-                module.fixed_capacity = True
+            elif hasattr(module, "merge_for_inference"):
+                module.merge_for_inference()
         if bf16:
             _round_weights(model)
         for value in model.parameters():
@@ -108,8 +87,8 @@ class MergedBranches(nn.Module):
         super().__init__()
         hidden = [part.hidden for part in branches]
         outputs = [output for part in branches for output in part.outputs]
-        self.hidden = _linear(torch.cat([x.weight for x in hidden]), torch.cat([x.bias for x in hidden]))
-        self.outputs = _block_diagonal(outputs)
+        self.hidden = joined_linear(torch.cat([x.weight for x in hidden]), torch.cat([x.bias for x in hidden]))
+        self.outputs = block_diagonal(outputs)
 
     def forward(
         self,
@@ -122,19 +101,14 @@ class MergedBranches(nn.Module):
 
 def _fold_norms(model: nn.Module) -> None:
     for module in model.modules():
-        for layer, norm in PAIRS.get(type(module), ()):
-            fold_norm(getattr(module, layer), getattr(module, norm))
-            setattr(module, norm, nn.Identity())
+        for layer, norm in getattr(module, "norm_pairs", ()):
+            fold_norm(module.get_submodule(layer), module.get_submodule(norm))
+            module.set_submodule(norm, nn.Identity())
         if isinstance(module, nn.Sequential):
             for number, (layer, norm) in enumerate(zip(module[:-1], module[1:], strict=True)):
                 if isinstance(layer, Linear) and isinstance(norm, _BatchNorm):
                     fold_norm(layer, norm)
                     module[number + 1] = nn.Identity()
-        elif isinstance(module, BEVPath | PillarEncoder):
-            layers = module.convs if isinstance(module, BEVPath) else module.layers
-            for number, (layer, norm) in enumerate(zip(layers, module.norms, strict=True)):
-                fold_norm(layer, norm)
-                module.norms[number] = nn.Identity()
 
 
 def _merge_head(head: CenterHead) -> None:
@@ -144,49 +118,16 @@ def _merge_head(head: CenterHead) -> None:
         head.regressions = nn.ModuleList(MergedBranches([part]) for part in head.regressions)
 
 
-def _merge_cell_heads(path: BEVPath) -> None:
-    """Occupancy and velocity read the same cells: one convolution and one linear layer for both."""
-    (occupancy, first), (velocity, second) = path.occupancy, path.velocity
-    occupancy.conv = _merged([occupancy.conv, velocity.conv])
-    path.occupancy = nn.ModuleList([occupancy, _block_diagonal([first, second])])
-    path.velocity = None
-
-
-def _merged(convs: Sequence[SubmanifoldConv]) -> SubmanifoldConv:
-    """One convolution with the outputs of all side by side."""
-    first, widths = convs[0], [conv.out_channels for conv in convs]
-    merged = SubmanifoldConv(first.in_channels, sum(widths), first.kernel_size, first.ndim, bias=True)
-    merged.weight.data = torch.cat([conv.weight for conv in convs], dim=2)
-    merged.bias.data = torch.cat([conv.bias for conv in convs])
-    return merged.requires_grad_(False).eval()
-
-
-def _block_diagonal(layers: Sequence[nn.Linear]) -> nn.Linear:
-    """One layer that maps the inputs of all, side by side, to the outputs of all."""
-    return _linear(torch.block_diag(*(x.weight for x in layers)), torch.cat([x.bias for x in layers]))
-
-
-def _linear(weight: Tensor, bias: Tensor) -> nn.Linear:
-    layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
-    layer.weight, layer.bias = (nn.Parameter(value, requires_grad=False) for value in (weight, bias))
-    return layer
-
-
 def _round_weights(model: nn.Module) -> None:
     """To bfloat16, except where the model computes in float32 whatever autocast says."""
-    exact = {id(module) for part in _exact_parts(model.modules()) for module in part.modules()}
+    exact = {id(module) for part in declared_parts(model, "full_precision_parts") for module in part.modules()}
     for module in model.modules():
         if isinstance(module, Linear) and id(module) not in exact:
             module.to(torch.bfloat16)
 
 
-def _exact_parts(modules: Iterable[nn.Module]) -> Iterator[nn.Module]:
-    for module in modules:
-        if isinstance(module, AnchorEncoder | TimeEmbedding | PillarEncoder):
-            yield module
-        elif isinstance(module, Refinement):
-            yield module.output
-        elif isinstance(module, KGGI) and hasattr(module, "property_heads"):
-            yield module.property_heads
-        elif isinstance(module, BEVPath):
-            yield module.occupancy[1]
+def declared_parts(model: nn.Module, member: str) -> Iterator[nn.Module]:
+    """The submodules that the modules of a model name in such a member."""
+    for module in model.modules():
+        for name in getattr(module, member, ()):
+            yield module.get_submodule(name)

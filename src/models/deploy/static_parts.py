@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from src.models.backbones.image import ImageEncoder
-from src.models.heads.keypoint_head import CameraKeypointHead
-from src.models.horizon3d.gaussian_encoder import AnchorEncoder, EncoderLayer, Refinement
-from src.models.horizon3d.temporal_attention import TemporalSelfAttention
+from src.models.deploy.inference import declared_parts
 
 WARM_UP_RUNS = 3
 """Before a capture, so that libraries have chosen their kernels and taken their memory."""
@@ -19,6 +16,8 @@ WARM_UP_RUNS = 3
 
 class ImageNetwork(nn.Module):
     """Backbone and neck of an image encoder as one function of the normalised views."""
+
+    static_parts = ("",)
 
     def __init__(self, backbone: nn.Module, neck: nn.Module) -> None:
         super().__init__()
@@ -90,12 +89,12 @@ def replay_image_encoder(model: nn.Module) -> None:
 def compile_static_parts(model: nn.Module) -> None:
     """Compile them in place with `torch.compile`; the first frames take a minute or two then.
 
-    The image network, the camera head, and of the Gaussian encoder all but sampling and self-encoding. The model must
-    be prepared for inference, which gives the Gaussians a fixed number of places.
+    They are the image network and what modules declare as `static_parts`. The model must be prepared for inference,
+    which gives the Gaussians a fixed number of places.
     """
     for encoder in _image_encoders(model):
         _join(encoder)
-    for part in _parts(model):
+    for part in list(declared_parts(model, "static_parts")):
         part.compile(dynamic=False)
 
 
@@ -106,11 +105,3 @@ def _image_encoders(model: nn.Module) -> list[ImageEncoder]:
 def _join(encoder: ImageEncoder) -> None:
     if not isinstance(encoder.backbone, ImageNetwork | GraphReplay):
         encoder.backbone, encoder.neck = ImageNetwork(encoder.backbone, encoder.neck), nn.Identity()
-
-
-def _parts(model: nn.Module) -> Iterator[nn.Module]:
-    for module in model.modules():
-        if isinstance(module, ImageNetwork | CameraKeypointHead | AnchorEncoder | TemporalSelfAttention | Refinement):
-            yield module
-        elif isinstance(module, EncoderLayer):
-            yield from module.feed_forward

@@ -16,6 +16,7 @@ from src.ops.checkpointed_mlp import checkpointed_mlp, projected_statistics
 class Branches(nn.Module):
     """Parallel branches of one input, each linear, batch norm, ReLU, linear; one matrix makes all hidden layers."""
 
+    norm_pairs = (("hidden", "norm"),)
     checkpointed = True
     """Evaluate by `checkpointed_branches` instead of layer by layer."""
 

@@ -14,6 +14,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import penalty_reduced_focal
 from src.losses.normalizers import full_precision, mean_over_ranks
 from src.losses.regression import masked_l1
+from src.models.detector import Objective
 from src.models.heads.branches import Branches, checkpointed_branches
 from src.models.heads.decode import (
     AttributeSource,
@@ -74,6 +75,19 @@ class HeadConfig:
             )
 
 
+@dataclass(kw_only=True)
+class BoxOptions:
+    """What a phase says to a model with this head (`phase.options`). Raises ConfigError for a negative weight."""
+
+    velocity_code_weight: float  # weight of velocity in the box loss
+
+    def __post_init__(self) -> None:
+        if not self.velocity_code_weight >= 0:
+            raise ConfigError(
+                f"phase.options.velocity_code_weight must be at least 0, but got {self.velocity_code_weight}"
+            )
+
+
 @dataclass
 class HeadOutput:
     """Predictions on the M active cells of B samples."""
@@ -81,7 +95,6 @@ class HeadOutput:
     bev: SparseBEV  # cells with the shared features that the regression branches read
     logits: Tensor  # [M, 12] float32, columns as taxonomy.CLASSES
     codes: Tensor | None  # [M, 7, CODE_SIZE (+ 11 attributes)] in training with `all`, else evaluated where needed
-    targets: HeadTargets | None = None  # what the loss compared with, once there was one; for diagnostics
 
 
 class CenterHead(nn.Module):
@@ -170,13 +183,25 @@ class CenterHead(nn.Module):
         boxes: list[Boxes3D],  # B, augmented ego frame
         heatmap_weight: float | None,
         box_weight: float | None,
-    ) -> dict[str, Tensor]:
+    ) -> Objective:
         """Weighted terms `heatmap`, `box` and, if learned, `attribute`; a weight of None leaves its term out.
+
+        Diagnostics are the objects per frame: those the head learns, those without a cell near enough, and those that
+        share their cell with another of their group, so that the head cannot meet both.
 
         Focal loss per group over its positive cells, L1 per group over its objects (method 8.1). Without objects the
         box term is 0 with zero gradients.
         """
-        targets = output.targets = self.targets(output, boxes)
+        targets = self.targets(output, boxes)
+        counts = {
+            "objects": len(targets.rows),
+            "distant_objects": targets.num_distant,
+            "shared_objects": targets.num_shared,
+        }
+        diagnostics = {
+            name: torch.as_tensor(count / len(boxes), dtype=torch.float32, device=output.logits.device)
+            for name, count in counts.items()
+        }
         group_of_class = targets.labels.new_tensor(GROUP_OF_CLASS)
         zeros = output.logits.new_zeros(len(HEAD_GROUPS))
         terms: dict[str, Tensor] = {}
@@ -186,7 +211,7 @@ class CenterHead(nn.Module):
             normalizer = mean_over_ranks(zeros.index_add(0, group_of_class, positives))
             terms["heatmap"] = heatmap_weight * (zeros.index_add(0, group_of_class, focal) / normalizer).sum()
         if box_weight is None and not self.learned:
-            return terms
+            return Objective(terms, diagnostics)
         predicted = self.regress(output, targets.rows, targets.groups)
         if box_weight is not None:
             errors = masked_l1(predicted[:, :CODE_SIZE], targets.codes) * zeros.new_tensor(self.code_weights)
@@ -195,7 +220,7 @@ class CenterHead(nn.Module):
             terms["box"] = box_weight * (sums / mean_over_ranks(objects)).sum()
         if self.learned:
             terms["attribute"] = ATTRIBUTE_WEIGHT * _attribute_loss(predicted[:, CODE_SIZE:], targets)
-        return terms
+        return Objective(terms, diagnostics)
 
     @torch.no_grad()
     def decode(self, output: HeadOutput) -> list[Boxes3D]:

@@ -24,6 +24,8 @@ class CameraMaps:
 class CameraKeypointHead(nn.Module):
     """2D keypoint map and depth distribution from one shared 3x3 convolution; 0.53 M parameters at full size."""
 
+    static_parts = ("",)
+
     def __init__(self, in_channels: int, channels: int, num_depth_bins: int) -> None:
         super().__init__()
         groups = max(1, channels // CHANNELS_PER_NORM_GROUP)

@@ -13,12 +13,11 @@ from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
 from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
-from src.models.layers.sparse import ConvNormReLU, RowNorm, SparseKernel, SubmanifoldConv
+from src.models.layers.merging import block_diagonal, joined_convs
+from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv, TemporalConv
 from src.models.memory import motions
-from src.ops.kernel_maps import strided_map, temporal_map
 from src.ops.segment_reduce import segment_mean, topk_per_sample
 from src.ops.sites import Sites
-from src.ops.sparse_conv import sparse_conv
 from src.structures.batch import FrameBatch
 from src.structures.sparse_bev import SparseBEV, SparseMap
 
@@ -73,21 +72,10 @@ class WarpedCells:
     features: Tensor  # [n, C]
 
 
-class TemporalConv(SparseKernel):
-    """3x3x3 convolution over (t, y, x) that halves the time axis and, unless dilating, keeps to occupied columns."""
-
-    def __init__(self, in_channels: int, out_channels: int, dilating: bool) -> None:
-        super().__init__(in_channels, out_channels, kernel_size=3, ndim=3, bias=False)
-        self.dilating = dilating
-
-    def forward(self, x: SparseMap) -> SparseMap:
-        build = strided_map if self.dilating else temporal_map
-        kernel_map, sites = build(x.sites, self.kernel_size, (2, 1, 1), 1)
-        return SparseMap(sites, sparse_conv(x.features, self.weight, kernel_map, self.bias))
-
-
 class BEVPath(nn.Module):
     """Sparse memory of occupied BEV cells (method 6.1)."""
+
+    full_precision_parts = ("occupancy.1",)
 
     def __init__(self, config: BEVPathConfig, channels: int, grid: BEVGrid) -> None:
         super().__init__()
@@ -110,6 +98,18 @@ class BEVPath(nn.Module):
     def num_slots(self) -> int:
         """T, the remembered frames and the current one."""
         return self.config.num_frames + 1
+
+    @property
+    def norm_pairs(self) -> list[tuple[str, str]]:
+        """Each temporal convolution has its norm."""
+        return [(f"convs.{number}", f"norms.{number}") for number in range(len(self.convs))]
+
+    def merge_for_inference(self) -> None:
+        """Occupancy and velocity read the same cells: one convolution and one linear layer for both."""
+        (occupancy, first), (velocity, second) = self.occupancy, self.velocity
+        occupancy.conv = joined_convs([occupancy.conv, velocity.conv])
+        self.occupancy = nn.ModuleList([occupancy, block_diagonal([first, second])])
+        self.velocity = None
 
     def predict(self, fused: SparseBEV) -> CellPrediction:
         """Occupancy and velocity of every cell of F_fuse."""

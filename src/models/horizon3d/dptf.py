@@ -14,6 +14,7 @@ from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.gaussian_path import GaussianPath, GaussianPathConfig
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.structures.batch import FrameBatch
+from src.structures.evidence import WarpedPoints
 from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV
 
@@ -112,3 +113,20 @@ class DPTF(nn.Module):
         )
         paths = (self.config.bev_path, self.config.gaussian_path)
         return past.push(frame, *(path.num_frames if path is not None else 0 for path in paths))
+
+
+def warped_evidence(config: DPTFConfig, output: DPTFOutput) -> dict[str, WarpedPoints | None]:
+    """`warped_gaussians` and `warped_cells` of the first sample for pictures, None for a path that is off."""
+    gaussians = cells = None
+    if config.gaussian_path is not None:
+        found = output.history if output.history is not None else GaussianSet.empty()
+        keep = found.valid[0]
+        columns = (found.means[0][keep], found.velocities[0][keep], found.elapsed_s[0][keep])
+        gaussians = WarpedPoints(*columns, config.gaussian_path.velocity_compensation, found)
+    if config.bev_path is not None:
+        nothing, warped = torch.zeros(0, 2), output.warped
+        columns = (
+            (nothing, nothing, nothing[:, 0]) if warped is None else (warped.xy, warped.velocities, warped.elapsed_s)
+        )
+        cells = WarpedPoints(*columns, config.bev_path.velocity_compensation)
+    return {"warped_gaussians": gaussians, "warped_cells": cells}

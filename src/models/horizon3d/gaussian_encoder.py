@@ -66,6 +66,8 @@ class AnchorEncoder(nn.Module):
     Runs in float32: a position of 150 m has steps of half a metre in bfloat16.
     """
 
+    full_precision_parts = static_parts = ("",)
+
     def __init__(self, channels: int, grid: BEVGrid, bounds: GaussianBounds) -> None:
         super().__init__()
         self.bounds = bounds
@@ -126,6 +128,9 @@ class SelfEncoding(nn.Module):
 class Refinement(nn.Module):
     """New attributes from features (Eq. 3): the mean moves by a bounded step, everything else is regressed anew."""
 
+    full_precision_parts = ("output",)
+    static_parts = ("",)
+
     def __init__(self, channels: int, grid: BEVGrid, bounds: GaussianBounds) -> None:
         super().__init__()
         self.bounds = bounds
@@ -157,6 +162,8 @@ class Refinement(nn.Module):
 
 class EncoderLayer(nn.Module):
     """One round of attention, self-encoding and refinement (method 5.1, Eq. 2-3)."""
+
+    static_parts = ("feed_forward.0", "feed_forward.1")
 
     def __init__(
         self,

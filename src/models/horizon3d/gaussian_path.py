@@ -76,6 +76,10 @@ class GaussianPath(nn.Module):
         self.register_buffer("centre_m", torch.tensor(grid.centre_m), persistent=False)
         self.fixed_capacity = False  # pad history to K_hist, so that shapes are static
 
+    def merge_for_inference(self) -> None:
+        """History keeps a fixed number of places."""
+        self.fixed_capacity = True
+
     def recall(self, memory: Memory, batch: FrameBatch, max_age_s: float) -> GaussianSet | None:
         """History Gaussians in the batch's augmented frame, newest first; None when nothing is remembered, unless the
         capacity is fixed.

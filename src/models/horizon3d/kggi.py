@@ -141,6 +141,11 @@ class KGGI(nn.Module):
         self.register_buffer("centre_m", torch.tensor(grid.centre_m), persistent=False)
         self.register_buffer("half_extent_m", torch.tensor(grid.half_extent_m), persistent=False)
 
+    @property
+    def full_precision_parts(self) -> tuple[str, ...]:
+        """Positions and velocities come from the property heads."""
+        return ("property_heads",) if hasattr(self, "property_heads") else ()
+
     def forward(self, radar_bev: SparseBEV, views: CameraViews, history: GaussianSet | None = None) -> KGGIOutput:
         """G_0: radar, camera, random, then history Gaussians with their own attributes and features (method 4.4)."""
         parts: list[GaussianSet] = []

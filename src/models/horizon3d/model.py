@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -12,10 +12,10 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.backbones.sparse_voxel import RadarEncoder, RadarEncoderConfig
-from src.models.detector import Detector
-from src.models.heads.center_head import CenterHead, HeadConfig, HeadOutput
+from src.models.detector import Detector, Objective
+from src.models.heads.center_head import BoxOptions, CenterHead, HeadConfig, HeadOutput
 from src.models.horizon3d.cross_attention import NUM_HEADS
-from src.models.horizon3d.dptf import DPTF, DPTFConfig, DPTFOutput
+from src.models.horizon3d.dptf import DPTF, DPTFConfig, DPTFOutput, warped_evidence
 from src.models.horizon3d.dptf_memory import Memory
 from src.models.horizon3d.kggi import KGGI, KGGIConfig, KGGIOutput
 from src.models.horizon3d.loss import Horizon3DLossConfig, cell_losses, gaussian_velocity_loss, kggi_losses, ocsf_losses
@@ -23,6 +23,7 @@ from src.models.horizon3d.ocsf import OCSF, OCSFConfig, OCSFOutput
 from src.models.horizon3d.views import CameraViews
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
+from src.structures.evidence import Evidence
 from src.structures.sparse_bev import SparseBEV
 from src.structures.taxonomy import CAMERAS
 
@@ -35,6 +36,7 @@ class Horizon3DConfig:
     """Settings of the model (`model`). Raises ConfigError for parts that do not go together."""
 
     temporal_part: ClassVar[str] = "dptf"
+    new_in_temporal_phase: ClassVar[str] = r"dptf\.|ocsf\.encoder\.layers\.\d+\.temporal_attention\."
 
     name: str
     channels: int  # C, width of BEV cells and Gaussians
@@ -70,8 +72,16 @@ class Horizon3DConfig:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Radar, and cameras where images are encoded."""
-        return ("camera", "radar") if self.ocsf is not None else ("radar",)
+        """Radar, and cameras where there are Gaussians."""
+        return ("radar",) if self.ocsf is None else ("camera", "radar")
+
+    @property
+    def keys_of_temporal_phase(self) -> tuple[str, ...]:
+        """All of DPTF with its loss terms; velocities of Gaussians unless they are supervised before."""
+        terms = [f"cell_{term}_weight" for term in ("focal", "dice", "lovasz", "velocity")]
+        if not self.loss.gaussian_velocity_in_phase1:
+            terms += ["dptf_weight", "gaussian_velocity_weight"]
+        return ("model.dptf", *(f"model.loss.{term}" for term in terms))
 
     @property
     def memory_frames(self) -> int:
@@ -110,12 +120,22 @@ class Horizon3D(Detector):
     `backbone` is only read when the model uses images. Raises ConfigError when parts, grid and backbone do not fit.
     """
 
+    phase_options = BoxOptions
+    benchmark_parts = {
+        "ocsf: gaussian encoder": ("ocsf.encoder.forward",),
+        "ocsf: splat": ("src.models.horizon3d.ocsf:splat_set",),
+        "ocsf: gated fusion": ("ocsf.fusion.forward",),
+        "dptf: recall": ("dptf.recall",),
+        "dptf: aggregate": ("dptf.aggregate",),
+        "dptf: remember": ("dptf.remember",),
+    }
+
     def __init__(
         self,
         config: Horizon3DConfig,
         grid: BEVGrid,
         backbone: ImageEncoderConfig | None,
-        velocity_code_weight: float,
+        options: BoxOptions,
     ) -> None:
         super().__init__()
         self.config, self.grid = config, grid
@@ -130,7 +150,7 @@ class Horizon3D(Detector):
             self.kggi = KGGI(config.kggi, channels, width, grid, config.ocsf.bounds)
             self.ocsf = OCSF(config.ocsf, channels, width, len(CAMERAS), levels, grid, config.temporal_heads)
         self.dptf = DPTF(config.dptf, channels, grid) if config.dptf is not None else None
-        self.head = CenterHead(config.head, channels, grid, velocity_code_weight)
+        self.head = CenterHead(config.head, channels, grid, options.velocity_code_weight)
 
     @property
     def image_backbone(self) -> nn.Module | None:
@@ -172,13 +192,13 @@ class Horizon3D(Detector):
             self.image_encoder(batch.images), batch.pix_from_aug, batch.image_valid, (int(height), int(width))
         )
 
-    def loss(self, output: Horizon3DOutput, batch: FrameBatch) -> dict[str, Tensor]:
+    def loss(self, output: Horizon3DOutput, batch: FrameBatch) -> Objective:
         """Terms of Eq. 10 as weighted, and their sum `total`. Raises ValueError for a batch without annotations."""
         if batch.boxes is None:
             raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
         config = self.config
         with torch.autocast(batch.device.type, enabled=False):
-            terms = self.head.loss(output.head, batch.boxes, config.loss.heatmap_weight, config.loss.box_weight)
+            terms, counts = self.head.loss(output.head, batch.boxes, config.loss.heatmap_weight, config.loss.box_weight)
             if output.kggi is not None and output.ocsf is not None:
                 terms |= kggi_losses(
                     output.kggi, output.radar_bev, output.views, batch.boxes, self.grid, config.kggi, config.loss
@@ -191,19 +211,28 @@ class Horizon3D(Detector):
             if output.dptf is not None and output.dptf.cells is not None:
                 terms |= cell_losses(output.dptf.cells, output.fused_bev, batch.boxes, self.grid, config.loss)
         zero = torch.zeros((), device=batch.device)
-        return terms | {"total": sum(terms.values(), zero)}
+        return Objective(terms | {"total": sum(terms.values(), zero)}, self.diagnostics(output) | counts)
 
     def decode(self, output: Horizon3DOutput) -> list[Boxes3D]:
         """Boxes of each frame, best first."""
         return self.head.decode(output.head)
 
+    def evidence(self, output: Horizon3DOutput) -> Evidence:
+        """Refined Gaussians, the occupied cells of their splat, and the warped memory."""
+        evidence = Evidence()
+        if output.ocsf is not None:
+            cells = output.ocsf.splat.cells
+            rows = cells.support % (self.grid.rows * self.grid.cols)
+            evidence.gaussians = output.ocsf.gaussians
+            evidence.occupied_cells = torch.stack([rows // self.grid.cols, rows % self.grid.cols], dim=1)
+            evidence.occupancy = cells.occupancy
+        if output.dptf is not None:
+            evidence = replace(evidence, **warped_evidence(self.config.dptf, output.dptf))
+        return evidence
+
     @torch.no_grad()
     def diagnostics(self, output: Horizon3DOutput) -> dict[str, Tensor]:
-        """Cells per frame, share of the grid that Gaussians open, cells cut by the guard, Gaussians by source.
-
-        After a loss also the objects per frame: those the head learns, those without a cell near enough, and those
-        that share their cell with another of their group, so that the head cannot meet both.
-        """
+        """Cells per frame, share of the grid that Gaussians open, cells cut by the guard, Gaussians by source."""
         frames = output.radar_bev.batch_size
         values: dict[str, Tensor | float] = {
             "radar_cells": len(output.radar_bev) / frames,
@@ -225,10 +254,5 @@ class Horizon3D(Detector):
                 values["head_cells"] = len(output.dptf.bev) / frames
             if output.dptf.history is not None:
                 values["gaussians_history"] = output.dptf.history.valid.sum() / frames
-        targets = output.head.targets
-        if targets is not None:
-            values["objects"] = len(targets.rows) / frames
-            values["distant_objects"] = targets.num_distant / frames
-            values["shared_objects"] = targets.num_shared / frames
         device = output.radar_bev.features.device
         return {name: torch.as_tensor(value, dtype=torch.float32, device=device) for name, value in values.items()}

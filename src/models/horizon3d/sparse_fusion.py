@@ -18,6 +18,7 @@ class SparseFusion(nn.Module):
     is; a branch without a site in a cell counts as zero there.
     """
 
+    norm_pairs = (("conv1", "norm1"), ("conv2", "norm2"))
     skip_zeros = True
     """Compute both equations by `gated_fusion_conv`. The literal form multiplies zeros in half of the rows: some 5 % of
     a training step and of a frame on a CPU (mini scale)."""

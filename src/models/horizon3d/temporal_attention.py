@@ -12,6 +12,8 @@ from src.structures.gaussians import GaussianSet
 class TemporalSelfAttention(nn.Module):
     """Pre-norm multi-head attention over all valid Gaussians; adds exactly zero before it is trained."""
 
+    static_parts = ("",)
+
     def __init__(self, channels: int, num_heads: int) -> None:
         super().__init__()
         self.num_heads = num_heads

@@ -9,6 +9,8 @@ from torch import Tensor, nn
 class TimeEmbedding(nn.Module):
     """MLP 1-C-C of an age in seconds. Runs in float32 so that 2 Hz frames stay apart under autocast."""
 
+    full_precision_parts = ("",)
+
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.mlp = nn.Sequential(nn.Linear(1, channels), nn.ReLU(), nn.Linear(channels, channels))

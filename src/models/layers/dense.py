@@ -13,6 +13,8 @@ from src.structures.sparse_bev import SparseBEV
 class DenseConvNormReLU(nn.Module):
     """A convolution that keeps or divides the size, batch norm and ReLU."""
 
+    norm_pairs = (("conv", "norm"),)
+
     def __init__(
         self, in_channels: int, out_channels: int, kernel_size: int, stride: int = 1, bias: bool = False
     ) -> None:

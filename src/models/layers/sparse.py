@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.ops.kernel_maps import strided_map, submanifold_map
+from src.ops.kernel_maps import strided_map, submanifold_map, temporal_map
 from src.ops.sparse_conv import sparse_conv
 from src.structures.sparse_bev import SparseMap
 
@@ -64,6 +64,19 @@ class SparseConv(SparseKernel):
         return type(x)(sites, sparse_conv(x.features, self.weight, kernel_map, self.bias))
 
 
+class TemporalConv(SparseKernel):
+    """3x3x3 convolution over (t, y, x) that halves the time axis and, unless dilating, keeps to occupied columns."""
+
+    def __init__(self, in_channels: int, out_channels: int, dilating: bool) -> None:
+        super().__init__(in_channels, out_channels, kernel_size=3, ndim=3, bias=False)
+        self.dilating = dilating
+
+    def forward(self, x: SparseMap) -> SparseMap:
+        build = strided_map if self.dilating else temporal_map
+        kernel_map, sites = build(x.sites, self.kernel_size, (2, 1, 1), 1)
+        return SparseMap(sites, sparse_conv(x.features, self.weight, kernel_map, self.bias))
+
+
 class RowNorm(nn.BatchNorm1d):
     """Batch norm over the rows of all samples; fewer than two rows carry no statistics, so running ones serve them."""
 
@@ -81,6 +94,8 @@ class RowNorm(nn.BatchNorm1d):
 class ConvNormReLU(nn.Module):
     """A sparse convolution, batch norm and ReLU."""
 
+    norm_pairs = (("conv", "norm"),)
+
     def __init__(self, conv: SubmanifoldConv | SparseConv, eps: float, momentum: float) -> None:
         super().__init__()
         self.conv = conv
@@ -93,6 +108,8 @@ class ConvNormReLU(nn.Module):
 
 class ResidualBlock(nn.Module):
     """Two submanifold convolutions with bias and norm around an identity (method 2)."""
+
+    norm_pairs = (("conv1", "bn1"), ("conv2", "bn2"))
 
     def __init__(self, channels: int, ndim: int, eps: float, momentum: float) -> None:
         super().__init__()

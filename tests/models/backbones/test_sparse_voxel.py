@@ -219,7 +219,8 @@ def test_conv_out_dilates_only_when_asked() -> None:
         (
             {},
             {"cells": (382, 384)},
-            r"grid.cells=\[382, 384\]: each must be a multiple of 4, the radar encoder's coarsest stride in cells",
+            r"grid.cells=\[382, 384\]: each must be a multiple of 4, the coarsest stride of "
+            "model.radar_encoder in cells",
         ),
         ({"voxel_size_m": [0.4, 0.2, 8.0]}, {}, "x equal to y"),
         ({"stage_channels": []}, {}, "at least one positive width"),

@@ -12,7 +12,7 @@ from src.models.dense_bev.lift_splat import LiftSplatConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig, DenseBEVLossConfig
 from src.models.dense_bev.pillars import PillarConfig
 from src.models.dense_bev.temporal_fusion import TemporalConfig
-from src.models.heads.center_head import HeadConfig, TrainRegression
+from src.models.heads.center_head import BoxOptions, HeadConfig, TrainRegression
 from src.models.heads.decode import AttributeSource, Suppression
 from src.structures.batch import FrameBatch
 from tests.models import moving
@@ -116,7 +116,7 @@ def dense_config(temporal=None, **changes):
 def dense_model(seed=0, neck=NeckName.fpn, **changes):
     """A fresh model with the random state fixed."""
     torch.manual_seed(seed)
-    return DenseBEV(dense_config(**changes), GRID, backbone(neck), velocity_code_weight=0.2)
+    return DenseBEV(dense_config(**changes), GRID, backbone(neck), BoxOptions(velocity_code_weight=0.2))
 
 
 def memory_config(num_frames=3, max_age_s=6.0):

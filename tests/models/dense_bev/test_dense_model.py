@@ -9,7 +9,7 @@ from src.assembly import build_model
 from src.config import compose_config
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models import MODELS
+from src.models import FAMILIES
 from src.models.backbones.image import NeckName
 from src.models.dense_bev.bev_decoder import BEVDecoder, BEVDecoderConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig, DenseBEVLossConfig
@@ -79,7 +79,7 @@ def test_what_a_missing_camera_shows_does_not_matter():
     batch.images[:, 2] = 255 - batch.images[:, 2]
     after = model(batch)[0]
     assert torch.equal(before.head.logits, after.head.logits)
-    assert torch.equal(model.loss(before, batch)["depth"], model.loss(after, batch)["depth"])
+    assert torch.equal(model.loss(before, batch).terms["depth"], model.loss(after, batch).terms["depth"])
 
 
 def test_two_samples_do_not_mix():
@@ -99,13 +99,13 @@ def test_weights_multiply_and_null_switches_a_term_off(name):
     batch, term = make_batch(), name.removesuffix("_weight")
     model = dense_model().eval()
     output = model(batch)[0]
-    plain = model.loss(output, batch)
+    plain = model.loss(output, batch).terms
     setattr(model.config.loss, name, 2.0 * getattr(model.config.loss, name))
-    double = model.loss(output, batch)
+    double = model.loss(output, batch).terms
     assert {key for key in plain if not torch.equal(plain[key], double[key])} == {term, "total"}
     torch.testing.assert_close(double[term], 2.0 * plain[term])
     setattr(model.config.loss, name, None)
-    assert set(model.loss(output, batch)) == TERMS - {term}
+    assert set(model.loss(output, batch).terms) == TERMS - {term}
 
 
 @pytest.mark.parametrize("temporal", [None, memory_config()])
@@ -113,7 +113,7 @@ def test_autocast_keeps_positions_and_losses_in_float32(temporal):
     model, batch = dense_model(temporal=temporal), make_batch()
     with torch.autocast("cpu", torch.bfloat16):
         output, _ = model(batch)
-        terms = model.loss(output, batch)
+        terms = model.loss(output, batch).terms
     terms["total"].backward()
     assert output.views.bev.dtype == output.radar_bev.dtype == output.head.logits.dtype == torch.float32
     assert output.fused_bev.dtype == torch.bfloat16
@@ -136,8 +136,7 @@ def test_diagnostics_count_pillars_pairs_frames_and_objects():
     assert 0 < found["pillars"] <= 75 and found["remembered_frames"] == 0.0
     assert found["lifted_pairs"] == output.views.num_lifted / 2 and 1 / 16 <= found["depth_confidence"] <= 1
     assert "objects" not in found
-    model.loss(output, batch)
-    assert model.diagnostics(output)["objects"] == 5.0
+    assert model.loss(output, batch).diagnostics["objects"] == 5.0
     memory = model(batch)[1]
     later = make_batch()
     later.timestamps_s += 0.5
@@ -187,7 +186,7 @@ def test_the_decoder_comes_back_to_every_cell(strides):
 def test_sizes_stand_beside_horizon3ds(scale, low, high):
     """40.6 M and 2.4 M parameters there (phase 1); the memory adds little."""
     config, _ = compose_config([f"scale={scale}", "model=dense_bev", "phase=phase2", "data.root=x"])
-    assert type(config.model) is DenseBEVConfig and MODELS[DenseBEVConfig] is DenseBEV
+    assert type(config.model) is DenseBEVConfig and FAMILIES["dense_bev"] == (DenseBEVConfig, DenseBEV)
     parts = {name: sum(p.numel() for p in part.parameters()) for name, part in build_model(config).named_children()}
     memory = parts.pop("temporal")
     assert low < sum(parts.values()) < high and 0 < memory < 0.05 * sum(parts.values()) + 1e4

@@ -1,6 +1,7 @@
 """Memory of maps: alignment under ego motion and augmentation, what is usable, streams, storage, the first step."""
 
 import io
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +11,13 @@ from torch import nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.models.dense_bev.model import DenseBEVConfig
 from src.models.dense_bev.temporal_fusion import MapMemory, TemporalFusion
 from src.reliability.checkpoints import load_model_weights
-from src.training.handoff import MAY_BE_NEW
 from tests.models.dense_bev.dense_frames import GRID, dense_model, drive, memory_config, pose
 from tests.models.moving import bare_frame, bda
+
+ADDED = re.compile(DenseBEVConfig.new_in_temporal_phase)
 
 WIDE = BEVGrid(cells=(96, 96), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
 
@@ -75,7 +78,7 @@ def test_whole_cells_move_without_loss():
 
 
 @pytest.mark.parametrize(("elapsed_s", "metres"), [(0.0, 0.0), (-0.5, 5.0), (6.5, 5.0), (0.5, 80.0)])
-def test_what_is_not_a_usable_past_is_zero_and_only_in_its_lane(elapsed_s, metres):
+def test_what_is_not_a_usable_past_is_zero_and_only_in_its_stream(elapsed_s, metres):
     fusion = make_fusion()
     past = bare_frame(10.0, [pose(), pose()])
     memory = fusion.remember(None, past, map_of(past) + 3.0)
@@ -86,7 +89,7 @@ def test_what_is_not_a_usable_past_is_zero_and_only_in_its_lane(elapsed_s, metre
     assert not found[0].any() and found[1].any()
 
 
-def test_the_newest_frames_stay_and_lanes_come_and_go():
+def test_the_newest_frames_stay_and_streams_come_and_go():
     fusion = make_fusion(num_frames=2)
     memory = None
     for step in range(4):
@@ -161,9 +164,9 @@ def pair():
                 value.add_(0.05 * torch.rand(value.shape, generator=generator))
     second = dense_model(seed=3, temporal=memory_config())
     state = {f"model.{key}": value.clone() for key, value in first.state_dict().items()}
-    new = load_model_weights(second, {"state_dict": state}, Path("phase1.ckpt"), MAY_BE_NEW)
+    new = load_model_weights(second, {"state_dict": state}, Path("phase1.ckpt"), ADDED)
     assert set(new) == second.state_dict().keys() - first.state_dict().keys() and new
-    assert not [key for key in first.state_dict() if MAY_BE_NEW.match(key)]  # none of phase 1 may be missing
+    assert not [key for key in first.state_dict() if ADDED.match(key)]  # none of phase 1 may be missing
     return first, second
 
 
@@ -187,12 +190,12 @@ def test_untrained_memory_leaves_phase_1_to_the_last_bit(pair, training, steps):
     one, two = first(batch)[0], second(batch, memory)[0]
     assert torch.equal(one.fused_bev, two.fused_bev) and torch.equal(one.head.logits, two.head.logits)
     if not training:
-        terms, more = first.loss(one, batch), second.loss(two, batch)
+        terms, more = first.loss(one, batch).terms, second.loss(two, batch).terms
         assert all(torch.equal(terms[name], more[name]) for name in terms)
     assert first(batch)[1] is None
 
 
-def test_trained_memory_changes_the_output_and_lanes_do_not_mix(pair):
+def test_trained_memory_changes_the_output_and_streams_do_not_mix(pair):
     _, model = pair
     model.eval()
     torch.nn.init.normal_(model.temporal.norm.weight)
@@ -216,7 +219,7 @@ def test_every_parameter_of_the_memory_learns(pair, steps):
     for _ in range(2):
         model.zero_grad()
         output, new = model(batch, memory)
-        model.loss(output, batch)["total"].backward()
+        model.loss(output, batch).terms["total"].backward()
         assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
         moved |= {name for name, p in model.temporal.named_parameters() if p.grad.any()}
         optimizer.step()
@@ -224,7 +227,7 @@ def test_every_parameter_of_the_memory_learns(pair, steps):
     assert len(new.frames) == min(steps + 1, 3) and not any(f.cells.requires_grad for f in new.frames)
 
 
-def test_a_memory_of_other_lanes_is_refused(pair):
+def test_a_memory_of_other_streams_is_refused(pair):
     model = pair[1].eval()
     memory = fill(model, 1)
     with pytest.raises(ValueError, match="2 streams, but the batch 1 frames"):

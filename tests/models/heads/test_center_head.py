@@ -98,8 +98,8 @@ def test_sampled_training_equals_all_where_the_sample_is_everything() -> None:
     sampled.regress(sampled(bev), rows, groups)
     for one, other in zip(head.buffers(), sampled.buffers(), strict=True):
         torch.testing.assert_close(one, other)
-    terms = sampled.loss(sampled(bev), boxes, 1.0, 0.25)
-    reference = head.loss(output, boxes, 1.0, 0.25)
+    terms = sampled.loss(sampled(bev), boxes, 1.0, 0.25).terms
+    reference = head.loss(output, boxes, 1.0, 0.25).terms
     torch.testing.assert_close(terms["heatmap"], reference["heatmap"])
     torch.testing.assert_close(terms["box"], reference["box"], rtol=0.2, atol=0)
 
@@ -110,7 +110,7 @@ def test_every_parameter_learns(mode: TrainRegression, attributes: AttributeSour
     head = head_of(train_regression=mode, attributes=attributes).train()
     bev = make_bev()
     bev.features.requires_grad_()
-    terms = head.loss(head(bev), [make_boxes(0), make_boxes(1)], 1.0, 0.25)
+    terms = head.loss(head(bev), [make_boxes(0), make_boxes(1)], 1.0, 0.25).terms
     assert set(terms) == {"heatmap", "box"} | ({"attribute"} if attributes is AttributeSource.learned else set())
     sum(terms.values()).backward()
     for name, parameter in head.named_parameters():
@@ -129,7 +129,7 @@ def test_every_parameter_learns(mode: TrainRegression, attributes: AttributeSour
 @pytest.mark.parametrize("cells", [0, 1, 300])
 def test_batch_without_objects(mode: TrainRegression, cells: int) -> None:
     head = head_of(train_regression=mode, attributes=AttributeSource.learned).train()
-    terms = head.loss(head(make_bev(cells)), [Boxes3D.empty(), Boxes3D.empty()], 1.0, 0.25)
+    terms = head.loss(head(make_bev(cells)), [Boxes3D.empty(), Boxes3D.empty()], 1.0, 0.25).terms
     sum(terms.values()).backward()
     assert all(term.isfinite() for term in terms.values()) and terms["box"].item() == 0
     for name, parameter in head.named_parameters():
@@ -157,11 +157,11 @@ def test_loss_by_hand() -> None:
         y, p = targets.heatmap[:, columns], output.logits[:, columns].sigmoid()
         terms = torch.where(y == 1, (1 - p) ** 2 * p.log(), (1 - y) ** 4 * p**2 * (1 - p).log())
         heatmap -= terms.sum() / max(1, int((y == 1).sum()))
-    terms = head.loss(output, boxes, 2.0, 0.25)
+    terms = head.loss(output, boxes, 2.0, 0.25).terms
     torch.testing.assert_close(terms["box"], 0.25 * box)
     torch.testing.assert_close(terms["heatmap"], 2.0 * heatmap)
-    assert set(head.loss(output, boxes, None, 0.25)) == {"box"}
-    assert head.loss(output, boxes, None, None) == {}
+    assert set(head.loss(output, boxes, None, 0.25).terms) == {"box"}
+    assert head.loss(output, boxes, None, None).terms == {}
 
 
 def output_of_targets(head: CenterHead, bev: SparseBEV, boxes: list[Boxes3D]) -> HeadOutput:
@@ -224,12 +224,12 @@ def test_samples_do_not_mix() -> None:
 def test_autocast_changes_little(regression: TrainRegression) -> None:
     bev = make_bev()
     head = head_of(train_regression=regression).train()
-    plain = head.loss(head(bev), [make_boxes(0), make_boxes(1)], 1.0, 0.25)
+    plain = head.loss(head(bev), [make_boxes(0), make_boxes(1)], 1.0, 0.25).terms
     with torch.autocast("cpu", torch.bfloat16):
         output = head(bev)
         assert output.logits.dtype == torch.float32
         assert output.codes is None or output.codes.dtype == torch.float32
-    halved = head.loss(output, [make_boxes(0), make_boxes(1)], 1.0, 0.25)
+    halved = head.loss(output, [make_boxes(0), make_boxes(1)], 1.0, 0.25).terms
     for name, term in plain.items():
         torch.testing.assert_close(halved[name], term, rtol=0.05, atol=0)
     head.eval()

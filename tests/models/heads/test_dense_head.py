@@ -63,7 +63,7 @@ def test_outputs_losses_gradients_and_boxes_are_the_sparse_heads(train_regressio
     found = []
     for head, bev in ((dense, x.clone().requires_grad_()), (sparse, x.clone().requires_grad_())):
         output = head(bev if head is dense else AllCells()(bev))
-        terms = head.loss(output, boxes, 1.0, 0.25)
+        terms = head.loss(output, boxes, 1.0, 0.25).terms
         sum(terms.values()).backward()
         found.append(
             (output.logits, terms, bev.grad, head.eval().decode(head(bev if head is dense else AllCells()(bev))))

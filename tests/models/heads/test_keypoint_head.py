@@ -13,7 +13,7 @@ def test_shapes_starting_probability_and_size():
     assert maps.depth_logits.shape == (1, 2, 80, 4, 6)
     assert maps.features.shape == (1, 2, 128, 4, 6)
     assert abs(float(maps.keypoint_logits.sigmoid().mean().detach()) - 0.1) < 0.05
-    assert abs(sum(p.numel() for p in head.parameters()) - 0.53e6) < 0.02 * 0.53e6  # specification 4.2
+    assert abs(sum(p.numel() for p in head.parameters()) - 0.53e6) < 0.02 * 0.53e6  # method 4.2
 
 
 def test_every_view_stands_alone():

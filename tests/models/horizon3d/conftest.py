@@ -7,7 +7,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.image import ImageEncoderConfig, NeckName
 from src.models.backbones.sparse_voxel import ConvOut, RadarEncoderConfig
 from src.models.backbones.weights import BackboneName
-from src.models.heads.center_head import HeadConfig, TrainRegression
+from src.models.heads.center_head import BoxOptions, HeadConfig, TrainRegression
 from src.models.heads.decode import AttributeSource, Suppression
 from src.models.horizon3d.bev_path import BEVPathConfig
 from src.models.horizon3d.dptf import DPTFConfig
@@ -203,7 +203,7 @@ def make_model(make_config, grid, backbone):
 
     def build(seed=0, **changes):
         torch.manual_seed(seed)
-        return Horizon3D(make_config(**changes), grid, backbone, velocity_code_weight=0.2)
+        return Horizon3D(make_config(**changes), grid, backbone, BoxOptions(velocity_code_weight=0.2))
 
     return build
 

@@ -57,7 +57,7 @@ def distinct_world_points(batch, grid, count=60, half_m=20.0):
     return points[first], cells[first]
 
 
-# -- the warp, specification section 15 point 4 --------------------------------------------------------------------
+# -- the warp, method 15.4 --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("augs", BDAS.values(), ids=BDAS)
@@ -258,7 +258,7 @@ def test_nothing_remembered_is_none_and_a_frame_without_cells_is_empty():
     assert len(path.recall(Memory((frame,)), now, 6.0).indices) == 0
 
 
-def test_lanes_with_different_motions_equal_single_lanes():
+def test_streams_with_different_motions_equal_single_streams():
     path = make_path(TINY).eval()
     with torch.no_grad():
         path.norms[-1].weight.fill_(1.0)
@@ -298,7 +298,7 @@ def test_lanes_with_different_motions_equal_single_lanes():
 # -- what is stored ------------------------------------------------------------------------------------------------
 
 
-def test_cells_above_the_threshold_are_stored_and_the_cap_keeps_the_best_of_each_lane():
+def test_cells_above_the_threshold_are_stored_and_the_cap_keeps_the_best_of_each_stream():
     path = make_path(memory_threshold=0.3, max_cells_per_frame=2)
     cells = torch.tensor([[0, 1, 1], [0, 2, 2], [0, 3, 3], [1, 1, 1], [1, 2, 2]])
     scores = torch.tensor([0.4, 0.9, 0.5, 0.29, 0.31])

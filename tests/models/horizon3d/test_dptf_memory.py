@@ -112,7 +112,7 @@ def test_the_age_limit_counts_from_time_stamps_not_from_the_number_of_frames():
         assert past.motion(bare_frame(10.0 + elapsed, [pose(5.0)]), 6.0).usable.tolist() == [usable]
 
 
-def test_a_jump_cuts_off_all_that_lies_before_it_and_only_in_its_lane():
+def test_a_jump_cuts_off_all_that_lies_before_it_and_only_in_its_stream():
     """300 m in half a second; in 3.5 s they would pass for a drive, so the neighbours decide."""
     memory = frames_of(2, 8)
     batch = bare_frame(4.0, [pose(70.0 + 300.0), pose(81.0)])
@@ -142,7 +142,7 @@ def test_frames_that_are_not_in_the_past_give_up_their_places():
     assert [frame.present.tolist() for frame in past.frames] == [[True, False], [True, True]]
 
 
-def test_select_follows_lanes_that_move_vanish_restart_and_appear():
+def test_select_follows_streams_that_move_vanish_restart_and_appear():
     memory = frames_of(4, 3, counts=[2, 0, 3, 1])
     # New streams: old stream 2, a new one, old stream 0, old stream 3 restarting; old stream 1 is gone.
     rows, keep = torch.tensor([2, 0, 0, 3]), torch.tensor([True, False, True, False])
@@ -161,7 +161,7 @@ def test_select_follows_lanes_that_move_vanish_restart_and_appear():
         assert torch.equal(new.gaussians.means[[0, 2]], old.gaussians.means[[2, 0]])
 
 
-def test_select_to_fewer_and_to_more_lanes():
+def test_select_to_fewer_and_to_more_streams():
     memory = frames_of(2, 2)
     fewer = memory.select(torch.tensor([1]), torch.tensor([True]))
     assert fewer.batch_size == 1 and set(fewer.frames[0].cells.xy[:, 0].tolist()) == {1.0}

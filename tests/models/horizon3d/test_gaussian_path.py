@@ -1,4 +1,4 @@
-"""What the Gaussian path remembers and how it comes back (specification 6.2, 6.4, 9)."""
+"""What the Gaussian path remembers and how it comes back (method 6.2, 6.4, 9)."""
 
 import math
 from dataclasses import fields, replace
@@ -147,7 +147,7 @@ def test_random_is_the_same_for_a_frame_and_another_for_the_next():
 @pytest.mark.parametrize("flip_x", [False, True])
 @pytest.mark.parametrize("flip_y", [False, True])
 def test_stored_as_if_never_augmented(flip_x, flip_y):
-    """Everything that enters memory is in the ego frame (specification 9)."""
+    """Everything that enters memory is in the ego frame (method 9)."""
     path, ego = make_path(gaussians_per_frame=12), make_gaussians()
     matrix = bda(0.37, 1.05, flip_x, flip_y)
     active = torch.ones(1, 12, dtype=torch.bool)
@@ -252,7 +252,7 @@ def test_without_compensation_only_the_ego_motion_counts():
 @pytest.mark.parametrize("then_aug", [bda(0.3, 1.04, flip_x=True), bda(-0.39, 0.95)])
 @pytest.mark.parametrize("now_aug", [bda(-0.2, 0.96, flip_y=True), bda(0.39, 1.05, True, True)])
 def test_augmentation_changes_nothing_once_it_is_undone(then_aug, now_aug):
-    """BDA on or off gives the same set after A^-1 (specification 15.4), also with another A in each frame."""
+    """BDA on or off gives the same set after A^-1 (method 15.4), also with another A in each frame."""
     path, ego = make_path(gaussians_per_frame=30), make_gaussians(g=30)
     before, after = MOTIONS["turn"]
     active = torch.ones(1, 30, dtype=torch.bool)
@@ -322,7 +322,7 @@ def test_nothing_remembered():
     assert path.recall(Memory((cells_only,)), make_frame([1.0]), 6.0) is None
 
 
-def test_lanes_do_not_mix():
+def test_streams_do_not_mix():
     """Each stream has its own clock, pose, augmentation and past."""
     path, stored = make_path(), make_gaussians(b=3, seed=4)
     befores = [pose(origin=UTM), pose(0.0, 0.0, 2.0, UTM), pose(0.0, 0.0, -1.0)]

@@ -1,4 +1,4 @@
-"""Losses of the temporal part by hand (specification 6.1, 8.1): cells of F_fuse against tight boxes."""
+"""Losses of the temporal part by hand (method 6.1, 8.1): cells of F_fuse against tight boxes."""
 
 import math
 

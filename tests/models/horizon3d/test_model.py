@@ -9,8 +9,9 @@ from omegaconf import OmegaConf
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models import MODEL_CONFIGS, build_model
+from src.models import FAMILIES, build_model
 from src.models.backbones.image import ImageEncoderConfig
+from src.models.heads.center_head import BoxOptions
 from src.models.horizon3d.kggi import Initialization
 from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, RefineFrom
@@ -77,7 +78,7 @@ def test_what_a_missing_camera_shows_does_not_matter(make_model, make_batch):
     batch.images[:, 2] = 255 - batch.images[:, 2]
     after = model(batch)[0]
     assert torch.equal(before.fused_bev.features, after.fused_bev.features)
-    assert torch.equal(model.loss(before, batch)["keypoint"], model.loss(after, batch)["keypoint"])
+    assert torch.equal(model.loss(before, batch).terms["keypoint"], model.loss(after, batch).terms["keypoint"])
 
 
 def test_no_visible_gaussian(make_model, make_batch):
@@ -110,7 +111,7 @@ def test_two_samples_do_not_mix(make_model, make_batch):
 
 def test_radar_only_needs_no_images_and_builds_no_image_part(make_config, make_batch, grid):
     config = make_config(radar_only=True)
-    model = Horizon3D(config, grid, None, velocity_code_weight=0.2)
+    model = Horizon3D(config, grid, None, BoxOptions(velocity_code_weight=0.2))
     assert config.sensors == ("radar",) and model.image_backbone is None
     output, terms = train_step(model, make_batch(images=False))
     assert set(terms) == {"heatmap", "box", "total"}
@@ -130,17 +131,17 @@ def test_random_initialisation_has_neither_keypoint_heads_nor_their_loss(make_mo
 )
 def test_a_null_weight_switches_its_term_off_and_no_other(make_model, make_batch, name):
     model, batch = make_model(**{f"{name}_weight": None}), make_batch()
-    assert set(model.loss(model(batch)[0], batch)) == ALL_TERMS - {name}
+    assert set(model.loss(model(batch)[0], batch).terms) == ALL_TERMS - {name}
 
 
 def test_outer_and_inner_weights_multiply_their_terms(make_model, make_batch):
     batch = make_batch()
     model = make_model()
     output = model(batch)[0]
-    plain = model.loss(output, batch)
+    plain = model.loss(output, batch).terms
     model.config.loss.ocsf_weight, model.config.loss.kggi_weight = 10.0, 3.0
     model.config.loss.depth_weight = 2.0
-    changed = model.loss(output, batch)
+    changed = model.loss(output, batch).terms
     ratios = {name: float((changed[name] / plain[name]).detach()) for name in plain}
     expected = {"occupancy_focal": 2.0, "occupancy_dice": 2.0, "keypoint": 3.0, "radar_objectness": 3.0, "depth": 6.0}
     assert {name: pytest.approx(value) for name, value in expected.items()}.items() <= ratios.items()
@@ -186,7 +187,7 @@ def test_enlarged_boxes_supervise_more_cells(make_model, make_batch):
     tight, wide = [], []
     for margin, found in ((0.0, tight), (4.8, wide)):
         model.config.ocsf.margin_m = margin
-        found.append(model.loss(output, batch)["occupancy_dice"])
+        found.append(model.loss(output, batch).terms["occupancy_dice"])
     assert tight[0] > wide[0]  # untrained Gaussians open far more cells than the boxes hold
 
 
@@ -194,7 +195,7 @@ def test_autocast_keeps_attributes_and_losses_in_float32(make_model, make_batch)
     model, batch = make_model(), make_batch()
     with torch.autocast("cpu", torch.bfloat16):
         output = model(batch)[0]
-        terms = model.loss(output, batch)
+        terms = model.loss(output, batch).terms
     terms["total"].backward()
     gaussians = output.ocsf.gaussians
     for name in ("means", "scales", "directions", "opacity_logits", "velocities"):
@@ -223,8 +224,8 @@ def test_diagnostics_count_objects_that_the_head_cannot_meet(make_model, make_ba
             layer.refinement.output.bias[6] = -30.0  # no Gaussian opens a cell: the second frame has none
         batch.boxes[0] = batch.boxes[0][torch.tensor([0, 1, 1, 2])]  # one object twice
         output = model(batch)[0]
-        model.loss(output, batch)
-    found = {name: float(value) for name, value in model.diagnostics(output).items()}
+        diagnostics = model.loss(output, batch).diagnostics
+    found = {name: float(value) for name, value in diagnostics.items()}
     assert found["objects"] + found["distant_objects"] == 4.0  # 8 in 2 frames
     assert found["distant_objects"] >= 2.0  # all of the second frame
     assert found["shared_objects"] == 1.0
@@ -247,7 +248,7 @@ def test_impossible_combinations_are_refused(make_config, make_batch, make_model
     with pytest.raises(ConfigError, match="model.channels=20"):
         Horizon3DConfig(**values)
     with pytest.raises(ConfigError, match="backbone=null"):
-        Horizon3D(config, grid, None, velocity_code_weight=0.2)
+        Horizon3D(config, grid, None, BoxOptions(velocity_code_weight=0.2))
     with pytest.raises(ValueError, match="images is None"):
         make_model()(make_batch(images=False))
     batch = make_batch()
@@ -278,7 +279,7 @@ def load_config(scale):
     """The model's values at a scale, as the entry points compose them."""
     values = OmegaConf.load(CONF / "model/horizon3d.yaml")
     del values["defaults"]
-    parts = [OmegaConf.structured(MODEL_CONFIGS["horizon3d"]), values]
+    parts = [OmegaConf.structured(FAMILIES["horizon3d"][0]), values]
     if scale != "paper":
         parts.append(OmegaConf.load(CONF / f"model/at_scale/horizon3d_{scale}.yaml"))
     name = "resnet50" if scale == "paper" else "small"
@@ -291,13 +292,13 @@ PAPER_GRID = BEVGrid(cells=(384, 384), cell_m=0.8, centre_m=(0.0, 0.0), z_range_
 
 def test_parameters_of_the_full_size_agree_with_the_budget():
     config, backbone = load_config("paper")
-    model = build_model(config, PAPER_GRID, backbone, velocity_code_weight=0.2)
+    model = build_model(config, PAPER_GRID, backbone, {"velocity_code_weight": 0.2})
     found = {name: sum(p.numel() for p in part.parameters()) / 1e6 for name, part in model.named_children()}
     attention = [layer.temporal_attention for layer in model.ocsf.encoder.layers]
     attention = sum(p.numel() for part in attention for p in part.parameters()) / 1e6
-    found["ocsf"] -= attention  # the specification books it under DPTF
+    found["ocsf"] -= attention  # method 0.3 books it under DPTF
     found["dptf"] += attention
-    # Budget of specification 0.3, millions.
+    # Budget of method 0.3, millions.
     budget = {"image_encoder": 26.2, "radar_encoder": 7.37, "kggi": 0.78, "ocsf": 3.25, "dptf": 2.18, "head": 0.86}
     assert found == {name: pytest.approx(value, rel=0.02) for name, value in budget.items()}
     assert sum(found.values()) == pytest.approx(40.6, rel=0.02)
@@ -308,7 +309,7 @@ def test_parameters_of_the_full_size_agree_with_the_budget():
 @pytest.mark.parametrize("scale", ["mini", "debug"])
 def test_small_scales_build(scale):
     config, backbone = load_config(scale)
-    model = build_model(config, PAPER_GRID, backbone, velocity_code_weight=0.2)
+    model = build_model(config, PAPER_GRID, backbone, {"velocity_code_weight": 0.2})
     assert model.radar_encoder.ndim == 2  # pillars
 
 

@@ -139,7 +139,7 @@ def two_steps(model, first, second):
     memory = None
     for batch in (first, second):
         output, memory = model(batch, memory)
-        terms = model.loss(output, batch)
+        terms = model.loss(output, batch).terms
         optimizer.zero_grad()
         terms["total"].backward()
         assert terms["total"].isfinite()
@@ -189,7 +189,7 @@ def test_what_cannot_go_together_is_refused(make_config, make_model, make_dptf):
         make_dptf(max_age_s=0.0)
 
 
-def test_a_memory_of_other_lanes_is_refused(with_past, make_batch):
+def test_a_memory_of_other_streams_is_refused(with_past, make_batch):
     model, memory, _ = with_past()
     with pytest.raises(ValueError, match="memory holds 2 streams, but the batch 1 frames"):
         model(at(make_batch(points=(100,), boxes=(3,)), 10.5), memory)

@@ -1,5 +1,6 @@
 """The model with memory: phase 1's outputs from phase 1's weights, what gradients reach, frames without anything."""
 
+import re
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -7,9 +8,11 @@ import pytest
 import torch
 
 from src.models.horizon3d.dptf_memory import Memory
+from src.models.horizon3d.model import Horizon3DConfig
 from src.reliability.checkpoints import load_model_weights
-from src.training.handoff import MAY_BE_NEW
 from tests.models.moving import UTM, bda, pose, tensors_of
+
+ADDED = re.compile(Horizon3DConfig.new_in_temporal_phase)
 
 VARIANTS = {
     "both": ({}, {}),
@@ -54,7 +57,7 @@ def pair(make_model, make_dptf):
                     value.add_(0.05 * torch.rand(value.shape, generator=generator))
         second = make_model(seed=3, dptf=make_dptf(**EVERYTHING, **changes), **model_changes)
         state = {f"model.{key}": value.clone() for key, value in first.state_dict().items()}
-        new = load_model_weights(second, {"state_dict": state}, Path("phase1.ckpt"), MAY_BE_NEW)
+        new = load_model_weights(second, {"state_dict": state}, Path("phase1.ckpt"), ADDED)
         assert set(new) == second.state_dict().keys() - first.state_dict().keys()
         return first, second
 
@@ -98,7 +101,7 @@ def test_the_first_frame_is_phase_1_to_the_last_bit(pair, drive, name, training)
         if not training:
             boxes = list(zip(first.decode(one), second.decode(two), strict=True))
             assert all(same(a, b) for a, b in boxes) and sum(len(a) for a, _ in boxes) > 0
-    terms, more = first.loss(one, batch), second.loss(two, batch)
+    terms, more = first.loss(one, batch).terms, second.loss(two, batch).terms
     assert all(torch.equal(terms[name], more[name]) for name in terms if name != "total")
     assert first(batch)[1] is None
 
@@ -158,7 +161,7 @@ def test_every_parameter_has_had_a_gradient_after_one_step_with_memory(make_mode
         batch = drive(step, boxes=(12, 12))  # every class, hence every branch of the head
         output, memory = model(batch, memory)
         optimizer.zero_grad()
-        model.loss(output, batch)["total"].backward()
+        model.loss(output, batch).terms["total"].backward()
         assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
         moved |= {name for name, p in model.named_parameters() if p.grad.any()}
         optimizer.step()
@@ -177,7 +180,7 @@ def test_no_gradient_flows_into_the_frame_before(make_model, make_dptf, drive):
     past = [before.fused_bev.features, before.ocsf.gaussians.means, before.ocsf.gaussians.velocities]
     past += [before.ocsf.gaussians.features, before.dptf.cells.velocities, before.dptf.cells.occupancy_logits]
     assert all(value.requires_grad for value in past)
-    gradients = torch.autograd.grad(model.loss(output, batch)["total"], past, allow_unused=True)
+    gradients = torch.autograd.grad(model.loss(output, batch).terms["total"], past, allow_unused=True)
     assert all(gradient is None for gradient in gradients)
 
 
@@ -198,7 +201,7 @@ def test_empty_frames_with_memory_give_finite_losses_and_gradients(make_model, m
     memory, _ = fill(model, drive, 2, **past)
     batch = drive(2, **now)
     output, after = model(batch, memory)
-    terms = model.loss(output, batch)
+    terms = model.loss(output, batch).terms
     terms["total"].backward()
     assert all(value.isfinite() for value in terms.values())
     assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
@@ -216,13 +219,13 @@ def test_no_visible_gaussian_and_no_radar_now_or_before(make_model, make_dptf, d
     memory, batch = fill(model, drive, 2, points=(0, 0))
     output, _ = model(batch, memory)
     assert len(output.dptf.bev) == len(output.dptf.warped.indices) == 0 and not output.dptf.history.valid.any()
-    terms = model.loss(output, batch)
+    terms = model.loss(output, batch).terms
     terms["total"].backward()
     assert all(value.isfinite() for value in terms.values())
     assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
 
 
-def test_lanes_with_memory_equal_single_lanes(pair, drive):
+def test_streams_with_memory_equal_single_streams(pair, drive):
     _, model = pair({}, {})
     memory, batch = fill(model.eval(), drive, 2)
     with torch.no_grad():
@@ -273,7 +276,7 @@ def test_memory_under_autocast_is_halved_where_it_may_be_and_stays_finite(make_m
         batch = drive(step)
         with torch.autocast("cpu", torch.bfloat16):
             output, memory = model(batch, memory)
-            terms = model.loss(output, batch)
+            terms = model.loss(output, batch).terms
         terms["total"].backward()
     assert all(value.dtype == torch.float32 and value.isfinite() for value in terms.values())
     assert output.dptf.cells.velocities.dtype == output.dptf.warped.xy.dtype == torch.float32

@@ -1,4 +1,4 @@
-"""Self-attention over current and history Gaussians (specification 6.3)."""
+"""Self-attention over current and history Gaussians (method 6.3)."""
 
 import math
 

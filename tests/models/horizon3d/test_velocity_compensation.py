@@ -1,4 +1,4 @@
-"""Velocity compensation beats none on fast synthetic traffic in phase 2 (specification section 15 point 10)."""
+"""Velocity compensation beats none on fast synthetic traffic in phase 2 (method 15.10)."""
 
 from dataclasses import replace
 
@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from src.geometry.bev_grid import BEVGrid
+from src.models.heads.center_head import BoxOptions
 from src.models.horizon3d.dptf_memory import Memory
 from src.models.horizon3d.model import Horizon3D
 from src.structures.batch import FrameBatch
@@ -118,12 +119,12 @@ def stream(model, seed, streams, steps):
 
 def train(config, seed=0, steps=STEPS, streams=STREAMS):
     torch.manual_seed(seed)
-    model = Horizon3D(config, GRID, None, velocity_code_weight=0.2).train()
+    model = Horizon3D(config, GRID, None, BoxOptions(velocity_code_weight=0.2)).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps)
     for batch, output in stream(model, seed, streams, steps):
         optimizer.zero_grad()
-        model.loss(output, batch)["total"].backward()
+        model.loss(output, batch).terms["total"].backward()
         optimizer.step()
         schedule.step()
     return model.eval()

@@ -1,0 +1,97 @@
+"""What suites measure: a model as trained and as prediction prepares it, its frame, its memory, scores as trained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from src.assembly import build_model
+from src.config import Config
+from src.models.deploy.inference import prepare_for_inference
+from src.models.detector import Detector, ModelConfig
+from src.reliability.checkpoints import load_model_weights, read_checkpoint
+from src.structures.batch import FrameBatch
+
+KEY_FRAME_S = 0.5
+CANDIDATES = 300  # cells above the score threshold: what traffic lights up in a trained model, within its 500 boxes
+CELLS_PER_VEHICLE = {"paper": 17, "mini": 6, "debug": 2}  # remembered in each frame; paper: 8000 cells in eight frames
+
+
+@dataclass
+class Case:
+    """A model, as trained and as prediction prepares it, with a batch and, in phase 2, a full memory."""
+
+    model: Detector
+    prepared: Detector
+    batch: FrameBatch
+    memory: Any
+    device: torch.device
+    autocast: bool  # bfloat16
+
+    @contextmanager
+    def precision(self) -> Iterator[None]:
+        """As training and prediction compute."""
+        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.autocast):
+            yield
+
+    def infer(self) -> tuple[Any, Any]:
+        """Forward and decode, without gradients."""
+        with torch.no_grad(), self.precision():
+            output, _ = self.prepared(self.batch, self.memory)
+            return output, self.prepared.decode(output)
+
+    def run(self) -> tuple[Any, Any]:
+        """Forward, for gradients."""
+        with self.precision():
+            return self.model(self.batch, self.memory)
+
+    def step(self) -> Tensor:
+        """Forward, losses and backward; the weights' gradients are dropped."""
+        with self.precision():
+            output, _ = self.model(self.batch, self.memory)
+            total = self.model.loss(output, self.batch).terms["total"]
+        total.backward()
+        self.model.zero_grad(set_to_none=True)
+        return total.detach()
+
+
+def build_case(config: Config, batch: FrameBatch, device: torch.device) -> Case:
+    """The configured model, with weights of `checkpoint=PATH` if given, before its first batch."""
+    model = build_model(config)
+    load_weights(config, model)
+    bf16 = config.precision == "bf16-mixed"
+    return Case(model.to(device).train(), prepare_for_inference(model, bf16), batch, None, device, bf16)
+
+
+def load_weights(config: Config, model: Detector) -> None:
+    """Weights of `checkpoint=PATH`, if given; it must be of this configuration."""
+    if config.checkpoint is not None:
+        load_model_weights(model, read_checkpoint(Path(config.checkpoint)), Path(config.checkpoint))
+
+
+def remember_traffic(model: ModelConfig, scale: str, vehicles: int) -> None:
+    """Fresh weights call no cell occupied: let a memory of cells keep as many of a frame as so much traffic fills."""
+    path = getattr(getattr(model, "dptf", None), "bev_path", None)
+    if path is not None:
+        path.memory_threshold, path.max_cells_per_frame = 0.0, vehicles * CELLS_PER_VEHICLE[scale]
+
+
+def expect_trained_scores(case: Case) -> Any:
+    """Set the score threshold of the prepared model so that decoding has the work that it has in a trained one.
+
+    Fresh weights give every cell about the threshold of the configuration, and boxes would be made of half of them.
+    Returns the memory after the frame that gave the scores.
+    """
+    with torch.no_grad(), case.precision():
+        output, memory = case.prepared(case.batch, case.memory)
+    scores = output.head.logits.float().sigmoid().flatten()
+    if len(scores) > CANDIDATES:
+        head = case.prepared.head
+        head.config = replace(head.config, score_threshold=float(scores.topk(CANDIDATES).values[-1]))
+    return memory

@@ -1,0 +1,34 @@
+"""Layers that lie side by side as one layer, for inference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from src.models.layers.sparse import SubmanifoldConv
+
+
+def joined_convs(convs: Sequence[SubmanifoldConv]) -> SubmanifoldConv:
+    """One convolution with the outputs of all side by side; they read the same input."""
+    first, widths = convs[0], [conv.out_channels for conv in convs]
+    joined = SubmanifoldConv(first.in_channels, sum(widths), first.kernel_size, first.ndim, bias=True)
+    joined.weight.data = torch.cat([conv.weight for conv in convs], dim=2)
+    joined.bias.data = torch.cat([conv.bias for conv in convs])
+    return joined.requires_grad_(False).eval()
+
+
+def block_diagonal(layers: Sequence[nn.Linear]) -> nn.Linear:
+    """One layer that maps the inputs of all, side by side, to the outputs of all."""
+    return joined_linear(torch.block_diag(*(x.weight for x in layers)), torch.cat([x.bias for x in layers]))
+
+
+def joined_linear(
+    weight: Tensor,  # [out, in]
+    bias: Tensor,  # [out]
+) -> nn.Linear:
+    """A linear layer of these values, without gradient."""
+    layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
+    layer.weight, layer.bias = (nn.Parameter(value, requires_grad=False) for value in (weight, bias))
+    return layer

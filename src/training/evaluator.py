@@ -1,0 +1,123 @@
+"""What a validation measures: one evaluator a task (`phase.task`), detection being the first."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from torch import nn
+
+from src.data.datamodule import DetectionDataModule
+from src.metrics.detection import DetectionMetric, score_detections
+from src.metrics.score_text import format_scores
+from src.metrics.scores import DetectionScores
+from src.metrics.submission import to_global
+from src.models.detector import Detector
+from src.pictures.learning_curves import draw_scores
+from src.structures.batch import FrameBatch
+from src.structures.detections import DetectionTable, EvaluationSet
+
+SaveTable = Callable[[Path, list[str], DetectionTable], bool]
+"""Writes the boxes of these samples as a submission; whether there were any."""
+
+
+class Evaluator(nn.Module, ABC):
+    """Collects outputs of a validation and scores them; a module, so that its metrics follow the device."""
+
+    headline: ClassVar[str]
+    """The number of `as_dict` that sweeps and messages go by."""
+
+    @classmethod
+    @abstractmethod
+    def of(cls, datamodule: DetectionDataModule) -> Self:
+        """The evaluator of a data set's validation split."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Forget what was collected."""
+
+    @abstractmethod
+    def update(self, model: Detector, output: Any, batch: FrameBatch) -> None:
+        """Collect one batch's output."""
+
+    @abstractmethod
+    def compute(self) -> dict[str, float]:
+        """Score what all ranks collected, the same on each; the numbers to log as `val/<name>`, the headline first."""
+
+    @abstractmethod
+    def as_dict(self) -> dict[str, Any]:
+        """The last scores as metrics.json holds them."""
+
+    @staticmethod
+    @abstractmethod
+    def describe(metrics: Mapping[str, Any]) -> str:
+        """Content of metrics.json as a table for the terminal. Raises KeyError or TypeError for another task's."""
+
+    def draw(self, folder: Path, title: str) -> None:
+        """Pictures of the last scores."""
+
+    def write(self, folder: Path, save: SaveTable) -> list[str]:
+        """Files besides metrics.json that hold the last results; their names."""
+        return []
+
+
+class DetectionEvaluator(Evaluator):
+    """3D boxes by the official TruckScenes metric.
+
+    After `compute`, `scores` and `detections` are the same on every process.
+    """
+
+    headline = "mAP"
+
+    def __init__(self, evaluation_set: EvaluationSet) -> None:
+        super().__init__()
+        self.metric = DetectionMetric(evaluation_set)
+        self.scores: DetectionScores | None = None
+        self.detections: DetectionTable | None = None
+
+    @classmethod
+    def of(cls, datamodule: DetectionDataModule) -> DetectionEvaluator:
+        """All annotations of the validation split."""
+        return cls(datamodule.evaluation_set())
+
+    def reset(self) -> None:
+        """Forget the boxes of an earlier pass."""
+        self.metric.reset()
+
+    def update(self, model: Detector, output: Any, batch: FrameBatch) -> None:
+        """Decode, bring the boxes to the global frame, hand them to the metric."""
+        for token, boxes, global_from_ego in zip(
+            batch.tokens, model.decode(output), batch.global_from_ego.cpu().numpy(), strict=True
+        ):
+            table = to_global(boxes.to("cpu"), global_from_ego, self.metric.evaluation_set.index_of[token])
+            self.metric.update([token], table)
+
+    def compute(self) -> dict[str, float]:
+        """mAP, NDS and the mean errors."""
+        with self.metric.sync_context():
+            self.detections, _ = self.metric.collected()
+        self.scores = score_detections(self.metric.evaluation_set, self.detections)
+        return self.scores.headline()
+
+    def as_dict(self) -> dict[str, Any]:
+        """See `DetectionScores.as_dict`."""
+        return self.scores.as_dict()
+
+    @staticmethod
+    def describe(metrics: Mapping[str, Any]) -> str:
+        """By distance, class and speed."""
+        return format_scores(metrics)
+
+    def draw(self, folder: Path, title: str) -> None:
+        """Bars by class and distance."""
+        scores = self.as_dict()
+        classes = {name: values["AP"] for name, values in scores["classes"].items()}
+        ranges = {name: values["mAP"] for name, values in scores["ranges"].items()}
+        draw_scores(folder / "scores.png", classes, ranges, title)
+
+    def write(self, folder: Path, save: SaveTable) -> list[str]:
+        """The submission, where there is any box."""
+        path = folder / "submission.json"
+        return [path.name] if save(path, self.metric.evaluation_set.tokens, self.detections) else []
