@@ -78,7 +78,7 @@ class StepGuard:
         bad = {name: float(value) for name, value in terms.items() if not torch.isfinite(value)}
         ranks = gather_by_rank({"bad": bad, "total": float(terms["total"]), "tokens": batch.tokens})
         failing_ranks = [rank for rank, own in enumerate(ranks) if own["bad"]]
-        # Gradients are means over the ranks by now: where every loss is finite, none can be told from the others.
+        # Gradients are means over the ranks by now: where every loss is finite, none can be singled out.
         named_ranks = failing_ranks or range(len(ranks))
         if failing_ranks:
             found = "; ".join(
