@@ -75,6 +75,7 @@ class StepGuard:
         The weights have not changed yet; gradients are dropped, so that the optimiser does nothing. All ranks come here
         together. Raises DivergedError on all of them, with the same words, or when too many steps were skipped.
         """
+        terms = {name: value.detach() for name, value in terms.items()}
         bad = {name: float(value) for name, value in terms.items() if not torch.isfinite(value)}
         ranks = gather_by_rank({"bad": bad, "total": float(terms["total"]), "tokens": batch.tokens})
         failing_ranks = [rank for rank, own in enumerate(ranks) if own["bad"]]
