@@ -219,6 +219,10 @@ class Config:
         if self.model.name not in FAMILIES:
             raise ConfigError(f"model.name={self.model.name}: must be one of {', '.join(FAMILIES)}")
         read_phase_options(self.model.name, self.phase.options)
+        if self.phase.temporal and not self.model.temporal_part:
+            raise ConfigError(
+                f"model={self.model.name} has no memory to train in phase={self.phase.name}; use phase=phase1"
+            )
         for name in ("checkpoint", "predictions", "out", "scene"):
             _refuse_empty(name, getattr(self, name))
         _refuse_empty("data.root", self.data.root)
@@ -277,7 +281,9 @@ def _compose(overrides: list[str]) -> DictConfig:
             tree = compose("config", overrides=overrides)
         if not tree.phase.temporal:
             # In code: a later at_scale file would revive a part that a phase file sets to null.
-            tree.model[OmegaConf.get_type(tree.model).temporal_part] = None
+            part = OmegaConf.get_type(tree.model).temporal_part
+            if part:
+                tree.model[part] = None
         return tree
     except (HydraException, OmegaConfBaseException, OverflowError) as error:  # the last: beyond every float
         raise ConfigError(hydra_message(error)) from error

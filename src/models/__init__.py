@@ -9,6 +9,7 @@ from typing import Any
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.image import ImageEncoderConfig
+from src.models.centerpoint.model import CenterPoint, CenterPointConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig
 from src.models.detector import Detector, ModelConfig
 from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
@@ -16,6 +17,7 @@ from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
 FAMILIES: dict[str, tuple[type[ModelConfig], type[Detector]]] = {
     "horizon3d": (Horizon3DConfig, Horizon3D),
     "dense_bev": (DenseBEVConfig, DenseBEV),
+    "centerpoint": (CenterPointConfig, CenterPoint),
 }
 
 

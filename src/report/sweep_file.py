@@ -95,6 +95,7 @@ class SweepConfig:
     name: str = ""  # the file's; filled in when it is read
     source: str | None = None  # the paper's table(s), as in `Table 12`
     overrides: Many[str] = field(default_factory=list)  # of every row
+    scale_overrides: dict[str, Many[str]] = field(default_factory=dict)  # of every row at a scale, by its name
     baseline: str | None = None  # label of the row that differences are taken to
     latency: bool = False  # measure the latency of every finished row, one after the other
     tables: Many[TableConfig] = field(default_factory=list)
@@ -114,7 +115,9 @@ class SweepConfig:
                 raise ConfigError(
                     f"{where}: the name {name!r} must be of letters, digits, _ and -, and begin with a letter or digit"
                 )
-        given = [*self.overrides, *(override for row in self.rows for override in row.overrides), *self.space]
+        given = [*self.overrides, *self.space]
+        for overrides in (*self.scale_overrides.values(), *(row.overrides for row in self.rows)):
+            given += overrides
         if any(key_of(override) == "seed" for override in given):
             raise ConfigError(f"{where}: seed=... is no part of a sweep; seed= and seeds= of its command say them")
         labels = [row.label for row in self.rows] + [row.label for row in self.paper_rows]
@@ -162,7 +165,8 @@ class SweepConfig:
         return next((row.baseline for row in self.rows if row.label == label and row.baseline), self.baseline)
 
     def at_scale(self, scale: str) -> SweepConfig:
-        """The same question at one scale: a row that is not for it becomes one that only the paper has."""
+        """The same question with the overrides of one scale; a row not for it becomes one that only the paper has."""
         rows = [row for row in self.rows if row.scales is None or scale in row.scales]
         others = [PaperRowConfig(label=row.label, paper=row.paper) for row in self.rows if row not in rows]
-        return replace(self, rows=rows, paper_rows=others + self.paper_rows)
+        overrides = [*self.overrides, *self.scale_overrides.get(scale, [])]
+        return replace(self, overrides=overrides, scale_overrides={}, rows=rows, paper_rows=others + self.paper_rows)

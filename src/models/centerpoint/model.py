@@ -1,0 +1,133 @@
+"""CenterPoint on LiDAR: VoxelNeXt's sparse backbone on points of accumulated sweeps, the sparse CenterPoint head."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.image import ImageEncoderConfig
+from src.models.backbones.sparse_voxel import VoxelEncoder, VoxelEncoderConfig
+from src.models.detector import Detector, Objective
+from src.models.heads.center_head import BoxOptions, CenterHead, HeadConfig, HeadOutput
+from src.structures.batch import FrameBatch
+from src.structures.boxes import Boxes3D
+from src.structures.sparse_bev import SparseBEV
+
+POINT_SCALES = (150.0, 150.0, 5.0, 100.0, 0.5)
+"""x, y, z (m), intensity and dt (s) are divided by these."""
+
+
+@dataclass(kw_only=True)
+class LidarEncoderConfig(VoxelEncoderConfig):
+    """Settings of the LiDAR encoder (`model.lidar_encoder`)."""
+
+    key: ClassVar[str] = "model.lidar_encoder"
+
+
+@dataclass(kw_only=True)
+class CenterPointLossConfig:
+    """Weights of the terms (`model.loss`); null switches a term off, uncomputed."""
+
+    heatmap_weight: float | None
+    box_weight: float | None
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None and value < 0:
+                raise ConfigError(f"model.loss.{field.name}={value}: must not be negative; null switches a term off")
+
+
+@dataclass(kw_only=True)
+class CenterPointConfig:
+    """Settings of the model (`model`)."""
+
+    temporal_part: ClassVar[str] = ""
+    new_in_temporal_phase: ClassVar[str] = ""
+
+    name: str
+    channels: int  # C, width of the BEV map that the head reads
+    lidar_encoder: LidarEncoderConfig
+    head: HeadConfig
+    loss: CenterPointLossConfig
+
+    def __post_init__(self) -> None:
+        if self.channels < 1:
+            raise ConfigError(f"model.channels={self.channels}: must be at least 1")
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """LiDAR alone."""
+        return ("lidar",)
+
+    @property
+    def keys_of_temporal_phase(self) -> tuple[str, ...]:
+        """None: sweeps are accumulated in the input, nothing is remembered."""
+        return ()
+
+    @property
+    def memory_frames(self) -> int:
+        """No past key frame is remembered."""
+        return 0
+
+    @property
+    def memory_max_age_s(self) -> float | None:
+        """Single frames."""
+        return None
+
+
+@dataclass
+class CenterPointOutput:
+    """One frame through the model."""
+
+    lidar_bev: SparseBEV
+    head: HeadOutput
+
+
+class CenterPoint(Detector):
+    """LiDAR points to sparse voxels to a sparse BEV map to boxes (Table 1, CenterPoint-V).
+
+    Raises ConfigError when voxels, stages and grid do not fit together.
+    """
+
+    phase_options = BoxOptions
+
+    def __init__(
+        self, config: CenterPointConfig, grid: BEVGrid, backbone: ImageEncoderConfig | None, options: BoxOptions
+    ) -> None:
+        super().__init__()
+        self.config, self.grid = config, grid
+        self.lidar_encoder = VoxelEncoder(config.lidar_encoder, grid, config.channels, POINT_SCALES)
+        self.head = CenterHead(config.head, config.channels, grid, options.velocity_code_weight)
+
+    def forward(self, batch: FrameBatch, memory: None = None) -> tuple[CenterPointOutput, None]:
+        """Detect in B frames. Raises ValueError for a batch without LiDAR."""
+        if batch.lidar_points is None or batch.lidar_batch is None:
+            raise ValueError("FrameBatch.lidar_points is None, but this model uses LiDAR; read it with the frames")
+        points = batch.lidar_points[:, : len(POINT_SCALES)]
+        bev = self.lidar_encoder(points, batch.lidar_batch, len(batch))
+        return CenterPointOutput(bev, self.head(bev)), None
+
+    def loss(self, output: CenterPointOutput, batch: FrameBatch) -> Objective:
+        """Weighted terms `heatmap` and `box`, and their sum `total`; ValueError without annotations."""
+        if batch.boxes is None:
+            raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
+        weights = self.config.loss
+        with torch.autocast(batch.device.type, enabled=False):
+            terms, counts = self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
+        zero = torch.zeros((), device=batch.device)
+        return Objective(terms | {"total": sum(terms.values(), zero)}, self.diagnostics(output) | counts)
+
+    def decode(self, output: CenterPointOutput) -> list[Boxes3D]:
+        """Boxes of each frame, best first."""
+        return self.head.decode(output.head)
+
+    def diagnostics(self, output: Any) -> dict[str, Tensor]:
+        """Cells of the LiDAR map per frame."""
+        bev = output.lidar_bev
+        return {"lidar_cells": torch.tensor(len(bev) / bev.batch_size, device=bev.features.device)}
