@@ -161,6 +161,8 @@ def run(
     module.evaluator.write(folder.path, partial(save_submission, config))
     record = {
         "run_id": folder.run_id,
+        "task": config.phase.task,
+        "headline": module.evaluator.headline,
         "overrides": overrides,
         "scale": config.scale,
         "seed": config.seed,

@@ -267,7 +267,7 @@ class BoardReader:
 
 def _kind(run: Run) -> tuple[Any, ...]:
     """What two finished runs must share for their numbers to compare."""
-    return (*run.parts[:3], run.result.dataset, run.seed)
+    return (*run.parts[:3], run.result.task, run.result.dataset, run.seed)
 
 
 def _stamps(folder: Path) -> Iterable[tuple[Path, Stamp]]:

@@ -43,7 +43,7 @@ def knob_figures(sweep: Sweep, plot: PlotConfig, results: dict[str, list[RunResu
 
     Both vertical axes have the same length, so that steps compare. Bars where the rows have no place on an axis.
     """
-    metric = find_metric(plot.metric, sweep.key)
+    metric = find_metric(plot.metric, sweep.key, sweep.record.sweep.task)
     rows = sweep.record.sweep.rows
     here = {row.label: _mean_and_spread(results.get(row.label, ()), metric) for row in rows}
     paper = {row.label: row.paper.get(metric.name) for row in rows}
@@ -90,7 +90,7 @@ def search_figures(sweep: Sweep) -> list[Markup]:
     tried = [run for run in sweep.record.runs.values() if run.value is not None] if search.is_search else []
     if not tried:
         return []
-    metric = find_metric(search.objective, sweep.key)
+    metric = find_metric(search.objective, sweep.key, search.task)
     tried.sort(key=lambda run: run.ended or 0.0)
     values = [run.value * metric.scale for run in tried]
     best = [(place, max(values[:place])) for place in range(1, len(values) + 1)]
@@ -171,9 +171,12 @@ def class_figures(results: dict[str, list[RunResult]]) -> list[Markup]:
 def curve_figures(curves: dict[str, Iterable[dict[str, Sequence[tuple[float, float]]]]]) -> list[Markup]:
     """Scores and loss over steps: a line for each run, runs of one row alike."""
     of_row = {label: list(runs) for label, runs in curves.items()}
-    has_epochs = any("loss/total" in run for runs in of_row.values() for run in runs)
+    names = {name for runs in of_row.values() for run in runs for name in run}
+    has_epochs = "loss/total" in names
+    scores = [name.removeprefix("val/") for name in sorted(names) if name.startswith("val/")]
+    of_task = [] if {"mAP", "NDS"} & set(scores) else scores
     figures = []
-    for name, title, words, scale in CURVES:
+    for name, title, words, scale in (*((f"val/{s}", f"{s} while training", s, 1.0) for s in of_task), *CURVES):
         if name == "step/total" and has_epochs:
             continue
         lines = [

@@ -26,6 +26,7 @@ from src.dashboard.figures import headline, run_figures, sweep_figures
 from src.dashboard.folders import Picture
 from src.dashboard.table_view import table_view
 from src.report.metric_names import METRICS, Metric
+from src.report.score_tables import metrics_of
 from src.report.time_left import duration
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -285,7 +286,7 @@ def metric_rows(run: Run, other: Run | None) -> dict[str, list[MetricRow]]:
     if run.result is None:
         return groups
     theirs = other.result.metrics if other is not None and other.result is not None else {}
-    for metric in METRICS.values():
+    for metric in metrics_of(run.result):
         value = run.result.metrics.get(metric.name)
         if value is None:
             continue

@@ -99,11 +99,13 @@ def draw_curves(
 ) -> None:
     """Write a PNG of a CSV log: every column named *loss* (left, logarithmic) and mAP and NDS (right) over epochs.
 
+    Without mAP and NDS, all of `val/` stand at the right.
     Raises DataError when the log cannot be read as numbers by epoch.
     """
     series = read_metrics(metrics_csv)
     losses = {name: line for name, line in series.items() if "loss" in name.lower()}
     scores = {name: line for name, line in series.items() if name.split("/")[-1].lower() in ("map", "nds")}
+    scores = scores or {name: line for name, line in series.items() if name.startswith("val/")}
     canvas = Canvas(SHEET_PX, HEIGHT_PX)
     canvas.text(12, 10, title, 20, bold=True)
     left = canvas.axes(70, 80, 520, HEIGHT_PX - 140)

@@ -13,8 +13,16 @@ from src.errors import DataError
 from src.pictures.comparison import BarPanel, draw_comparison
 from src.reliability.command import run_command
 from src.report.atomic_write import write_whole
-from src.report.metric_names import RANGES, SPEEDS
-from src.report.pages import PHASES_OF, compared_experiments, comparison_page, phase_page, runs_on_page, without_dropout
+from src.report.metric_names import DETECTION, RANGES, SPEEDS
+from src.report.pages import (
+    PHASES_OF,
+    compared_experiments,
+    comparison_page,
+    phase_page,
+    runs_on_page,
+    task_page,
+    without_dropout,
+)
 from src.report.results import RunResult, finished_runs, publish_result, read_results
 from src.report.score_tables import BY_RANGE, BY_SPEED, ERROR_BY_SPEED, Experiment, mean_and_spread
 from src.report.sweep_record import SweepRecord, read_records
@@ -64,31 +72,40 @@ def publish_all(outputs: Path, reports: Path, scale: str) -> list[str]:
 def write_pages(
     config: Config, results: dict[str, RunResult], in_sweeps: Collection[str]
 ) -> tuple[dict[str, Path], list[str]]:
-    """`<phase>_<scale>.md` of every phase that has runs, and what is wrong with the others."""
+    """`<phase>_<scale>.md` of every phase that has runs, and what is wrong with the others.
+
+    Of another task than detection: `<phase>_<task>_<scale>.md`.
+    """
     pages, faults = {}, []
     with_settings = {result.phase for result in results.values() if result.settings} & set(PHASES)
     defaults = {phase: compose_config([f"scale={config.scale}", f"phase={phase}"])[1] for phase in with_settings}
-    for phase in PHASES:
-        runs = runs_on_page(results.values(), phase, in_sweeps, defaults)
+    detection = [run for run in results.values() if run.task == DETECTION]
+    groups = {phase: runs_on_page(detection, phase, in_sweeps, defaults) for phase in PHASES}
+    for run in results.values():
+        if run.task != DETECTION and run.phase in PHASES and run.run_id not in in_sweeps:
+            groups.setdefault(f"{run.phase}_{run.task}", []).append(run)
+    for name, runs in groups.items():
         if runs:
             try:
-                pages[phase] = write_page(Path(config.paths.reports), phase, config.scale, runs)
+                pages[name] = write_page(Path(config.paths.reports), name, config.scale, runs)
             except ValueError as error:
                 kept = f"{config.paths.reports}/results"
                 faults.append(f"{kept}: {error}; keep results on different data in different paths.reports")
     return pages, faults
 
 
-def write_page(reports: Path, phase: str, scale: str, runs: list[RunResult]) -> Path:
+def write_page(reports: Path, name: str, scale: str, runs: list[RunResult]) -> Path:
     """One phase's page; phase 2's holds its runs against phase 1's, and has a picture."""
-    if phase in PHASES_OF:
+    if runs[0].task != DETECTION:
+        text = task_page(runs, scale)
+    elif name in PHASES_OF:
         experiments = compared_experiments(runs)
-        picture = f"pictures/{phase}_{scale}.png"
-        draw_comparison(reports / picture, bar_panels(without_dropout(experiments)), f"{phase}, scale {scale}")
+        picture = f"pictures/{name}_{scale}.png"
+        draw_comparison(reports / picture, bar_panels(without_dropout(experiments)), f"{name}, scale {scale}")
         text = comparison_page(experiments, scale, picture)
     else:
         text = phase_page(runs, scale)
-    path = reports / f"{phase}_{scale}.md"
+    path = reports / f"{name}_{scale}.md"
     write_whole(path, text)
     return path
 

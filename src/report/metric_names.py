@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from src.errors import ConfigError
 from src.structures.taxonomy import CLASSES
 
+DETECTION = "detection"
+"""The task (`phase.task`) whose numbers have names here."""
 RANGES = ("0-25", "25-50", "50-100", "100-150")
 SPEEDS = ("0-0.5", "0.5-10", "10-25", "25+")
 PARTS = ("image_encoder", "radar_encoder", "kggi", "ocsf", "dptf", "detection_head", "total")
@@ -22,10 +24,10 @@ class Metric:
 
     name: str  # path within a result's metrics
     title: str
-    unit: str  # empty where the title says it
-    scale: float  # from the result's unit to the table's: fractions of 1 become percent
-    digits: int
-    higher_is_better: bool
+    unit: str = ""  # empty where the title says it
+    scale: float = 1.0  # from the result's unit to the table's: fractions of 1 become percent
+    digits: int = 3
+    higher_is_better: bool = True
 
     @property
     def heading(self) -> str:
@@ -62,10 +64,15 @@ METRICS["latency.fps"] = Metric("latency.fps", "frames per second", "1/s", 1.0, 
 METRICS["latency.memory_gb"] = Metric("latency.memory_gb", "memory", "GB", 1.0, 2, False)
 
 
-def find_metric(name: str, where: str) -> Metric:
-    """The metric of this name. Raises ConfigError naming `where` it stands and the nearest names there are."""
+def find_metric(name: str, where: str, task: str = DETECTION) -> Metric:
+    """The metric of this name; of another task than detection, any other name is a plain number, larger being better.
+
+    Raises ConfigError naming `where` it stands and the nearest names there are.
+    """
     if name in METRICS:
         return METRICS[name]
+    if task != DETECTION:
+        return Metric(name, name)
     near = difflib.get_close_matches(name, METRICS, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(list(METRICS)[:7])}, ..."
     raise ConfigError(f"{where}: {name} is not a metric; {hint}")

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from src.report.escaping import as_code
-from src.report.metric_names import SPEEDS
+from src.report.metric_names import DETECTION, SPEEDS
 from src.report.plain_yaml import load_plain_yaml
 from src.report.results import RunResult
 from src.report.score_tables import (
@@ -25,6 +25,7 @@ from src.report.score_tables import (
     cost_table,
     gain_table,
     group_runs,
+    metrics_of,
     score_table,
 )
 from src.training.identity import key_of
@@ -54,7 +55,8 @@ NAMES_OF_COMPARISON = {
 
 DROPOUT = "data.sensor_dropout="
 
-METRIC = "official TruckScenes metric on the validation split; percent, mean ± standard deviation over seeds."
+SPREAD = "mean ± standard deviation over seeds."
+METRIC = f"official TruckScenes metric on the validation split; percent, {SPREAD}"
 
 BY_SPEED_TEXT = """By speed of the ground truth (a match follows its ground truth whatever speed it states, a false
 positive the speed it states). Means over the classes that occur at that speed; the velocity error (m/s, at 2 m) of a
@@ -124,6 +126,16 @@ def phase_page(runs: list[RunResult], scale: str) -> str:
     tables = [score_table(experiments, SUMMARY), class_table(experiments), cost_table(experiments)]
     epochs = ", ".join(map(str, sorted({run.epochs for run in runs})))
     return _page(runs[0].phase, scale, f"{epochs} epochs", runs) + "\n\n".join(tables) + "\n"
+
+
+def task_page(runs: list[RunResult], scale: str) -> str:
+    """The runs of one phase and another task than detection: its numbers, cost.
+
+    Raises ValueError when they are of different data.
+    """
+    experiments = group_runs(runs, lambda run: None)
+    tables = [score_table(experiments, metrics_of(runs[0])), cost_table(experiments, epochs=True)]
+    return _page(runs[0].phase, scale, f"task {runs[0].task}", runs) + "\n\n".join(tables) + "\n"
 
 
 def compared_experiments(runs: list[RunResult]) -> list[Experiment]:
@@ -205,7 +217,7 @@ def _page(phase: str, scale: str, epochs: str, runs: list[RunResult]) -> str:
     """Title, conventions and the commands of the runs."""
     text = (
         f"# {phase}, scale {scale}\n\n"
-        f"Data: {runs[0].dataset}; {epochs}; {METRIC} Written by "
+        f"Data: {runs[0].dataset}; {epochs}; {METRIC if runs[0].task == DETECTION else SPREAD} Written by "
         f"`python -m src.report phase={phase} scale={scale}` from the runs\n\n```\n"
     )
     for run in sorted(runs, key=lambda run: (run.phase, run.settings, run.seed)):

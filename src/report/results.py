@@ -18,8 +18,8 @@ from typing_extensions import TypedDict
 
 from src.errors import DataError
 from src.report.atomic_write import write_whole
-from src.report.json_format import ANY_KEYS, OPEN, Count, Many, Measure, read_as
-from src.report.metric_names import METRICS
+from src.report.json_format import ANY_KEYS, OPEN, Count, Many, Measure, read_as, read_json
+from src.report.metric_names import DETECTION, METRICS
 from src.report.plain_yaml import load_plain_yaml
 from src.training.identity import OUTSIDE_IDENTITY, is_of, key_of, without_keys
 
@@ -102,7 +102,7 @@ class SpeedScores(TypedDict):
 
 
 class Scores(Errors):
-    """What tables read of metrics.json."""
+    """What tables read of a detection run's metrics.json."""
 
     mAP: Share
     NDS: Share
@@ -110,6 +110,11 @@ class Scores(Errors):
     classes: dict[str, ClassScores]
     ranges: dict[str, RangeScores]
     speeds: NotRequired[dict[str, SpeedScores]]  # older runs have none
+
+
+@with_config(OPEN)
+class OtherScores(TypedDict, extra_items=Measure | dict[str, Any] | None):
+    """metrics.json of another task: numbers by name are read, what is nested is not."""
 
 
 @with_config(ANY_KEYS)
@@ -149,6 +154,8 @@ class RunRecord:
     """What run.json says of a finished run."""
 
     run_id: str
+    task: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,99}$")] = DETECTION
+    headline: str = "mAP"  # the task's main number; older records have neither
     scale: str
     seed: Count
     overrides: Many[str]  # as typed, in a result without those outside its identity
@@ -178,7 +185,7 @@ class RunResult(RunRecord):
     metrics: dict[str, float | None]
     """By the names of src/report/metric_names.py, as measured: fractions of 1, m/s, ms; None where there is no such
     ground truth; a name is absent where the run was not scored by it. Also speeds.<class>.<boxes | car.boxes>, how
-    much ground truth there is."""
+    much ground truth there is. Of another task than detection: the numbers that its metrics.json has at the top."""
     curves: dict[str, Many[Annotated[list[Measure], Field(min_length=2, max_length=2)]]]
     """[step, value] by column of metrics.csv: loss/*, val/*."""
     latency: Latency | None
@@ -200,6 +207,13 @@ class ResultFile(RunResult):
 
     format: Annotated[int, Field(ge=FORMAT, le=FORMAT)]
     metrics: Scores
+
+
+@dataclass(kw_only=True)
+class OtherResultFile(ResultFile):
+    """The same of another task than detection."""
+
+    metrics: OtherScores
 
 
 def settings_of(overrides: Iterable[str]) -> tuple[str, ...]:
@@ -228,8 +242,13 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
     """
     remedy = "delete run.json and metrics.json there and give the run's command again"
     record = read_as(RunRecord, run_folder / "run.json", remedy)
-    read_as(Scores, run_folder / "metrics.json", remedy)
-    scores = from_json((run_folder / "metrics.json").read_bytes())
+    is_detection = record.task == DETECTION
+    metrics_path = run_folder / "metrics.json"
+    scores = read_as(Scores if is_detection else OtherScores, metrics_path, remedy)
+    if is_detection:
+        scores = _slim(from_json(metrics_path.read_bytes()))
+    else:
+        scores = _numbers(scores, record.headline, metrics_path, remedy)
     config = _read_config(run_folder / "config.yaml")
     latency_path = run_folder / "latency.json"
     latency = read_as(Latency, latency_path, "delete it and measure again") if latency_path.is_file() else None
@@ -244,7 +263,7 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
         **vars(record),
         "overrides": overrides,
         "config": without_local_paths(config),
-        "metrics": _slim(scores),
+        "metrics": scores,
         "curves": _read_curves(run_folder / "metrics.csv"),
         "latency": latency,
     }
@@ -259,11 +278,17 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
 def read_result(path: Path) -> RunResult:
     """Read one result. Raises DataError naming file, key, what was expected and found, and the remedy."""
     remedy = "delete it and run python -m src.report, which writes it anew from the run's folder"
-    fields = vars(read_as(ResultFile, path, remedy))
+    content = from_json(read_json(path, remedy))
+    is_detection = not isinstance(content, dict) or content.get("task", DETECTION) == DETECTION
+    fields = vars(read_as(ResultFile if is_detection else OtherResultFile, path, remedy))
     del fields["format"]
     if fields["run_id"] != path.stem:
         raise DataError(f"{path}: run_id must be {path.stem}, the file's name, but is {fields['run_id']}; {remedy}")
-    return RunResult(**fields | {"metrics": _flat_metrics(fields["metrics"], fields["latency"])})
+    if is_detection:
+        numbers = _flat_scores(fields["metrics"])
+    else:
+        numbers = _numbers(fields["metrics"], fields["headline"], path, remedy)
+    return RunResult(**fields | {"metrics": numbers | _flat_latency(fields["latency"])})
 
 
 def read_results(reports: Path, scale: str | None = None) -> tuple[dict[str, RunResult], dict[Path, DataError]]:
@@ -281,7 +306,14 @@ def read_results(reports: Path, scale: str | None = None) -> tuple[dict[str, Run
     return results, broken
 
 
-def _flat_metrics(scores: Scores, latency: Latency | None) -> dict[str, float | None]:
+def _numbers(scores: OtherScores, headline: str, path: Path, remedy: str) -> dict[str, float | None]:
+    """What is not nested. Raises DataError for a missing headline number."""
+    if not isinstance(scores.get(headline), float):
+        raise DataError(f"{path}: {headline}, the headline number of its task, is missing; {remedy}")
+    return {name: value for name, value in scores.items() if not isinstance(value, dict)}
+
+
+def _flat_scores(scores: Scores) -> dict[str, float | None]:
     """See RunResult.metrics."""
     groups = {"": scores}
     groups |= {f"classes.{name}.": part for name, part in scores["classes"].items()}
@@ -295,10 +327,14 @@ def _flat_metrics(scores: Scores, latency: Latency | None) -> dict[str, float | 
         values[prefix + "car.boxes"] = car["num_gt"]
         for key in ("AP", "AVE"):  # the official numbers of a class without ground truth are 0 and 1, and say nothing
             values[f"{prefix}car.{key}"] = car[key] if car["num_gt"] else None
-    if latency is not None:
-        values |= {f"latency.{part}": value for part, value in latency["ms"].items()}
-        values |= {f"latency.{name}": latency[name] for name in ("fps", "memory_gb")}
     return values
+
+
+def _flat_latency(latency: Latency | None) -> dict[str, float]:
+    if latency is None:
+        return {}
+    values = {f"latency.{part}": value for part, value in latency["ms"].items()}
+    return values | {f"latency.{name}": latency[name] for name in ("fps", "memory_gb")}
 
 
 def _slim(scores: dict[str, Any]) -> dict[str, Any]:

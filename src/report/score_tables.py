@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from src.report.escaping import as_code
-from src.report.metric_names import METRICS, RANGES, SPEEDS, Metric
+from src.report.metric_names import DETECTION, METRICS, RANGES, SPEEDS, Metric
 from src.report.results import RunResult
 
 CAR_AP = METRICS["classes.car.AP"]
@@ -38,10 +38,15 @@ class Experiment:
         return [] if None in found else found
 
 
-def group_runs(runs: list[RunResult], name_of: Callable[[RunResult], str | None]) -> list[Experiment]:
-    """Runs by phase and settings, best mAP first; `name_of` names known ones, others show their overrides.
+def metrics_of(run: RunResult) -> list[Metric]:
+    """What may be shown of a run: detection's metrics, or its own task's."""
+    return [METRICS.get(name, Metric(name, name)) for name in (METRICS if run.task == DETECTION else run.metrics)]
 
-    Raises ValueError when the runs are of different data.
+
+def group_runs(runs: list[RunResult], name_of: Callable[[RunResult], str | None]) -> list[Experiment]:
+    """Runs of one task by phase and settings, best headline number first.
+
+    `name_of` names known ones, others show their overrides. Raises ValueError when the runs are of different data.
     """
     data = {run.dataset for run in runs}
     if len(data) > 1:
@@ -50,7 +55,11 @@ def group_runs(runs: list[RunResult], name_of: Callable[[RunResult], str | None]
     for run in sorted(runs, key=lambda run: run.seed):
         groups.setdefault((run.phase, *run.settings), []).append(run)
     experiments = []
-    for group in sorted(groups.values(), key=lambda group: -statistics.mean(run.metrics["mAP"] for run in group)):
+
+    def headline(group: list[RunResult]) -> float:
+        return statistics.mean(run.metrics[run.headline] for run in group)
+
+    for group in sorted(groups.values(), key=headline, reverse=True):
         label = name_of(group[0]) or as_code(group[0].settings or ("defaults",))
         experiments.append(Experiment(label, group))
     labels = [experiment.label for experiment in experiments]

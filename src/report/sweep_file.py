@@ -13,7 +13,7 @@ from pydantic import with_config
 
 from src.errors import ConfigError
 from src.report.json_format import CLOSED, Count, Many
-from src.report.metric_names import find_metric
+from src.report.metric_names import DETECTION, find_metric
 from src.training.identity import key_of
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
@@ -40,7 +40,7 @@ class TableConfig:
 
     name: str  # file name under reports/tables, without scale
     title: str
-    columns: Many[str]  # names of src/report/metric_names.py
+    columns: Many[str]  # names of src/report/metric_names.py, or another task's own
     rows: Many[str] | None = None  # labels, the paper's own rows included; null: all
 
 
@@ -94,6 +94,7 @@ class SweepConfig:
     question: str  # what the rows tell, one sentence
     name: str = ""  # the file's; filled in when it is read
     source: str | None = None  # the paper's table(s), as in `Table 12`
+    task: str = DETECTION  # of every row, as `phase.task`
     overrides: Many[str] = field(default_factory=list)  # of every row
     scale_overrides: dict[str, Many[str]] = field(default_factory=dict)  # of every row at a scale, by its name
     baseline: str | None = None  # label of the row that differences are taken to
@@ -103,7 +104,7 @@ class SweepConfig:
     rows: Many[RowConfig] = field(default_factory=list)
     paper_rows: Many[PaperRowConfig] = field(default_factory=list)
     space: dict[str, DimensionConfig] = field(default_factory=dict)  # a search instead of rows
-    objective: str = "NDS"  # of a search, larger is better
+    objective: str | None = None  # of a search, larger is better; null: detection's is NDS
     trials: Count = 0  # of a search
 
     def __post_init__(self) -> None:
@@ -115,6 +116,12 @@ class SweepConfig:
                 raise ConfigError(
                     f"{where}: the name {name!r} must be of letters, digits, _ and -, and begin with a letter or digit"
                 )
+        if self.task == DETECTION:
+            self.objective = self.objective or "NDS"
+        elif self.rows and not self.tables:
+            raise ConfigError(f"{where}: give tables with the columns of task {self.task}")
+        elif self.space and self.objective is None:
+            raise ConfigError(f"{where}: give the objective of task {self.task}")
         given = [*self.overrides, *self.space]
         for overrides in (*self.scale_overrides.values(), *(row.overrides for row in self.rows)):
             given += overrides
@@ -134,24 +141,24 @@ class SweepConfig:
                 raise ConfigError(f"{where}: baseline {baseline!r} must be for every scale; leave its scales out")
         for row in [*self.rows, *self.paper_rows]:
             for metric in row.paper:
-                find_metric(metric, f"{where}, row {row.label!r}, paper")
+                find_metric(metric, f"{where}, row {row.label!r}, paper", self.task)
         names = [table.name for table in self.tables]
         if len(set(names)) < len(names):
             raise ConfigError(f"{where}: two tables have one name ({', '.join(names)})")
         for table in self.tables:
             for column in table.columns:
-                find_metric(column, f"{where}, table {table.name}, columns")
+                find_metric(column, f"{where}, table {table.name}, columns", self.task)
             unknown = [label for label in table.rows or () if label not in labels]
             if unknown:
                 raise ConfigError(f"{where}, table {table.name}: there is no row {', '.join(unknown)}")
             if not table.columns:
                 raise ConfigError(f"{where}, table {table.name}: columns is empty; name at least one metric")
         for plot in self.plots:
-            find_metric(plot.metric, f"{where}, plots")
+            find_metric(plot.metric, f"{where}, plots", self.task)
         for key, dimension in self.space.items():
             dimension.check(f"{where}, space, {key}")
         if self.space:
-            find_metric(self.objective, f"{where}, objective")
+            find_metric(self.objective, f"{where}, objective", self.task)
             if self.trials < 1:
                 raise ConfigError(f"{where}: trials must be at least 1, but got {self.trials}")
 

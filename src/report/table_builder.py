@@ -6,7 +6,7 @@ from pathlib import Path
 
 from src.errors import DataError
 from src.report.atomic_write import write_whole
-from src.report.metric_names import METRICS, Metric
+from src.report.metric_names import Metric, find_metric
 from src.report.orderings import paired_gains
 from src.report.results import RunResult, read_result, result_path
 from src.report.sweep_file import TableConfig
@@ -107,6 +107,10 @@ def _table_configs(record: SweepRecord) -> list[TableConfig]:
     return record.sweep.tables or [TableConfig(name=record.name, title=record.sweep.title, columns=columns)]
 
 
+def _columns(record: SweepRecord, config: TableConfig) -> list[Metric]:
+    return [find_metric(name, config.name, record.sweep.task) for name in config.columns]
+
+
 def _run_ids(record: SweepRecord) -> list[str]:
     """Runs that a table shows, without those that others only start from."""
     if not record.sweep.is_search:
@@ -116,7 +120,7 @@ def _run_ids(record: SweepRecord) -> list[str]:
 
 
 def _row_table(record: SweepRecord, results: dict[str, RunResult], config: TableConfig) -> SweepTable:
-    columns, sweep = [METRICS[name] for name in config.columns], record.sweep
+    columns, sweep = _columns(record, config), record.sweep
     rows: dict[str, SweepRow] = {}
     for row in sweep.rows:
         runs = record.rows.get(row.label, {})
@@ -145,8 +149,8 @@ def _row_table(record: SweepRecord, results: dict[str, RunResult], config: Table
 
 def _search_table(record: SweepRecord, results: dict[str, RunResult], config: TableConfig) -> SweepTable:
     """Trials by objective, the best first; pruned, failed and open ones below."""
-    columns = [METRICS[name] for name in config.columns]
-    objective = METRICS[record.sweep.objective]
+    columns = _columns(record, config)
+    objective = find_metric(record.sweep.objective, record.name, record.sweep.task)
     scored: list[tuple[SweepRow, float | None]] = []
     for run_id in _run_ids(record):
         run, result = record.runs[run_id], results.get(run_id)

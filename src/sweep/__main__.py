@@ -150,7 +150,7 @@ class Identifier:
         config, tree = self.compose(overrides)
         source = find_source(config, overrides, self.compose, PHASES)
         run_id = run_identity(tree, source.identity if source is not None else None)
-        return RunIdentity(run_id, config.scale, source.overrides if source is not None else None)
+        return RunIdentity(run_id, config.scale, source and source.overrides, config.phase.task)
 
 
 def definition(plan: Plan, common: list[str]) -> dict[str, Any]:

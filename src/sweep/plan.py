@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from src.errors import ConfigError, HorizonError
+from src.report.metric_names import DETECTION
 from src.report.sweep_file import RowConfig, SweepConfig
 from src.report.sweep_record import suffix_of
 from src.training.identity import OUTSIDE_IDENTITY, is_of, key_of
@@ -19,6 +20,7 @@ class RunIdentity:
     run_id: str
     scale: str
     source: list[str] | None  # command line of the run whose weights it starts from
+    task: str = DETECTION
 
 
 Identify = Callable[[list[str]], RunIdentity]
@@ -152,13 +154,16 @@ def _compose(
     sweep: SweepConfig, row: RowConfig | None, overrides: list[str], common: list[str], identify: Identify
 ) -> RunIdentity:
     """Identify a row; errors name it, unless the command line alone already fails the same way."""
+    where = f"sweeps/{sweep.name}.yaml" + (f", row {row.label!r}" if row is not None else ", overrides")
     try:
-        return identify(overrides)
+        found = identify(overrides)
     except HorizonError as error:
         try:
             identify(common)
         except HorizonError as of_command:
             if str(of_command) == str(error):
                 raise
-        where = f"sweeps/{sweep.name}.yaml" + (f", row {row.label!r}" if row is not None else ", overrides")
         raise ConfigError(f"{where}: {error}") from error
+    if found.task != sweep.task:
+        raise ConfigError(f"{where}: phase.task={found.task}, but the sweep is of task {sweep.task}")
+    return found

@@ -19,7 +19,16 @@ def is_finished(folder: Path) -> bool:
 
 def is_done(folder: Path) -> bool:
     """Whether the run is finished and has a score."""
-    return is_finished(folder) and read_score(folder, "mAP") is not None
+    return is_finished(folder) and read_score(folder, read_headline(folder)) is not None
+
+
+def read_headline(folder: Path) -> str:
+    """Name of the task's main number in metrics.json; detection's where run.json does not say."""
+    try:
+        name = json.loads((folder / "run.json").read_text())["headline"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return "mAP"
+    return name if isinstance(name, str) else "mAP"
 
 
 def read_score(folder: Path, metric: str) -> float | None:

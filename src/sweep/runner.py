@@ -19,12 +19,13 @@ from optuna.trial import Trial
 
 from src.errors import HorizonError
 from src.reliability.command import INTERRUPT_GRACE_S
+from src.report.metric_names import METRICS, Metric
 from src.report.sweep_record import SweepRecord
 from src.sweep.launcher import ExitStatus, Launcher, StopRequest
 from src.sweep.plan import Plan, RunSpec
 from src.sweep.progress import progress_line
 from src.sweep.record_writer import RecordWriter
-from src.sweep.run_status import is_busy, is_finished, read_score
+from src.sweep.run_status import is_busy, is_finished, read_headline, read_score
 from src.sweep.sweep_study import DatabaseError, SweepStudy, SweepTrial, TrialEndedError
 
 logger = logging.getLogger(__name__)
@@ -188,7 +189,8 @@ class Runner:
             if status.reason:
                 self.study.set_attr(trial, "reason", status.reason)
             raise TrialEndedError(status.reason)
-        return read_score(self.outputs / spec.run_id, "mAP") or 0.0
+        folder = self.outputs / spec.run_id
+        return read_score(folder, read_headline(folder)) or 0.0
 
     def train(self, spec: RunSpec, worker: int, watch: Callable[[], bool] | None = None) -> ExitStatus | None:
         """Train one run, or wait for whoever trains it: None when it is done, else the exit status.
@@ -217,12 +219,14 @@ class Runner:
         if not reason and not is_finished(folder):
             reason = f"it ended with exit code 0, but {folder} has no run.json and metrics.json"
         elif not reason and not self.writer.is_done(spec.run_id):
-            reason = f"{folder / 'metrics.json'} has no finite mAP"
+            reason = f"{folder / 'metrics.json'} has no finite {read_headline(folder)}"
         if reason:
             logger.warning("%s: FAILED after %.0f s: %s; log: %s", name_of(spec), seconds, reason, self._log(spec))
             return replace(status, reason=reason)
-        score = read_score(folder, "mAP") or 0.0
-        logger.info("%s: done after %.0f s, mAP %.1f %%", name_of(spec), seconds, 100 * score)
+        name = read_headline(folder)
+        metric = METRICS.get(name, Metric(name, name))
+        score = f"{metric.scale * (read_score(folder, name) or 0.0):.{metric.digits}f} {metric.unit}".rstrip()
+        logger.info("%s: done after %.0f s, %s %s", name_of(spec), seconds, metric.title, score)
         self._publish(spec.run_id)
         return None
 

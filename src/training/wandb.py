@@ -88,7 +88,9 @@ class WandbRun(Logger):
         def send(run: Any) -> None:
             import wandb
 
-            tables = {name: wandb.Table(*_table(name, scores[name])) for name in ("classes", "ranges")}
+            tables = {
+                name: wandb.Table(*_table(name, scores[name])) for name in ("classes", "ranges") if name in scores
+            }
             shown = sorted(pictures.glob("*.png"))
             run.log(tables | {f"pictures/{_picture_name(path)}": wandb.Image(str(path)) for path in shown})
             run.summary.update({name: value for name, value in scores.items() if _is_number(value)})
