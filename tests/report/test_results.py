@@ -233,6 +233,37 @@ def test_a_share_of_all_may_be_a_rounding_above_one(published):
     assert read_result(published).metrics["mAP"] == 1.0000000000000002
 
 
+def other_task(folder, **metrics):
+    damage(folder / "run.json", lambda record: record.update(task="segmentation", headline="IoU"))
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    return folder
+
+
+def test_a_run_of_another_task_has_the_numbers_it_has(write_run, reports):
+    folder = other_task(write_run("a", [], 0, 0.3), IoU=1, recall=0.25, lanes=None, classes={"car": float("nan")})
+    path = publish_result(folder, reports)
+    result = read_result(path)
+    assert (result.task, result.headline) == ("segmentation", "IoU")
+    assert result.metrics == {"IoU": 1.0, "recall": 0.25, "lanes": None}
+    damage(path, lambda content: content.update(task="detection"))
+    with pytest.raises(DataError, match="metrics.mAP is missing"):
+        read_result(path)
+    damage(path, lambda content: content.update(task="../x"))
+    with pytest.raises(DataError, match="task must match pattern"):
+        read_result(path)
+
+
+@pytest.mark.parametrize(
+    ("metrics", "message"),
+    [({"recall": 0.5}, "IoU, the headline number of its task, is missing"),
+     ({"IoU": None}, "IoU, the headline number of its task, is missing"),
+     ({"IoU": float("nan")}, "IoU.* must be a finite number"), ({"IoU": 0.5, "recall": "high"}, "recall.* must be a")],
+)  # fmt: skip
+def test_numbers_of_another_task_are_checked(write_run, reports, metrics, message):
+    with pytest.raises(DataError, match=rf"a/metrics\.json: {message}"):
+        publish_result(other_task(write_run("a", [], 0, 0.3), **metrics), reports)
+
+
 def test_losses_too_large_to_draw_are_left_out(write_run, reports):
     folder = write_run("a", [], 0, 0.3)
     (folder / "metrics.csv").write_text("step,loss/total\n1,1e300\n2,5.0\n")

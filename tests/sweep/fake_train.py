@@ -34,7 +34,7 @@ def identify(overrides):
     source = None
     if phase == "phase2":
         source = ["phase=phase1", *[override for override in overrides if not is_of(override, SOURCE)]]
-    return RunIdentity(f"fake-{phase}-{scale}-{digest}", scale, source)
+    return RunIdentity(f"fake-{phase}-{scale}-{digest}", scale, source, keys.get("phase.task", "detection"))
 
 
 def main(overrides):
@@ -78,8 +78,11 @@ def main(overrides):
         print("Epoch 0: 50%\rEpoch 0: 100%\n\nDivergedError: the loss is nan at step 3\n")
         sys.exit(int(code))
     metrics = {"mAP": None if score != score else score, "NDS": None if score != score else score}
+    record = {"run_id": run_id, "seconds": {"fit": 1.0, "all": 2.0}}
+    if keys.get("phase.task", "detection") != "detection":
+        metrics, record["headline"] = {"IoU": metrics["mAP"]}, "IoU"
     (folder / "metrics.json").write_text(json.dumps(metrics))
-    (folder / "run.json").write_text(json.dumps({"run_id": run_id, "seconds": {"fit": 1.0, "all": 2.0}}))
+    (folder / "run.json").write_text(json.dumps(record))
     note("end")
 
 

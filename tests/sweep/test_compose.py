@@ -107,6 +107,12 @@ def test_a_misplaced_password_is_refused_and_not_shown(sweeps, override):
         ("title: t\nquestion: q\nrows: [{label: a\n", "while parsing"),
         ("title: t\nquestion: q\nspace: {optim.lr: {low: 3, high: 2}}\n", "low must be below high"),
         ("title: t\nquestion: q\nspace: {optim.lr: {low: 1, high: 2}}\n", "trials must be at least 1"),
+        (GOOD + "tables: [{name: t, title: T, columns: [IoU]}]\n", "table t, columns: IoU is not a metric"),
+        (GOOD + "task: segmentation\n", "give tables with the columns of task segmentation"),
+        (
+            "title: t\nquestion: q\ntask: segmentation\ntrials: 2\nspace: {optim.lr: {low: 1, high: 2}}\n",
+            "give the objective of task segmentation",
+        ),
         ("", "title"),
         ("- a\n", r"the file must be an object, but is \['a'\]"),
     ],
@@ -116,6 +122,14 @@ def test_bad_files_are_named(sweeps, content, said):
     with pytest.raises(ConfigError, match=said) as caught:
         load_sweep("bad")
     assert str(caught.value).startswith("sweeps/bad.yaml")
+
+
+def test_a_sweep_of_another_task_names_its_own_numbers(sweeps):
+    (sweeps / "other.yaml").write_text(
+        GOOD.replace("label: a", "label: a, paper: {IoU: 3}") + "task: segmentation\n"
+        "tables: [{name: t, title: T, columns: [IoU, latency.total]}]\nplots: [{metric: IoU, label: x}]\n"
+    )
+    assert load_sweep("other").task == "segmentation" and load_sweep("good").task == "detection"
 
 
 def test_a_files_name_is_the_sweeps(sweeps):

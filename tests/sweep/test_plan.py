@@ -91,3 +91,8 @@ def test_a_phase_other_than_the_files_is_refused():
         make_plan(make_sweep(rows), ["phase=phase2"], [0], identify)
     plan = make_plan(make_sweep({"a": ["model.x=1"]}), ["phase=phase2"], [0], identify)  # the file says none
     assert plan.changes == ["phase=phase2"]
+
+
+def test_a_row_of_another_task_than_the_sweeps_is_refused():
+    with pytest.raises(ConfigError, match="row 'a': phase.task=segmentation, but the sweep is of task detection"):
+        make_plan(make_sweep({"a": ["phase.task=segmentation"]}), [], [0], identify)

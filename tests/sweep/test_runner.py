@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from src.errors import ConfigError
+from src.report.sweep_file import TableConfig
 from src.report.sweep_record import read_record, record_path, write_record
 from src.sweep.launcher import ExitStatus
 from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep
@@ -126,6 +127,18 @@ def test_a_score_that_is_no_number_is_a_failure(tmp_path):
     record = make_runner(tmp_path, make_sweep({"nan": ["fake.score=nan"]})).run()
     (run,) = record.runs.values()
     assert run.state == "failed" and "no finite mAP" in run.reason
+
+
+def test_a_run_of_another_task_is_done_by_its_own_headline(tmp_path, caplog):
+    sweep = make_sweep(
+        {"good": ["fake.score=0.5"], "nan": ["fake.score=nan"]}, overrides=["phase.task=segmentation"],
+        task="segmentation", tables=[TableConfig(name="t", title="t", columns=["IoU"])],
+    )  # fmt: skip
+    with caplog.at_level("INFO"):
+        record = make_runner(tmp_path, sweep).run()
+    good, bad = record.runs.values()
+    assert good.state == "done" and good.value == 0.5 and "IoU 0.500" in caplog.text
+    assert bad.state == "failed" and "no finite IoU" in bad.reason
 
 
 def test_rows_and_seeds_extend_a_sweep_and_earlier_seeds_stay(tmp_path):
