@@ -249,7 +249,7 @@ def test_a_run_of_another_task_has_the_numbers_it_has(write_run, reports):
     with pytest.raises(DataError, match="metrics.mAP is missing"):
         read_result(path)
     damage(path, lambda content: content.update(task="../x"))
-    with pytest.raises(DataError, match="task must match pattern"):
+    with pytest.raises(DataError, match="task String should match pattern"):
         read_result(path)
 
 
