@@ -27,7 +27,7 @@ class Evaluator(nn.Module, ABC):
     """Collects outputs of a validation and scores them; a module, so that its metrics follow the device."""
 
     headline: ClassVar[str]
-    """The number of `as_dict` that sweeps and messages go by."""
+    """The number at the top of `as_dict` that sweeps and messages go by; larger is better."""
 
     @classmethod
     @abstractmethod
