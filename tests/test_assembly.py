@@ -45,7 +45,7 @@ def test_a_submission_states_the_sensors_that_the_model_reads(tmp_path, monkeypa
     monkeypatch.setattr(type(config.model), "sensors", sensors)
     written = []
     monkeypatch.setattr(assembly, "write_submission", lambda path, tokens, table, meta: written.append(meta))
-    assert save_submission(tmp_path / "submission.json", ["a"], [None], config)
+    assert save_submission(config, tmp_path / "submission.json", ["a"], [None])
     stated = {name.removeprefix("use_") for name, used in written[0].items() if name.startswith("use_") and used}
     assert stated == set(sensors)
 

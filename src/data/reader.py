@@ -14,22 +14,20 @@ import numpy as np
 import torch
 
 from src.data.augment import AugmentationConfig, draw_bev_transform, draw_crop, frame_generator
-from src.data.deskew import lidar_tensors, place_sweep
+from src.data.compensation import compensate_clouds, ego_motion, lidar_tensors, place_sweep
 from src.data.images import read_image, width_fit
 from src.data.pcd import LidarCloud, read_lidar_points, read_radar_points
 from src.data.schema import CHANNELS, DatasetIndex
 from src.errors import DataError
 from src.geometry.camera import pixels_from_points
-from src.geometry.transforms import invert_rigid, pose_matrix, quaternion_to_matrix, rotation_vector, yaw_of
-from src.structures.batch import MAX_EGO_SPEED_MPS, RADAR_POINT_FIELDS, FrameBatch
+from src.geometry.transforms import invert_rigid, pose_matrix, quaternion_to_matrix, yaw_of
+from src.structures.batch import RADAR_POINT_FIELDS, FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CAMERAS, LIDARS, RADARS
 
 Array = np.ndarray
 T = TypeVar("T")
 
-VELOCITY_WINDOW_US = 100_000
-"""Ego velocity is the pose difference over +- this time; the chassis table reads zero for long stretches."""
 MAX_SCAN_S = 0.3
 """Points further in time from their sweep are of another clock; a LiDAR takes 0.1 s for a sweep."""
 
@@ -377,93 +375,6 @@ def compensate_sweeps(
         velocity=velocity,
         rate=rate,
         elapsed_s=1e-6 * (key_time_us - index.data_times_us[rows]),
-        settings=settings,
+        min_distance_m=settings.min_distance_m,
+        propagate_points=settings.propagate_points,
     )
-
-
-def compensate_clouds(
-    clouds: list[Array],  # S of [n, 7] in the order of RADAR_FIELDS, sensor frame
-    ego_from_sensor: Array,  # [S, 4, 4]
-    key_from_sweep: Array,  # [S, 4, 4] ego(t) from the ego frame at each sweep
-    velocity: Array,  # [S, 3] m/s of the ego at each sweep, its own axes
-    rate: Array,  # [S, 3] rad/s, same axes
-    elapsed_s: Array,  # [S] key frame minus sweep
-    settings: ReaderSettings,
-) -> Array:  # [P, 7] float64: x, y, z (m, ego(t)), rcs, vx, vy (m/s over ground, radial, ego(t) axes), dt (s)
-    """Move sweeps to ego(t) and turn relative radial velocities into velocities over ground (method 1.3).
-
-    r_hat points from the sensor to the target, v_s is the sensor's own velocity, lever arm included:
-    v_r = vrel . r_hat + v_s . r_hat, zero for whatever stands still.
-    """
-    sensor_velocity = velocity + np.cross(rate, ego_from_sensor[:, :3, 3])
-    key_from_sensor = key_from_sweep @ ego_from_sensor
-    counts = [len(cloud) for cloud in clouds]
-
-    def rows(values: Array, *shape: int) -> Array:  # [S, ...] -> [..., P]
-        """A sweep's numbers once for each of its points, as rows: whole rows are what numpy is fast on."""
-        return np.repeat(values.reshape(len(counts), -1).T, counts, axis=1).reshape(*shape, -1)
-
-    # [3, P] each
-    place, relative, (rcs,) = np.split(np.concatenate(clouds).T.astype(np.float64, order="C"), (3, 6))
-    distance = np.sqrt(_dot(place, place))
-    near = (np.abs(place[:2]) < settings.min_distance_m).all(axis=0) | (distance < 1e-6)
-    distance[near] = 1.0  # left out at the end; until then no division by zero
-    direction = place / distance  # sensor frame
-    direction_ego = _rotate(rows(ego_from_sensor[:, :3, :3], 3, 3), direction)
-    speed = _dot(relative, direction) + _dot(rows(sensor_velocity, 3), direction_ego)
-    position = _rotate(rows(key_from_sensor[:, :3, :3], 3, 3), place) + rows(key_from_sensor[:, :3, 3], 3)
-    ground_velocity = speed * _rotate(rows(key_from_sweep[:, :2, :3], 2, 3), direction_ego)
-    lag = rows(elapsed_s)
-    if settings.propagate_points:
-        position[:2] += ground_velocity * lag
-    points = np.stack([*position, rcs, *ground_velocity, lag])
-    return (points[:, ~near] if near.any() else points).T
-
-
-def _dot(
-    a: Array,  # [3, P]
-    b: Array,  # [3, P]
-) -> Array:  # [P]
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _rotate(
-    matrices: Array,  # [n, 3, P]
-    vectors: Array,  # [3, P]
-) -> Array:  # [n, P]
-    """A matrix of its own for every point."""
-    # The order of the sum is that of numpy's einsum on x86, to the last bit.
-    return matrices[:, 0] * vectors[0] + matrices[:, 2] * vectors[2] + matrices[:, 1] * vectors[1]
-
-
-def ego_motion(
-    index: DatasetIndex,
-    times_us: Array,  # [S] int64
-    global_from_ego: Array,  # [S, 3, 3] rotations at those times
-) -> tuple[Array, Array]:  # [S, 3] m/s, [S, 3] rad/s, both in ego axes
-    """Velocity and rotation rate by finite differences of the ego poses within +-0.1 s.
-
-    Raises DataError when poses are too sparse for a difference or jump.
-    """
-    stamps = index.pose_times_us
-    first = np.searchsorted(stamps, times_us - VELOCITY_WINDOW_US, side="left")
-    last = np.searchsorted(stamps, times_us + VELOCITY_WINDOW_US, side="right") - 1
-    elapsed_s = 1e-6 * (stamps[last.clip(0)] - stamps[first.clip(max=len(stamps) - 1)])
-    if (last <= first).any() or (elapsed_s <= 0).any():
-        at = int(np.argmax((last <= first) | (elapsed_s <= 0)))
-        raise DataError(
-            f"{index.root / index.version}/ego_pose.json: fewer than two ego poses within 0.1 s of time "
-            f"{int(times_us[at])} us, so the ego velocity is unknown; unpack the release again"
-        )
-    start, end = quaternion_to_matrix(index.pose_rotations[first]), quaternion_to_matrix(index.pose_rotations[last])
-    shift = (index.pose_translations[last] - index.pose_translations[first]) / elapsed_s[:, None]
-    velocity = np.einsum("sji,sj->si", global_from_ego, shift)
-    rate = rotation_vector(np.swapaxes(start, -1, -2) @ end) / elapsed_s[:, None]
-    speed = np.linalg.norm(velocity, axis=1)
-    if not (speed <= MAX_EGO_SPEED_MPS).all():
-        at = int(np.argmax(speed))
-        raise DataError(
-            f"{index.root / index.version}/ego_pose.json: the poses around time {int(times_us[at])} us move at "
-            f"{speed[at]:.0f} m/s; a truck stays below {MAX_EGO_SPEED_MPS:.0f}, so the pose table is damaged there"
-        )
-    return velocity, rate

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from PIL import Image
 
-from src.data.deskew import lidar_tensors, place_sweep
+from src.data.compensation import compensate_clouds, lidar_tensors, place_sweep
 from src.data.images import MAX_PIXELS, resample, width_fit
 from src.data.pcd import LIDAR_FIELDS, RADAR_FIELDS
-from src.data.reader import MAX_SCAN_S, ReaderSettings, compensate_clouds
+from src.data.reader import MAX_SCAN_S, ReaderSettings
 from src.errors import DataError
 from src.geometry.camera import pixels_from_points
 from src.geometry.transforms import invert_rigid
@@ -183,7 +183,8 @@ def _radar_points(
         velocity=np.stack([sweep.velocity for sweep in sweeps]),
         rate=np.stack([sweep.rate for sweep in sweeps]),
         elapsed_s=np.array([sweep.age_s for sweep in sweeps]),
-        settings=settings,
+        min_distance_m=settings.min_distance_m,
+        propagate_points=settings.propagate_points,
     ).astype(np.float32, order="C")
 
 

@@ -75,10 +75,11 @@ class StepGuard:
         The weights have not changed yet; gradients are dropped, so that the optimiser does nothing. All ranks come here
         together. Raises DivergedError on all of them, with the same words, or when too many steps were skipped.
         """
+        terms = {name: value.detach() for name, value in terms.items()}
         bad = {name: float(value) for name, value in terms.items() if not torch.isfinite(value)}
         ranks = gather_by_rank({"bad": bad, "total": float(terms["total"]), "tokens": batch.tokens})
         failing_ranks = [rank for rank, own in enumerate(ranks) if own["bad"]]
-        # Gradients are means over the ranks by now: where every loss is finite, none can be told from the others.
+        # Gradients are means over the ranks by now: where every loss is finite, none can be singled out.
         named_ranks = failing_ranks or range(len(ranks))
         if failing_ranks:
             found = "; ".join(

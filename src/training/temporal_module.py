@@ -80,7 +80,7 @@ class TemporalModule(TrainingModule):
         self.memories = [(streams.to(self.device), memory.to(self.device)) for streams, memory in self.memories]
 
     def on_train_epoch_start(self) -> None:
-        """Begin without memory; not called when a run goes on inside an epoch."""
+        """Begin without memory; not called when a run resumes inside an epoch."""
         self.forget()
 
     def on_train_epoch_end(self) -> None:

@@ -6,7 +6,7 @@ import torch
 
 from src.data.augment import AugmentationConfig, BevAugmentationConfig
 from src.data.cache import load_index
-from src.data.deskew import deskew
+from src.data.compensation import deskew
 from src.data.pcd import read_lidar_points
 from src.data.reader import FrameReader, OnBadFile
 from src.data.schema import CHANNELS
@@ -188,13 +188,14 @@ def test_deskewing_is_the_motion_of_a_constant_twist():
     points = rng.uniform(-150, 150, (40, 3)).astype(np.float32)
     offsets = rng.uniform(-0.1, 0.1, 40).astype(np.float32)
     velocity, yaw_rate = np.array([25.0, -0.5, 0.2]), 0.5
-    found = deskew(points, offsets, velocity, np.array([0.0, 0.0, yaw_rate]))
+    found = deskew(points.T, offsets, velocity, np.array([0.0, 0.0, yaw_rate])).T
+    assert found.dtype == np.float32
     for point, t, place in zip(points, offsets, found, strict=True):
         angle = yaw_rate * t
         s, c = np.sin(angle) / yaw_rate, (1 - np.cos(angle)) / yaw_rate  # the arc that the origin drives
         drive = np.array([s * velocity[0] - c * velocity[1], c * velocity[0] + s * velocity[1], t * velocity[2]])
         np.testing.assert_allclose(place, apply(rigid(rotation(2, angle), drive), point), atol=5e-3)
-    np.testing.assert_array_equal(deskew(points, np.zeros(40, np.float32), velocity, np.ones(3)), points)
+    np.testing.assert_array_equal(deskew(points.T, np.zeros(40, np.float32), velocity, np.ones(3)), points.T)
 
 
 @pytest.mark.slow

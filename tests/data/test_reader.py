@@ -10,8 +10,9 @@ import torch
 
 from src.data.augment import AugmentationConfig, BevAugmentationConfig, ImageAugmentationConfig
 from src.data.cache import load_index
+from src.data.compensation import compensate_clouds, ego_motion
 from src.data.pcd import read_radar_points
-from src.data.reader import FrameReader, OnBadFile, compensate_clouds, compensate_sweeps, ego_motion
+from src.data.reader import FrameReader, OnBadFile, compensate_sweeps
 from src.errors import DataError
 from src.geometry.camera import project
 from src.geometry.transforms import invert_rigid, quaternion_to_matrix, rigid
@@ -102,8 +103,8 @@ def test_compensation_is_that_of_one_point_after_the_other(propagate_points):
     velocity, rate, elapsed_s = rng.normal(size=(4, 3)) * 20, rng.normal(size=(4, 3)), rng.uniform(0, 0.5, 4)
     clouds = [rng.normal(scale=4, size=(n, 7)).astype(np.float32) for n in (5, 0, 40, 1)]
     clouds[2][3, :3] = 0
-    settings = reader_settings(propagate_points=propagate_points, min_distance_m=2.0)
-    found = compensate_clouds(clouds, mounts, key_from_sweep, velocity, rate, elapsed_s, settings)
+    settings = {"propagate_points": propagate_points, "min_distance_m": 2.0}
+    found = compensate_clouds(clouds, mounts, key_from_sweep, velocity, rate, elapsed_s, **settings)
     expected = []
     for cloud, mount_, motion, v, w, lag in zip(clouds, mounts, key_from_sweep, velocity, rate, elapsed_s, strict=True):
         for point in cloud.astype(np.float64):
@@ -119,7 +120,7 @@ def test_compensation_is_that_of_one_point_after_the_other(propagate_points):
     assert found.dtype == np.float64 and 20 < len(expected) < 45
     np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11)
     nothing = compensate_clouds(clouds[1:2], *(a[1:2] for a in (mounts, key_from_sweep, velocity, rate)), np.zeros(1),
-                                settings)  # fmt: skip
+                                **settings)  # fmt: skip
     assert nothing.shape == (0, 7)
 
 

@@ -8,8 +8,8 @@ import torch
 from PIL import Image
 
 from src.data.cache import load_index
+from src.data.compensation import ego_motion
 from src.data.pcd import read_lidar_points, read_radar_points
-from src.data.reader import ego_motion
 from src.data.schema import CHANNELS
 from src.data.sensors import Camera, LidarSweep, RadarSweep, frame_from_sensors
 from src.errors import DataError

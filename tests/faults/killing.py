@@ -129,7 +129,7 @@ def brisk():
     checkpoints.RETRY_EVERY_S = 0.1
 
 
-def impatient():
+def short_wait():
     """In the new process: do not wait long for a disk."""
     from src.reliability import checkpoints
 

@@ -93,7 +93,7 @@ def test_a_disk_that_is_full_for_a_while_only_costs_time(small_disk, training):
 
 @pytest.mark.faults
 def test_a_disk_that_stays_full_ends_the_run_and_the_same_command_resumes(small_disk, training):
-    process = training.start(killing.impatient)
+    process = training.start(killing.short_wait)
     training.wait_for(lambda: training.last, process)
     fill(small_disk)
     assert killing.wait(process, training.log) == 3
@@ -132,7 +132,7 @@ def test_a_folder_that_vanishes_for_a_while_only_costs_time(training):
 
 @pytest.mark.faults
 def test_a_folder_that_vanishes_for_good_ends_the_run_and_is_not_made_anew(training):
-    process = training.start(killing.impatient)
+    process = training.start(killing.short_wait)
     training.wait_for(lambda: training.last, process)
     away = training.base / "away"
     training.outputs.rename(away)
