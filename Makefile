@@ -9,11 +9,12 @@ PYTHON := $(if $(ACTIVE),python,.venv/bin/python)
 # The stamp remembers an install: it is redone when pyproject.toml or constraints.txt changes. It lives inside the
 # environment it describes.
 STAMP := $(if $(ACTIVE),$(ACTIVE),.venv)/.horizon3d-installed
+TEST_STAMP := $(STAMP)-tests
 SCALE_ARG := $(if $(SCALE),scale=$(SCALE))
 INIT_ARG := $(if $(CHECKPOINT),'phase.init_from="$(CHECKPOINT)"')
 $(if $(filter 1 2,$(PHASE)),,$(error PHASE=$(PHASE): must be 1 or 2))
 
-.PHONY: help install world train sweep report dashboard benchmark performance test test-faults audit check
+.PHONY: help install world train sweep report dashboard benchmark performance test test-all test-faults audit check
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -23,6 +24,10 @@ help: ## show this list
 PINNED := $(if $(ACTIVE),,--constraint constraints.txt)
 $(STAMP): pyproject.toml constraints.txt
 	$(if $(ACTIVE),,test -x .venv/bin/python || python3 -m venv .venv)
+	$(PYTHON) -m pip install --quiet $(PINNED) --editable .
+	@touch $@
+
+$(TEST_STAMP): $(STAMP)
 	$(PYTHON) -m pip install --quiet $(PINNED) --editable ".[test,oracle]"
 	@touch $@
 
@@ -62,10 +67,13 @@ performance: $(STAMP) ## all pages of reports/performance, an hour and a half of
 # One thread per process: small operators gain nothing from a second one, and side by side they slow each other down.
 PYTEST := OMP_NUM_THREADS=1 $(PYTHON) -m pytest -n auto --dist loadfile
 
-test: $(STAMP) ## run every test but the fault suite
+test: $(TEST_STAMP) ## run the tests, some minutes
+	$(PYTEST) -m "not faults and not exhaustive" $(ARGS)
+
+test-all: $(TEST_STAMP) ## run every test but the fault suite: every sweep, every option, long trainings
 	$(PYTEST) -m "not faults" $(ARGS)
 
-test-faults: $(STAMP) ## kill, starve and corrupt running commands, half an hour [ARGS="-k kills"]
+test-faults: $(TEST_STAMP) ## kill, starve and corrupt running commands, half an hour [ARGS="-k kills"]
 	$(PYTEST) -m faults $(ARGS)
 
 # In an environment of its own, so that it changes nothing of what it looks at. What cannot be looked up is a failure.
@@ -74,6 +82,6 @@ audit: $(STAMP) ## look the versions of constraints.txt up among known vulnerabi
 	test -x $(AUDITOR)/bin/pip-audit || { $(PYTHON) -m venv $(AUDITOR) && $(AUDITOR)/bin/pip install --quiet pip-audit; }
 	$(AUDITOR)/bin/pip-audit --strict --requirement constraints.txt --no-deps --disable-pip $(ARGS)
 
-check: $(STAMP) ## lint and the fast tests, some minutes
+check: $(TEST_STAMP) ## lint and the fast tests, a minute
 	$(PYTHON) -m ruff check .
-	$(PYTEST) -q -m "not slow and not gpu and not faults" $(ARGS)
+	$(PYTEST) -q -m "not slow and not gpu and not faults and not exhaustive" $(ARGS)

@@ -17,7 +17,7 @@ def test_agrees_with_the_official_evaluator(seed, shape):
     assert result["max_difference"] <= 1e-9 and result["ours_s"] > 0 and result["devkit_ranges_s"] > 0
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_is_much_faster_than_the_official_evaluator():
     pytest.importorskip("truckscenes", reason="truckscenes-devkit is not installed (extra: oracle)")
     result = compare_with_devkit(400, 25, 300, seed=0)

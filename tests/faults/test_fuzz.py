@@ -106,6 +106,7 @@ def test_a_reader_that_crashes_is_caught_with_its_case(tmp_path):
     assert damaged_file(kind_of(read), 1, case - 1, [b"x"])[2] != b""
 
 
+@pytest.mark.faults
 def test_a_reader_that_hangs_is_ended(tmp_path, monkeypatch):
     monkeypatch.setattr("fuzzing.CPU_S", 0.1)
 

@@ -161,7 +161,7 @@ def test_tables_show_every_number_of_the_paper_that_a_file_has():
 @pytest.mark.parametrize("scale", SCALES)
 def test_every_row_composes_and_differs_from_the_others(scale):
     for name in QUESTIONS:
-        sweep = load_sweep(name)
+        sweep = load_sweep(name).at_scale(scale)
         trees = {}
         for row in sweep.rows:
             tree = tree_of(scale, overrides_of(sweep, row))
@@ -208,9 +208,17 @@ def test_tables_have_names_of_their_own():
 def test_a_row_for_one_scale_is_the_papers_alone_at_others():
     sweep = load_sweep(OTHER_METHODS)
     small, full = sweep.at_scale("mini"), sweep.at_scale("paper")
-    assert [row.label for row in small.rows] == ["Horizon3D", "BEVFusion"] and len(full.rows) == 3
-    assert small.paper_rows[0].label == "Horizon3D, V2-99" and small.paper_rows[0].paper == full.rows[2].paper
-    assert full == sweep and small.baseline == "Horizon3D"
+    assert [row.label for row in small.rows] == ["Horizon3D", "BEVFusion", "CenterPoint-V, lidar"]
+    assert len(full.rows) == 4
+    assert small.paper_rows[0].label == "Horizon3D, V2-99" and small.paper_rows[0].paper == full.rows[3].paper
+    assert full.rows == sweep.rows and small.baseline == "Horizon3D"
+
+
+def test_overrides_of_a_scale_hold_at_that_scale_alone():
+    sweep = load_sweep(OTHER_METHODS)
+    small, full = sweep.at_scale("mini"), sweep.at_scale("paper")
+    assert small.overrides == [*sweep.overrides, "data.world.lidar=true"] and full.overrides == sweep.overrides
+    assert small.at_scale("mini") == small  # as a record keeps it
 
 
 @pytest.mark.parametrize("scale", SCALES)

@@ -49,7 +49,7 @@ def score(module, frames, truth: EvaluationSet):
     return score_detections(truth, DetectionTable.concatenate(tables))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_ten_frames_are_overfitted(ten_frames):
     """Over 0.9 AP, averaged over the classes that are present (specification 15.10)."""
     module, frames, truth = ten_frames

@@ -202,7 +202,7 @@ def test_phase_1_has_no_memory(phase):
     assert (build_model(config).temporal is None) == (settings is None)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_frames_can_be_learnt_by_heart():
     """Boxes come back where they were, within a cell, and nothing scores as high elsewhere."""
     model, batch = dense_model(), make_batch(boxes=(5, 4))

@@ -313,7 +313,7 @@ def test_small_scales_build(scale):
     assert model.radar_encoder.ndim == 2  # pillars
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_overfits_two_frames(make_model, make_batch):
     model, batch = make_model(), make_batch(boxes=(4, 4))
     optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3)
