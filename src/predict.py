@@ -65,7 +65,7 @@ def main(overrides: list[str]) -> None:
         film.write_strip(out / "strip.png", command.trainer.num_pictures)
         film.write_animation(out / "scene.gif")
     table = DetectionTable.concatenate([to_global(*found[token], row) for row, token in enumerate(tokens)])
-    written = save_submission(out / "submission.json", tokens, table, config)
+    written = save_submission(config, out / "submission.json", tokens, table)
     print(f"{len(tokens)} frames, {sum(len(boxes) for boxes, _ in found.values())} boxes, written into {out}: ", end="")
     print(", ".join(["submission.json"] * written + ["scene.gif", "strip.png"] * bool(film)))
     if skipped:
@@ -119,7 +119,8 @@ def draw_picture(
 ) -> None:
     """One frame on one sheet: cameras, BEV, Gaussians by source, boxes."""
     frame = frame.to(detector.device)
-    draw_frame(path, scene_of(frame, boxes, output, detector.grid), views_of(frame), title, SHOWN_SCORE)
+    scene = scene_of(frame, boxes, detector.model.evidence(output), detector.grid)
+    draw_frame(path, scene, views_of(frame), title, SHOWN_SCORE)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ def score(module, frames, truth: EvaluationSet):
     tables = []
     for batch in batches(frames, torch.arange(len(frames))):
         with torch.no_grad():
-            boxes = module.detect(batch)
+            boxes = module.model.decode(module.run(batch))
         poses = batch.global_from_ego.numpy()
         tables += [to_global(b, poses[i], truth.index_of[batch.tokens[i]]) for i, b in enumerate(boxes)]
     module.train()
