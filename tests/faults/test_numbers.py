@@ -18,6 +18,7 @@ from src.assembly import build_datamodule, build_module, data_root
 from src.config import OnNonfinite, compose_config, restore_config
 from src.data.datamodule import collate, in_stream
 from src.errors import CheckpointError, ConfigError, DivergedError
+from src.models.detector import Objective
 from src.models.horizon3d.model import Horizon3D
 from src.reliability.checkpoints import read_checkpoint
 from src.reliability.nonfinite import step_seed, write_dump
@@ -174,8 +175,8 @@ def test_an_infinite_gradient_of_a_finite_loss_is_reported(dump, capsys, monkeyp
 
     def loss(self, output, batch, original=Horizon3D.loss):
         bias = next(self.head.parameters())
-        terms = original(self, output, batch)
-        return terms | {"total": terms["total"] + (bias - bias.detach()).sqrt().sum()}
+        terms, diagnostics = original(self, output, batch)
+        return Objective(terms | {"total": terms["total"] + (bias - bias.detach()).sqrt().sum()}, diagnostics)
 
     monkeypatch.setattr(Horizon3D, "loss", loss)
     printed, error = replayed(dump(), capsys)
