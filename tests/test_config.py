@@ -87,7 +87,7 @@ def test_every_choice_composes(group):
 
 
 def test_paper_values():
-    """The bold values of the specification, section 16."""
+    """The bold values of the method 16."""
     config, _ = compose_config(["scale=paper", "data.root=x"])
     model = config.model
     assert config.backbone.name.value == "resnet50" and config.backbone.image_size_px == [256, 864]

@@ -19,7 +19,7 @@ def test_image_draws_fill_the_papers_ranges():
     rng = np.random.default_rng(0)
     crops = [draw_crop(PAPER_IMAGE, rng, (943, 1980), (256, 864)) for _ in range(2000)]
     resize = np.array([crop.resize for crop in crops])
-    assert 0.376 < resize.min() < 0.38 and 0.54 < resize.max() < 0.547  # spec section 9
+    assert 0.376 < resize.min() < 0.38 and 0.54 < resize.max() < 0.547  # method 9
     turns = np.rad2deg([crop.rotation_rad for crop in crops])
     assert -5.4 <= turns.min() < -5.2 and 5.2 < turns.max() <= 5.4
     assert 0.45 < np.mean([crop.flip for crop in crops]) < 0.55

@@ -1,4 +1,4 @@
-"""One frame: radar compensation, projection under augmentation, boxes, bad files (spec section 15, points 5 to 7)."""
+"""One frame: radar compensation, projection under augmentation, boxes, bad files (method 15, points 5 to 7)."""
 
 import json
 from dataclasses import replace

@@ -51,7 +51,7 @@ def score(module, frames, truth: EvaluationSet):
 
 @pytest.mark.exhaustive
 def test_ten_frames_are_overfitted(ten_frames):
-    """Over 0.9 AP, averaged over the classes that are present (specification 15.10)."""
+    """Over 0.9 AP, averaged over the classes that are present (method 15.10)."""
     module, frames, truth = ten_frames
     steps = EPOCHS * len(frames) // BATCH_SIZE
     optimizer = torch.optim.AdamW(module.model.parameters(), lr=2e-3)

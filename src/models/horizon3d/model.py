@@ -110,7 +110,7 @@ class Horizon3DOutput:
     kggi: KGGIOutput | None  # G_0 and the keypoint maps
     ocsf: OCSFOutput | None  # G_L, its splat and F_fuse
     fused_bev: SparseBEV  # F_fuse, or F_R where there is nothing to fuse
-    dptf: DPTFOutput | None  # recollections and F_out; None in phase 1
+    dptf: DPTFOutput | None  # warped memory and F_out; None in phase 1
     head: HeadOutput
 
 
