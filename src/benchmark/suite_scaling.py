@@ -27,7 +27,7 @@ from src.benchmark.page import gpu_notes, page_name
 from src.benchmark.parts import is_within, parts_of, tensors_in
 from src.benchmark.plots import draw_scaling
 from src.benchmark.scenes import ROADS, Highway, highway_frame, highway_points
-from src.benchmark.timing import added_bytes, chosen_device, clock, interleaved, milliseconds, timed_parts
+from src.benchmark.timing import added_bytes, clock, interleaved, milliseconds, timed_parts
 from src.config import Config, compose_config
 
 logger = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ class Point:
 
 def benchmark_scaling(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """Time and memory of a frame without its image encoder, at every point of every sweep; growth first."""
-    device = chosen_device(config)
+    device = config.trainer.device()
     configs = {name: config_of(config, name) for name in (OURS, DENSE)}
     sweeps = sweeps_of(ROADS[config.scale], RANGES_M[config.scale], config.phase.temporal)
     measured = {name: measure_sweep(name, points, configs, device) for name, points in sweeps.items()}
