@@ -10,7 +10,7 @@ from torch import Tensor
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.losses.weights import LossWeights
+from src.losses.loss_weights import LossWeights
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.backbones.sparse_voxel import VoxelEncoder, VoxelEncoderConfig
 from src.models.detector import Detector, Objective

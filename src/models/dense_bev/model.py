@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import depth_cross_entropy
+from src.losses.loss_weights import LossWeights
 from src.losses.normalizers import mean_over_ranks
-from src.losses.weights import LossWeights
 from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.dense_bev.bev_decoder import MIN_CHANNELS, BEVDecoder, BEVDecoderConfig, ConvFuser
 from src.models.dense_bev.lift_splat import LiftedViews, LiftSplat, LiftSplatConfig

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import depth_cross_entropy, penalty_reduced_focal, sigmoid_focal
+from src.losses.loss_weights import LossWeights
 from src.losses.normalizers import mean_over_ranks
 from src.losses.regression import masked_l1, masked_smooth_l1
 from src.losses.segmentation import dice, lovasz_foreground, occupancy_losses
-from src.losses.weights import LossWeights
 from src.models.horizon3d.bev_path import CellPrediction
 from src.models.horizon3d.kggi import KGGIConfig, KGGIOutput
 from src.models.horizon3d.ocsf import OCSFOutput
