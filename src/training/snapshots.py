@@ -71,8 +71,8 @@ def scene_of(
         truth = truth[counted]
     scene = BevScene(
         grid=PictureGrid(grid.x_min_m, grid.y_min_m, grid.cell_m, grid.rows, grid.cols),
-        predictions=_boxes(predictions),
-        ground_truth=_boxes(truth),
+        predictions=boxes_of(predictions),
+        ground_truth=boxes_of(truth),
         radar_points=_numpy(batch.radar_points) if batch.radar_points is not None else None,
     )
     if evidence.gaussians is not None:
@@ -129,7 +129,8 @@ def _gaussians(gaussians: GaussianSet) -> PictureGaussians:
     )
 
 
-def _boxes(boxes: Boxes3D) -> PictureBoxes:
+def boxes_of(boxes: Boxes3D) -> PictureBoxes:
+    """Boxes as pictures take them."""
     names = ("centers", "sizes", "yaws", "velocities", "labels")
     scores = None if boxes.scores is None else _numpy(boxes.scores)
     return PictureBoxes(**{name: _numpy(getattr(boxes, name)) for name in names}, scores=scores)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import logging
+from dataclasses import replace
 from pathlib import Path
 
 from src.assembly import data_root
-from src.config import compose_config
+from src.config import Config, compose_config
+from src.data.cache import load_index
+from src.data.reader import FrameReader
 from src.errors import ConfigError
-from src.pictures.cameras import PictureViews
-from src.pictures.contents import PictureBoxes
 from src.pictures.scene_preview import draw_scene_preview
 from src.reliability.command import run_command
-from src.structures.taxonomy import CAMERAS
 from src.training.run_folder import make_writable
-from src.world.preview import WorldPreview
+from src.training.snapshots import boxes_of, views_of
 
-logger = logging.getLogger(__name__)
+PREVIEW_SWEEPS = 3  # of each radar
 
 
 def main(overrides: list[str]) -> None:
@@ -29,16 +28,22 @@ def main(overrides: list[str]) -> None:
     if config.preview:
         folder = Path(config.out) if config.out else Path(config.paths.outputs) / "previews" / root.name
         make_writable(folder, "out")
-        for number, (_, frame) in enumerate(WorldPreview(root).frames()):
-            path = folder / f"scene_{number:03d}.png"
-            draw_scene_preview(
-                path,
-                PictureViews(frame.images, frame.pix_from_ego, CAMERAS),
-                PictureBoxes(frame.centers, frame.sizes, frame.yaws, frame.velocities, frame.labels),
-                frame.radar_points,
-                frame.title,
-            )
-            print(f"picture: {path}")
+        draw_previews(config, root, folder)
+
+
+def draw_previews(config: Config, root: Path, folder: Path) -> None:
+    """A picture of the frame in the middle of every scene, with images at the size in which they are stored."""
+    world = config.data.world
+    index = load_index(root, config.data.version, None)
+    settings = config.data.reader_settings(("radar", "camera"), (world.image_height_px, world.image_width_px))
+    reader = FrameReader(index, replace(settings, num_sweeps=PREVIEW_SWEEPS, test_resize_offset=0.0))
+    for number, (name, tags) in enumerate(zip(index.scene_names, index.scene_descriptions, strict=True)):
+        samples = index.samples_of({name})
+        frame = reader.read(int(samples[round(0.5 * (len(samples) - 1))]), None)
+        title = f"{name[:14]}…  " + "  ".join(tag.split(".")[1] for tag in tags.split(";"))
+        path = folder / f"scene_{number:03d}.png"
+        draw_scene_preview(path, views_of(frame), boxes_of(frame.boxes[0]), frame.radar_points.numpy(), title)
+        print(f"picture: {path}")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from src.world.conditions import Conditions
-from src.world.mesh import Mesh
+from src.world.mesh import Colour, Mesh, MeshMaker
 from src.world.raster import draw_quads
 from src.world.rig import Mount
 from src.world.scenery import Scenery
@@ -18,6 +18,7 @@ Array = np.ndarray
 
 VIEW_M = 250.0
 HEADLIGHT_M = 45.0
+SHADE: Colour = (34, 35, 38)
 
 
 @dataclass(kw_only=True)
@@ -50,16 +51,7 @@ class Studio:
         near = np.flatnonzero(np.hypot(*(positions - ego_xyz)[:, :2].T) < VIEW_M)
         ego_s = float(self.scene.ego.tracks.road_state(time_s)[0][0])
         kept = np.flatnonzero(np.abs(self.scenery.s - ego_s) < VIEW_M + 20)
-        ground = self.scenery.mesh
-        parts = [
-            Mesh(
-                corners=ground.corners[kept],
-                colours=ground.colours[kept],
-                glows=ground.glows[kept],
-                open=ground.open[kept],
-            )
-        ]
-        layers, groups = [self.scenery.layer[kept]], [np.full(len(kept), -1)]
+        parts, layers, groups = [self.scenery.mesh[kept]], [self.scenery.layer[kept]], [np.full(len(kept), -1)]
         for n in near:
             placed = self.meshes[n].moved(positions[n] + [0.0, 0.0, self.floors[n]], float(headings[n]))
             parts.append(placed)
@@ -146,12 +138,8 @@ class Studio:
 
 def _shadow(size: Array) -> Mesh:
     half_l, half_w = 0.52 * size[0], 0.56 * size[1]
-    corners = np.array(
-        [[[-half_l, -half_w, 0.03], [half_l, -half_w, 0.03], [half_l, half_w, 0.03], [-half_l, half_w, 0.03]]]
+    maker = MeshMaker()
+    maker.quad(
+        [(-half_l, -half_w, 0.03), (half_l, -half_w, 0.03), (half_l, half_w, 0.03), (-half_l, half_w, 0.03)], SHADE
     )
-    return Mesh(
-        corners=corners,
-        colours=np.array([[34, 35, 38]], dtype=np.float32),
-        glows=np.zeros(1, dtype=bool),
-        open=np.zeros(1, dtype=bool),
-    )
+    return maker.mesh()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-
-Colour = tuple[float, float, float]
+import yaml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,11 +22,10 @@ class Conditions:
     ambient: float  # share of light that reaches shaded faces
     sun: float  # extra light on faces turned to the sun
     sun_azimuth_rad: float  # in local coordinates
-    sky_low: Colour  # 0..255, at the horizon
-    sky_high: Colour
+    sky_low: list[float]  # RGB of 0..255, at the horizon
+    sky_high: list[float]
     sight_m: float  # distance at which haze takes 63 % of the contrast
     noise: float  # grey levels, standard deviation
-    night: bool
     precipitation_mm: float
     temperature_k: float
     wind_mps: float
@@ -36,6 +35,11 @@ class Conditions:
     def rain(self) -> bool:
         """Whether drops are in the air."""
         return self.weather == "weather.rain"
+
+    @property
+    def night(self) -> bool:
+        """Whether headlights are on."""
+        return self.daytime == "daytime.night"
 
     @property
     def tags(self) -> str:
@@ -52,92 +56,7 @@ class Conditions:
         return ";".join(groups)
 
 
-_LIGHT: dict[str, dict[str, object]] = {
-    "day": {
-        "weather": "weather.clear",
-        "daytime": "daytime.noon",
-        "lighting": "lighting.illuminated",
-        "ambient": 0.62,
-        "sun": 0.5,
-        "sky_low": (196, 214, 232),
-        "sky_high": (92, 142, 208),
-        "sight_m": 900.0,
-        "noise": 2.0,
-        "night": False,
-    },
-    "overcast": {
-        "weather": "weather.overcast",
-        "daytime": "daytime.morning",
-        "lighting": "lighting.illuminated",
-        "ambient": 0.72,
-        "sun": 0.14,
-        "sky_low": (206, 208, 212),
-        "sky_high": (164, 170, 178),
-        "sight_m": 500.0,
-        "noise": 2.5,
-        "night": False,
-    },
-    "dusk": {
-        "weather": "weather.clear",
-        "daytime": "daytime.evening",
-        "lighting": "lighting.twilight",
-        "ambient": 0.36,
-        "sun": 0.26,
-        "sky_low": (232, 158, 104),
-        "sky_high": (58, 72, 118),
-        "sight_m": 600.0,
-        "noise": 4.0,
-        "night": False,
-    },
-    "rain": {
-        "weather": "weather.rain",
-        "daytime": "daytime.noon",
-        "lighting": "lighting.illuminated",
-        "ambient": 0.56,
-        "sun": 0.05,
-        "sky_low": (168, 172, 178),
-        "sky_high": (128, 134, 142),
-        "sight_m": 170.0,
-        "noise": 4.0,
-        "night": False,
-    },
-    "night": {
-        "weather": "weather.clear",
-        "daytime": "daytime.night",
-        "lighting": "lighting.dark",
-        "ambient": 0.13,
-        "sun": 0.0,
-        "sky_low": (26, 28, 40),
-        "sky_high": (8, 9, 16),
-        "sight_m": 700.0,
-        "noise": 6.0,
-        "night": True,
-    },
-    "fog": {
-        "weather": "weather.fog",
-        "daytime": "daytime.morning",
-        "lighting": "lighting.illuminated",
-        "ambient": 0.68,
-        "sun": 0.06,
-        "sky_low": (200, 202, 204),
-        "sky_high": (188, 190, 194),
-        "sight_m": 75.0,
-        "noise": 2.5,
-        "night": False,
-    },
-    "glare": {
-        "weather": "weather.clear",
-        "daytime": "daytime.evening",
-        "lighting": "lighting.glare",
-        "ambient": 0.6,
-        "sun": 0.6,
-        "sky_low": (255, 236, 200),
-        "sky_high": (128, 160, 206),
-        "sight_m": 450.0,
-        "noise": 2.5,
-        "night": False,
-    },
-}
+_LIGHT = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
 
 ORDER = ("day", "rain", "night", "overcast", "dusk", "day", "fog", "glare")
 """Scene number within a split -> light, so that even four scenes differ."""
@@ -156,5 +75,5 @@ def draw_conditions(rng: np.random.Generator, number: int) -> Conditions:
         temperature_k=round(float(rng.uniform(274.0, 301.0)), 2),
         wind_mps=round(float(rng.uniform(0.0, 9.0)), 2),
         wind_rad=round(float(rng.uniform(0.0, 2 * np.pi)), 3),
-        **_LIGHT[name],  # type: ignore[arg-type]
+        **_LIGHT[name],
     )

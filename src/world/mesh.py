@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
 Array = np.ndarray
 Colour = tuple[int, int, int]
+
+TYRE: Colour = (24, 24, 26)
 
 
 def shade(colour: Colour, factor: float) -> Colour:
@@ -32,18 +34,16 @@ class Mesh:
         """All quads in one mesh; the list may be empty."""
         if not meshes:
             return MeshMaker().mesh()
-        return cls(
-            **{
-                name: np.concatenate([getattr(m, name) for m in meshes])
-                for name in ("corners", "colours", "glows", "open")
-            }
-        )
+        return cls(**{f.name: np.concatenate([getattr(m, f.name) for m in meshes]) for f in fields(cls)})
+
+    def __getitem__(self, rows: Array) -> Mesh:
+        return Mesh(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def moved(self, offset: Array, yaw: float) -> Mesh:
         """Turned about z, then shifted."""
         cos, sin = np.cos(yaw), np.sin(yaw)
         turn = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        return Mesh(corners=self.corners @ turn + offset, colours=self.colours, glows=self.glows, open=self.open)
+        return replace(self, corners=self.corners @ turn + offset)
 
 
 @dataclass
@@ -72,8 +72,6 @@ class MeshMaker:
         *,
         top: Colour | None = None,
         front: Colour | None = None,
-        back: Colour | None = None,
-        glow: bool = False,
     ) -> None:
         """A box with slanted sides; `low` and `high` are (x0, x1, y0, y1) at the heights z0 and z1. No underside."""
         a0, a1, b0, b1 = low
@@ -92,11 +90,11 @@ class MeshMaker:
             ((0, 1, 5, 4), colour),
             ((1, 2, 6, 5), front or colour),
             ((2, 3, 7, 6), colour),
-            ((3, 0, 4, 7), back or colour),
+            ((3, 0, 4, 7), colour),
             ((4, 5, 6, 7), top or colour),
         ]
         for indices, paint in faces:
-            self.quad([p[i] for i in indices], paint, glow=glow)
+            self.quad([p[i] for i in indices], paint)
 
     def box(
         self, x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, colour: Colour, **faces: object
@@ -104,19 +102,9 @@ class MeshMaker:
         """An upright box without underside."""
         self.frustum((x0, x1, y0, y1), (x0, x1, y0, y1), z0, z1, colour, **faces)  # type: ignore[arg-type]
 
-    def wheel(
-        self,
-        x: float,
-        y: float,
-        radius: float,
-        side: int,
-        colour: Colour = (24, 24, 26),
-        hub: Colour | None = (120, 120, 124),
-    ) -> None:
+    def wheel(self, x: float, y: float, radius: float, side: int, hub: Colour = (120, 120, 124)) -> None:
         """A six-sided disc that faces `side` (+1 left, -1 right)."""
-        for size, paint, lift in ((1.0, colour, 0.0), (0.5, hub, 0.012)):
-            if paint is None:
-                continue
+        for size, paint, lift in ((1.0, TYRE, 0.0), (0.5, hub, 0.012)):
             angles = side * -np.arange(6) * np.pi / 3
             ring = [
                 (x + size * radius * np.cos(a), y + side * lift, radius + size * radius * np.sin(a)) for a in angles

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from src.world.catalogue import KINDS, Kind
+from src.world.mesh import Colour
 from src.world.road import Road
 from src.world.world_config import WorldConfig
 
@@ -21,7 +22,7 @@ class Actor:
     kind: Kind
     name: str  # key of KINDS
     size: Array  # [3] length, width, height in m
-    colour: tuple[int, int, int]
+    colour: Colour
     has_rider: bool
     parked: bool
     variant: int  # of its look: sign face, coat, cargo
@@ -38,6 +39,22 @@ class Start:
     turn: float = 0.0
 
 
+def make_actor(
+    name: str, size: Array, rng: np.random.Generator, *, has_rider: bool = True, parked: bool = False
+) -> Actor:
+    """An object of this size with a look of its own."""
+    kind = KINDS[name]
+    return Actor(
+        kind=kind,
+        name=name,
+        size=size,
+        colour=kind.colours[int(rng.integers(len(kind.colours)))],
+        has_rider=has_rider,
+        parked=parked,
+        variant=int(rng.integers(1 << 16)),
+    )
+
+
 class _Maker:
     """Draws actors from one random stream."""
 
@@ -45,16 +62,7 @@ class _Maker:
         self.config, self.rng = config, rng
 
     def actor(self, name: str, *, has_rider: bool = True, parked: bool = False) -> Actor:
-        kind, rng = KINDS[name], self.rng
-        return Actor(
-            kind=kind,
-            name=name,
-            size=kind.draw_size(rng),
-            colour=kind.colours[int(rng.integers(len(kind.colours)))],
-            has_rider=has_rider,
-            parked=parked,
-            variant=int(rng.integers(1 << 16)),
-        )
+        return make_actor(name, KINDS[name].draw_size(self.rng), self.rng, has_rider=has_rider, parked=parked)
 
     def count(self, mean: float) -> int:
         return int(np.floor(mean * self.config.rare_objects + self.rng.random()))

@@ -28,36 +28,33 @@ class Mount:
     delay_s: float  # from the key frame's time to this sensor's firing
 
 
-def _degrees(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> Array:
-    return rotation_zyx(np.radians(yaw), np.radians(pitch), np.radians(roll))
-
-
 # x forward, y left, z up -> x right, y down, z forward
 _EGO_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
-# Two of the six are published (RADAR_LEFT_FRONT and RADAR_RIGHT_BACK, the latter upside down); the others mirror them.
-_RADARS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float], float]] = {
+IMUS = ("XSENSE_CABIN", "XSENSE_CHASSIS")
+_PLACES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float], float]] = {
+    "CAMERA_LEFT_FRONT": ((5.05, 1.25, 2.12), (42.0, 1.5, 0.0), 0.008),
+    "CAMERA_RIGHT_FRONT": ((5.05, -1.25, 2.12), (-42.0, 1.5, 0.0), 0.011),
+    "CAMERA_RIGHT_BACK": ((4.85, -1.30, 2.10), (-138.0, 1.5, 0.0), -0.006),
+    "CAMERA_LEFT_BACK": ((4.85, 1.30, 2.10), (138.0, 1.5, 0.0), -0.003),
+    # Two of the six are published (RADAR_LEFT_FRONT and RADAR_RIGHT_BACK, the latter upside down); the others mirror
+    # them.
     "RADAR_LEFT_FRONT": ((5.26, 1.23, 2.01), (-19.6, 0.3, 0.4), -0.011),
     "RADAR_RIGHT_FRONT": ((5.26, -1.23, 2.00), (19.4, -0.2, -0.3), 0.006),
     "RADAR_RIGHT_SIDE": ((5.12, -1.38, 2.02), (-88.0, 0.4, 0.2), -0.004),
     "RADAR_RIGHT_BACK": ((5.01, -1.40, 2.00), (-146.0, 0.2, 180.0), 0.013),
     "RADAR_LEFT_BACK": ((5.01, 1.40, 2.01), (147.0, -0.3, 0.3), -0.017),
     "RADAR_LEFT_SIDE": ((5.12, 1.38, 2.02), (89.0, 0.1, -0.4), 0.009),
+    "LIDAR_LEFT": ((4.95, 1.45, 1.95), (45.0, 0.0, 0.5), 0.001),
+    "LIDAR_RIGHT": ((4.95, -1.45, 1.95), (-45.0, 0.0, -0.5), 0.001),
+    "LIDAR_REAR": ((-0.86, 0.0, 1.10), (180.0, 0.0, 0.0), 0.001),
+    "LIDAR_TOP_FRONT": ((4.90, 0.0, 3.70), (0.0, 8.0, 0.0), 0.001),
+    "LIDAR_TOP_LEFT": ((4.70, 1.10, 3.65), (90.0, 8.0, 0.0), 0.001),
+    "LIDAR_TOP_RIGHT": ((4.70, -1.10, 3.65), (-90.0, 8.0, 0.0), 0.001),
+    "XSENSE_CABIN": ((4.4, 0.0, 1.9), (0.0, 0.0, 0.0), 0.0),
+    "XSENSE_CHASSIS": ((0.2, 0.0, 0.9), (0.0, 0.0, 0.0), 0.0),
 }
-_CAMERAS: dict[str, tuple[tuple[float, float, float], float, float]] = {
-    "CAMERA_LEFT_FRONT": ((5.05, 1.25, 2.12), 42.0, 0.008),
-    "CAMERA_RIGHT_FRONT": ((5.05, -1.25, 2.12), -42.0, 0.011),
-    "CAMERA_RIGHT_BACK": ((4.85, -1.30, 2.10), -138.0, -0.006),
-    "CAMERA_LEFT_BACK": ((4.85, 1.30, 2.10), 138.0, -0.003),
-}
-_LIDARS: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
-    "LIDAR_LEFT": ((4.95, 1.45, 1.95), (45.0, 0.0, 0.5)),
-    "LIDAR_RIGHT": ((4.95, -1.45, 1.95), (-45.0, 0.0, -0.5)),
-    "LIDAR_REAR": ((-0.86, 0.0, 1.10), (180.0, 0.0, 0.0)),
-    "LIDAR_TOP_FRONT": ((4.90, 0.0, 3.70), (0.0, 8.0, 0.0)),
-    "LIDAR_TOP_LEFT": ((4.70, 1.10, 3.65), (90.0, 8.0, 0.0)),
-    "LIDAR_TOP_RIGHT": ((4.70, -1.10, 3.65), (-90.0, 8.0, 0.0)),
-}
+"""By channel the place (m), yaw, pitch and roll (degrees; a camera's of its optical axis) and the delay (s)."""
 
 
 def camera_intrinsic(config: WorldConfig) -> Array:
@@ -70,52 +67,17 @@ def camera_intrinsic(config: WorldConfig) -> Array:
 
 def sensor_rig(config: WorldConfig) -> dict[str, Mount]:
     """All 18 channels by name: four cameras, six radars, six lidars, two IMUs."""
-    mounts = []
-    for name in CAMERAS:
-        place, yaw, delay = _CAMERAS[name]
-        mounts.append(
-            Mount(
-                channel=name,
-                modality="camera",
-                rotation=_degrees(yaw, 1.5) @ _EGO_FROM_OPTICAL,
+    mounts = {}
+    for modality, channels in (("camera", CAMERAS), ("radar", RADARS), ("lidar", LIDARS), ("imu", IMUS)):
+        for channel in channels:
+            place, angles_deg, delay_s = _PLACES[channel]
+            rotation = rotation_zyx(*np.radians(angles_deg))
+            mounts[channel] = Mount(
+                channel=channel,
+                modality=modality,
+                rotation=rotation @ _EGO_FROM_OPTICAL if modality == "camera" else rotation,
                 translation=np.array(place),
-                intrinsic=camera_intrinsic(config),
-                delay_s=delay,
+                intrinsic=camera_intrinsic(config) if modality == "camera" else None,
+                delay_s=delay_s,
             )
-        )
-    for name in RADARS:
-        place, angles, delay = _RADARS[name]
-        mounts.append(
-            Mount(
-                channel=name,
-                modality="radar",
-                rotation=_degrees(*angles),
-                translation=np.array(place),
-                intrinsic=None,
-                delay_s=delay,
-            )
-        )
-    for name in LIDARS:
-        place, angles = _LIDARS[name]
-        mounts.append(
-            Mount(
-                channel=name,
-                modality="lidar",
-                rotation=_degrees(*angles),
-                translation=np.array(place),
-                intrinsic=None,
-                delay_s=0.001,
-            )
-        )
-    for name, place in (("XSENSE_CABIN", (4.4, 0.0, 1.9)), ("XSENSE_CHASSIS", (0.2, 0.0, 0.9))):
-        mounts.append(
-            Mount(
-                channel=name,
-                modality="imu",
-                rotation=np.eye(3),
-                translation=np.array(place),
-                intrinsic=None,
-                delay_s=0.0,
-            )
-        )
-    return {mount.channel: mount for mount in mounts}
+    return mounts

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,6 +43,7 @@ Array = np.ndarray
 EPOCH_US = 1_695_000_000_000_000
 SCENE_GAP_US = 3_600_000_000
 JITTER_S = 0.0015
+CAMERA_SWEEPS = CAMERA_RATE_HZ // KEY_FRAME_RATE_HZ
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +52,9 @@ class _Shot:
 
     channel: str
     frame: int
-    time_s: float
     is_key: bool
+    time_s: float
+    points: int  # 0 for images
 
 
 class SceneWriter:
@@ -74,18 +77,16 @@ class SceneWriter:
         self.key_times = [
             self._quantised(k / KEY_FRAME_RATE_HZ + self._jitter()) for k in range(config.key_frames_per_scene)
         ]
+        self.shots: list[_Shot] = []
         self.name = f"scene-{self._token('drive')}-1"
 
     def write(self) -> Tables:
         """Simulate, render and store the scene; returns its rows of every table."""
-        radar_shots, key_points = self._write_radars()
-        camera_shots, pixels = self._write_cameras()
-        lidar_shots, lidar_points = self._write_lidars()
+        key_points = self._write_radars()
+        pixels = self._write_cameras()
+        lidar_points = self._write_lidars()
         frames = self._truths(pixels, key_points, lidar_points)
-        tables = self._annotation_tables(frames)
-        tables |= self._sample_tables(radar_shots + camera_shots + lidar_shots)
-        tables |= self._motion_tables()
-        return tables
+        return self._annotation_tables(frames) | self._sample_tables() | self._motion_tables()
 
     def _token(self, *parts: object) -> str:
         return token(self.config.seed, "scene", self.index, *parts)
@@ -103,82 +104,75 @@ class SceneWriter:
         kind, ending = "samples" if shot.is_key else "sweeps", "jpg" if shot.channel in CAMERAS else "pcd"
         return f"{kind}/{shot.channel}/{shot.channel}_{self._stamp(shot.time_s)}.{ending}"
 
-    def _store(self, shot: _Shot, data: bytes) -> None:
+    def _store(self, channel: str, frame: int, is_key: bool, time_s: float, data: bytes, points: int = 0) -> None:
+        shot = _Shot(channel=channel, frame=frame, is_key=is_key, time_s=time_s, points=points)
         (self.folder / self._filename(shot)).write_bytes(data)
+        self.shots.append(shot)
 
-    def _write_radars(self) -> tuple[list[tuple[_Shot, int]], list[Array]]:
-        """All radar sweeps; returns shots with point counts and, per key frame, its points in local coordinates."""
+    def _firings(self, rate_hz: int, sweeps: int) -> Iterator[tuple[int, bool, float]]:
+        """Key frame, whether it is the key frame itself, and time of a sensor's sweeps, those before it first."""
+        for frame, key_time in enumerate(self.key_times):
+            for back in range(sweeps - 1, -1, -1):
+                yield frame, back == 0, key_time if back == 0 else frame / KEY_FRAME_RATE_HZ - back / rate_hz
+
+    def _write_radars(self) -> list[Array]:
+        """All radar sweeps; returns the points of each key frame in local coordinates."""
         mounts = [self.rig[name] for name in RADARS]
         rng = scene_rng(self.config, self.index, 4)
-        per_frame = RADAR_RATE_HZ // KEY_FRAME_RATE_HZ
-        shots, key_points = [], []
-        for frame, key_time in enumerate(self.key_times):
-            for back in range(self.config.radar_sweeps_per_key_frame - 1, -1, -1):
-                base = key_time if back == 0 else frame / KEY_FRAME_RATE_HZ - back / per_frame / KEY_FRAME_RATE_HZ
-                times = [self._quantised(base + m.delay_s + self._jitter()) for m in mounts]
-                sweeps = simulate_sweeps(self.config, self.scene, self.scenery, mounts, times, rng)
-                here = []
-                for mount, time, points in zip(mounts, times, sweeps, strict=True):
-                    shot = _Shot(channel=mount.channel, frame=frame, time_s=time, is_key=back == 0)
-                    self._store(shot, radar_pcd(points))
-                    shots.append((shot, len(points)))
-                    here.append(self._to_local(mount, time, points[:, :3]))
-                if back == 0:
-                    key_points.append(np.concatenate(here))
-        return shots, key_points
+        key_points = []
+        for frame, is_key, base in self._firings(RADAR_RATE_HZ, self.config.radar_sweeps_per_key_frame):
+            times = [self._quantised(base + m.delay_s + self._jitter()) for m in mounts]
+            sweeps = simulate_sweeps(self.config, self.scene, self.scenery, mounts, times, rng)
+            for mount, time, points in zip(mounts, times, sweeps, strict=True):
+                self._store(mount.channel, frame, is_key, time, radar_pcd(points), len(points))
+            if is_key:
+                here = [self._to_local(*seen) for seen in zip(mounts, times, sweeps, strict=True)]
+                key_points.append(np.concatenate(here))
+        return key_points
 
     def _to_local(self, mount: Mount, time_s: float, points: Array) -> Array:
         rotation, translation = self.scene.ego.pose(time_s)
-        return (points.astype(np.float64) @ mount.rotation.T + mount.translation) @ rotation.T + translation
+        in_ego = points[:, :3].astype(np.float64) @ mount.rotation.T + mount.translation
+        return in_ego @ rotation.T + translation
 
-    def _write_cameras(self) -> tuple[list[tuple[_Shot, int]], list[tuple[Array, Array]]]:
-        """All images; returns shots and, per key frame, each actor's own and seen pixels over all cameras."""
+    def _write_cameras(self) -> list[tuple[Array, Array]]:
+        """All images; returns each actor's own and seen pixels over all cameras of each key frame."""
         rng = scene_rng(self.config, self.index, 5)
-        count = len(self.scene.actors)
-        per_frame = CAMERA_RATE_HZ // KEY_FRAME_RATE_HZ
-        shots, pixels = [], []
-        for frame, key_time in enumerate(self.key_times):
-            own, seen = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
-            for back in range(per_frame - 1 if self.config.camera_sweeps else 0, -1, -1):
-                base = key_time if back == 0 else frame / KEY_FRAME_RATE_HZ - back / CAMERA_RATE_HZ
-                stage = None
-                for name in CAMERAS:
-                    mount = self.rig[name]
-                    time = self._quantised(base + mount.delay_s + self._jitter())
-                    rotation, translation = self.scene.ego.pose(time)
-                    stage = self.studio.stage(time, translation)
-                    photo = self.studio.photograph(mount, rotation, translation, stage, rng)
-                    buffer = io.BytesIO()
-                    Image.fromarray(photo.rgb).save(buffer, "JPEG", quality=self.config.jpeg_quality)
-                    shot = _Shot(channel=name, frame=frame, time_s=time, is_key=back == 0)
-                    self._store(shot, buffer.getvalue())
-                    shots.append((shot, 0))
-                    if back == 0:
-                        own, seen = own + photo.own_pixels, seen + photo.seen_pixels
-            pixels.append((own, seen))
-        return shots, pixels
+        pixels = []
+        for frame, is_key, base in self._firings(CAMERA_RATE_HZ, CAMERA_SWEEPS if self.config.camera_sweeps else 1):
+            photos = []
+            for name in CAMERAS:
+                mount = self.rig[name]
+                time = self._quantised(base + mount.delay_s + self._jitter())
+                rotation, translation = self.scene.ego.pose(time)
+                stage = self.studio.stage(time, translation)
+                photo = self.studio.photograph(mount, rotation, translation, stage, rng)
+                buffer = io.BytesIO()
+                Image.fromarray(photo.rgb).save(buffer, "JPEG", quality=self.config.jpeg_quality)
+                self._store(name, frame, is_key, time, buffer.getvalue())
+                photos.append(photo)
+            if is_key:
+                pixels.append((sum(photo.own_pixels for photo in photos), sum(photo.seen_pixels for photo in photos)))
+        return pixels
 
-    def _write_lidars(self) -> tuple[list[tuple[_Shot, int]], list[Array] | None]:
-        """All sweeps of six lidars, or empty key frames of LIDAR_LEFT; returns shots and, if scanned, per key frame its
-        points in local coordinates.
+    def _write_lidars(self) -> list[Array] | None:
+        """All sweeps of six lidars, or empty key frames of LIDAR_LEFT; returns, if scanned, the points of each key
+        frame in local coordinates.
         """
         rng = scene_rng(self.config, self.index, 6)
         mounts = [self.rig[name] for name in LIDARS]
-        per_frame = LIDAR_RATE_HZ // KEY_FRAME_RATE_HZ
-        shots, points = [], []
-        for frame, key_time in enumerate(self.key_times):
-            for back in range(self.config.lidar_sweeps_per_key_frame - 1 if self.config.lidar else 0, -1, -1):
-                base = key_time if back == 0 else frame / KEY_FRAME_RATE_HZ - back / per_frame / KEY_FRAME_RATE_HZ
-                time = self._quantised(base + self.rig[REFERENCE_CHANNEL].delay_s)
-                clouds = {REFERENCE_CHANNEL: np.zeros(0, dtype=LIDAR_TYPE)}
-                if self.config.lidar:
-                    clouds = scan_lidars(self.config, self.scene, self.studio, mounts, time, self._stamp(time), rng)
-                for name, cloud in clouds.items():
-                    shot = _Shot(channel=name, frame=frame, time_s=time, is_key=back == 0)
-                    self._store(shot, lidar_pcd(cloud))
-                    shots.append((shot, len(cloud)))
-            points.append(np.concatenate([self._scan_to_local(self.rig[name], clouds[name]) for name in clouds]))
-        return shots, points if self.config.lidar else None
+        sweeps = self.config.lidar_sweeps_per_key_frame if self.config.lidar else 1
+        points = []
+        for frame, is_key, base in self._firings(LIDAR_RATE_HZ, sweeps):
+            time = self._quantised(base + self.rig[REFERENCE_CHANNEL].delay_s)
+            clouds = {REFERENCE_CHANNEL: np.zeros(0, dtype=LIDAR_TYPE)}
+            if self.config.lidar:
+                clouds = scan_lidars(self.config, self.scene, self.studio, mounts, time, self._stamp(time), rng)
+            for name, cloud in clouds.items():
+                self._store(name, frame, is_key, time, lidar_pcd(cloud), len(cloud))
+            if is_key:
+                points.append(np.concatenate([self._scan_to_local(self.rig[name], clouds[name]) for name in clouds]))
+        return points if self.config.lidar else None
 
     def _scan_to_local(self, mount: Mount, cloud: Array) -> Array:
         """Each point by the ego pose at its own time."""
@@ -247,7 +241,7 @@ class SceneWriter:
         annotations.sort(key=lambda row: order[str(row["sample_token"])])
         return {"sample_annotation": annotations, "instance": instances}
 
-    def _sample_tables(self, shots: list[tuple[_Shot, int]]) -> Tables:
+    def _sample_tables(self) -> Tables:
         """scene, sample, sample_data, ego_pose and weather_annotation."""
         config, scene = self.config, self.scene
         samples: list[Row] = [
@@ -255,9 +249,8 @@ class SceneWriter:
             for k, time in enumerate(self.key_times)
         ]
         link_chain(samples)
-        shots = sorted(shots, key=lambda item: (item[0].time_s, item[0].channel))
         data: list[Row] = []
-        for shot, points in shots:
+        for shot in sorted(self.shots, key=lambda shot: (shot.time_s, shot.channel)):
             camera = shot.channel in CAMERAS
             stamp = self._stamp(shot.time_s)
             data.append(
@@ -269,13 +262,13 @@ class SceneWriter:
                     "timestamp": stamp,
                     "fileformat": "jpg" if camera else "pcd",
                     "is_key_frame": shot.is_key,
-                    "width": config.image_width_px if camera else points,
+                    "width": config.image_width_px if camera else shot.points,
                     "height": config.image_height_px if camera else 1,
                     "filename": self._filename(shot),
                 }
             )
         link_by(data, "calibrated_sensor_token")
-        times = sorted({shot.time_s for shot, _ in shots} | set(self._ego_times()))
+        times = sorted({shot.time_s for shot in self.shots} | set(self._ego_times()))
         rotations, translations = scene.ego.poses(np.array(times))
         poses = [
             {

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from src.world.catalogue import KINDS, Kind
+from src.world.catalogue import KINDS
 from src.world.conditions import Conditions, draw_conditions
 from src.world.motion import LEAD_IN_S, EgoMotion, Tracks
-from src.world.placement import Actor, bystanders
+from src.world.placement import Actor, bystanders, make_actor
 from src.world.road import Road, make_road
 from src.world.traffic import STEP_S, Vehicle, simulate_traffic
 from src.world.world_config import WorldConfig
@@ -196,17 +196,5 @@ def _split_trains(
                     turn + (np.pi if vehicle.direction < 0 else 0.0),
                 )
             )
-            actors.append(_actor(KINDS[name], name, size, rng))
+            actors.append(make_actor(name, size, rng))
     return actors, rows
-
-
-def _actor(kind: Kind, name: str, size: Array, rng: np.random.Generator) -> Actor:
-    return Actor(
-        kind=kind,
-        name=name,
-        size=size,
-        colour=kind.colours[int(rng.integers(len(kind.colours)))],
-        has_rider=True,
-        parked=False,
-        variant=int(rng.integers(1 << 16)),
-    )

@@ -21,7 +21,6 @@ def _rider(m: MeshMaker, x: float, seat: float, top: float, width: float, coat: 
 
 
 def add_motorcycle(m: MeshMaker, a: Actor) -> None:
-    """Motorcycle."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     for x in (-0.66 * l, 0.66 * l):
         m.wheel(x, 0.05, 0.33 * l, 1)
@@ -43,7 +42,6 @@ def add_motorcycle(m: MeshMaker, a: Actor) -> None:
 
 
 def add_bicycle(m: MeshMaker, a: Actor) -> None:
-    """Bicycle."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     for x in (-0.6 * l, 0.6 * l):
         m.wheel(x, 0.0, 0.38 * l, 1, hub=(150, 170, 150))
@@ -56,7 +54,6 @@ def add_bicycle(m: MeshMaker, a: Actor) -> None:
 
 
 def add_person(m: MeshMaker, a: Actor) -> None:
-    """Person."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     trousers: Colour = ((50, 54, 70), (80, 70, 60), (36, 36, 40))[a.variant % 3]
     for side, lean in ((-1, 0.35), (1, -0.35)):
@@ -79,7 +76,6 @@ def add_person(m: MeshMaker, a: Actor) -> None:
 
 
 def add_worker(m: MeshMaker, a: Actor) -> None:
-    """Worker."""
     add_person(m, a)
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     m.box(-0.14, 0.14, -0.66 * w, 0.66 * w, 0.6 * h, 0.66 * h, (240, 240, 220))
@@ -88,7 +84,6 @@ def add_worker(m: MeshMaker, a: Actor) -> None:
 
 
 def add_cone(m: MeshMaker, a: Actor) -> None:
-    """Cone."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     m.box(-l, l, -w, w, 0.0, 0.07 * h, (50, 50, 50))
     bands = ((0.07, 0.4, a.colour), (0.4, 0.65, (245, 245, 245)), (0.65, 1.0, a.colour))
@@ -98,7 +93,6 @@ def add_cone(m: MeshMaker, a: Actor) -> None:
 
 
 def add_barrier(m: MeshMaker, a: Actor) -> None:
-    """Barrier."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     for y in (-0.75 * w, 0.75 * w):
         m.box(-l, l, y - 0.06, y + 0.06, 0.0, 0.5 * h, STEEL)
@@ -111,7 +105,6 @@ def add_barrier(m: MeshMaker, a: Actor) -> None:
 
 
 def add_animal(m: MeshMaker, a: Actor) -> None:
-    """Animal."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     m.box(-l, 0.55 * l, -0.85 * w, 0.85 * w, 0.42 * h, 0.8 * h, a.colour)
     for x in (-0.82 * l, 0.42 * l):
@@ -148,7 +141,6 @@ def _disc(m: MeshMaker, x: float, z: float, radius: float, colour: Colour, corne
 
 
 def add_sign(m: MeshMaker, a: Actor) -> None:
-    """Sign."""
     _, w, h = a.size * [0.5, 0.5, 1.0]
     radius = min(w, 0.5 * h)
     middle = 0.5 * h
@@ -190,17 +182,14 @@ def _board(m: MeshMaker, a: Actor, *, poles: bool) -> None:
 
 
 def add_guide_sign(m: MeshMaker, a: Actor) -> None:
-    """Guide sign."""
     _board(m, a, poles=True)
 
 
 def add_gantry_sign(m: MeshMaker, a: Actor) -> None:
-    """Gantry sign."""
     _board(m, a, poles=False)
 
 
 def add_temporary_sign(m: MeshMaker, a: Actor) -> None:
-    """Temporary sign."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     m.box(-0.03, 0.0, -w, w, 0.0, h, POST)
     m.panel(0.01, -w, w, 0.0, h, 1, a.colour)
@@ -217,7 +206,6 @@ def add_temporary_sign(m: MeshMaker, a: Actor) -> None:
 
 
 def add_post(m: MeshMaker, a: Actor) -> None:
-    """Post."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     m.box(-0.5 * l, 0.5 * l, -0.5 * w, 0.5 * w, 0.0, 0.72 * h, a.colour)
     m.box(-0.5 * l, 0.5 * l, -0.5 * w, 0.5 * w, 0.72 * h, 0.9 * h, (30, 30, 30))
@@ -225,20 +213,17 @@ def add_post(m: MeshMaker, a: Actor) -> None:
 
 
 def add_crate(m: MeshMaker, a: Actor) -> None:
-    """Crate."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     m.box(-l, l, -w, w, 0.0, h, a.colour, top=shade(a.colour, 1.1))
 
 
 def add_bush(m: MeshMaker, a: Actor) -> None:
-    """Bush."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     m.frustum((-0.7 * l, 0.7 * l, -0.7 * w, 0.7 * w), (-l, l, -w, w), 0.0, 0.45 * h, a.colour)
     m.frustum((-l, l, -w, w), (-0.4 * l, 0.4 * l, -0.4 * w, 0.4 * w), 0.45 * h, h, shade(a.colour, 1.12))
 
 
 def add_lamp_post(m: MeshMaker, a: Actor) -> None:
-    """Lamp post."""
     h = a.size[2]
     m.box(-0.09, 0.09, -0.09, 0.09, 0.0, h, a.colour)
     m.box(-0.08, 0.08, -0.9, 0.9, h - 0.15, h, a.colour)

@@ -10,7 +10,6 @@ STEEL: Colour = (90, 92, 96)
 
 
 def add_car(m: MeshMaker, a: Actor) -> None:
-    """Car."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     belt = 0.58 * h
     m.frustum((-l, l, -w, w), (-l * 0.98, l * 0.97, -w * 0.97, w * 0.97), 0.17 * h, belt, a.colour)
@@ -29,7 +28,6 @@ def add_car(m: MeshMaker, a: Actor) -> None:
 
 
 def add_van(m: MeshMaker, a: Actor) -> None:
-    """Van."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     m.box(-l, 0.45 * l, -w, w, 0.12 * h, h, a.colour)
     m.frustum((0.45 * l, l, -w, w), (0.45 * l, 0.62 * l, -0.94 * w, 0.94 * w), 0.12 * h, 0.97 * h, a.colour)
@@ -71,7 +69,6 @@ def _cab(m: MeshMaker, a: Actor, front: float, depth: float) -> None:
 
 
 def add_tractor_unit(m: MeshMaker, a: Actor) -> None:
-    """Tractor unit."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     _cab(m, a, l, 2.3)
     m.box(-l, l - 2.3, -0.4 * w, 0.4 * w, 0.17 * h, 0.28 * h, STEEL)
@@ -80,7 +77,6 @@ def add_tractor_unit(m: MeshMaker, a: Actor) -> None:
 
 
 def add_rigid_truck(m: MeshMaker, a: Actor) -> None:
-    """Rigid truck."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     cargo: Colour = ((238, 238, 236), (205, 200, 190), (70, 110, 170))[a.variant % 3]
     _cab(m, a, l, 2.1)
@@ -92,7 +88,6 @@ def add_rigid_truck(m: MeshMaker, a: Actor) -> None:
 
 
 def add_trailer(m: MeshMaker, a: Actor) -> None:
-    """Trailer."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     m.box(-l, l, -w, w, 0.28 * h, h, a.colour, top=shade(a.colour, 0.9))
     m.box(-l, 0.3 * l, -0.4 * w, 0.4 * w, 0.16 * h, 0.28 * h, STEEL)
@@ -108,7 +103,6 @@ def add_trailer(m: MeshMaker, a: Actor) -> None:
 
 
 def add_bus(m: MeshMaker, a: Actor) -> None:
-    """Bus."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     m.box(-l, l, -w, w, 0.1 * h, h, a.colour, top=(225, 225, 225))
     for side in (-1, 1):
@@ -124,7 +118,6 @@ def add_bus(m: MeshMaker, a: Actor) -> None:
 
 
 def add_bendy_bus(m: MeshMaker, a: Actor) -> None:
-    """Bendy bus."""
     add_bus(m, a)
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     for side in (-1, 1):
@@ -133,7 +126,6 @@ def add_bendy_bus(m: MeshMaker, a: Actor) -> None:
 
 
 def add_excavator(m: MeshMaker, a: Actor) -> None:
-    """Excavator."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     for side in (-1, 1):
         m.box(-0.95 * l, 0.3 * l, side * w * 0.62 - 0.38 * w, side * w * 0.62 + 0.38 * w, 0.0, 0.26 * h, (44, 44, 46))
@@ -153,7 +145,6 @@ def add_excavator(m: MeshMaker, a: Actor) -> None:
 
 
 def add_farm_tractor(m: MeshMaker, a: Actor) -> None:
-    """Farm tractor."""
     l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
     m.box(-0.1 * l, l, -0.4 * w, 0.4 * w, 0.3 * h, 0.6 * h, a.colour)
     m.frustum(

@@ -17,6 +17,34 @@ CAMERA_RATE_HZ = 10
 LIDAR_RATE_HZ = 10
 KEY_FRAME_RATE_HZ = 2
 
+LIMITS = {
+    "num_train_scenes": (0, math.inf),
+    "num_val_scenes": (0, math.inf),
+    "key_frames_per_scene": (1, 60),
+    "seed": (0, math.inf),
+    "num_workers": (0, math.inf),
+    "image_width_px": (32, 8192),
+    "image_height_px": (32, 8192),
+    "camera_fov_deg": (10.0, 150.0),
+    "jpeg_quality": (1, 95),
+    "radar_sweeps_per_key_frame": (1, RADAR_RATE_HZ // KEY_FRAME_RATE_HZ),
+    "returns_density": (0.0, 100_000.0),
+    "clutter_density": (0.0, 100.0),
+    "ghost_fraction": (0.0, 1.0),
+    "false_alarms_per_sweep": (0.0, 1000.0),
+    "range_noise_m": (0.0, math.inf),
+    "azimuth_noise_deg": (0.0, math.inf),
+    "elevation_noise_deg": (0.0, math.inf),
+    "doppler_noise_mps": (0.0, math.inf),
+    "vehicles_per_lane_km": (0.0, 40.0),
+    "rare_objects": (0.0, 10.0),
+    "annotation_range_m": (1.0, 250.0),
+    "lidar_sweeps_per_key_frame": (1, LIDAR_RATE_HZ // KEY_FRAME_RATE_HZ),
+    "lidar_step_deg": (0.05, 10.0),
+    "ego_rate_hz": (1, 1000),
+}
+"""The least and the largest value of every number."""
+
 
 @dataclass(kw_only=True)
 class WorldConfig:
@@ -53,55 +81,11 @@ class WorldConfig:
     ego_rate_hz: int  # ego_pose and ego_motion rows per second besides those of the sensors
 
     def __post_init__(self) -> None:
-        at_least = {
-            "num_train_scenes": 0,
-            "num_val_scenes": 0,
-            "key_frames_per_scene": 1,
-            "seed": 0,
-            "num_workers": 0,
-            "image_width_px": 32,
-            "image_height_px": 32,
-            "jpeg_quality": 1,
-            "radar_sweeps_per_key_frame": 1,
-            "returns_density": 0.0,
-            "clutter_density": 0.0,
-            "ghost_fraction": 0.0,
-            "false_alarms_per_sweep": 0.0,
-            "range_noise_m": 0.0,
-            "azimuth_noise_deg": 0.0,
-            "elevation_noise_deg": 0.0,
-            "doppler_noise_mps": 0.0,
-            "vehicles_per_lane_km": 0.0,
-            "rare_objects": 0.0,
-            "annotation_range_m": 1.0,
-            "camera_fov_deg": 10.0,
-            "lidar_sweeps_per_key_frame": 1,
-            "lidar_step_deg": 0.05,
-            "ego_rate_hz": 1,
-        }
-        at_most = {
-            "jpeg_quality": 95,
-            "radar_sweeps_per_key_frame": RADAR_RATE_HZ // KEY_FRAME_RATE_HZ,
-            "lidar_sweeps_per_key_frame": LIDAR_RATE_HZ // KEY_FRAME_RATE_HZ,
-            "camera_fov_deg": 150.0,
-            "annotation_range_m": 250.0,
-            "vehicles_per_lane_km": 40.0,
-            "ego_rate_hz": 1000,
-            "key_frames_per_scene": 60,
-            "ghost_fraction": 1.0,
-            "lidar_step_deg": 10.0,
-            "image_width_px": 8192,
-            "image_height_px": 8192,
-            "returns_density": 100_000.0,
-            "clutter_density": 100.0,
-            "false_alarms_per_sweep": 1000.0,
-            "rare_objects": 10.0,
-        }
-        for name, low in at_least.items():
-            value, high = getattr(self, name), at_most.get(name, math.inf)
+        for name, (low, high) in LIMITS.items():
+            value = getattr(self, name)
             if not (math.isfinite(value) and low <= value <= high):
                 raise ConfigError(f"data.world.{name} must be a number from {low} to {high}, but got {value}")
-        if self.num_train_scenes + self.num_val_scenes == 0:
+        if self.num_scenes == 0:
             raise ConfigError("data.world: num_train_scenes and num_val_scenes are both 0; a world needs a scene")
 
     @property

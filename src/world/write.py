@@ -121,14 +121,10 @@ def _fill(config: WorldConfig, folder: Path, progress: bool) -> None:
 
 def _scenes(config: WorldConfig, folder: Path) -> Iterator[Tables]:
     """Rows of all scenes in order, written by `num_workers` processes."""
-    work = partial(_write_one, config, folder)
+    work = partial(write_scene, config, folder=folder)
     workers = min(config.num_workers, config.num_scenes)
     if workers < 2:
         yield from map(work, range(config.num_scenes))
         return
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
         yield from pool.imap(work, range(config.num_scenes))
-
-
-def _write_one(config: WorldConfig, folder: Path, index: int) -> Tables:
-    return write_scene(config, index, folder)
