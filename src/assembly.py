@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import logging
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from src.config import Config, OnNonfinite
+from src.config import Config
 from src.data.datamodule import DetectionDataModule
 from src.errors import ConfigError
 from src.metrics.submission import write_submission
 from src.models import build_model as build_model_of
 from src.models.detector import Detector
+from src.reliability.checkpoints import load_model_weights
 from src.structures.detections import DetectionTable
 from src.structures.taxonomy import SENSORS
 from src.training.module import TrainingModule
 from src.training.phases import EVALUATORS, MODULES
+from src.training.trainer_config import OnNonfinite
 from src.world.write import ensure_world, world_digest
 
 logger = logging.getLogger(__name__)
@@ -63,6 +66,16 @@ def build_datamodule(config: Config, root: Path) -> DetectionDataModule:
 def build_model(config: Config) -> Detector:
     """The configured detector with fresh weights (and pretrained backbone weights where given)."""
     return build_model_of(config.model, config.grid.build(), config.backbone, config.phase.options)
+
+
+def restored_model(config: Config, checkpoint: dict[str, Any], path: Path) -> Detector:
+    """The configured detector with the weights of a checkpoint that has been read from `path`.
+
+    Every weight comes from the checkpoint; the file that training began from may not be on this machine.
+    """
+    model = build_model(replace(config, backbone=replace(config.backbone, weights=None)))
+    load_model_weights(model, checkpoint, path)
+    return model
 
 
 def save_submission(config: Config, path: Path, tokens: list[str], table: DetectionTable) -> bool:

@@ -11,6 +11,7 @@ import difflib
 import math
 from dataclasses import dataclass
 from enum import Enum
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,9 @@ from src.reliability.passwords import masked
 from src.reliability.untrusted import fault_of_tree
 from src.training.identity import key_of
 from src.training.optim import OptimConfig
-from src.training.phases import EVALUATORS, MODULES
+from src.training.phases import PhaseConfig
 from src.training.run_folder import Resume
+from src.training.trainer_config import TrainerConfig
 from src.training.wandb import WandbConfig
 from src.world.world_config import WorldConfig
 
@@ -39,6 +41,12 @@ CONF = Path(__file__).resolve().parent.parent / "conf"
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir())
 PHASES = sorted(path.stem for path in (CONF / "phase").glob("*.yaml"))
 SCALES = sorted(path.stem for path in (CONF / "scale").glob("*.yaml"))
+
+FILES_AND_NAMES = (
+    *("checkpoint", "predictions", "out", "scene", "data.root", "phase.init_from"),
+    *("paths.outputs", "paths.reports"),
+)
+"""What a shell variable that is not set leaves empty."""
 
 # Lines of Hydra's messages that tell a user nothing, or to do what is refused here (`+key`).
 HYDRA_INTERNALS = (
@@ -76,79 +84,6 @@ class RunDataConfig(DataConfig):
 
 
 @dataclass(kw_only=True)
-class PhaseConfig:
-    """One training phase."""
-
-    name: str
-    module: str  # what trains it, of src/training/phases.py
-    task: str  # what a validation scores, of src/training/phases.py
-    monitor: str  # logged number that best.ckpt is chosen by, larger being better
-    temporal: bool  # clips in order with memory; false: shuffled single frames, and the model has no temporal part
-    init_from: str | None  # a phase, that is the run of the same command in that phase; or the path of a checkpoint
-    train_missing: bool  # train the run that init_from names when it has not finished yet
-    epochs: int
-    validate_every: int  # epochs
-    options: dict[str, Any]  # what the phase says to the model's family
-
-    def __post_init__(self) -> None:
-        if self.name not in PHASES:
-            raise ConfigError(f"phase.name={self.name}: must be one of {', '.join(PHASES)}; choose with phase=...")
-        _refuse_empty("phase.init_from", self.init_from)
-        for key, known in (("module", MODULES), ("task", EVALUATORS)):
-            if getattr(self, key) not in known:
-                raise ConfigError(f"phase.{key}={getattr(self, key)}: must be one of {', '.join(known)}")
-        if MODULES[self.module].temporal is not self.temporal:
-            raise ConfigError(
-                f"phase.temporal={self.temporal} does not go with phase.module={self.module}, which is for "
-                f"{'streamed clips' if MODULES[self.module].temporal else 'single frames'}"
-            )
-        for name in ("epochs", "validate_every"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"phase.{name} must be at least 1, but got {getattr(self, name)}")
-
-
-class Accelerator(Enum):
-    """Where a run computes; `auto` takes a GPU where torch sees one."""
-
-    auto = "auto"
-    cpu = "cpu"
-    gpu = "gpu"
-
-
-class OnNonfinite(Enum):
-    """What happens at a step whose loss or gradients are not finite; either way a dump of it is left."""
-
-    stop = "stop"  # the training ends there and says why
-    skip = "skip"  # weights and optimiser stay as they were, the step is counted; too many in a row end the training
-
-
-@dataclass(kw_only=True)
-class TrainerConfig:
-    """Where a run computes, how often it reports, and what it does when something goes wrong with its numbers."""
-
-    accelerator: Accelerator
-    devices: int  # processes on each machine
-    num_nodes: int  # machines
-    log_every_steps: int
-    checkpoint_every_steps: int | None  # null: after every epoch
-    num_pictures: int  # validation frames drawn at the end
-    on_nonfinite: OnNonfinite
-    deterministic: bool  # refuse operations whose result differs from run to run, of which a GPU has some
-
-    def __post_init__(self) -> None:
-        least_of = {"devices": 1, "num_nodes": 1, "log_every_steps": 1, "checkpoint_every_steps": 1, "num_pictures": 0}
-        for name, least in least_of.items():
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ConfigError(f"trainer.{name} must be at least {least}, but got {value}")
-
-    @property
-    def num_processes(self) -> int:
-        """Ranks that train together."""
-        return self.devices * self.num_nodes
-
-
-@dataclass(kw_only=True)
 class LoggerConfig:
     """Loggers beside metrics.csv."""
 
@@ -161,10 +96,6 @@ class PathsConfig:
 
     outputs: str  # runs, worlds, caches
     reports: str
-
-    def __post_init__(self) -> None:
-        for name in ("outputs", "reports"):
-            _refuse_empty(f"paths.{name}", getattr(self, name))
 
 
 class Precision(Enum):
@@ -218,14 +149,20 @@ class Config:
             raise ConfigError(f"seed must be at least 0 and below 2**32, but got {self.seed}")
         if self.model.name not in FAMILIES:
             raise ConfigError(f"model.name={self.model.name}: must be one of {', '.join(FAMILIES)}")
+        if self.phase.name not in PHASES:
+            known = ", ".join(PHASES)
+            raise ConfigError(f"phase.name={self.phase.name}: must be one of {known}; choose with phase=...")
         read_phase_options(self.model.name, self.phase.options)
         if self.phase.temporal and not self.model.temporal_part:
             raise ConfigError(
                 f"model={self.model.name} has no memory to train in phase={self.phase.name}; use phase=phase1"
             )
-        for name in ("checkpoint", "predictions", "out", "scene"):
-            _refuse_empty(name, getattr(self, name))
-        _refuse_empty("data.root", self.data.root)
+        for key in FILES_AND_NAMES:
+            value = attrgetter(key)(self)
+            if value is not None and not value.strip():
+                raise ConfigError(
+                    f"{key} is empty; give a path, or leave {key} out (was an unset shell variable meant?)"
+                )
         if "lidar" in self.model.sensors and self.data.world is not None and not self.data.world.lidar:
             raise ConfigError(
                 f"model={self.model.name} reads LiDAR, which this world lacks; give data.world.lidar=true"
@@ -240,11 +177,6 @@ class Config:
     def image_size_px(self) -> tuple[int, int] | None:
         """(height, width) of the images that the model uses, None for a model without."""
         return tuple(self.backbone.image_size_px) if "camera" in self.model.sensors else None
-
-
-def _refuse_empty(key: str, value: str | None) -> None:
-    if value is not None and not value.strip():
-        raise ConfigError(f"{key} is empty; give a path, or leave {key} out (was an unset shell variable meant?)")
 
 
 def _register() -> None:

@@ -16,7 +16,6 @@ from src.metrics.submission import load_submission
 from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.checkpoints import load_model_weights, read_checkpoint
 from src.reliability.command import run_command
-from src.reliability.processes import check_devices
 from src.training.evaluator import Evaluator
 from src.training.fit import build_evaluation_trainer
 from src.training.identity import digest_of_changes
@@ -71,7 +70,7 @@ def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[Evalu
     checkpoint = read_checkpoint(path)
     tree = checkpoint["horizon3d"]["config"]
     config = restore_config(tree, overrides)
-    check_devices(config.trainer.accelerator.value, 1)
+    config.trainer.device()  # or an error, before data are made
     datamodule = build_datamodule(config, data_root(config, write=False))
     module = build_module(config, tree, datamodule)
     load_model_weights(module.model, checkpoint, path)

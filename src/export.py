@@ -8,15 +8,15 @@ from pathlib import Path
 
 import torch
 
-from src.assembly import build_model
+from src.assembly import restored_model
 from src.config import compose_config, restore_config
 from src.errors import ConfigError
 from src.models.backbones.image import ImageEncoder
 from src.models.deploy.inference import prepare_for_inference
-from src.reliability.checkpoints import load_model_weights, read_checkpoint
+from src.reliability.checkpoints import read_checkpoint
 from src.reliability.command import run_command
 from src.structures.taxonomy import CAMERAS
-from src.training.run_folder import make_writable
+from src.training.run_folder import make_writable, run_of
 
 EXAMPLE_FRAMES = 2
 """One frame would be taken for a constant; the program takes any number."""
@@ -45,10 +45,7 @@ def main(overrides: list[str]) -> None:
             f"checkpoint={path}: backbone.trim_padding=true looks at each image to decide what to compute, which a "
             "fixed program cannot; train with backbone.trim_padding=false for an export"
         )
-    config.backbone.weights = None  # every weight comes from the checkpoint
-    model = build_model(config)
-    load_model_weights(model, checkpoint, path)
-    encoder = prepare_for_inference(model).image_encoder
+    encoder = prepare_for_inference(restored_model(config, checkpoint, path)).image_encoder
     make_writable(out.parent, "out")
     about = {
         "input": f"[B, {len(CAMERAS)}, 3, {', '.join(map(str, encoder.image_size_px))}] uint8 RGB",
@@ -70,12 +67,6 @@ def export_encoder(encoder: ImageEncoder) -> torch.export.ExportedProgram:
     frames = torch.export.Dim("frames", min=1)
     with torch.no_grad():
         return torch.export.export(encoder, (images,), dynamic_shapes=({0: frames},))
-
-
-def run_of(checkpoint: Path) -> str:
-    """The checkpoint's run, else its file's name."""
-    folder = checkpoint.resolve().parent
-    return folder.parent.name if folder.name == "checkpoints" else checkpoint.stem
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from tqdm import tqdm
 
 from src.assembly import build_datamodule, data_root, save_submission
@@ -21,14 +20,13 @@ from src.pictures.frame import draw_frame
 from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.checkpoints import read_checkpoint
 from src.reliability.command import run_command
-from src.reliability.processes import check_devices
 from src.streaming import StreamingDetector
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
 from src.structures.skipped import SkippedFiles
 from src.training.identity import digest_of_changes
-from src.training.run_folder import make_writable
+from src.training.run_folder import make_writable, run_of
 from src.training.snapshots import SHOWN_SCORE, scene_of, views_of
 
 # The boxes of one frame and its global_from_ego.
@@ -47,7 +45,7 @@ def main(overrides: list[str]) -> None:
     path = Path(command.checkpoint)
     checkpoint = read_checkpoint(path)
     config = restore_config(checkpoint["horizon3d"]["config"], overrides)
-    detector = StreamingDetector.restore(config, checkpoint, path, chosen_device(config))
+    detector = StreamingDetector.restore(config, checkpoint, path, config.trainer.device())
     datamodule = build_datamodule(config, data_root(config, write=False))
     frames = datamodule.stream(None if command.scene is None else [command.scene])
     out = output_folder(path, command, config, overrides)  # named by the scene, which is known by now
@@ -81,16 +79,8 @@ def output_folder(checkpoint: Path, command: Config, config: Config, overrides: 
     """`out`, or a folder named by the checkpoint's run (else its file), by what is predicted and by what is changed."""
     if command.out is not None:
         return Path(command.out)
-    run = checkpoint.resolve().parent
-    name = run.parent.name if run.name == "checkpoints" else checkpoint.stem
-    name += digest_of_changes(overrides)
+    name = run_of(checkpoint) + digest_of_changes(overrides)
     return Path(command.paths.outputs) / "predictions" / name / (command.scene or config.data.split)
-
-
-def chosen_device(config: Config) -> str:
-    """A GPU where there is one and `trainer.accelerator` does not say otherwise."""
-    check_devices(config.trainer.accelerator.value, 1)
-    return "cuda" if config.trainer.accelerator.value != "cpu" and torch.cuda.is_available() else "cpu"
 
 
 def predict(

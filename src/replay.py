@@ -18,18 +18,16 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from src.assembly import build_model
+from src.assembly import restored_model
 from src.config import Config, Precision, compose_config, restore_config
 from src.errors import ConfigError, DivergedError
-from src.predict import chosen_device
-from src.reliability.checkpoints import load_model_weights
 from src.reliability.command import run_command
 from src.reliability.nonfinite import describe_gradients, gradient_norm, read_dump
 from src.structures.batch import LIDAR_POINT_FIELDS, RADAR_POINT_FIELDS, FrameBatch
@@ -47,7 +45,7 @@ def main(overrides: list[str]) -> None:
     path = Path(command.checkpoint)
     content, batch = read_dump(path)
     config = restore_config(content["horizon3d"]["config"], overrides)
-    step = Step(path, config, content, batch, chosen_device(config))
+    step = Step(path, config, content, batch, config.trainer.device())
     print(f"{content['horizon3d']['step']['found']}\n")
     for line in describe_inputs(batch):
         print(line)
@@ -72,13 +70,12 @@ class Step:
     config: Config
     content: dict[str, Any]  # of the dump
     batch: FrameBatch
-    device: str
+    device: torch.device
 
     def build(self) -> TrainingModule:
         """The module as it was when the step began. Raises CheckpointError when the weights do not fit."""
         config, step = self.config, self.content["horizon3d"]["step"]
-        model = build_model(replace(config, backbone=replace(config.backbone, weights=None)))
-        load_model_weights(model, self.content, self.path)
+        model = restored_model(config, self.content, self.path)
         kind = MODULES[config.phase.module]
         module = kind(model, config.optim, config.backbone.lr_multiplier, None, config.seed, {})
         module.restore_rank({"means": {}, "memories": step["memories"]})
@@ -91,7 +88,7 @@ class Step:
         torch.manual_seed(self.content["horizon3d"]["step"]["seed"])
         bf16 = self.config.precision == Precision.bf16.value
         batch = self.batch.to(self.device)
-        with torch.autocast(self.device, torch.bfloat16, enabled=bf16):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16):
             return module.model.loss(module.run(batch), batch).terms
 
     def stop_at_first(self, seen: Watch) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import torch
 
-from src.assembly import build_model
+from src.assembly import restored_model
 from src.config import Config, Precision, restore_config
 from src.data.reader import ReaderSettings
 from src.data.sensors import Camera, LidarSweep, RadarSweep, frame_from_sensors
@@ -19,7 +18,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.deploy.inference import prepare_for_inference
 from src.models.deploy.static_parts import compile_static_parts, replay_image_encoder
 from src.models.detector import Detector
-from src.reliability.checkpoints import load_model_weights, read_checkpoint
+from src.reliability.checkpoints import read_checkpoint
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CAMERAS
@@ -108,9 +107,7 @@ class StreamingDetector:
         **switches: bool,
     ) -> Self:
         """The detector of a checkpoint that has been read already; `path` is for messages."""
-        # Every weight comes from the checkpoint; the file that training began from may not be on this machine.
-        model = build_model(replace(config, backbone=replace(config.backbone, weights=None)))
-        load_model_weights(model, checkpoint, path)
+        model = restored_model(config, checkpoint, path)
         settings = config.data.reader_settings(config.model.sensors, config.image_size_px)
         bf16 = config.precision == Precision.bf16.value
         return cls(model, config.grid.build(), settings, device, bf16, **switches)

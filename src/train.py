@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import logging
-import platform
-import resource
-import sys
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -13,21 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-import numpy as np
-import torch
 import yaml
-from lightning.pytorch.loggers.logger import Logger
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
 from src.config import PHASES, Config, compose_config
 from src.data.datamodule import DetectionDataModule
-from src.errors import DataError
 from src.pictures.learning_curves import draw_curves
 from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.checkpoints import OpenCheckpoint, open_checkpoint
 from src.reliability.command import run_command
 from src.reliability.processes import (
-    build_strategy,
     check_devices,
     created_externally,
     decided_by_main,
@@ -37,13 +29,13 @@ from src.reliability.processes import (
     launch,
     process_group,
 )
-from src.structures.skipped import SHOWN_NAMES, SkippedFiles
+from src.structures.skipped import SkippedFiles
 from src.training.fit import build_loggers, build_trainer, fit
 from src.training.handoff import WeightSource, find_source, hand_over, open_source, train_source
 from src.training.identity import run_identity
 from src.training.module import TrainingModule
-from src.training.phases import EVALUATORS
-from src.training.run_folder import Resume, RunFolder, current_commit, write_json
+from src.training.result import print_result, run_record, show_finished
+from src.training.run_folder import Resume, RunFolder, write_json
 from src.training.snapshots import draw_frames
 from src.training.wandb import WandbRun
 
@@ -54,8 +46,7 @@ def main(overrides: list[str]) -> None:
     """Train one run, or show it when it has finished; start its processes first when there are to be several."""
     started = time.monotonic()
     config, tree = compose_config(overrides)
-    where = (config.trainer.accelerator.value, config.trainer.devices, config.trainer.num_nodes)
-    check_devices(*where)
+    check_devices(*config.trainer.processes)
     source = find_source(config, overrides, compose_config, PHASES)
     folder = RunFolder(Path(config.paths.outputs), run_identity(tree, source.identity if source is not None else None))
     if config.trainer.num_processes > 1 and not created_externally():
@@ -63,7 +54,7 @@ def main(overrides: list[str]) -> None:
             train_source(source, config.phase.train_missing, processes_exist=False)
         launch("src.train", overrides, config.trainer.devices)
         return
-    with process_group(*where):
+    with process_group(*config.trainer.processes):
         start = prepare(config, tree, folder, source)
         if start is not None:
             run(config, tree, folder, source, start, started, overrides)
@@ -102,7 +93,7 @@ def prepare(
             weights = open_source(source)
         folder.open(config.resume)
         if folder.finished:
-            show_finished(config, folder)
+            show_finished(folder)
             return None
         resume = folder.newest_checkpoint()
         start_log(config, tree, folder)
@@ -144,7 +135,14 @@ def run(
     elif start.weights is not None:
         hand_over(module.model, start.weights, tree)
     loggers = build_loggers(folder, start.resume, config.logger.wandb, tree) if is_main_process() else []
-    trainer = make_trainer(config, folder, loggers)
+    trainer = build_trainer(
+        folder,
+        config.trainer,
+        config.phase,
+        precision=config.precision,
+        ema_decay=config.optim.ema_decay,
+        loggers=loggers,
+    )
     training_started = time.monotonic()
     fit(trainer, module, datamodule, start.resume)
     seconds = time.monotonic() - training_started
@@ -159,40 +157,23 @@ def run(
     write_json(folder.metrics_json, scores)  # what took long is safe; run.json, the last file, marks the run finished
     draw_pictures(config, module, datamodule, folder)
     module.evaluator.write(folder.path, partial(save_submission, config))
-    record = {
-        "run_id": folder.run_id,
-        "task": config.phase.task,
-        "headline": module.evaluator.headline,
-        "overrides": overrides,
-        "scale": config.scale,
-        "seed": config.seed,
-        "data": datamodule.identity(),
-        "commit": current_commit(),
-        "initialized_from": source.identity if source is not None else None,
-        "epochs": config.phase.epochs,
-        "steps": trainer.global_step,
-        "parameters": sum(p.numel() for p in module.model.parameters()),
-        "resumed": start.resume is not None,
-        "seconds": {"fit": round(seconds, 1), "all": round(time.monotonic() - started, 1)},
-        "peak_memory_mib": peak_memory_mib(),
-        "skipped_files": dict(skipped.channels),
-        "skipped_names": skipped.names(),
-        "skipped_steps": module.guard.skipped_steps,
-        "device": str(module.device),
-        "processes": config.trainer.num_processes,
-        "threads": torch.get_num_threads(),
-        "versions": {
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "lightning": L.__version__,
-            "numpy": np.__version__,
-        },
-    }
+    record = run_record(
+        config,
+        module,
+        run_id=folder.run_id,
+        overrides=overrides,
+        data=datamodule.identity(),
+        initialized_from=source.identity if source is not None else None,
+        resumed=start.resume is not None,
+        seconds={"fit": round(seconds, 1), "all": round(time.monotonic() - started, 1)},
+        skipped_files=dict(skipped.channels),
+        skipped_names=skipped.names(),
+    )
     folder.finish(record)
     if skipped:
         logger.warning("skipped sensor files: %s", skipped.text())
     logger.info("finished in %.0f s", record["seconds"]["all"])
-    print_result(config, folder, record, scores)
+    print_result(folder, record, scores)
     for tracked in [own for own in loggers if isinstance(own, WandbRun)]:
         print(f"W&B: {tracked.finish(scores, folder.pictures) or 'not complete, see the warning above'}")
 
@@ -205,68 +186,6 @@ def draw_pictures(config: Config, module: TrainingModule, datamodule: DetectionD
     length = config.model.memory_frames + 1 if config.phase.temporal else 1
     clips = datamodule.validation_clips(config.trainer.num_pictures, length)
     draw_frames(module.model, clips, config.grid.build(), folder.pictures)
-
-
-def make_trainer(config: Config, folder: RunFolder, loggers: list[Logger]) -> L.Trainer:
-    """The Trainer of this configuration; the main process alone has loggers."""
-    where = (config.trainer.accelerator.value, config.trainer.devices, config.trainer.num_nodes)
-    return build_trainer(
-        folder,
-        epochs=config.phase.epochs,
-        validate_every=config.phase.validate_every,
-        monitor=config.phase.monitor,
-        precision=config.precision,
-        accelerator=config.trainer.accelerator.value,
-        devices=config.trainer.devices,
-        num_nodes=config.trainer.num_nodes,
-        strategy=build_strategy(*where),
-        checkpoint_every_steps=config.trainer.checkpoint_every_steps,
-        log_every_steps=config.trainer.log_every_steps,
-        ema_decay=config.optim.ema_decay,
-        loggers=loggers,
-        deterministic=config.trainer.deterministic,
-    )
-
-
-def peak_memory_mib() -> dict[str, int]:
-    """Largest resident memory of this process and of its largest ended child (a loader worker)."""
-    unit = 1024 if sys.platform != "darwin" else 2**20  # Linux counts KiB, macOS bytes
-    return {
-        name: resource.getrusage(who).ru_maxrss // unit
-        for name, who in (("process", resource.RUSAGE_SELF), ("largest_worker", resource.RUSAGE_CHILDREN))
-    }
-
-
-def show_finished(config: Config, folder: RunFolder) -> None:
-    """Print a finished run, and say when other code than today's made it. Raises DataError for edited results."""
-    record, scores = folder.read_result()
-    try:
-        if record["commit"] != current_commit():
-            logger.warning(
-                "this run was made by commit %s, the code is at %s; resume=restart trains it anew",
-                record["commit"],
-                current_commit(),
-            )
-        print_result(config, folder, record, scores)
-    except (KeyError, TypeError, ValueError) as error:
-        reason = f"{type(error).__name__}: {error}"
-        raise DataError(
-            f"{folder.record} or metrics.json beside it is not as written ({reason}); delete it to have it made again"
-        ) from error
-
-
-def print_result(config: Config, folder: RunFolder, record: dict[str, Any], scores: dict[str, Any]) -> None:
-    """The table people wait for, and where everything lies."""
-    print(EVALUATORS[config.phase.task].describe(scores))
-    print(
-        f"\n{folder.run_id}: {record['epochs']} epochs, {record['steps']} steps, {record['parameters'] / 1e6:.2f} M "
-        f"parameters, {record['seconds']['all']:.0f} s, {record['peak_memory_mib']['process']} MiB"
-    )
-    if record["skipped_files"]:
-        names = record.get("skipped_names", [])  # older records have none
-        shown = f": {', '.join(names[:SHOWN_NAMES])}{' ...' if len(names) > SHOWN_NAMES else ''}" if names else ""
-        print(f"skipped sensor files: {record['skipped_files']}{shown} (names in run.json)")
-    print(f"run folder: {folder.path}  (metrics.json, metrics.csv, config.yaml, log.txt, pictures/, submission.json)")
 
 
 if __name__ == "__main__":

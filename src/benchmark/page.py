@@ -8,7 +8,6 @@ from typing import Any
 import torch
 
 from src.benchmark.machine import busy_warning
-from src.benchmark.timing import chosen_device
 from src.config import BenchmarkSuite, Config
 from src.training.run_folder import current_commit, write_json
 
@@ -31,7 +30,7 @@ def page_name(config: Config) -> str:
         return config.suite.value
     of_one_model = config.suite in (BenchmarkSuite.model, BenchmarkSuite.training, BenchmarkSuite.soak)
     which = [config.model.name, config.phase.name] if of_one_model else []
-    device = ["gpu"] if config.suite is not BenchmarkSuite.reader and chosen_device(config).type == "cuda" else []
+    device = ["gpu"] if config.suite is not BenchmarkSuite.reader and config.trainer.device().type == "cuda" else []
     return "_".join([config.suite.value, *which, config.scale, *device])
 
 

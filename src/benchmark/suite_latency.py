@@ -12,7 +12,7 @@ import torch
 from src.assembly import build_datamodule, data_root
 from src.benchmark.machine import busy_cores, describe_machine, processor
 from src.benchmark.page import page_of
-from src.benchmark.timing import chosen_device, clock, median_iqr, peak_bytes, timed_parts
+from src.benchmark.timing import clock, median_iqr, peak_bytes, timed_parts
 from src.config import Config, restore_config
 from src.data.clips import scenes_of
 from src.data.datamodule import DetectionDataModule
@@ -35,7 +35,7 @@ def measure_latency(command: Config, overrides: list[str]) -> dict[str, Any]:
     path = Path(command.checkpoint)
     checkpoint = read_checkpoint(path)
     config = restore_config(checkpoint["horizon3d"]["config"], overrides)
-    detector = StreamingDetector.restore(config, checkpoint, path, chosen_device(config))
+    detector = StreamingDetector.restore(config, checkpoint, path, config.trainer.device())
     datamodule = build_datamodule(config, data_root(config, write=False))
     result = benchmark_latency(detector, datamodule, config.model.memory_frames)
     return {"format": LATENCY_FORMAT, **result, "precision": config.precision, "commit": current_commit()}

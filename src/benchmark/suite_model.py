@@ -19,7 +19,6 @@ from src.benchmark.page import gpu_notes
 from src.benchmark.parts import Call, backward_from, is_within, parts_of, record_calls, tensors_in
 from src.benchmark.timing import (
     added_bytes,
-    chosen_device,
     clock,
     interleaved,
     milliseconds,
@@ -39,7 +38,7 @@ WHOLE = "whole: frame to boxes, step to gradients"
 def benchmark_model(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """The configured model on the first training batch; see `measure_parts` for the columns."""
     torch.manual_seed(config.seed)
-    device = chosen_device(config)
+    device = config.trainer.device()
     case = make_case(config, device)
     roofline = measure_roofline(device)
     rate = gemm_rate(roofline, config.precision)

@@ -22,7 +22,6 @@ from src.benchmark.operation_table import OPERATIONS_NOTE
 from src.benchmark.page import gpu_notes
 from src.benchmark.scenes import highway_points
 from src.benchmark.spconv_baseline import load_spconv
-from src.benchmark.timing import chosen_device
 from src.config import Config
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
@@ -39,7 +38,7 @@ def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     if not encoders:
         raise ConfigError(f"suite=ops measures a sparse radar backbone, which model={config.model.name} does not have")
     torch.manual_seed(config.seed)
-    device, sizes, grid = chosen_device(config), SIZES[config.scale], config.grid.build()
+    device, sizes, grid = config.trainer.device(), SIZES[config.scale], config.grid.build()
     every = torch.get_num_threads()
     threads = sorted({1, every}) if device.type == "cpu" else [every]
     points = highway_points(sizes.road).to(device)

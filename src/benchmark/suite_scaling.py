@@ -28,7 +28,7 @@ from src.benchmark.page import gpu_notes, page_name
 from src.benchmark.parts import is_within, parts_of, tensors_in
 from src.benchmark.plots import draw_scaling
 from src.benchmark.scenes import FRAME_SENSORS, ROADS, Highway, highway_frame, highway_points
-from src.benchmark.timing import added_bytes, chosen_device, clock, interleaved, milliseconds, timed_parts
+from src.benchmark.timing import added_bytes, clock, interleaved, milliseconds, timed_parts
 from src.config import Config, compose_config
 from src.errors import ConfigError
 from src.models import FAMILIES
@@ -74,7 +74,7 @@ def benchmark_scaling(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
             f"suite=scaling measures on made frames of {' and '.join(FRAME_SENSORS)}, but model={config.model.name} "
             f"reads {', '.join(config.model.sensors)}"
         )
-    device = chosen_device(config)
+    device = config.trainer.device()
     configs = configs_of(config)
     sweeps = sweeps_of(ROADS[config.scale], RANGES_M[config.scale], config.phase.temporal)
     measured = {name: measure_sweep(name, points, configs, device) for name, points in sweeps.items()}

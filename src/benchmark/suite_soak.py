@@ -27,7 +27,7 @@ from src.benchmark.page import page_name
 from src.benchmark.parts import tensors_in, wrapped_parts
 from src.benchmark.plots import draw_soak
 from src.benchmark.scenes import ROADS
-from src.benchmark.timing import chosen_device, clock, median_iqr, status_bytes, trim_heap
+from src.benchmark.timing import clock, median_iqr, status_bytes, trim_heap
 from src.config import Config
 from src.data.datamodule import DetectionDataModule
 from src.errors import ConfigError
@@ -54,7 +54,7 @@ def benchmark_soak(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """
     if not config.phase.temporal:
         raise ConfigError(f"suite=soak streams with memory, but phase={config.phase.name} has none; give phase=phase2")
-    device = chosen_device(config)
+    device = config.trainer.device()
     config = replace(config, optim=replace(config.optim, lr=UNLEARNED))
     if config.checkpoint is None:
         cells = ROADS[config.scale].num_vehicles * CELLS_PER_VEHICLE[config.scale]
@@ -188,16 +188,11 @@ def soak_training(
         folder.open(Resume.auto)
         trainer = build_trainer(
             folder,
-            epochs=epochs,
-            validate_every=config.phase.validate_every,
-            monitor=config.phase.monitor,
+            replace(config.trainer, devices=1),
+            replace(config.phase, epochs=epochs),
             precision=config.precision,
-            accelerator=config.trainer.accelerator.value,
-            devices=1,
-            log_every_steps=config.trainer.log_every_steps,
             ema_decay=config.optim.ema_decay,
             loggers=build_loggers(folder, None, None),
-            checkpoint_every_steps=config.trainer.checkpoint_every_steps,
         )
         hooks = {"epoch": ("on_train_epoch_start",), "step": ("on_train_batch_end",)}
         with wrapped_parts(module, hooks, watched):

@@ -15,7 +15,7 @@ import torch
 
 from src.assembly import build_datamodule, build_module, data_root
 from src.benchmark.operation_table import OPERATIONS_NOTE, operation_table
-from src.benchmark.timing import chosen_device, clock, milliseconds, peak_bytes, timed_parts
+from src.benchmark.timing import clock, milliseconds, peak_bytes, timed_parts
 from src.config import Config
 from src.structures.batch import FrameBatch
 from src.training.module import TrainingModule
@@ -34,7 +34,7 @@ def benchmark_training(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     means of the training module, backward, clipping, AdamW and schedule. What the trainer adds (progress bar, logs,
     validation, checkpoints) is not in it. Steps per epoch and the schedule's length do not matter here.
     """
-    device = chosen_device(config)
+    device = config.trainer.device()
     datamodule = build_datamodule(config, data_root(config))
     autocast = config.precision == "bf16-mixed"
     batches: list[FrameBatch] = []

@@ -17,18 +17,9 @@ import torch
 from torch import nn
 
 from src.benchmark.parts import Paths, backward_from, wrapped_parts
-from src.config import Accelerator, Config
 from src.ops.sparse_conv_tiled import release_scratch
-from src.reliability.processes import check_devices
 
 PATIENCE = 4.0  # a first call that takes so many times what a candidate may take is its only one
-
-
-def chosen_device(config: Config) -> torch.device:
-    """A GPU where there is one and `trainer.accelerator` does not say otherwise."""
-    check_devices(config.trainer.accelerator.value, 1)
-    on_gpu = torch.cuda.is_available() and config.trainer.accelerator is not Accelerator.cpu
-    return torch.device("cuda" if on_gpu else "cpu")
 
 
 # torch.utils.benchmark's clock waits for any GPU there is, and so gives a CPU's process the memory of a CUDA context.

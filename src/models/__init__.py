@@ -12,7 +12,8 @@ from src.models.backbones.image import ImageEncoderConfig
 from src.models.centerpoint.model import CenterPoint, CenterPointConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig
 from src.models.detector import Detector, ModelConfig
-from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
+from src.models.horizon3d.model import Horizon3D
+from src.models.horizon3d.model_config import Horizon3DConfig
 
 FAMILIES: dict[str, tuple[type[ModelConfig], type[Detector]]] = {
     "horizon3d": (Horizon3DConfig, Horizon3D),

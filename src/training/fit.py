@@ -9,16 +9,17 @@ from typing import Any
 import lightning as L
 from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, TQDMProgressBar, WeightAveraging
 from lightning.pytorch.loggers.logger import Logger
-from lightning.pytorch.strategies import Strategy
 
 from src.data.datamodule import DetectionDataModule, dead_workers_named
 from src.errors import InterruptedRunError
 from src.reliability.checkpoints import BEST, LAST, AtomicCheckpointIO, OpenCheckpoint
 from src.reliability.interruption import Interruption
 from src.reliability.metrics_csv import MetricsCSV
-from src.reliability.processes import SharedBuffers
+from src.reliability.processes import SharedBuffers, build_strategy
 from src.training.module import TrainingModule
+from src.training.phases import PhaseConfig
 from src.training.run_folder import RunFolder
+from src.training.trainer_config import TrainerConfig
 from src.training.wandb import WandbConfig, start_wandb
 
 EXPECTED_WARNINGS = (
@@ -42,32 +43,23 @@ class LossProgressBar(TQDMProgressBar):
 
 def build_trainer(
     folder: RunFolder,
+    config: TrainerConfig,
+    phase: PhaseConfig,
     *,
-    epochs: int,
-    validate_every: int,
-    monitor: str,  # logged number that `best.ckpt` is chosen by, larger being better
     precision: str,
-    accelerator: str,
-    devices: int,
-    log_every_steps: int,
     ema_decay: float | None,
-    loggers: list[Logger],
-    checkpoint_every_steps: int | None = None,
-    strategy: Strategy | str = "auto",
-    num_nodes: int = 1,
-    deterministic: bool = False,
+    loggers: list[Logger],  # of the main process; the others have none
 ) -> L.Trainer:
-    """A Trainer that keeps `last.ckpt` of every epoch and `best.ckpt` by `monitor` in the run's folder.
+    """A Trainer that keeps `last.ckpt` of every epoch and `best.ckpt` by `phase.monitor` in the run's folder.
 
     The last but one stays as `previous.ckpt`. With `checkpoint_every_steps`, `last.ckpt` is written inside epochs too.
-    `devices` counts those of one node.
     """
     # Checkpoint names carry no metric: an unquoted `=` in a path cannot be typed after checkpoint=.
     fixed_name = {"dirpath": folder.checkpoints, "auto_insert_metric_name": False, "enable_version_counter": False}
     best, last = Path(BEST).stem, Path(LAST).stem
-    interruption = Interruption(folder.checkpoints / LAST, checkpoint_every_steps)
+    interruption = Interruption(folder.checkpoints / LAST, config.checkpoint_every_steps)
     callbacks: list[L.Callback] = [
-        ModelCheckpoint(filename=best, monitor=monitor, mode="max", save_top_k=1, **fixed_name),
+        ModelCheckpoint(filename=best, monitor=phase.monitor, mode="max", save_top_k=1, **fixed_name),
         ModelCheckpoint(filename=last, save_top_k=1, save_on_train_epoch_end=True, **fixed_name),
         interruption,
         LossProgressBar(refresh_rate=10),
@@ -76,18 +68,18 @@ def build_trainer(
         callbacks.append(EMAWeightAveraging(decay=ema_decay))
     callbacks.append(SharedBuffers())  # behind the moving average
     return L.Trainer(
-        max_epochs=epochs,
-        check_val_every_n_epoch=validate_every,
+        max_epochs=phase.epochs,
+        check_val_every_n_epoch=phase.validate_every,
         precision=precision,
-        accelerator=accelerator,
-        devices=devices,
-        num_nodes=num_nodes,
-        strategy=strategy,
+        accelerator=config.accelerator.value,
+        devices=config.devices,
+        num_nodes=config.num_nodes,
+        strategy=build_strategy(*config.processes),
         logger=loggers,
         callbacks=callbacks,
         plugins=[AtomicCheckpointIO(folder.check_held, fail_fast=lambda: interruption.requested)],
-        log_every_n_steps=log_every_steps,
-        deterministic=deterministic,
+        log_every_n_steps=config.log_every_steps,
+        deterministic=config.deterministic,
         num_sanity_val_steps=0,
         use_distributed_sampler=False,  # Lightning's pads validation, so samples would count twice
         default_root_dir=folder.path,

@@ -2,9 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
+from src.errors import ConfigError
 from src.training.evaluator import DetectionEvaluator, Evaluator
 from src.training.module import TrainingModule
 from src.training.temporal_module import TemporalModule
 
 MODULES: dict[str, type[TrainingModule]] = {kind.__name__: kind for kind in (TrainingModule, TemporalModule)}
 EVALUATORS: dict[str, type[Evaluator]] = {"detection": DetectionEvaluator}
+
+
+@dataclass(kw_only=True)
+class PhaseConfig:
+    """One training phase."""
+
+    name: str
+    module: str  # what trains it, one of MODULES
+    task: str  # what a validation scores, one of EVALUATORS
+    monitor: str  # logged number that best.ckpt is chosen by, larger being better
+    temporal: bool  # clips in order with memory; false: shuffled single frames, and the model has no temporal part
+    init_from: str | None  # a phase, that is the run of the same command in that phase; or the path of a checkpoint
+    train_missing: bool  # train the run that init_from names when it has not finished yet
+    epochs: int
+    validate_every: int  # epochs
+    options: dict[str, Any]  # what the phase says to the model's family
+
+    def __post_init__(self) -> None:
+        for key, known in (("module", MODULES), ("task", EVALUATORS)):
+            if getattr(self, key) not in known:
+                raise ConfigError(f"phase.{key}={getattr(self, key)}: must be one of {', '.join(known)}")
+        if MODULES[self.module].temporal is not self.temporal:
+            raise ConfigError(
+                f"phase.temporal={self.temporal} does not go with phase.module={self.module}, which is for "
+                f"{'streamed clips' if MODULES[self.module].temporal else 'single frames'}"
+            )
+        for name in ("epochs", "validate_every"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"phase.{name} must be at least 1, but got {getattr(self, name)}")

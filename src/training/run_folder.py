@@ -152,6 +152,12 @@ class RunFolder:
         return contents[0], contents[1]
 
 
+def run_of(checkpoint: Path) -> str:
+    """The run whose checkpoint this is, else the file's name."""
+    folder = checkpoint.resolve().parent
+    return folder.parent.name if folder.name == "checkpoints" else checkpoint.stem
+
+
 def make_writable(folder: Path, key: str) -> None:
     """Make a folder and try to write in it; raises ConfigError naming the setting `key` that chose it."""
     probe = folder / f".probe-{os.getpid()}"

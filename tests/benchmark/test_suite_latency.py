@@ -114,9 +114,9 @@ def test_frames_count_once_the_memory_is_as_full_as_it_gets(monkeypatch, lengths
 def test_a_busy_machine_is_warned_of(tmp_path, monkeypatch, capsys, load, warned):
     monkeypatch.setattr(latency, "read_checkpoint", lambda path: {"horizon3d": {"config": None}})
     model = types.SimpleNamespace(memory_frames=0)
-    config = types.SimpleNamespace(model=model, precision="32-true", trainer=None)
+    trainer = types.SimpleNamespace(device=lambda: torch.device("cpu"))
+    config = types.SimpleNamespace(model=model, precision="32-true", trainer=trainer)
     monkeypatch.setattr(latency, "restore_config", lambda config_, overrides: config)
-    monkeypatch.setattr(latency, "chosen_device", lambda config: torch.device("cpu"))
     monkeypatch.setattr(latency.StreamingDetector, "restore", lambda *_: FakeDetector(0))
     monkeypatch.setattr(latency, "data_root", lambda config, write: None)
     monkeypatch.setattr(latency, "build_datamodule", lambda config, root: FakeData((6, 6)))

@@ -15,7 +15,7 @@ import torch
 
 from src import replay, train
 from src.assembly import build_datamodule, build_module, data_root
-from src.config import OnNonfinite, compose_config, restore_config
+from src.config import compose_config, restore_config
 from src.data.datamodule import collate, in_stream
 from src.errors import CheckpointError, ConfigError, DivergedError
 from src.models.detector import Objective
@@ -23,6 +23,7 @@ from src.models.horizon3d.model import Horizon3D
 from src.reliability.checkpoints import read_checkpoint
 from src.reliability.nonfinite import step_seed, write_dump
 from src.training.module import TrainingModule
+from src.training.trainer_config import OnNonfinite
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = (

@@ -15,14 +15,12 @@ import torch
 from src.errors import InterruptedRunError
 from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
 from src.reliability.interruption import Interruption
-from src.reliability.processes import build_strategy, is_main_process, process_group
-from src.training.fit import build_loggers, build_trainer, fit
+from src.reliability.processes import is_main_process, process_group
+from src.training.fit import fit
 from src.training.run_folder import Resume, RunFolder
 from src.training.temporal_module import TemporalModule
-from tests.training.toys import STEPS, ToyData, toy_module
+from tests.training.toys import EPOCHS, STEPS, ToyData, toy_module, toy_trainer
 from tests.training.two_ranks import spawn_two
-
-EPOCHS = 3
 
 
 class Faulty(TemporalModule):
@@ -54,13 +52,9 @@ def train(path, *, fault=None, at_step=None, at_validation=None, ema=None, valid
     module, data = toy_module(Faulty), ToyData()
     module.fault, module.at_step, module.at_validation, module.seen = fault, at_step, at_validation, []
     resume_from = folder.newest_checkpoint()
-    trainer = build_trainer(
-        folder, epochs=EPOCHS, validate_every=validate_every, monitor="val/mAP", precision="32-true",
-        accelerator="cpu", devices=ranks, log_every_steps=1, ema_decay=ema, checkpoint_every_steps=every_steps,
-        strategy=build_strategy("cpu", ranks),
-        loggers=build_loggers(folder, resume_from, None) if is_main_process() else [],
-    )  # fmt: skip
-    trainer.progress_bar_callback.disable()
+    trainer = toy_trainer(
+        folder, resume_from, validate_every=validate_every, ema=ema, every_steps=every_steps, ranks=ranks
+    )
     try:
         fit(trainer, module, data, resume_from)
     finally:

@@ -17,12 +17,12 @@ from src.models.detector import Objective
 from src.reliability import nonfinite
 from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
 from src.reliability.nonfinite import describe_gradients, finite_everywhere, gradient_norm, read_dump, write_dump
-from src.reliability.processes import build_strategy, is_main_process, process_group
-from src.training.fit import build_loggers, build_trainer, fit
+from src.reliability.processes import is_main_process, process_group
+from src.training.fit import fit
 from src.training.module import TrainingModule
 from src.training.run_folder import Resume, RunFolder
 from src.training.temporal_module import TemporalModule
-from tests.training.toys import STEPS, ToyData, toy_batch, toy_module
+from tests.training.toys import STEPS, ToyData, toy_batch, toy_module, toy_trainer
 from tests.training.two_ranks import spawn_two
 
 EPOCHS = 2
@@ -77,13 +77,7 @@ def train(path, fault=None, bad_steps=(BAD_STEP,), skip=True, stop_after=None, e
     module.fault, module.bad_steps, module.stop_after = fault, bad_steps, stop_after
     module.guard.skip = skip
     resume_from = folder.newest_checkpoint()
-    trainer = build_trainer(
-        folder, epochs=EPOCHS, validate_every=1, monitor="val/mAP", precision="32-true", accelerator="cpu",
-        devices=ranks, log_every_steps=1, ema_decay=None, checkpoint_every_steps=every_steps,
-        strategy=build_strategy("cpu", ranks),
-        loggers=build_loggers(folder, resume_from, None) if is_main_process() else [],
-    )  # fmt: skip
-    trainer.progress_bar_callback.disable()
+    trainer = toy_trainer(folder, resume_from, epochs=EPOCHS, every_steps=every_steps, ranks=ranks)
     try:
         fit(trainer, module, ToyData(), resume_from)
     except (DivergedError, InterruptedRunError) as error:

@@ -22,13 +22,13 @@ from src.models.horizon3d.kggi import Initialization
 from src.reliability.processes import SharedBuffers, build_strategy, is_main_process, process_group
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.training.evaluator import DetectionEvaluator
-from src.training.fit import build_loggers, build_trainer, fit
+from src.training.fit import fit
 from src.training.module import TrainingModule
 from src.training.optim import OptimConfig
 from src.training.run_folder import Resume, RunFolder
 from src.training.temporal_module import TemporalModule
 from tests.training.toys import STEPS as TOY_STEPS
-from tests.training.toys import Positions, toy_batch, toy_module
+from tests.training.toys import Positions, toy_batch, toy_module, toy_trainer
 from tests.training.two_ranks import spawn_two
 
 STREAMS, STEPS = 4, 3
@@ -304,12 +304,7 @@ def train_single(path, world_size, stop_at=None):
     module = toy_module(Single)
     module.model.dropout.p = 0.0  # its draws are a rank's own
     module.evaluator, module.stop_at = DetectionEvaluator(random_problem(*PROBLEM)[0]), stop_at
-    trainer = build_trainer(
-        folder, epochs=3, validate_every=1, monitor="val/mAP", precision="32-true", accelerator="cpu",
-        devices=world_size, log_every_steps=1, ema_decay=None, strategy=build_strategy("cpu", world_size),
-        loggers=build_loggers(folder, resume_from, None) if is_main_process() else [],
-    )  # fmt: skip
-    trainer.progress_bar_callback.disable()
+    trainer = toy_trainer(folder, resume_from, ranks=world_size)
     try:
         fit(trainer, module, SharedData(), resume_from)
     except InterruptedRunError:

@@ -26,7 +26,7 @@ from src.errors import (
     HorizonError,
     InterruptedRunError,
 )
-from src.models.horizon3d.model import Horizon3DConfig
+from src.models.horizon3d.model_config import Horizon3DConfig
 from src.reliability.checkpoints import open_checkpoint
 from src.training import handoff
 from src.training.handoff import find_source, hand_over, train_source

@@ -9,14 +9,19 @@ from torch import nn
 from torch.utils.data import DataLoader, Sampler
 
 from src.models.detector import Detector, Objective
+from src.reliability.processes import is_main_process
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.training.evaluator import DetectionEvaluator
+from src.training.fit import build_loggers, build_trainer
 from src.training.optim import OptimConfig
+from src.training.phases import PhaseConfig
 from src.training.temporal_module import TemporalModule
+from src.training.trainer_config import Accelerator, OnNonfinite, TrainerConfig
 
 STEPS = 3  # of one epoch
+EPOCHS = 3
 
 
 @dataclass(frozen=True)
@@ -141,3 +146,19 @@ def toy_module(module_class=TemporalModule, seed=0):
         seed=seed,
         config={"model": {"name": "toy"}},
     )
+
+
+def toy_trainer(folder, resume=None, *, epochs=EPOCHS, validate_every=1, ema=None, every_steps=None, ranks=1):
+    """A Trainer on the CPU for this module, without a progress bar."""
+    config = TrainerConfig(
+        accelerator=Accelerator.cpu, devices=ranks, num_nodes=1, log_every_steps=1, checkpoint_every_steps=every_steps,
+        num_pictures=0, on_nonfinite=OnNonfinite.stop, deterministic=False,
+    )  # fmt: skip
+    phase = PhaseConfig(
+        name="toy", module="TemporalModule", task="detection", monitor="val/mAP", temporal=True, init_from=None,
+        train_missing=False, epochs=epochs, validate_every=validate_every, options={},
+    )  # fmt: skip
+    loggers = build_loggers(folder, resume, None) if is_main_process() else []
+    trainer = build_trainer(folder, config, phase, precision="32-true", ema_decay=ema, loggers=loggers)
+    trainer.progress_bar_callback.disable()
+    return trainer

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.losses.loss_weights import LossWeights
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.backbones.sparse_voxel import VoxelEncoder, VoxelEncoderConfig
 from src.models.detector import Detector, Objective
@@ -30,17 +31,11 @@ class LidarEncoderConfig(VoxelEncoderConfig):
 
 
 @dataclass(kw_only=True)
-class CenterPointLossConfig:
+class CenterPointLossConfig(LossWeights):
     """Weights of the terms (`model.loss`); null switches a term off, uncomputed."""
 
     heatmap_weight: float | None
     box_weight: float | None
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value is not None and value < 0:
-                raise ConfigError(f"model.loss.{field.name}={value}: must not be negative; null switches a term off")
 
 
 @dataclass(kw_only=True)

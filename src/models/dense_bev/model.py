@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import depth_cross_entropy
+from src.losses.loss_weights import LossWeights
 from src.losses.normalizers import mean_over_ranks
 from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.dense_bev.bev_decoder import MIN_CHANNELS, BEVDecoder, BEVDecoderConfig, ConvFuser
@@ -27,18 +28,12 @@ from src.targets.supervision import supervised_boxes
 
 
 @dataclass(kw_only=True)
-class DenseBEVLossConfig:
+class DenseBEVLossConfig(LossWeights):
     """Weights of the terms (`model.loss`); null switches a term off, uncomputed."""
 
     heatmap_weight: float | None
     box_weight: float | None
     depth_weight: float | None
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value is not None and value < 0:
-                raise ConfigError(f"model.loss.{field.name}={value}: must not be negative; null switches a term off")
 
 
 @dataclass(kw_only=True)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from torch import Tensor
 
-from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import depth_cross_entropy, penalty_reduced_focal, sigmoid_focal
+from src.losses.loss_weights import LossWeights
 from src.losses.normalizers import mean_over_ranks
 from src.losses.regression import masked_l1, masked_smooth_l1
 from src.losses.segmentation import dice, lovasz_foreground, occupancy_losses
@@ -27,7 +27,7 @@ from src.targets.velocity import velocity_raster
 
 
 @dataclass(kw_only=True)
-class Horizon3DLossConfig:
+class Horizon3DLossConfig(LossWeights):
     """Weights of the terms (`model.loss`); an inner weight of null switches its term off, uncomputed."""
 
     kggi_weight: float  # lambda_kggi, on keypoint, depth and radar objectness
@@ -46,12 +46,6 @@ class Horizon3DLossConfig:
     cell_velocity_weight: float | None
     gaussian_velocity_weight: float | None
     gaussian_velocity_in_phase1: bool  # supervise Gaussian velocities (Eq. 9) already without memory
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name.endswith("_weight") and value is not None and value < 0:
-                raise ConfigError(f"model.loss.{field.name}={value}: must not be negative; null switches a term off")
 
 
 def kggi_losses(

@@ -14,7 +14,8 @@ from src.models.horizon3d.dptf import DPTFConfig
 from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling, SelfAttentionConfig
 from src.models.horizon3d.kggi import Initialization, KGGIConfig
 from src.models.horizon3d.loss import Horizon3DLossConfig
-from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
+from src.models.horizon3d.model import Horizon3D
+from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom
 from src.models.horizon3d.views import CameraViews
 from src.structures.batch import FrameBatch

@@ -13,7 +13,8 @@ from src.models import FAMILIES, build_model
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.heads.center_head import BoxOptions
 from src.models.horizon3d.kggi import Initialization
-from src.models.horizon3d.model import Horizon3D, Horizon3DConfig
+from src.models.horizon3d.model import Horizon3D
+from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, RefineFrom
 from src.structures.boxes import Boxes3D
 from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step

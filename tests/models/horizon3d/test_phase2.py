@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from src.models.horizon3d.dptf_memory import Memory
-from src.models.horizon3d.model import Horizon3DConfig
+from src.models.horizon3d.model_config import Horizon3DConfig
 from src.reliability.checkpoints import load_model_weights
 from tests.models.moving import UTM, bda, pose, tensors_of
 

@@ -1,0 +1,109 @@
+"""Settings of Horizon3D: its parts, and which of them go together."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+from src.errors import ConfigError
+from src.models.backbones.sparse_voxel import RadarEncoderConfig
+from src.models.heads.center_head import HeadConfig
+from src.models.horizon3d.cross_attention import NUM_HEADS
+from src.models.horizon3d.dptf import DPTFConfig
+from src.models.horizon3d.kggi import KGGIConfig
+from src.models.horizon3d.loss import Horizon3DLossConfig
+from src.models.horizon3d.ocsf import OCSFConfig
+
+CHANNEL_MULTIPLE = 4 * NUM_HEADS
+"""C splits into attention heads of at least 4 channels and into groups of 4 for the camera head's norm."""
+
+
+@dataclass(kw_only=True)
+class Horizon3DConfig:
+    """Settings of the model (`model`). Raises ConfigError for parts that do not go together."""
+
+    temporal_part: ClassVar[str] = "dptf"
+    new_in_temporal_phase: ClassVar[str] = r"dptf\.|ocsf\.encoder\.layers\.\d+\.temporal_attention\."
+
+    name: str
+    channels: int  # C, width of BEV cells and Gaussians
+    radar_encoder: RadarEncoderConfig
+    kggi: KGGIConfig | None  # null together with ocsf: radar only
+    ocsf: OCSFConfig | None
+    dptf: DPTFConfig | None  # null: single frames, phase 1
+    head: HeadConfig
+    loss: Horizon3DLossConfig
+
+    def __post_init__(self) -> None:
+        if (self.kggi is None) != (self.ocsf is None):
+            off, on = ("kggi", "ocsf") if self.kggi is None else ("ocsf", "kggi")
+            raise ConfigError(
+                f"model.{off}=null while model.{on} is set: one makes the Gaussians, the other uses them; set both to "
+                "null for radar only, or model.kggi.initialization=random for OCSF without keypoints"
+            )
+        if self.ocsf is None and self.dptf is not None and self.dptf.gaussian_path is not None:
+            raise ConfigError(
+                "model.dptf.gaussian_path is set, but model.ocsf=null makes no Gaussians to remember; set "
+                "model.dptf.gaussian_path=null as well"
+            )
+        if self.channels < 1 or self.channels % CHANNEL_MULTIPLE:
+            raise ConfigError(
+                f"model.channels={self.channels}: must be a positive multiple of {CHANNEL_MULTIPLE}, whole norm groups "
+                f"of 4 channels in each of {NUM_HEADS} attention heads"
+            )
+        if self.temporal_heads is not None and self.channels % self.temporal_heads:
+            raise ConfigError(
+                f"model.dptf.gaussian_path.self_attention.num_heads={self.temporal_heads}: must divide "
+                f"model.channels={self.channels}"
+            )
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Radar, and cameras where there are Gaussians."""
+        return ("radar",) if self.ocsf is None else ("camera", "radar")
+
+    @property
+    def keys_of_temporal_phase(self) -> tuple[str, ...]:
+        """All of DPTF with its loss terms; velocities of Gaussians unless they are supervised before."""
+        terms = [f"cell_{term}_weight" for term in ("focal", "dice", "lovasz", "velocity")]
+        if not self.loss.gaussian_velocity_in_phase1:
+            terms += ["dptf_weight", "gaussian_velocity_weight"]
+        return ("model.dptf", *(f"model.loss.{term}" for term in terms))
+
+    @property
+    def memory_frames(self) -> int:
+        """How many past key frames are remembered at most; 0 for single frames."""
+        return self.dptf.num_frames if self.dptf is not None else 0
+
+    @property
+    def memory_max_age_s(self) -> float | None:
+        """How far back the memory may lie; None for single frames."""
+        return self.dptf.max_age_s if self.dptf is not None else None
+
+    @property
+    def temporal_heads(self) -> int | None:
+        """Heads of the temporal self-attention, None where it is off."""
+        path = self.dptf.gaussian_path if self.dptf is not None else None
+        attention = path.self_attention if path is not None else None
+        return attention.num_heads if attention is not None else None
+
+    def scaled(
+        self, gaussians: float = 1.0, memory_frames: int | None = None, cells_per_frame: int | None = None
+    ) -> Self:
+        """Keypoints of all kinds, frames of both paths (of Gaussians no more than configured) and their cells."""
+        settings = copy.deepcopy(self)
+        if settings.kggi is not None and gaussians != 1.0:
+            for key in ("num_radar_keypoints", "num_camera_keypoints", "num_random_keypoints"):
+                setattr(settings.kggi, key, max(1, round(gaussians * getattr(settings.kggi, key))))
+        if memory_frames == 0:
+            settings.dptf = None
+        cells = settings.dptf.bev_path if settings.dptf is not None else None
+        history = settings.dptf.gaussian_path if settings.dptf is not None else None
+        if cells is not None and memory_frames is not None:
+            cells.num_frames = memory_frames
+        if history is not None and memory_frames is not None:
+            history.num_frames = min(memory_frames, history.num_frames)
+        if cells is not None and cells_per_frame is not None:
+            cells.memory_threshold, cells.max_cells_per_frame = 0.0, cells_per_frame
+        return settings
