@@ -2,6 +2,8 @@
 
 import signal
 
+from tests import running  # noqa: F401, sets up the server that processes are forked from
+
 
 def pytest_configure(config):
     """A shell's background job ignores SIGINT, and so would the commands that tests start and interrupt."""

@@ -5,12 +5,11 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 
 import pytest
 
-from tests.running import ROOT, command
+from tests.running import ROOT, call, command, start
 
 pytestmark = pytest.mark.slow
 
@@ -49,20 +48,20 @@ def test_train_leaves_everything_that_is_promised(trained):
 def test_the_same_command_shows_the_finished_run(trained, outputs):
     folder, first = trained
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file() and p.name != ".lock"}
-    again = command("train", "phase=phase1", "scale=debug", f"paths.outputs={outputs}")
+    again = call("train", "phase=phase1", "scale=debug", f"paths.outputs={outputs}")
     assert "mAP" in again.stdout
     assert before == {p: p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file() and p.name != ".lock"}
-    command("train", "phase=phase1", "scale=debug", f"paths.outputs={outputs}", "resume=never", expect=3)
+    call("train", "phase=phase1", "scale=debug", f"paths.outputs={outputs}", "resume=never", expect=3)
 
 
 def test_evaluate_agrees_with_training_from_checkpoint_and_from_file(trained, outputs, tmp_path):
     folder, _ = trained
     expected = json.loads((folder / "metrics.json").read_text())
     checkpoint = folder / "checkpoints" / "last.ckpt"
-    command("evaluate", f"checkpoint={checkpoint}", f"out={tmp_path / 'a'}", f"paths.outputs={outputs}")
+    call("evaluate", f"checkpoint={checkpoint}", f"out={tmp_path / 'a'}", f"paths.outputs={outputs}")
     assert json.loads((tmp_path / "a" / "metrics.json").read_text()) == expected
     (world,) = (outputs / "worlds").iterdir()
-    command(
+    call(
         "evaluate", f"predictions={tmp_path / 'a' / 'submission.json'}", f"data.root={world}",
         f"out={tmp_path / 'b'}", f"paths.outputs={outputs}",
     )  # fmt: skip
@@ -74,15 +73,15 @@ def test_evaluate_refuses_what_it_cannot_score(trained, outputs, tmp_path):
     (world,) = (outputs / "worlds").iterdir()
     base = (f"data.root={world}", f"paths.outputs={outputs}", f"out={tmp_path}")
     assert "either checkpoint" in command("evaluate", *base, expect=3).stderr
-    assert "does not exist" in command("evaluate", "checkpoint=nothing.ckpt", *base, expect=3).stderr
+    assert "does not exist" in call("evaluate", "checkpoint=nothing.ckpt", *base, expect=3).stderr
     half = tmp_path / "half.ckpt"
     half.write_bytes((folder / "checkpoints" / "last.ckpt").read_bytes()[:5000])
-    assert "half.ckpt" in command("evaluate", f"checkpoint={half}", *base, expect=3).stderr
+    assert "half.ckpt" in call("evaluate", f"checkpoint={half}", *base, expect=3).stderr
     wrong = tmp_path / "wrong.json"
     wrong.write_text('{"meta": {}, "results": {}}')
-    assert "wrong.json" in command("evaluate", f"predictions={wrong}", *base, expect=4).stderr
+    assert "wrong.json" in call("evaluate", f"predictions={wrong}", *base, expect=4).stderr
     other = ("data=truckscenes", f"data.root={tmp_path / 'nowhere'}")
-    assert "nowhere" in command("evaluate", f"predictions={wrong}", *other, f"out={tmp_path}", expect=4).stderr
+    assert "nowhere" in call("evaluate", f"predictions={wrong}", *other, f"out={tmp_path}", expect=4).stderr
 
 
 def test_a_killed_run_resumes_and_ends_with_the_same_weights(trained, outputs, tmp_path):
@@ -92,19 +91,17 @@ def test_a_killed_run_resumes_and_ends_with_the_same_weights(trained, outputs, t
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     (world,) = (outputs / "worlds").iterdir()
     arguments = (*changes, f"data.root={world}")
-    command("train", *arguments, f"paths.outputs={whole}")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "src.train", *arguments, f"paths.outputs={killed}"],
-        cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
-    )  # fmt: skip
+    call("train", *arguments, f"paths.outputs={whole}")
+    said = tmp_path / "said"
+    process = start("train", *arguments, f"paths.outputs={killed}", out=said, err=said)
     deadline = time.monotonic() + 400
     while not list(killed.glob("*/checkpoints/last.ckpt")):
-        assert time.monotonic() < deadline and process.poll() is None
+        assert time.monotonic() < deadline and process.is_alive()
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    process.join()
     assert not list(killed.glob("*/metrics.json"))
-    command("train", *arguments, f"paths.outputs={killed}")
+    call("train", *arguments, f"paths.outputs={killed}")
     (a,) = whole.glob("horizon3d-*/checkpoints/last.ckpt")
     (b,) = killed.glob("horizon3d-*/checkpoints/last.ckpt")
     first, second = (torch.load(p, weights_only=True)["state_dict"] for p in (a, b))
@@ -115,7 +112,7 @@ def test_a_killed_run_resumes_and_ends_with_the_same_weights(trained, outputs, t
 
 
 def test_world_preview(outputs, tmp_path):
-    result = command("world", "scale=debug", "preview=true", f"paths.outputs={outputs}", f"out={tmp_path}")
+    result = call("world.__main__", "scale=debug", "preview=true", f"paths.outputs={outputs}", f"out={tmp_path}")
     assert list(tmp_path.glob("*.png")) and "picture:" in result.stdout
 
 

@@ -4,15 +4,13 @@ import math
 import os
 import re
 import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from src.config import CONF, compose_config, restore_config
 from src.errors import CheckpointError, ConfigError
 from src.reliability.command import run_command
+from tests.running import command
 
 SCALES = sorted(p.stem for p in (CONF / "scale").glob("*.yaml"))
 
@@ -378,10 +376,6 @@ def exit_code_of(main, monkeypatch):
 
 
 def test_exit_code_of_a_configuration_error():
-    root = Path(__file__).resolve().parent.parent
-    result = subprocess.run(
-        [sys.executable, "-m", "src.train", "phase=phase3"], cwd=root, capture_output=True, text=True
-    )
-    assert result.returncode == 3
+    result = command("train", "phase=phase3", expect=3)
     assert "phase3" in result.stderr and "phase1" in result.stderr and "phase2" in result.stderr
     assert "Traceback" not in result.stderr

@@ -9,7 +9,7 @@ from src.assembly import build_datamodule
 from src.config import restore_config
 from src.reliability.checkpoints import read_checkpoint
 from src.streaming import StreamingDetector
-from tests.running import command
+from tests.running import call
 
 pytestmark = pytest.mark.slow
 
@@ -23,7 +23,7 @@ def outputs(tmp_path_factory):
 def trained(outputs):
     """A run of phase 2, which trains its phase 1 first."""
     few = "model.head.score_threshold=0.005"  # one step leaves every score near where it began
-    command("train", "phase=phase2", "model=dense_bev", "scale=debug", few, f"paths.outputs={outputs}")
+    call("train", "phase=phase2", "model=dense_bev", "scale=debug", few, f"paths.outputs={outputs}")
     (folder,) = outputs.glob("dense_bev-phase2-debug-*")
     return folder
 
@@ -47,7 +47,7 @@ def test_both_phases_leave_what_is_promised(trained, outputs):
 
 def test_evaluation_agrees_with_training(trained, outputs, tmp_path):
     checkpoint = f"checkpoint={trained / 'checkpoints' / 'last.ckpt'}"
-    command("evaluate", checkpoint, f"out={tmp_path}", f"paths.outputs={outputs}")
+    call("evaluate", checkpoint, f"out={tmp_path}", f"paths.outputs={outputs}")
     assert (tmp_path / "metrics.json").read_text() == (trained / "metrics.json").read_text()
 
 

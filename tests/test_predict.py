@@ -1,9 +1,6 @@
 """`python -m src.predict`: the boxes of `src.evaluate`, scene by scene, with pictures, whole files or none."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +10,9 @@ from PIL import Image
 from src import evaluate, predict
 from src.errors import CheckpointError, ConfigError, DataError
 from src.streaming import StreamingDetector
+from tests.running import command
 from tests.untrained import write_checkpoint
 
-ROOT = Path(__file__).resolve().parent.parent
 FRAMES = 3  # of a scene
 
 
@@ -144,9 +141,9 @@ def test_bad_input_is_named(checkpoints, outputs, tmp_path):
         run(tmp_path / "none.ckpt", *base)
     with pytest.raises(CheckpointError, match="is a folder"):
         run(tmp_path, *base)
-    for command in (predict, evaluate):
+    for entry in (predict, evaluate):
         with pytest.raises(ConfigError, match="phase=phase2: the checkpoint is of phase=phase1"):
-            command.main([f"checkpoint={good}", base[0], f"out={tmp_path / 'never'}", "phase=phase2"])
+            entry.main([f"checkpoint={good}", base[0], f"out={tmp_path / 'never'}", "phase=phase2"])
     with pytest.raises(DataError, match="none.json: there is no such file"):
         evaluate.main([f"predictions={tmp_path / 'none.json'}", f"paths.outputs={tmp_path / 'new'}"])
     assert not (tmp_path / "new").exists()
@@ -176,12 +173,9 @@ def test_bad_input_is_named(checkpoints, outputs, tmp_path):
 
 @pytest.mark.slow
 def test_the_command_itself(checkpoints, outputs, tmp_path):
-    def command(*overrides):
-        line = [sys.executable, "-m", "src.predict", *overrides, f"paths.outputs={outputs}", f"out={tmp_path}"]
-        return subprocess.run(line, cwd=ROOT, capture_output=True, text=True, timeout=300)
-
-    ended = command(f"checkpoint={checkpoints['phase2']}", "trainer.num_pictures=0")
-    assert ended.returncode == 0 and f"{2 * FRAMES} frames" in ended.stdout and str(tmp_path) in ended.stdout
+    base = (f"checkpoint={checkpoints['phase2']}", f"paths.outputs={outputs}", f"out={tmp_path}")
+    ended = command("predict", *base, "trainer.num_pictures=0")
+    assert f"{2 * FRAMES} frames" in ended.stdout and str(tmp_path) in ended.stdout
     assert "predicting" in ended.stderr and len(results(tmp_path)) == 2 * FRAMES
-    refused = command(f"checkpoint={checkpoints['phase2']}", "scene=nothing")
-    assert refused.returncode == 3 and "no such scene" in refused.stderr and "Traceback" not in refused.stderr
+    refused = command("predict", *base, "scene=nothing", expect=3)
+    assert "no such scene" in refused.stderr and "Traceback" not in refused.stderr

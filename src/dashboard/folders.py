@@ -7,7 +7,6 @@ that leads out of its folder counts as missing.
 from __future__ import annotations
 
 import csv
-import math
 import os
 import re
 import struct
@@ -19,7 +18,7 @@ from typing import Any
 import yaml
 
 from src.report.plain_yaml import load_plain_yaml
-from src.report.results import thinned, without_local_paths
+from src.report.results import Point, read_curves, without_local_paths
 
 TAIL_BYTES = 24_000
 CONFIG_BYTES = 1_000_000
@@ -29,7 +28,6 @@ ALIVE_S = 300.0
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _PNG = b"\x89PNG\r\n\x1a\n"
-Curves = dict[str, list[tuple[float, float]]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,10 +112,13 @@ class RunFolders:
         # A progress bar rewrites its line: what stands after the last carriage return is what a terminal shows.
         return "\n".join(line.rstrip("\r").rpartition("\r")[2] for line in text.split("\n")).strip()
 
-    def curves(self, run_id: str) -> Curves:
-        """Losses and scores so far, from metrics.csv: steps and values, as thinned as those of a result."""
+    def curves(self, run_id: str) -> dict[str, list[Point]]:
+        """Losses and scores so far, from metrics.csv; empty if unreadable."""
         path = self._file_of(run_id, "metrics.csv")
-        return read_curves(path) if path is not None else {}
+        try:
+            return read_curves(path, live=True) if path is not None else {}
+        except (OSError, csv.Error, UnicodeDecodeError):
+            return {}
 
     def config(self, run_id: str) -> dict[str, Any]:
         """The configuration of a run that has no result yet, without what concerns the machine; empty if unreadable."""
@@ -171,30 +172,6 @@ class RunFolders:
             for entry in sorted(entries, key=lambda entry: entry.name):
                 if _is_run(entry.name) and os.path.isfile(os.path.join(entry.path, "config.yaml")):
                     yield entry
-
-
-def read_curves(path: Path) -> Curves:
-    """Columns loss/*, step/total and val/* of a metrics.csv by step; blanks and what is not a number are left out."""
-    curves: Curves = {}
-    try:
-        with path.open(newline="") as file:
-            for row in csv.DictReader(file):
-                try:
-                    step = float(row.get("step") or "nan")
-                except ValueError:
-                    continue
-                for name, text in row.items():
-                    if not name or not text or not (name.startswith(("loss/", "val/")) or name == "step/total"):
-                        continue
-                    try:
-                        value = float(text)
-                    except (TypeError, ValueError):
-                        continue
-                    if math.isfinite(step) and math.isfinite(value):
-                        curves.setdefault(name, []).append((step, value))
-    except (OSError, csv.Error, UnicodeDecodeError):
-        return {}
-    return {name: thinned(points) for name, points in curves.items()}
 
 
 def _is_run(name: str) -> bool:

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgba
 from matplotlib.patches import Circle, Polygon
 
+from src.pictures.canvas import Canvas
 from src.pictures.contents import (
     CLASS_COLOURS,
     CLASS_MARKERS,
     INK,
+    MOVING_MPS,
     OCCUPANCY_COLOUR,
     SOURCE_COLOURS,
     SOURCES,
     PictureBoxes,
     PictureGaussians,
     PictureGrid,
+    Window,
     match_boxes,
 )
 from src.structures.taxonomy import CLASSES
@@ -29,21 +34,19 @@ Array = np.ndarray
 ARROW_S = 0.5
 """An arrow shows the travel in this time: the interval of two key frames, so its tip is the next position."""
 
-MOVING_MPS = 1.0
-"""Radar points and boxes slower than this count as standing."""
-
 SPEED_LIMIT_MPS = 30.0
 SPEED_COLOURS = LinearSegmentedColormap.from_list("speed", ("#08519C", "#4A9BD4", "#B9BEC4", "#F08A3C", "#A63603"))
 """Blue comes nearer, orange moves away; grey stands."""
 
 STANDING_COLOUR = "#9AA2AB"
+LIDAR_COLOUR = "#7A828B"
 MISSED_COLOUR = "#D7263D"
 RINGS_M = (25, 50, 100, 150)
 
 
 @dataclass
 class BevScene:
-    """What lies on the ground around one ego vehicle. Raises ValueError when shapes disagree."""
+    """What lies on the ground around one ego vehicle."""
 
     grid: PictureGrid
     predictions: PictureBoxes = field(default_factory=PictureBoxes.empty)
@@ -51,24 +54,12 @@ class BevScene:
     radar_points: Array | None = None  # [P, 7] x, y, z (m), rcs (dB), vx, vy (m/s, compensated, radial), dt (s)
     gaussians: PictureGaussians | None = None
     occupancy: tuple[Array, Array] | None = None  # [n, 2] (row, col) cells and [n] alpha in 0..1
-
-    def __post_init__(self) -> None:
-        points = self.radar_points
-        if points is not None and (points.ndim != 2 or points.shape[1] != 7):
-            raise ValueError(f"BevScene.radar_points must be [P, 7], but got {list(points.shape)}")
-        if self.occupancy is not None:
-            cells, alpha = self.occupancy
-            if cells.shape != (len(alpha), 2) or alpha.ndim != 1:
-                raise ValueError(
-                    f"BevScene.occupancy must be [n, 2] cells and [n] alpha, but got {cells.shape} and {alpha.shape}"
-                )
+    lidar_points: Array | None = None  # [L, 3 or more] x, y, z (m); drawn where there is no radar
 
     def drawable(self, score_threshold: float) -> BevScene:
         """The scene with the boxes that are drawn, see PictureBoxes.drawable."""
-        return BevScene(
-            self.grid, self.predictions.drawable(score_threshold), self.ground_truth.drawable(), self.radar_points,
-            self.gaussians, self.occupancy,
-        )  # fmt: skip
+        predictions = self.predictions.drawable(score_threshold)
+        return replace(self, predictions=predictions, ground_truth=self.ground_truth.drawable())
 
 
 def upright(
@@ -78,8 +69,21 @@ def upright(
     return np.stack([-xy[..., 1], xy[..., 0]], axis=-1)
 
 
-def frame_axes(axes: Axes, right_m: tuple[float, float], up_m: tuple[float, float]) -> None:
-    """Set the window, hide ticks, draw rings of equal range with their labels."""
+def bev_panel(
+    canvas: Canvas,
+    area: tuple[float, float, float, float],  # of the plot: left, top, width, height in picture pixels
+    window: Window,
+    caption: str,
+    keys: Sequence[Artist] = (),
+    note: str = "",
+) -> Axes:
+    """A plot of the ground with rings of equal range and the ego; above it the caption, and keys or a note."""
+    left, top, width, height = area
+    canvas.text(left, top - (41 if note else 25), caption, 15, bold=True)
+    canvas.text(left, top - 21, note, 13)
+    canvas.legend(left + 10 + 9.2 * len(caption), top - 23, keys, size_px=12)
+    axes = canvas.axes(left, top, width, height)
+    right_m, up_m = window
     axes.set_xlim(*right_m)
     axes.set_ylim(*up_m)
     axes.set_aspect("equal", adjustable="box")
@@ -88,16 +92,28 @@ def frame_axes(axes: Axes, right_m: tuple[float, float], up_m: tuple[float, floa
     axes.set_facecolor("#FBFBFC")
     for spine in axes.spines.values():
         spine.set_color("#C9CED4")
+    paint_rings(axes, right_m, up_m)
+    paint_ego(axes)
+    return axes
+
+
+def paint_rings(axes: Axes, right_m: tuple[float, float], up_m: tuple[float, float]) -> None:
+    """Circles of equal range around the ego, labelled where the label fits into the window."""
     wide = right_m[1] - right_m[0] > 150
     turn = np.deg2rad(38 if wide else 62)  # from forward to the right, where roads seldom lead
     for radius in RINGS_M[1:] if wide else RINGS_M:
         axes.add_patch(Circle((0, 0), radius, fill=False, edgecolor="#D5D9DE", linewidth=1.0, zorder=0.5))
         right, up = radius * np.sin(turn), radius * np.cos(turn)
         if right_m[0] + 3 < right < right_m[1] - 3 and up_m[0] + 2 < up < up_m[1] - 2:
-            axes.text(
-                right, up, f"{radius} m", color="#6C757D", fontsize=8.5, ha="center", va="center", zorder=6,
-                bbox={"boxstyle": "square,pad=0.15", "fc": "#FBFBFC", "ec": "none", "alpha": 0.85},
-            )  # fmt: skip
+            paint_label(axes, right, up, f"{radius} m", "#6C757D")
+
+
+def paint_label(axes: Axes, right: float, up: float, text: str, colour: str) -> None:
+    """A length in metres on the ground, readable over what lies there."""
+    axes.text(
+        right, up, text, color=colour, fontsize=8.5, ha="center", va="center", zorder=6,
+        bbox={"boxstyle": "square,pad=0.15", "fc": "#FBFBFC", "ec": "none", "alpha": 0.85},
+    )  # fmt: skip
 
 
 def paint_ego(axes: Axes) -> None:
@@ -120,8 +136,8 @@ def paint_occupancy(axes: Axes, scene: BevScene) -> None:
     inside = ((cells >= 0) & (cells < (grid.rows, grid.cols))).all(axis=1)
     rows, cols = np.asarray(cells)[inside].astype(np.int64).T
     image[cols, grid.rows - 1 - rows, 3] = 0.75 * np.clip(np.nan_to_num(alpha[inside]), 0, 1)
-    extent = (-grid.y_max_m, -grid.y_min_m, grid.x_min_m, grid.x_max_m)
     limits = axes.get_xlim(), axes.get_ylim()
+    extent = (*grid.window[0], *grid.window[1])
     axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", aspect="equal", zorder=1)
     axes.set_xlim(*limits[0])
     axes.set_ylim(*limits[1])
@@ -147,6 +163,12 @@ def paint_radar(axes: Axes, points: Array | None) -> None:
     axes.plot(*xy[~moving].T, linestyle="none", marker=".", markersize=2 * size, color=STANDING_COLOUR, mew=0, zorder=2)
     colours = SPEED_COLOURS(Normalize(-SPEED_LIMIT_MPS, SPEED_LIMIT_MPS)(speeds[moving]))
     axes.scatter(*xy[moving].T, s=7 * size, c=colours, linewidths=0, zorder=2.2)
+
+
+def paint_lidar(axes: Axes, points: Array | None) -> None:
+    """A pixel each: they are many."""
+    if points is not None:
+        axes.plot(*upright(points[:, :2]).T, linestyle="none", marker=",", color=LIDAR_COLOUR, zorder=2)
 
 
 def paint_gaussians(axes: Axes, gaussians: PictureGaussians | None) -> None:
@@ -190,7 +212,10 @@ def paint_boxes(axes: Axes, boxes: PictureBoxes, predicted: bool, arrows: bool =
         axes.add_collection(LineCollection(footprints[:, :2], colors=colours, linewidths=3.2, zorder=order + 0.1))
     paint_markers(axes, boxes, predicted, order + 0.2)
     if arrows:
-        paint_arrows(axes, boxes, colours, predicted, order + 0.3 if predicted else 3.9)  # truth shows where it differs
+        moving = boxes.moving()
+        style = (2.8, (3.6, 4.0, 3.6)) if predicted else (1.1, (6.0, 7.0, 3.6))
+        order = order + 0.3 if predicted else 3.9  # truth shows where it differs
+        paint_arrows(axes, boxes.centers[moving, :2], boxes.velocities[moving], colours[moving], *style, order)
 
 
 def paint_markers(axes: Axes, boxes: PictureBoxes, predicted: bool, order: float) -> None:
@@ -206,16 +231,20 @@ def paint_markers(axes: Axes, boxes: PictureBoxes, predicted: bool, order: float
             )  # fmt: skip
 
 
-def paint_arrows(axes: Axes, boxes: PictureBoxes, colours: Array, predicted: bool, order: float) -> None:
-    """Arrows from the centres over the travel of ARROW_S seconds; none for standing boxes or unknown velocities."""
-    speeds = np.linalg.norm(boxes.velocities, axis=1)
-    moving = np.isfinite(speeds) & (speeds >= MOVING_MPS)
-    if moving.any():
+def paint_arrows(
+    axes: Axes,
+    xy: Array,  # [n, 2] m
+    velocities: Array,  # [n, 2] m/s
+    colours: Array | str,
+    width_px: float,
+    head: tuple[float, float, float],  # width, length and length along the shaft, in widths
+    order: float,
+) -> None:
+    """Arrows over the travel of ARROW_S seconds."""
+    if len(xy):
         axes.quiver(
-            *upright(boxes.centers[moving, :2]).T, *(ARROW_S * upright(boxes.velocities[moving])).T,
-            color=colours[moving], angles="xy", scale_units="xy", scale=1, units="dots", zorder=order,
-            width=2.8 if predicted else 1.1, headwidth=3.6 if predicted else 6, headlength=4 if predicted else 7,
-            headaxislength=3.6,
+            *upright(xy).T, *(ARROW_S * upright(velocities)).T, color=colours, angles="xy", scale_units="xy", scale=1,
+            units="dots", width=width_px, headwidth=head[0], headlength=head[1], headaxislength=head[2], zorder=order,
         )  # fmt: skip
 
 
@@ -229,30 +258,18 @@ def ring_missed(axes: Axes, scene: BevScene) -> None:
         )  # fmt: skip
 
 
-def paint_detections(
-    axes: Axes,
-    scene: BevScene,
-    right_m: tuple[float, float],
-    up_m: tuple[float, float],
-) -> None:
-    """Detections: radar points, true and predicted boxes with velocities."""
-    frame_axes(axes, right_m, up_m)
+def paint_detections(axes: Axes, scene: BevScene) -> None:
+    """Detections: radar (else LiDAR) points, true and predicted boxes with velocities."""
+    if scene.radar_points is None:
+        paint_lidar(axes, scene.lidar_points)
     paint_radar(axes, scene.radar_points)
     ring_missed(axes, scene)
     paint_boxes(axes, scene.predictions, predicted=True)
     paint_boxes(axes, scene.ground_truth, predicted=False)
-    paint_ego(axes)
 
 
-def paint_evidence(
-    axes: Axes,
-    scene: BevScene,
-    right_m: tuple[float, float],
-    up_m: tuple[float, float],
-) -> None:
+def paint_evidence(axes: Axes, scene: BevScene) -> None:
     """Evidence: splatted occupancy and Gaussians by source, with the true boxes."""
-    frame_axes(axes, right_m, up_m)
     paint_occupancy(axes, scene)
     paint_gaussians(axes, scene.gaussians)
     paint_boxes(axes, scene.ground_truth, predicted=False, arrows=False)
-    paint_ego(axes)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba
 
-from src.pictures.canvas import SHEET_PX, Canvas
+from src.pictures.canvas import Canvas
 from src.pictures.contents import BOX_EDGES, FRONT_FACE, INK, MUTED, PictureBoxes
 from src.structures.taxonomy import CLASSES
 
@@ -28,23 +27,11 @@ MIN_LABELLED_PX = 16
 
 @dataclass
 class PictureViews:
-    """N cameras of one frame. Raises ValueError when counts or shapes disagree."""
+    """N cameras of one frame."""
 
     images: Sequence[Array | None]  # N of [H, W, 3] uint8 RGB, None where the camera gave no image
     pix_from_ego: Array  # [N, 4, 4], rows 0-2: ego metres -> (u*d, v*d, d); pixel centres lie at +0.5
     names: Sequence[str]  # N channel names, e.g. CAMERA_LEFT_FRONT
-
-    def __post_init__(self) -> None:
-        self.pix_from_ego = np.asarray(self.pix_from_ego, dtype=np.float64)
-        n = len(self.images)
-        if len(self.names) != n or self.pix_from_ego.shape != (n, 4, 4):
-            raise ValueError(
-                f"PictureViews of {n} images must have {n} names and pix_from_ego [{n}, 4, 4], "
-                f"but got {len(self.names)} names and {list(self.pix_from_ego.shape)}"
-            )
-        for name, image in zip(self.names, self.images, strict=True):
-            if image is not None and (image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8):
-                raise ValueError(f"image of {name} must be [H, W, 3] uint8, but got {image.shape} {image.dtype}")
 
     def __len__(self) -> int:
         return len(self.images)
@@ -250,19 +237,3 @@ def paint_cameras(
         paint_camera(
             axes, views.images[index], views.pix_from_ego[index], views.names[index], predictions, ground_truth
         )
-
-
-def draw_cameras(
-    path: Path | str,
-    views: PictureViews,
-    predictions: PictureBoxes,
-    ground_truth: PictureBoxes,
-    score_threshold: float = 0.0,
-) -> None:
-    """Write a PNG of the cameras with projected boxes, SHEET_PX wide.
-
-    Predictions are solid in class colours with their front face tinted, ground truth is dashed white.
-    """
-    canvas = Canvas(SHEET_PX, max(cameras_height(views, SHEET_PX), 1))
-    paint_cameras(canvas, views, (0, 0, SHEET_PX), predictions.drawable(score_threshold), ground_truth.drawable())
-    canvas.save(path)

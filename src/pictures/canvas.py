@@ -17,6 +17,11 @@ from src.pictures.contents import INK
 DPI = 100
 SHEET_PX = 1600
 """Width of every picture."""
+MARGIN_PX = 10
+GAP_PX = 12
+"""Between panels."""
+CAPTION_PX = 34
+"""Above a panel."""
 
 
 class Canvas:

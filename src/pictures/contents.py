@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import numpy as np
 
 from src.structures.taxonomy import CLASSES
 
 Array = np.ndarray
-Colour = str
+Window = tuple[tuple[float, float], tuple[float, float]]
+"""Part of the ground that a plot shows (right, up), m: forward is up, left is left."""
 
 # Hues are spread over lightness as well, after Okabe & Ito (2008) and P. Tol, so that they stay apart for colour-blind
 # readers; the seven small classes also differ by marker.
-CLASS_COLOURS: dict[str, Colour] = {
+CLASS_COLOURS: dict[str, str] = {
     "car": "#0072B2",
     "truck": "#D55E00",
     "bus": "#E6A000",
@@ -39,7 +41,7 @@ CLASS_MARKERS: dict[str, str] = {
 """Classes whose footprint is too small to be seen from above at 150 m; the others show as rectangles."""
 
 SOURCES = ("radar", "camera", "random", "history")
-SOURCE_COLOURS: dict[str, Colour] = {
+SOURCE_COLOURS: dict[str, str] = {
     "radar": "#D55E00",
     "camera": "#0072B2",
     "random": "#A3A3A3",
@@ -51,18 +53,31 @@ OCCUPANCY_COLOUR = (0.62, 0.47, 0.82)
 BOX_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 FRONT_FACE = (0, 1, 5, 4)
 MATCH_DISTANCE_M = 2.0
+MOVING_MPS = 1.0
+"""Radar points and boxes slower than this count as standing."""
 
 
-def check_shapes(name: str, arrays: dict[str, Array], expected: dict[str, tuple[int, ...]]) -> None:
-    """Raise ValueError, naming the array, where a shape differs from the expected one."""
-    for field, shape in expected.items():
-        if arrays[field].shape != shape:
-            raise ValueError(f"{name}.{field} must be {list(shape)}, but got {list(arrays[field].shape)}")
+class Rows:
+    """Arrays of one length, a row for each thing; an index (a boolean mask or numbers) takes rows of all of them."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None and not isinstance(value, bool | Rows):
+                kind = np.int64 if field.name in ("labels", "sources") else np.float64
+                setattr(self, field.name, np.asarray(value, dtype=kind))
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    def __getitem__(self, rows: Array) -> Self:
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: value[rows] for name, value in values.items() if hasattr(value, "__len__")})
 
 
 @dataclass
-class PictureBoxes:
-    """K boxes in ego metres (x forward, y left, z up). Raises ValueError when shapes disagree."""
+class PictureBoxes(Rows):
+    """K boxes in ego metres (x forward, y left, z up)."""
 
     centers: Array  # [K, 3] m, box centre
     sizes: Array  # [K, 3] m (length, width, height)
@@ -71,31 +86,10 @@ class PictureBoxes:
     labels: Array  # [K] integer, index into taxonomy.CLASSES
     scores: Array | None = None  # [K] in 0..1, for predictions
 
-    def __post_init__(self) -> None:
-        for name in ("centers", "sizes", "yaws", "velocities"):
-            setattr(self, name, np.asarray(getattr(self, name), dtype=np.float64))
-        self.labels = np.asarray(self.labels, dtype=np.int64)
-        k = len(self.labels)
-        expected = {"centers": (k, 3), "sizes": (k, 3), "yaws": (k,), "velocities": (k, 2), "labels": (k,)}
-        if self.scores is not None:
-            self.scores = np.asarray(self.scores, dtype=np.float64)
-            expected["scores"] = (k,)
-        check_shapes("PictureBoxes", vars(self), expected)
-        if k and not (0 <= self.labels.min() and self.labels.max() < len(CLASSES)):
-            raise ValueError(f"PictureBoxes.labels must lie in 0..{len(CLASSES) - 1}, but got {np.unique(self.labels)}")
-
-    def __len__(self) -> int:
-        return len(self.labels)
-
     @classmethod
     def empty(cls) -> PictureBoxes:
         """No box at all."""
         return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-
-    def __getitem__(self, rows: Array) -> PictureBoxes:
-        """The boxes at `rows` (a boolean mask or indices)."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: None if value is None else value[rows] for name, value in values.items()})
 
     def drawable(self, score_threshold: float = 0.0) -> PictureBoxes:
         """The finite boxes, of those with scores the ones at or above the threshold, weakest first."""
@@ -125,14 +119,18 @@ class PictureBoxes:
         across = cos * away[..., 1] - sin * away[..., 0]
         return ((np.abs(along) <= self.sizes[:, 0] / 2) & (np.abs(across) <= self.sizes[:, 1] / 2)).any(axis=1)
 
-    def colours(self) -> list[Colour]:
+    def moving(self) -> Array:
+        """Which boxes are known to move [K] bool."""
+        return np.linalg.norm(self.velocities, axis=1) >= MOVING_MPS  # NaN is not
+
+    def colours(self) -> list[str]:
         """The class colour of each box."""
         return [CLASS_COLOURS[CLASSES[label]] for label in self.labels]
 
 
 @dataclass
-class PictureGaussians:
-    """G Gaussians on the ground plane, ego metres (Eq. 1). Raises ValueError when shapes disagree."""
+class PictureGaussians(Rows):
+    """G Gaussians on the ground plane, ego metres (Eq. 1)."""
 
     means: Array  # [G, 2] m
     scales: Array  # [G, 2] m, standard deviation along and across `directions`
@@ -140,27 +138,10 @@ class PictureGaussians:
     opacities: Array  # [G] in 0..1
     sources: Array  # [G] integer, index into SOURCES
 
-    def __post_init__(self) -> None:
-        for name in ("means", "scales", "directions", "opacities"):
-            setattr(self, name, np.asarray(getattr(self, name), dtype=np.float64))
-        self.sources = np.asarray(self.sources, dtype=np.int64)
-        g = len(self.sources)
-        pairs = {name: (g, 2) for name in ("means", "scales", "directions")}
-        check_shapes("PictureGaussians", vars(self), pairs | {"opacities": (g,), "sources": (g,)})
-        if g and not (0 <= self.sources.min() and self.sources.max() < len(SOURCES)):
-            raise ValueError(f"PictureGaussians.sources must lie in 0..{len(SOURCES) - 1}, but got {self.sources}")
-
-    def __len__(self) -> int:
-        return len(self.sources)
-
     @classmethod
     def empty(cls) -> PictureGaussians:
         """No Gaussian at all."""
         return cls(*(np.zeros((0, 2)),) * 3, *(np.zeros(0),) * 2)
-
-    def __getitem__(self, rows: Array) -> PictureGaussians:
-        """The Gaussians at `rows` (a boolean mask or indices)."""
-        return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def outlines(self, corners: int = 24) -> Array:
         """The one-sigma ellipses as polygons [G, corners, 2] m."""
@@ -172,38 +153,14 @@ class PictureGaussians:
 
 
 @dataclass
-class PictureMemory:
-    """n things remembered from past key frames, in today's ego metres: BEV cells, or Gaussians where these are given.
-
-    Raises ValueError when shapes disagree.
-    """
+class PictureMemory(Rows):
+    """n things remembered from past key frames, in today's ego metres: BEV cells, or Gaussians where given."""
 
     moved: Array  # [n, 2] m, carried along by the ego motion and by their own velocity (Eq. 8)
     velocities: Array  # [n, 2] m/s over ground, today's axes
     elapsed_s: Array  # [n] s since each was seen
     gaussians: PictureGaussians | None = None  # n, their shapes; means as in `moved`
     compensated: bool = True  # whether the model read them at `moved`, or at `stayed`
-
-    def __post_init__(self) -> None:
-        for name in ("moved", "velocities", "elapsed_s"):
-            setattr(self, name, np.asarray(getattr(self, name), dtype=np.float64))
-        n = len(self.elapsed_s)
-        check_shapes("PictureMemory", vars(self), {"moved": (n, 2), "velocities": (n, 2), "elapsed_s": (n,)})
-        if self.gaussians is not None and len(self.gaussians) != n:
-            raise ValueError(f"PictureMemory.gaussians must be {n}, but got {len(self.gaussians)}")
-
-    def __len__(self) -> int:
-        return len(self.elapsed_s)
-
-    def __getitem__(self, rows: Array) -> PictureMemory:
-        """What lies at `rows` (a boolean mask or indices)."""
-        return replace(
-            self,
-            moved=self.moved[rows],
-            velocities=self.velocities[rows],
-            elapsed_s=self.elapsed_s[rows],
-            gaussians=None if self.gaussians is None else self.gaussians[rows],
-        )
 
     @classmethod
     def read_at(
@@ -245,14 +202,10 @@ class PictureGrid:
     cols: int
 
     @property
-    def x_max_m(self) -> float:
-        """Upper edge of the last column."""
-        return self.x_min_m + self.cols * self.cell_m
-
-    @property
-    def y_max_m(self) -> float:
-        """Upper edge of the last row."""
-        return self.y_min_m + self.rows * self.cell_m
+    def window(self) -> Window:
+        """The whole of it."""
+        x_max_m, y_max_m = self.x_min_m + self.cols * self.cell_m, self.y_min_m + self.rows * self.cell_m
+        return (-y_max_m, -self.y_min_m), (self.x_min_m, x_max_m)
 
 
 def match_boxes(

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from matplotlib.artist import Artist
-from matplotlib.axes import Axes
 
-from src.pictures.bev import BevScene, paint_detections, paint_evidence
+from src.pictures.bev import BevScene, bev_panel, paint_detections, paint_evidence
 from src.pictures.cameras import PictureViews, cameras_height, paint_cameras
-from src.pictures.canvas import SHEET_PX, Canvas
-from src.pictures.contents import MUTED, match_boxes
-from src.pictures.legends import class_keys, gaussian_keys, radar_keys, reading_keys
+from src.pictures.canvas import CAPTION_PX, GAP_PX, MARGIN_PX, SHEET_PX, Canvas
+from src.pictures.contents import MUTED, Window, match_boxes
+from src.pictures.legends import class_keys, gaussian_keys, point_keys, reading_keys
 
-MARGIN_PX = 10
-GAP_PX = 12
 HEADER_PX = 112
-CAPTION_PX = 34
 NEAR_PX = 500
 NEAR_PX_PER_M = 8.0
 NEAR_BEHIND_SHARE = 0.35
 """Share of the near view that lies behind the ego's rear axle."""
 
-Painter = Callable[[Axes, BevScene, tuple[float, float], tuple[float, float]], None]
-Window = tuple[tuple[float, float], tuple[float, float]]
 
 
 def counts_line(scene: BevScene, score_threshold: float) -> str:
@@ -47,32 +41,10 @@ def paint_header(canvas: Canvas, scene: BevScene, title: str, score_threshold: f
     canvas.legend(MARGIN_PX, 89, class_keys({*scene.predictions.labels, *scene.ground_truth.labels}))
 
 
-def whole_window(scene: BevScene) -> Window:
-    """Plot window (right, up) of the whole grid, m."""
-    grid = scene.grid
-    return (-grid.y_max_m, -grid.y_min_m), (grid.x_min_m, grid.x_max_m)
-
-
 def near_window(width: float, height: float) -> Window:
     """Plot window (right, up) of the close surroundings in a panel of this size, m."""
     wide, high = width / NEAR_PX_PER_M, height / NEAR_PX_PER_M
     return (-wide / 2, wide / 2), (-NEAR_BEHIND_SHARE * high, (1 - NEAR_BEHIND_SHARE) * high)
-
-
-def paint_panel(
-    canvas: Canvas,
-    area: tuple[float, float, float, float],  # left, top, width, height in picture pixels, caption included
-    painter: Painter,
-    scene: BevScene,
-    window: Window,
-    caption: str,
-    keys: Sequence[Artist],
-) -> None:
-    """One BEV with its caption and keys above it."""
-    left, top, width, height = area
-    canvas.text(left, top + 9, caption, 15, bold=True)
-    canvas.legend(left + 10 + 9.2 * len(caption), top + 11, keys, size_px=12)
-    painter(canvas.axes(left, top + CAPTION_PX, width, height - CAPTION_PX), scene, *window)
 
 
 def bev_height(scene: BevScene) -> int:
@@ -95,22 +67,22 @@ def paint_bev(canvas: Canvas, scene: BevScene, top: float) -> None:
     """
     wide = (SHEET_PX - 2 * MARGIN_PX - GAP_PX) / 2
     high = wide * scene.grid.cols / scene.grid.rows
-    right = MARGIN_PX + wide + GAP_PX
-    whole_area = (MARGIN_PX, top, wide, high + CAPTION_PX)
-    paint_panel(canvas, whole_area, paint_detections, scene, whole_window(scene), "Detections", radar_keys())
-    canvas.text(MARGIN_PX + wide, top + 12, "forward is up", 12, colour=MUTED, align="right")
+    right, top = MARGIN_PX + wide + GAP_PX, top + CAPTION_PX
+
+    def panel(area: tuple[float, float, float, float], window: Window, caption: str, keys: Sequence[Artist]) -> None:
+        paint = paint_detections if caption.startswith("Detections") else paint_evidence
+        paint(bev_panel(canvas, area, window, caption, keys), scene)
+
+    panel((MARGIN_PX, top, wide, high), scene.grid.window, "Detections", point_keys(scene))
+    canvas.text(MARGIN_PX + wide, top - CAPTION_PX + 12, "forward is up", 12, colour=MUTED, align="right")
     if not has_evidence(scene):
-        area = (right, top, wide, high + CAPTION_PX)
-        paint_panel(canvas, area, paint_detections, scene, near_window(wide, high), "Detections close up", [])
+        panel((right, top, wide, high), near_window(wide, high), "Detections close up", [])
         return
     name = "Gaussians" if scene.gaussians is not None else "Occupancy"
-    area = (right, top, wide, high + CAPTION_PX)
-    paint_panel(canvas, area, paint_evidence, scene, whole_window(scene), name, gaussian_keys(scene))
+    panel((right, top, wide, high), scene.grid.window, name, gaussian_keys(scene))
     below, near = top + high + CAPTION_PX, near_window(wide, NEAR_PX)
-    area = (MARGIN_PX, below, wide, NEAR_PX + CAPTION_PX)
-    paint_panel(canvas, area, paint_detections, scene, near, "Detections close up", [])
-    area = (right, below, wide, NEAR_PX + CAPTION_PX)
-    paint_panel(canvas, area, paint_evidence, scene, near, f"{name} close up", [])
+    panel((MARGIN_PX, below, wide, NEAR_PX), near, "Detections close up", [])
+    panel((right, below, wide, NEAR_PX), near, f"{name} close up", [])
 
 
 def draw_frame(
@@ -135,13 +107,3 @@ def draw_frame(
         paint_cameras(canvas, views, (MARGIN_PX, HEADER_PX, wide), shown.predictions, shown.ground_truth)
     paint_bev(canvas, shown, HEADER_PX + camera_px)
     canvas.save(path)
-
-
-def draw_bev(
-    path: Path | str,
-    scene: BevScene,
-    title: str = "",
-    score_threshold: float = 0.0,
-) -> None:
-    """Write one PNG of the BEV panels with header, as `draw_frame` without cameras."""
-    draw_frame(path, scene, None, title, score_threshold)

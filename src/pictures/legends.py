@@ -8,7 +8,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from src.pictures.bev import ARROW_S, MISSED_COLOUR, SPEED_COLOURS, STANDING_COLOUR, BevScene
+from src.pictures.bev import ARROW_S, LIDAR_COLOUR, MISSED_COLOUR, SPEED_COLOURS, STANDING_COLOUR, BevScene
 from src.pictures.contents import CLASS_COLOURS, CLASS_MARKERS, INK, OCCUPANCY_COLOUR, SOURCE_COLOURS, SOURCES
 from src.structures.taxonomy import CLASSES
 
@@ -49,6 +49,13 @@ def radar_keys() -> list[Artist]:
         Line2D([], [], linestyle="none", marker="o", markersize=5, color=colour, mew=0, label=f"radar, {name}")
         for name, colour in shades.items()
     ]
+
+
+def point_keys(scene: BevScene) -> list[Artist]:
+    """Legend keys of the points among the detections."""
+    if scene.radar_points is not None or scene.lidar_points is None:
+        return radar_keys()
+    return [Line2D([], [], linestyle="none", marker="o", markersize=3, color=LIDAR_COLOUR, mew=0, label="LiDAR")]
 
 
 def gaussian_keys(scene: BevScene) -> list[Artist]:

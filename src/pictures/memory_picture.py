@@ -13,18 +13,15 @@ from matplotlib.colors import LinearSegmentedColormap, PowerNorm, to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from src.pictures.bev import ARROW_S, MOVING_MPS, frame_axes, paint_ego, upright
-from src.pictures.canvas import DPI, SHEET_PX, Canvas
-from src.pictures.contents import INK, MUTED, PictureBoxes, PictureGrid, PictureMemory
+from src.pictures.bev import ARROW_S, bev_panel, paint_arrows, paint_label, upright
+from src.pictures.canvas import DPI, GAP_PX, MARGIN_PX, SHEET_PX, Canvas
+from src.pictures.contents import INK, MOVING_MPS, MUTED, PictureBoxes, PictureGrid, PictureMemory, Window
 
 Array = np.ndarray
-Window = tuple[tuple[float, float], tuple[float, float]]
-"""Plot window (right, up), m."""
 
-MARGIN_PX = 10
-GAP_PX = 12
 HEADER_PX = 92
-CAPTION_PX = 48
+CAPTION_PX = 48  # of two lines
+HEAD = (4.0, 4.5, 4.0)  # of arrows
 CLOSE_PX = 720
 CLOSE_PX_PER_M = 7.0
 TRAIL_S = 2.0
@@ -63,7 +60,7 @@ class MemoryScene:
 
     def moving(self) -> PictureBoxes:
         """True boxes known to move."""
-        return self.ground_truth[np.linalg.norm(self.ground_truth.velocities, axis=1) >= MOVING_MPS]
+        return self.ground_truth[self.ground_truth.moving()]
 
 
 @dataclass(frozen=True)
@@ -122,7 +119,7 @@ def close_window(
                 low, high = lower, upper
     slack = np.maximum(size / 2 - EDGE_M, 0)
     centre = np.clip((low + high) / 2, now - slack, now + slack)
-    (left, right), (down, up) = _whole_window(scene.grid)
+    (left, right), (down, up) = scene.grid.window
     lower, upper = np.array([left, down]) + size / 2, np.array([right, up]) - size / 2
     centre = np.where(lower < upper, np.clip(centre, lower, np.maximum(lower, upper)), (lower + upper) / 2)
     (left, down), (right, up) = centre - size / 2, centre + size / 2
@@ -140,14 +137,10 @@ def _is_remembered(scene: MemoryScene, box: PictureBoxes) -> bool:
     return False
 
 
-def _whole_window(grid: PictureGrid) -> Window:
-    return (-grid.y_max_m, -grid.y_min_m), (grid.x_min_m, grid.x_max_m)
-
-
 def paint_truth(axes: Axes, scene: MemoryScene, close: bool) -> None:
     """True boxes: moving ones filled and with their velocity, the others dashed."""
     moving, everything = scene.moving(), scene.ground_truth
-    standing = everything[~(np.linalg.norm(everything.velocities, axis=1) >= MOVING_MPS)]
+    standing = everything[~everything.moving()]
     corners = [upright(boxes.corners()[:, :4, :2]) for boxes in (standing, moving)]
     dashes = {"facecolors": "none", "edgecolors": STANDING_COLOUR, "linewidths": 0.9, "linestyles": (0, (2.6, 1.6))}
     axes.add_collection(PolyCollection(corners[0], zorder=4, **dashes), autolim=False)
@@ -157,15 +150,8 @@ def paint_truth(axes: Axes, scene: MemoryScene, close: bool) -> None:
     for colour, extra in (("white", 1.6), (TRUTH_COLOUR, 0.0)):
         edge = {"facecolors": "none", "edgecolors": colour, "linewidths": (2.0 if close else 1.0) + extra}
         axes.add_collection(PolyCollection(corners[1], zorder=4.1, **edge), autolim=False)
-    if close and len(moving):
-        _arrows(axes, moving.centers[:, :2], moving.velocities, TRUTH_COLOUR, 3.2, 4.2)
-
-
-def _arrows(axes: Axes, xy: Array, velocities: Array, colour: Array | str, width_px: float, order: float) -> None:
-    axes.quiver(
-        *upright(xy).T, *(ARROW_S * upright(velocities)).T, color=colour, angles="xy", scale_units="xy", scale=1,
-        units="dots", width=width_px, headwidth=4, headlength=4.5, headaxislength=4, minlength=0.5, zorder=order,
-    )  # fmt: skip
+    if close:
+        paint_arrows(axes, moving.centers[:, :2], moving.velocities, TRUTH_COLOUR, 3.2, HEAD, 4.2)
 
 
 def paint_memory(
@@ -198,9 +184,8 @@ def paint_memory(
         scale = axes.get_window_extent().width / (right - left)  # pixels per metre
         points = max(cell_m * scale, 2.0) * 72 / DPI
         axes.scatter(*plot.T, s=points**2, c=colours, marker="s", linewidths=0, antialiased=False, zorder=2)
-    starts, velocities = arrow_means(xy, memory)
-    if close and len(starts):
-        _arrows(axes, starts, velocities, INK, 1.4, 4.4)
+    if close:
+        paint_arrows(axes, *arrow_means(xy, memory), INK, 1.4, HEAD, 4.4)
 
 
 def arrow_means(
@@ -225,10 +210,7 @@ def paint_scale(axes: Axes) -> None:
     """A bar of 20 m in the lower left corner."""
     left, down = axes.get_xlim()[0] + 3, axes.get_ylim()[0] + 3
     axes.plot([left, left + 20], [down, down], color=INK, linewidth=2, zorder=6)
-    axes.text(
-        left + 10, down + 0.8, "20 m", color=INK, fontsize=8.5, ha="center", va="bottom", zorder=6,
-        bbox={"boxstyle": "square,pad=0.1", "fc": "#FBFBFC", "ec": "none", "alpha": 0.85},
-    )  # fmt: skip
+    paint_label(axes, left + 10, down + 1.8, "20 m", INK)
 
 
 def hits_line(name: str, memory: PictureMemory, moving: PictureBoxes) -> str:
@@ -291,31 +273,16 @@ def draw_memory(
     each = (wide - GAP_PX * (len(closes) - 1)) / max(len(closes), 1)
     window = close_window(scene, each / CLOSE_PX_PER_M, CLOSE_PX / CLOSE_PX_PER_M)
     for column, (name, memory, moved) in enumerate(closes):
-        area = (MARGIN_PX + column * (each + GAP_PX), HEADER_PX, each, CLOSE_PX)
-        axes = _panel(canvas, area, (name, caption(memory, moved)), window)
+        area = (MARGIN_PX + column * (each + GAP_PX), HEADER_PX + CAPTION_PX, each, CLOSE_PX)
+        axes = bev_panel(canvas, area, window, name, note=caption(memory, moved))
         paint_memory(axes, memory, ages, moved, scene.grid.cell_m, close=True)
         paint_truth(axes, scene, close=True)
         paint_scale(axes)
     for column, (name, memory, moved) in enumerate(overviews):
-        area = (MARGIN_PX + column * (half + GAP_PX), below, half, high)
-        axes = _panel(canvas, area, (f"{name}, whole range", caption(memory, moved)), _whole_window(scene.grid))
+        area = (MARGIN_PX + column * (half + GAP_PX), below + CAPTION_PX, half, high)
+        axes = bev_panel(canvas, area, scene.grid.window, f"{name}, whole range", note=caption(memory, moved))
         paint_memory(axes, memory, ages, moved, scene.grid.cell_m, close=False)
         paint_truth(axes, scene, close=False)
         (left, right), (down, up) = window
         axes.add_patch(Rectangle((left, down), right - left, up - down, fill=False, edgecolor=INK, zorder=6))
     canvas.save(path, photographs=False)
-
-
-def _panel(
-    canvas: Canvas,
-    area: tuple[float, float, float, float],  # left, top (of the caption), width, height (of the plot) in pixels
-    lines: tuple[str, str],
-    window: Window,
-) -> Axes:
-    left, top, width, height = area
-    canvas.text(left, top + 7, lines[0], 15, bold=True)
-    canvas.text(left, top + 27, lines[1], 13)
-    axes = canvas.axes(left, top + CAPTION_PX, width, height)
-    frame_axes(axes, *window)
-    paint_ego(axes)
-    return axes

@@ -74,6 +74,7 @@ def scene_of(
         predictions=boxes_of(predictions),
         ground_truth=boxes_of(truth),
         radar_points=_numpy(batch.radar_points) if batch.radar_points is not None else None,
+        lidar_points=_numpy(batch.lidar_points) if batch.lidar_points is not None else None,
     )
     if evidence.gaussians is not None:
         scene.gaussians = _gaussians(evidence.gaussians)

@@ -3,7 +3,6 @@
 import ctypes
 import hashlib
 import json
-import multiprocessing
 import os
 import random
 import signal
@@ -16,6 +15,7 @@ import torch
 
 from src.errors import CheckpointError
 from src.reliability.checkpoints import LAST, PREVIOUS, read_checkpoint
+from tests.running import FORKS
 
 ROOT = Path(__file__).resolve().parents[2]
 GRACE_S = 60.0
@@ -40,9 +40,7 @@ class InWrite:
 
 def fork_server():
     """What starts processes that have imported the training already; set up before the first thread."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["src.train", "tests.faults.killing"])
-    return context
+    return FORKS
 
 
 def start(context, overrides, log, fault=None, prepare=None):

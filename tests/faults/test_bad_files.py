@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +18,7 @@ from src.data.schema import CHANNELS, DatasetIndex
 from src.data.splits import split_samples
 from src.structures.taxonomy import CAMERAS, RADARS
 from tests.faults.mutations import cut, empty
+from tests.running import command
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = (
@@ -31,12 +30,7 @@ DEADLINE_S = 400
 
 
 def train(outputs: Path, *overrides: str, expect: int = 0) -> subprocess.CompletedProcess:
-    result = subprocess.run(
-        [sys.executable, "-m", "src.train", *TINY, f"paths.outputs={outputs}", *overrides],
-        cwd=ROOT, capture_output=True, text=True, timeout=DEADLINE_S, env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert result.returncode == expect, result.stdout[-3000:] + result.stderr[-3000:]
-    return result
+    return command("train", *TINY, f"paths.outputs={outputs}", *overrides, expect=expect, timeout=DEADLINE_S)
 
 
 @pytest.fixture(scope="module")

@@ -25,6 +25,7 @@ from src.reliability.checkpoints import read_checkpoint
 from src.reliability.nonfinite import step_seed, write_dump
 from src.training.module import TrainingModule
 from src.training.trainer_config import OnNonfinite
+from tests.running import command
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = (
@@ -114,18 +115,12 @@ def test_training_continues_without_a_broken_radar_point(world, tmp_path, monkey
 @pytest.mark.slow
 def test_the_commands_of_a_user(world, tmp_path):
     """An exploding weight of a term ends the command with code 5, and what it prints may be typed as it stands."""
-    told = command("train", *SMALL, f"data.root={world}", f"paths.outputs={tmp_path}", "model.loss.box_weight=1e39")
-    assert told.returncode == 5, told.stderr[-3000:]
+    overrides = (*SMALL, f"data.root={world}", f"paths.outputs={tmp_path}", "model.loss.box_weight=1e39")
+    told = command("train", *overrides, expect=5)
     assert "loss terms {'box': inf, 'total': inf} of rank 0 are not finite" in told.stderr
     typed = told.stderr.partition("python -m src.replay ")[2].split()[0]
     screen, code = in_terminal("replay", typed, "trainer.accelerator=cpu", answers=["p error", "q"])
     assert code == 5 and "box                  inf   <- not finite" in screen and "(Pdb)" in screen, screen[-3000:]
-
-
-def command(module, *overrides):
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    line = [sys.executable, "-m", f"src.{module}", *overrides]
-    return subprocess.run(line, cwd=ROOT, capture_output=True, text=True, timeout=300, env=environment)
 
 
 def in_terminal(module, *overrides, answers):

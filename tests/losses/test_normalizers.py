@@ -26,4 +26,4 @@ def _rank(rank: int, folder: str) -> None:
 
 @pytest.mark.slow
 def test_two_ranks_divide_by_the_same_mean(tmp_path: Path) -> None:
-    mp.spawn(_rank, args=(str(tmp_path),), nprocs=2)
+    mp.start_processes(_rank, args=(str(tmp_path),), nprocs=2, start_method="forkserver")

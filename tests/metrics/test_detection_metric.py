@@ -116,7 +116,7 @@ def _rank(rank: int, folder: str, shards: list[list[int]]) -> None:
 def test_two_processes_give_the_numbers_of_one(problem, tmp_path):
     evaluation_set, predictions = problem
     # Sample 4 was seen by both, as a padded sampler does; the second rank has far more boxes than the first.
-    mp.spawn(_rank, args=(str(tmp_path), [[4], [5, 4, 3, 2, 1, 0]]), nprocs=2)
+    mp.start_processes(_rank, args=(str(tmp_path), [[4], [5, 4, 3, 2, 1, 0]]), nprocs=2, start_method="forkserver")
     expected = score_detections(evaluation_set, predictions).as_dict()
     nothing = score_detections(evaluation_set, DetectionTable.empty()).as_dict()
     for rank in range(2):

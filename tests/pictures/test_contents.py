@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from src.pictures.contents import CLASS_COLOURS, PictureBoxes, PictureGaussians, match_boxes
 from src.structures.taxonomy import CLASSES
@@ -49,14 +48,3 @@ def test_matching_is_greedy_by_score_within_class_and_two_metres() -> None:
 def test_drawable_sorts_weakest_first() -> None:
     kept = boxes([(0, 0), (1, 0), (2, 0)], [0, 1, 2], [0.9, 0.1, 0.5]).drawable(0.3)
     assert kept.labels.tolist() == [2, 0]
-
-
-def test_wrong_shapes_are_named() -> None:
-    with pytest.raises(ValueError, match=r"PictureBoxes\.yaws must be \[2\], but got \[1\]"):
-        PictureBoxes(np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(1), np.zeros((2, 2)), [0, 0])
-    with pytest.raises(ValueError, match=r"labels must lie in 0\.\.11"):
-        boxes([(0, 0)], [12])
-    with pytest.raises(ValueError, match=r"PictureGaussians\.scales"):
-        PictureGaussians(np.zeros((1, 2)), np.zeros((1, 3)), np.zeros((1, 2)), np.zeros(1), [0])
-    with pytest.raises(ValueError, match=r"sources must lie in 0\.\.3"):
-        PictureGaussians(np.zeros((1, 2)), np.ones((1, 2)), np.ones((1, 2)), np.zeros(1), [4])

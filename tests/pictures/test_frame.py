@@ -13,6 +13,7 @@ from PIL import Image
 
 from src.pictures.bev import BevScene, radial_speeds
 from src.pictures.cameras import PictureViews
+from src.pictures.canvas import CAPTION_PX, GAP_PX, MARGIN_PX
 from src.pictures.contents import (
     CLASS_COLOURS,
     SOURCE_COLOURS,
@@ -21,7 +22,7 @@ from src.pictures.contents import (
     PictureGrid,
     match_boxes,
 )
-from src.pictures.frame import CAPTION_PX, GAP_PX, HEADER_PX, MARGIN_PX, counts_line, draw_bev, draw_frame
+from src.pictures.frame import HEADER_PX, counts_line, draw_frame
 
 REAL = Path(__file__).parents[3] / "shared" / "real" / "horizon3d_page" / "ocsf_demo.json"
 GRID = PictureGrid(-153.6, -153.6, 0.8, 384, 384)
@@ -36,7 +37,7 @@ def pixel_of(x: float, y: float, column: int = 0) -> tuple[float, float]:
 
 
 def render(path: Path, scene: BevScene) -> np.ndarray:
-    draw_bev(path, scene)
+    draw_frame(path, scene)
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
 
@@ -104,6 +105,16 @@ def test_occupancy_cell_and_gaussian_land_on_their_place(tmp_path: Path) -> None
     assert np.abs(picture[rows, cols] - edge).sum(axis=1).min() < 60
 
 
+def test_lidar_points_stand_where_there_is_no_radar(tmp_path: Path) -> None:
+    lidar, radar = np.array([[80.0, 90, 1, 12, 0], [np.nan] * 5]), np.zeros((0, 7))
+    empty = render(tmp_path / "a.png", BevScene(GRID, lidar_points=np.zeros((0, 5))))
+    rows, cols = drawn(render(tmp_path / "b.png", BevScene(GRID, lidar_points=lidar)), empty)
+    assert (rows.mean(), cols.mean()) == pytest.approx(pixel_of(80, 90), abs=1.5)
+    with_radar = render(tmp_path / "c.png", BevScene(GRID, radar_points=radar))
+    both = render(tmp_path / "d.png", BevScene(GRID, radar_points=radar, lidar_points=lidar))
+    assert (both == with_radar).all()
+
+
 def test_radar_speed_has_the_sign_of_its_direction() -> None:
     points = np.zeros((3, 7))
     points[:, :2] = (10, 0), (-10, 0), (0, 10)
@@ -134,12 +145,6 @@ def test_counts_line() -> None:
     assert "1 ground truth" in line and "1 matched" in line and "0 missed" in line and "0 false" in line
     assert "no ground truth" in counts_line(BevScene(GRID), 0.3)
 
-
-def test_wrong_scene_names_what_is_wrong() -> None:
-    with pytest.raises(ValueError, match=r"radar_points must be \[P, 7\]"):
-        BevScene(GRID, radar_points=np.zeros((3, 5)))
-    with pytest.raises(ValueError, match=r"occupancy must be"):
-        BevScene(GRID, occupancy=(np.zeros((3, 2)), np.zeros(4)))
 
 
 @pytest.mark.skipif(not REAL.exists(), reason="the published demo frame is not at hand")
@@ -173,6 +178,6 @@ def test_real_frame_is_drawn_quickly(tmp_path: Path) -> None:
     grid = PictureGrid(-153.6, -153.6, 307.2 / cells_per_side, cells_per_side, cells_per_side)
     scene = BevScene(grid, predictions, truth, None, gaussians, (cells, occupancy[:, 2]))
     begin = time.perf_counter()
-    draw_bev(tmp_path / "real.png", scene, "project page, OCSF demo")
+    draw_frame(tmp_path / "real.png", scene, title="project page, OCSF demo")
     assert time.perf_counter() - begin < 10
     assert Image.open(tmp_path / "real.png").size[0] == 1600

@@ -9,13 +9,12 @@ import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
 
+from src.pictures.canvas import GAP_PX, MARGIN_PX
 from src.pictures.contents import PictureBoxes, PictureGaussians, PictureGrid, PictureMemory
 from src.pictures.memory_picture import (
     CAPTION_PX,
     CLOSE_PX,
-    GAP_PX,
     HEADER_PX,
-    MARGIN_PX,
     TRUTH_COLOUR,
     AgeScale,
     MemoryScene,
@@ -71,12 +70,6 @@ def test_drawn_oldest_first_and_only_what_is_finite() -> None:
     assert broken.drawable().moved.tolist() == [[2, 0]]
     assert len(broken.drawable().gaussians) == 1
 
-
-def test_wrong_shapes_are_named() -> None:
-    with pytest.raises(ValueError, match=r"PictureMemory\.velocities must be \[2, 2\], but got \[1, 2\]"):
-        PictureMemory(np.zeros((2, 2)), np.zeros((1, 2)), np.zeros(2))
-    with pytest.raises(ValueError, match="PictureMemory.gaussians must be 2, but got 0"):
-        PictureMemory(np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2), PictureGaussians.empty())
 
 
 def test_points_on_turned_boxes() -> None:

@@ -5,7 +5,7 @@ from PIL import Image
 
 from src.pictures.cameras import PictureViews
 from src.pictures.contents import PictureBoxes
-from src.pictures.scene_preview import draw_radar_comparison, draw_scene_preview
+from src.pictures.scene_preview import draw_scene_preview
 from src.structures.taxonomy import CAMERAS
 
 
@@ -33,12 +33,3 @@ def test_preview_shows_radar_boxes_and_arrows(tmp_path):
     assert changed[:, :half].any() and not changed[:, half:].any()  # radar stands on the left
     arrow = np.abs(moving - standing).sum(2) > 60
     assert arrow[:, half:].sum() > 50 and not arrow[:, :half].any()
-
-
-def test_radar_comparison_is_drawn(tmp_path):
-    rng = np.random.default_rng(0)
-    sweep = np.concatenate([rng.uniform(10, 90, (50, 3)), rng.normal(0, 9, (50, 4))], 1)
-    draw_radar_comparison(
-        tmp_path / "r.png", sweep, rng.normal(0, 9, 50), [sweep, sweep[:20]], [np.zeros(50), np.zeros(20)]
-    )
-    assert Image.open(tmp_path / "r.png").size == (1600, 1180)

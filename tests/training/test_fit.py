@@ -101,7 +101,6 @@ def work_as(rank, port, world_size, work):
         lr=1e-3, weight_decay=0.0, clip_norm=35.0, peak_lr_ratio=1.0, final_lr_ratio=1.0, rise_fraction=0.5,
         betas=[0.9, 0.99], cycled_beta1=None, ema_decay=None,
     )  # fmt: skip
-    # Tensors travel to a process as shared memory, in which the other would see them trained.
     module = Module(copy.deepcopy(work.model), optim, 1.0, DetectionEvaluator(work.truth), 0, {})
     module.eval_norms = work.eval_norms
     streams = (FIRST_RANK, SECOND_RANK)[rank] if world_size > 1 else range(STREAMS)

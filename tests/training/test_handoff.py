@@ -32,6 +32,7 @@ from src.training import handoff
 from src.training.handoff import find_source, hand_over, train_source
 from src.training.identity import run_identity
 from src.training.run_folder import RunFolder
+from tests.running import call, start
 from tests.untrained import write_checkpoint
 
 ADDED = re.compile(Horizon3DConfig.new_in_temporal_phase)
@@ -394,31 +395,13 @@ def test_settings_without_weights_that_differ_are_logged(phase_1, caplog):
 # ---------------------------------------------------------------- the commands
 
 
-def command(*overrides, expect=0, module="train"):
-    result = subprocess.run(
-        [sys.executable, "-m", f"src.{module}", *overrides], cwd=ROOT, capture_output=True, text=True, timeout=480
-    )
-    assert result.returncode == expect, result.stdout[-3000:] + result.stderr[-3000:]
-    return result
-
-
 @pytest.fixture(scope="module")
 def handed_over(tmp_path_factory):
     """One command that asks for phase 2 where there is nothing yet: (outputs, phase-1 run, phase-2 run, its output)."""
     outputs = tmp_path_factory.mktemp("outputs")
-    result = command("phase=phase2", "scale=debug", f"paths.outputs={outputs}")
+    result = call("train", "phase=phase2", "scale=debug", f"paths.outputs={outputs}")
     (first,), (second,) = outputs.glob("horizon3d-phase1-debug-*"), outputs.glob("horizon3d-phase2-debug-*")
     return outputs, first, second, result
-
-
-@pytest.fixture
-def trained_in_process():
-    """`src.train.main` here, which spares a start of Python; its log files are let go afterwards."""
-    handlers = list(logging.getLogger().handlers)
-    yield lambda *overrides: train.main(list(overrides))
-    for handler in [handler for handler in logging.getLogger().handlers if handler not in handlers]:
-        logging.getLogger().removeHandler(handler)
-        handler.close()
 
 
 def record(run):
@@ -447,7 +430,7 @@ def test_evaluate_gives_the_scores_of_the_training(handed_over, tmp_path):
     assert (tmp_path / "same" / "metrics.json").read_text() == (second / "metrics.json").read_text()
     assert evaluate.name_of(second / "checkpoints" / "last.ckpt") == f"{second.name}-last"
     short = (checkpoint, "model.dptf.max_age_s=0.55", f"out={tmp_path / 'short'}", f"paths.outputs={outputs}")
-    command(*short, module="evaluate")
+    call("evaluate", *short)
     assert (
         json.loads((tmp_path / "short" / "metrics.json").read_text()).keys()
         == json.loads((second / "metrics.json").read_text()).keys()
@@ -455,11 +438,11 @@ def test_evaluate_gives_the_scores_of_the_training(handed_over, tmp_path):
 
 
 @pytest.mark.slow
-def test_restarting_phase_2_leaves_phase_1_alone(handed_over, trained_in_process):
+def test_restarting_phase_2_leaves_phase_1_alone(handed_over):
     outputs, first, second, _ = handed_over
     before = {path: path.stat().st_mtime_ns for path in first.rglob("*") if path.is_file()}
     scores, record_of = (second / "metrics.json").read_text(), (second / "run.json").stat().st_mtime_ns
-    trained_in_process("phase=phase2", "scale=debug", f"paths.outputs={outputs}", "resume=restart")
+    call("train", "phase=phase2", "scale=debug", f"paths.outputs={outputs}", "resume=restart")
     assert before == {path: path.stat().st_mtime_ns for path in first.rglob("*") if path.is_file()}
     assert (second / "run.json").stat().st_mtime_ns > record_of
     assert len(list(outputs.glob(f"{second.name}.before-*"))) == 1
@@ -467,21 +450,21 @@ def test_restarting_phase_2_leaves_phase_1_alone(handed_over, trained_in_process
 
 
 @pytest.mark.slow
-def test_the_weights_of_phase_1_are_read_once(handed_over, trained_in_process, monkeypatch):
+def test_the_weights_of_phase_1_are_read_once(handed_over, monkeypatch):
     outputs, first, _, _ = handed_over
     load, loads = torch.load, []
     monkeypatch.setattr(torch, "load", lambda file, **options: loads.append(Path(file.name)) or load(file, **options))
     overrides = ("phase=phase2", "scale=debug", f"paths.outputs={outputs}", "seed=1", "trainer.num_pictures=0")
-    trained_in_process(*overrides, f"phase.init_from={first / 'checkpoints' / 'last.ckpt'}")
+    call("train", *overrides, f"phase.init_from={first / 'checkpoints' / 'last.ckpt'}")
     assert loads == [first / "checkpoints" / "last.ckpt"]
 
 
 @pytest.mark.slow
-def test_a_given_checkpoint_is_taken_whatever_run_it_is_of(handed_over, trained_in_process):
+def test_a_given_checkpoint_is_taken_whatever_run_it_is_of(handed_over):
     outputs, first, second, _ = handed_over
     path = first / "checkpoints" / "last.ckpt"
     arguments = ("phase=phase2", "scale=debug", f"paths.outputs={outputs}", f"phase.init_from={path}")
-    trained_in_process(*arguments, "trainer.num_pictures=0")
+    call("train", *arguments, "trainer.num_pictures=0")
     run = outputs / source_of(*arguments[:1], arguments[-1])[1]
     assert run != second and record(run)["initialized_from"] == source_of("phase=phase2", arguments[-1])[0].identity
     scores = [json.loads((one / "metrics.json").read_text()) for one in (run, second)]
@@ -489,11 +472,11 @@ def test_a_given_checkpoint_is_taken_whatever_run_it_is_of(handed_over, trained_
 
 
 @pytest.mark.slow
-def test_phase_1_for_further_epochs(handed_over, trained_in_process, caplog):
+def test_phase_1_for_further_epochs(handed_over, caplog):
     caplog.set_level(logging.INFO)
     outputs, first, _, _ = handed_over
     own = ("phase=phase1", "phase.init_from=phase1", "phase.epochs=2")
-    trained_in_process("scale=debug", f"paths.outputs={outputs}", "trainer.num_pictures=0", *own)
+    call("train", "scale=debug", f"paths.outputs={outputs}", "trainer.num_pictures=0", *own)
     run = outputs / source_of(*own)[1]
     assert record(run)["initialized_from"] == first.name and record(run)["epochs"] == 2 and run != first
     assert f"weights from {first / 'checkpoints' / 'last.ckpt'}; new: 0 tensors in nothing" in caplog.text
@@ -503,18 +486,17 @@ def test_phase_1_for_further_epochs(handed_over, trained_in_process, caplog):
 def test_an_interrupted_phase_1_ends_the_command_resumably(handed_over, tmp_path):
     (world,) = (handed_over[0] / "worlds").iterdir()
     log = tmp_path / identity("phase=phase1") / "log.txt"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "src.train", "phase=phase2", "scale=debug", f"paths.outputs={tmp_path}",
-         f"data.root={world}"],
-        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-    )  # fmt: skip
+    said = tmp_path / "said"
+    arguments = ("phase=phase2", "scale=debug", f"paths.outputs={tmp_path}", f"data.root={world}")
+    process = start("train", *arguments, out=said, err=said)
     deadline = time.monotonic() + 300
     while not log.is_file():
-        assert time.monotonic() < deadline and process.poll() is None
+        assert time.monotonic() < deadline and process.is_alive()
         time.sleep(0.02)
-    process.send_signal(signal.SIGTERM)
-    output = process.communicate(timeout=300)[0]
-    assert process.returncode == 6, output[-3000:]
+    os.kill(process.pid, signal.SIGTERM)
+    process.join(300)
+    output = said.read_text()
+    assert process.exitcode == 6, output[-3000:]
     assert f"the run {log.parent.name} that comes first ended with exit code 6" in output
     assert not list(tmp_path.glob("horizon3d-*/run.json"))
 
@@ -522,7 +504,7 @@ def test_an_interrupted_phase_1_ends_the_command_resumably(handed_over, tmp_path
 @pytest.mark.slow
 def test_without_phase_1_and_without_training_it(tmp_path):
     overrides = ("phase=phase2", "scale=debug", f"paths.outputs={tmp_path}")
-    result = command(*overrides, "phase.train_missing=false", expect=3)
+    result = call("train", *overrides, "phase.train_missing=false", expect=3)
     wanted = identity("phase=phase1")
     assert wanted in result.stderr and f"python -m src.train phase=phase1 scale=debug paths.outputs={tmp_path}" in (
         result.stderr

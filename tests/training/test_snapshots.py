@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -171,3 +171,11 @@ def test_paths_that_are_off_or_have_nothing_yet() -> None:
     first = shown(config(), None, None)
     assert len(first.gaussians) == 0 and len(first.cells) == 0
     assert shown(None, history, cells) is None
+
+
+def test_lidar_points_are_shown() -> None:
+    points = torch.tensor([[5.0, 2.0, 1.0, 9.0, 0.0]])
+    batch = replace(frame(0), lidar_points=points, lidar_batch=torch.zeros(1, dtype=torch.int64))
+    scene = scene_of(batch, Boxes3D.empty(), Evidence(), GRID)
+    assert scene.lidar_points.tolist() == points.tolist()
+    assert scene_of(frame(0), Boxes3D.empty(), Evidence(), GRID).lidar_points is None

@@ -1,5 +1,6 @@
 """Runs a test's function on two ranks."""
 
+import pickle
 import socket
 import time
 
@@ -9,11 +10,12 @@ DEADLINE_S = 300.0
 
 
 def spawn_two(function, *arguments):
-    """`function` of rank, a free port and `arguments` in two processes, with a deadline."""
+    """`function` of rank, a free port and `arguments`, a copy each, in two processes, with a deadline."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    context = mp.spawn(function, (port, *arguments), nprocs=2, join=False)
+    packed = pickle.dumps(arguments)  # by value: a server of forks takes few shared tensors
+    context = mp.start_processes(_unpack, (function, port, packed), nprocs=2, join=False, start_method="forkserver")
     deadline = time.monotonic() + DEADLINE_S
     try:
         while not context.join(timeout=1.0):
@@ -22,3 +24,7 @@ def spawn_two(function, *arguments):
         for process in context.processes:
             if process.is_alive():
                 process.kill()
+
+
+def _unpack(rank, function, port, packed):
+    function(rank, port, *pickle.loads(packed))
