@@ -113,6 +113,7 @@ def _rank(rank: int, folder: str, shards: list[list[int]]) -> None:
     dist.destroy_process_group()
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_numbers_of_one(problem, tmp_path):
     evaluation_set, predictions = problem
     # Sample 4 was seen by both, as a padded sampler does; the second rank has far more boxes than the first.

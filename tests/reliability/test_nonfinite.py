@@ -294,23 +294,39 @@ def test_parameters_are_named():
     assert not finite_everywhere(gradient_norm(model)) and finite_everywhere(torch.tensor(1e30), torch.tensor(0.0))
 
 
-def as_rank(rank, port, path, fault, skip):
-    """Train as one of two ranks, of which the second alone meets the fault; what it ended with goes to a file."""
+def as_rank(rank, port, path):
+    """Train as one of two ranks, of which the second alone meets each fault; what it ended with goes to a file."""
     torch.set_num_threads(1)
     who = {"LOCAL_RANK": rank, "RANK": rank, "WORLD_SIZE": 2, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
     os.environ.update({name: str(value) for name, value in who.items()})
     with process_group("cpu", 2):
-        bad_steps = (BAD_STEP,) if rank == 1 else ()
-        module, _, error = train(path / "run", fault, bad_steps, skip, ranks=2)
-    weights = module.model.layer.state_dict()
-    torch.save({"message": str(error), "weights": weights, "counts": module.guard.state()}, path / f"{rank}.pt")
+        for fault, skip in FAULTS_OF_RANKS:
+            bad_steps = (BAD_STEP,) if rank == 1 else ()
+            folder = path / fault
+            module, _, error = train(folder / "run", fault, bad_steps, skip, ranks=2)
+            weights = module.model.layer.state_dict()
+            said = {"message": str(error), "weights": weights, "counts": module.guard.state()}
+            torch.save(said, folder / f"{rank}.pt")
+
+
+FAULTS_OF_RANKS = [("point", False), ("gradient", False), ("constant", True)]
+
+
+@pytest.fixture(scope="module")
+def both_ranks(tmp_path_factory):
+    """What two ranks say of each fault on one of them, a folder each."""
+    path = tmp_path_factory.mktemp("ranks")
+    for fault, _ in FAULTS_OF_RANKS:
+        (path / fault).mkdir()
+    spawn_two(as_rank, path)
+    return path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("fault", "skip"), [("point", False), ("gradient", False), ("constant", True)])
-def test_ranks_agree(tmp_path, fault, skip):
+@pytest.mark.parametrize(("fault", "skip"), FAULTS_OF_RANKS)
+def test_ranks_agree(both_ranks, fault, skip):
     """What one of two ranks meets, both stop at with the same words, or both skip; nobody waits for the other."""
-    spawn_two(as_rank, tmp_path, fault, skip)
+    tmp_path = both_ranks / fault
     first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2))
     assert first["message"] == second["message"] and same(first["weights"], second["weights"])
     folder = tmp_path / "run"
