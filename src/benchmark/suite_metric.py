@@ -7,11 +7,11 @@ import time
 import numpy as np
 
 from src.errors import ConfigError
-from src.metrics.detection import SCENE_TAGS, score_detections
+from src.metrics.detection import score_detections
 from src.metrics.filtering import RANGE_BINS_M
 from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERRORS, SubsetScores
 from src.structures.detections import DetectionTable, EvaluationSet
-from src.structures.taxonomy import ATTRIBUTES, BICYCLE_RACK, CLASSES, REFERENCE_CHANNEL
+from src.structures.taxonomy import ATTRIBUTES, BICYCLE_RACK, CLASSES, REFERENCE_CHANNEL, SCENE_TAGS
 
 Array = np.ndarray
 

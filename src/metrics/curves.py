@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 Array = np.ndarray
@@ -14,31 +12,25 @@ FIRST_POINT = 11
 """Curve points count from here: above the minimum recall of 0.1."""
 
 
-@dataclass
-class RankedMatches:
-    """The matches of one class at one threshold, within the predictions of that class by descending score."""
-
-    ranks: Array  # [m] int64, ascending: place of each matched prediction
-    scores: Array  # [n] of all n predictions, descending
-    num_ground_truth: int
-
-
-def precision_and_confidence(matches: RankedMatches) -> tuple[Array, Array]:
+def precision_and_confidence(
+    ranks: Array,  # [m] int64, ascending: place of each matched prediction among those of its class
+    scores: Array,  # [n] of all n predictions of the class, descending
+    num_ground_truth: int,
+) -> tuple[Array, Array]:
     """Precision and score at the 101 recalls, interpolated linearly, 0 beyond the recall that is reached.
 
     Recall rises only at a match, so a recall point lies between the prediction just before a match and the match
     itself, or on the last prediction; no other prediction can touch the curve.
     """
-    ranks, n = matches.ranks, len(matches.scores)
-    if not len(ranks) or not matches.num_ground_truth:
+    if not len(ranks) or not num_ground_truth:
         return np.zeros(len(RECALLS)), np.zeros(len(RECALLS))
-    marked = np.concatenate([ranks - 1, ranks, [n - 1]])
+    marked = np.concatenate([ranks - 1, ranks, [len(scores) - 1]])
     marked.sort()
     knots = marked[(np.diff(marked, prepend=-1) > 0) & (marked >= 0)]
     hits = np.searchsorted(ranks, knots, "right").astype(float)
-    recall = hits / float(matches.num_ground_truth)
+    recall = hits / float(num_ground_truth)
     precision = np.interp(RECALLS, recall, hits / (knots + 1), right=0)
-    confidence = np.interp(RECALLS, recall, matches.scores[knots], right=0)
+    confidence = np.interp(RECALLS, recall, scores[knots], right=0)
     return precision, confidence
 
 

@@ -8,7 +8,7 @@ averaged over four thresholds; errors are running means over the matches at 2 m.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -19,7 +19,6 @@ from torchmetrics.utilities import dim_zero_cat
 from src.metrics.checks import check_predictions
 from src.metrics.curves import (
     RECALLS,
-    RankedMatches,
     average_precision,
     error_curve,
     mean_error,
@@ -35,59 +34,31 @@ from src.metrics.filtering import (
 )
 from src.metrics.ranking import Matching, Ranking, find_candidates, match_predictions, rank_predictions
 from src.metrics.scores import (
-    CLASS_WITHOUT_ERRORS,
     DISTANCE_THRESHOLDS_M,
     ERROR_THRESHOLD_M,
     ERRORS,
     DetectionScores,
     SubsetScores,
 )
-from src.structures.detections import DetectionTable, EvaluationSet
-from src.structures.taxonomy import CLASSES
+from src.structures.detections import COLUMN_WIDTHS, DetectionTable, EvaluationSet
+from src.structures.taxonomy import CLASS_WITHOUT_ERRORS, CLASSES, SCENE_TAGS, TAGS_WITHOUT_SCORE
 
 Array = np.ndarray
 
-SCENE_TAGS = tuple(
-    f"{group}.{name}"
-    for group, names in {
-        "weather": ("clear", "rain", "snow", "fog", "hail", "overcast", "other_weather"),
-        "area": ("highway", "rural", "terminal", "parking", "city", "residential", "other_area"),
-        "daytime": ("morning", "noon", "evening", "night"),
-        "season": ("spring", "summer", "autumn", "winter"),
-        "lighting": ("illuminated", "glare", "dark", "twilight", "other_lighting"),
-        "structure": ("tunnel", "bridge", "underpass", "overpass", "regular"),
-        "construction": ("roadworks", "unchanged"),
-    }.items()
-    for name in names
-)
-
-TAGS_WITHOUT_SCORE = (
-    "weather.other_weather",
-    "weather.snow",
-    "weather.hail",
-    "area.parking",
-    "area.other_area",
-    "season.spring",
-    "lighting.other_lighting",
-)
-"""The official evaluation reports NaN for these, whatever the boxes are."""
-
-_UNDEFINED = np.array([[error in CLASS_WITHOUT_ERRORS.get(name, ()) for error in ERRORS] for name in CLASSES])
+_UNDEFINED = np.array([[error in CLASS_WITHOUT_ERRORS[name] for error in ERRORS] for name in CLASSES])
 
 
 def score_detections(
     evaluation_set: EvaluationSet,
     predictions: DetectionTable,
-    samples: Array | None = None,  # [S] bool, the samples to score; all without it
     by_range: bool = True,
     by_tag: bool = True,
     by_speed: bool = True,
 ) -> DetectionScores:
     """Score predictions as the official evaluator does, and by distance bin, scene tag and speed class.
 
-    A sample of the set without predictions is scored as empty. `samples` restricts ground truth and predictions to
-    some samples (the part of a split that was seen so far). Tags follow the official rule: samples whose scene carries
-    the tag, NaN for the tags in TAGS_WITHOUT_SCORE. Distance bins are our own: see RANGE_BINS_M; so are speed
+    A sample of the set without predictions is scored as empty. Tags follow the official rule: samples whose scene
+    carries the tag, NaN for the tags in TAGS_WITHOUT_SCORE. Distance bins are our own: see RANGE_BINS_M; so are speed
     classes: see `_score_speeds`.
 
     Raises DataError for predictions that cannot be scored (see `check_predictions`) and for matched ground truth
@@ -99,9 +70,6 @@ def score_detections(
     truth_distances = ego_distances(evaluation_set, truth)
     kept = official_filter(evaluation_set, predictions, distances)
     truth_kept = official_filter(evaluation_set, truth, truth_distances)
-    if samples is not None:
-        kept &= samples[predictions.samples]
-        truth_kept &= samples[truth.samples]
 
     ranking = rank_predictions(evaluation_set, predictions, kept, truth_kept)
     pairs = find_candidates(ranking)
@@ -158,11 +126,11 @@ def _score_subset(
         for c in np.flatnonzero(np.diff(match_starts)):
             begin, end = class_starts[c], class_starts[c + 1]
             of_class = slice(match_starts[c], match_starts[c + 1])
-            ranked = RankedMatches(matched[of_class] - begin, scores[begin:end], int(num_gt[c]))
-            precision[c, t], confidence[c, t] = precision_and_confidence(ranked)
+            ranks, class_scores = matched[of_class] - begin, scores[begin:end]
+            precision[c, t], confidence[c, t] = precision_and_confidence(ranks, class_scores, int(num_gt[c]))
             if match_errors is None:
                 continue
-            match_scores = ranked.scores[ranked.ranks]
+            match_scores = class_scores[ranks]
             for e, values in enumerate(match_errors[of_class].T):
                 error_curves[c, e] = error_curve(values, match_scores, confidence[c, t])
                 errors[c, e] = mean_error(error_curves[c, e], confidence[c, t])
@@ -206,11 +174,10 @@ def _score_speeds(ranking: Ranking, matching: Matching) -> dict[str, SubsetScore
 
 
 class DetectionMetric(Metric):
-    """Collects the boxes of a validation pass on any number of processes, then scores them.
+    """Collects the boxes of a validation pass on any number of processes.
 
-    A sample that several processes (or a padded batch) saw counts once. Samples that nobody saw are scored as empty,
-    which is the official rule; with `seen_only` they are left out instead, for a pass over part of the split. The
-    result does not depend on who saw what, nor on the order: boxes are scored in the order of the evaluation set.
+    A sample that several processes (or a padded batch) saw counts once. The result does not depend on who saw what, nor
+    on the order: boxes come in the order of the evaluation set.
     """
 
     full_state_update = False
@@ -218,97 +185,31 @@ class DetectionMetric(Metric):
     is_differentiable = False
 
     boxes: list[Tensor]  # each [n, 17] float64, the columns of DetectionTable
-    blocks: list[Tensor]  # each [t, 2] int64: sample, number of its boxes in `boxes`
+    blocks: list[Tensor]  # each [1, 2] int64: sample, number of its boxes in `boxes`
 
-    def __init__(self, evaluation_set: EvaluationSet, seen_only: bool = False) -> None:
+    def __init__(self, evaluation_set: EvaluationSet) -> None:
         super().__init__()
         self.evaluation_set = evaluation_set
-        self.seen_only = seen_only
         self.add_state("boxes", default=[], dist_reduce_fx="cat")
         self.add_state("blocks", default=[], dist_reduce_fx="cat")
 
-    def update(self, tokens: Sequence[str], boxes: DetectionTable | Sequence[DetectionTable]) -> None:
-        """Add the boxes of the samples `tokens`; a sample without boxes is named all the same.
-
-        `boxes` is either one table, whose `samples` say which box is whose, or one table per token.
-        Raises ValueError for a token that is not in the evaluation set, a table per token too many or too few, or
-        boxes of a sample that is not named.
-        """
-        index_of = self.evaluation_set.index_of
-        unknown = [token for token in tokens if token not in index_of]
-        if unknown:
-            raise ValueError(f"sample {unknown[0]!r} is not one of the {len(index_of)} of the evaluation set")
-        samples = [index_of[token] for token in tokens]
-        if isinstance(boxes, DetectionTable):
-            stray = set(boxes.samples.tolist()) - set(samples)
-            if stray:
-                raise ValueError(f"boxes of sample {min(stray)}, but this update names only the samples {samples}")
-            boxes = [boxes[boxes.samples == sample] for sample in samples]
-        rows = [_as_rows(sample, table) for sample, table in zip(samples, boxes, strict=True)]
-        counts = [[sample, len(of_sample)] for sample, of_sample in zip(samples, rows, strict=True)]
-        if counts:
-            self.boxes.append(torch.from_numpy(np.concatenate(rows)).to(self.device))
-            self.blocks.append(torch.tensor(counts, dtype=torch.int64, device=self.device))
+    def update(self, sample: int, boxes: DetectionTable) -> None:
+        """Add the boxes of one sample, a row of the evaluation set's tokens."""
+        self.boxes.append(torch.from_numpy(replace(boxes, samples=np.full(len(boxes), sample)).rows()).to(self.device))
+        self.blocks.append(torch.tensor([[sample, len(boxes)]], dtype=torch.int64, device=self.device))
 
     def sync(self, *args: object, **kwargs: object) -> None:
         """Gather from all processes; one that saw nothing contributes empty tensors of the right shape and type."""
-        self.boxes.append(torch.zeros(0, _NUM_COLUMNS, dtype=torch.float64, device=self.device))
+        self.boxes.append(torch.zeros(0, sum(COLUMN_WIDTHS.values()), dtype=torch.float64, device=self.device))
         self.blocks.append(torch.zeros(0, 2, dtype=torch.int64, device=self.device))
         super().sync(*args, **kwargs)
 
-    def compute(self) -> DetectionScores:
-        """Scores of everything collected so far.
-
-        Raises DataError for boxes that cannot be scored, with the sample's token.
-        """
-        predictions, seen = self.collected()
-        return score_detections(self.evaluation_set, predictions, seen if self.seen_only else None)
-
-    def collected(self) -> tuple[DetectionTable, Array]:
-        """The boxes so far, each sample once and in the order of the evaluation set, and which samples those are.
-
-        Within `compute` and a `sync_context` these are the boxes of all processes, otherwise of this one.
-        """
-        seen = np.zeros(len(self.evaluation_set.tokens), dtype=bool)
+    def compute(self) -> DetectionTable:
+        """The boxes so far of all processes, each sample once and in the order of the evaluation set."""
         if not len(self.blocks):
-            return DetectionTable.empty(), seen
+            return DetectionTable.empty()
         blocks = dim_zero_cat(self.blocks).cpu().numpy()
         ends = np.cumsum(blocks[:, 1])
-        samples, first = np.unique(blocks[:, 0], return_index=True)
+        _, first = np.unique(blocks[:, 0], return_index=True)
         _, rows = expand_ranges((ends - blocks[:, 1])[first], ends[first])
-        seen[samples] = True
-        return _from_rows(dim_zero_cat(self.boxes).cpu().numpy()[rows]), seen
-
-
-_COLUMNS = {
-    "samples": 1,
-    "labels": 1,
-    "centers": 3,
-    "sizes": 3,
-    "rotations": 4,
-    "velocities": 2,
-    "attributes": 1,
-    "scores": 1,
-    "num_points": 1,
-}
-_NUM_COLUMNS = sum(_COLUMNS.values())
-
-
-def _as_rows(sample: int, table: DetectionTable) -> Array:
-    """The table as [n, 17] float64, which holds every index exactly, with `sample` as the sample of each box."""
-    columns = [getattr(table, name).reshape(len(table), width).astype(np.float64) for name, width in _COLUMNS.items()]
-    columns[0] = np.full((len(table), 1), float(sample))
-    return np.concatenate(columns, axis=1)
-
-
-def _from_rows(
-    rows: Array,  # [n, 17] float64
-) -> DetectionTable:
-    columns, start = {}, 0
-    for name, width in _COLUMNS.items():
-        part = rows[:, start : start + width]
-        columns[name] = part if width > 1 else part[:, 0]
-        if name in ("samples", "labels", "attributes", "num_points"):
-            columns[name] = columns[name].astype(np.int64)
-        start += width
-    return DetectionTable(**columns)
+        return DetectionTable.from_rows(dim_zero_cat(self.boxes).cpu().numpy()[rows])

@@ -19,14 +19,6 @@ ERROR_THRESHOLD_M = 2.0
 ERRORS = ("ATE", "ASE", "AOE", "AVE", "AAE")
 """Translation (m), scale (1 - IoU), orientation (rad), velocity (m/s) and attribute (1 - accuracy) errors."""
 
-CLASS_WITHOUT_ERRORS: dict[str, tuple[str, ...]] = {
-    "traffic_cone": ("AOE", "AVE", "AAE"),
-    "barrier": ("AVE", "AAE"),
-    "animal": ("AAE",),
-    "traffic_sign": ("AVE",),
-}
-"""Errors that are undefined for a class and left out of the means."""
-
 MEAN_AP_WEIGHT = 5
 
 

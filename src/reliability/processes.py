@@ -12,7 +12,6 @@ import inspect
 import logging
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -31,8 +30,8 @@ from lightning.fabric.plugins.environments import (
     SLURMEnvironment,
     TorchElasticEnvironment,
 )
+from lightning.fabric.plugins.environments.lightning import find_free_network_port
 from lightning.pytorch.strategies import DDPStrategy, Strategy
-from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 from src.errors import ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
@@ -154,7 +153,8 @@ def launch(module: str, overrides: Sequence[str], devices: int) -> None:
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        rendezvous = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(_free_port()), "WORLD_SIZE": str(devices)}
+        port = str(find_free_network_port())
+        rendezvous = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": str(devices)}
         # Below errors torch's C++ would advise against looking for unused parameters, see `build_strategy`.
         rendezvous["TORCH_CPP_LOG_LEVEL"] = os.environ.get("TORCH_CPP_LOG_LEVEL", "ERROR")
         for rank in range(devices):
@@ -216,12 +216,6 @@ def _signal_all(ranks: list[subprocess.Popen], number: int) -> None:
         process.send_signal(number)  # does nothing to one that has ended
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 def die_with_parent(number: int = signal.SIGKILL) -> None:
     """In a new process: get this signal when the launching one is killed, which can pass nothing on (Linux only)."""
     if sys.platform == "linux":
@@ -266,7 +260,8 @@ def process_group(accelerator: str, devices: int, num_nodes: int = 1) -> Iterato
         reason = str(error).splitlines()[0]
         late = "timed out" in reason.lower() or "timeout" in reason.lower()
         if not late:  # a hanging rank has no message of its own
-            _let_failing_rank_report()
+            with suppress(KeyboardInterrupt):  # whoever ends this process meanwhile need not wait
+                time.sleep(REPORT_DELAY_S)
         what = "hangs or is cut off" if late else "ended, its message says why"
         raise HorizonError(
             f"another process of this run {what} ({reason}); the same command resumes from the last checkpoint"
@@ -285,12 +280,6 @@ def _rendezvous_store(cluster: ClusterEnvironment) -> dist.Store:
     one_agent = os.environ.get("GROUP_WORLD_SIZE", "1") == "1"
     attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") if one_agent else "0"
     return dist.PrefixStore(f"attempt {attempt}", where[0])
-
-
-def _let_failing_rank_report() -> None:
-    """Wait for the failing rank's own message; whoever ends this process meanwhile need not wait."""
-    with suppress(KeyboardInterrupt):
-        time.sleep(REPORT_DELAY_S)
 
 
 def end_processes() -> None:
@@ -377,29 +366,19 @@ class SharedBuffers(L.Callback):
     exchange the weights for validation.
     """
 
+    @torch.no_grad()
     def on_validation_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Copy them; every process comes here once per validation."""
-        share_buffers(module)
-
-
-@torch.no_grad()
-def share_buffers(module: nn.Module) -> None:
-    """Copy the buffers of the main process's `module` into the others', in one message per type."""
-    if not _several():
-        return
-    by_type: dict[torch.dtype, list[torch.Tensor]] = {}
-    for buffer in module.buffers():
-        by_type.setdefault(buffer.dtype, []).append(buffer)
-    for buffers in by_type.values():
-        joined = torch.cat([buffer.flatten() for buffer in buffers])
-        dist.broadcast(joined, src=0)
-        for buffer, part in zip(buffers, joined.split([buffer.numel() for buffer in buffers]), strict=True):
-            buffer.copy_(part.view_as(buffer))
+        if _several():
+            for buffer in module.buffers():
+                value = buffer.contiguous()
+                dist.broadcast(value, src=0)
+                buffer.copy_(value)
 
 
 def gather_by_rank(value: Any) -> list[Any]:
     """The `value`s of all ranks in their order; every rank must call it. One value without a process group."""
-    if not (dist.is_available() and dist.is_initialized()):
+    if not _several():
         return [value]
     values: list[Any] = [None] * dist.get_world_size()
     dist.all_gather_object(values, value)

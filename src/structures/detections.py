@@ -8,6 +8,20 @@ import numpy as np
 
 Array = np.ndarray
 
+COLUMN_WIDTHS = {
+    "samples": 1,
+    "labels": 1,
+    "centers": 3,
+    "sizes": 3,
+    "rotations": 4,
+    "velocities": 2,
+    "attributes": 1,
+    "scores": 1,
+    "num_points": 1,
+}
+"""Columns of a table of boxes in their order; those of width 1 are vectors."""
+INTEGER_COLUMNS = ("samples", "labels", "attributes", "num_points")
+
 
 @dataclass
 class DetectionTable:
@@ -28,34 +42,43 @@ class DetectionTable:
 
     def __post_init__(self) -> None:
         n = len(self.samples)
-        for name, width in {"centers": 3, "sizes": 3, "rotations": 4, "velocities": 2}.items():
-            if getattr(self, name).shape != (n, width):
-                raise ValueError(f"DetectionTable.{name} must be [{n}, {width}], but got {getattr(self, name).shape}")
-        for name in ("labels", "attributes", "scores", "num_points"):
-            if getattr(self, name).shape != (n,):
-                raise ValueError(f"DetectionTable.{name} must be [{n}], but got {getattr(self, name).shape}")
+        for name, width in COLUMN_WIDTHS.items():
+            shape, found = (n, width) if width > 1 else (n,), getattr(self, name).shape
+            if found != shape:
+                raise ValueError(f"DetectionTable.{name} must be {list(shape)}, but got {found}")
 
     def __len__(self) -> int:
         return len(self.samples)
 
     def __getitem__(self, rows: Array) -> DetectionTable:
         """The boxes at `rows` (a boolean mask or indices), in that order."""
-        return DetectionTable(**{name: getattr(self, name)[rows] for name in DetectionTable.__dataclass_fields__})
+        return DetectionTable(**{name: getattr(self, name)[rows] for name in COLUMN_WIDTHS})
 
     @staticmethod
     def empty() -> DetectionTable:
         """No boxes."""
-        integers = {name: np.zeros(0, np.int64) for name in ("samples", "labels", "attributes", "num_points")}
-        widths = {"centers": 3, "sizes": 3, "rotations": 4, "velocities": 2}
-        return DetectionTable(
-            **integers, scores=np.zeros(0), **{name: np.zeros((0, width)) for name, width in widths.items()}
-        )
+        return DetectionTable.from_rows(np.zeros((0, sum(COLUMN_WIDTHS.values()))))
+
+    def rows(self) -> Array:  # [n, 17] float64, which holds every index exactly
+        """All columns side by side."""
+        return np.column_stack([getattr(self, name).astype(np.float64) for name in COLUMN_WIDTHS])
+
+    @staticmethod
+    def from_rows(
+        rows: Array,  # [n, 17] float64
+    ) -> DetectionTable:
+        """The table that has these `rows`."""
+        parts = np.split(rows, np.cumsum(list(COLUMN_WIDTHS.values()))[:-1], axis=1)
+        columns = {}
+        for part, (name, width) in zip(parts, COLUMN_WIDTHS.items(), strict=True):
+            column = part if width > 1 else part[:, 0]
+            columns[name] = column.astype(np.int64) if name in INTEGER_COLUMNS else column
+        return DetectionTable(**columns)
 
     @staticmethod
     def concatenate(parts: list[DetectionTable]) -> DetectionTable:
         """Join tables row after row."""
-        names = DetectionTable.__dataclass_fields__
-        return DetectionTable(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+        return DetectionTable(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in COLUMN_WIDTHS})
 
 
 @dataclass

@@ -91,13 +91,12 @@ class DetectionEvaluator(Evaluator):
         for token, boxes, global_from_ego in zip(
             batch.tokens, model.decode(output), batch.global_from_ego.cpu().numpy(), strict=True
         ):
-            table = to_global(boxes.to("cpu"), global_from_ego, self.metric.evaluation_set.index_of[token])
-            self.metric.update([token], table)
+            sample = self.metric.evaluation_set.index_of[token]
+            self.metric.update(sample, to_global(boxes.to("cpu"), global_from_ego, sample))
 
     def compute(self) -> dict[str, float]:
         """mAP, NDS and the mean errors."""
-        with self.metric.sync_context():
-            self.detections, _ = self.metric.collected()
+        self.detections = self.metric.compute()
         self.scores = score_detections(self.metric.evaluation_set, self.detections)
         return self.scores.headline()
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from src.errors import DataError
-from src.metrics.detection import SCENE_TAGS, TAGS_WITHOUT_SCORE, score_detections
+from src.metrics.detection import score_detections
 from src.metrics.score_text import format_scores
 from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERRORS
 from src.structures.detections import DetectionTable, EvaluationSet
-from src.structures.taxonomy import ATTRIBUTES, CLASSES
+from src.structures.taxonomy import ATTRIBUTES, CLASSES, SCENE_TAGS, TAGS_WITHOUT_SCORE
 
 OFFICIAL_ERRORS = ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
 
@@ -179,16 +179,6 @@ def test_ranges_match_within_the_bin_only():
     assert found.overall.ap[0, 3] == pytest.approx(1.0)
     assert found.ranges["0-25"].num_gt[0] == 1 and found.ranges["0-25"].ap[0, 3] == 0
     assert found.ranges["25-50"].num_gt[0] == 0 and found.ranges["25-50"].ap[0, 3] == 0
-
-
-def test_some_samples_only():
-    evaluation_set = EvaluationSet(
-        ["a", "b"], np.zeros((2, 3)), [()] * 2, boxes([(10, 0), (10, 0)], samples=[0, 1]), DetectionTable.empty()
-    )
-    predictions = boxes([(10, 0)], scores=[0.5])
-    everything = class_ap(evaluation_set, predictions)[3]
-    assert everything < 0.5, "the sample without predictions counts"
-    assert class_ap(evaluation_set, predictions, samples=np.array([True, False]))[3] == pytest.approx(1.0)
 
 
 def test_nothing_at_all():
