@@ -52,7 +52,7 @@ def simulate_sweeps(
     vrel is relative to the moving sensor, along the line of sight, positive when the range grows.
     """
     rotation, origin = scene.ego.poses(np.array(times_s))
-    speed, turning = scene.ego.rates_at(np.array(times_s))
+    speed, turning = scene.ego.rates(np.array(times_s))
     parts = [
         _object_returns(config, scene, mounts, times_s, rotation, origin, rng),
         _clutter_returns(config, scene, scenery, mounts, times_s[0], rotation, origin, rng),

@@ -136,7 +136,6 @@ def test_training(outputs, tmp_path, phase, request):
 
 @pytest.mark.slow
 def test_ops(outputs, tmp_path, monkeypatch):
-    monkeypatch.setattr(convolutions, "memory_of", lambda *_: (1.0, 2.0))  # its own test runs processes
     monkeypatch.setattr(convolutions, "DENSE_LIMIT_FLOPS", 1e9)
     result = measured("ops_debug", outputs, tmp_path, "suite=ops")
     layers = result["sparse convolution"]
