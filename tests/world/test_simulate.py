@@ -97,7 +97,6 @@ def test_labelled_objects_lie_inside_their_boxes(config):
 def test_points_are_counted_in_turned_boxes_with_their_borders():
     nothing = np.zeros(1, dtype=int)
     truth = FrameTruth(
-        time_s=0.0,
         centres=np.array([[10.0, 5.0, 1.0]]),
         yaws=np.array([np.pi / 2]),
         speeds=nothing,
