@@ -23,7 +23,8 @@ from src.benchmark.timing import interleaved, milliseconds
 from src.config import Config
 from src.data import images
 from src.data.augment import AugmentationConfig
-from src.data.datamodule import DetectionDataModule, collate
+from src.data.datamodule import DetectionDataModule
+from src.data.frame_loader import collate
 from src.data.images import width_fit
 from src.data.jpeg import decode_fast, decoder_name
 from src.data.pcd import RADAR_FIELDS, read_radar_points
