@@ -26,7 +26,7 @@ from src.benchmark.spconv_baseline import (
     sparse_tensor,
     uncached,
 )
-from src.benchmark.timing import MODES, added_bytes, clock, interleaved, milliseconds, without_gradient
+from src.benchmark.timing import MODES, added_bytes, clock, interleaved, milliseconds
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.layers.sparse import SparseConv, SparseKernel, SubmanifoldConv, TemporalConv
@@ -151,7 +151,7 @@ def measure_layer(
             runs = (functions["spconv"]().detach().index_select(0, order) for _ in range(SPCONV_TRIALS))
             wrong = sum(largest_difference([reference], [run]) > AGREEMENT for run in runs)
             agreement["spconv wrong"] = f"{wrong} of {SPCONV_TRIALS}"
-    forward = {name: without_gradient(function) for name, function in functions.items()}
+    forward = {name: torch.no_grad()(function) for name, function in functions.items()}
     forward["map"] = lambda: layer.map(Sites(layer.sites.shape, layer.sites.keys))
     rows = []
     for mode, candidates, times in (("forward", forward, 1), ("f+b", both, 3)):
