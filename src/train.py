@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -54,7 +55,7 @@ def main(overrides: list[str]) -> None:
             train_source(source, config.phase.train_missing, processes_exist=False)
         launch("src.train", overrides, config.trainer.devices)
         return
-    with process_group(*config.trainer.processes):
+    with process_group(*config.trainer.processes), closing(folder):
         start = prepare(config, tree, folder, source)
         if start is not None:
             run(config, tree, folder, source, start, started, overrides)

@@ -62,7 +62,7 @@ class RunFolder:
             self._acquire()
             aside = self._aside()
             self.path.rename(aside)
-            self._release()
+            self.close()
             logger.info("moved the old run to %s", aside)
         make_writable(self.checkpoints, "paths.outputs")
         self._acquire()
@@ -72,6 +72,12 @@ class RunFolder:
         """Write run.json, by which the run counts as finished; checkpoints that only a resumption needs go."""
         write_json(self.record, record)
         self._tidy()
+
+    def close(self) -> None:
+        """Let other processes train here."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def check_held(self) -> None:
         """Whether this is the folder that was opened.
@@ -106,10 +112,6 @@ class RunFolder:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise BusyError(f"{self.path} is being trained by another process; wait for it or end it") from error
-
-    def _release(self) -> None:
-        self._lock.close()
-        self._lock = None
 
     @property
     def has_checkpoint(self) -> bool:
