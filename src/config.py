@@ -22,7 +22,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from src.data.datamodule import DataConfig
+from src.data.data_config import DataConfig
 from src.errors import CheckpointError, ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models import FAMILIES, read_phase_options

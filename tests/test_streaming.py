@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from src.data.datamodule import collate
+from src.data.frame_loader import collate
 from src.data.sensors import Camera, RadarSweep
 from src.errors import CheckpointError, ConfigError
 from src.streaming import StreamingDetector

@@ -14,13 +14,14 @@ from torch import Tensor
 from src.assembly import build_model
 from src.config import Config
 from src.models.deploy.inference import prepare_for_inference
-from src.models.detector import Detector, ModelConfig
+from src.models.detector import Detector
 from src.reliability.checkpoints import load_model_weights, read_checkpoint
 from src.structures.batch import FrameBatch
 
 KEY_FRAME_S = 0.5
 CANDIDATES = 300  # cells above the score threshold: what traffic lights up in a trained model, within its 500 boxes
-CELLS_PER_VEHICLE = {"paper": 17, "mini": 6, "debug": 2}  # remembered in each frame; paper: 8000 cells in eight frames
+CELLS_PER_VEHICLE = {"paper": 17, "mini": 6, "debug": 2}
+"""Remembered in each frame, where fresh weights would call no cell occupied; paper: 8000 cells in eight frames."""
 
 
 @dataclass
@@ -75,18 +76,11 @@ def load_weights(config: Config, model: Detector) -> None:
         load_model_weights(model, read_checkpoint(Path(config.checkpoint)), Path(config.checkpoint))
 
 
-def remember_traffic(model: ModelConfig, scale: str, vehicles: int) -> None:
-    """Fresh weights call no cell occupied: let a memory of cells keep as many of a frame as so much traffic fills."""
-    path = getattr(getattr(model, "dptf", None), "bev_path", None)
-    if path is not None:
-        path.memory_threshold, path.max_cells_per_frame = 0.0, vehicles * CELLS_PER_VEHICLE[scale]
-
-
-def expect_trained_scores(case: Case) -> Any:
+def expect_trained_scores(case: Case) -> tuple[Any, Any]:
     """Set the score threshold of the prepared model so that decoding has the work that it has in a trained one.
 
     Fresh weights give every cell about the threshold of the configuration, and boxes would be made of half of them.
-    Returns the memory after the frame that gave the scores.
+    Returns what forward gave for the frame that the scores are of: output and memory.
     """
     with torch.no_grad(), case.precision():
         output, memory = case.prepared(case.batch, case.memory)
@@ -94,4 +88,4 @@ def expect_trained_scores(case: Case) -> Any:
     if len(scores) > CANDIDATES:
         head = case.prepared.head
         head.config = replace(head.config, score_threshold=float(scores.topk(CANDIDATES).values[-1]))
-    return memory
+    return output, memory

@@ -12,12 +12,8 @@ from src.pictures.canvas import SHEET_PX, Canvas
 from src.pictures.contents import INK, MUTED
 from src.pictures.learning_curves import LINE_COLOURS, style_axes
 
-MODEL_STYLES = {
-    "horizon3d": {"color": LINE_COLOURS[0], "marker": "o", "linestyle": "-"},
-    "dense_bev": {"color": LINE_COLOURS[1], "marker": "s", "linestyle": (0, (5, 1.6))},
-}
-"""Told apart by colour, marker and dashes."""
 MARKERS = "os^Dv<>Ph"
+DASHES = ("-", (0, (5, 1.6)), (0, (1, 1.2)))
 PANEL_PX, GAP_PX = (300, 220), (92, 96)
 LEFT_PX, TOP_PX = 66, 104
 
@@ -25,11 +21,12 @@ Rows = list[dict[str, Any]]
 
 
 def draw_scaling(path: Path, measured: dict[str, Rows], title: str) -> None:
-    """Time over every sweep, memory over the two ranges, and time by part over the fixed scene, both models."""
+    """Time over every sweep, memory over the two ranges, and time by part over the fixed scene, of all models."""
     fixed = "range, fixed scene"
     panels = [("time", name, rows) for name, rows in measured.items()]
     panels += [("memory", name, rows) for name, rows in measured.items() if name.startswith("range")]
-    panels += [(model, fixed, measured[fixed]) for model in MODEL_STYLES]
+    models = list(dict.fromkeys(point["model"] for point in measured[fixed]))
+    panels += [(model, fixed, measured[fixed]) for model in models]
     columns = 4
     lines = -(-len(panels) // columns)
     canvas = Canvas(SHEET_PX, TOP_PX + lines * (PANEL_PX[1] + GAP_PX[1]))
@@ -38,20 +35,22 @@ def draw_scaling(path: Path, measured: dict[str, Rows], title: str) -> None:
         row, column = divmod(place, columns)
         left = LEFT_PX + column * (PANEL_PX[0] + GAP_PX[0])
         axes = canvas.axes(left, TOP_PX + row * (PANEL_PX[1] + GAP_PX[1]), *PANEL_PX)
-        if kind in MODEL_STYLES:
+        if kind in models:
             style_axes(axes, f"{kind}: ms by part")
             _paint_parts(axes, name, [point for point in rows if point["model"] == kind])
         else:
             style_axes(axes, "ms a frame" if kind == "time" else "MiB added and remembered")
-            _paint_models(axes, name, rows, kind)
+            _paint_models(axes, name, rows, kind, models)
         _label(axes, name, rows)
     first = canvas.figure.axes[0]
     canvas.legend(12, 48, first.get_legend_handles_labels()[0])
     canvas.save(path, photographs=False)
 
 
-def _paint_models(axes: Axes, name: str, rows: Rows, kind: str) -> None:
-    for model, style in MODEL_STYLES.items():
+def _paint_models(axes: Axes, name: str, rows: Rows, kind: str, models: list[str]) -> None:
+    """Models told apart by colour, marker and dashes."""
+    for index, model in enumerate(models):
+        style = {"color": LINE_COLOURS[index], "marker": MARKERS[index], "linestyle": DASHES[index % len(DASHES)]}
         own = [point for point in rows if point["model"] == model]
         if kind == "time":
             values = [point["ms"] for point in own]

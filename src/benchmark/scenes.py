@@ -25,6 +25,7 @@ NOISE_M, AZIMUTH_NOISE_RAD = 0.2, math.radians(0.5)
 HALF_DENSITY_M = 90.0  # where a metre of road gives half the returns that it gives at the truck
 SHARES = {"rails": 0.45, "vegetation": 0.4, "clutter": 0.15}  # of the background
 CAMERA_YAWS_RAD = tuple(math.radians(yaw) for yaw in (45.0, -45.0, 135.0, -135.0))
+FRAME_SENSORS = ("radar", "camera")  # of `taxonomy.SENSORS`, what a made frame has
 CAMERA_FOV_RAD, CAMERA_HEIGHT_M = math.radians(110.0), 2.2
 
 

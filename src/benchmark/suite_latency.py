@@ -26,19 +26,6 @@ from src.training.run_folder import current_commit
 LATENCY_FORMAT = 1
 WARM_UP_FRAMES = 5
 MEASURED_FRAMES = 20
-LATENCY_PARTS = {
-    "image_encoder": ("image_encoder.forward",),
-    "radar_encoder": ("radar_encoder.forward",),
-    "view_transform": ("view_transform.forward", "fuser.forward"),
-    # The dense baseline's way from the fused map to the head; where the paper books its decoder is not known.
-    "temporal_fusion": ("temporal.recall", "temporal.aggregate", "temporal.remember", "decoder.forward"),
-    "kggi": ("kggi.forward",),
-    "ocsf": ("ocsf.forward",),
-    "gaussian_encoder": ("ocsf.encoder.forward",),  # within ocsf (Table 14)
-    "dptf": ("dptf.recall", "dptf.aggregate", "dptf.remember"),
-    "detection_head": ("head.forward", "head.decode"),
-}
-"""The parts of Table 15 by the methods of a model that they are; a part that a model lacks is left out."""
 
 
 def measure_latency(command: Config, overrides: list[str]) -> dict[str, Any]:
@@ -74,6 +61,7 @@ def benchmark_latency(
     `memory_gb` is the largest that torch held on a GPU, or the process with its libraries on a CPU, in 1e9 bytes.
     """
     device, now, load = detector.device, clock(detector.device), busy_cores()
+    parts = detector.model.latency_parts
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
     scenes = scenes_of(datamodule.index, split_samples(datamodule.index, datamodule.config.split))
@@ -82,14 +70,14 @@ def benchmark_latency(
     while len(measured) < MEASURED_FRAMES:
         frame, number = next(frames)
         frame, timings = frame.to(device), {}
-        with timed_parts(detector.model, LATENCY_PARTS, timings, device):
+        with timed_parts(detector.model, parts, timings, device):
             begin = now()
             detector.run(frame)
             total = now() - begin
         seen += 1
         if seen > WARM_UP_FRAMES and number >= full:
             measured.append({name: 1e3 * sum(calls) for name, calls in timings.items()} | {"total": 1e3 * total})
-    columns = {name: [row[name] for row in measured] for name in (*LATENCY_PARTS, "total") if name in measured[0]}
+    columns = {name: [row[name] for row in measured] for name in (*parts, "total") if name in measured[0]}
     medians = {name: median_iqr(values) for name, values in columns.items()}
     return {
         "ms": {name: middle for name, (middle, _) in medians.items()},

@@ -31,6 +31,7 @@ logger = logging.getLogger(__name__)
 
 ROUNDS = 5  # of all parts; a round of the full size takes ten seconds on two cores
 BACKWARD_PASSES = 3  # of inputs, outputs and weights: forward, and once more each for gradients to be read and written
+POINTS = ("radar_points", "lidar_points")  # of a batch, None without the sensor
 WHOLE = "whole: frame to boxes, step to gradients"
 
 
@@ -67,7 +68,7 @@ def benchmark_model(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
         "batch_size": len(case.batch),
         "peak_memory_mib": int(peak_bytes(device) / 2**20),
         "parameters": {n: sum(p.numel() for p in part.parameters()) for n, part in case.model.named_children()},
-        "radar_points": len(case.batch.radar_points),
+        **{name: len(points) for name in POINTS if (points := getattr(case.batch, name)) is not None},
         "loss": float(loss),
         "state": {name: float(value) for name, value in state.items()},
     }

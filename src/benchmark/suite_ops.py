@@ -23,18 +23,26 @@ from src.benchmark.page import gpu_notes
 from src.benchmark.scenes import highway_points
 from src.benchmark.spconv_baseline import load_spconv
 from src.config import Config
+from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.sparse_voxel import RadarEncoderConfig
 from src.ops.sites import Sites
 
 
 def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
-    """Tables of sparse convolutions, of the whole radar backbone, of splatting, and of everything else."""
+    """Tables of sparse convolutions, of the whole radar backbone, of splatting, and of everything else.
+
+    Raises ConfigError for a model without a sparse radar backbone.
+    """
+    encoders = [part for part in vars(config.model).values() if isinstance(part, RadarEncoderConfig)]
+    if not encoders:
+        raise ConfigError(f"suite=ops measures a sparse radar backbone, which model={config.model.name} does not have")
     torch.manual_seed(config.seed)
     device, sizes, grid = config.trainer.device(), SIZES[config.scale], config.grid.build()
     every = torch.get_num_threads()
     threads = sorted({1, every}) if device.type == "cpu" else [every]
     points = highway_points(sizes.road).to(device)
-    backbone = Backbone(config.model.radar_encoder, grid, config.model.channels, config.seed)
+    backbone = Backbone(encoders[0], grid, config.model.channels, config.seed)
     encoder = backbone.build().to(device)
     with torch.no_grad():
         voxels = encoder.voxelise(points, torch.zeros(len(points), dtype=torch.int64, device=device), 1)

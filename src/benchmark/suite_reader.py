@@ -23,13 +23,14 @@ from src.benchmark.timing import interleaved, milliseconds
 from src.config import Config
 from src.data import images, reader
 from src.data.augment import AugmentationConfig
-from src.data.datamodule import DetectionDataModule, collate
+from src.data.datamodule import DetectionDataModule
+from src.data.frame_loader import collate
 from src.data.images import width_fit
 from src.data.jpeg import decode_fast, decoder_name
 from src.data.pcd import RADAR_FIELDS, read_radar_points
 from src.data.schema import CHANNELS
 from src.data.splits import split_samples
-from src.structures.taxonomy import CAMERAS, RADARS
+from src.structures.taxonomy import CAMERAS, LIDARS, RADARS
 
 Array = np.ndarray
 
@@ -43,6 +44,8 @@ STAGES = {
     "mirror and rotate": (images, "turn"),
     "radar files": (reader, "read_radar_points"),
     "radar compensation": (reader, "compensate_sweeps"),
+    "LiDAR files": (reader, "read_lidar_points"),
+    "LiDAR compensation": (reader, "place_sweep"),
 }
 """Functions of the reader by the names under which it calls them; what is in none of them is `assembling`."""
 
@@ -61,18 +64,25 @@ def benchmark_reader(config: Config) -> dict[str, Any]:
     runs = {"training": config.data.augmentation, "test": None}
     measured = {name: time_frames(datamodule, samples, augmentation) for name, augmentation in runs.items()}
     total = sum(measured["training"]["all"])
+    settings, frame = datamodule.settings, samples[0]
+    comparisons = {}
+    if settings.image_size_px:
+        comparisons["images of one frame"] = compare_decoding(datamodule, frame)
+    if settings.num_sweeps:
+        comparisons["radar files of one frame"] = compare_parsing(datamodule, frame)
+    stages = [stage for stage, seconds in measured["training"].items() if stage not in ("all", "wall") and any(seconds)]
     return {
         "frames": READER_FRAMES,
         "cpu_seconds": total,
         "frames_per_second": READER_FRAMES / total,
         "decoder": decoder_name(),
-        "image_px": "x".join(map(str, datamodule.index.data_sizes[datamodule.index.key_data[samples[0], 0]][::-1])),
-        "network_px": "x".join(map(str, (datamodule.settings.image_size_px or (0, 0))[::-1])),
-        "radar_files": len(radar_paths(datamodule, samples[0])),
+        "image_px": "x".join(map(str, datamodule.index.data_sizes[datamodule.index.key_data[frame, 0]][::-1])),
+        "network_px": "x".join(map(str, (settings.image_size_px or (0, 0))[::-1])),
+        "radar_files": len(sweep_paths(datamodule, frame, RADARS, settings.num_sweeps)),
+        "lidar_files": len(sweep_paths(datamodule, frame, LIDARS, settings.num_lidar_sweeps)),
         "frames with and without augmentation": [frame_row(name, columns) for name, columns in measured.items()],
-        "stages": [stage_row(stage, measured) for stage in measured["training"] if stage not in ("all", "wall")],
-        "images of one frame": compare_decoding(datamodule, samples[0]) if datamodule.settings.image_size_px else [],
-        "radar files of one frame": compare_parsing(datamodule, samples[0]),
+        "stages": [stage_row(stage, measured) for stage in stages],
+        **comparisons,
         "loader": [loader_row(config)],
         "notes": [
             "CPU time of one thread, medians over frames; ± is the interquartile range; files come from the system's "
@@ -83,18 +93,20 @@ def benchmark_reader(config: Config) -> dict[str, Any]:
 
 
 def full_samples(datamodule: DetectionDataModule) -> list[int]:
-    """Frames of the training split with as many radar files as any has: early frames of a scene have fewer."""
+    """Frames of the training split with as many sweeps as any has: early frames of a scene have fewer."""
     samples = [int(sample) for sample in split_samples(datamodule.index, datamodule.config.train_split)]
-    counts = [len(radar_paths(datamodule, sample)) for sample in samples]
+    settings = datamodule.settings
+    read = ((RADARS, settings.num_sweeps), (LIDARS, settings.num_lidar_sweeps))
+    counts = [sum(len(sweep_paths(datamodule, sample, *sweeps)) for sweeps in read) for sample in samples]
     return [sample for sample, count in zip(samples, counts, strict=True) if count == max(counts)]
 
 
-def radar_paths(datamodule: DetectionDataModule, sample: int) -> list[str]:
+def sweep_paths(datamodule: DetectionDataModule, sample: int, channels: tuple[str, ...], num_sweeps: int) -> list[str]:
     """Files of a frame's sweeps."""
     index, paths = datamodule.index, []
-    for channel in RADARS:
+    for channel in channels:
         row = int(index.key_data[sample, CHANNELS.index(channel)])
-        for _ in range(datamodule.settings.num_sweeps):
+        for _ in range(num_sweeps):
             if row >= 0:
                 paths.append(str(index.root / index.filename(row)))
                 row = int(index.data_previous[row])
@@ -228,7 +240,7 @@ def naive_image(
 
 def compare_parsing(datamodule: DetectionDataModule, sample: int) -> list[dict[str, Any]]:
     """The frame's radar files: field by field, as general readers do, and as one view."""
-    paths = radar_paths(datamodule, sample)
+    paths = sweep_paths(datamodule, sample, RADARS, datamodule.settings.num_sweeps)
     candidates = {
         "header and fields one by one": lambda: [fields_one_by_one(path) for path in paths],
         "known headers, one view": lambda: [read_radar_points(path) for path in paths],

@@ -1,4 +1,4 @@
-"""suite=scaling: cost of a frame as range, traffic, radar, Gaussians and memory grow, for both models."""
+"""suite=scaling: cost of a frame as range, traffic, radar, Gaussians and memory grow, model beside model."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import logging
 import math
 import statistics
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from src.benchmark.cases import (
     CANDIDATES,
@@ -20,19 +22,20 @@ from src.benchmark.cases import (
     Case,
     build_case,
     expect_trained_scores,
-    remember_traffic,
 )
 from src.benchmark.counting import counted_work
 from src.benchmark.page import gpu_notes, page_name
 from src.benchmark.parts import is_within, parts_of, tensors_in
 from src.benchmark.plots import draw_scaling
-from src.benchmark.scenes import ROADS, Highway, highway_frame, highway_points
+from src.benchmark.scenes import FRAME_SENSORS, ROADS, Highway, highway_frame, highway_points
 from src.benchmark.timing import added_bytes, clock, interleaved, milliseconds, timed_parts
 from src.config import Config, compose_config
+from src.errors import ConfigError
+from src.models import FAMILIES
+from src.models.detector import ModelConfig
 
 logger = logging.getLogger(__name__)
 
-OURS, DENSE = "horizon3d", "dense_bev"
 ROUNDS, BUDGET_S = 5, 8.0  # of each model at each point; whole maps of 600 m are measured once
 NOMINAL_M = 150.0  # the range of the paper: `grid.cells` cover it
 EGO_STEP_M = 12.0  # between remembered frames: 24 m/s
@@ -62,22 +65,30 @@ class Point:
 
 
 def benchmark_scaling(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
-    """Time and memory of a frame without its image encoder, at every point of every sweep; growth first."""
+    """Time and memory of a frame without its image encoder, at every point of every sweep; growth first.
+
+    Raises ConfigError for a model that reads what a made frame does not have.
+    """
+    if not set(config.model.sensors) <= set(FRAME_SENSORS):
+        raise ConfigError(
+            f"suite=scaling measures on made frames of {' and '.join(FRAME_SENSORS)}, but model={config.model.name} "
+            f"reads {', '.join(config.model.sensors)}"
+        )
     device = config.trainer.device()
-    configs = {name: config_of(config, name) for name in (OURS, DENSE)}
+    configs = configs_of(config)
     sweeps = sweeps_of(ROADS[config.scale], RANGES_M[config.scale], config.phase.temporal)
     measured = {name: measure_sweep(name, points, configs, device) for name, points in sweeps.items()}
     result = {
         "notes": [
-            f"Scale {config.scale}, {config.phase.name}, {config.precision} on {device}, batch 1, both models as "
+            f"Scale {config.scale}, {config.phase.name}, {config.precision} on {device}, batch 1, the models as "
             "prediction prepares them, with fresh weights, from features that the image encoder has made already. The "
             "cell stays 0.8 m, so a longer range has more cells. Medians; ± is the interquartile range. `added` "
             "is the most memory that a frame takes beyond inputs and weights, `remembered` waits for the next one. "
             f"{CANDIDATES} cells pass the score threshold, as of trained models; fresh weights alone would pass half.",
             "range, equal density: the road goes on to the end of the range. range, fixed scene: the road ends at "
-            f"{FIXED_REACH_M:g} m. Only these two have anything beyond {NOMINAL_M:g} m. Each remembered frame of "
-            f"{OURS} holds {CELLS_PER_VEHICLE[config.scale]} cells a vehicle and the Gaussians it is configured "
-            f"for; {DENSE} remembers whole maps.",
+            f"{FIXED_REACH_M:g} m. Only these two have anything beyond {NOMINAL_M:g} m. A remembered frame holds "
+            f"{CELLS_PER_VEHICLE[config.scale]} cells a vehicle and the Gaussians that are configured for it, or, in a "
+            "dense model, its whole map.",
             *gpu_notes(device),
         ],
         "picture": None,
@@ -92,14 +103,16 @@ def benchmark_scaling(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     return result | measured
 
 
-def config_of(config: Config, name: str) -> Config:
-    """That of a model with fresh weights: as configured, or the other one at the same scale, phase, grid, backbone."""
-    if config.model.name == name:
-        return replace(config, checkpoint=None)
-    other, _ = compose_config(
-        [f"model={name}", f"scale={config.scale}", f"phase={config.phase.name}", "data=synthetic"]
-    )
-    return replace(other, grid=config.grid, backbone=config.backbone, precision=config.precision, seed=config.seed)
+def configs_of(config: Config) -> dict[str, Config]:
+    """By name the configured model with fresh weights, then all others that read radar and cameras in this phase, at
+    the same scale, grid and backbone."""
+    configs = {config.model.name: replace(config, checkpoint=None)}
+    same = {name: getattr(config, name) for name in ("grid", "backbone", "precision", "seed")}
+    for name in [name for name in FAMILIES if name not in configs]:
+        overrides = [f"model={name}", f"scale={config.scale}", f"phase={config.phase.name}", "data=synthetic"]
+        with suppress(ConfigError):  # of a model without this phase, or one that reads what this world lacks
+            configs[name] = replace(compose_config(overrides)[0], **same)
+    return configs
 
 
 def sweeps_of(
@@ -140,9 +153,9 @@ def measure_sweep(
     rows = []
     for number, point in enumerate(points, 1):
         logger.info("%s: point %d of %d", name, number, len(points))
-        cases = {model: make_case(config, point, device) for model, config in configs.items()}
-        counts = {model: number_of_gaussians(config, point) for model, config in configs.items()}
-        x = counts[OURS] if name == "gaussians" else point.x
+        made = {model: make_case(config, point, device) for model, config in configs.items()}
+        cases = {model: case for model, (case, _) in made.items()}
+        x = max(gaussians for _, gaussians in made.values()) if name == "gaussians" else point.x
         seconds, parts = measure_cases(cases)
         for model, case in cases.items():
             added = added_bytes(case.infer, device)
@@ -153,7 +166,7 @@ def measure_sweep(
                 case.infer()
             row |= {"GFLOP": work.flops / 1e9, "radar points": len(case.batch.radar_points)}
             rows.append(row | {f"{part} ms": 1e3 * statistics.median(values) for part, values in parts[model].items()})
-        del cases
+        del made, cases
     return rows
 
 
@@ -182,50 +195,28 @@ def measure_cases(cases: dict[str, Case]) -> tuple[dict[str, list[float]], dict[
     return interleaved(candidates, clock(device), ROUNDS, BUDGET_S), parts
 
 
-def make_case(config: Config, point: Point, device: torch.device) -> Case:
-    """A model on a grid of this range, with a full memory of frames that saw the same road a little behind."""
+def make_case(config: Config, point: Point, device: torch.device) -> tuple[Case, int]:
+    """A model on a grid of this range, with a full memory of frames that saw the same road a little behind.
+
+    Also how many Gaussians it has without memory.
+    """
     torch.manual_seed(config.seed)
-    settings = model_settings(config, point)
+    settings = settings_at(config, point)
     cells = [round(number * point.range_m / NOMINAL_M) for number in config.grid.cells]
     batch = highway_frame(highway_points(point.road), tuple(config.backbone.image_size_px)).to(device)
     case = build_case(replace(config, model=settings, grid=replace(config.grid, cells=cells)), batch, device)
     cache_images(case)
-    memory = expect_trained_scores(case)
+    output, memory = expect_trained_scores(case)
     if settings.memory_frames:
-        case.memory = aged(memory, settings)
-        case.batch = replace(batch, timestamps_s=batch.timestamps_s + KEY_FRAME_S)
-    return case
+        fill_memory(case, memory, settings.memory_frames)
+    gaussians = case.prepared.evidence(output).gaussians
+    return case, 0 if gaussians is None else gaussians.valid.shape[1]
 
 
-def model_settings(config: Config, point: Point) -> Any:
-    """The model's settings at a point. Fresh weights call no cell occupied: as many as traffic fills are kept."""
-    settings = copy.deepcopy(config.model)
-    if settings.name == OURS and settings.kggi is not None:
-        for kind in ("radar", "camera", "random"):
-            key = f"num_{kind}_keypoints"
-            setattr(settings.kggi, key, max(1, round(point.gaussians * getattr(settings.kggi, key))))
-    frames = point.memory_frames
-    part = "dptf" if settings.name == OURS else "temporal"
-    if frames == 0:
-        setattr(settings, part, None)
-    temporal = getattr(settings, part)
-    if temporal is None:
-        return settings
-    paths = [temporal] if settings.name == DENSE else [temporal.bev_path, temporal.gaussian_path]
-    for path in paths:
-        if path is not None and frames is not None:
-            path.num_frames = (
-                min(frames, path.num_frames) if path is getattr(temporal, "gaussian_path", None) else frames
-            )
+def settings_at(config: Config, point: Point) -> ModelConfig:
+    """The model's settings at a point, with as many remembered cells as its traffic fills."""
     vehicles = max(1, round(point.road.num_vehicles * point.road.reach_m / NOMINAL_M))
-    remember_traffic(settings, config.scale, vehicles)
-    return settings
-
-
-def number_of_gaussians(config: Config, point: Point) -> int:
-    """Of the current frame, for a model that has some."""
-    kggi = getattr(model_settings(config, point), "kggi", None)
-    return sum(kggi.counts.values()) if kggi is not None else 0
+    return config.model.scaled(point.gaussians, point.memory_frames, vehicles * CELLS_PER_VEHICLE[config.scale])
 
 
 def cache_images(case: Case) -> None:
@@ -237,28 +228,34 @@ def cache_images(case: Case) -> None:
         encoder.forward = lambda images: features
 
 
-def aged(memory: Any, settings: Any) -> Any:
-    """The memory of one frame as a full one: the same cells seen from further and further behind."""
+def fill_memory(case: Case, memory: Any, num_frames: int) -> None:
+    """Make a memory of one frame a full one: the same frame seen from further and further behind."""
     (frame,) = memory.frames
-    frames = []
-    for age in range(settings.memory_frames):
-        pose = frame.global_from_ego.clone()
-        pose[:, 0, 3] -= EGO_STEP_M * (age + 1)
-        own = {"global_from_ego": pose, "timestamps_s": frame.timestamps_s - KEY_FRAME_S * age}
-        frames.append(replace(copy.deepcopy(frame), **own))
-    if settings.name == OURS:
-        for name, path in (("cells", settings.dptf.bev_path), ("gaussians", settings.dptf.gaussian_path)):
-            kept = path.num_frames if path is not None else 0
-            frames = [replace(old, **{name: None}) if age >= kept else old for age, old in enumerate(frames)]
-    return type(memory)(tuple(frames))
+    past = []
+    for age in range(1, num_frames + 1):
+        own = {"timestamps_s": frame.timestamps_s - KEY_FRAME_S * age}
+        past.append(replace(copy.deepcopy(frame), global_from_ego=behind(frame, age + 1), **own))
+    before = replace(case.batch, global_from_ego=behind(case.batch, 1))
+    with torch.no_grad(), case.precision():
+        # Once more by the model, which keeps of each frame what it reads at that age.
+        _, case.memory = case.prepared(before, type(memory)(tuple(past)))
+    case.batch = replace(case.batch, timestamps_s=case.batch.timestamps_s + KEY_FRAME_S)
+
+
+def behind(frame: Any, steps: int) -> Tensor:  # [B, 4, 4]
+    """The pose of a frame so many steps before."""
+    pose = frame.global_from_ego.clone()
+    pose[:, 0, 3] -= EGO_STEP_M * steps
+    return pose
 
 
 def growth_rows(measured: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """How much time and memory grow over each sweep; over ranges from the nominal one."""
+    """How much time and memory grow over each sweep, over ranges from the nominal one; others beside the first."""
     rows = []
     for name, points in measured.items():
         row: dict[str, Any] = {"sweep": name}
-        for model in (OURS, DENSE):
+        models = list(dict.fromkeys(point["model"] for point in points))
+        for model in models:
             own = [point for point in points if point["model"] == model]
             first = next((point for point in own if point[name] == NOMINAL_M), own[0]) if "range" in name else own[0]
             row |= {"from": first[name], "to": own[-1][name]}
@@ -266,9 +263,10 @@ def growth_rows(measured: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any
             if first["added MiB"] is not None:
                 row[f"{model} memory x"] = held_mib(own[-1]) / max(held_mib(first), 1e-9)
         for place in ("from", "to"):
-            ours, dense = (point for point in points if point[name] == row[place])  # as they were measured
-            row[f"dense / ours at {place}"] = dense["ms"] / ours["ms"]
-            row[f"GFLOP dense / ours at {place}"] = dense["GFLOP"] / ours["GFLOP"]
+            first, *others = (point for point in points if point[name] == row[place])  # as they were measured
+            for other in others:
+                ratio = f"{other['model']} / {first['model']} at {place}"
+                row |= {ratio: other["ms"] / first["ms"], f"GFLOP {ratio}": other["GFLOP"] / first["GFLOP"]}
         rows.append(row)
     return rows
 

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from src.assembly import build_datamodule, build_model, build_module, data_root
-from src.benchmark.cases import KEY_FRAME_S, Case, expect_trained_scores, load_weights, remember_traffic
+from src.benchmark.cases import CELLS_PER_VEHICLE, KEY_FRAME_S, Case, expect_trained_scores, load_weights
 from src.benchmark.page import page_name
 from src.benchmark.parts import tensors_in, wrapped_parts
 from src.benchmark.plots import draw_soak
@@ -57,7 +57,8 @@ def benchmark_soak(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     device = config.trainer.device()
     config = replace(config, optim=replace(config.optim, lr=UNLEARNED))
     if config.checkpoint is None:
-        remember_traffic(config.model, config.scale, ROADS[config.scale].num_vehicles)
+        cells = ROADS[config.scale].num_vehicles * CELLS_PER_VEHICLE[config.scale]
+        config = replace(config, model=config.model.scaled(cells_per_frame=cells))
     datamodule = build_datamodule(config, data_root(config))
     frames, curves = FRAMES[config.scale], {}
     for name in (DRIVE, CLIPS):

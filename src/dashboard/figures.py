@@ -21,6 +21,7 @@ CURVES = (
     ("loss/total", "Training loss", "loss", 1.0),
     ("step/total", "Training loss by step", "loss", 1.0),
 )
+Curves = dict[str, Sequence[tuple[float, float]]]
 LATENCY, ACCURACY = "latency.total", "NDS"
 
 
@@ -45,43 +46,37 @@ def knob_figures(sweep: Sweep, plot: PlotConfig, results: dict[str, list[RunResu
     """
     metric = find_metric(plot.metric, sweep.key, sweep.record.sweep.task)
     rows = sweep.record.sweep.rows
-    here = {row.label: _mean_and_spread(results.get(row.label, ()), metric) for row in rows}
-    paper = {row.label: row.paper.get(metric.name) for row in rows}
+    labels = [row.label for row in rows]
+    here = {label: _mean_and_spread(results.get(label, ()), metric) for label in labels}
+    stated = {row.label: row.paper.get(metric.name) for row in rows}
+    paper = {label: None if value is None else (value, 0.0) for label, value in stated.items()}
     spread = any(value is not None and value[1] > 0 for value in here.values())
-    titles = (
-        f"{metric.title} here, scale {sweep.record.scale}{', ± deviation over seeds' if spread else ''}",
-        f"{metric.title} in the paper, TruckScenes",
-    )
-    known_paper = any(value is not None for value in paper.values())
+    sides = {f"{metric.title} here, scale {sweep.record.scale}{', ± deviation over seeds' if spread else ''}": here}
+    if any(value is not None for value in stated.values()):
+        sides[f"{metric.title} in the paper, TruckScenes"] = paper
     if any(row.x is None for row in rows):
-        labels = [row.label for row in rows]
-        bars = [Bars(label="", values=[here[row] and here[row][0] for row in labels],
-                     spread=[here[row] and here[row][1] for row in labels])]  # fmt: skip
-        figures = [category_chart(titles[0], labels, bars, metric.heading, metric.digits)]
-        if known_paper:
-            shown = [Bars(label="", values=[paper[row] for row in labels], style=1)]
-            figures.append(category_chart(titles[1], labels, shown, metric.heading, metric.digits))
-        return figures
+        return [
+            category_chart(title, labels, [_bars("", side.values(), style)], metric.heading, metric.digits)
+            for style, (title, side) in enumerate(sides.items())
+        ]
     ordered = sorted(rows, key=lambda row: row.x)
-    measured = [row for row in ordered if here[row.label] is not None]
-    stated = [row for row in ordered if paper[row.label] is not None]
-    values = [here[row.label][0] + sign * here[row.label][1] for row in measured for sign in (-1, 1)]
-    span = max(_span(values), _span([paper[row.label] for row in stated]))
+    series = []
+    for style, side in enumerate(sides.values()):
+        known = [(row, *side[row.label]) for row in ordered if side[row.label] is not None]
+        series.append(
+            Series(
+                label="",
+                points=[(row.x, value) for row, value, _ in known],
+                spread=[deviation for _, _, deviation in known],
+                notes=[_note(row.label, side[row.label], metric, with_spread=side is here) for row, *_ in known],
+                style=style,
+            )
+        )
+    ends = [[y + sign * s for (_, y), s in zip(o.points, o.spread, strict=True) for sign in (-1, 1)] for o in series]
+    span = max((max(values) - min(values) for values in ends if values), default=0.0)
     ticks = list({row.x: f"{row.x:g}" for row in ordered}.items())
-    ours = Series(
-        label="",
-        points=[(row.x, here[row.label][0]) for row in measured],
-        spread=[here[row.label][1] for row in measured],
-        notes=[_note(row.label, here[row.label], metric) for row in measured],
-    )
-    theirs = Series(
-        label="",
-        points=[(row.x, paper[row.label]) for row in stated],
-        notes=[f"{row.label}: {paper[row.label]:.{metric.digits}f}" for row in stated],
-        style=1,
-    )
-    chosen = ((titles[0], ours), (titles[1], theirs)) if known_paper else ((titles[0], ours),)
-    return [line_chart(t, [one], plot.label, metric.heading, x_ticks=ticks, y_span=span or None) for t, one in chosen]
+    charts = zip(sides, series, strict=True)
+    return [line_chart(t, [one], plot.label, metric.heading, x_ticks=ticks, y_span=span or None) for t, one in charts]
 
 
 def search_figures(sweep: Sweep) -> list[Markup]:
@@ -118,16 +113,8 @@ def latency_figures(sweep: Sweep, results: dict[str, list[RunResult]]) -> list[M
         score, time = _mean_and_spread(runs, accuracy), _mean_and_spread(runs, latency)
         if score is not None and time is not None:
             note = f"{label}: {time[0]:.1f} ms, {score[0]:.1f} {accuracy.title}"
-            points.append(
-                Series(
-                    label=label,
-                    points=[(time[0], score[0])],
-                    spread=[score[1]],
-                    notes=[note],
-                    style=style,
-                    joined=False,
-                )
-            )
+            place = [(time[0], score[0])]
+            points.append(Series(label=label, points=place, spread=[score[1]], notes=[note], style=style, joined=False))
     if len(points) < 2:
         return []
     return [line_chart(f"{ACCURACY} over latency", points, "milliseconds per frame", f"{ACCURACY}, %")]
@@ -168,9 +155,8 @@ def class_figures(results: dict[str, list[RunResult]]) -> list[Markup]:
     return [category_chart("AP by class", names, rows, "AP, %", dots=len(rows) > 2)] if rows else []
 
 
-def curve_figures(curves: dict[str, Iterable[dict[str, Sequence[tuple[float, float]]]]]) -> list[Markup]:
+def curve_figures(of_row: dict[str, list[Curves]]) -> list[Markup]:
     """Scores and loss over steps: a line for each run, runs of one row alike."""
-    of_row = {label: list(runs) for label, runs in curves.items()}
     names = {name for runs in of_row.values() for run in runs for name in run}
     has_epochs = "loss/total" in names
     scores = [name.removeprefix("val/") for name in sorted(names) if name.startswith("val/")]
@@ -194,29 +180,27 @@ def curve_figures(curves: dict[str, Iterable[dict[str, Sequence[tuple[float, flo
 def run_figures(board: Board, runs: dict[str, Run]) -> dict[str, list[Markup]]:
     """The figures of a run, or of runs side by side, by section."""
     results = {label: [run.result] for label, run in runs.items() if run.result is not None}
+    curves = {label: board_curves(board, [run]) for label, run in runs.items()}
+    losses = [figure for found in curves.values() for of_run in found for figure in loss_figures(of_run)]
     sections = {
-        "Learning curves": curve_figures({label: board_curves(board, [run]) for label, run in runs.items()}),
+        "Learning curves": curve_figures(curves),
         "By distance, speed and class": distance_figures(results) + class_figures(results),
-        "Losses": loss_figures(board_curves(board, list(runs.values())[:1])) if len(runs) == 1 else [],
+        "Losses": losses if len(runs) == 1 else [],
     }
     return {title: figures for title, figures in sections.items() if figures}
 
 
-def loss_figures(curves: Iterable[dict[str, Sequence[tuple[float, float]]]]) -> list[Markup]:
+def loss_figures(curves: Curves) -> list[Markup]:
     """Every loss term of one run, as it stands in the total."""
-    figures = []
-    for run in curves:
-        terms = [(name, points) for name, points in run.items() if name.startswith("loss/") and name != "loss/total"]
-        lines = [
-            Series(label=name.removeprefix("loss/").replace("_", " "), points=points, style=style)
-            for style, (name, points) in enumerate(terms)
-        ]
-        if lines:
-            figures.append(line_chart("Loss terms", lines, "steps", "loss", markers=False))
-    return figures
+    terms = [(name, points) for name, points in curves.items() if name.startswith("loss/") and name != "loss/total"]
+    lines = [
+        Series(label=name.removeprefix("loss/").replace("_", " "), points=points, style=style)
+        for style, (name, points) in enumerate(terms)
+    ]
+    return [line_chart("Loss terms", lines, "steps", "loss", markers=False)] if lines else []
 
 
-def board_curves(board: Board, runs: Iterable[Run]) -> list[dict[str, Sequence[tuple[float, float]]]]:
+def board_curves(board: Board, runs: Iterable[Run]) -> list[Curves]:
     """Learning curves of runs that have any: from the result, or from the folder of one that still trains."""
     found = (run.result.curves if run.result is not None else board.folders.curves(run.run_id) for run in runs)
     return [curves for curves in found if curves]
@@ -260,12 +244,15 @@ def headline(sweep: Sweep) -> str:
     return line + "."
 
 
-def _span(values: Sequence[float]) -> float:
-    return max(values) - min(values) if values else 0.0
+def _bars(label: str, values: Iterable[tuple[float, float] | None], style: int) -> Bars:
+    values = list(values)
+    means, spread = ([value and value[place] for value in values] for place in (0, 1))
+    return Bars(label=label, values=means, spread=spread, style=style)
 
 
-def _note(label: str, value: tuple[float, float], metric: Metric) -> str:
-    return f"{label}: {value[0]:.{metric.digits}f} ± {value[1]:.{metric.digits}f}"
+def _note(label: str, value: tuple[float, float], metric: Metric, with_spread: bool = True) -> str:
+    spread = f" ± {value[1]:.{metric.digits}f}" if with_spread else ""
+    return f"{label}: {value[0]:.{metric.digits}f}{spread}"
 
 
 def _number(text: str | None) -> bool:

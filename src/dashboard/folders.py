@@ -7,11 +7,9 @@ that leads out of its folder counts as missing.
 from __future__ import annotations
 
 import csv
-import math
 import os
 import re
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,7 @@ from typing import Any
 import yaml
 
 from src.report.plain_yaml import load_plain_yaml
-from src.report.results import thinned, without_local_paths
+from src.report.results import Point, read_curves, without_local_paths
 
 TAIL_BYTES = 24_000
 CONFIG_BYTES = 1_000_000
@@ -29,7 +27,6 @@ ALIVE_S = 300.0
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _PNG = b"\x89PNG\r\n\x1a\n"
-Curves = dict[str, list[tuple[float, float]]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,14 +66,16 @@ class RunFolders:
 
     def names(self) -> list[str]:
         """Run ids with a folder, without those a restart moved aside."""
-        return [entry.name for entry in self._entries()]
+        if self.outputs is None:
+            return []
+        return sorted(name for name in os.listdir(self.outputs) if _is_run(name) and self._has_config(name))
 
     def find(self, run_id: str) -> Path | None:
         """The folder of a run that there is."""
         if self.outputs is None or not _is_run(run_id):
             return None
         folder = self.outputs / run_id
-        return folder if (folder / "config.yaml").is_file() and folder.resolve().parent == self.outputs else None
+        return folder if self._has_config(run_id) and folder.resolve().parent == self.outputs else None
 
     def pictures(self, run_id: str) -> list[Picture]:
         """Whole PNG files of a run, frames first; a file still being written is left out."""
@@ -114,10 +113,13 @@ class RunFolders:
         # A progress bar rewrites its line: what stands after the last carriage return is what a terminal shows.
         return "\n".join(line.rstrip("\r").rpartition("\r")[2] for line in text.split("\n")).strip()
 
-    def curves(self, run_id: str) -> Curves:
-        """Losses and scores so far, from metrics.csv: steps and values, as thinned as those of a result."""
+    def curves(self, run_id: str) -> dict[str, list[Point]]:
+        """Losses and scores so far, from metrics.csv; empty if unreadable."""
         path = self._file_of(run_id, "metrics.csv")
-        return read_curves(path) if path is not None else {}
+        try:
+            return read_curves(path, live=True) if path is not None else {}
+        except (OSError, csv.Error, UnicodeDecodeError):
+            return {}
 
     def config(self, run_id: str) -> dict[str, Any]:
         """The configuration of a run that has no result yet, without what concerns the machine; empty if unreadable."""
@@ -149,6 +151,9 @@ class RunFolders:
         folder = self.find(run_id)
         return folder is not None and (folder / "metrics.json").is_file() and (folder / "run.json").is_file()
 
+    def _has_config(self, run_id: str) -> bool:
+        return (self.outputs / run_id / "config.yaml").is_file()
+
     def _inside(self, relative: str) -> Path | None:
         """A log file that lies inside outputs, whether or not it is there."""
         if self.outputs is None:
@@ -163,38 +168,6 @@ class RunFolders:
         folder = self.find(run_id)
         path = (folder / name).resolve() if folder is not None else None
         return path if path is not None and path.is_file() and path.is_relative_to(folder) else None
-
-    def _entries(self) -> Iterator[os.DirEntry]:
-        if self.outputs is None:
-            return
-        with os.scandir(self.outputs) as entries:
-            for entry in sorted(entries, key=lambda entry: entry.name):
-                if _is_run(entry.name) and os.path.isfile(os.path.join(entry.path, "config.yaml")):
-                    yield entry
-
-
-def read_curves(path: Path) -> Curves:
-    """Columns loss/*, step/total and val/* of a metrics.csv by step; blanks and what is not a number are left out."""
-    curves: Curves = {}
-    try:
-        with path.open(newline="") as file:
-            for row in csv.DictReader(file):
-                try:
-                    step = float(row.get("step") or "nan")
-                except ValueError:
-                    continue
-                for name, text in row.items():
-                    if not name or not text or not (name.startswith(("loss/", "val/")) or name == "step/total"):
-                        continue
-                    try:
-                        value = float(text)
-                    except (TypeError, ValueError):
-                        continue
-                    if math.isfinite(step) and math.isfinite(value):
-                        curves.setdefault(name, []).append((step, value))
-    except (OSError, csv.Error, UnicodeDecodeError):
-        return {}
-    return {name: thinned(points) for name, points in curves.items()}
 
 
 def _is_run(name: str) -> bool:

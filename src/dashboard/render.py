@@ -24,7 +24,6 @@ from markupsafe import Markup
 from src.dashboard.board import Board, Run, Sweep
 from src.dashboard.figures import headline, run_figures, sweep_figures
 from src.dashboard.folders import Picture
-from src.dashboard.table_view import table_view
 from src.report.metric_names import METRICS, Metric
 from src.report.score_tables import metrics_of
 from src.report.time_left import duration
@@ -157,7 +156,7 @@ class Renderer:
         listed += [(state.label, board.runs[run_id], state) for run_id, state in states.items() if run_id not in rowed]
         content = self._content(
             "sweep.html", board=board, sweep=sweep, failed=failed, runs=listed, study=study_command(record.storage),
-            tables=[table_view(table) for table in sweep.tables], figures=sweep_figures(board, sweep),
+            figures=sweep_figures(board, sweep),
         )  # fmt: skip
         title = ", ".join([record.sweep.title, record.scale, *record.changes])
         return Page(id=f"sweep-{sweep.key}", title=title, content=content)

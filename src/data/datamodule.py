@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import difflib
-import signal
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,7 @@ from typing import Any
 import lightning as L
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, default_collate
+from torch.utils.data import DataLoader, Dataset
 
 from src.data.augment import AugmentationConfig
 from src.data.cache import load_index
@@ -28,89 +26,22 @@ from src.data.clips import (
     streamed_groups,
     whole_scenes,
 )
+from src.data.data_config import DataConfig
 from src.data.evaluation_set import evaluation_set
-from src.data.packed_batch import PackedBatch
-from src.data.reader import FrameReader, OnBadFile, ReaderSettings
+from src.data.frame_loader import FrameLoader, collate, collate_in_worker, init_worker
+from src.data.reader import FrameReader
 from src.data.schema import DatasetIndex
 from src.data.splits import split_samples
 from src.errors import ConfigError, DataError, HorizonError
 from src.structures.batch import FrameBatch
 from src.structures.detections import EvaluationSet
-from src.structures.taxonomy import SENSORS
-
-TERMINATION_GRACE_S = 10
-
-
-@dataclass(kw_only=True)
-class DataConfig:
-    """What is read and how (`data`). Raises ConfigError for values that cannot work."""
-
-    root: str | None  # folder of the data set; null with a world: a folder under paths.outputs
-    version: str  # table folder, e.g. v1.2-trainval
-    train_split: str
-    split: str  # what validation and evaluation read
-    batch_size: int  # total over all devices; the streams when clips are streamed
-    groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; method 6.4
-    stream_sets: int  # at most so many sets of streams take turns when clips are streamed; 1: all streams at every step
-    sensor_dropout: float  # share of streamed frames, never a clip's first, that come without any sensor data
-    num_workers: int  # loader processes per device
-    num_sweeps: int  # past sweeps of each radar
-    num_lidar_sweeps: int  # past sweeps of each LiDAR
-    lidar_origins: bool  # also where the ray of each LiDAR point began
-    deskew_lidar: bool  # move LiDAR points by what was driven between their own times and their sweep's
-    num_future_frames: int  # next key frames of the scene whose LiDAR comes along as supervision
-    min_distance_m: float  # nearer points are the truck itself
-    propagate_points: bool  # move points by their own radial velocity
-    on_bad_file: OnBadFile
-    test_resize_offset: float  # added to the image scale without augmentation
-    augmentation: AugmentationConfig | None
-
-    def __post_init__(self) -> None:
-        least_values = {
-            "batch_size": 1,
-            "groups_per_scene": 1,
-            "stream_sets": 1,
-            "num_workers": 0,
-            "num_sweeps": 1,
-            "num_lidar_sweeps": 1,
-            "num_future_frames": 0,
-            "min_distance_m": 0,
-        }
-        for name, least in least_values.items():
-            if not getattr(self, name) >= least:
-                raise ConfigError(f"data.{name}={getattr(self, name)}: must be at least {least}")
-        if not 0 <= self.sensor_dropout < 1:
-            raise ConfigError(f"data.sensor_dropout={self.sensor_dropout}: must be at least 0 and below 1")
-        if not -0.5 < self.test_resize_offset < 1:
-            raise ConfigError(f"data.test_resize_offset={self.test_resize_offset}: must lie between -0.5 and 1")
-
-    def reader_settings(
-        self,
-        sensors: Collection[str],  # of taxonomy.SENSORS: what is read
-        image_size_px: tuple[int, int] | None,  # (height, width); None for a model without images
-    ) -> ReaderSettings:
-        """How a frame is read. Raises ValueError for sensors that are none, or a camera without an image size."""
-        if not sensors or not set(sensors) <= set(SENSORS) or ("camera" in sensors and image_size_px is None):
-            raise ValueError(f"sensors must be some of {SENSORS}, a camera with its image size, but got {sensors}")
-        return ReaderSettings(
-            num_sweeps=self.num_sweeps if "radar" in sensors else 0,
-            num_lidar_sweeps=self.num_lidar_sweeps if "lidar" in sensors else 0,
-            lidar_origins=self.lidar_origins,
-            deskew_lidar=self.deskew_lidar,
-            num_future_frames=self.num_future_frames,
-            min_distance_m=self.min_distance_m,
-            propagate_points=self.propagate_points,
-            on_bad_file=self.on_bad_file,
-            image_size_px=image_size_px if "camera" in sensors else None,
-            test_resize_offset=self.test_resize_offset,
-        )
 
 
 class FrameDataset(Dataset[FrameBatch]):
     """Frames by key: its epoch and clip seed the augmentation, also in worker processes.
 
     A fault comes back as a value rather than an exception: a loader would wrap an exception of a worker into a
-    traceback and lose its message. `collate` passes it on and `FrameLoader` raises it.
+    traceback and lose its message. `frame_loader.collate` passes it on and `FrameLoader` raises it.
     """
 
     def __init__(
@@ -146,40 +77,6 @@ def drop_sensors(frame: FrameBatch, share: float, draw: tuple[int, ...]) -> Fram
     if frame.images is not None:
         changes |= {"images": torch.zeros_like(frame.images), "image_valid": torch.zeros_like(frame.image_valid)}
     return replace(frame, **changes)
-
-
-class FrameLoader(DataLoader):
-    """A loader whose workers' faults arrive as the errors they are."""
-
-    def __iter__(self) -> Iterator[FrameBatch]:
-        """Batches of the epoch; raises the first DataError met, or one for a worker that died."""
-        with dead_workers_named():
-            for batch in super().__iter__():
-                if isinstance(batch, HorizonError):
-                    raise batch
-                yield batch.unpack() if isinstance(batch, PackedBatch) else batch
-
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing: the place in an epoch follows from the trainer's step. Lightning warns of a loader without this."""
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Nothing to restore."""
-
-
-@contextmanager
-def dead_workers_named() -> Iterator[None]:
-    """Turn torch's RuntimeError for a killed worker into a DataError.
-
-    Torch raises it from a signal handler, so it can strike anywhere in a training step: wrap the whole fit as well.
-    """
-    try:
-        yield
-    except RuntimeError as error:
-        if "DataLoader worker" not in str(error):
-            raise
-        remedy = "the usual cause is too little memory: lower data.num_workers; the same command then resumes"
-        raise DataError(f"{str(error).splitlines()[0]}; {remedy}") from error
 
 
 class DetectionDataModule(L.LightningDataModule):
@@ -328,7 +225,7 @@ class DetectionDataModule(L.LightningDataModule):
             pin_memory=torch.cuda.is_available(),
             persistent_workers=workers > 0,
             prefetch_factor=4 if workers else None,
-            worker_init_fn=_init_worker,
+            worker_init_fn=init_worker,
         )
 
     def transfer_batch_to_device(self, batch: FrameBatch, device: torch.device, dataloader_idx: int) -> FrameBatch:
@@ -336,51 +233,7 @@ class DetectionDataModule(L.LightningDataModule):
         return batch.to(device, non_blocking=True)
 
 
-def collate(frames: list[FrameBatch | HorizonError]) -> FrameBatch | HorizonError:
-    """Batches of one into one batch; the first fault instead, if there is one."""
-    for frame in frames:
-        if isinstance(frame, HorizonError):
-            return frame
-    if len(frames) == 1:
-        return frames[0]
-    values: dict[str, Any] = {}
-    for field in fields(FrameBatch):
-        parts = [getattr(frame, field.name) for frame in frames]
-        if isinstance(parts[0], torch.Tensor):
-            # torch's own collate writes a worker's stack into shared memory at once.
-            stack = field.name == "images"
-            values[field.name] = default_collate([part[0] for part in parts]) if stack else torch.cat(parts)
-        elif isinstance(parts[0], list):
-            values[field.name] = [item for part in parts for item in part]
-    for sensor in ("radar", "lidar"):
-        clouds = [getattr(frame, f"{sensor}_points") for frame in frames]
-        if clouds[0] is not None:
-            counts = torch.tensor([len(cloud) for cloud in clouds])
-            values[f"{sensor}_batch"] = torch.repeat_interleave(torch.arange(len(frames)), counts)
-    values["future"] = tuple(collate(list(parts)) for parts in zip(*(frame.future for frame in frames), strict=True))
-    values["skipped"] = {
-        name: sum(frame.skipped.get(name, 0) for frame in frames) for frame in frames for name in frame.skipped
-    }
-    return FrameBatch(**values)
-
-
-def collate_in_worker(frames: list[FrameBatch | HorizonError]) -> PackedBatch | HorizonError:
-    """As `collate`, packed for the way to the training process."""
-    batch = collate(frames)
-    return batch if isinstance(batch, HorizonError) else PackedBatch.pack(batch)
-
-
 def _evenly_spread(samples: np.ndarray, count: int) -> np.ndarray:
     """Up to `count` different ones, each in the middle of an equal share."""
     picks = np.linspace(0, len(samples) - 1, 2 * count + 1)[1::2].round().astype(int)
     return samples[np.unique(picks)]
-
-
-def _init_worker(worker: int) -> None:
-    """One thread, since loader processes share the cores; and a delayed end on a signal to the whole process group.
-
-    The training process finishes its step on such a signal and needs their batches; it ends them itself afterwards.
-    """
-    torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda number, frame: signal.alarm(TERMINATION_GRACE_S))  # SIGALRM then ends it

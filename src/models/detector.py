@@ -18,6 +18,7 @@ class ModelConfig(Protocol):
     """What commands ask of every model's settings, whatever else these hold."""
 
     name: str
+    channels: int  # C, width of the map that the head reads
     temporal_part: ClassVar[str]
     """The key of all that is temporal; a phase of single frames sets it to null. Empty for a model without."""
     new_in_temporal_phase: ClassVar[str]
@@ -39,6 +40,13 @@ class ModelConfig(Protocol):
     @property
     def memory_max_age_s(self) -> float | None:
         """How far back the memory may lie; None for single frames."""
+
+    def scaled(
+        self, gaussians: float = 1.0, memory_frames: int | None = None, cells_per_frame: int | None = None
+    ) -> Self:
+        """The settings of a measurement: with so many times the Gaussians; with so many remembered frames (0: none,
+        None: as configured); with so many cells remembered of each, whatever fresh weights call occupied. What a model
+        does not have stays as it is."""
 
 
 class TemporalMemory(Protocol):
@@ -77,6 +85,8 @@ class Detector(nn.Module, ABC):
     benchmark_parts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """Parts worth looking into, beside the model's children: by name the methods, `ocsf.encoder.forward`, or functions,
     `package.module:function`, that each is; `part: inner` lies within `part`."""
+    latency_parts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    """The parts of Table 15 by the methods that each is; one within another counts for both."""
     prepared_bf16: bool | None = None
     """Whether `prepare_for_inference` made this copy for bfloat16 or for float32; None: as trained."""
 

@@ -11,5 +11,5 @@ Pinned to Lightning 2.6 (`pyproject.toml`): check these places before raising th
 - `processes`: Lightning starts ranks itself, inside `Trainer.fit`, and its DDP lets every forward broadcast buffers.
 
 Outside this room `training.fit` (KeyboardInterrupt arrives as SystemExit; validation with padded samples), `data.clips`
-(a rank without validation batches is left out) and `data.datamodule` (loaders need `state_dict`) do likewise.
+(a rank without validation batches is left out) and `data.frame_loader` (loaders need `state_dict`) do likewise.
 """

@@ -14,7 +14,7 @@ RANGES = ("0-25", "25-50", "50-100", "100-150")
 SPEEDS = ("0-0.5", "0.5-10", "10-25", "25+")
 PARTS = ("image_encoder", "radar_encoder", "kggi", "ocsf", "dptf", "detection_head", "total")
 """What a frame's latency is made of (Table 15)."""
-FURTHER_PARTS = ("gaussian_encoder", "view_transform", "temporal_fusion")
+FURTHER_PARTS = ("gaussian_encoder", "view_transform", "temporal_fusion", "lidar_encoder")
 """The encoder within `ocsf` (Table 14), and what only other methods have (Table 15)."""
 
 

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NotRequired, TypeVar
+from typing import Annotated, Any, NotRequired
 
 import yaml
 from pydantic import Field, with_config
@@ -27,7 +27,7 @@ FORMAT = 1
 RUN_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 MAX_POINTS = 200
 """Of a learning curve."""
-LARGEST_LOSS = 1e15
+LARGEST_POINT = 1e15
 """One beyond it is left out of a learning curve."""
 
 NOT_A_SETTING = ("seed", "scale", "phase")
@@ -38,7 +38,7 @@ LOCAL_PATH = re.compile(r"""["']*(/|~|\$|\.\./|file:|[A-Za-z]:[\\/])""")
 KEPT_OF_A_CLASS = ("AP", "AVE", "num_gt")
 """Within a range or a speed class; the run's metrics.json has the rest."""
 
-Point = TypeVar("Point")
+Point = tuple[int, float]  # step, value
 Share = Annotated[float, Field(ge=0, le=1 + 1e-12)]
 """From 0 to 1; a mean of ones may be 1.0000000000000002."""
 Score = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -264,7 +264,7 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
         "overrides": overrides,
         "config": without_local_paths(config),
         "metrics": scores,
-        "curves": _read_curves(run_folder / "metrics.csv"),
+        "curves": _curves_of(run_folder / "metrics.csv"),
         "latency": latency,
     }
     lines = (f"{json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
@@ -366,23 +366,38 @@ def _read_config(path: Path) -> dict[str, Any]:
     return content
 
 
-def _read_curves(path: Path) -> dict[str, list[list[float]]]:
-    """The losses and validation scores of metrics.csv, thinned out evenly to at most MAX_POINTS each."""
-    curves: dict[str, list[list[float]]] = {}
-    if not path.is_file():
-        return curves
+def _curves_of(path: Path) -> dict[str, list[Point]]:
     try:
-        with path.open(newline="") as file:
-            for row in csv.DictReader(file):
-                for name, value in row.items():
-                    if name and name.startswith(("loss/", "val/")) and value and abs(float(value)) <= LARGEST_LOSS:
-                        curves.setdefault(name, []).append([int(row["step"]), float(value)])
-    except (OSError, ValueError, TypeError, KeyError, csv.Error) as error:
+        return read_curves(path) if path.is_file() else {}
+    except (OSError, ValueError, TypeError, csv.Error) as error:
         raise DataError(f"{path}: not a run's learning curves ({type(error).__name__}: {error}); delete it") from error
-    return {name: thinned(points) for name, points in sorted(curves.items())}
 
 
-def thinned(points: list[Point]) -> list[Point]:
+def read_curves(path: Path, live: bool = False) -> dict[str, list[Point]]:
+    """The losses and validation scores of metrics.csv, thinned out evenly to at most MAX_POINTS each.
+
+    Of a run that still trains (`live`) also the loss by step; a line may be half written, and what is no number is left
+    out. Else it raises ValueError or TypeError.
+    """
+    columns = ("loss/", "val/", *(["step/total"] if live else []))
+    curves: dict[str, list[Point]] = {}
+    with path.open(newline="") as file:
+        for row in csv.DictReader(file):
+            for name, text in row.items():
+                if not (name and text and name.startswith(columns)):
+                    continue
+                try:
+                    step, value = int(row.get("step")), float(text)
+                except (ValueError, TypeError):
+                    if live:
+                        continue
+                    raise
+                if abs(step) <= LARGEST_POINT and abs(value) <= LARGEST_POINT:
+                    curves.setdefault(name, []).append((step, value))
+    return {name: _thinned(points) for name, points in sorted(curves.items())}
+
+
+def _thinned(points: list[Point]) -> list[Point]:
     """At most MAX_POINTS of them, evenly; the first and the last stay."""
     last = len(points) - 1
     if last < MAX_POINTS:

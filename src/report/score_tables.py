@@ -101,15 +101,14 @@ def class_table(experiments: list[Experiment]) -> str:
 
 def cost_table(experiments: list[Experiment], epochs: bool = False) -> str:
     """What the runs cost: of their own phase, the slowest run's time and the largest run's memory."""
-    text = f"| experiment | seeds |{' epochs |' if epochs else ''} parameters | time, s | peak memory, MiB |\n"
-    text += "|---" * (6 if epochs else 5) + "|"
+    titles = ["seeds", *(["epochs"] if epochs else []), "parameters", "time, s", "peak memory, MiB"]
+    cells = []
     for experiment in experiments:
         runs = experiment.runs
-        seeds = ", ".join(str(run.seed) for run in runs)
         slowest, largest = max(run.seconds["all"] for run in runs), max(run.peak_memory_mib["process"] for run in runs)
-        text += f"\n| {experiment.label} | {seeds} |" + (f" {runs[0].epochs} |" if epochs else "")
-        text += f" {runs[0].parameters / 1e6:.2f} M | {slowest:.0f} | {largest} |"
-    return text
+        row = [", ".join(str(run.seed) for run in runs), *([str(runs[0].epochs)] if epochs else [])]
+        cells.append([*row, f"{runs[0].parameters / 1e6:.2f} M", f"{slowest:.0f}", str(largest)])
+    return _markdown("experiment", titles, [experiment.label for experiment in experiments], cells)
 
 
 def gain_table(subject: Experiment, others: list[Experiment], columns: list[Metric]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from src.report.escaping import escape_latex, escape_markdown
@@ -13,7 +13,9 @@ from src.report.metric_names import Metric
 
 MISSING = "–"
 PAPER = "paper"
-"""State of a row that only the paper has."""
+"""State of a row that only the paper has, and its part of a column."""
+HERE, BASELINE = "here", "to baseline"
+"""The other parts of a column."""
 
 
 @dataclass
@@ -58,6 +60,17 @@ class TableCell:
     def difference_spread(self) -> float | None:
         """Standard deviation of the differences; None of fewer than two."""
         return _spread(self.differences)
+
+
+@dataclass(frozen=True)
+class ShownCell:
+    """One number of a row, as every form of the table shows it."""
+
+    part: str  # see SweepTable.parts
+    text: str
+    value: float | None  # sorting goes by it
+    best: bool = False
+    verdict: str = ""  # `better` or `worse` than the baseline at the digits shown
 
 
 @dataclass
@@ -117,7 +130,20 @@ class SweepTable:
     def parts(self, column: int) -> list[str]:
         """What stands under a metric's name: the paper's number and the difference where there are any."""
         parts = [PAPER] if self.has_paper(column) else []
-        return [*parts, "here", *(["to baseline"] if self.baselines else [])]
+        return [*parts, HERE, *([BASELINE] if self.baselines else [])]
+
+    def shown(self, row: SweepRow) -> Iterator[ShownCell]:
+        """The row's numbers, as many for each column as it has parts."""
+        for place, (column, cell) in enumerate(zip(self.columns, row.cells, strict=True)):
+            gain = rounded(cell.difference or 0.0, column) * (1 if column.higher_is_better else -1)
+            verdict = "better" if gain > 0 else "worse" if gain < 0 else ""
+            difference = ShownCell(BASELINE, format_difference(cell, column, row.done), cell.difference, False, verdict)
+            cells = {
+                PAPER: ShownCell(PAPER, format_paper(cell.paper, column), cell.paper, cell.paper_best),
+                HERE: ShownCell(HERE, format_here(cell, column, row.done), cell.mean, cell.best),
+                BASELINE: ShownCell(BASELINE, "baseline", 0.0) if row.is_baseline else difference,
+            }
+            yield from map(cells.__getitem__, self.parts(place))
 
     def to_markdown(self) -> str:
         """Title, table, caption, text."""
@@ -184,15 +210,7 @@ class SweepTable:
     def _line(self, row: SweepRow, escape: Callable[[str], str], bold: Callable[[str], str]) -> list[str]:
         """The row's cells, escaped."""
         line = [escape(row.label)]
-        for place, (column, cell) in enumerate(zip(self.columns, row.cells, strict=True)):
-            difference = "baseline" if row.is_baseline else format_difference(cell, column, row.done)
-            shown = {
-                PAPER: (format_paper(cell.paper, column), cell.paper_best),
-                "here": (format_here(cell, column, row.done), cell.best),
-                "to baseline": (difference, False),
-            }
-            for text, best in map(shown.__getitem__, self.parts(place)):
-                line.append(bold(escape(text)) if best else escape(text))
+        line += [bold(escape(cell.text)) if cell.best else escape(cell.text) for cell in self.shown(row)]
         seeds = f"{row.done}" if row.done == row.planned else f"{row.done} of {row.planned}"
         line.append(escape(MISSING if row.state == PAPER else seeds))
         line += [escape(" ".join(row.overrides))] if self.is_search else []

@@ -10,7 +10,8 @@ import lightning as L
 from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, TQDMProgressBar, WeightAveraging
 from lightning.pytorch.loggers.logger import Logger
 
-from src.data.datamodule import DetectionDataModule, dead_workers_named
+from src.data.datamodule import DetectionDataModule
+from src.data.frame_loader import dead_workers_named
 from src.errors import InterruptedRunError
 from src.reliability.checkpoints import BEST, LAST, AtomicCheckpointIO, OpenCheckpoint
 from src.reliability.interruption import Interruption

@@ -22,6 +22,13 @@ def outputs(tmp_path_factory):
     return tmp_path_factory.mktemp("outputs")
 
 
+@pytest.fixture
+def without_profiler(monkeypatch):
+    """Tables of operations have their own tests, and profiling takes as long as all else."""
+    for module in (model, training):
+        monkeypatch.setattr(module, "operation_table", lambda function, device: [{"operation": "none", "ms": 0.0}])
+
+
 @pytest.fixture(autouse=True)
 def in_a_hurry(monkeypatch):
     """Few rounds and a small roofline; what is measured stays the same. All operations are rows, not the longest."""
@@ -52,6 +59,7 @@ def column(rows, key, name):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_profiler")
 def test_model_with_a_full_memory(outputs, tmp_path):
     own = ["suite=model", "phase=phase2", "model.dptf.bev_path.memory_threshold=0"]
     result = measured("model_horizon3d_phase2_debug", outputs, tmp_path, *own)
@@ -71,6 +79,8 @@ def test_model_with_a_full_memory(outputs, tmp_path):
     assert result["batch_size"] == 1
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_profiler")
 @pytest.mark.parametrize(
     ("own", "absent"), [(["phase=phase1"], "dptf"), (["model.kggi=null", "model.ocsf=null"], "image_encoder")]
 )
@@ -82,6 +92,7 @@ def test_parts_that_a_model_lacks_are_left_out(outputs, tmp_path, own, absent):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_profiler")
 def test_model_of_the_dense_baseline(outputs, tmp_path):
     own = ["suite=model", "model=dense_bev", "phase=phase2"]
     result = measured("model_dense_bev_phase2_debug", outputs, tmp_path, *own)
@@ -90,8 +101,27 @@ def test_model_of_the_dense_baseline(outputs, tmp_path):
     assert result["state"]["remembered_frames"] == 2
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_profiler")
+def test_model_that_reads_lidar_alone(outputs, tmp_path):
+    own = ["suite=model", "model=centerpoint", "phase=phase1", "data.world.lidar=true", "data.world.lidar_step_deg=2.0"]
+    result = measured("model_centerpoint_phase1_debug", outputs, tmp_path, *own)
+    parts = column(result["time by part"], "part", "f+b ms")
+    assert {"lidar_encoder", "head"} < set(parts) and not any(part.startswith("radar") for part in parts)
+    assert result["lidar_points"] > 0 and "radar_points" not in result
+
+
+@pytest.mark.parametrize(("suite", "why"), [("scaling", "reads lidar"), ("ops", "radar backbone")])
+def test_a_suite_that_makes_no_sense_for_a_model_says_why(suite, why):
+    with pytest.raises(ConfigError, match=f"suite={suite} .*centerpoint|suite={suite} .*{why}"):
+        main([f"suite={suite}", "scale=debug", "model=centerpoint", "phase=phase1", "data.world.lidar=true"])
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
-def test_training(outputs, tmp_path, phase):
+def test_training(outputs, tmp_path, phase, request):
+    if phase == "phase2":
+        request.getfixturevalue("without_profiler")
     result = measured(f"training_horizon3d_{phase}_debug", outputs, tmp_path, "suite=training", f"phase={phase}")
     rows = column(result["training step"], "batches", "frames/s")
     assert list(rows) == ["with loader", "loaded"] and min(rows.values()) > 0
@@ -100,9 +130,11 @@ def test_training(outputs, tmp_path, phase):
         assert all(row[f"{stage} ms"] >= 0 for stage in stages)
         # Medians of three steps each: their sum is near the median of the sum.
         assert sum(row[f"{stage} ms"] for stage in stages) == pytest.approx(row["step ms"], rel=0.8)
-    assert "_TiledSparseConvBackward" in column(result["operations of a step"], "operation", "ms")
+    if phase == "phase1":
+        assert "_TiledSparseConvBackward" in column(result["operations of a step"], "operation", "ms")
 
 
+@pytest.mark.slow
 def test_ops(outputs, tmp_path, monkeypatch):
     monkeypatch.setattr(convolutions, "memory_of", lambda *_: (1.0, 2.0))  # its own test runs processes
     monkeypatch.setattr(convolutions, "DENSE_LIMIT_FLOPS", 1e9)

@@ -31,14 +31,16 @@ def latency_of(outputs, folder, monkeypatch, *own):
     return json.loads((folder / "latency.json").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("own", "parts"),
     [
         (["phase=phase2"], ALL_PARTS | {"dptf"}),
         (["phase=phase1"], ALL_PARTS),
         (["phase=phase1", "model.kggi=null", "model.ocsf=null"], {"radar_encoder", "detection_head", "total"}),
+        (["phase=phase1", "model=centerpoint", "data.world.lidar=true"], {"lidar_encoder", "detection_head", "total"}),
     ],
-    ids=["with memory", "single frames", "radar only"],
+    ids=["with memory", "single frames", "radar only", "LiDAR only"],
 )
 def test_latency_of_the_parts_makes_up_that_of_a_frame(outputs, tmp_path, monkeypatch, capsys, own, parts):
     result = latency_of(outputs, tmp_path, monkeypatch, *own)
@@ -80,6 +82,7 @@ class FakeDetector:
 
     def __init__(self, depth):
         self.device, self.model, self.depth = torch.device("cpu"), torch.nn.Module(), depth
+        self.model.latency_parts = {}
         self.seen, self.remembered = [], 0
 
     def run(self, frame):

@@ -6,7 +6,7 @@ import torch
 
 from src.benchmark.cases import CELLS_PER_VEHICLE
 from src.benchmark.scenes import ROADS, Highway, highway_frame, highway_points
-from src.benchmark.suite_scaling import NOMINAL_M, RANGES_M, Point, config_of, growth_rows, model_settings, sweeps_of
+from src.benchmark.suite_scaling import NOMINAL_M, RANGES_M, Point, configs_of, growth_rows, settings_at, sweeps_of
 from src.config import compose_config
 
 ROAD = Highway(background=400, num_vehicles=20, points_per_vehicle=10, reach_m=150.0)
@@ -36,8 +36,8 @@ def test_growth_is_from_the_nominal_range_and_else_from_the_first_point():
     assert (first["from"], first["to"]) == (150.0, 600.0)
     assert (first["horizon3d time x"], first["dense_bev time x"]) == (1.2, 16.0)
     assert (first["horizon3d memory x"], first["dense_bev memory x"]) == (1.2, 16.0)
-    assert (first["dense / ours at from"], first["dense / ours at to"]) == (5.0, 800.0 / 12.0)
-    assert first["GFLOP dense / ours at from"] == 1.5 * first["dense / ours at from"]
+    assert (first["dense_bev / horizon3d at from"], first["dense_bev / horizon3d at to"]) == (5.0, 800.0 / 12.0)
+    assert first["GFLOP dense_bev / horizon3d at from"] == 1.5 * first["dense_bev / horizon3d at from"]
     assert (second["from"], second["horizon3d time x"], second["dense_bev time x"]) == (0, 1.5, 1.0)
     assert "horizon3d memory x" not in second  # not known there
 
@@ -74,15 +74,16 @@ def test_only_the_ranges_reach_beyond_the_nominal_one():
 def test_a_point_changes_what_it_names():
     config, _ = compose_config(["scale=debug", "phase=phase2"])
     point = Point(1.0, NOMINAL_M, ROAD, gaussians=0.5, memory_frames=5)
-    settings = model_settings(config, point)
+    settings = settings_at(config, point)
     assert (settings.kggi.num_radar_keypoints, settings.kggi.num_camera_keypoints) == (16, 8)
     assert settings.dptf.bev_path.num_frames == 5 and settings.dptf.gaussian_path.num_frames == 2
     assert settings.dptf.bev_path.max_cells_per_frame == 20 * CELLS_PER_VEHICLE["debug"]
     twice_as_far = replace(point, road=replace(ROAD, reach_m=300.0))
-    assert model_settings(config, twice_as_far).dptf.bev_path.max_cells_per_frame == 40 * CELLS_PER_VEHICLE["debug"]
-    assert model_settings(config, replace(point, memory_frames=0)).dptf is None
+    assert settings_at(config, twice_as_far).dptf.bev_path.max_cells_per_frame == 40 * CELLS_PER_VEHICLE["debug"]
+    assert settings_at(config, replace(point, memory_frames=0)).dptf is None
     assert config.model.kggi.num_radar_keypoints == 32 and config.model.dptf.bev_path.num_frames == 2
 
-    dense = config_of(config, "dense_bev")
-    assert model_settings(dense, point).temporal.num_frames == 5 and dense.grid == config.grid
-    assert model_settings(dense, replace(point, memory_frames=0)).temporal is None
+    same, dense = configs_of(config).values()
+    assert same.model == config.model and dense.model.name == "dense_bev"
+    assert settings_at(dense, point).temporal.num_frames == 5 and dense.grid == config.grid
+    assert settings_at(dense, replace(point, memory_frames=0)).temporal is None

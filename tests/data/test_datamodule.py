@@ -15,7 +15,9 @@ import torch
 from src.data.augment import AugmentationConfig, BevAugmentationConfig, ImageAugmentationConfig
 from src.data.cache import load_index
 from src.data.clips import shuffled_frames
-from src.data.datamodule import DataConfig, DetectionDataModule, collate, dead_workers_named
+from src.data.data_config import DataConfig
+from src.data.datamodule import DetectionDataModule
+from src.data.frame_loader import collate, dead_workers_named
 from src.data.reader import OnBadFile
 from src.errors import ConfigError, DataError, HorizonError
 from src.structures.taxonomy import RADARS

@@ -7,7 +7,8 @@ from dataclasses import fields, replace
 import pytest
 from torch import Tensor
 
-from src.data.datamodule import collate, in_stream
+from src.data.datamodule import in_stream
+from src.data.frame_loader import collate
 from src.data.packed_batch import LARGE_BYTES, PackedBatch
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D

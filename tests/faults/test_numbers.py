@@ -16,7 +16,8 @@ import torch
 from src import replay, train
 from src.assembly import build_datamodule, build_module, data_root
 from src.config import compose_config, restore_config
-from src.data.datamodule import collate, in_stream
+from src.data.datamodule import in_stream
+from src.data.frame_loader import collate
 from src.errors import CheckpointError, ConfigError, DivergedError
 from src.models.detector import Objective
 from src.models.horizon3d.model import Horizon3D

@@ -15,7 +15,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from src.benchmark.suite_metric import random_problem
-from src.data.datamodule import collate, in_stream
+from src.data.datamodule import in_stream
+from src.data.frame_loader import collate
 from src.errors import InterruptedRunError
 from src.metrics.detection import score_detections
 from src.models.horizon3d.kggi import Initialization

@@ -6,7 +6,7 @@ import torch
 
 from src.assembly import build_datamodule, build_module, data_root
 from src.config import compose_config
-from src.data.datamodule import collate
+from src.data.frame_loader import collate
 from src.metrics.detection import score_detections
 from src.metrics.submission import to_global
 from src.structures.detections import DetectionTable, EvaluationSet

@@ -123,6 +123,7 @@ def test_scene_tags_are_known_to_the_devkit(devkit):
         assert set(scene["description"].split(";")) <= set(TAG_NAMES)
 
 
+@pytest.mark.slow
 def test_lidar_world_is_read_with_times_and_hits_boxes(make_config, tmp_path):
     from truckscenes.utils.data_classes import LidarPointCloud
 

@@ -65,6 +65,7 @@ def check(table, frames, slack):
     assert (table["radar"] + table["lidar"] == 0)[scored].mean() < 0.12
 
 
+@pytest.mark.slow
 def test_a_small_world_looks_like_the_real_frames(make_config, tmp_path, stored_world):
     config = make_config(
         num_train_scenes=6,
@@ -88,7 +89,7 @@ def default_world(default_values, tmp_path_factory, stored_world):
     return config, stored_world(write_world(config, tmp_path_factory.mktemp("default") / "w", progress=False))
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_ranges_of_the_default_world_are_those_of_the_real_sweep(default_world):
     if not REAL_SWEEP.is_file():
         pytest.skip(f"no real radar file at {REAL_SWEEP.name}")
@@ -102,7 +103,7 @@ def test_the_ranges_of_the_default_world_are_those_of_the_real_sweep(default_wor
     np.testing.assert_allclose(here, there, atol=25.0)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 def test_the_default_world_looks_like_the_real_frames_and_holds_every_class(default_world):
     config, world = default_world
     table = table_of(world)

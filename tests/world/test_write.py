@@ -123,6 +123,7 @@ def test_files_are_what_the_tables_say(world, config):
     assert on_disk == {row["filename"] for row in world["sample_data"]}
 
 
+@pytest.mark.slow
 def test_annotated_velocity_is_that_of_the_motion(world, config):
     for index in range(config.num_scenes):
         scene = make_scene(config, index)
@@ -186,6 +187,7 @@ def test_chassis_speed_reads_zero_now_and_then_while_the_cabin_moves(make_config
     assert 0 < np.mean(silent) < 0.8
 
 
+@pytest.mark.slow
 def test_same_bytes_with_one_and_two_workers(tmp_path, make_config):
     one = write_world(make_config(**TINY, num_workers=1), tmp_path / "one", progress=False)
     two = write_world(make_config(**TINY, num_workers=2), tmp_path / "two", progress=False)
@@ -197,6 +199,7 @@ def test_another_seed_is_another_world(make_config):
     assert world_digest(make_config()) != world_digest(make_config(seed=4))
 
 
+@pytest.mark.slow
 def test_ensure_reuses_the_same_world_and_refuses_another(tmp_path, make_config):
     config = make_config(**TINY)
     root = ensure_world(config, tmp_path / "w", progress=False)
@@ -225,6 +228,7 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch, make_config):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_killed_write_leaves_nothing_that_looks_complete(tmp_path, make_config):
     root = tmp_path / "w"
     child = multiprocessing.get_context("spawn").Process(
@@ -241,6 +245,7 @@ def test_a_killed_write_leaves_nothing_that_looks_complete(tmp_path, make_config
     assert ensure_world(make_config(**TINY), root, progress=False) == root
 
 
+@pytest.mark.slow
 def test_camera_sweeps_fill_the_time_between_key_frames(tmp_path, make_config, stored_world):
     values = TINY | {"num_val_scenes": 0, "camera_sweeps": True, "radar_sweeps_per_key_frame": 1}
     world = stored_world(write_world(make_config(**values), tmp_path / "w", progress=False))
@@ -249,6 +254,7 @@ def test_camera_sweeps_fill_the_time_between_key_frames(tmp_path, make_config, s
     np.testing.assert_allclose(np.diff([row["timestamp"] for row in rows]) * 1e-6, 0.1, atol=0.02)
 
 
+@pytest.mark.slow
 def test_lidar_sweeps_are_a_tenth_of_a_second_apart(make_config, stored_world, tmp_path):
     changes = {"num_train_scenes": 1, "num_val_scenes": 0, "key_frames_per_scene": 2, "radar_sweeps_per_key_frame": 1}
     config = make_config(**changes, lidar=True, lidar_sweeps_per_key_frame=5, lidar_step_deg=4.0)
@@ -271,6 +277,7 @@ def test_lidar_sweeps_are_a_tenth_of_a_second_apart(make_config, stored_world, t
     assert not any((keys.root / "sweeps").glob("LIDAR*")) and len(keys["sample"]) == 2
 
 
+@pytest.mark.slow
 def test_lidar_does_not_change_what_other_sensors_see(make_config, tmp_path):
     changes = {"num_train_scenes": 1, "num_val_scenes": 0, "key_frames_per_scene": 1, "radar_sweeps_per_key_frame": 1}
     with_lidar = write_world(make_config(**changes, lidar=True, lidar_step_deg=8.0), tmp_path / "a", progress=False)

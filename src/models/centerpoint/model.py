@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -75,6 +75,12 @@ class CenterPointConfig:
         """Single frames."""
         return None
 
+    def scaled(
+        self, gaussians: float = 1.0, memory_frames: int | None = None, cells_per_frame: int | None = None
+    ) -> Self:
+        """Neither Gaussians nor memory."""
+        return self
+
 
 @dataclass
 class CenterPointOutput:
@@ -91,6 +97,10 @@ class CenterPoint(Detector):
     """
 
     phase_options = BoxOptions
+    latency_parts = {
+        "lidar_encoder": ("lidar_encoder.forward",),
+        "detection_head": ("head.forward", "head.decode"),
+    }
 
     def __init__(
         self, config: CenterPointConfig, grid: BEVGrid, backbone: ImageEncoderConfig | None, options: BoxOptions

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -78,6 +78,14 @@ class DenseBEVConfig:
         """How far back the memory may lie; None for single frames."""
         return self.temporal.max_age_s if self.temporal is not None else None
 
+    def scaled(
+        self, gaussians: float = 1.0, memory_frames: int | None = None, cells_per_frame: int | None = None
+    ) -> Self:
+        """Remembered maps: there are no Gaussians, and every cell is remembered."""
+        if memory_frames is None or self.temporal is None:
+            return self
+        return replace(self, temporal=replace(self.temporal, num_frames=memory_frames) if memory_frames else None)
+
 
 @dataclass
 class DenseBEVOutput:
@@ -97,6 +105,14 @@ class DenseBEV(Detector):
     """
 
     phase_options = BoxOptions
+    latency_parts = {
+        "image_encoder": ("image_encoder.forward",),
+        "radar_encoder": ("radar_encoder.forward",),
+        "view_transform": ("view_transform.forward", "fuser.forward"),
+        # The way from the fused map to the head; where the paper books the decoder is not known.
+        "temporal_fusion": ("temporal.recall", "temporal.aggregate", "temporal.remember", "decoder.forward"),
+        "detection_head": ("head.forward", "head.decode"),
+    }
 
     def __init__(
         self,

@@ -42,6 +42,15 @@ class Horizon3D(Detector):
         "dptf: aggregate": ("dptf.aggregate",),
         "dptf: remember": ("dptf.remember",),
     }
+    latency_parts = {
+        "image_encoder": ("image_encoder.forward",),
+        "radar_encoder": ("radar_encoder.forward",),
+        "kggi": ("kggi.forward",),
+        "ocsf": ("ocsf.forward",),
+        "gaussian_encoder": ("ocsf.encoder.forward",),  # within ocsf (Table 14)
+        "dptf": ("dptf.recall", "dptf.aggregate", "dptf.remember"),
+        "detection_head": ("head.forward", "head.decode"),
+    }
 
     def __init__(
         self,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 from src.errors import ConfigError
 from src.models.backbones.sparse_voxel import RadarEncoderConfig
@@ -86,3 +87,23 @@ class Horizon3DConfig:
         path = self.dptf.gaussian_path if self.dptf is not None else None
         attention = path.self_attention if path is not None else None
         return attention.num_heads if attention is not None else None
+
+    def scaled(
+        self, gaussians: float = 1.0, memory_frames: int | None = None, cells_per_frame: int | None = None
+    ) -> Self:
+        """Keypoints of all kinds, frames of both paths (of Gaussians no more than configured) and their cells."""
+        settings = copy.deepcopy(self)
+        if settings.kggi is not None and gaussians != 1.0:
+            for key in ("num_radar_keypoints", "num_camera_keypoints", "num_random_keypoints"):
+                setattr(settings.kggi, key, max(1, round(gaussians * getattr(settings.kggi, key))))
+        if memory_frames == 0:
+            settings.dptf = None
+        cells = settings.dptf.bev_path if settings.dptf is not None else None
+        history = settings.dptf.gaussian_path if settings.dptf is not None else None
+        if cells is not None and memory_frames is not None:
+            cells.num_frames = memory_frames
+        if history is not None and memory_frames is not None:
+            history.num_frames = min(memory_frames, history.num_frames)
+        if cells is not None and cells_per_frame is not None:
+            cells.memory_threshold, cells.max_cells_per_frame = 0.0, cells_per_frame
+        return settings
