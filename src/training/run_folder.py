@@ -14,6 +14,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from src.errors import BusyError, CheckpointError, ConfigError, DataError
 from src.reliability.checkpoints import BEST, LAST, PREVIOUS, OpenCheckpoint, open_checkpoint, sync_folder
 
@@ -67,6 +69,14 @@ class RunFolder:
         make_writable(self.checkpoints, "paths.outputs")
         self._acquire()
         self._tidy()
+
+    def start_log(self, tree: dict[str, Any]) -> None:
+        """Write log.txt from here on, and the configuration into config.yaml."""
+        log = logging.FileHandler(self.log)
+        log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        logging.getLogger().addHandler(log)
+        self.config.write_text(yaml.safe_dump(tree, sort_keys=False))
+        logger.info("run %s in %s", self.run_id, self.path)
 
     def finish(self, record: dict[str, Any]) -> None:
         """Write run.json, by which the run counts as finished; checkpoints that only a resumption needs go."""
