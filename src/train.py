@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 import time
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import lightning as L
-import yaml
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
 from src.config import PHASES, Config, compose_config
@@ -54,7 +54,7 @@ def main(overrides: list[str]) -> None:
             train_source(source, config.phase.train_missing, processes_exist=False)
         launch("src.train", overrides, config.trainer.devices)
         return
-    with process_group(*config.trainer.processes):
+    with process_group(*config.trainer.processes), closing(folder):
         start = prepare(config, tree, folder, source)
         if start is not None:
             run(config, tree, folder, source, start, started, overrides)
@@ -96,7 +96,7 @@ def prepare(
             show_finished(folder)
             return None
         resume = folder.newest_checkpoint()
-        start_log(config, tree, folder)
+        folder.start_log(tree)
         return {"resume": resume and str(resume.path), "root": str(data_root(config))}
 
     decided = decided_by_main(decide)
@@ -105,15 +105,6 @@ def prepare(
     if decided["resume"] is not None:
         return StartingPoint(Path(decided["root"]), resume=resume or open_checkpoint(Path(decided["resume"])))
     return StartingPoint(Path(decided["root"]), weights=weights or (source and open_source(source)))
-
-
-def start_log(config: Config, tree: dict[str, Any], folder: RunFolder) -> None:
-    """Write log.txt from here on, and config.yaml."""
-    log = logging.FileHandler(folder.log)
-    log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    logging.getLogger().addHandler(log)
-    folder.config.write_text(yaml.safe_dump(tree, sort_keys=False))
-    logger.info("run %s in %s", folder.run_id, folder.path)
 
 
 def run(

@@ -21,36 +21,45 @@ FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(["src.train", "src.evaluate", "src.sweep.__main__", "tests.faults.killing"])
 
 
-def start(module, *overrides, out, err, env=None):
-    """Start `python -m src.<module>` at the root, the leader of a session of its own; output goes to two files."""
-    surroundings = dict(os.environ) | (env or {})
-    process = FORKS.Process(target=_run, args=(module, overrides, str(out), str(err), surroundings))
+def fork(function, *arguments, out, err, env=None):
+    """Start a function at the root, the leader of a session of its own; what it says goes to two files."""
+    process = FORKS.Process(target=_alone, args=(function, arguments, str(out), str(err), dict(env or os.environ)))
     process.start()
     return process
 
 
-def _run(module, overrides, out, err, surroundings):
+def _alone(function, arguments, out, err, env):
     os.setsid()
     os.chdir(ROOT)
     os.environ.clear()
-    os.environ.update(surroundings)
+    os.environ.update(env)
     for descriptor, path in ((1, out), (2, err)):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND), descriptor)
+    function(*arguments)
+
+
+def ended(function, *arguments, timeout=480, env=None):
+    """As `fork`, to its end; with its exit code and what it said."""
+    with tempfile.TemporaryDirectory() as folder:
+        out, err = Path(folder) / "out", Path(folder) / "err"
+        process = fork(function, *arguments, out=out, err=err, env=env)
+        process.join(timeout)
+        if process.is_alive():
+            process.kill()
+            process.join()
+        said = [path.read_text() if path.exists() else "" for path in (out, err)]
+    return subprocess.CompletedProcess(arguments, process.exitcode, *said)
+
+
+def run_module(module, *overrides):
+    """What `python -m src.<module>` does."""
     sys.argv = [f"src.{module}", *overrides]
     runpy.run_module(f"src.{module}", run_name="__main__", alter_sys=True)
 
 
 def command(module, *overrides, expect=0, timeout=480, env=None):
     """Run `python -m src.<module>` at the root; its output, once it has ended with the expected exit code."""
-    with tempfile.TemporaryDirectory() as folder:
-        out, err = Path(folder) / "out", Path(folder) / "err"
-        process = start(module, *overrides, out=out, err=err, env=env)
-        process.join(timeout)
-        if process.is_alive():
-            process.kill()
-            process.join()
-        said = [path.read_text() if path.exists() else "" for path in (out, err)]
-    result = subprocess.CompletedProcess([module, *overrides], process.exitcode, *said)
+    result = ended(run_module, module, *overrides, timeout=timeout, env=env)
     assert result.returncode == expect, result.stdout[-3000:] + result.stderr[-3000:]
     return result
 

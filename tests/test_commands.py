@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from tests.running import ROOT, call, command, start
+from tests.running import ROOT, call, command, fork, run_module
 
 pytestmark = pytest.mark.slow
 
@@ -93,7 +93,7 @@ def test_a_killed_run_resumes_and_ends_with_the_same_weights(trained, outputs, t
     arguments = (*changes, f"data.root={world}")
     call("train", *arguments, f"paths.outputs={whole}")
     said = tmp_path / "said"
-    process = start("train", *arguments, f"paths.outputs={killed}", out=said, err=said)
+    process = fork(run_module, "train", *arguments, f"paths.outputs={killed}", out=said, err=said)
     deadline = time.monotonic() + 400
     while not list(killed.glob("*/checkpoints/last.ckpt")):
         assert time.monotonic() < deadline and process.is_alive()

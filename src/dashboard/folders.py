@@ -10,7 +10,6 @@ import csv
 import os
 import re
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,14 +66,16 @@ class RunFolders:
 
     def names(self) -> list[str]:
         """Run ids with a folder, without those a restart moved aside."""
-        return [entry.name for entry in self._entries()]
+        if self.outputs is None:
+            return []
+        return sorted(name for name in os.listdir(self.outputs) if _is_run(name) and self._has_config(name))
 
     def find(self, run_id: str) -> Path | None:
         """The folder of a run that there is."""
         if self.outputs is None or not _is_run(run_id):
             return None
         folder = self.outputs / run_id
-        return folder if (folder / "config.yaml").is_file() and folder.resolve().parent == self.outputs else None
+        return folder if self._has_config(run_id) and folder.resolve().parent == self.outputs else None
 
     def pictures(self, run_id: str) -> list[Picture]:
         """Whole PNG files of a run, frames first; a file still being written is left out."""
@@ -150,6 +151,9 @@ class RunFolders:
         folder = self.find(run_id)
         return folder is not None and (folder / "metrics.json").is_file() and (folder / "run.json").is_file()
 
+    def _has_config(self, run_id: str) -> bool:
+        return (self.outputs / run_id / "config.yaml").is_file()
+
     def _inside(self, relative: str) -> Path | None:
         """A log file that lies inside outputs, whether or not it is there."""
         if self.outputs is None:
@@ -164,14 +168,6 @@ class RunFolders:
         folder = self.find(run_id)
         path = (folder / name).resolve() if folder is not None else None
         return path if path is not None and path.is_file() and path.is_relative_to(folder) else None
-
-    def _entries(self) -> Iterator[os.DirEntry]:
-        if self.outputs is None:
-            return
-        with os.scandir(self.outputs) as entries:
-            for entry in sorted(entries, key=lambda entry: entry.name):
-                if _is_run(entry.name) and os.path.isfile(os.path.join(entry.path, "config.yaml")):
-                    yield entry
 
 
 def _is_run(name: str) -> bool:

@@ -7,11 +7,11 @@ from urllib.parse import quote
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
+from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
 from starlette.routing import Route
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from src.dashboard.board import Board, BoardReader
 from src.dashboard.render import Page, Renderer, content_policy
@@ -78,24 +78,18 @@ def live_address(kind: str, name: str = "") -> str:
     return f"/{kind}/{quote(name, safe='')}"
 
 
-class _Headers:
+class _Headers(BaseHTTPMiddleware):
     """Tells browsers that pages load nothing from elsewhere and that no other site may use them."""
 
-    def __init__(self, app: ASGIApp) -> None:
-        self.app = app
-        policy = content_policy(live=True)
-        self.headers = [
-            (b"content-security-policy", policy.encode()),
-            (b"x-content-type-options", b"nosniff"),
-            (b"referrer-policy", b"no-referrer"),
-            (b"cross-origin-resource-policy", b"same-origin"),
-            (b"cache-control", b"no-cache"),
-        ]
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        async def with_headers(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                message["headers"] = [*message["headers"], *self.headers]
-            await send(message)
-
-        await self.app(scope, receive, with_headers if scope["type"] == "http" else send)
+    async def dispatch(self, request: Request, call_next: RequestResponseEndpoint) -> Response:
+        response = await call_next(request)
+        response.headers.update(
+            {
+                "content-security-policy": content_policy(live=True),
+                "x-content-type-options": "nosniff",
+                "referrer-policy": "no-referrer",
+                "cross-origin-resource-policy": "same-origin",
+                "cache-control": "no-cache",
+            }
+        )
+        return response

@@ -24,21 +24,31 @@ def is_done(folder: Path) -> bool:
 
 def read_headline(folder: Path) -> str:
     """Name of the task's main number in metrics.json; detection's where run.json does not say."""
-    try:
-        name = json.loads((folder / "run.json").read_text())["headline"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return "mAP"
+    name = _read(folder / "run.json", "headline")
     return name if isinstance(name, str) else "mAP"
 
 
 def read_score(folder: Path, metric: str) -> float | None:
     """One number of metrics.json by its dotted name, None where it is not there or not finite."""
+    return _number(_read(folder / "metrics.json", metric))
+
+
+def read_seconds(folder: Path) -> float | None:
+    """How long the run took, None where it does not say."""
+    seconds = _number(_read(folder / "run.json", "seconds.all"))
+    return seconds if seconds is not None and seconds >= 0 else None
+
+
+def _number(value: Any) -> float | None:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if is_number and abs(value) <= LARGEST else None
+
+
+def _read(path: Path, name: str) -> Any:
     try:
-        value = _find(json.loads((folder / "metrics.json").read_text()), metric)
+        return _find(json.loads(path.read_text()), name)
     except (OSError, ValueError, RecursionError):
         return None
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if number and abs(value) <= LARGEST else None
 
 
 def _find(node: Any, name: str) -> Any:
@@ -51,15 +61,6 @@ def _find(node: Any, name: str) -> Any:
         if name.startswith(f"{key}."):
             return _find(node[key], name.removeprefix(f"{key}."))
     return None
-
-
-def read_seconds(folder: Path) -> float | None:
-    """How long the run took, None where it does not say."""
-    try:
-        seconds = float(json.loads((folder / "run.json").read_text())["seconds"]["all"])
-    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
-        return None
-    return seconds if 0 <= seconds <= LARGEST else None
 
 
 def is_busy(folder: Path) -> bool:

@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import TypeVar
+from typing import Any, TextIO, TypeVar
 
 from optuna.trial import Trial
 
@@ -144,16 +144,19 @@ class Runner:
         """Take and train one run, or wait a little. False when no run is left for any worker."""
         with self.study.lock() as lock:
             self._log_dead(self.study.release_dead())
-            spec, settled = self._next(self.study.trials())
-            if spec is not None:
-                attrs = {"run_id": spec.run_id, "label": spec.label, "seed": spec.seed, "overrides": spec.overrides}
-                self.study.take(lock, lambda trial: self._train(spec, worker, trial), attrs=attrs, params={})
-        if spec is not None:
+            took, settled = self._take_next(lock, worker)
+        if took:
             self._logging_errors(self.writer.write)
-            return True
-        if not settled:
+        elif not settled:
             time.sleep(POLL_S)
-        return not settled
+        return took or not settled
+
+    def _take_next(self, lock: TextIO, worker: int) -> tuple[bool, bool]:
+        """Train the next run, whose taking releases the lock: (whether there was one, else whether all have ended)."""
+        spec, settled = self._next(self.study.trials())
+        if spec is not None:
+            self.study.take(lock, lambda trial: self._train(spec, worker, trial), attrs=attrs_of(spec), params={})
+        return spec is not None, settled
 
     def _next(self, trials: list[SweepTrial]) -> tuple[RunSpec | None, bool]:
         """(the next run to train, whether all are done or have failed); the lock is held."""
@@ -172,8 +175,7 @@ class Runner:
                 continue
             if spec.needs in failed:
                 reason = f"{spec.needs}, which it starts from, failed: {failed[spec.needs]}"
-                attrs = {"run_id": spec.run_id, "label": spec.label, "seed": spec.seed, "overrides": spec.overrides}
-                self.study.add_failed(attrs, reason)
+                self.study.add_failed(attrs_of(spec), reason)
                 failed[spec.run_id] = reason
                 continue
             settled = False
@@ -286,6 +288,11 @@ class Runner:
             threading.excepthook = hook
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+def attrs_of(spec: RunSpec) -> dict[str, Any]:
+    """What a trial says of its run."""
+    return {"run_id": spec.run_id, "label": spec.label, "seed": spec.seed, "overrides": spec.overrides}
 
 
 def name_of(spec: RunSpec) -> str:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
-import time
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import optuna
 from optuna.trial import Trial
@@ -17,7 +16,7 @@ from src.report.sweep_file import DimensionConfig
 from src.sweep.plan import Identify, RunSpec, join_overrides, run_specs_of, split_machine
 from src.sweep.record_writer import run_spec_from
 from src.sweep.run_status import read_score, read_validations
-from src.sweep.runner import POLL_S, Runner, name_of
+from src.sweep.runner import Runner, name_of
 from src.sweep.sweep_study import SweepStudy, SweepTrial, TrialEndedError, trials_begun
 
 logger = logging.getLogger(__name__)
@@ -46,28 +45,20 @@ class Search(Runner):
 
     # ---------------------------------------------------------------- a worker
 
-    def _step(self, worker: int) -> bool:
-        with self.study.lock() as lock:
-            self._log_dead(self.study.release_dead())
-            trials = self.study.trials()
-            resumed, new, settled = self._next_trial(trials)
-            if resumed is not None or new:
-                attrs = {} if resumed is None else {"retry_of": resumed.number, "first": _first(resumed)}
-                self.study.take(
-                    lock,
-                    lambda trial: self._try(trial, worker),
-                    choose=self._choose,
-                    attrs=attrs,
-                    params=resumed.params if resumed is not None else None,
-                    sampler=self._sampler(len(trials)),
-                    pruner=optuna.pruners.MedianPruner(n_startup_trials=STARTUP_TRIALS),
-                )
+    def _take_next(self, lock: TextIO, worker: int) -> tuple[bool, bool]:
+        trials = self.study.trials()
+        resumed, new, settled = self._next_trial(trials)
         if resumed is not None or new:
-            self._logging_errors(self.writer.write)
-            return True
-        if not settled:
-            time.sleep(POLL_S)
-        return not settled
+            self.study.take(
+                lock,
+                lambda trial: self._try(trial, worker),
+                choose=self._choose,
+                attrs={} if resumed is None else {"retry_of": resumed.number, "first": _first(resumed)},
+                params=resumed.params if resumed is not None else None,
+                sampler=self._sampler(len(trials)),
+                pruner=optuna.pruners.MedianPruner(n_startup_trials=STARTUP_TRIALS),
+            )
+        return resumed is not None or new, settled
 
     def _next_trial(self, trials: list[SweepTrial]) -> tuple[SweepTrial | None, bool, bool]:
         """(a trial to resume, whether to make a new one, whether all have ended); the lock is held."""

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import optuna
 from optuna.storages import RDBStorage
@@ -70,27 +70,13 @@ def trials_begun(trials: Iterable[SweepTrial]) -> int:
     return sum(trial.run_id is not None and "retry_of" not in trial.attrs for trial in trials)
 
 
-class Lock:
-    """A held file lock, which can be released before its `with` block ends."""
-
-    def __init__(self, file: Any) -> None:
-        self._file = file
-
-    def release(self) -> None:
-        """Release the lock; a second call does nothing."""
-        self._file.close()
-
-
 @contextmanager
-def file_lock(path: Path) -> Iterator[Lock]:
-    """Wait for the lock file and hold it; the system releases it when the process dies."""
+def file_lock(path: Path) -> Iterator[TextIO]:
+    """Wait for the lock file and hold it; closing the file, or the end of the process, releases it before the block."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    file = path.open("a")
-    try:
+    with path.open("a") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        yield Lock(file)
-    finally:
-        file.close()
+        yield file
 
 
 @contextmanager
@@ -204,7 +190,7 @@ class SweepStudy:
 
     def take(
         self,
-        lock: Lock,
+        lock: TextIO,
         work: Callable[[Trial], float],
         choose: Callable[[Trial], None] | None = None,
         attrs: dict[str, Any] | None = None,
@@ -237,7 +223,7 @@ class SweepStudy:
                     choose(trial)
                 trial.set_user_attr("worker", me)
             finally:
-                lock.release()
+                lock.close()
             try:
                 return work(trial)
             except (TrialEndedError, optuna.TrialPruned):

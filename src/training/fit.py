@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, TQDMProgressBar, WeightAveraging
+from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, WeightAveraging
 from lightning.pytorch.loggers.logger import Logger
 
 from src.data.datamodule import DetectionDataModule
@@ -19,6 +19,7 @@ from src.reliability.metrics_csv import MetricsCSV
 from src.reliability.processes import SharedBuffers, build_strategy
 from src.training.module import TrainingModule
 from src.training.phases import PhaseConfig
+from src.training.progress_bar import LossProgressBar
 from src.training.run_folder import RunFolder
 from src.training.trainer_config import TrainerConfig
 from src.training.wandb import WandbConfig, start_wandb
@@ -27,19 +28,6 @@ EXPECTED_WARNINGS = (
     ".*resuming from a checkpoint that ended before the epoch ended",  # the sampler knows its place by the step
     ".*recommended to use `self.log.*sync_dist=True",  # everything logged by epoch is the same on all ranks
 )
-
-
-class LossProgressBar(TQDMProgressBar):
-    """Lightning's bar with the loss terms by their bare names."""
-
-    def get_metrics(self, trainer: L.Trainer, module: L.LightningModule) -> dict[str, int | str | float]:
-        """Terms of the last step, three digits each."""
-        items = super().get_metrics(trainer, module)
-        items.pop("v_num", None)
-        return {
-            name.removeprefix("step/").removeprefix("val/"): f"{value:.3g}" if isinstance(value, float) else value
-            for name, value in items.items()
-        }
 
 
 def build_trainer(

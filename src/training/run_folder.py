@@ -14,6 +14,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from src.errors import BusyError, CheckpointError, ConfigError, DataError
 from src.reliability.checkpoints import BEST, LAST, PREVIOUS, OpenCheckpoint, open_checkpoint, sync_folder
 
@@ -62,16 +64,30 @@ class RunFolder:
             self._acquire()
             aside = self._aside()
             self.path.rename(aside)
-            self._release()
+            self.close()
             logger.info("moved the old run to %s", aside)
         make_writable(self.checkpoints, "paths.outputs")
         self._acquire()
         self._tidy()
 
+    def start_log(self, tree: dict[str, Any]) -> None:
+        """Write log.txt from here on, and the configuration into config.yaml."""
+        log = logging.FileHandler(self.log)
+        log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        logging.getLogger().addHandler(log)
+        self.config.write_text(yaml.safe_dump(tree, sort_keys=False))
+        logger.info("run %s in %s", self.run_id, self.path)
+
     def finish(self, record: dict[str, Any]) -> None:
         """Write run.json, by which the run counts as finished; checkpoints that only a resumption needs go."""
         write_json(self.record, record)
         self._tidy()
+
+    def close(self) -> None:
+        """Let other processes train here."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def check_held(self) -> None:
         """Whether this is the folder that was opened.
@@ -106,10 +122,6 @@ class RunFolder:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise BusyError(f"{self.path} is being trained by another process; wait for it or end it") from error
-
-    def _release(self) -> None:
-        self._lock.close()
-        self._lock = None
 
     @property
     def has_checkpoint(self) -> bool:

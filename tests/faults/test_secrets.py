@@ -9,24 +9,36 @@ from pathlib import Path
 
 import pytest
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+from tests.running import ROOT, command
+
 KEY = "5ecretke" * 5  # as long as W&B's are
 PASSWORD, OPTION = "pa55-w0rd-of-the-database", "an0ther-pa55-of-its-option"
 ADDRESS = f"storage=postgresql+psycopg://me:{PASSWORD}@127.0.0.1:9/sweeps?password={OPTION}"
 RADAR_ALONE = ["model.kggi=null", "model.ocsf=null", "scale=debug", "trainer=cpu", "data.num_workers=0"]
 
 
-def run(place, module, *words, expect):
-    """A command in surroundings full of secrets; returns all it said and every command line seen meanwhile."""
+def surroundings(place):
+    """Full of secrets."""
     known = {name: value for name, value in os.environ.items() if not name.startswith("WANDB_")}
     secrets = {"WANDB_API_KEY": KEY, "PGPASSWORD": f"{PASSWORD}-of-libpq", "HORIZON3D_SECRET": KEY[::-1]}
-    command = [sys.executable, "-m", f"src.{module}", *words]
-    command += [f"paths.outputs={place / 'outputs'}", f"paths.reports={place / 'reports'}"]
+    return known | secrets | {"HOME": str(place / "home"), "OMP_NUM_THREADS": "1"}
+
+
+def folders(place):
+    return f"paths.outputs={place / 'outputs'}", f"paths.reports={place / 'reports'}"
+
+
+def run(place, module, *words, expect):
+    """What a command says."""
+    result = command(module, *words, *folders(place), expect=expect, env=surroundings(place))
+    return (result.stdout + result.stderr).encode()
+
+
+def run_watched(place, module, *words, expect):
+    """What a command says, started by a shell's own line, and every command line seen meanwhile."""
+    line = [sys.executable, "-m", f"src.{module}", *words, *folders(place)]
     with (place / "said").open("w+b") as said:
-        process = subprocess.Popen(
-            command, cwd=REPOSITORY, stdout=said, stderr=subprocess.STDOUT,
-            env=known | secrets | {"HOME": str(place / "home"), "OMP_NUM_THREADS": "1"},
-        )  # fmt: skip
+        process = subprocess.Popen(line, cwd=ROOT, stdout=said, stderr=subprocess.STDOUT, env=surroundings(place))
         lines = set()
         while process.poll() is None:
             lines |= command_lines(process.pid)
@@ -70,9 +82,9 @@ def test_nothing_that_commands_write_or_say_holds_a_secret(tmp_path):
     """A training with W&B, its results, pages and the exported dashboard."""
     pytest.importorskip("wandb")
     wandb = ["logger=wandb", "logger.wandb.offline=true"]
-    text, lines = run(tmp_path, "train", "phase=phase1", *RADAR_ALONE, *wandb, expect=0)
-    text += run(tmp_path, "report", "scale=debug", expect=0)[0]
-    text += run(tmp_path, "dashboard", f"export={tmp_path / 'dashboard.html'}", expect=0)[0]
+    text, lines = run_watched(tmp_path, "train", "phase=phase1", *RADAR_ALONE, *wandb, expect=0)
+    text += run(tmp_path, "report", "scale=debug", expect=0)
+    text += run(tmp_path, "dashboard", f"export={tmp_path / 'dashboard.html'}", expect=0)
     assert_no_secret("what was said", text)
     assert_no_secret("a command line", b"\n".join(lines))
     names = {path.name for path in assert_nothing_written(tmp_path)}
@@ -84,16 +96,18 @@ def test_nothing_that_commands_write_or_say_holds_a_secret(tmp_path):
 def test_the_password_of_a_database_is_neither_shown_nor_written(tmp_path):
     """A plan, a server that cannot be reached, and a command that takes no address."""
     pytest.importorskip("psycopg")
-    lines = set()
-    for module, words, expect, said in (
-        ("sweep", ["+sweep=epsilon", "dry_run=true", ADDRESS], 0, "5 results"),
-        ("sweep", ["+sweep=epsilon", ADDRESS], 3, "cannot be used"),
-        ("train", ["phase=phase1", ADDRESS], 3, "looks like a password"),
+    plan = ["+sweep=epsilon", "dry_run=true", ADDRESS]
+    text, seen = run_watched(tmp_path, "sweep", *plan, *RADAR_ALONE, expect=0)
+    assert "5 results" in text.decode()
+    assert_no_secret("the plan", text)
+    lines = {line for line in seen if b"src.sweep" in line}
+    for module, words, said in (
+        ("sweep", ["+sweep=epsilon", ADDRESS], "cannot be used"),
+        ("train", ["phase=phase1", ADDRESS], "looks like a password"),
     ):
-        text, seen = run(tmp_path, module, *words, *RADAR_ALONE, expect=expect)
+        text = run(tmp_path, module, *words, *RADAR_ALONE, expect=3)
         assert said in text.decode()
-        assert_no_secret(" ".join(words[:2]), text)
-        lines |= {line for line in seen if b"src.sweep" in line}
+        assert_no_secret(module, text)
     assert_nothing_written(tmp_path)
     # The command line says it until Python has loaded what it needs to hide it; then stars.
     assert not lines or any(b"storage=" in line and PASSWORD.encode() not in line for line in lines)

@@ -60,7 +60,7 @@ def train(path, *, fault=None, at_step=None, at_validation=None, ema=None, valid
         fit(trainer, module, data, resume_from)
     finally:
         if is_main_process():
-            folder._release()
+            folder.close()
     return result(folder, module), module
 
 

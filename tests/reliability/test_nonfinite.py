@@ -84,7 +84,7 @@ def train(path, fault=None, bad_steps=(BAD_STEP,), skip=True, stop_after=None, e
         return module, folder, error
     finally:
         if is_main_process():
-            folder._release()
+            folder.close()
     return module, folder, None
 
 

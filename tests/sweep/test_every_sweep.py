@@ -14,7 +14,7 @@ from src.sweep.compose import sweep_files
 ROOT = Path(__file__).resolve().parents[2]
 PARTS_OF_SOME = ("kggi", "ocsf", "gaussian_encoder", "dptf", "view_transform", "temporal_fusion")
 """Of Table 15: not every model has each of them."""
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.exhaustive]  # test_sweep.py trains one with every other suite
 
 
 @pytest.fixture(scope="module")
@@ -23,9 +23,7 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("sweeps")
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "epsilon" else pytest.param(name, marks=pytest.mark.exhaustive) for name in sweep_files()]
-)
+@pytest.mark.parametrize("name", sweep_files())
 def test_a_sweep_ends_with_complete_tables(name, folder):
     reports = folder / "reports"
     places = (f"paths.outputs={folder / 'outputs'}", f"paths.reports={reports}", "trainer.num_pictures=0")

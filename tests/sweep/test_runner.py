@@ -19,6 +19,7 @@ from src.sweep.launcher import ExitStatus
 from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep
 from tests.sweep.fake_train import identify
 
+pytestmark = pytest.mark.slow
 TWELVE = {f"{i}": [f"model.x={i}"] for i in range(12)}
 
 
@@ -219,7 +220,6 @@ def test_a_run_that_someone_else_trains_is_waited_for(tmp_path):
     assert trained(tmp_path, "begin") == {other: 1}
 
 
-@pytest.mark.slow
 def test_several_runners_at_once_train_every_run_once(tmp_path):
     runners = [start(tmp_path, rows=TWELVE, barrier=True, workers=2) for _ in range(3)]
     for runner in runners:
@@ -233,7 +233,6 @@ def test_several_runners_at_once_train_every_run_once(tmp_path):
     assert record_of(tmp_path).count("done") == 12
 
 
-@pytest.mark.slow
 def test_two_workers_killed_at_random_times_finish_every_row_once(tmp_path):
     rng = random.Random(5)
     what = {"rows": TWELVE, "sweep": {"overrides": ["fake.seconds=0.4"]}}
@@ -252,7 +251,6 @@ def test_two_workers_killed_at_random_times_finish_every_row_once(tmp_path):
     assert record.count("done") == 12 and len(record.runs) == 12
 
 
-@pytest.mark.slow
 def test_children_of_a_killed_runner_end_and_the_same_command_goes_on_at_once(tmp_path):
     what = {"rows": {"a": ["model.x=1"]}, "sweep": {"overrides": ["fake.seconds=30"]}}
     runner = start(tmp_path, **what)
@@ -270,7 +268,6 @@ def test_children_of_a_killed_runner_end_and_the_same_command_goes_on_at_once(tm
     assert "is gone" in again.communicate()[1]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_sweep_lets_runs_write_checkpoints_and_goes_on(tmp_path, number):
     what = {"rows": {"a": ["model.x=1"], "b": ["model.x=2"]}, "workers": 2}

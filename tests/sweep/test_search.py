@@ -11,6 +11,7 @@ from src.sweep.search import _PruningWatch
 from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep
 from tests.sweep.test_runner import fault, finish, record_of, start, trained, wait_for
 
+pytestmark = pytest.mark.slow
 SPACE = {"fake.score": {"low": 0.1, "high": 0.9}, "model.x": {"choices": [1, 2, None]}}
 
 
@@ -45,7 +46,6 @@ def test_choices_are_repeatable(tmp_path):
     assert runs[0] == runs[1] and len(runs[0]) == 3
 
 
-@pytest.mark.slow
 def test_trials_that_promise_little_are_pruned(tmp_path):
     search(
         tmp_path, 5, {"fake.score": {"low": 0.8, "high": 0.9}}, overrides=["fake.epochs=4", "fake.seconds=0.1"]
@@ -99,7 +99,6 @@ def test_a_database_that_is_away_for_a_moment_ends_no_run(tmp_path):
     assert watch() is True and watch.pruned  # nothing has changed since; what was said stays said
 
 
-@pytest.mark.slow
 def test_a_killed_search_goes_on_with_the_same_values(tmp_path):
     what = {"space": SPACE, "sweep": {"objective": "NDS", "trials": 2, "overrides": ["fake.seconds=1"]}}
     runner = start(tmp_path, **what)
@@ -130,7 +129,6 @@ def test_values_that_do_not_compose_are_failed_trials(tmp_path):
     assert all("not a configuration key" in run.reason for run in record.runs.values())
 
 
-@pytest.mark.slow
 def test_two_searching_processes_share_the_trials(tmp_path):
     what = {"folder": str(tmp_path), "space": SPACE, "sweep": {"objective": "NDS", "trials": 6}}
     command = [sys.executable, "-m", "tests.sweep.fake_sweep", json.dumps(what)]

@@ -311,7 +311,7 @@ def train_single(path, world_size, stop_at=None):
         assert stop_at is not None and trainer.global_step == stop_at + 1
     finally:
         if is_main_process():
-            folder._release()
+            folder.close()
     return module.evaluator.scores and module.evaluator.as_dict()
 
 

@@ -32,7 +32,7 @@ from src.training import handoff
 from src.training.handoff import find_source, hand_over, train_source
 from src.training.identity import run_identity
 from src.training.run_folder import RunFolder
-from tests.running import call, start
+from tests.running import call, fork, run_module
 from tests.untrained import write_checkpoint
 
 ADDED = re.compile(Horizon3DConfig.new_in_temporal_phase)
@@ -488,7 +488,7 @@ def test_an_interrupted_phase_1_ends_the_command_resumably(handed_over, tmp_path
     log = tmp_path / identity("phase=phase1") / "log.txt"
     said = tmp_path / "said"
     arguments = ("phase=phase2", "scale=debug", f"paths.outputs={tmp_path}", f"data.root={world}")
-    process = start("train", *arguments, out=said, err=said)
+    process = fork(run_module, "train", *arguments, out=said, err=said)
     deadline = time.monotonic() + 300
     while not log.is_file():
         assert time.monotonic() < deadline and process.is_alive()

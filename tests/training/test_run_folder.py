@@ -18,7 +18,7 @@ def test_a_new_run_is_unfinished_and_a_finished_one_is_kept(tmp_path):
     folder.open(Resume.auto)
     assert not folder.finished and folder.newest_checkpoint() is None
     finish(folder)
-    folder._release()
+    folder.close()
     again = RunFolder(tmp_path, "run")
     again.open(Resume.auto)
     assert again.finished and again.read_result() == ({"commit": "abc"}, {"mAP": 0.5})
@@ -28,7 +28,7 @@ def test_never_refuses_and_restart_moves_the_old_folder_aside(tmp_path):
     folder = RunFolder(tmp_path, "run")
     folder.open(Resume.auto)
     finish(folder)
-    folder._release()
+    folder.close()
     with pytest.raises(ConfigError, match="resume=never"):
         RunFolder(tmp_path, "run").open(Resume.never)
     fresh = RunFolder(tmp_path, "run")
@@ -116,7 +116,7 @@ def test_what_a_killed_process_was_writing_goes_and_so_does_what_only_resuming_n
         "../metrics.csv.tmp",
     ):
         (folder.checkpoints / name).write_bytes(b"half")
-    folder._release()
+    folder.close()
     again = RunFolder(tmp_path, "run")
     again.open(Resume.auto)
     assert {path.name for path in folder.checkpoints.iterdir()} == {"last.ckpt", "previous.ckpt", "best.ckpt"}
@@ -132,7 +132,7 @@ def test_a_clock_that_says_the_same_time_again_costs_no_old_folder(tmp_path, mon
         folder = RunFolder(tmp_path, "run")
         folder.open(Resume.restart)
         folder.log.write_text(str(number))
-        folder._release()
+        folder.close()
     assert {path.name: (path / "log.txt").read_text() for path in tmp_path.iterdir()} == {
         "run.before-19700101-000000": "0",
         "run.before-19700101-000000-2": "1",

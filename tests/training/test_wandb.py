@@ -4,9 +4,9 @@ import json
 import logging
 import os
 import signal
-import subprocess
 import sys
 import types
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,6 +19,7 @@ from src.training.fit import build_loggers
 from src.training.identity import run_identity
 from src.training.run_folder import RunFolder
 from src.training.wandb import WandbConfig, start_wandb
+from tests.running import command, ended
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 TREE = {"phase": {"name": "phase1"}, "scale": "debug", "seed": 3}
@@ -195,24 +196,19 @@ def test_labels_of_rows_can_be_typed():
 
 # ---------------------------------------------------------------- the real package
 
-SCRIPT = """
-import json, os, signal, sys
-from pathlib import Path
-from src.training import wandb as ours
-from src.training.run_folder import RunFolder
 
-ours.INIT_LIMIT_S = 3.0
-folder = RunFolder(Path(sys.argv[1]), "run-0")
-folder.pictures.mkdir(parents=True, exist_ok=True)
-given = json.loads(sys.argv[2])
-config = ours.WandbConfig(project="p", offline=given["offline"], group="g", row="r")
-run = ours.start_wandb(config, folder, {"phase": {"name": "phase1"}, "scale": "debug", "seed": 0}, given["earlier"])
-for step in given["steps"]:
-    run.log_metrics({"loss/total": step / 2}, step)
-if given["killed"]:
-    os.kill(os.getpid(), signal.SIGKILL)
-print(run.finish(given["scores"], folder.pictures))
-"""
+def real_run(outputs, *, offline, earlier, steps, killed):
+    """A run of W&B with these steps; prints how it may be sent."""
+    ours.INIT_LIMIT_S = 3.0
+    folder = RunFolder(outputs, "run-0")
+    folder.pictures.mkdir(parents=True, exist_ok=True)
+    config = ours.WandbConfig(project="p", offline=offline, group="g", row="r")
+    run = ours.start_wandb(config, folder, {"phase": {"name": "phase1"}, "scale": "debug", "seed": 0}, earlier)
+    for step in steps:
+        run.log_metrics({"loss/total": step / 2}, step)
+    if killed:
+        os.kill(os.getpid(), signal.SIGKILL)
+    print(run.finish(SCORES, folder.pictures))
 
 
 def apart(tmp_path):
@@ -222,10 +218,8 @@ def apart(tmp_path):
 
 
 def start_real(tmp_path, environment=(), *, offline=True, earlier=(), steps=(), killed=False):
-    given = {"offline": offline, "earlier": list(earlier), "steps": list(steps), "killed": killed, "scores": SCORES}
-    command = [sys.executable, "-c", SCRIPT, str(tmp_path / "outputs"), json.dumps(given)]
-    surroundings = apart(tmp_path) | dict(environment)
-    return subprocess.run(command, capture_output=True, text=True, timeout=180, env=surroundings, cwd=REPOSITORY)
+    work = partial(real_run, tmp_path / "outputs", offline=offline, earlier=earlier, steps=steps, killed=killed)
+    return ended(work, timeout=180, env=apart(tmp_path) | dict(environment))
 
 
 def history_of(path):
@@ -282,14 +276,14 @@ def test_a_training_with_wandb_leaves_the_same_run_and_nothing_elsewhere(tmp_pat
     """The command itself, radar alone: one training, its W&B run below the run's folder, the command to send it."""
     pytest.importorskip("wandb")
     before = {path for path in REPOSITORY.rglob("*wandb*") if ".venv" not in path.parts and ".git" not in path.parts}
-    command = [sys.executable, "-m", "src.train", "scale=debug", "phase=phase1", "model.kggi=null", "model.ocsf=null"]
-    command += [f"paths.outputs={tmp_path}", "trainer=cpu", "logger=wandb", "logger.wandb.row=radar only"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=apart(tmp_path), cwd=REPOSITORY)
-    assert done.returncode == 0, done.stderr
+    overrides = ["scale=debug", "phase=phase1", "model.kggi=null", "model.ocsf=null", f"paths.outputs={tmp_path}"]
+    done = command(
+        *("train", *overrides, "trainer=cpu", "logger=wandb", "logger.wandb.row=radar only"), env=apart(tmp_path)
+    )
     (record,) = tmp_path.glob("horizon3d-*/run.json")
     (offline,) = (record.parent / "wandb").glob("offline-run-*")
     assert done.stdout.strip().splitlines()[-1] == f"W&B: wandb sync {offline}"
-    _, tree = compose_config(command[3:-3])
+    _, tree = compose_config(overrides)
     assert record.parent.name == run_identity(tree)  # as without a logger
     rows = history_of(next(offline.glob("*.wandb")))
     logged = set().union(*rows.values())
