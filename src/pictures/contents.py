@@ -138,11 +138,6 @@ class PictureGaussians(Rows):
     opacities: Array  # [G] in 0..1
     sources: Array  # [G] integer, index into SOURCES
 
-    @classmethod
-    def empty(cls) -> PictureGaussians:
-        """No Gaussian at all."""
-        return cls(*(np.zeros((0, 2)),) * 3, *(np.zeros(0),) * 2)
-
     def outlines(self, corners: int = 24) -> Array:
         """The one-sigma ellipses as polygons [G, corners, 2] m."""
         turn = np.linspace(0, 2 * np.pi, corners, endpoint=False)
@@ -156,34 +151,29 @@ class PictureGaussians(Rows):
 class PictureMemory(Rows):
     """n things remembered from past key frames, in today's ego metres: BEV cells, or Gaussians where given."""
 
-    moved: Array  # [n, 2] m, carried along by the ego motion and by their own velocity (Eq. 8)
+    xy: Array  # [n, 2] m, where the model read them
     velocities: Array  # [n, 2] m/s over ground, today's axes
     elapsed_s: Array  # [n] s since each was seen
-    gaussians: PictureGaussians | None = None  # n, their shapes; means as in `moved`
+    gaussians: PictureGaussians | None = None  # n, their shapes; means as in `xy`
     compensated: bool = True  # whether the model read them at `moved`, or at `stayed`
 
-    @classmethod
-    def read_at(
-        cls,
-        xy: Array,  # [n, 2] m, where the model read them
-        velocities: Array,  # [n, 2] m/s over ground
-        elapsed_s: Array,  # [n] s
-        compensated: bool,  # whether `xy` already holds the travel by `velocities`
-        gaussians: PictureGaussians | None = None,
-    ) -> PictureMemory:
-        """A memory as the model saw it, with or without velocity compensation."""
-        travel = np.asarray(velocities) * np.asarray(elapsed_s)[:, None]
-        moved = xy if compensated else xy + travel
-        return cls(moved, velocities, elapsed_s, gaussians, compensated)
+    @property
+    def moved(self) -> Array:
+        """Where they lie carried along by the ego motion and by their own velocity [n, 2] m (Eq. 8)."""
+        return self.xy if self.compensated else self.xy + self._travel
 
     @property
     def stayed(self) -> Array:
         """Where they would lie by the ego motion alone [n, 2] m: exact, as velocities hold over ground."""
-        return self.moved - self.velocities * self.elapsed_s[:, None]
+        return self.xy - self._travel if self.compensated else self.xy
+
+    @property
+    def _travel(self) -> Array:
+        return self.velocities * self.elapsed_s[:, None]
 
     def drawable(self) -> PictureMemory:
         """The finite ones, oldest first, so that the freshest come out on top."""
-        finite = np.isfinite(np.c_[self.moved, self.velocities, self.elapsed_s]).all(axis=1)
+        finite = np.isfinite(np.c_[self.xy, self.velocities, self.elapsed_s]).all(axis=1)
         if self.gaussians is not None:
             shapes = (self.gaussians.scales, self.gaussians.directions, self.gaussians.opacities)
             finite &= np.isfinite(np.column_stack(shapes)).all(axis=1)

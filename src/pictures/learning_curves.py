@@ -29,7 +29,6 @@ def read_metrics(
 ) -> Series:
     """Columns of a CSV log with an `epoch` column, averaged within each epoch; blank or non-finite values are left out.
 
-    Where a value was logged both by step and by epoch (`x_step`, `x_epoch`), the epoch's stands as `x`.
     Raises DataError when the file has no `epoch` column or holds something else than numbers.
     """
     path = Path(path)
@@ -51,15 +50,10 @@ def read_metrics(
         for name, value in numbers.items():
             if name != "step" and abs(value) <= LARGEST:
                 values.setdefault(name, {}).setdefault(int(epoch), []).append(value)
-    series = {
+    return {
         name: (np.array(sorted(by_epoch)), np.array([np.mean(by_epoch[epoch]) for epoch in sorted(by_epoch)]))
         for name, by_epoch in values.items()
     }
-    for name in [name for name in series if name.endswith("_epoch")]:
-        base = name.removesuffix("_epoch")
-        series[base] = series.pop(name)
-        series.pop(f"{base}_step", None)
-    return series
 
 
 def style_axes(axes: Axes, title: str) -> None:

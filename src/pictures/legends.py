@@ -37,9 +37,13 @@ def reading_keys(missed: bool) -> list[Artist]:
         ring = Line2D([], [], linestyle="none", marker="o", markersize=11, mfc="none", mec=MISSED_COLOUR)
         ring.set_label("missed")
         keys.append(ring)
-    arrow = Line2D([], [], linestyle="none", marker=r"$\longrightarrow$", markersize=20, color=INK)
-    arrow.set_label(f"travel in {ARROW_S:g} s")
-    return [*keys, arrow]
+    return [*keys, arrow_key("travel", INK)]
+
+
+def arrow_key(what: str, colour: str) -> Artist:
+    """Legend key of arrows."""
+    arrow = {"linestyle": "none", "marker": r"$\longrightarrow$", "markersize": 20}
+    return Line2D([], [], color=colour, label=f"{what} in {ARROW_S:g} s", **arrow)
 
 
 def radar_keys() -> list[Artist]:

@@ -13,9 +13,10 @@ from matplotlib.colors import LinearSegmentedColormap, PowerNorm, to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from src.pictures.bev import ARROW_S, bev_panel, paint_arrows, paint_label, upright
+from src.pictures.bev import bev_panel, paint_arrows, paint_label, upright
 from src.pictures.canvas import DPI, GAP_PX, MARGIN_PX, SHEET_PX, Canvas
 from src.pictures.contents import INK, MOVING_MPS, MUTED, PictureBoxes, PictureGrid, PictureMemory, Window
+from src.pictures.legends import arrow_key
 
 Array = np.ndarray
 
@@ -228,13 +229,12 @@ def paint_header(canvas: Canvas, scene: MemoryScene, ages: AgeScale, title: str)
     for name, memory in scene.paths():
         parts.append(hits_line(name, memory, moving) if truth else f"{name}: {len(memory)}")
     canvas.text(MARGIN_PX, 40, "   ·   ".join(parts), 15)
-    arrow = {"linestyle": "none", "marker": r"$\longrightarrow$", "markersize": 20}
     face = to_rgba(TRUTH_COLOUR, 0.22)
     keys: list[Artist] = [
         Patch(facecolor=face, edgecolor=TRUTH_COLOUR, linewidth=1.8, label="moving ground truth"),
         Line2D([], [], color=STANDING_COLOUR, linewidth=1.0, linestyle=(0, (2.6, 1.6)), label="standing ground truth"),
-        Line2D([], [], color=TRUTH_COLOUR, label=f"true travel in {ARROW_S:g} s", **arrow),
-        Line2D([], [], color=INK, label=f"predicted travel in {ARROW_S:g} s", **arrow),
+        arrow_key("true travel", TRUTH_COLOUR),
+        arrow_key("predicted travel", INK),
     ]
     canvas.legend(MARGIN_PX, 66, keys)
     canvas.text(890, 66, "age" if ages.ages_s else "", 13, bold=True)

@@ -5,7 +5,8 @@ Results of the runs under paths.outputs, a page per phase, the tables of every s
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from src.config import PHASES, Config, compose_config
@@ -25,7 +26,7 @@ from src.report.pages import (
 )
 from src.report.results import RunResult, finished_runs, publish_result, read_results
 from src.report.score_tables import BY_RANGE, BY_SPEED, ERROR_BY_SPEED, Experiment, mean_and_spread
-from src.report.sweep_record import SweepRecord, read_records
+from src.report.sweep_record import read_records
 from src.report.table_builder import write_sweep_tables
 from src.training.run_folder import make_writable
 
@@ -38,17 +39,26 @@ def main(overrides: list[str]) -> None:
     config, _ = compose_config(overrides)
     outputs, reports = Path(config.paths.outputs), Path(config.paths.reports)
     make_writable(reports, "paths.reports")
-    faults = publish_all(outputs, reports, config.scale)
+    faults: list[str] = []
+    for folder in finished_runs(outputs, config.scale):
+        with noted_in(faults):
+            publish_result(folder, reports)
     results, broken = read_results(reports, config.scale)
     records, broken_records = read_records(reports, config.scale)
     faults += [*map(str, broken.values()), *map(str, broken_records.values())]
     pages, of_pages = write_pages(config, results, {run for record in records for run in record.runs})
-    tables, of_tables = write_tables(reports, records, results)
-    faults += of_pages + of_tables
+    faults += of_pages
+    tables: list[Path] = []
+    for record in records:
+        with noted_in(faults):
+            tables += write_sweep_tables(reports, record, results)
     if not pages and not records:
         what = f"{outputs}: no finished run of {config.phase.name} at scale={config.scale}"
         raise DataError("\n".join([what, *faults]))
-    dashboard = export(reports, outputs)
+    from src.dashboard.single_file import export_dashboard  # its templates are not needed before
+
+    dashboard = reports / "dashboard.html"
+    export_dashboard(reports, outputs, dashboard)
     if config.phase.name in pages:
         text = pages[config.phase.name].read_text()
         print(text[text.index("\n| ") + 1 :])
@@ -58,15 +68,13 @@ def main(overrides: list[str]) -> None:
         raise DataError("\n".join(["all else is written, but", *faults]))
 
 
-def publish_all(outputs: Path, reports: Path, scale: str) -> list[str]:
-    """Bring the results of all finished runs up to date; returns what is broken."""
-    faults = []
-    for folder in finished_runs(outputs, scale):
-        try:
-            publish_result(folder, reports)
-        except DataError as error:
-            faults.append(str(error))
-    return faults
+@contextmanager
+def noted_in(faults: list[str]) -> Iterator[None]:
+    """What is broken costs no other run or sweep."""
+    try:
+        yield
+    except DataError as error:
+        faults.append(str(error))
 
 
 def write_pages(
@@ -107,28 +115,6 @@ def write_page(reports: Path, name: str, scale: str, runs: list[RunResult]) -> P
         text = phase_page(runs, scale)
     path = reports / f"{name}_{scale}.md"
     write_whole(path, text)
-    return path
-
-
-def write_tables(
-    reports: Path, records: list[SweepRecord], results: dict[str, RunResult]
-) -> tuple[list[Path], list[str]]:
-    """The tables of every sweep, and what is wrong with the others."""
-    written, faults = [], []
-    for record in records:
-        try:
-            written += write_sweep_tables(reports, record, results)
-        except DataError as error:
-            faults.append(str(error))
-    return written, faults
-
-
-def export(reports: Path, outputs: Path) -> Path:
-    """The dashboard as one file."""
-    from src.dashboard.single_file import export_dashboard  # its templates are not needed before
-
-    path = reports / "dashboard.html"
-    export_dashboard(reports, outputs, path)
     return path
 
 

@@ -100,8 +100,8 @@ def memory_of(
 
 def _memory(points: WarpedPoints) -> PictureMemory:
     gaussians = None if points.gaussians is None else _gaussians(points.gaussians)
-    return PictureMemory.read_at(
-        _numpy(points.xy), _numpy(points.velocities), _numpy(points.elapsed_s), points.compensated, gaussians
+    return PictureMemory(
+        _numpy(points.xy), _numpy(points.velocities), _numpy(points.elapsed_s), gaussians, points.compensated
     )
 
 

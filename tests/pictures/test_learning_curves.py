@@ -10,13 +10,13 @@ from PIL import Image
 from src.errors import DataError
 from src.pictures.learning_curves import draw_curves, draw_scores, read_metrics
 
-LOG = """epoch,step,train/loss_$x$,train/loss_box_step,train/loss_box_epoch,val/mAP
-0,0,4.0,9,,
-0,1,2.0,9,,
-0,1,,,5.0,0.1
-1,2,nan,9,,
-1,3,1.0,9,,
-1,3,,,-1.0,
+LOG = """epoch,step,train/loss_$x$,train/loss_box,val/mAP
+0,0,4.0,,
+0,1,2.0,,
+0,1,,5.0,0.1
+1,2,nan,,
+1,3,1.0,,
+1,3,,-1.0,
 """
 
 

@@ -54,9 +54,9 @@ def inside(window: tuple, x: float, y: float) -> bool:
 
 def test_both_places_from_what_the_model_read() -> None:
     xy, velocity, age = np.array([[10.0, -4.0]]), np.array([[20.0, -2.0]]), np.array([1.5])
-    used = PictureMemory.read_at(xy, velocity, age, compensated=True)
+    used = PictureMemory(xy, velocity, age, compensated=True)
     assert np.allclose(used.moved, [[10, -4]]) and np.allclose(used.stayed, [[-20, -1]])
-    unused = PictureMemory.read_at(xy, velocity, age, compensated=False)
+    unused = PictureMemory(xy, velocity, age, compensated=False)
     assert np.allclose(unused.stayed, [[10, -4]]) and np.allclose(unused.moved, [[40, -7]])
 
 
@@ -181,7 +181,8 @@ def test_cells_lie_behind_the_box_without_velocity_and_on_it_with(tmp_path: Path
 def test_every_kind_of_gap_still_gives_a_picture(tmp_path: Path) -> None:
     truth = boxes([(30, 5, 10, 0), (10, -5, 0, 0)])
     history = gaussians([(30.0, 5.0), (140.0, -20.0)], (12.0, 0.0), 0.5)
-    empty_history = PictureMemory(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), PictureGaussians.empty())
+    no_shapes = PictureGaussians(*[np.zeros((0, 2))] * 3, *[np.zeros(0)] * 2)
+    empty_history = PictureMemory(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), no_shapes)
     scenes = {
         "no truth, one path": MemoryScene(GRID, gaussians=history),
         "nothing remembered": MemoryScene(GRID, truth, empty_history, cells([], (0.0, 0.0), 1.0)),
