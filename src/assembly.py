@@ -20,7 +20,8 @@ from src.structures.taxonomy import SENSORS
 from src.training.module import TrainingModule
 from src.training.phases import EVALUATORS, MODULES
 from src.training.trainer_config import OnNonfinite
-from src.world.write import ensure_world, world_digest
+from src.world.world_config import world_digest
+from src.world.write import ensure_world
 
 logger = logging.getLogger(__name__)
 

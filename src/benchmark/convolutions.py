@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import logging
-import multiprocessing
 import statistics
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -27,14 +26,13 @@ from src.benchmark.spconv_baseline import (
     sparse_tensor,
     uncached,
 )
-from src.benchmark.timing import MODES, clock, interleaved, milliseconds, status_bytes, without_gradient
+from src.benchmark.timing import MODES, added_bytes, clock, interleaved, milliseconds
 from src.geometry.bev_grid import BEVGrid
-from src.models.backbones.sparse_voxel import RadarEncoder, RadarEncoderConfig
+from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.layers.sparse import SparseConv, SparseKernel, SubmanifoldConv, TemporalConv
 from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
 from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv
-from src.reliability.allocator import tune_cpu_allocator
 from src.structures.sparse_bev import SparseMap
 
 logger = logging.getLogger(__name__)
@@ -153,7 +151,7 @@ def measure_layer(
             runs = (functions["spconv"]().detach().index_select(0, order) for _ in range(SPCONV_TRIALS))
             wrong = sum(largest_difference([reference], [run]) > AGREEMENT for run in runs)
             agreement["spconv wrong"] = f"{wrong} of {SPCONV_TRIALS}"
-    forward = {name: without_gradient(function) for name, function in functions.items()}
+    forward = {name: torch.no_grad()(function) for name, function in functions.items()}
     forward["map"] = lambda: layer.map(Sites(layer.sites.shape, layer.sites.keys))
     rows = []
     for mode, candidates, times in (("forward", forward, 1), ("f+b", both, 3)):
@@ -214,33 +212,18 @@ def dense_convolution(layer: Layer, features: Tensor, out_sites: Sites) -> Tenso
 # ---------------------------------------------------------------- the whole backbone
 
 
-@dataclass(frozen=True)
-class Backbone:
-    """What a process of its own needs to build the radar backbone."""
-
-    config: RadarEncoderConfig
-    grid: BEVGrid
-    channels: int
-    seed: int
-
-    def build(self) -> RadarEncoder:
-        """Fresh weights, the same for the same seed; in training mode."""
-        torch.manual_seed(self.seed)
-        return RadarEncoder(self.config, self.grid, self.channels).train()
-
-
 def measure_backbone(
-    backbone: Backbone,
+    encoder: RadarEncoder,
     scenes: dict[str, Tensor],  # by name the radar points [P, 7] of one frame
     device: torch.device,
     threads: list[int],
 ) -> list[dict[str, Any]]:
     """Rows by scene, mode and threads; kernel maps are made anew every time, batch norm uses the batch."""
     spconv, gemm = load_spconv(device), Gemm(device)
-    encoder = backbone.build().to(device)
+    encoder = copy.deepcopy(encoder).train()
     encoder.local_means = None  # spconv has no counterpart, and it is not part of the backbone
     rows = []
-    for number, (name, points) in enumerate(scenes.items()):
+    for name, points in scenes.items():
         logger.info("backbone, %s", name)
         points = points.to(device)
         with torch.no_grad():
@@ -251,22 +234,13 @@ def measure_backbone(
             functions["spconv"] = lambda v=voxels, twin=twin: twin(v)[1]
         for count in threads:
             with set_torch_threads(count):
-                # A process each, so only of the first scene and with all threads.
-                with_memory = device.type == "cpu" and number == 0 and count == max(threads)
-                rows += _backbone_rows(name, backbone, points, voxels, functions, device, gemm, count, with_memory)
+                found = _backbone_rows(functions, device, gemm, count)
+            rows += [{"scene": name, **row, "voxels": len(voxels)} for row in found]
     return rows
 
 
 def _backbone_rows(
-    name: str,
-    backbone: Backbone,
-    points: Tensor,
-    voxels: SparseMap,
-    functions: dict[str, Callable[[], Tensor]],
-    device: torch.device,
-    gemm: Gemm,
-    threads: int,
-    with_memory: bool,
+    functions: dict[str, Callable[[], Tensor]], device: torch.device, gemm: Gemm, threads: int
 ) -> list[dict[str, Any]]:
     agreement = {}
     if "spconv" in functions and threads == 1:
@@ -278,20 +252,19 @@ def _backbone_rows(
         with counted_work() as work:
             candidates["ours"]()
         seconds = interleaved(candidates | {"GEMM": gemm}, clock(device), ROUNDS, BACKBONE_BUDGET_S)
-        row = {"scene": name, "mode": mode, "threads": threads} | ratio_columns(seconds, work.flops, gemm)
+        row = {"mode": mode, "threads": threads} | ratio_columns(seconds, work.flops, gemm)
         row |= {"GFLOP": work.flops / 1e9}
-        if with_memory:
-            for kind in functions:
-                held = memory_of(backbone, points, kind, mode, threads)
-                if held is not None:
-                    row |= {f"{kind} peak MiB": held[1], f"{kind} MiB before": held[0]}
-        rows.append(row | agreement | {"voxels": len(voxels)})
+        for kind, function in candidates.items():
+            added = added_bytes(function, device)
+            if added is not None:
+                row[f"{kind} added MiB"] = added / 2**20
+        rows.append(row | agreement)
     return rows
 
 
-def backbone_operations(backbone: Backbone, points: Tensor) -> dict[str, list[dict[str, Any]]]:
+def backbone_operations(encoder: RadarEncoder, points: Tensor) -> dict[str, list[dict[str, Any]]]:
     """Where the time of our backbone goes, by mode, as `operation_table` has it."""
-    encoder = backbone.build().to(points.device)
+    encoder = copy.deepcopy(encoder).train()
     owners = torch.zeros(len(points), dtype=torch.int64, device=points.device)
 
     def run() -> Tensor:
@@ -300,31 +273,6 @@ def backbone_operations(backbone: Backbone, points: Tensor) -> dict[str, list[di
     return {
         f"operations of the backbone, {mode}": operation_table(wrap(run), points.device) for mode, wrap in MODES.items()
     }
-
-
-def memory_of(backbone: Backbone, points: Tensor, kind: str, mode: str, threads: int) -> tuple[float, float] | None:
-    """MiB that a process of its own holds before and at most, None where the system does not report it."""
-    if status_bytes("VmRSS") is None:
-        return None
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(_run_alone, backbone, points, kind, mode, threads).result()
-
-
-def _run_alone(backbone: Backbone, points: Tensor, kind: str, mode: str, threads: int) -> tuple[float, float]:
-    tune_cpu_allocator()
-    torch.set_num_threads(threads)
-    encoder = backbone.build()
-    encoder.local_means = None
-    with torch.no_grad():
-        voxels = encoder.voxelise(points, torch.zeros(len(points), dtype=torch.int64), 1)
-    if kind == "ours":
-        run: Callable[[], Tensor] = lambda: encoder.encode(voxels).features  # noqa: E731
-    else:
-        twin = SpconvEncoder(load_spconv(torch.device("cpu")), encoder).train()
-        run = lambda: twin(voxels)[1]  # noqa: E731
-    before = status_bytes("VmRSS") / 2**20
-    MODES[mode](run)()
-    return before, status_bytes("VmHWM") / 2**20
 
 
 def remembered_sites(grid: BEVGrid, bev: Sites, frames: int) -> Sites:

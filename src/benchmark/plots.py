@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
 from src.pictures.canvas import SHEET_PX, Canvas
-from src.pictures.contents import INK, MUTED
+from src.pictures.contents import INK
 from src.pictures.learning_curves import LINE_COLOURS, style_axes
 
 MARKERS = "os^Dv<>Ph"
@@ -98,8 +98,6 @@ def _label(axes: Axes, name: str, rows: Rows) -> None:
     axes.xaxis.set_major_locator(FixedLocator(places))
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.tick_params(axis="x", labelsize=8)
-    if not rows:
-        axes.text(0.5, 0.5, "nothing measured", transform=axes.transAxes, ha="center", color=MUTED)
 
 
 SOAK_PANELS = {

@@ -38,10 +38,6 @@ class Highway:
     points_per_vehicle: int  # in the mean
     reach_m: float  # the road ends here, ahead and behind
 
-    def rings(self) -> list[tuple[float, float]]:
-        """The rings that the road covers."""
-        return [(low, min(high, self.reach_m)) for low, high in RINGS_M if low < self.reach_m]
-
 
 ROADS = {
     "paper": Highway(12_700, 60, 113, 150.0),
@@ -53,7 +49,8 @@ ROADS = {
 
 def highway_points(road: Highway, seed: int = 0) -> Tensor:  # [P, 7] x, y, z (m), rcs (dB), vx, vy (m/s), dt (s)
     """Radar points of the road, nearer stretches denser; twice the vehicles give twice their returns."""
-    return torch.cat([_ring_points(road, ring, seed) for ring in road.rings()])
+    rings = [(low, min(high, road.reach_m)) for low, high in RINGS_M if low < road.reach_m]
+    return torch.cat([_ring_points(road, ring, seed) for ring in rings])
 
 
 def _ring_points(road: Highway, ring: tuple[float, float], seed: int) -> Tensor:

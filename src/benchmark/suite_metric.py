@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -21,14 +22,12 @@ AGREEMENT = 1e-9
 _DEVKIT_ERRORS = dict(zip(ERRORS, ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err"), strict=True))
 
 
-def compare_with_devkit(
-    num_samples: int, gts: int, preds: int, seed: int, ranges: bool = True
-) -> dict[str, float | int | bool]:
+def compare_with_devkit(num_samples: int, gts: int, preds: int, seed: int) -> dict[str, float | int | bool]:
     """Score one random problem with ours and with the official evaluator, both from parsed boxes to all numbers.
 
-    `gts` and `preds` are boxes per sample. Seconds are CPU time of this process. With `ranges` both also score the
-    four distance bins: the official evaluator on boxes cut to each bin. `agrees` says whether every AP and error of
-    every class (and mAP and NDS) is within 1e-9.
+    `gts` and `preds` are boxes per sample. Seconds are CPU time of this process. Both also score the four distance
+    bins: the official evaluator on boxes cut to each bin. `agrees` says whether every AP and error of every class (and
+    mAP and NDS) is within 1e-9.
 
     Raises ConfigError when truckscenes-devkit is not installed.
     """
@@ -47,12 +46,11 @@ def compare_with_devkit(
     timed["devkit_s"] = time.process_time() - start
     result: dict[str, float | int | bool] = {"samples": num_samples, "ground_truth": gts, "predictions": preds}
     result |= timed | {"speedup": timed["devkit_s"] / timed["ours_s"]}
-    if ranges:
-        start = time.process_time()
-        for low, high in RANGE_BINS_M:
-            differences.append(_difference(ours.ranges[f"{low:.0f}-{high:.0f}"], official.evaluate(low, high)))
-        result["devkit_ranges_s"] = timed["devkit_s"] + time.process_time() - start
-        result["speedup_ranges"] = result["devkit_ranges_s"] / timed["ours_ranges_s"]
+    start = time.process_time()
+    for low, high in RANGE_BINS_M:
+        differences.append(_difference(ours.ranges[f"{low:.0f}-{high:.0f}"], official.evaluate(low, high)))
+    result["devkit_ranges_s"] = timed["devkit_s"] + time.process_time() - start
+    result["speedup_ranges"] = result["devkit_ranges_s"] / timed["ours_ranges_s"]
     worst = max(differences)
     return result | {"max_difference": worst, "agrees": bool(worst <= AGREEMENT)}
 
@@ -112,29 +110,27 @@ def _random_boxes(
     )
 
 
-class _Devkit:
+def _import_devkit() -> SimpleNamespace:
     """The parts of truckscenes-devkit that score boxes."""
-
-    def __init__(self) -> None:
+    try:
         from truckscenes.eval.common.data_classes import EvalBoxes
         from truckscenes.eval.common.loaders import add_center_dist, filter_eval_boxes
         from truckscenes.eval.detection.config import config_factory
         from truckscenes.eval.detection.data_classes import DetectionBox
         from truckscenes.eval.detection.evaluate import DetectionEval
-
-        self.EvalBoxes, self.DetectionBox, self.DetectionEval = EvalBoxes, DetectionBox, DetectionEval
-        self.add_center_dist, self.filter_eval_boxes = add_center_dist, filter_eval_boxes
-        self.config = config_factory("detection_cvpr_2024")
-
-
-def _import_devkit() -> _Devkit:
-    try:
-        return _Devkit()
     except ImportError as error:
         raise ConfigError(
             f"the metric benchmark compares with truckscenes-devkit, which cannot be imported ({error}); "
             "install it with pip install 'truckscenes-devkit>=1.2,<2' (Python below 3.12)"
         ) from error
+    return SimpleNamespace(
+        EvalBoxes=EvalBoxes,
+        DetectionBox=DetectionBox,
+        DetectionEval=DetectionEval,
+        add_center_dist=add_center_dist,
+        filter_eval_boxes=filter_eval_boxes,
+        config=config_factory("detection_cvpr_2024"),
+    )
 
 
 class _Tables:
@@ -164,7 +160,7 @@ class _Tables:
 class _OfficialEvaluation:
     """The official evaluator on boxes in memory; building it is parsing and not timed."""
 
-    def __init__(self, devkit: _Devkit, evaluation_set: EvaluationSet, predictions: DetectionTable) -> None:
+    def __init__(self, devkit: SimpleNamespace, evaluation_set: EvaluationSet, predictions: DetectionTable) -> None:
         self.devkit = devkit
         self.tables = _Tables(evaluation_set)
         tokens = evaluation_set.tokens

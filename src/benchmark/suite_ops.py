@@ -9,7 +9,6 @@ from torch import Tensor
 
 from src.assembly import build_datamodule, data_root
 from src.benchmark.convolutions import (
-    Backbone,
     backbone_operations,
     layers_of,
     measure_backbone,
@@ -25,7 +24,7 @@ from src.benchmark.spconv_baseline import load_spconv
 from src.config import Config
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.backbones.sparse_voxel import RadarEncoderConfig
+from src.models.backbones.sparse_voxel import RadarEncoder, RadarEncoderConfig
 from src.ops.sites import Sites
 
 
@@ -42,8 +41,7 @@ def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     every = torch.get_num_threads()
     threads = sorted({1, every}) if device.type == "cpu" else [every]
     points = highway_points(sizes.road).to(device)
-    backbone = Backbone(encoders[0], grid, config.model.channels, config.seed)
-    encoder = backbone.build().to(device)
+    encoder = RadarEncoder(encoders[0], grid, config.model.channels).to(device)
     with torch.no_grad():
         voxels = encoder.voxelise(points, torch.zeros(len(points), dtype=torch.int64, device=device), 1)
     bev = bev_sites(points, grid, sizes.cells)
@@ -68,8 +66,8 @@ def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
             *gpu_notes(device),
         ],
         "sparse convolution": measure_layers(layers, device, threads),
-        "radar backbone": measure_backbone(backbone, scenes, device, threads),
-        **backbone_operations(backbone, points),
+        "radar backbone": measure_backbone(encoder, scenes, device, threads),
+        **backbone_operations(encoder, points),
         "splat": measure_splat(gaussians, grid, sizes.splat_subset, device),
         "other operations": measure_rest(config, sizes, grid, points, bev, device),
         "roofline": measure_roofline(device),

@@ -6,22 +6,22 @@ import math
 import resource
 import statistics
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import partial
 from itertools import chain, cycle, islice, repeat
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import torch
 from PIL import Image
 
 from src.assembly import build_datamodule, data_root
+from src.benchmark.parts import wrapped_parts
 from src.benchmark.timing import interleaved, milliseconds
 from src.config import Config
-from src.data import images, reader
+from src.data import images
 from src.data.augment import AugmentationConfig
 from src.data.datamodule import DetectionDataModule
 from src.data.frame_loader import collate
@@ -39,13 +39,13 @@ WARM_UP_FRAMES = 4
 LOADER_FRAMES = 60
 COMPARISON_ROUNDS = 8
 STAGES = {
-    "JPEG decode": (images, "decode"),
-    "resample": (images, "resample"),
-    "mirror and rotate": (images, "turn"),
-    "radar files": (reader, "read_radar_points"),
-    "radar compensation": (reader, "compensate_sweeps"),
-    "LiDAR files": (reader, "read_lidar_points"),
-    "LiDAR compensation": (reader, "place_sweep"),
+    "JPEG decode": ("src.data.images:decode",),
+    "resample": ("src.data.images:resample",),
+    "mirror and rotate": ("src.data.images:turn",),
+    "radar files": ("src.data.reader:read_radar_points",),
+    "radar compensation": ("src.data.reader:compensate_sweeps",),
+    "LiDAR files": ("src.data.reader:read_lidar_points",),
+    "LiDAR compensation": ("src.data.reader:place_sweep",),
 }
 """Functions of the reader by the names under which it calls them; what is in none of them is `assembling`."""
 
@@ -139,13 +139,9 @@ class StageClock:
         return call
 
 
-@contextmanager
-def timed_stages(clock: StageClock) -> Iterator[None]:
+def timed_stages(clock: StageClock) -> AbstractContextManager[None]:
     """Within the context the reader's stages count on the clock."""
-    with ExitStack() as stack:
-        for stage, (module, name) in STAGES.items():
-            stack.enter_context(patch.object(module, name, clock.timed(stage, getattr(module, name))))
-        yield
+    return wrapped_parts(torch.nn.Module(), STAGES, lambda stage, path, function: clock.timed(stage, function))
 
 
 def time_frames(

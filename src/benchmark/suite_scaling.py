@@ -210,7 +210,7 @@ def make_case(config: Config, point: Point, device: torch.device) -> tuple[Case,
     if settings.memory_frames:
         fill_memory(case, memory, settings.memory_frames)
     gaussians = case.prepared.evidence(output).gaussians
-    return case, 0 if gaussians is None else gaussians.valid.shape[1]
+    return case, 0 if gaussians is None else int(gaussians.valid.sum())
 
 
 def settings_at(config: Config, point: Point) -> ModelConfig:

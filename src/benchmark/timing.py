@@ -79,16 +79,6 @@ def interleaved(
     return seconds
 
 
-def without_gradient(function: Callable[[], Any]) -> Callable[[], Any]:
-    """The function as inference calls it."""
-
-    def call() -> Any:
-        with torch.no_grad():
-            return function()
-
-    return call
-
-
 def with_gradient(function: Callable[[], Any]) -> Callable[[], None]:
     """The function and, from gradients of one, its backward pass."""
 
@@ -98,7 +88,7 @@ def with_gradient(function: Callable[[], Any]) -> Callable[[], None]:
     return call
 
 
-MODES = {"forward": without_gradient, "f+b": with_gradient}
+MODES = {"forward": torch.no_grad(), "f+b": with_gradient}
 """How an operation is called, by the names that pages use."""
 
 

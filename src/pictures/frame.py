@@ -20,7 +20,6 @@ NEAR_BEHIND_SHARE = 0.35
 """Share of the near view that lies behind the ego's rear axle."""
 
 
-
 def counts_line(scene: BevScene, score_threshold: float) -> str:
     """Numbers of boxes, matches, misses and false positives; of predictions alone where there is no ground truth."""
     predictions, truth = scene.predictions, scene.ground_truth

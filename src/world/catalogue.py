@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from src.structures.taxonomy import ATTRIBUTES, CATEGORY_TO_CLASS, IGNORED_CATEGORIES
+from src.structures.taxonomy import CATEGORY_TO_CLASS, IGNORED_CATEGORIES
 
 ALL_CATEGORIES = tuple(CATEGORY_TO_CLASS) + IGNORED_CATEGORIES
 """The 27 categories of the tables."""
@@ -47,16 +47,12 @@ def attribute_of(kind: Kind, speed_mps: float, *, has_rider: bool, parked: bool)
     """The TruckScenes attribute of an object that moves at this speed; None for classes without one."""
     klass = kind.klass
     if klass in ("car", "truck", "bus", "trailer", "other_vehicle"):
-        name = "vehicle.parked" if parked else "vehicle.moving" if speed_mps > 0.5 else "vehicle.stopped"
-    elif klass in ("motorcycle", "bicycle"):
-        name = "cycle.with_rider" if has_rider else "cycle.without_rider"
-    elif klass == "pedestrian":
-        name = "pedestrian.moving" if speed_mps > 0.3 else "pedestrian.standing"
-    elif klass == "traffic_sign":
+        return "vehicle.parked" if parked else "vehicle.moving" if speed_mps > 0.5 else "vehicle.stopped"
+    if klass in ("motorcycle", "bicycle"):
+        return "cycle.with_rider" if has_rider else "cycle.without_rider"
+    if klass == "pedestrian":
+        return "pedestrian.moving" if speed_mps > 0.3 else "pedestrian.standing"
+    if klass == "traffic_sign":
         postures = {"gantry_sign": "overhanging", "temporary_sign": "temporary"}
-        name = "traffic_sign." + postures.get(kind.shape, "pole_mounted")
-    else:
-        return None
-    if name not in ATTRIBUTES:
-        raise ValueError(f"attribute {name} is not one of the TruckScenes attributes")
-    return name
+        return "traffic_sign." + postures.get(kind.shape, "pole_mounted")
+    return None

@@ -13,7 +13,6 @@ import yaml
 class Conditions:
     """Tags of one scene with the light and air that belong to them."""
 
-    name: str
     weather: str
     daytime: str
     lighting: str
@@ -67,7 +66,6 @@ def draw_conditions(rng: np.random.Generator, number: int) -> Conditions:
     name = ORDER[number % len(ORDER)]
     rain = name == "rain"
     return Conditions(
-        name=name,
         season=str(rng.choice(["season.summer", "season.autumn", "season.winter"], p=[0.5, 0.35, 0.15])),
         area=str(rng.choice(["area.highway", "area.terminal", "area.rural"], p=[0.7, 0.15, 0.15])),
         sun_azimuth_rad=float(rng.uniform(-np.pi, np.pi)),

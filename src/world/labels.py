@@ -22,7 +22,6 @@ LIDAR_REACH_M = 170.0
 class FrameTruth:
     """State of all N actors at one key frame, in local coordinates."""
 
-    time_s: float
     centres: Array  # [N, 3] m
     yaws: Array  # [N] rad
     speeds: Array  # [N] m/s
@@ -41,7 +40,6 @@ def frame_truth(scene: Scene, time_s: float, own_pixels: Array, seen_pixels: Arr
     centres = ground + np.stack([np.zeros_like(floors), np.zeros_like(floors), floors + 0.5 * scene.sizes[:, 2]], 1)
     nothing = np.zeros(len(centres), dtype=np.int64)
     return FrameTruth(
-        time_s=time_s,
         centres=centres,
         yaws=yaw,
         speeds=np.linalg.norm(velocity, axis=1),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from src.world.camera_render import Studio
@@ -23,16 +21,6 @@ REACH_M = 180.0
 RANGE_NOISE_M = 0.02
 
 
-@dataclass
-class _Boxes:
-    """The actors near the truck at the scan's middle, local coordinates."""
-
-    middles: Array  # [N, 3] m
-    velocities: Array  # [N, 3] m/s
-    sizes: Array  # [N, 3] m, length, width, height
-    yaws: Array  # [N] rad
-
-
 def scan_lidars(
     config: WorldConfig,
     scene: Scene,
@@ -49,8 +37,9 @@ def scan_lidars(
     """
     ground, velocity, yaw = scene.tracks.state(time_s)
     near = np.flatnonzero(np.hypot(*(ground - scene.ego.pose(time_s)[1])[:, :2].T) < REACH_M + 10)
-    boxes = _Boxes(ground[near], velocity[near], scene.sizes[near], yaw[near])
-    boxes.middles[:, 2] += studio.floors[near] + 0.5 * boxes.sizes[:, 2]
+    middles, sizes = ground[near], scene.sizes[near]
+    middles[:, 2] += studio.floors[near] + 0.5 * sizes[:, 2]
+    boxes = list(zip(middles, velocity[near], sizes, yaw[near], strict=True))
     azimuths = np.arange(-HALF_WIDTH_RAD, HALF_WIDTH_RAD, np.radians(config.lidar_step_deg))
     after_s = azimuths / (2 * HALF_WIDTH_RAD) * SCAN_S
     rotations, translations = scene.ego.poses(time_s + after_s)  # [A, 3, 3], [A, 3]
@@ -78,7 +67,7 @@ def _nearest_hit(
     origins: Array,  # [R, 3]
     rays: Array,  # [R, 3]
     after_s: Array,  # [R] since the scan's middle
-    boxes: _Boxes,
+    boxes: list[tuple[Array, Array, Array, float]],  # middle (m), velocity (m/s), size (m), yaw (rad) at the middle
     ground_z: Array,  # [R]
 ) -> tuple[Array, Array]:  # [R] each
     """Distance to the nearest box or to the ground along each ray (inf if none) and its brightness."""
@@ -87,7 +76,7 @@ def _nearest_hit(
     bright = np.full(len(rays), 18.0)
     bearing = np.arctan2(rays[:, 1], rays[:, 0])
     middle, drift = origins.mean(0), 0.5 * np.linalg.norm(np.ptp(origins, axis=0))
-    for centre, velocity, size, yaw in zip(boxes.middles, boxes.velocities, boxes.sizes, boxes.yaws, strict=True):
+    for centre, velocity, size, yaw in boxes:
         offset = centre - middle
         distance = np.hypot(offset[0], offset[1])
         reach = 0.6 * np.hypot(size[0], size[1]) + drift + 0.5 * SCAN_S * np.linalg.norm(velocity)

@@ -89,7 +89,7 @@ class EgoMotion:
         rotation, translation = self.poses(np.array([time_s]))
         return rotation[0], translation[0]
 
-    def rates_at(self, times_s: Array, half_step_s: float = 0.002) -> tuple[Array, Array]:
+    def rates(self, times_s: Array, half_step_s: float = 0.002) -> tuple[Array, Array]:
         """Velocities [T, 3] and angular rates [T, 3] in the ego frame, by central differences of the pose."""
         now, _ = self.poses(times_s)
         before, t_before = self.poses(times_s - half_step_s)
@@ -98,8 +98,3 @@ class EgoMotion:
         skew = np.einsum("tji,tjk->tik", now, after - before) / (4 * half_step_s)
         turning = [skew[:, 2, 1] - skew[:, 1, 2], skew[:, 0, 2] - skew[:, 2, 0], skew[:, 1, 0] - skew[:, 0, 1]]
         return velocity, np.stack(turning, 1)
-
-    def rates(self, time_s: float) -> tuple[Array, Array]:
-        """Velocity [3], m/s, and angular rate [3], rad/s, in the ego frame at one moment."""
-        velocity, turning = self.rates_at(np.array([time_s]))
-        return velocity[0], turning[0]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from src.geometry.transforms import yaw_of
 from src.world.rig import RADAR_AZIMUTH_RAD, RADAR_ELEVATION_RAD, Mount
 from src.world.scenery import Scenery
 from src.world.simulate import Scene
@@ -52,7 +53,7 @@ def simulate_sweeps(
     vrel is relative to the moving sensor, along the line of sight, positive when the range grows.
     """
     rotation, origin = scene.ego.poses(np.array(times_s))
-    speed, turning = scene.ego.rates_at(np.array(times_s))
+    speed, turning = scene.ego.rates(np.array(times_s))
     parts = [
         _object_returns(config, scene, mounts, times_s, rotation, origin, rng),
         _clutter_returns(config, scene, scenery, mounts, times_s[0], rotation, origin, rng),
@@ -62,7 +63,7 @@ def simulate_sweeps(
     )
     found = _ghosts(config, found, rng)
     sensor_from_ego = np.stack([m.rotation.T for m in mounts])
-    places = np.stack([m.translation for m in mounts])
+    places, _ = _mounted(mounts)
     sensor_speed = speed + np.cross(turning, places)
     relative = found.point - places[found.radar]
     distance = np.linalg.norm(relative, axis=1)
@@ -70,6 +71,11 @@ def simulate_sweeps(
     doppler = np.einsum("ki,ki->k", found.speed - sensor_speed[found.radar], sight)
     beam = np.einsum("kij,kj->ki", sensor_from_ego[found.radar], relative)
     return _measure(config, found, beam, distance, doppler, len(mounts), rng)
+
+
+def _mounted(mounts: list[Mount]) -> tuple[Array, Array]:
+    """Places [R, 3] m and azimuths [R] rad of the radars in the ego frame."""
+    return np.stack([m.translation for m in mounts]), np.array([yaw_of(m.rotation) for m in mounts])
 
 
 def _strength(rcs_db: Array, distance: Array, azimuth: Array) -> Array:
@@ -97,12 +103,11 @@ def _object_returns(
     ground = np.stack([s[0] for s in states])  # [R, N, 3] local
     centre = np.einsum("rni,rij->rnj", ground - origin[:, None], rotation)  # ego
     velocity = np.einsum("rni,rij->rnj", np.stack([s[1] for s in states]), rotation)
-    ego_yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+    ego_yaw = yaw_of(rotation)
     yaw = np.stack([s[2] for s in states]) - ego_yaw[:, None]
-    places = np.stack([m.translation for m in mounts])
+    places, boresight = _mounted(mounts)
     ray = centre - places[:, None]
     distance = np.hypot(ray[..., 0], ray[..., 1])
-    boresight = np.array([np.arctan2(m.rotation[1, 0], m.rotation[0, 0]) for m in mounts])
     azimuth = _wrap(np.arctan2(ray[..., 1], ray[..., 0]) - boresight[:, None])
     aspect = _wrap(np.arctan2(-ray[..., 1], -ray[..., 0]) - yaw)  # where the radar stands, in the object's axes
     width = np.abs(np.sin(aspect)) * sizes[:, 0] + np.abs(np.cos(aspect)) * sizes[:, 1]
@@ -195,8 +200,7 @@ def _clutter_returns(
     ego_s = float(scene.ego.tracks.road_state(time_s)[0][0])
     near = np.abs(scenery.clutter_s - ego_s) < REACH_M + 20
     points, rcs = scenery.clutter[near], scenery.clutter_rcs_db[near]
-    places = np.stack([m.translation for m in mounts])
-    boresight = np.array([np.arctan2(m.rotation[1, 0], m.rotation[0, 0]) for m in mounts])
+    places, boresight = _mounted(mounts)
     seen = np.einsum("rpi,rij->rpj", points[None] - origin[:, None], rotation)
     ray = seen - places[:, None]
     distance = np.linalg.norm(ray, axis=-1)
@@ -209,7 +213,7 @@ def _clutter_returns(
     radar, index = np.repeat(radar, count[radar, index]), np.repeat(index, count[radar, index])
     states = scene.tracks.state(time_s)
     centre = (states[0] - origin[0]) @ rotation[0]
-    yaw = states[2] - np.arctan2(rotation[0, 1, 0], rotation[0, 0, 0])
+    yaw = states[2] - yaw_of(rotation[0])
     floor = np.array([actor.kind.floor_m for actor in scene.actors])
     shadows = _shadow_map(np.tile(centre, (1, 1, 1)), yaw[None], scene.sizes, floor, places.mean(0, keepdims=True))
     hidden = _hidden(np.zeros(len(radar), dtype=np.int64), ray[radar, index], shadows)

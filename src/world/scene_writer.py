@@ -317,7 +317,7 @@ class SceneWriter:
     def _motion_tables(self) -> Tables:
         """Both ego_motion tables. The chassis one reads zero speed for stretches, as in the real data."""
         times = self._ego_times()
-        speed, spin = self.scene.ego.rates_at(np.array(times))
+        speed, spin = self.scene.ego.rates(np.array(times))
         accel = np.gradient(speed, np.array(times), axis=0) if len(times) > 1 else np.zeros_like(speed)
         rotations, _ = self.scene.ego.poses(np.array(times))
         angles = np.stack(

@@ -37,9 +37,9 @@ class Scenery:
     clutter_s: Array  # [P] m along the road
 
 
-def _strips(road: Road, s: Array, d0: float, d1: float, height: float) -> Array:
+def _strips(road: Road, s: Array, d0: float, d1: float) -> Array:
     """Quads [len(s) - 1, 4, 3] between two lateral positions, seen from above."""
-    right, left = road.place(s, np.full_like(s, d0), height), road.place(s, np.full_like(s, d1), height)
+    right, left = road.place(s, np.full_like(s, d0)), road.place(s, np.full_like(s, d1))
     return np.stack([right[:-1], right[1:], left[1:], left[:-1]], 1)
 
 
@@ -51,7 +51,7 @@ def make_scenery(
     pieces: list[tuple[Array, Array, float, bool]] = []  # quads, colours, layer, open
 
     def ground(d0: float, d1: float, colour: Colour, layer: float, where: Array = s, mottle: float = 0.03) -> None:
-        quads = _strips(road, where, d0, d1, 0.0)
+        quads = _strips(road, where, d0, d1)
         shade = 1.0 + mottle * rng.standard_normal((len(quads), 1))
         pieces.append((quads, np.clip(np.array(colour) * shade, 0, 255), layer, False))
 

@@ -12,5 +12,5 @@ _SHAPES = vars(small_shapes) | vars(vehicle_shapes)
 def build_mesh(actor: Actor) -> Mesh:
     """The mesh of one actor, in its own axes above the middle of its box's underside."""
     maker = MeshMaker()
-    _SHAPES[f"add_{actor.kind.shape}"](maker, actor)
+    _SHAPES[f"add_{actor.kind.shape}"](maker, actor, *(actor.size * [0.5, 0.5, 1.0]))
     return maker.mesh()

@@ -29,8 +29,6 @@ HITCH_OVERLAP_M = {"tractor_unit": 1.9, "rigid_truck": -1.2}
 class Scene:
     """Everything that the sensors look at, in local coordinates (metres; the writer adds the UTM offset)."""
 
-    index: int
-    split: str
     conditions: Conditions
     road: Road
     actors: list[Actor]
@@ -52,9 +50,8 @@ def scene_rng(config: WorldConfig, index: int, purpose: int) -> np.random.Genera
 def make_scene(config: WorldConfig, index: int) -> Scene:
     """Simulate scene `index` (train scenes first). Every scene has its own road."""
     rng = scene_rng(config, index, 0)
-    split = "train" if index < config.num_train_scenes else "val"
-    within = index if split == "train" else index - config.num_train_scenes
-    conditions = draw_conditions(rng, within)
+    first_of_split = 0 if index < config.num_train_scenes else config.num_train_scenes
+    conditions = draw_conditions(rng, index - first_of_split)
     road = make_road(rng)
     steps = int(np.ceil((config.duration_s + 2 * LEAD_IN_S) / STEP_S)) + 2
     ego_mps = rng.uniform(60, 90) / 3.6
@@ -84,8 +81,6 @@ def make_scene(config: WorldConfig, index: int) -> Scene:
     tracks = Tracks(road=road, s=columns[0], s_rate=columns[1], d=columns[2], d_rate=columns[3], turn=columns[4])
     offset = np.array([7.0e5, 5.3e6, 0.0]) + np.array([rng.uniform(-2e4, 2e4), rng.uniform(-2e4, 2e4), 0.0])
     return Scene(
-        index=index,
-        split=split,
         conditions=conditions,
         road=road,
         actors=actors,

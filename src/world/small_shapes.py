@@ -1,4 +1,7 @@
-"""Riders, people, animals, signs, roadside things. Origin: middle of the underside; only poles leave the box."""
+"""Riders, people, animals, signs, roadside things. Origin: middle of the underside; only poles leave the box.
+
+l and w are half the length and width of the box, h its height, all in metres.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +23,7 @@ def _rider(m: MeshMaker, x: float, seat: float, top: float, width: float, coat: 
         m.box(x - 0.1, x + 0.25, side * width - 0.07, side * width + 0.07, seat - 0.5, seat + 0.02, (40, 44, 60))
 
 
-def add_motorcycle(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_motorcycle(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     for x in (-0.66 * l, 0.66 * l):
         m.wheel(x, 0.05, 0.33 * l, 1)
         m.wheel(x, -0.05, 0.33 * l, -1)
@@ -41,8 +43,7 @@ def add_motorcycle(m: MeshMaker, a: Actor) -> None:
         )
 
 
-def add_bicycle(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_bicycle(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     for x in (-0.6 * l, 0.6 * l):
         m.wheel(x, 0.0, 0.38 * l, 1, hub=(150, 170, 150))
     m.box(-0.55 * l, 0.55 * l, -0.03, 0.03, 0.42, 0.5, a.colour)
@@ -53,8 +54,7 @@ def add_bicycle(m: MeshMaker, a: Actor) -> None:
         _rider(m, -0.1, 0.92, h, 0.2, coats[a.variant % 4], (235, 235, 235))
 
 
-def add_person(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_person(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     trousers: Colour = ((50, 54, 70), (80, 70, 60), (36, 36, 40))[a.variant % 3]
     for side, lean in ((-1, 0.35), (1, -0.35)):
         m.frustum(
@@ -75,16 +75,14 @@ def add_person(m: MeshMaker, a: Actor) -> None:
     m.box(-0.1, 0.1, -0.1, 0.1, 0.85 * h, h, SKIN, top=(70, 50, 36))
 
 
-def add_worker(m: MeshMaker, a: Actor) -> None:
-    add_person(m, a)
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_worker(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
+    add_person(m, a, l, w, h)
     m.box(-0.14, 0.14, -0.66 * w, 0.66 * w, 0.6 * h, 0.66 * h, (240, 240, 220))
     helmet: Colour = (250, 220, 30) if a.name == "worker" else (30, 40, 90)
     m.box(-0.13, 0.13, -0.13, 0.13, 0.93 * h, h + 0.01, helmet)
 
 
-def add_cone(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_cone(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-l, l, -w, w, 0.0, 0.07 * h, (50, 50, 50))
     bands = ((0.07, 0.4, a.colour), (0.4, 0.65, (245, 245, 245)), (0.65, 1.0, a.colour))
     for low, high, colour in bands:
@@ -92,8 +90,7 @@ def add_cone(m: MeshMaker, a: Actor) -> None:
         m.frustum((-r0, r0, -r0, r0), (-r1, r1, -r1, r1), low * h, high * h, colour)
 
 
-def add_barrier(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_barrier(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     for y in (-0.75 * w, 0.75 * w):
         m.box(-l, l, y - 0.06, y + 0.06, 0.0, 0.5 * h, STEEL)
     for z0, z1, shift in ((0.35, 0.6, 0), (0.7, 1.0, 1)):
@@ -104,8 +101,7 @@ def add_barrier(m: MeshMaker, a: Actor) -> None:
                 m.panel(facing * 0.075, y0, y0 + w / 3, z0 * h, z1 * h, facing, a.colour)
 
 
-def add_animal(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_animal(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-l, 0.55 * l, -0.85 * w, 0.85 * w, 0.42 * h, 0.8 * h, a.colour)
     for x in (-0.82 * l, 0.42 * l):
         for side in (-1, 1):
@@ -140,8 +136,7 @@ def _disc(m: MeshMaker, x: float, z: float, radius: float, colour: Colour, corne
         m.quad([ring[0], ring[k], ring[k + 1], ring[k + 2]], colour)
 
 
-def add_sign(m: MeshMaker, a: Actor) -> None:
-    _, w, h = a.size * [0.5, 0.5, 1.0]
+def add_sign(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     radius = min(w, 0.5 * h)
     middle = 0.5 * h
     _pole(m, 0.0, a.kind.floor_m)
@@ -167,8 +162,7 @@ def add_sign(m: MeshMaker, a: Actor) -> None:
     m.box(-0.03, 0.0, -0.9 * radius, 0.9 * radius, middle - 0.8 * radius, middle + 0.8 * radius, POST)
 
 
-def _board(m: MeshMaker, a: Actor, *, poles: bool) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def _board(m: MeshMaker, a: Actor, l: float, w: float, h: float, *, poles: bool) -> None:
     ink: Colour = (245, 245, 245) if a.colour[2] > 100 else (20, 20, 20)
     m.box(-0.3 * l, 0.3 * l, -w, w, 0.0, h, POST, front=ink)
     m.panel(0.3 * l + 0.02, -0.96 * w, 0.96 * w, 0.04 * h, 0.96 * h, 1, a.colour)
@@ -181,16 +175,15 @@ def _board(m: MeshMaker, a: Actor, *, poles: bool) -> None:
             _pole(m, y, a.kind.floor_m)
 
 
-def add_guide_sign(m: MeshMaker, a: Actor) -> None:
-    _board(m, a, poles=True)
+def add_guide_sign(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
+    _board(m, a, l, w, h, poles=True)
 
 
-def add_gantry_sign(m: MeshMaker, a: Actor) -> None:
-    _board(m, a, poles=False)
+def add_gantry_sign(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
+    _board(m, a, l, w, h, poles=False)
 
 
-def add_temporary_sign(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_temporary_sign(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-0.03, 0.0, -w, w, 0.0, h, POST)
     m.panel(0.01, -w, w, 0.0, h, 1, a.colour)
     m.quad(
@@ -205,25 +198,21 @@ def add_temporary_sign(m: MeshMaker, a: Actor) -> None:
         m.box(-0.2, 0.2, y - 0.05, y + 0.05, -a.kind.floor_m, 0.05, STEEL)
 
 
-def add_post(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_post(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-0.5 * l, 0.5 * l, -0.5 * w, 0.5 * w, 0.0, 0.72 * h, a.colour)
     m.box(-0.5 * l, 0.5 * l, -0.5 * w, 0.5 * w, 0.72 * h, 0.9 * h, (30, 30, 30))
     m.box(-0.5 * l, 0.5 * l, -0.5 * w, 0.5 * w, 0.9 * h, h, a.colour)
 
 
-def add_crate(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_crate(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-l, l, -w, w, 0.0, h, a.colour, top=shade(a.colour, 1.1))
 
 
-def add_bush(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_bush(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.frustum((-0.7 * l, 0.7 * l, -0.7 * w, 0.7 * w), (-l, l, -w, w), 0.0, 0.45 * h, a.colour)
     m.frustum((-l, l, -w, w), (-0.4 * l, 0.4 * l, -0.4 * w, 0.4 * w), 0.45 * h, h, shade(a.colour, 1.12))
 
 
-def add_lamp_post(m: MeshMaker, a: Actor) -> None:
-    h = a.size[2]
+def add_lamp_post(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-0.09, 0.09, -0.09, 0.09, 0.0, h, a.colour)
     m.box(-0.08, 0.08, -0.9, 0.9, h - 0.15, h, a.colour)

@@ -1,4 +1,7 @@
-"""Vehicles with cabins. Origin: middle of the underside; x forward. Everything lies inside the box."""
+"""Vehicles with cabins. Origin: middle of the underside; x forward. Everything lies inside the box.
+
+l and w are half its length and width, h its height, all in metres.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,7 @@ GLASS: Colour = (38, 48, 60)
 STEEL: Colour = (90, 92, 96)
 
 
-def add_car(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_car(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     belt = 0.58 * h
     m.frustum((-l, l, -w, w), (-l * 0.98, l * 0.97, -w * 0.97, w * 0.97), 0.17 * h, belt, a.colour)
     m.frustum(
@@ -27,8 +29,7 @@ def add_car(m: MeshMaker, a: Actor) -> None:
     m.panel(-l - 0.01, -0.28 * w, 0.28 * w, 0.3 * h, 0.4 * h, -1, (245, 245, 240))
 
 
-def add_van(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_van(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-l, 0.45 * l, -w, w, 0.12 * h, h, a.colour)
     m.frustum((0.45 * l, l, -w, w), (0.45 * l, 0.62 * l, -0.94 * w, 0.94 * w), 0.12 * h, 0.97 * h, a.colour)
     m.quad(
@@ -48,9 +49,8 @@ def add_van(m: MeshMaker, a: Actor) -> None:
     m.lights(l, -l, 0.94 * w, 0.28 * h, 0.09 * h)
 
 
-def _cab(m: MeshMaker, a: Actor, front: float, depth: float) -> None:
+def _cab(m: MeshMaker, a: Actor, front: float, depth: float, w: float, h: float) -> None:
     """A cab-over driver's cabin that ends at x = front."""
-    w, h = 0.5 * a.size[1], a.size[2]
     back = front - depth
     m.frustum((back, front, -w, w), (back, front - 0.25, -w, w), 0.13 * h, h, a.colour)
     m.quad(
@@ -68,18 +68,16 @@ def _cab(m: MeshMaker, a: Actor, front: float, depth: float) -> None:
         m.side_panel(side * (w + 0.01), front - 0.6 * depth, front - 0.25, 0.5 * h, 0.78 * h, GLASS)
 
 
-def add_tractor_unit(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
-    _cab(m, a, l, 2.3)
+def add_tractor_unit(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
+    _cab(m, a, l, 2.3, w, h)
     m.box(-l, l - 2.3, -0.4 * w, 0.4 * w, 0.17 * h, 0.28 * h, STEEL)
     m.wheels([l - 1.4, -l + 1.1], w - 0.02, 0.5)
     m.lights(l, -l, 0.94 * w, 0.2 * h, 0.2)
 
 
-def add_rigid_truck(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_rigid_truck(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     cargo: Colour = ((238, 238, 236), (205, 200, 190), (70, 110, 170))[a.variant % 3]
-    _cab(m, a, l, 2.1)
+    _cab(m, a, l, 2.1, w, h)
     m.box(-l, l - 2.3, -w, w, 0.3 * h, h, cargo, top=shade(cargo, 0.9))
     m.box(-l, l - 2.1, -0.4 * w, 0.4 * w, 0.14 * h, 0.3 * h, STEEL)
     m.wheels([l - 1.3, -l + 1.4, -l + 2.6], w - 0.02, 0.5)
@@ -87,8 +85,7 @@ def add_rigid_truck(m: MeshMaker, a: Actor) -> None:
     m.panel(-l - 0.01, -0.04, 0.04, 0.32 * h, 0.98 * h, -1, shade(cargo, 0.55))
 
 
-def add_trailer(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_trailer(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-l, l, -w, w, 0.28 * h, h, a.colour, top=shade(a.colour, 0.9))
     m.box(-l, 0.3 * l, -0.4 * w, 0.4 * w, 0.16 * h, 0.28 * h, STEEL)
     m.wheels([-0.72 * l, -0.5 * l, -0.28 * l], w - 0.02, 0.5)
@@ -102,8 +99,7 @@ def add_trailer(m: MeshMaker, a: Actor) -> None:
         m.panel(-l - 0.012, y, y + 0.4 * w, 0.29 * h, 0.35 * h, -1, (230, 190, 40))
 
 
-def add_bus(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_bus(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-l, l, -w, w, 0.1 * h, h, a.colour, top=(225, 225, 225))
     for side in (-1, 1):
         for k in range(6):
@@ -117,16 +113,14 @@ def add_bus(m: MeshMaker, a: Actor) -> None:
     m.lights(l, -l, 0.94 * w, 0.17 * h, 0.2)
 
 
-def add_bendy_bus(m: MeshMaker, a: Actor) -> None:
-    add_bus(m, a)
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_bendy_bus(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
+    add_bus(m, a, l, w, h)
     for side in (-1, 1):
         m.side_panel(side * (w + 0.03), -0.12 * l, 0.06 * l, 0.1 * h, h, (40, 40, 42))
     m.wheels([-0.2 * l], w, 0.5)
 
 
-def add_excavator(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_excavator(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     for side in (-1, 1):
         m.box(-0.95 * l, 0.3 * l, side * w * 0.62 - 0.38 * w, side * w * 0.62 + 0.38 * w, 0.0, 0.26 * h, (44, 44, 46))
     m.box(-l, 0.25 * l, -0.85 * w, 0.85 * w, 0.3 * h, 0.62 * h, a.colour)
@@ -144,8 +138,7 @@ def add_excavator(m: MeshMaker, a: Actor) -> None:
     m.box(0.7 * l, l, -0.55 * w, 0.15 * w, 0.02 * h, 0.26 * h, (70, 70, 72))
 
 
-def add_farm_tractor(m: MeshMaker, a: Actor) -> None:
-    l, w, h = a.size * [0.5, 0.5, 1.0]  # noqa: E741
+def add_farm_tractor(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-0.1 * l, l, -0.4 * w, 0.4 * w, 0.3 * h, 0.6 * h, a.colour)
     m.frustum(
         (-0.9 * l, 0.05 * l, -0.6 * w, 0.6 * w),

@@ -19,9 +19,7 @@ from src.structures.taxonomy import CAMERAS, LIDARS, RADARS, REFERENCE_CHANNEL
 from src.world.rig import sensor_rig
 from src.world.scene_writer import write_scene
 from src.world.table_rows import Tables, shared_tables
-from src.world.world_config import WorldConfig, stored_config, world_digest
-
-__all__ = ["VERSION", "ensure_world", "world_digest", "write_world"]
+from src.world.world_config import WorldConfig, stored_config
 
 VERSION = "v1.2-trainval"
 CONFIG_FILE = "world.json"

@@ -136,7 +136,6 @@ def test_training(outputs, tmp_path, phase, request):
 
 @pytest.mark.slow
 def test_ops(outputs, tmp_path, monkeypatch):
-    monkeypatch.setattr(convolutions, "memory_of", lambda *_: (1.0, 2.0))  # its own test runs processes
     monkeypatch.setattr(convolutions, "DENSE_LIMIT_FLOPS", 1e9)
     result = measured("ops_debug", outputs, tmp_path, "suite=ops")
     layers = result["sparse convolution"]
@@ -174,6 +173,7 @@ def test_scaling(outputs, tmp_path, monkeypatch):
     assert remembered[0, "horizon3d"] == remembered[0, "dense_bev"] == 0.0
     channels = compose_config(["scale=debug", "model=dense_bev"])[0].model.fused_channels
     assert remembered[2, "dense_bev"] == pytest.approx(2 * 192 * 192 * channels * 2 / 2**20, rel=1e-3)  # bfloat16
+    assert {row["gaussians"] for row in result["gaussians"]} == {32, 64}  # of the frame, none of the memory
     fixed = [row["radar points"] for row in result["range, fixed scene"]]
     dense = [row["radar points"] for row in result["range, equal density"]]
     assert len(set(fixed)) == 1 and dense == sorted(dense) and dense[0] < dense[-1]

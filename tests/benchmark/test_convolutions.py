@@ -1,16 +1,14 @@
-"""The baselines of sparse convolution compute what ours computes; memory is that of a process of its own."""
+"""The baselines of sparse convolution compute what ours computes."""
 
 import pytest
 import torch
 from torch.utils.benchmark import set_torch_threads
 
 from src.benchmark.convolutions import (
-    Backbone,
     Layer,
     dense_convolution,
     fits_dense,
     layers_of,
-    memory_of,
     remembered_sites,
 )
 from src.benchmark.scenes import Highway, highway_points
@@ -23,6 +21,7 @@ from src.benchmark.spconv_baseline import (
     sparse_tensor,
 )
 from src.config import compose_config
+from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.layers.sparse import SparseConv, SubmanifoldConv
 from src.ops import Sites, sparse_conv
 from src.structures.sparse_bev import SparseMap
@@ -75,12 +74,11 @@ def test_spconv_computes_the_same_at_one_thread(layer):
 
 def encoder_of(scale):
     config, _ = compose_config([f"scale={scale}", "data=synthetic"])
-    backbone = Backbone(config.model.radar_encoder, config.grid.build(), config.model.channels, seed=0)
-    encoder = backbone.build()
+    encoder = RadarEncoder(config.model.radar_encoder, config.grid.build(), config.model.channels).train()
     encoder.local_means = None
     points = highway_points(Highway(150, 10, 5, 150.0))
     voxels = encoder.voxelise(points, torch.zeros(len(points), dtype=torch.int64), 1)
-    return backbone, encoder, points, voxels
+    return encoder, voxels, config.grid.build()
 
 
 @needs_spconv
@@ -88,7 +86,7 @@ def encoder_of(scale):
 def test_the_whole_backbone_in_spconv_computes_the_same(scale):
     """Two and three dimensions, with submanifold and with dilating output."""
     with set_torch_threads(1):
-        _, encoder, _, voxels = encoder_of(scale)
+        encoder, voxels, _ = encoder_of(scale)
         sites, theirs = SpconvEncoder(SPCONV, encoder).train()(voxels)
         ours = encoder.encode(voxels)
     assert torch.equal(sites.keys, ours.sites.keys)
@@ -96,23 +94,13 @@ def test_the_whole_backbone_in_spconv_computes_the_same(scale):
 
 
 def test_layers_are_those_of_the_backbone_and_of_the_memory():
-    backbone, encoder, _, voxels = encoder_of("debug")
-    bev = sites_on((1, *backbone.grid.cells), 40)
-    past = remembered_sites(backbone.grid, bev, 3)
-    assert past.shape == (1, 3, *backbone.grid.cells) and len(past) == 3 * len(bev)
+    encoder, voxels, grid = encoder_of("debug")
+    bev = sites_on((1, *grid.cells), 40)
+    past = remembered_sites(grid, bev, 3)
+    assert past.shape == (1, 3, *grid.cells) and len(past) == 3 * len(bev)
     found = layers_of(encoder, voxels, 16, bev, past)
     assert [layer.kernel.ndim for layer in found] == [2, 2, 2, 3, 3, 3]
     assert [layer.temporal for layer in found] == [False] * 5 + [True]
     assert not fits_dense(found[-1], past)  # no dense convolution keeps to occupied columns
     wide = Sites((1, 64, 3072, 3072), past.keys[:0])
     assert not fits_dense(Layer("wide", wide, SubmanifoldConv(64, 64, 3, 3, False), (1, 1, 1), (1, 1, 1)), wide)
-
-
-@pytest.mark.slow
-def test_memory_of_a_process_of_its_own():
-    backbone, _, points, _ = encoder_of("debug")
-    held = memory_of(backbone, points, "ours", "f+b", threads=1)
-    if held is None:
-        pytest.skip("the system does not report what a process holds")
-    before, most = held
-    assert 50 < before <= most < 4000

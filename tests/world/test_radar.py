@@ -51,8 +51,6 @@ def straight_scene(kind, ahead_m, speed_mps=0.0):
     )
     ego = EgoMotion(tracks=track(0.0, EGO_MPS), sway=np.zeros((4, 3)))
     return Scene(
-        index=0,
-        split="train",
         conditions=None,
         road=road,
         actors=[actor],

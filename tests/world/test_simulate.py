@@ -53,7 +53,7 @@ def test_velocities_and_rates_are_the_derivatives_of_the_poses(config, index):
         r0, t0 = scene.ego.pose(now - h)
         r1, t1 = scene.ego.pose(now + h)
         r, _ = scene.ego.pose(now)
-        linear, angular = scene.ego.rates(now)
+        (linear,), (angular,) = scene.ego.rates(np.array([now]))
         np.testing.assert_allclose(r @ linear, (t1 - t0) / (2 * h), atol=0.05)
         np.testing.assert_allclose(
             r @ np.cross(angular, [5.0, 1.0, 2.0]), (r1 - r0) @ [5.0, 1.0, 2.0] / (2 * h), atol=0.02
@@ -64,7 +64,7 @@ def test_velocities_and_rates_are_the_derivatives_of_the_poses(config, index):
 def test_the_truck_drives_60_to_90_kmh_and_traffic_stays_below_180(config):
     for index in range(config.num_scenes):
         scene = make_scene(config, index)
-        assert 40 < np.linalg.norm(scene.ego.rates(0.5)[0]) * 3.6 < 92
+        assert 40 < np.linalg.norm(scene.ego.rates(np.array([0.5]))[0]) * 3.6 < 92
         assert np.linalg.norm(scene.tracks.state(0.5)[1], axis=1).max() * 3.6 < 182
 
 
@@ -97,7 +97,6 @@ def test_labelled_objects_lie_inside_their_boxes(config):
 def test_points_are_counted_in_turned_boxes_with_their_borders():
     nothing = np.zeros(1, dtype=int)
     truth = FrameTruth(
-        time_s=0.0,
         centres=np.array([[10.0, 5.0, 1.0]]),
         yaws=np.array([np.pi / 2]),
         speeds=nothing,
