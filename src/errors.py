@@ -13,6 +13,14 @@ class ConfigError(HorizonError):
     exit_code = 3
 
 
+def require_least(config: object, key: str, least: dict[str, float], hint: str = "") -> None:
+    """Raise ConfigError, naming `key`.field, for the first field of a settings object below its least; null passes."""
+    for name, low in least.items():
+        value = getattr(config, name)
+        if value is not None and value < low:
+            raise ConfigError(f"{key}.{name}={value}: must be at least {low}{hint}")
+
+
 class BusyError(ConfigError):
     """Another process works in the folder of a run."""
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from src.data.augment import AugmentationConfig
 from src.data.reader import OnBadFile, ReaderSettings
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.structures.taxonomy import SENSORS
 
 
@@ -46,9 +46,7 @@ class DataConfig:
             "num_future_frames": 0,
             "min_distance_m": 0,
         }
-        for name, least in least_values.items():
-            if not getattr(self, name) >= least:
-                raise ConfigError(f"data.{name}={getattr(self, name)}: must be at least {least}")
+        require_least(self, "data", least_values)
         if not 0 <= self.sensor_dropout < 1:
             raise ConfigError(f"data.sensor_dropout={self.sensor_dropout}: must be at least 0 and below 1")
         if not -0.5 < self.test_resize_offset < 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import torch
@@ -14,32 +15,42 @@ from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
 
 
-class ModelConfig(Protocol):
-    """What commands ask of every model's settings, whatever else these hold."""
+@dataclass(kw_only=True)
+class ModelConfig:
+    """What every model's settings (`model`) have in common, and what commands ask of them."""
+
+    temporal_part: ClassVar[str] = ""
+    """The key of all that is temporal; a phase of single frames sets it to null. Empty for a model without."""
+    new_in_temporal_phase: ClassVar[str] = ""
+    """Regular expression: names of the parameters that the temporal phase adds, and no checkpoint of the phase before
+    holds. Empty for a model without."""
 
     name: str
     channels: int  # C, width of the map that the head reads
-    temporal_part: ClassVar[str]
-    """The key of all that is temporal; a phase of single frames sets it to null. Empty for a model without."""
-    new_in_temporal_phase: ClassVar[str]
-    """Regular expression: names of the parameters that the temporal phase adds, and no checkpoint of the phase before
-    holds. Empty for a model without."""
 
     @property
     def sensors(self) -> tuple[str, ...]:
         """Which of `taxonomy.SENSORS` are read: all that `forward` takes of a batch, and what a submission states."""
+        raise NotImplementedError
 
     @property
     def keys_of_temporal_phase(self) -> tuple[str, ...]:
-        """Dotted keys that change nothing of a run of the phase before, `model.dptf` for example."""
+        """Dotted keys that change nothing of a run of the phase before."""
+        return (f"model.{self.temporal_part}",) if self.temporal_part else ()
 
     @property
     def memory_frames(self) -> int:
         """How many past key frames are remembered at most; 0 for single frames."""
+        return 0 if self._temporal is None else self._temporal.num_frames
 
     @property
     def memory_max_age_s(self) -> float | None:
         """How far back the memory may lie; None for single frames."""
+        return None if self._temporal is None else self._temporal.max_age_s
+
+    @property
+    def _temporal(self) -> Any:
+        return getattr(self, self.temporal_part) if self.temporal_part else None
 
     def scaled(
         self, gaussians: float = 1.0, memory_frames: int | None = None, cells_per_frame: int | None = None
@@ -47,6 +58,7 @@ class ModelConfig(Protocol):
         """The settings of a measurement: with so many times the Gaussians; with so many remembered frames (0: none,
         None: as configured); with so many cells remembered of each, whatever fresh weights call occupied. What a model
         does not have stays as it is."""
+        return self
 
 
 class TemporalMemory(Protocol):

@@ -46,23 +46,17 @@ class PictureViews:
         return next((image.shape[1] / image.shape[0] for image in self.images if image is not None), DEFAULT_ASPECT)
 
 
-def frustum(
+def border_distances(
+    points: Array,  # [..., 3] (u*d, v*d, d)
     width: float,
     height: float,
-) -> Array:  # [5, 3]
-    """Half-spaces n . (u*d, v*d, d) >= offset that bound what an image shows; see `clip_edges`.
+) -> Array:  # [..., 5], inside where >= 0
+    """Distances of points to the planes that bound what an image shows, the first being depth - NEAR_M.
 
     In these homogeneous coordinates projection is linear in 3D, so clipping before the division is exact even for
     an edge that ends behind the camera.
     """
-    return np.array([[0, 0, 1], [1, 0, 0], [-1, 0, width], [0, 1, 0], [0, -1, height]], dtype=np.float64)
-
-
-def signed_distances(
-    points: Array,  # [..., 3] (u*d, v*d, d)
-    planes: Array,  # [5, 3], see `frustum`
-) -> Array:  # [..., 5], inside where >= 0
-    """Distance of each point to each plane, the first being depth - NEAR_M."""
+    planes = np.array([[0, 0, 1], [1, 0, 0], [-1, 0, width], [0, 1, 0], [0, -1, height]], dtype=np.float64)
     return points @ planes.T - np.array([NEAR_M, 0, 0, 0, 0])
 
 
@@ -72,7 +66,7 @@ def clip_edges(
     height: float,
 ) -> tuple[Array, Array]:  # [V, 2, 2] pixels, [V] index of the edge each visible piece came from
     """The pieces of straight 3D edges that an image of this size shows, in pixels."""
-    distance = signed_distances(edges, frustum(width, height))  # [E, 2, 5]
+    distance = border_distances(edges, width, height)  # [E, 2, 5]
     start, end = distance[:, 0], distance[:, 1]
     with np.errstate(divide="ignore", invalid="ignore"):
         crossing = start / (start - end)  # only read where the signs differ
@@ -92,7 +86,7 @@ def clip_polygon(
 ) -> Array:  # [m, 2] pixels, m = 0 where nothing is visible
     """The part of a plane convex polygon that an image of this size shows (Sutherland & Hodgman 1974), in pixels."""
     for index in range(5):
-        distance = signed_distances(polygon, frustum(width, height))[:, index]
+        distance = border_distances(polygon, width, height)[:, index]
         kept = []
         for i in range(len(polygon)):
             j = (i + 1) % len(polygon)
@@ -104,15 +98,6 @@ def clip_polygon(
     return polygon[:, :2] / polygon[:, 2:]
 
 
-def project_corners(
-    boxes: PictureBoxes,
-    pix_from_ego: Array,  # [4, 4]
-) -> Array:  # [K, 8, 3] (u*d, v*d, d)
-    """Corners of the boxes in homogeneous pixels."""
-    corners = boxes.corners()
-    return corners @ pix_from_ego[:3, :3].T + pix_from_ego[:3, 3]
-
-
 def paint_boxes(
     axes: Axes,
     boxes: PictureBoxes,
@@ -121,7 +106,7 @@ def paint_boxes(
     predicted: bool,
 ) -> None:
     """Add the visible edges: predictions solid in class colours with a tinted front face, truth dashed on a halo."""
-    corners = project_corners(boxes, pix_from_ego)
+    corners = boxes.corners() @ pix_from_ego[:3, :3].T + pix_from_ego[:3, 3]  # [K, 8, 3] (u*d, v*d, d)
     edges = corners[:, BOX_EDGES, :]  # [K, 12, 2, 3]
     pieces, rows = clip_edges(edges.reshape(-1, 2, 3), *size)
     depth = np.maximum(corners[:, :, 2].mean(axis=1), NEAR_M)

@@ -20,6 +20,8 @@ SHEET_PX = 1600
 MARGIN_PX = 10
 GAP_PX = 12
 """Between panels."""
+HALF_PX = (SHEET_PX - 2 * MARGIN_PX - GAP_PX) / 2
+"""Width of one of two panels side by side."""
 CAPTION_PX = 34
 """Above a panel."""
 

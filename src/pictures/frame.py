@@ -9,7 +9,7 @@ from matplotlib.artist import Artist
 
 from src.pictures.bev import BevScene, bev_panel, paint_detections, paint_evidence
 from src.pictures.cameras import PictureViews, cameras_height, paint_cameras
-from src.pictures.canvas import CAPTION_PX, GAP_PX, MARGIN_PX, SHEET_PX, Canvas
+from src.pictures.canvas import CAPTION_PX, GAP_PX, HALF_PX, MARGIN_PX, SHEET_PX, Canvas
 from src.pictures.contents import MUTED, Window, match_boxes
 from src.pictures.legends import class_keys, gaussian_keys, point_keys, reading_keys
 
@@ -18,7 +18,6 @@ NEAR_PX = 500
 NEAR_PX_PER_M = 8.0
 NEAR_BEHIND_SHARE = 0.35
 """Share of the near view that lies behind the ego's rear axle."""
-
 
 
 def counts_line(scene: BevScene, score_threshold: float) -> str:
@@ -49,8 +48,7 @@ def near_window(width: float, height: float) -> Window:
 
 def bev_height(scene: BevScene) -> int:
     """Height in picture pixels of all BEV panels."""
-    wide = (SHEET_PX - 2 * MARGIN_PX - GAP_PX) / 2
-    whole = CAPTION_PX + wide * scene.grid.cols / scene.grid.rows
+    whole = CAPTION_PX + HALF_PX * scene.grid.cols / scene.grid.rows
     return round(whole + (CAPTION_PX + NEAR_PX if has_evidence(scene) else 0))
 
 
@@ -65,8 +63,7 @@ def paint_bev(canvas: Canvas, scene: BevScene, top: float) -> None:
     Left column detections, right column Gaussians, the near views below; without Gaussians the near view takes the
     right column.
     """
-    wide = (SHEET_PX - 2 * MARGIN_PX - GAP_PX) / 2
-    high = wide * scene.grid.cols / scene.grid.rows
+    wide, high = HALF_PX, HALF_PX * scene.grid.cols / scene.grid.rows
     right, top = MARGIN_PX + wide + GAP_PX, top + CAPTION_PX
 
     def panel(area: tuple[float, float, float, float], window: Window, caption: str, keys: Sequence[Artist]) -> None:

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from src.pictures.bev import bev_panel, paint_arrows, paint_label, upright
-from src.pictures.canvas import DPI, GAP_PX, MARGIN_PX, SHEET_PX, Canvas
+from src.pictures.canvas import DPI, GAP_PX, HALF_PX, MARGIN_PX, SHEET_PX, Canvas
 from src.pictures.contents import INK, MOVING_MPS, MUTED, PictureBoxes, PictureGrid, PictureMemory, Window
 from src.pictures.legends import arrow_key
 
@@ -265,8 +265,7 @@ def draw_memory(
     wide = SHEET_PX - 2 * MARGIN_PX
     closes = [(name, memory, moved) for name, memory in paths for moved in (False, True)]
     overviews = closes if len(paths) == 1 else [(name, memory, memory.compensated) for name, memory in paths]
-    half = (wide - GAP_PX) / 2
-    high = half * scene.grid.cols / scene.grid.rows
+    high = HALF_PX * scene.grid.cols / scene.grid.rows
     below = HEADER_PX + CAPTION_PX + CLOSE_PX + GAP_PX
     canvas = Canvas(SHEET_PX, round(below + CAPTION_PX + high + MARGIN_PX) if paths else HEADER_PX + MARGIN_PX)
     paint_header(canvas, scene, ages, title)
@@ -279,7 +278,7 @@ def draw_memory(
         paint_truth(axes, scene, close=True)
         paint_scale(axes)
     for column, (name, memory, moved) in enumerate(overviews):
-        area = (MARGIN_PX + column * (half + GAP_PX), below + CAPTION_PX, half, high)
+        area = (MARGIN_PX + column * (HALF_PX + GAP_PX), below + CAPTION_PX, HALF_PX, high)
         axes = bev_panel(canvas, area, scene.grid.window, f"{name}, whole range", note=caption(memory, moved))
         paint_memory(axes, memory, ages, moved, scene.grid.cell_m, close=False)
         paint_truth(axes, scene, close=False)

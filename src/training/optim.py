@@ -9,7 +9,7 @@ import torch
 from torch import nn
 from torch.optim.lr_scheduler import LRScheduler
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.models.layers.sparse import SparseKernel
 
 
@@ -31,9 +31,7 @@ class OptimConfig:
         for name in ("lr", "clip_norm", "peak_lr_ratio"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"optim.{name} must be above 0, but got {getattr(self, name)}")
-        for name in ("weight_decay", "final_lr_ratio"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"optim.{name} must be at least 0, but got {getattr(self, name)}")
+        require_least(self, "optim", {"weight_decay": 0, "final_lr_ratio": 0})
         if not 0 <= self.rise_fraction <= 1:
             raise ConfigError(f"optim.rise_fraction must lie in [0, 1], but got {self.rise_fraction}")
         for name in ("betas", "cycled_beta1"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.training.evaluator import DetectionEvaluator, Evaluator
 from src.training.module import TrainingModule
 from src.training.temporal_module import TemporalModule
@@ -38,6 +38,4 @@ class PhaseConfig:
                 f"phase.temporal={self.temporal} does not go with phase.module={self.module}, which is for "
                 f"{'streamed clips' if MODULES[self.module].temporal else 'single frames'}"
             )
-        for name in ("epochs", "validate_every"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"phase.{name} must be at least 1, but got {getattr(self, name)}")
+        require_least(self, "phase", {"epochs": 1, "validate_every": 1})

@@ -7,7 +7,7 @@ from enum import Enum
 
 import torch
 
-from src.errors import ConfigError
+from src.errors import require_least
 from src.reliability.processes import check_devices
 
 
@@ -41,10 +41,7 @@ class TrainerConfig:
 
     def __post_init__(self) -> None:
         least_of = {"devices": 1, "num_nodes": 1, "log_every_steps": 1, "checkpoint_every_steps": 1, "num_pictures": 0}
-        for name, least in least_of.items():
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ConfigError(f"trainer.{name} must be at least {least}, but got {value}")
+        require_least(self, "trainer", least_of)
 
     @property
     def num_processes(self) -> int:

@@ -11,7 +11,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.local_means import LocalMeans
 from src.models.layers.sparse import ConvNormReLU, ResidualBlock, SparseConv, SubmanifoldConv
@@ -59,9 +59,7 @@ class VoxelEncoderConfig:
             )
         if not self.stage_channels or min(self.stage_channels) < 1:
             raise ConfigError(f"{self.key}.stage_channels={self.stage_channels}: must list at least one positive width")
-        for key, value, least in (("blocks_per_stage", self.blocks_per_stage, 0), ("max_voxels", self.max_voxels, 1)):
-            if value < least:
-                raise ConfigError(f"{self.key}.{key}={value}: must be at least {least}")
+        require_least(self, self.key, {"blocks_per_stage": 0, "max_voxels": 1})
         if not 0 < self.norm_momentum <= 1:
             raise ConfigError(f"{self.key}.norm_momentum={self.norm_momentum}: must lie in (0, 1]")
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from src.errors import ConfigError
+from src.errors import require_least
 from src.geometry.bev_grid import BEVGrid
 from src.losses.loss_weights import LossWeights
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.backbones.sparse_voxel import VoxelEncoder, VoxelEncoderConfig
-from src.models.detector import Detector, Objective
+from src.models.detector import Detector, ModelConfig, Objective
 from src.models.heads.center_head import BoxOptions, CenterHead, HeadConfig, HeadOutput
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
@@ -39,47 +39,20 @@ class CenterPointLossConfig(LossWeights):
 
 
 @dataclass(kw_only=True)
-class CenterPointConfig:
+class CenterPointConfig(ModelConfig):
     """Settings of the model (`model`)."""
 
-    temporal_part: ClassVar[str] = ""
-    new_in_temporal_phase: ClassVar[str] = ""
-
-    name: str
-    channels: int  # C, width of the BEV map that the head reads
     lidar_encoder: LidarEncoderConfig
     head: HeadConfig
     loss: CenterPointLossConfig
 
     def __post_init__(self) -> None:
-        if self.channels < 1:
-            raise ConfigError(f"model.channels={self.channels}: must be at least 1")
+        require_least(self, "model", {"channels": 1})
 
     @property
     def sensors(self) -> tuple[str, ...]:
         """LiDAR alone."""
         return ("lidar",)
-
-    @property
-    def keys_of_temporal_phase(self) -> tuple[str, ...]:
-        """None: sweeps are accumulated in the input, nothing is remembered."""
-        return ()
-
-    @property
-    def memory_frames(self) -> int:
-        """No past key frame is remembered."""
-        return 0
-
-    @property
-    def memory_max_age_s(self) -> float | None:
-        """Single frames."""
-        return None
-
-    def scaled(
-        self, gaussians: float = 1.0, memory_frames: int | None = None, cells_per_frame: int | None = None
-    ) -> Self:
-        """Neither Gaussians nor memory."""
-        return self
 
 
 @dataclass

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.resnet import BasicBlock
 from src.models.layers.dense import DenseConvNormReLU
@@ -36,8 +36,7 @@ class BEVDecoderConfig:
         for name, least in (("stage_channels", MIN_CHANNELS), ("stage_strides", 1)):
             if min(getattr(self, name)) < least:
                 raise ConfigError(f"model.decoder.{name}={getattr(self, name)}: each must be at least {least}")
-        if self.blocks_per_stage < 1:
-            raise ConfigError(f"model.decoder.blocks_per_stage={self.blocks_per_stage}: must be at least 1")
+        require_least(self, "model.decoder", {"blocks_per_stage": 1})
 
 
 class ConvFuser(nn.Module):

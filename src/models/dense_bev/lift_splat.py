@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import invert_projection, pixel_centres
 from src.models.backbones.resnet import BasicBlock
@@ -28,9 +28,8 @@ class LiftSplatConfig:
     z_range_m: list[float]  # [low, high): lifted points outside are dropped
 
     def __post_init__(self) -> None:
-        for name in ("image_stride_px", "hidden_channels", "context_channels", "num_depth_bins"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"model.view_transform.{name}={getattr(self, name)}: must be at least 1")
+        own = ("image_stride_px", "hidden_channels", "context_channels", "num_depth_bins")
+        require_least(self, "model.view_transform", dict.fromkeys(own, 1))
         low_high = self.depth_range_m
         if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
             raise ConfigError(

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import depth_cross_entropy
 from src.losses.loss_weights import LossWeights
@@ -18,7 +18,7 @@ from src.models.dense_bev.bev_decoder import MIN_CHANNELS, BEVDecoder, BEVDecode
 from src.models.dense_bev.lift_splat import LiftedViews, LiftSplat, LiftSplatConfig
 from src.models.dense_bev.pillars import PillarConfig, PillarEncoder
 from src.models.dense_bev.temporal_fusion import MapMemory, TemporalConfig, TemporalFusion, WarpedMaps
-from src.models.detector import Detector, Objective
+from src.models.detector import Detector, ModelConfig, Objective
 from src.models.heads.center_head import BoxOptions, CenterHead, HeadConfig, HeadOutput
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
@@ -37,14 +37,12 @@ class DenseBEVLossConfig(LossWeights):
 
 
 @dataclass(kw_only=True)
-class DenseBEVConfig:
+class DenseBEVConfig(ModelConfig):
     """Settings of the model (`model`). Raises ConfigError for parts that do not go together."""
 
     temporal_part: ClassVar[str] = "temporal"
     new_in_temporal_phase: ClassVar[str] = r"temporal\."
 
-    name: str
-    channels: int  # C, width of the map that the head reads
     fused_channels: int  # width of the fused map, which is also what is remembered
     radar_encoder: PillarConfig
     view_transform: LiftSplatConfig
@@ -54,29 +52,12 @@ class DenseBEVConfig:
     loss: DenseBEVLossConfig
 
     def __post_init__(self) -> None:
-        for name, least in (("channels", 1), ("fused_channels", MIN_CHANNELS)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"model.{name}={getattr(self, name)}: must be at least {least}")
+        require_least(self, "model", {"channels": 1, "fused_channels": MIN_CHANNELS})
 
     @property
     def sensors(self) -> tuple[str, ...]:
         """Both always: without cameras there is nothing to fuse."""
         return ("camera", "radar")
-
-    @property
-    def keys_of_temporal_phase(self) -> tuple[str, ...]:
-        """The part that aligns and fuses past maps."""
-        return ("model.temporal",)
-
-    @property
-    def memory_frames(self) -> int:
-        """How many past key frames are remembered at most; 0 for single frames."""
-        return self.temporal.num_frames if self.temporal is not None else 0
-
-    @property
-    def memory_max_age_s(self) -> float | None:
-        """How far back the memory may lie; None for single frames."""
-        return self.temporal.max_age_s if self.temporal is not None else None
 
     def scaled(
         self, gaussians: float = 1.0, memory_frames: int | None = None, cells_per_frame: int | None = None

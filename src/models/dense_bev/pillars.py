@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.sparse_voxel import POINT_SCALES
 from src.models.layers.dense import map_of_rows
@@ -29,8 +29,7 @@ class PillarConfig:
     def __post_init__(self) -> None:
         if self.channels < 2 or self.channels % 2:
             raise ConfigError(f"model.radar_encoder.channels={self.channels}: must be a positive even number")
-        if self.num_layers < 1:
-            raise ConfigError(f"model.radar_encoder.num_layers={self.num_layers}: must be at least 1")
+        require_least(self, "model.radar_encoder", {"num_layers": 1})
 
 
 class PillarEncoder(nn.Module):

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy
 from src.models.layers.dense import DenseConvNormReLU
@@ -31,10 +31,7 @@ class TemporalConfig:
     max_age_s: float  # older ones are not used
 
     def __post_init__(self) -> None:
-        if self.num_frames < 1:
-            raise ConfigError(
-                f"model.temporal.num_frames={self.num_frames}: must be at least 1; model.temporal=null means no memory"
-            )
+        require_least(self, "model.temporal", {"num_frames": 1}, "; model.temporal=null means no memory")
         if not self.max_age_s > 0:
             raise ConfigError(f"model.temporal.max_age_s={self.max_age_s}: must be positive")
 

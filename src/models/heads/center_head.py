@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import penalty_reduced_focal
 from src.losses.normalizers import full_precision, mean_over_ranks
@@ -82,10 +82,7 @@ class BoxOptions:
     velocity_code_weight: float  # weight of velocity in the box loss
 
     def __post_init__(self) -> None:
-        if not self.velocity_code_weight >= 0:
-            raise ConfigError(
-                f"phase.options.velocity_code_weight must be at least 0, but got {self.velocity_code_weight}"
-            )
+        require_least(self, "phase.options", {"velocity_code_weight": 0})
 
 
 @dataclass

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
 from src.models.horizon3d.dptf_memory import Memory, StoredCells
@@ -41,12 +41,8 @@ class BEVPathConfig:
     spatial_dilation: bool  # literal strided convolutions, which spread every cell to its neighbours
 
     def __post_init__(self) -> None:
-        for name in ("num_frames", "max_cells_per_frame"):
-            if getattr(self, name) < 1:
-                raise ConfigError(
-                    f"model.dptf.bev_path.{name}={getattr(self, name)}: must be at least 1; bev_path=null switches "
-                    "the path off"
-                )
+        own = {"num_frames": 1, "max_cells_per_frame": 1}
+        require_least(self, "model.dptf.bev_path", own, "; bev_path=null switches the path off")
         if not 0 <= self.memory_threshold < 1:
             raise ConfigError(
                 f"model.dptf.bev_path.memory_threshold={self.memory_threshold}: must be at least 0 and below 1"

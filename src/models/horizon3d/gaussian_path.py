@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import ConfigError
+from src.errors import require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.time_embedding import TimeEmbedding
@@ -35,11 +35,8 @@ class SelfAttentionConfig:
     num_heads: int
 
     def __post_init__(self) -> None:
-        if self.num_heads < 1:
-            raise ConfigError(
-                f"model.dptf.gaussian_path.self_attention.num_heads={self.num_heads}: must be at least 1; "
-                "self_attention=null switches it off"
-            )
+        key = "model.dptf.gaussian_path.self_attention"
+        require_least(self, key, {"num_heads": 1}, "; self_attention=null switches it off")
 
 
 @dataclass(kw_only=True)
@@ -53,12 +50,8 @@ class GaussianPathConfig:
     self_attention: SelfAttentionConfig | None
 
     def __post_init__(self) -> None:
-        for name in ("num_frames", "gaussians_per_frame"):
-            if getattr(self, name) < 1:
-                raise ConfigError(
-                    f"model.dptf.gaussian_path.{name}={getattr(self, name)}: must be at least 1; "
-                    "gaussian_path=null switches the path off"
-                )
+        own = {"num_frames": 1, "gaussians_per_frame": 1}
+        require_least(self, "model.dptf.gaussian_path", own, "; gaussian_path=null switches the path off")
 
     @property
     def num_history_gaussians(self) -> int:

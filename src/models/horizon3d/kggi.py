@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.heads.keypoint_head import KEYPOINT_BIAS, CameraKeypointHead, CameraMaps, keypoint_scores
 from src.models.horizon3d.gaussian_encoder import RAW_ATTRIBUTES, GaussianBounds
@@ -46,10 +46,9 @@ class KGGIConfig:
     property_head: bool  # local features correct the learnable attributes
 
     def __post_init__(self) -> None:
-        for name in ("num_radar_keypoints", "num_camera_keypoints"):
-            least = 0 if self.initialization is Initialization.random else 1
-            if getattr(self, name) < least:
-                raise ConfigError(f"model.kggi.{name}={getattr(self, name)}: must be at least {least}")
+        least = 0 if self.initialization is Initialization.random else 1
+        own = {"num_radar_keypoints": least, "num_camera_keypoints": least, "num_depth_bins": 1}
+        require_least(self, "model.kggi", own)
         if self.num_random_keypoints < 0 or sum(self.counts.values()) < 1:
             raise ConfigError(
                 f"model.kggi.num_random_keypoints={self.num_random_keypoints}: must not be negative, and "
@@ -58,8 +57,6 @@ class KGGIConfig:
         low_high = self.depth_range_m
         if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
             raise ConfigError(f"model.kggi.depth_range_m={low_high}: must be [near, far] in metres with 0 < near < far")
-        if self.num_depth_bins < 1:
-            raise ConfigError(f"model.kggi.num_depth_bins={self.num_depth_bins}: must be at least 1")
         window = self.keypoint_nms_cells
         if window is not None and (window < 3 or window % 2 == 0):
             raise ConfigError(f"model.kggi.keypoint_nms_cells={window}: must be null or an odd number from 3 on")

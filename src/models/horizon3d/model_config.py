@@ -8,6 +8,7 @@ from typing import ClassVar, Self
 
 from src.errors import ConfigError
 from src.models.backbones.sparse_voxel import RadarEncoderConfig
+from src.models.detector import ModelConfig
 from src.models.heads.center_head import HeadConfig
 from src.models.horizon3d.cross_attention import NUM_HEADS
 from src.models.horizon3d.dptf import DPTFConfig
@@ -20,14 +21,12 @@ CHANNEL_MULTIPLE = 4 * NUM_HEADS
 
 
 @dataclass(kw_only=True)
-class Horizon3DConfig:
+class Horizon3DConfig(ModelConfig):
     """Settings of the model (`model`). Raises ConfigError for parts that do not go together."""
 
     temporal_part: ClassVar[str] = "dptf"
     new_in_temporal_phase: ClassVar[str] = r"dptf\.|ocsf\.encoder\.layers\.\d+\.temporal_attention\."
 
-    name: str
-    channels: int  # C, width of BEV cells and Gaussians
     radar_encoder: RadarEncoderConfig
     kggi: KGGIConfig | None  # null together with ocsf: radar only
     ocsf: OCSFConfig | None
@@ -70,16 +69,6 @@ class Horizon3DConfig:
         if not self.loss.gaussian_velocity_in_phase1:
             terms += ["dptf_weight", "gaussian_velocity_weight"]
         return ("model.dptf", *(f"model.loss.{term}" for term in terms))
-
-    @property
-    def memory_frames(self) -> int:
-        """How many past key frames are remembered at most; 0 for single frames."""
-        return self.dptf.num_frames if self.dptf is not None else 0
-
-    @property
-    def memory_max_age_s(self) -> float | None:
-        """How far back the memory may lie; None for single frames."""
-        return self.dptf.max_age_s if self.dptf is not None else None
 
     @property
     def temporal_heads(self) -> int | None:

@@ -7,7 +7,7 @@ from enum import Enum
 
 from torch import nn
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.gaussian_encoder import FIXED_POINTS, GaussianBounds, GaussianEncoder
 from src.models.horizon3d.sparse_fusion import SparseFusion
@@ -49,9 +49,8 @@ class OCSFConfig:
     gate_kernel_size: int  # of psi: 1 or 3
 
     def __post_init__(self) -> None:
-        for name, least in (("num_layers", 1), ("num_learnable_points", 0), ("max_occupied_cells", 1), ("margin_m", 0)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"model.ocsf.{name}={getattr(self, name)}: must be at least {least}")
+        own = {"num_layers": 1, "num_learnable_points": 0, "max_occupied_cells": 1, "margin_m": 0}
+        require_least(self, "model.ocsf", own)
         for name in ("max_mean_shift_m", "max_speed_mps", "support_sigmas"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"model.ocsf.{name}={getattr(self, name)}: must be positive")
