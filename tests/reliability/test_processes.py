@@ -387,7 +387,7 @@ def test_a_stopped_run_resumes_under_torchrun_and_scores_as_one_process_does(pha
 
 
 @needs_proc
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_run_on_two_nodes_survives_the_loss_of_one(phase1, outputs):
     """Temporal training as SLURM starts it; killed without warning on one node, ended by the plain command."""
     command = ["src.train", *overrides(outputs, "phase2"), f"phase.init_from={phase1 / 'checkpoints' / 'last.ckpt'}"]
