@@ -17,6 +17,8 @@ def require_least(config: object, key: str, least: dict[str, float], hint: str =
     """Raise ConfigError, naming `key`.field, for the first field of a settings object below its least; null passes."""
     for name, low in least.items():
         value = getattr(config, name)
+        if value is not None and value != value:
+            raise ConfigError(f"{key}.{name} must be a finite number, but got {value}")
         if value is not None and value < low:
             raise ConfigError(f"{key}.{name}={value}: must be at least {low}{hint}")
 

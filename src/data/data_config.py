@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from src.data.augment import AugmentationConfig
-from src.data.reader import OnBadFile, ReaderSettings
+from src.data.reader import ReaderOptions, ReaderSettings
 from src.errors import ConfigError, require_least
 from src.structures.taxonomy import SENSORS
 
 
 @dataclass(kw_only=True)
-class DataConfig:
+class DataConfig(ReaderOptions):
     """What is read and how (`data`). Raises ConfigError for values that cannot work."""
 
     root: str | None  # folder of the data set; null with a world: a folder under paths.outputs
@@ -24,15 +24,6 @@ class DataConfig:
     stream_sets: int  # at most so many sets of streams take turns when clips are streamed; 1: all streams at every step
     sensor_dropout: float  # share of streamed frames, never a clip's first, that come without any sensor data
     num_workers: int  # loader processes per device
-    num_sweeps: int  # past sweeps of each radar
-    num_lidar_sweeps: int  # past sweeps of each LiDAR
-    lidar_origins: bool  # also where the ray of each LiDAR point began
-    deskew_lidar: bool  # move LiDAR points by what was driven between their own times and their sweep's
-    num_future_frames: int  # next key frames of the scene whose LiDAR comes along as supervision
-    min_distance_m: float  # nearer points are the truck itself
-    propagate_points: bool  # move points by their own radial velocity
-    on_bad_file: OnBadFile
-    test_resize_offset: float  # added to the image scale without augmentation
     augmentation: AugmentationConfig | None
 
     def __post_init__(self) -> None:
@@ -60,15 +51,7 @@ class DataConfig:
         """How a frame is read. Raises ValueError for sensors that are none, or a camera without an image size."""
         if not sensors or not set(sensors) <= set(SENSORS) or ("camera" in sensors and image_size_px is None):
             raise ValueError(f"sensors must be some of {SENSORS}, a camera with its image size, but got {sensors}")
-        return ReaderSettings(
-            num_sweeps=self.num_sweeps if "radar" in sensors else 0,
-            num_lidar_sweeps=self.num_lidar_sweeps if "lidar" in sensors else 0,
-            lidar_origins=self.lidar_origins,
-            deskew_lidar=self.deskew_lidar,
-            num_future_frames=self.num_future_frames,
-            min_distance_m=self.min_distance_m,
-            propagate_points=self.propagate_points,
-            on_bad_file=self.on_bad_file,
-            image_size_px=image_size_px if "camera" in sensors else None,
-            test_resize_offset=self.test_resize_offset,
-        )
+        options = {field.name: getattr(self, field.name) for field in fields(ReaderOptions)}
+        for sensor, sweeps in (("radar", "num_sweeps"), ("lidar", "num_lidar_sweeps")):
+            options[sweeps] *= sensor in sensors
+        return ReaderSettings(**options, image_size_px=image_size_px if "camera" in sensors else None)

@@ -52,20 +52,26 @@ class _Skipped:
         self.channels[channel] = self.channels.get(channel, 0) + 1
 
 
-@dataclass(frozen=True)
-class ReaderSettings:
-    """What is read of a frame."""
+@dataclass(kw_only=True)
+class ReaderOptions:
+    """How frames are read, whatever a model takes of them."""
 
-    num_sweeps: int  # past sweeps of each radar, the key frame's included; 0: radar is not read
-    num_lidar_sweeps: int  # past sweeps of each LiDAR, the key frame's included; 0: LiDAR is not read
+    num_sweeps: int  # past sweeps of each radar, the key frame's included
+    num_lidar_sweeps: int  # past sweeps of each LiDAR, the key frame's included
     lidar_origins: bool  # also where the ray of each LiDAR point began
     deskew_lidar: bool  # LiDAR points are moved by what was driven between their own times and the sweep's
     num_future_frames: int  # next key frames of the scene whose LiDAR comes along as supervision
-    min_distance_m: float  # points nearer than this in both x and y (sensor frame) are dropped
-    propagate_points: bool  # move points by their own radial velocity to the key frame's time
+    min_distance_m: float  # points nearer than this in both x and y (sensor frame) are dropped: the truck itself
+    propagate_points: bool  # move radar points by their own radial velocity to the key frame's time
     on_bad_file: OnBadFile
+    test_resize_offset: float  # added to the scale that fits the image's width, without augmentation
+
+
+@dataclass(kw_only=True)
+class ReaderSettings(ReaderOptions):
+    """What is read of a frame; a number of sweeps of 0 means that sensor is not read."""
+
     image_size_px: tuple[int, int] | None  # (height, width); None: images are not read
-    test_resize_offset: float  # added to the scale that fits the width, without augmentation
 
 
 class FrameReader:

@@ -121,15 +121,28 @@ class Detector(nn.Module, ABC):
         """The memory that `TemporalMemory.state` described. Raises NotImplementedError for single-frame detectors."""
         raise NotImplementedError(f"{type(self).__name__} has no memory")
 
-    @abstractmethod
     def loss(self, output: Any, batch: FrameBatch) -> Objective:
-        """Weighted loss terms by name, and what comparing with the truth shows besides; needs `batch.boxes`."""
+        """Weighted terms by name with their sum `total`, and scalars worth a curve, all in float32."""
+        with torch.autocast(batch.device.type, enabled=False):
+            terms, counts = self.loss_terms(output, batch)
+        with torch.no_grad():
+            values = (self.diagnostics(output) | counts).items()
+            shown = {name: torch.as_tensor(value, dtype=torch.float32, device=batch.device) for name, value in values}
+        total = sum(terms.values(), torch.zeros((), device=batch.device))
+        return Objective(terms | {"total": total}, shown)
+
+    @abstractmethod
+    def loss_terms(self, output: Any, batch: FrameBatch) -> Objective:
+        """Weighted loss terms by name, and what comparing with the truth shows besides.
+
+        Raises ValueError for a batch that lacks what it compares with.
+        """
 
     @abstractmethod
     def decode(self, output: Any) -> list[Boxes3D]:
         """Predicted boxes with scores, one entry per sample, in the (augmented) ego frame."""
 
-    def diagnostics(self, output: Any) -> dict[str, Tensor]:
+    def diagnostics(self, output: Any) -> dict[str, Tensor | float]:
         """Scalars of the output that are worth a curve."""
         return {}
 

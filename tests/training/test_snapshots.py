@@ -97,7 +97,7 @@ class Recorder(Detector):
         history, cells = recollection(True) if memory else (None, None)
         return Output(DPTFOutput(history, cells, None, None)), [*(memory or []), batch.tokens[0]]
 
-    def loss(self, output: Any, batch: FrameBatch) -> Objective:
+    def loss_terms(self, output: Any, batch: FrameBatch) -> Objective:
         raise NotImplementedError
 
     def evidence(self, output: Output) -> Evidence:

@@ -56,10 +56,11 @@ class ToyDetector(Detector):
     def restore_memory(self, state):
         return ToyMemory(state[0]["values"])
 
-    def loss(self, output, batch):
-        terms = {"near": (output - 1.0).square().mean(), "small": output.abs().mean()}
-        diagnostics = {"spread": output.detach().std()}
-        return Objective(terms | {"total": terms["near"] + terms["small"]}, diagnostics)
+    def loss_terms(self, output, batch):
+        return Objective({"near": (output - 1.0).square().mean(), "small": output.abs().mean()}, {})
+
+    def diagnostics(self, output):
+        return {"spread": output.detach().std()}
 
     def decode(self, output):
         return [Boxes3D.empty() for _ in output]

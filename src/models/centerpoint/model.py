@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from src.errors import require_least
@@ -91,21 +90,15 @@ class CenterPoint(Detector):
         bev = self.lidar_encoder(points, batch.lidar_batch, len(batch))
         return CenterPointOutput(bev, self.head(bev)), None
 
-    def loss(self, output: CenterPointOutput, batch: FrameBatch) -> Objective:
-        """Weighted terms `heatmap` and `box`, and their sum `total`; ValueError without annotations."""
-        if batch.boxes is None:
-            raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
+    def loss_terms(self, output: CenterPointOutput, batch: FrameBatch) -> Objective:
+        """Weighted terms `heatmap` and `box`."""
         weights = self.config.loss
-        with torch.autocast(batch.device.type, enabled=False):
-            terms, counts = self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
-        zero = torch.zeros((), device=batch.device)
-        return Objective(terms | {"total": sum(terms.values(), zero)}, self.diagnostics(output) | counts)
+        return self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
 
     def decode(self, output: CenterPointOutput) -> list[Boxes3D]:
         """Boxes of each frame, best first."""
         return self.head.decode(output.head)
 
-    def diagnostics(self, output: Any) -> dict[str, Tensor]:
+    def diagnostics(self, output: CenterPointOutput) -> dict[str, Tensor | float]:
         """Cells of the LiDAR map per frame."""
-        bev = output.lidar_bev
-        return {"lidar_cells": torch.tensor(len(bev) / bev.batch_size, device=bev.features.device)}
+        return {"lidar_cells": len(output.lidar_bev) / output.lidar_bev.batch_size}

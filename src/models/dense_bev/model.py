@@ -146,17 +146,13 @@ class DenseBEV(Detector):
         """The memory that `MapMemory.state` described."""
         return MapMemory.from_state(state)
 
-    def loss(self, output: DenseBEVOutput, batch: FrameBatch) -> Objective:
-        """Weighted terms `heatmap`, `box` and `depth`, and their sum `total`; ValueError without annotations."""
-        if batch.boxes is None:
-            raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
+    def loss_terms(self, output: DenseBEVOutput, batch: FrameBatch) -> Objective:
+        """Weighted terms `heatmap`, `box` and `depth`."""
         weights = self.config.loss
-        with torch.autocast(batch.device.type, enabled=False):
-            terms, counts = self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
-            if weights.depth_weight is not None:
-                terms["depth"] = weights.depth_weight * self._depth_loss(output.views.depth_logits, batch)
-        zero = torch.zeros((), device=batch.device)
-        return Objective(terms | {"total": sum(terms.values(), zero)}, self.diagnostics(output) | counts)
+        terms, counts = self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
+        if weights.depth_weight is not None:
+            terms["depth"] = weights.depth_weight * self._depth_loss(output.views.depth_logits, batch)
+        return Objective(terms, counts)
 
     def _depth_loss(
         self,
@@ -176,8 +172,7 @@ class DenseBEV(Detector):
         """Boxes of each frame, best first."""
         return self.head.decode(output.head)
 
-    @torch.no_grad()
-    def diagnostics(self, output: DenseBEVOutput) -> dict[str, Tensor]:
+    def diagnostics(self, output: DenseBEVOutput) -> dict[str, Tensor | float]:
         """Pillars and lifted pairs per frame, how sure depth is, past maps in use."""
         frames = len(output.radar_bev)
         probabilities = output.views.depth_logits.float().softmax(2)  # [B, N, D, h, w]
@@ -188,5 +183,4 @@ class DenseBEV(Detector):
         }
         if output.warped_maps is not None:
             values["remembered_frames"] = output.warped_maps.usable.sum() / frames
-        device = output.radar_bev.device
-        return {name: torch.as_tensor(value, dtype=torch.float32, device=device) for name, value in values.items()}
+        return values

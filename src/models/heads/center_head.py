@@ -177,7 +177,7 @@ class CenterHead(nn.Module):
     def loss(
         self,
         output: HeadOutput,
-        boxes: list[Boxes3D],  # B, augmented ego frame
+        boxes: list[Boxes3D] | None,  # B, augmented ego frame
         heatmap_weight: float | None,
         box_weight: float | None,
     ) -> Objective:
@@ -187,18 +187,17 @@ class CenterHead(nn.Module):
         share their cell with another of their group, so that the head cannot meet both.
 
         Focal loss per group over its positive cells, L1 per group over its objects (method 8.1). Without objects the
-        box term is 0 with zero gradients.
+        box term is 0 with zero gradients. Raises ValueError for a batch without annotations.
         """
+        if boxes is None:
+            raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
         targets = self.targets(output, boxes)
         counts = {
             "objects": len(targets.rows),
             "distant_objects": targets.num_distant,
             "shared_objects": targets.num_shared,
         }
-        diagnostics = {
-            name: torch.as_tensor(count / len(boxes), dtype=torch.float32, device=output.logits.device)
-            for name, count in counts.items()
-        }
+        diagnostics = {name: count / len(boxes) for name, count in counts.items()}
         group_of_class = targets.labels.new_tensor(GROUP_OF_CLASS)
         zeros = output.logits.new_zeros(len(HEAD_GROUPS))
         terms: dict[str, Tensor] = {}

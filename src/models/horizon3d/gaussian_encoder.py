@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -239,33 +240,15 @@ class GaussianEncoder(nn.Module):
         self,
         channels: int,
         image_channels: int,
-        num_layers: int,
-        num_learnable_points: int,
-        num_views: int,
-        num_levels: int,
         grid: BEVGrid,
         bounds: GaussianBounds,
-        chained_attention: bool,
-        refine_before_self_encoding: bool,
-        temporal_heads: int | None,
+        num_layers: int,
+        make_layer: Callable[[], EncoderLayer],
     ) -> None:
         super().__init__()
         self.anchor = AnchorEncoder(channels, grid, bounds)
         self.image_value = nn.Conv2d(image_channels, channels, 1)
-        self.layers = nn.ModuleList(
-            EncoderLayer(
-                channels,
-                num_learnable_points,
-                num_views,
-                num_levels,
-                grid,
-                bounds,
-                chained_attention,
-                refine_before_self_encoding,
-                temporal_heads,
-            )
-            for _ in range(num_layers)
-        )
+        self.layers = nn.ModuleList(make_layer() for _ in range(num_layers))
 
     def forward(self, gaussians: GaussianSet, radar_bev: SparseBEV, views: CameraViews) -> GaussianSet:
         """G_0 -> G_L."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from src.errors import ConfigError
@@ -114,26 +113,18 @@ class Horizon3D(Detector):
             self.image_encoder(batch.images), batch.pix_from_aug, batch.image_valid, (int(height), int(width))
         )
 
-    def loss(self, output: Horizon3DOutput, batch: FrameBatch) -> Objective:
-        """Terms of Eq. 10 as weighted, and their sum `total`. Raises ValueError for a batch without annotations."""
-        if batch.boxes is None:
-            raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
-        config = self.config
-        with torch.autocast(batch.device.type, enabled=False):
-            terms, counts = self.head.loss(output.head, batch.boxes, config.loss.heatmap_weight, config.loss.box_weight)
-            if output.kggi is not None and output.ocsf is not None:
-                terms |= kggi_losses(
-                    output.kggi, output.radar_bev, output.views, batch.boxes, self.grid, config.kggi, config.loss
-                )
-                terms |= ocsf_losses(output.ocsf, batch.boxes, self.grid, config.ocsf.margin_m, config.loss)
-                if config.dptf is not None or config.loss.gaussian_velocity_in_phase1:
-                    terms |= gaussian_velocity_loss(
-                        output.ocsf, batch.boxes, self.grid, config.ocsf.margin_m, config.loss
-                    )
-            if output.dptf is not None and output.dptf.cells is not None:
-                terms |= cell_losses(output.dptf.cells, output.fused_bev, batch.boxes, self.grid, config.loss)
-        zero = torch.zeros((), device=batch.device)
-        return Objective(terms | {"total": sum(terms.values(), zero)}, self.diagnostics(output) | counts)
+    def loss_terms(self, output: Horizon3DOutput, batch: FrameBatch) -> Objective:
+        """Terms of Eq. 10 as weighted."""
+        config, boxes, weights = self.config, batch.boxes, self.config.loss
+        terms, counts = self.head.loss(output.head, boxes, weights.heatmap_weight, weights.box_weight)
+        if output.kggi is not None and output.ocsf is not None:
+            terms |= kggi_losses(output.kggi, output.radar_bev, output.views, boxes, self.grid, config.kggi, weights)
+            terms |= ocsf_losses(output.ocsf, boxes, self.grid, config.ocsf.margin_m, weights)
+            if config.dptf is not None or weights.gaussian_velocity_in_phase1:
+                terms |= gaussian_velocity_loss(output.ocsf, boxes, self.grid, config.ocsf.margin_m, weights)
+        if output.dptf is not None and output.dptf.cells is not None:
+            terms |= cell_losses(output.dptf.cells, output.fused_bev, boxes, self.grid, weights)
+        return Objective(terms, counts)
 
     def decode(self, output: Horizon3DOutput) -> list[Boxes3D]:
         """Boxes of each frame, best first."""
@@ -143,6 +134,6 @@ class Horizon3D(Detector):
         """Refined Gaussians, the occupied cells of their splat, and the warped memory."""
         return output.evidence(self.config, self.grid)
 
-    def diagnostics(self, output: Horizon3DOutput) -> dict[str, Tensor]:
+    def diagnostics(self, output: Horizon3DOutput) -> dict[str, Tensor | float]:
         """What is occupied and remembered; see `Horizon3DOutput.diagnostics`."""
         return output.diagnostics(self.config, self.grid)

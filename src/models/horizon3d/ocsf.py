@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 
 from torch import nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
-from src.models.horizon3d.gaussian_encoder import FIXED_POINTS, GaussianBounds, GaussianEncoder
+from src.models.horizon3d.gaussian_encoder import FIXED_POINTS, EncoderLayer, GaussianBounds, GaussianEncoder
 from src.models.horizon3d.sparse_fusion import SparseFusion
 from src.models.horizon3d.splatting import GaussianSplat, splat_set
 from src.models.horizon3d.views import CameraViews
@@ -98,10 +99,9 @@ class OCSF(nn.Module):
     ) -> None:
         super().__init__()
         self.config, self.grid = config, grid
-        self.encoder = GaussianEncoder(
+        layer = partial(
+            EncoderLayer,
             channels,
-            image_channels,
-            config.num_layers,
             config.num_learnable_points,
             num_views,
             num_levels,
@@ -111,6 +111,7 @@ class OCSF(nn.Module):
             refine_before_self_encoding=config.refine_from is RefineFrom.cross_attention,
             temporal_heads=temporal_heads,
         )
+        self.encoder = GaussianEncoder(channels, image_channels, grid, config.bounds, config.num_layers, layer)
         self.fusion = SparseFusion(channels, config.gate_kernel_size)
 
     def forward(self, gaussians: GaussianSet, radar_bev: SparseBEV, views: CameraViews) -> OCSFOutput:

@@ -43,8 +43,7 @@ class Horizon3DOutput:
             evidence = replace(evidence, **warped_evidence(config.dptf, self.dptf))
         return evidence
 
-    @torch.no_grad()
-    def diagnostics(self, config: Horizon3DConfig, grid: BEVGrid) -> dict[str, Tensor]:
+    def diagnostics(self, config: Horizon3DConfig, grid: BEVGrid) -> dict[str, Tensor | float]:
         """Cells per frame, share of the grid that Gaussians open, cells cut by the guard, Gaussians by source."""
         frames = self.radar_bev.batch_size
         values: dict[str, Tensor | float] = {
@@ -67,5 +66,4 @@ class Horizon3DOutput:
                 values["head_cells"] = len(self.dptf.bev) / frames
             if self.dptf.history is not None:
                 values["gaussians_history"] = self.dptf.history.valid.sum() / frames
-        device = self.radar_bev.features.device
-        return {name: torch.as_tensor(value, dtype=torch.float32, device=device) for name, value in values.items()}
+        return values

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -49,7 +50,8 @@ def make_radar(grid, count=300, b=1, seed=1):
 
 def make_encoder(grid, layers=2, chained=False, early=False, learnable=3):
     torch.manual_seed(3)
-    return GaussianEncoder(C, 16, layers, learnable, 4, 3, grid, BOUNDS, chained, early, None).eval()
+    layer = partial(EncoderLayer, C, learnable, 4, 3, grid, BOUNDS, chained, early, None)
+    return GaussianEncoder(C, 16, grid, BOUNDS, layers, layer).eval()
 
 
 def places(count, b=1, seed=5):
