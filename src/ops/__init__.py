@@ -3,7 +3,7 @@
 from src.ops.deform_sample import deform_attend_bev, deform_attend_images, sample_sparse_bev
 from src.ops.farthest_point import farthest_points
 from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
-from src.ops.nms import maxpool_peaks, nms_circle, nms_rotated, rotated_iou
+from src.ops.nms import maxpool_peaks
 from src.ops.segment_reduce import segment_mean, segment_sum
 from src.ops.sites import Sites, union
 from src.ops.sparse_conv import neighbour_sum, sparse_conv
@@ -20,9 +20,6 @@ __all__ = [
     "log1mexp",
     "maxpool_peaks",
     "neighbour_sum",
-    "nms_circle",
-    "nms_rotated",
-    "rotated_iou",
     "sample_sparse_bev",
     "segment_mean",
     "segment_sum",

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
-from src.ops.backend import implementation, register
 from src.ops.segment_reduce import inverse_rows, weighted_segment_sum
 from src.ops.sites import Sites
 
@@ -55,15 +54,8 @@ def deform_attend_bev(
             "expected values [M, heads, c], points [Q, P, 2] and weights [Q, heads, P], got "
             f"{list(values.shape)}, {list(points.shape)} and {list(weights.shape)}"
         )
-    return implementation("deform_attend_bev")(values, sites, points, batch, weights, grid)
-
-
-@register("deform_attend_bev", "reference")
-def deform_attend_bev_reference(
-    values: Tensor, sites: Sites, points: Tensor, batch: Tensor, weights: Tensor, grid: BEVGrid
-) -> Tensor:
-    """Sample whole rows once, then weigh the heads: fewer, wider segments than one per head."""
     queries, num_points, _ = points.shape
+    # Whole rows once, then the heads: fewer, wider segments than one per head.
     sampled = sample_sparse_bev(
         values.flatten(1), sites, points, batch[:, None].expand(queries, num_points), grid
     )  # [Q, P, C]
@@ -87,16 +79,11 @@ def deform_attend_images(
     """
     _check_images(values, pixels, image_size_px, weights)
     with torch.autocast(pixels.device.type, enabled=False):
-        return implementation("deform_attend_images")(values, pixels, image_size_px, weights, visible)
+        return _attend_images(values, pixels, image_size_px, weights, visible)
 
 
-@register("deform_attend_images", "reference")
-def deform_attend_images_reference(
-    values: list[Tensor],
-    pixels: Tensor,
-    image_size_px: tuple[int, int],
-    weights: Tensor,
-    visible: Tensor | None,
+def _attend_images(
+    values: list[Tensor], pixels: Tensor, image_size_px: tuple[int, int], weights: Tensor, visible: Tensor | None
 ) -> Tensor:
     """`grid_sample` per image and level, for the queries that have a point in that image."""
     batch_size, queries, views, _, _ = pixels.shape

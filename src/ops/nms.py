@@ -14,50 +14,6 @@ from src.ops.sites import Sites
 PAIR_CHUNK = 8192
 
 
-def rotated_iou(
-    boxes_a: Tensor,  # [n, 5] (x, y, length, width, yaw): metres, radians
-    boxes_b: Tensor,  # [m, 5]
-) -> Tensor:  # [n, m]
-    """Intersection over union of rotated rectangles. No gradient; computed in float64 relative to each pair.
-
-    Only pairs whose circumscribed circles overlap are intersected. Raises ValueError for tensors that are not [n, 5].
-    """
-    for name, boxes in (("boxes_a", boxes_a), ("boxes_b", boxes_b)):
-        if boxes.dim() != 2 or boxes.shape[1] != 5:
-            raise ValueError(f"{name}: expected [n, 5] (x, y, length, width, yaw), got {list(boxes.shape)}")
-    a, b = boxes_a.detach().double(), boxes_b.detach().double()
-    i, j = _touching(a, b).nonzero(as_tuple=True)
-    iou = boxes_a.new_zeros(len(boxes_a), len(boxes_b))
-    iou[i, j] = _pair_iou(a, b, i, j).to(iou.dtype)
-    return iou
-
-
-def nms_rotated(
-    boxes: Tensor,  # [n, 5] (x, y, length, width, yaw)
-    scores: Tensor,  # [n]
-    iou_threshold: float,
-) -> Tensor:  # [kept] int64, by descending score
-    """Greedy NMS: a box is dropped if its IoU with a better kept one exceeds the threshold; ties keep their order."""
-    order = torch.argsort(scores, descending=True, stable=True)
-    return _suppress(boxes.index_select(0, order), order, None, iou_threshold)
-
-
-def nms_circle(
-    centers: Tensor,  # [n, 2] (x, y) metres
-    scores: Tensor,  # [n]
-    radius_m: float,
-) -> Tensor:  # [kept] int64, by descending score
-    """Greedy NMS: a detection is dropped if a better kept one lies within `radius_m` metres (not squared)."""
-    order = torch.argsort(scores, descending=True, stable=True)
-    return _suppress(F.pad(centers, (0, 3)).index_select(0, order), order, radius_m, 0.0)
-
-
-def _suppress(ranked: Tensor, order: Tensor, radius_m: float | None, iou_threshold: float) -> Tensor:
-    better, worse = conflicting_pairs(ranked, [len(order)], [radius_m], iou_threshold)
-    kept = greedy_survivors(better.tolist(), worse.tolist(), len(order))
-    return order[torch.tensor(kept, dtype=torch.int64, device=order.device)]
-
-
 @torch.no_grad()
 def conflicting_pairs(
     boxes: Tensor,  # [n, 5] (x, y, length, width, yaw), block after block, best first within each
@@ -78,7 +34,7 @@ def conflicting_pairs(
             by_overlap.append((start, count, None))
         start += count
     near, meeting = (_near_pairs(boxes, blocks) for blocks in (by_distance, by_overlap))
-    overlapping = (_pair_iou(boxes, boxes, *meeting) > iou_threshold).nonzero().squeeze(1)
+    overlapping = (pair_iou(boxes, boxes, *meeting) > iou_threshold).nonzero().squeeze(1)
     better, worse = (torch.cat([first, second[overlapping]]) for first, second in zip(near, meeting, strict=True))
     return better, worse
 
@@ -148,25 +104,13 @@ def maxpool_peaks(
     return scores == F.embedding_bag(picks, scores, starts[:-1], mode="max")
 
 
-def _squared_distance(a: Tensor, b: Tensor) -> Tensor:  # [n, m]
-    return (a[:, None, 0] - b[:, 0]).square() + (a[:, None, 1] - b[:, 1]).square()
-
-
-def _touching(
-    a: Tensor,  # [n, 5]
-    b: Tensor,  # [m, 5]
-) -> Tensor:  # [n, m] bool
-    """Whether the circumscribed circles meet."""
-    radius_a, radius_b = 0.5 * a[:, 2:4].norm(dim=1), 0.5 * b[:, 2:4].norm(dim=1)
-    return _squared_distance(a, b) <= (radius_a[:, None] + radius_b).square()
-
-
-def _pair_iou(
+def pair_iou(
     a: Tensor,  # [n, 5] float64
     b: Tensor,  # [m, 5] float64
     i: Tensor,  # [pairs] int64, row of a
     j: Tensor,  # [pairs] int64, row of b
 ) -> Tensor:  # [pairs]
+    """Intersection over union of pairs of rotated rectangles (x, y, length, width, yaw): metres, radians."""
     iou = a.new_zeros(len(i))
     for start in range(0, len(i), PAIR_CHUNK):
         span = slice(start, start + PAIR_CHUNK)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.autograd.function import FunctionCtx
 
 from src.ops.kernel_maps import KernelMap
 from src.ops.segment_reduce import gather_segment_sum
+from src.ops.sparse_conv_function import SparseConvFunction
 
 # Types of the grouped product, where this torch has it.
 GROUPED_DTYPES = (torch.float32, torch.bfloat16, torch.float16) if hasattr(F, "grouped_mm") else ()
@@ -21,41 +21,26 @@ def grouped_sparse_conv(
     bias: Tensor | None,  # [Cout]
 ) -> Tensor:  # [M_out, Cout]
     """`sparse_conv` as gather by input, one launch for the products of all offsets, segment sum by output."""
-    return _GroupedSparseConv.apply(features, weight, bias, kernel_map)
+    return SparseConvFunction.apply(features, weight, bias, kernel_map, _forward, _gradients)
 
 
-class _GroupedSparseConv(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: FunctionCtx,
-        features: Tensor,
-        weight: Tensor,
-        bias: Tensor | None,
-        kernel_map: KernelMap,
-    ) -> Tensor:
-        weight = weight.contiguous()  # the grouped product takes plain row- or column-major matrices only
-        ctx.save_for_backward(features, weight)
-        ctx.kernel_map = kernel_map
-        out = _gather_multiply_sum(features, weight, kernel_map.inputs, kernel_map, kernel_map.segments_by_output())
-        return out if bias is None else out.add_(bias)
+def _forward(features: Tensor, weight: Tensor, bias: Tensor | None, kernel_map: KernelMap) -> Tensor:
+    out = _gather_multiply_sum(features, weight, kernel_map.inputs, kernel_map, kernel_map.segments_by_output())
+    return out if bias is None else out.add_(bias)
 
-    @staticmethod
-    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, Tensor | None, None]:
-        features, weight = ctx.saved_tensors
-        maps: KernelMap = ctx.kernel_map
-        grad = grad.contiguous()
-        need_features, need_weight, need_bias, _ = ctx.needs_input_grad
-        grad_features = grad_weight = None
-        if need_features and maps.mirrored:
-            # The transposed map is the map itself with reversed offsets, whose segments exist already.
-            back = weight.flip(0).transpose(1, 2)
-            grad_features = _gather_multiply_sum(grad, back, maps.inputs, maps, maps.segments_by_output())
-        elif need_features:
-            back = weight.transpose(1, 2)
-            grad_features = _gather_multiply_sum(grad, back, maps.outputs, maps, maps.segments_by_input())
-        if need_weight:
-            grad_weight = _weight_gradient(features, grad, maps)
-        return grad_features, grad_weight, grad.sum(0) if need_bias else None, None
+
+def _gradients(
+    features: Tensor, weight: Tensor, grad: Tensor, maps: KernelMap, needed: list[bool]
+) -> tuple[Tensor | None, Tensor | None]:
+    grad_features = None
+    if needed[0] and maps.mirrored:
+        # The transposed map is the map itself with reversed offsets, whose segments exist already.
+        back = weight.flip(0).transpose(1, 2)
+        grad_features = _gather_multiply_sum(grad, back, maps.inputs, maps, maps.segments_by_output())
+    elif needed[0]:
+        back = weight.transpose(1, 2)
+        grad_features = _gather_multiply_sum(grad, back, maps.outputs, maps, maps.segments_by_input())
+    return grad_features, _weight_gradient(features, grad, maps) if needed[1] else None
 
 
 def _gather_multiply_sum(

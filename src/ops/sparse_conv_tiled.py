@@ -6,10 +6,10 @@ import threading
 
 import torch
 from torch import Tensor
-from torch.autograd.function import FunctionCtx
 
 from src.ops.kernel_maps import KernelMap
 from src.ops.segment_reduce import gather_segment_sum
+from src.ops.sparse_conv_function import SparseConvFunction
 from src.ops.tiled_rulebook import tiled_rulebook
 
 
@@ -20,34 +20,18 @@ def tiled_sparse_conv(
     bias: Tensor | None,  # [Cout]
 ) -> Tensor:  # [M_out, Cout]
     """`sparse_conv` as gather, one product per offset and segment sum within each tile of the rulebook."""
-    return _TiledSparseConv.apply(features, weight, bias, kernel_map)
+    return SparseConvFunction.apply(features, weight, bias, kernel_map, _forward, _gradients)
 
 
-class _TiledSparseConv(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: FunctionCtx,
-        features: Tensor,
-        weight: Tensor,
-        bias: Tensor | None,
-        kernel_map: KernelMap,
-    ) -> Tensor:
-        weight = weight.contiguous()
-        ctx.save_for_backward(features, weight)
-        ctx.kernel_map = kernel_map
-        out, _ = _convolve(features, weight, kernel_map, backward=False)
-        return out if bias is None else out.add_(bias)
+def _forward(features: Tensor, weight: Tensor, bias: Tensor | None, kernel_map: KernelMap) -> Tensor:
+    out, _ = _convolve(features, weight, kernel_map, backward=False)
+    return out if bias is None else out.add_(bias)
 
-    @staticmethod
-    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, Tensor | None, None]:
-        features, weight = ctx.saved_tensors
-        grad = grad.contiguous()
-        need_features, need_weight, need_bias, _ = ctx.needs_input_grad
-        grad_features = grad_weight = None
-        if need_features or need_weight:
-            others = features if need_weight else None
-            grad_features, grad_weight = _convolve(grad, weight, ctx.kernel_map, backward=True, others=others)
-        return grad_features, grad_weight, grad.sum(0) if need_bias else None, None
+
+def _gradients(
+    features: Tensor, weight: Tensor, grad: Tensor, kernel_map: KernelMap, needed: list[bool]
+) -> tuple[Tensor, Tensor | None]:
+    return _convolve(grad, weight, kernel_map, backward=True, others=features if needed[1] else None)
 
 
 def _convolve(

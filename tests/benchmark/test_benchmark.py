@@ -131,7 +131,7 @@ def test_training(outputs, tmp_path, phase, request):
         # Medians of three steps each: their sum is near the median of the sum.
         assert sum(row[f"{stage} ms"] for stage in stages) == pytest.approx(row["step ms"], rel=0.8)
     if phase == "phase1":
-        assert "_TiledSparseConvBackward" in column(result["operations of a step"], "operation", "ms")
+        assert "SparseConvFunctionBackward" in column(result["operations of a step"], "operation", "ms")
 
 
 @pytest.mark.slow
@@ -146,8 +146,8 @@ def test_ops(outputs, tmp_path, monkeypatch):
         assert row.get("spconv differs by", 0.0) < 1e-5
     assert {row["mode"] for row in result["splat"]} == {"forward", "f+b"}
     backward = column(result["operations of the backbone, f+b"], "operation", "ms")
-    assert "_TiledSparseConvBackward" in backward
-    assert "_TiledSparseConvBackward" not in column(result["operations of the backbone, forward"], "operation", "ms")
+    assert "SparseConvFunctionBackward" in backward
+    assert "SparseConvFunctionBackward" not in column(result["operations of the backbone, forward"], "operation", "ms")
     others = {row["operation"] for row in result["other operations"]}
     assert {"segment sum", "bilinear sampling", "image attention", "farthest points", "box raster", "voxels"} == others
 

@@ -58,9 +58,7 @@ def test_no_boxes_and_wrong_shapes():
 
 def test_windows_are_cut_at_the_grid():
     centres = torch.tensor([[0.0, 0.0], [2.5, 1.5], [-9.0, 1.0], [math.nan, 0.0]])
-    window, row, col = window_cells(
-        centres, torch.tensor([[1.2, 0.5], [0.5, 0.5], [2.0, 9.0], [1.0, 1.0]]), SMALL
-    )
+    window, row, col = window_cells(centres, torch.tensor([[1.2, 0.5], [0.5, 0.5], [2.0, 9.0], [1.0, 1.0]]), SMALL)
     found = list(zip(window.tolist(), row.tolist(), col.tolist(), strict=True))
     assert found[:6] == [(0, 0, 0), (0, 0, 1), (1, 1, 2), (1, 1, 3), (1, 2, 2), (1, 2, 3)]
     assert all(entry[0] == 3 for entry in found[6:])

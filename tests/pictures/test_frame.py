@@ -146,7 +146,6 @@ def test_counts_line() -> None:
     assert "no ground truth" in counts_line(BevScene(GRID), 0.3)
 
 
-
 @pytest.mark.skipif(not REAL.exists(), reason="the published demo frame is not at hand")
 def test_real_frame_is_drawn_quickly(tmp_path: Path) -> None:
     page = json.loads(REAL.read_text())

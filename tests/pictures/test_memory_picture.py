@@ -71,7 +71,6 @@ def test_drawn_oldest_first_and_only_what_is_finite() -> None:
     assert len(broken.drawable().gaussians) == 1
 
 
-
 def test_points_on_turned_boxes() -> None:
     turned = PictureBoxes([(10, 20, 0)], [(4, 2, 2)], [np.pi / 2], [(0, 5)], [0])
     assert turned.cover(np.array([(10, 21.9), (11.9, 20), (10.9, 18.1), (10, 22.1)])).tolist() == [

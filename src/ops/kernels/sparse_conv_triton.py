@@ -10,11 +10,11 @@ import torch.nn.functional as F
 import triton
 import triton.language as tl
 from torch import Tensor
-from torch.autograd.function import FunctionCtx
 
 from src.ops.backend import REFERENCE, TRITON, implementation, interpreted, register, runs_kernels
 from src.ops.kernel_maps import KernelMap
 from src.ops.segment_reduce import gather_segment_sum
+from src.ops.sparse_conv_function import SparseConvFunction
 
 DTYPES = (torch.float32, torch.float16, torch.bfloat16)
 # Output rows a program computes, and pairs it multiplies at a time for the gradient of the weights.
@@ -56,36 +56,22 @@ def sparse_conv_triton(
     """The reference's sums in float32, in one launch forward and two or three backward; a linear layer stays one."""
     if kernel_map.identity or features.dtype not in DTYPES or not runs_kernels(features):
         return implementation("sparse_conv", REFERENCE)(features, weight, kernel_map, bias)
-    return _SparseConv.apply(features, weight, bias, kernel_map)
+    return SparseConvFunction.apply(features.contiguous(), weight, bias, kernel_map, _forward, _gradients)
 
 
-class _SparseConv(torch.autograd.Function):
-    """y_o = b + sum over taps k of x_i W_k; backward the same product through the transposed map, and x_i^T dy_o."""
+def _forward(features: Tensor, weight: Tensor, bias: Tensor | None, kernel_map: KernelMap) -> Tensor:
+    return _product(features, weight, _neighbours(kernel_map, backward=False), bias)
 
-    @staticmethod
-    def forward(
-        ctx: FunctionCtx, features: Tensor, weight: Tensor, bias: Tensor | None, kernel_map: KernelMap
-    ) -> Tensor:
-        features, weight = features.contiguous(), weight.contiguous()
-        ctx.save_for_backward(features, weight)
-        ctx.kernel_map = kernel_map
-        return _product(features, weight, _neighbours(kernel_map, backward=False), bias)
 
-    @staticmethod
-    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, Tensor | None, None]:
-        features, weight = ctx.saved_tensors
-        maps: KernelMap = ctx.kernel_map
-        grad = grad.contiguous()
-        grad_features = grad_weight = grad_bias = None
-        if ctx.needs_input_grad[0]:
-            # A mirrored map is its own transpose once the taps are reversed.
-            turned = (weight.flip(0) if maps.mirrored else weight).transpose(1, 2)
-            grad_features = _product(grad, turned, _neighbours(maps, backward=not maps.mirrored), None)
-        if ctx.needs_input_grad[1]:
-            grad_weight = _weight_gradient(features, grad, maps)
-        if ctx.needs_input_grad[2]:
-            grad_bias = grad.sum(0)
-        return grad_features, grad_weight, grad_bias, None
+def _gradients(
+    features: Tensor, weight: Tensor, grad: Tensor, maps: KernelMap, needed: list[bool]
+) -> tuple[Tensor | None, Tensor | None]:
+    grad_features = None
+    if needed[0]:
+        # A mirrored map is its own transpose once the taps are reversed.
+        turned = (weight.flip(0) if maps.mirrored else weight).transpose(1, 2)
+        grad_features = _product(grad, turned, _neighbours(maps, backward=not maps.mirrored), None)
+    return grad_features, _weight_gradient(features, grad, maps) if needed[1] else None
 
 
 def _product(

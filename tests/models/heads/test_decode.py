@@ -18,7 +18,7 @@ from src.models.heads.decode import (
     suppress,
     top_candidates,
 )
-from src.ops.nms import nms_circle, nms_rotated
+from src.ops.nms import conflicting_pairs, greedy_survivors
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import ATTRIBUTES, CLASS_RANGE_M, CLASSES
 from src.targets.heatmap import HEAD_GROUPS
@@ -75,10 +75,17 @@ def test_equal_scores_come_in_the_order_of_the_cells_and_only_the_best_of_a_grou
     assert best.scores.tolist() == pytest.approx([0.7, 0.5, 0.5, 0.9, *[0.6] * 5])
 
 
+def survivors(bev: torch.Tensor, scores: torch.Tensor, radius_m: float | None) -> torch.Tensor:
+    """Rows that stay of one block of boxes, best first."""
+    order = scores.argsort(descending=True, stable=True)
+    better, worse = conflicting_pairs(bev[order], [len(order)], [radius_m], 0.2)
+    return order[greedy_survivors(better.tolist(), worse.tolist(), len(order))]
+
+
 @pytest.mark.parametrize("method", Suppression)
 @pytest.mark.parametrize("at_once", ["each block", "all blocks"])
 def test_all_groups_at_once_equal_one_after_the_other(method: Suppression, at_once: str, monkeypatch) -> None:
-    """Against the plain loop: each sample and group by `nms_rotated` or `nms_circle`, then limits."""
+    """Against the plain loop: each sample and group alone, then limits."""
     if at_once == "all blocks":
         monkeypatch.setattr("src.ops.nms._blocks_at_once", lambda count, device: max(count, 1))
     generator = torch.Generator().manual_seed(0)
@@ -97,10 +104,8 @@ def test_all_groups_at_once_equal_one_after_the_other(method: Suppression, at_on
         mine = boxes[rows]
         circle = method is Suppression.circle or (method is Suppression.per_group and group in CIRCLE_GROUPS)
         kept = torch.arange(len(rows))
-        if circle:
-            kept = nms_circle(mine.centers[:, :2], mine.scores, CIRCLE_RADII_M[group])
-        elif method is not Suppression.maxpool:
-            kept = nms_rotated(mine.bev(), mine.scores, 0.2)
+        if method is not Suppression.maxpool:
+            kept = survivors(mine.bev(), mine.scores, CIRCLE_RADII_M[group] if circle else None)
         return rows[kept[:83]]
 
     found = suppress(boxes, counts, method, 100)
@@ -116,7 +121,8 @@ def test_all_groups_at_once_equal_one_after_the_other(method: Suppression, at_on
 @pytest.mark.parametrize("radius", [0.4, 1.0, 2.5])
 def test_golden_circle_suppression(radius: float) -> None:
     table = torch.from_numpy(CASE["circle/xy_score"])
-    assert nms_circle(table[:, :2], table[:, 2], radius).tolist() == CASE[f"circle/keep_{radius}"].tolist()
+    bev = torch.nn.functional.pad(table[:, :2], (0, 3))
+    assert survivors(bev, table[:, 2], radius).tolist() == CASE[f"circle/keep_{radius}"].tolist()
 
 
 def test_log_sizes_are_clamped() -> None:
