@@ -183,6 +183,7 @@ def test_the_launcher_says_which_process_failed_and_ends_with_the_code_of_the_ca
         assert [record.message for record in caplog.records if record.levelname == "WARNING"] == warning
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_to_the_launching_process_reaches_all_as_sigterm(number, command, tmp_path):
     def once_both_wait():
