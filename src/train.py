@@ -29,6 +29,7 @@ from src.reliability.processes import (
     launch,
     process_group,
 )
+from src.report.results import curves_of
 from src.structures.skipped import SkippedFiles
 from src.training.fit import build_loggers, build_trainer, fit
 from src.training.handoff import WeightSource, find_source, hand_over, open_source, train_source
@@ -172,7 +173,7 @@ def run(
 def draw_pictures(config: Config, module: TrainingModule, datamodule: DetectionDataModule, folder: RunFolder) -> None:
     """Learning curves, the evaluator's pictures, and some validation frames spread over the split."""
     folder.pictures.mkdir(exist_ok=True)
-    draw_curves(folder.pictures / "curves.png", folder.metrics_csv, folder.run_id)
+    draw_curves(folder.pictures / "curves.png", curves_of(folder.metrics_csv), folder.run_id)
     module.evaluator.draw(folder.pictures, folder.run_id)
     length = config.model.memory_frames + 1 if config.phase.temporal else 1
     clips = datamodule.validation_clips(config.trainer.num_pictures, length)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from markupsafe import Markup, escape
 
@@ -27,28 +28,31 @@ MARKERS = (
 Scale = Callable[[float], float]  # from a number to its place on the figure
 
 
+class ChartPoint(NamedTuple):
+    """A point of a line."""
+
+    x: float
+    y: float
+    spread: float = 0.0  # half the length of its error bar
+    note: str = ""  # what it says; empty: label and number
+
+
 @dataclass(frozen=True, kw_only=True)
 class Series:
-    """Points of one line; `spread` is half the length of each error bar, `notes` what each point says.
-
-    A label of no letters has no entry in the legend: the figure's title says what is shown.
-    """
+    """One line; a label of no letters has no entry in the legend: the figure's title says what is shown."""
 
     label: str
-    points: Sequence[tuple[float, float]]
-    spread: Sequence[float] = ()
-    notes: Sequence[str] = ()
+    points: Sequence[ChartPoint]
     style: int = 0  # colour, marker and dash; equal for lines that belong together, which share a legend entry
     joined: bool = True  # by a line
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bars:
-    """One value for every category; None where there is none."""
+    """One value and its spread for every category; None where there is none."""
 
     label: str
-    values: Sequence[float | None]
-    spread: Sequence[float | None] = ()
+    values: Sequence[tuple[float, float] | None]
     style: int = 0
 
 
@@ -94,11 +98,10 @@ def line_chart(
     drawn = [kept for one in series if (kept := _finite(one, log_x)).points]
     if not drawn:
         return _nothing(title)
-    xs = [x for one in drawn for x, _ in one.points] + [x for x, _ in x_ticks or ()]
+    points = [point for one in drawn for point in one.points]
+    xs = [point.x for point in points] + [x for x, _ in x_ticks or ()]
     xs = [math.log10(x) for x in xs] if log_x else xs
-    ends = [
-        y + sign * s for one in drawn for (_, y), s in zip(one.points, _spread(one), strict=True) for sign in (-1, 1)
-    ]
+    ends = [point.y + sign * point.spread for point in points for sign in (-1, 1)]
     y_low, y_high = _padded(min(ends), max(ends), 0.08, y_span)
     x_low, x_high = _padded(min(xs), max(xs), 0.06 if markers else 0.0)
     y_marks = nice_ticks(y_low, y_high)
@@ -131,15 +134,10 @@ def category_chart(
     dots: bool = False,
 ) -> Markup:
     """Horizontal bars from zero with their numbers, or (`dots`) one marker per series on a line for each category."""
-    values = [value for one in series for value in one.values if value is not None and math.isfinite(value)]
-    if not values or not categories:
+    ends = [sum(found) for one in series for found in one.values if found is not None]
+    if not ends or not categories:
         return _nothing(title)
-    spreads = [[s or 0.0 for s in one.spread] or [0.0] * len(categories) for one in series]
-    highest = max(
-        (value + s for one, row in zip(series, spreads, strict=True) for value, s in zip(one.values, row, strict=True)
-         if value is not None and math.isfinite(value)),
-    )  # fmt: skip
-    top_value = highest if highest > 0 else 1.0
+    top_value = max(ends) if max(ends) > 0 else 1.0
     room = max(7, min(22, max(len(name) for name in categories)))
     left, right = 14 + room * 1.08 * GLYPH, WIDTH - (14 if dots else 44)
     step, pad = (17.0, 2.0) if dots else (13.0, 6.0)
@@ -159,20 +157,20 @@ def category_chart(
             f'<text class="end" x="{left - 6:.1f}" y="{y + (tall - pad) / 2 + 4:.1f}">'
             f"{escape(shown)}<title>{escape(name)}</title></text>"
         )
-        for number, (one, row) in enumerate(zip(series, spreads, strict=True)):
-            value = one.values[place]
-            known = value is not None and math.isfinite(value)
-            note = f"{name}{', ' if one.label else ''}{one.label}: {_number(value, row[place], digits)}"
+        for number, one in enumerate(series):
+            value, spread = one.values[place] or (0.0, 0.0)
+            text = "\N{EN DASH}" if one.values[place] is None else f"{value:.{digits}f}"
+            said = "no value" if one.values[place] is None else text + (f" ± {spread:.{digits}f}" if spread else "")
+            note = f"{name}{', ' if one.label else ''}{one.label}: {said}"
             if dots:
-                if known:
+                if one.values[place] is not None:
                     aside = (number - (len(series) - 1) / 2) * min(2.5, 10 / len(series))  # equal values stay apart
                     parts.append(_marker(one.style, x_of(value), y + 8 + aside, note))
                 continue
-            parts.append(_bar(one.style, left, y + step * number, step - 2, x_of(value) if known else left, note))
-            if known and row[place]:
-                parts.append(_whisker(x_of(value - row[place]), x_of(value + row[place]), y + step * number + 5.5))
-            text = f"{value:.{digits}f}" if known else "\N{EN DASH}"
-            after = x_of(value + row[place]) + 5 if known else left + 5
+            parts.append(_bar(one.style, left, y + step * number, step - 2, x_of(value), note))
+            if spread:
+                parts.append(_whisker(x_of(value - spread), x_of(value + spread), y + step * number + 5.5))
+            after = x_of(value + spread) + 5
             parts.append(f'<text class="number" x="{after:.1f}" y="{y + step * number + 9.5:.1f}">{text}</text>')
     entries = [(one.label, one.style) for one in series]
     legend, height = _legend(entries, bottom + 38, False, dots, bars=not dots)
@@ -181,20 +179,8 @@ def category_chart(
 
 
 def _finite(one: Series, log_x: bool) -> Series:
-    keep = [
-        place
-        for place, (x, y) in enumerate(one.points)
-        if math.isfinite(x) and math.isfinite(y) and (x > 0 or not log_x)
-    ]
-
-    def of(sequence: Sequence) -> list:
-        return [sequence[place] for place in keep] if sequence else []
-
-    return replace(one, points=of(one.points), spread=of(one.spread), notes=of(one.notes))
-
-
-def _spread(one: Series) -> Sequence[float]:
-    return one.spread or [0.0] * len(one.points)
+    points = [point for point in one.points if math.isfinite(point.x) and math.isfinite(point.y)]
+    return replace(one, points=[point for point in points if point.x > 0 or not log_x])
 
 
 def _padded(low: float, high: float, share: float, span: float | None = None) -> tuple[float, float]:
@@ -253,22 +239,25 @@ def _y_axis(
 
 
 def _line(one: Series, x_of: Scale, y_of: Scale, markers: bool) -> str:
-    places = [(x_of(x), y_of(y)) for x, y in one.points]
+    places = [(x_of(point.x), y_of(point.y)) for point in one.points]
     parts = []
     if one.joined and len(places) > 1:
         path = "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
-        dash = DASHES[one.style // COLOURS % len(DASHES)]
-        parts.append(f'<path class="line" d="M{path}"' + (f' stroke-dasharray="{dash}"' if dash else "") + "/>")
-    for (x, _), (_, y), spread in zip(places, one.points, _spread(one), strict=True):
+        parts.append(f'<path class="line" d="M{path}"{_dashed(one.style)}/>')
+    for (x, _), (_, y, spread, _) in zip(places, one.points, strict=True):
         if spread:
             parts.append(_whisker(y_of(y - spread), y_of(y + spread), x, upright=True))
     if markers or len(places) == 1:
-        for place, (x, y) in enumerate(places):
-            value = one.points[place][1]
-            note = one.notes[place] if one.notes else f"{one.label}{': ' if one.label else ''}{value:.6g}"
+        for (x, y), point in zip(places, one.points, strict=True):
+            note = point.note or f"{one.label}{': ' if one.label else ''}{point.y:.6g}"
             parts.append(_marker(one.style, x, y, note))
     name = f"<title>{escape(one.label)}</title>" if one.label else ""
     return f'<g class="s{one.style % COLOURS}">{"".join(parts)}{name}</g>'
+
+
+def _dashed(style: int) -> str:
+    dash = DASHES[style // COLOURS % len(DASHES)]
+    return f' stroke-dasharray="{dash}"' if dash else ""
 
 
 def _marker(style: int, x: float, y: float, note: str) -> str:
@@ -311,21 +300,13 @@ def _legend(
         if bars:
             sample = _bar(style, 0, -8, 9, 14, "")
         else:
-            dash = DASHES[style // COLOURS % len(DASHES)]
             if lines:
-                dashed = f' stroke-dasharray="{dash}"' if dash else ""
-                sample += f'<path class="line s{style % COLOURS}" d="M0-4H16"{dashed}/>'
+                sample += f'<path class="line s{style % COLOURS}" d="M0-4H16"{_dashed(style)}/>'
             if markers:
                 sample += _marker(style, 8, -4, "")
         parts.append(f'<g transform="translate({x:.1f} {y:.1f})">{sample}<text x="20" y="0">{escape(shown)}</text></g>')
         x += wide + 8
     return parts, y + 10
-
-
-def _number(value: float | None, spread: float, digits: int) -> str:
-    if value is None or not math.isfinite(value):
-        return "no value"
-    return f"{value:.{digits}f}" + (f" ± {spread:.{digits}f}" if spread else "")
 
 
 def _described(one: Series) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from markupsafe import Markup
 
 from src.dashboard.board import Board, Run, Sweep
-from src.dashboard.charts import Bars, Series, category_chart, line_chart, nice_ticks
+from src.dashboard.charts import Bars, ChartPoint, Series, category_chart, line_chart, nice_ticks
 from src.report.metric_names import RANGES, SPEEDS, Metric, find_metric
 from src.report.results import RunResult
 from src.report.score_tables import mean_and_spread
@@ -56,23 +56,21 @@ def knob_figures(sweep: Sweep, plot: PlotConfig, results: dict[str, list[RunResu
         sides[f"{metric.title} in the paper, TruckScenes"] = paper
     if any(row.x is None for row in rows):
         return [
-            category_chart(title, labels, [_bars("", side.values(), style)], metric.heading, metric.digits)
+            category_chart(
+                title, labels, [Bars(label="", values=list(side.values()), style=style)], metric.heading, metric.digits
+            )
             for style, (title, side) in enumerate(sides.items())
         ]
     ordered = sorted(rows, key=lambda row: row.x)
     series = []
     for style, side in enumerate(sides.values()):
-        known = [(row, *side[row.label]) for row in ordered if side[row.label] is not None]
-        series.append(
-            Series(
-                label="",
-                points=[(row.x, value) for row, value, _ in known],
-                spread=[deviation for _, _, deviation in known],
-                notes=[_note(row.label, side[row.label], metric, with_spread=side is here) for row, *_ in known],
-                style=style,
-            )
-        )
-    ends = [[y + sign * s for (_, y), s in zip(o.points, o.spread, strict=True) for sign in (-1, 1)] for o in series]
+        points = [
+            ChartPoint(row.x, *found, f"{row.label}: {found[0]:.{metric.digits}f}"
+                  + (f" ± {found[1]:.{metric.digits}f}" if side is here else ""))
+            for row in ordered if (found := side[row.label]) is not None
+        ]  # fmt: skip
+        series.append(Series(label="", points=points, style=style))
+    ends = [[y + sign * s for _, y, s, _ in one.points for sign in (-1, 1)] for one in series]
     span = max((max(values) - min(values) for values in ends if values), default=0.0)
     ticks = list({row.x: f"{row.x:g}" for row in ordered}.items())
     charts = zip(sides, series, strict=True)
@@ -88,9 +86,9 @@ def search_figures(sweep: Sweep) -> list[Markup]:
     metric = find_metric(search.objective, sweep.key, search.task)
     tried.sort(key=lambda run: run.ended or 0.0)
     values = [run.value * metric.scale for run in tried]
-    best = [(place, max(values[:place])) for place in range(1, len(values) + 1)]
-    by_trial = list(enumerate(values, start=1))
-    trials = Series(label="trial", points=by_trial, notes=[run.label for run in tried], joined=False)
+    by_trial = [ChartPoint(place, value, 0.0, tried[place - 1].label) for place, value in enumerate(values, start=1)]
+    trials = Series(label="trial", points=by_trial, joined=False)
+    best = [ChartPoint(place, max(values[:place])) for place in range(1, len(values) + 1)]
     so_far = Series(label="best so far", points=best, style=1)
     ticks = [(mark, f"{mark:g}") for mark in nice_ticks(1, len(tried)) if mark == round(mark)]
     figures = [line_chart(f"{metric.title} by trial", [trials, so_far], "trial", metric.title, x_ticks=ticks)]
@@ -98,7 +96,9 @@ def search_figures(sweep: Sweep) -> list[Markup]:
         if dimension.choices is None:
             settings = (dict(part.lstrip("+").split("=", 1) for part in run.overrides if "=" in part) for run in tried)
             points = [
-                (float(of[key]), value) for of, value in zip(settings, values, strict=True) if _number(of.get(key))
+                ChartPoint(float(of[key]), value)
+                for of, value in zip(settings, values, strict=True)
+                if _number(of.get(key))
             ]
             dots = Series(label="", points=points, joined=False)
             figures.append(line_chart(f"{metric.title} by {key}", [dots], key, metric.title, log_x=dimension.log))
@@ -113,8 +113,7 @@ def latency_figures(sweep: Sweep, results: dict[str, list[RunResult]]) -> list[M
         score, time = _mean_and_spread(runs, accuracy), _mean_and_spread(runs, latency)
         if score is not None and time is not None:
             note = f"{label}: {time[0]:.1f} ms, {score[0]:.1f} {accuracy.title}"
-            place = [(time[0], score[0])]
-            points.append(Series(label=label, points=place, spread=[score[1]], notes=[note], style=style, joined=False))
+            points.append(Series(label=label, points=[ChartPoint(time[0], *score, note)], style=style, joined=False))
     if len(points) < 2:
         return []
     return [line_chart(f"{ACCURACY} over latency", points, "milliseconds per frame", f"{ACCURACY}, %")]
@@ -130,14 +129,13 @@ def distance_figures(results: dict[str, list[RunResult]]) -> list[Markup]:
         lines = []
         for style, (label, runs) in enumerate(results.items()):
             found = [_mean_and_spread(runs, find_metric(name.format(part), title)) for part in parts]
-            known = [(place, value) for place, value in enumerate(found) if value is not None]
-            notes = [
-                f"{label}, {parts[place]} {axis.rpartition(' ')[2]}: {value[0]:.1f} ± {value[1]:.1f}"
-                for place, value in known
-            ]
-            points = [(float(place), value[0]) for place, value in known]
+            points = [
+                ChartPoint(float(place), value[0], 0.0,
+                      f"{label}, {parts[place]} {axis.rpartition(' ')[2]}: {value[0]:.1f} ± {value[1]:.1f}")
+                for place, value in enumerate(found) if value is not None
+            ]  # fmt: skip
             if points:
-                lines.append(Series(label=label, points=points, notes=notes, style=style))
+                lines.append(Series(label=label, points=points, style=style))
         if lines:
             ticks = [(float(place), part) for place, part in enumerate(parts)]
             figures.append(line_chart(title, lines, axis, "mAP, %", x_ticks=ticks))
@@ -150,7 +148,7 @@ def class_figures(results: dict[str, list[RunResult]]) -> list[Markup]:
     for style, (label, runs) in enumerate(results.items()):
         found = [_mean_and_spread(runs, find_metric(f"classes.{name}.AP", "by class")) for name in CLASSES]
         if any(value is not None for value in found):
-            rows.append(Bars(label=label, values=[value and value[0] for value in found], style=style))
+            rows.append(Bars(label=label, values=[value and (value[0], 0.0) for value in found], style=style))
     names = [name.replace("_", " ") for name in CLASSES]
     return [category_chart("AP by class", names, rows, "AP, %", dots=len(rows) > 2)] if rows else []
 
@@ -166,7 +164,7 @@ def curve_figures(of_row: dict[str, list[Curves]]) -> list[Markup]:
         if name == "step/total" and has_epochs:
             continue
         lines = [
-            Series(label=label, points=[(x, y * scale) for x, y in run[name]], style=style)
+            Series(label=label, points=[ChartPoint(x, y * scale) for x, y in run[name]], style=style)
             for style, (label, runs) in enumerate(of_row.items())
             for run in runs
             if run.get(name)
@@ -194,7 +192,11 @@ def loss_figures(curves: Curves) -> list[Markup]:
     """Every loss term of one run, as it stands in the total."""
     terms = [(name, points) for name, points in curves.items() if name.startswith("loss/") and name != "loss/total"]
     lines = [
-        Series(label=name.removeprefix("loss/").replace("_", " "), points=points, style=style)
+        Series(
+            label=name.removeprefix("loss/").replace("_", " "),
+            points=[ChartPoint(*point) for point in points],
+            style=style,
+        )
         for style, (name, points) in enumerate(terms)
     ]
     return [line_chart("Loss terms", lines, "steps", "loss", markers=False)] if lines else []
@@ -242,17 +244,6 @@ def headline(sweep: Sweep) -> str:
         value, label = best(paper)
         line += f". In the paper: {label}, {format_paper(value, metric)}"
     return line + "."
-
-
-def _bars(label: str, values: Iterable[tuple[float, float] | None], style: int) -> Bars:
-    values = list(values)
-    means, spread = ([value and value[place] for value in values] for place in (0, 1))
-    return Bars(label=label, values=means, spread=spread, style=style)
-
-
-def _note(label: str, value: tuple[float, float], metric: Metric, with_spread: bool = True) -> str:
-    spread = f" ± {value[1]:.{metric.digits}f}" if with_spread else ""
-    return f"{label}: {value[0]:.{metric.digits}f}{spread}"
 
 
 def _number(text: str | None) -> bool:

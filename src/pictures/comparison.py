@@ -1,4 +1,4 @@
-"""Several experiments side by side: grouped bars with their spread over seeds."""
+"""Grouped bars with their spread over seeds: several experiments side by side, or one."""
 
 from __future__ import annotations
 
@@ -57,8 +57,9 @@ def paint_groups(axes: Axes, panel: BarPanel) -> None:
 
 
 def draw_comparison(path: Path | str, panels: Sequence[BarPanel], title: str = "") -> None:
-    """Write a PNG of panels of grouped bars, one below the other, under one row of keys."""
+    """Write a PNG of panels of grouped bars, one below the other, under the keys of the experiments if several."""
     names = list(dict.fromkeys(name for panel in panels for name in panel.bars))
+    names = names if len(names) > 1 else []
     rows = int(np.ceil(len(names) / KEYS_PER_ROW))
     head = 50 + 24 * rows
     canvas = Canvas(SHEET_PX, head + HEIGHT_PX * max(len(panels), 1))

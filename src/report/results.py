@@ -264,7 +264,7 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
         "overrides": overrides,
         "config": without_local_paths(config),
         "metrics": scores,
-        "curves": _curves_of(run_folder / "metrics.csv"),
+        "curves": curves_of(run_folder / "metrics.csv"),
         "latency": latency,
     }
     lines = (f"{json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
@@ -366,7 +366,8 @@ def _read_config(path: Path) -> dict[str, Any]:
     return content
 
 
-def _curves_of(path: Path) -> dict[str, list[Point]]:
+def curves_of(path: Path) -> dict[str, list[Point]]:
+    """As `read_curves`, of a run that has ended; none without the file. Raises DataError naming it."""
     try:
         return read_curves(path) if path.is_file() else {}
     except (OSError, ValueError, TypeError, csv.Error) as error:

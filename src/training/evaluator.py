@@ -15,7 +15,7 @@ from src.metrics.score_text import format_scores
 from src.metrics.scores import DetectionScores
 from src.metrics.submission import to_global
 from src.models.detector import Detector
-from src.pictures.learning_curves import draw_scores
+from src.pictures.comparison import BarPanel, draw_comparison
 from src.reliability.processes import gather_by_rank
 from src.structures.batch import FrameBatch
 from src.structures.detections import DetectionTable, EvaluationSet
@@ -118,10 +118,11 @@ class DetectionEvaluator(Evaluator):
 
     def draw(self, folder: Path, title: str) -> None:
         """Bars by class and distance."""
-        scores = self.as_dict()
-        classes = {name: values["AP"] for name, values in scores["classes"].items()}
-        ranges = {name: values["mAP"] for name, values in scores["ranges"].items()}
-        draw_scores(folder / "scores.png", classes, ranges, title)
+        scores, panels = self.as_dict(), []
+        for what, group, metric in (("AP by class, %", "classes", "AP"), ("mAP by distance, %", "ranges", "mAP")):
+            names = [name.replace("_", " ") for name in scores[group]]
+            panels.append(BarPanel(what, names, {title: [(100 * of[metric], 0.0) for of in scores[group].values()]}))
+        draw_comparison(folder / "scores.png", panels, title)
 
     def write(self, folder: Path, save: SaveTable) -> list[str]:
         """The submission, where there is any box."""

@@ -6,7 +6,21 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from src.dashboard.charts import GLYPH, WIDTH, Bars, Series, category_chart, line_chart, nice_ticks, tick_text
+from src.dashboard.charts import (
+    GLYPH,
+    WIDTH,
+    Bars,
+    ChartPoint,
+    Series,
+    category_chart,
+    line_chart,
+    nice_ticks,
+    tick_text,
+)
+
+
+def points_of(*points):
+    return [ChartPoint(*point) for point in points]
 
 
 def parts(figure, kind, of_class=None):
@@ -44,7 +58,7 @@ def test_tick_texts_are_short():
 
 
 def test_points_stand_in_proportion_and_error_bars_have_their_length():
-    series = Series(label="here", points=[(0, 10), (1, 20), (3, 40)], spread=[5.0, 0.0, 0.0])
+    series = Series(label="here", points=points_of((0, 10, 5.0), (1, 20), (3, 40)))
     figure = line_chart("t", [series], "x", "y")
     (x0, y0), (x1, y1), (x3, y3) = places(figure)
     assert (x3 - x0) / (x1 - x0) == pytest.approx(3, rel=0.01)
@@ -58,35 +72,37 @@ def test_points_stand_in_proportion_and_error_bars_have_their_length():
 def test_two_figures_of_one_span_have_one_measure():
     steps = []
     for low, high in ((10, 12), (40, 48)):
-        series = Series(label="", points=[(0, low), (1, high)])
+        series = Series(label="", points=points_of((0, low), (1, high)))
         (_, y0), (_, y1) = places(line_chart("t", [series], "x", "y", y_span=8))
         steps.append((y0 - y1) / (high - low))
     assert steps[0] == pytest.approx(steps[1], rel=0.02)
 
 
 def test_what_is_no_number_is_left_out():
-    series = Series(label="", points=[(0, math.nan), (1, 5), (2, math.inf), (3, 6)], notes=["a", "b", "c", "d"])
+    series = Series(label="", points=points_of((0, math.nan), (1, 5, 0.0, "b"), (2, math.inf), (3, 6, 0.0, "d")))
     figure = line_chart("t", [series], "x", "y")
     assert [mark.find("title").text for mark in parts(figure, "path", "mark")] == ["b", "d"]
     assert "nan" not in str(figure) and "inf" not in str(figure)
-    assert "No values yet" in line_chart("t", [Series(label="", points=[(1, math.nan)])], "x", "y")
+    assert "No values yet" in line_chart("t", [Series(label="", points=points_of((1, math.nan)))], "x", "y")
     assert "No values yet" in line_chart("t", [], "x", "y")
 
 
 def test_a_logarithmic_axis_leaves_out_what_it_cannot_show():
-    series = Series(label="", points=[(0.0, 1), (1e-5, 1), (1e-4, 2), (1e-3, 3)], joined=False)
+    series = Series(label="", points=points_of((0.0, 1), (1e-5, 1), (1e-4, 2), (1e-3, 3)), joined=False)
     figure = line_chart("t", [series], "rate", "y", log_x=True)
     (a, _), (b, _), (c, _) = places(figure)
     assert b - a == pytest.approx(c - b, abs=0.2)
     assert [text for *_, text in x_texts(figure)] == ["1e-05", "0.0001", "0.001"]
     assert not parts(figure, "path", "line")
-    short = line_chart("t", [Series(label="", points=[(2.1e-4, 1), (2.9e-4, 2)])], "rate", "y", log_x=True)
+    short = line_chart("t", [Series(label="", points=points_of((2.1e-4, 1), (2.9e-4, 2)))], "rate", "y", log_x=True)
     assert len(x_texts(short)) >= 2
 
 
 @pytest.mark.parametrize("points", [[(1, 5)], [(1, 5), (2, 5)], [(1, 0), (1, 0)], [(-3, -7), (1e6, 1e9)]])
 def test_nothing_leaves_the_figure(points):
-    figure = line_chart("t", [Series(label=f"series {n}", points=points, style=n) for n in range(9)], "x", "y")
+    figure = line_chart(
+        "t", [Series(label=f"series {n}", points=points_of(*points), style=n) for n in range(9)], "x", "y"
+    )
     svg = next(ET.fromstring(str(figure)).iter("svg"))
     *_, height = map(float, svg.get("viewBox").split())
     for x, y in places(figure):
@@ -99,7 +115,7 @@ def test_nothing_leaves_the_figure(points):
 
 def test_texts_on_the_axis_do_not_touch():
     crowded = [(float(x), f"row {x} with a name") for x in (0, 0.1, 0.2, 1, 5, 9.9, 10)]
-    figure = line_chart("t", [Series(label="", points=[(0, 1), (10, 2)])], "x", "y", x_ticks=crowded)
+    figure = line_chart("t", [Series(label="", points=points_of((0, 1), (10, 2)))], "x", "y", x_ticks=crowded)
     texts = sorted(x_texts(figure))
     assert len(texts) >= 2
     assert all(right < left for (_, right, _), (left, _, _) in zip(texts, texts[1:], strict=False))
@@ -108,7 +124,7 @@ def test_texts_on_the_axis_do_not_touch():
 
 def test_an_axis_shows_all_its_marks():
     figure = line_chart(
-        "t", [Series(label="", points=[(1, 1), (2, 2)])], "x", "y", x_ticks=[(x, f"{x}") for x in (1, 2, 9)]
+        "t", [Series(label="", points=points_of((1, 1), (2, 2)))], "x", "y", x_ticks=[(x, f"{x}") for x in (1, 2, 9)]
     )
     assert [text for *_, text in x_texts(figure)] == ["1", "2", "9"]
     (x1, _), (x2, _) = places(figure)
@@ -117,7 +133,9 @@ def test_an_axis_shows_all_its_marks():
 
 
 def test_series_differ_without_colour():
-    figure = line_chart("t", [Series(label=str(n), points=[(0, n), (1, n)], style=n) for n in range(10)], "x", "y")
+    figure = line_chart(
+        "t", [Series(label=str(n), points=points_of((0, n), (1, n)), style=n) for n in range(10)], "x", "y"
+    )
     lines = [path for path in parts(figure, "path", "line")]
     marks = {mark.get("d") for mark in parts(figure, "path", "mark")}
     assert len(marks) == 6
@@ -127,8 +145,11 @@ def test_series_differ_without_colour():
 
 def test_figures_have_names_and_escape_them():
     evil = "<script>alert('x')</script>&"
-    lines = [Series(label=evil, points=[(0, 1)], notes=[evil]), Series(label="b", points=[(1, 1)], style=1)]
-    bars = [Bars(label=evil, values=[1.0, 2.0])]
+    lines = [
+        Series(label=evil, points=[ChartPoint(0, 1, 0.0, evil)]),
+        Series(label="b", points=points_of((1, 1)), style=1),
+    ]
+    bars = [Bars(label=evil, values=[(1.0, 0.0), (2.0, 0.0)])]
     for figure in (line_chart(evil, lines, evil, evil), category_chart(evil, [evil, "b"], bars, evil)):
         assert "<script" not in figure
         svg = next(ET.fromstring(str(figure)).iter("svg"))
@@ -136,7 +157,7 @@ def test_figures_have_names_and_escape_them():
 
 
 def test_bars_have_their_lengths_and_numbers():
-    bars = [Bars(label="a", values=[10.0, None, 40.0], spread=[1.0, None, 0.0])]
+    bars = [Bars(label="a", values=[(10.0, 1.0), None, (40.0, 0.0)])]
     figure = category_chart("t", ["x", "y", "z"], bars, "AP, %")
     widths = [float(bar.get("width")) for bar in parts(figure, "rect", "bar")]
     assert widths[2] / widths[0] == pytest.approx(4, rel=0.01) and widths[1] == 0
@@ -146,6 +167,6 @@ def test_bars_have_their_lengths_and_numbers():
 
 
 def test_dots_are_one_for_each_value():
-    rows = [Bars(label=str(n), values=[1.0 * n, None, 3.0], style=n) for n in range(3)]
+    rows = [Bars(label=str(n), values=[(1.0 * n, 0.0), None, (3.0, 0.0)], style=n) for n in range(3)]
     figure = category_chart("t", ["x", "y", "z"], rows, "AP, %", dots=True)
     assert [len(places(figure, style)) for style in range(3)] == [2, 2, 2]

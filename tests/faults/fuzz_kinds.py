@@ -36,7 +36,6 @@ from src.data.splits import split_samples
 from src.errors import CheckpointError, DataError, HorizonError
 from src.metrics.submission import load_submission
 from src.models.backbones.weights import BackboneName, load_backbone_weights
-from src.pictures.learning_curves import read_metrics
 from src.reliability.checkpoints import load_model_weights, read_checkpoint
 from src.reliability.metrics_csv import MetricsCSV
 from src.report.results import publish_result, read_result
@@ -393,7 +392,7 @@ def write_run(folder: Path) -> None:
 
 
 def read_run(path: Path, number: int) -> None:
-    """As the report, the sweep runner, the dashboard, a resumed training and the pictures read a run's folder."""
+    """As the report, the sweep runner, the dashboard and a resumed training read a run's folder."""
     folder, outputs = path.parent, path.parents[1]
     for name in ("mAP", "NDS", "classes.car.AP", "ranges.50-100.mAP"):
         score = read_score(folder, name)
@@ -408,7 +407,6 @@ def read_run(path: Path, number: int) -> None:
     readers: list[Callable[[], Any]] = [
         RunFolder(outputs, RUN).read_result,
         lambda: MetricsCSV(folder / "metrics.csv", resume_step=5).rows,
-        lambda: read_metrics(folder / "metrics.csv"),
         lambda: read_result(publish_result(folder, outputs / "reports")),
     ]
     for reader in readers:

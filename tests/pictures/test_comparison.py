@@ -28,3 +28,5 @@ def test_pictures_are_written(tmp_path: Path) -> None:
     draw_comparison(tmp_path / "b.png", [])
     assert Image.open(tmp_path / "out" / "a.png").size == (1600, 50 + 2 * 24 + 2 * HEIGHT_PX)
     assert Image.open(tmp_path / "b.png").size == (1600, 50 + HEIGHT_PX)
+    draw_comparison(tmp_path / "one.png", [BarPanel("AP", ["car", "bus"], {"run": [(50.0, 0.0), (0.0, 0.0)]})])
+    assert Image.open(tmp_path / "one.png").size == (1600, 50 + HEIGHT_PX)  # one experiment needs no key
