@@ -187,6 +187,7 @@ def test_scaling(outputs, tmp_path, monkeypatch):
     assert len(set(fixed)) == 1 and dense == sorted(dense) and dense[0] < dense[-1]
 
 
+@pytest.mark.slow
 def test_a_disagreement_of_the_metric_is_an_error_after_the_page(tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark, "compare_with_devkit", lambda **_: {"agrees": False, "max_difference": 0.5})
     with pytest.raises(DataError, match="disagree"):

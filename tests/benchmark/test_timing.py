@@ -51,6 +51,7 @@ def test_what_is_slow_has_fewer_rounds():
     assert [len(values) for values in seconds.values()] == [6, 2, 1, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux reports the peak of a process")
 def test_added_memory_is_that_of_the_call():
     held = torch.ones(8 * 2**20)  # 32 MiB that were there before
@@ -67,6 +68,7 @@ def test_added_memory_is_that_of_the_call():
     assert added_mib(lambda: None, CPU) < 8  # the peak of the call before is forgotten
 
 
+@pytest.mark.slow
 def test_memory_that_is_used_again_counts_for_every_call():
     def call():
         return scratch("of a test", 32 * 2**20, 1, torch.uint8, CPU).fill_(1)[0, 0]

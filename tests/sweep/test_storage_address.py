@@ -19,6 +19,7 @@ def test_an_address_that_would_be_read_wrongly_is_refused_unseen():
     check_address("postgresql://me:s3%40cret@host/db")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["{x}", "50%20off", "a?b", "a#b @:c", "{SCHEMA_VERSION}"])
 def test_any_folder_can_hold_the_database(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)

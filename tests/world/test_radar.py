@@ -144,6 +144,7 @@ def test_one_radar_hangs_upside_down(make_config):
         assert np.linalg.det(rig[name].rotation) > 0.999
 
 
+@pytest.mark.slow
 def test_static_points_of_a_stored_world_stand_still(world):
     """Own motion from finite differences of the stored poses, independent of the simulator's rates."""
     speeds = []
