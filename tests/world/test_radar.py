@@ -41,7 +41,6 @@ def straight_scene(kind, ahead_m, speed_mps=0.0):
         return Tracks(road=road, s=start + speed * time[None], s_rate=moving, d=still, d_rate=still, turn=still)
 
     actor = Actor(
-        kind=KINDS[kind],
         name=kind,
         size=np.array(KINDS[kind].size_m),
         colour=(0, 0, 0),
