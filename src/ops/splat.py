@@ -12,7 +12,7 @@ from torch.autograd.function import FunctionCtx
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import rotate_back
-from src.ops.backend import implementation, register
+from src.ops.backend import implementation
 from src.ops.gaussian_cells import GaussianCellPairs, gaussian_cells
 from src.ops.segment_reduce import gather_segment_sum, inverse_rows, rank_per_sample, weighted_segment_sum
 from src.ops.sites import Sites
@@ -103,7 +103,7 @@ def splat_gaussians(
         gaussians = [x.to(dtype) for x in (means, scales, directions, opacity_logits, features)]
         pairs, support = gaussian_cells(*gaussians[:3], batch, grid, batch_size, support_sigmas)
         choice = (support, threshold, max_cells, grid.rows * grid.cols)
-        log_free, out, occupied_rows, peak_cell, num_cut = implementation("splat")(
+        log_free, out, occupied_rows, peak_cell, num_cut = implementation(splat_reference)(
             *gaussians, pairs, choice, smooth_cap
         )
     return Splat(
@@ -191,7 +191,6 @@ class _Distance(torch.autograd.Function):
         return grad_means, -sums[:, 2:4] / scales, sums[:, 4:6], None
 
 
-@register("splat", "reference")
 def splat_reference(
     means: Tensor,
     scales: Tensor,

@@ -11,10 +11,10 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from src.ops.backend import REFERENCE, TRITON, implementation, register, runs_kernels
+from src.ops.backend import runs_kernels
 from src.ops.gaussian_cells import GaussianCellPairs
 from src.ops.segment_reduce import inverse_rows
-from src.ops.splat import CAP, Choice, occupied_cells
+from src.ops.splat import CAP, Choice, occupied_cells, splat_reference
 
 # Cells a program sums the free probability of, one lane each.
 CELLS = 128
@@ -28,7 +28,6 @@ TILE = 4096
 LN2 = tl.constexpr(math.log(2.0))
 
 
-@register("splat", TRITON)
 def splat_triton(
     means: Tensor,
     scales: Tensor,
@@ -42,7 +41,7 @@ def splat_triton(
     """The reference's results by three kernels over the pairs forward and one backward."""
     gaussians = (means, scales, directions, opacity_logits, features)
     if means.dtype != torch.float32 or not runs_kernels(means):
-        return implementation("splat", REFERENCE)(*gaussians, pairs, choice, smooth_cap)
+        return splat_reference(*gaussians, pairs, choice, smooth_cap)
     # Any surprise -log a that the cap binds for becomes `least`; the smooth cap adds to all of them instead.
     extra, least = (CAP, 0.0) if smooth_cap else (0.0, -math.log1p(-CAP))
     return _Splat.apply(*gaussians, pairs, choice, extra, least)
