@@ -33,7 +33,6 @@ class Sweep:
     record: SweepRecord
     tables: list[SweepTable]
     problem: str | None  # why there are no tables
-    taken: dict[str, float]  # seconds that finished runs took, by run id
     written: float  # when the runner or one of its running runs last wrote something, seconds since 1970
     now: float
 
@@ -64,7 +63,7 @@ class Sweep:
     @property
     def left_s(self) -> float | None:
         """Time left, with as many runs side by side as now; None before the first has finished, and when none runs."""
-        return seconds_left(self.record, self.taken, 1, self.now) if self.state == "running" else None
+        return seconds_left(self.record, 1, self.now) if self.state == "running" else None
 
 
 @dataclass(kw_only=True)
@@ -239,8 +238,7 @@ class BoardReader:
             tables, problem = sweep_tables(record, results), None
         except (ValueError, DataError) as error:
             tables, problem = [], str(error)
-        taken = {run_id: results[run_id].seconds["all"] for run_id in record.runs if run_id in results}
-        return Sweep(record=record, tables=tables, problem=problem, taken=taken, written=written, now=now)
+        return Sweep(record=record, tables=tables, problem=problem, written=written, now=now)
 
     def _cached(self, path: Path, stamp: Stamp) -> RunResult | SweepRecord | DataError:
         known = self._files.get(path)
