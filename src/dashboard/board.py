@@ -214,12 +214,8 @@ class BoardReader:
             for run_id, planned in record.runs.items():
                 run = runs.setdefault(run_id, Run(run_id=run_id, state=planned.state))
                 run.planned = run.planned or planned
-            labels = [(label, run_id) for label, by_seed in record.rows.items() for run_id in by_seed.values()]
-            rowed = {run_id for _, run_id in labels}
-            labels += [(planned.label, run_id) for run_id, planned in record.runs.items() if run_id not in rowed]
-            for label, run_id in labels:
-                if run_id in runs:
-                    runs[run_id].rows.append((record.stem, label))
+            for label, run_id in record.labelled:
+                runs[run_id].rows.append((record.stem, label))
         for name in names:
             alive = now - (unfinished.get(name) or 0.0) < ALIVE_S
             state = "running" if name in unfinished and alive else "stopped" if name in unfinished else "done"

@@ -78,6 +78,13 @@ class SweepRecord:
         return f"{self.name}_{self.scale}{self.suffix}"
 
     @property
+    def labelled(self) -> list[tuple[str, str]]:
+        """Label and run id of every row and seed, then of the runs of no row: of trials, and what rows start from."""
+        rows = [(label, run_id) for label, by_seed in self.rows.items() for run_id in by_seed.values()]
+        rowed = {run_id for _, run_id in rows}
+        return rows + [(run.label, run_id) for run_id, run in self.runs.items() if run_id not in rowed]
+
+    @property
     def unchosen(self) -> int:
         """Trials of a search whose values have not been chosen yet."""
         return max(0, self.sweep.trials - self.trials) if self.sweep.is_search else 0
