@@ -39,6 +39,7 @@ def test_devices_that_are_not_there_are_named(monkeypatch):
         check_devices("gpu", 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensors", [("radar",), ("camera", "radar"), ("lidar",)])
 def test_a_submission_states_the_sensors_that_the_model_reads(tmp_path, monkeypatch, sensors):
     config, _ = compose_config(["scale=debug"])

@@ -15,6 +15,7 @@ from tests.running import command
 SCALES = sorted(p.stem for p in (CONF / "scale").glob("*.yaml"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("radar_only", [False, True])
 def test_every_scale_composes(scale, radar_only):
@@ -26,6 +27,7 @@ def test_every_scale_composes(scale, radar_only):
     assert config.grid.cells == [384, 384] and config.grid.cell_m == 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
 def test_phase_2_composes_at_every_scale(scale):
     """With every part of the memory on; only counts shrink, and phase 1 drops the part altogether."""
@@ -40,6 +42,7 @@ def test_phase_2_composes_at_every_scale(scale):
     assert single["model"]["dptf"] is None and tree["model"]["dptf"] is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
 def test_the_dense_baseline_composes_at_every_scale(scale, phase):
@@ -52,6 +55,7 @@ def test_the_dense_baseline_composes_at_every_scale(scale, phase):
     assert model.view_transform.num_depth_bins in (16, 80) and model.view_transform.depth_range == (1.0, 160.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize(
     ("overrides", "off"),
@@ -78,6 +82,7 @@ def test_memory_is_switched_by_configuration_values(scale, overrides, off):
     assert {name for name, part in parts.items() if part is None} == off
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", ["backbone", "data", "trainer", "logger"])
 def test_every_choice_composes(group):
     for path in (CONF / group).glob("*.yaml"):
@@ -190,6 +195,7 @@ def test_full_size_values_are_those_of_the_specification(phase):
         assert {name: node.get(name, "no such key") for name in values} == values, group
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -265,6 +271,7 @@ def test_relations_with_the_grid_are_named():
         build_model(config)
 
 
+@pytest.mark.slow
 def test_a_stored_phase_2_comes_back_with_its_memory():
     """The command's own default phase drops the memory; the checkpoint's phase counts."""
     _, tree = compose_config(["scale=debug", "phase=phase2", "model.dptf.gaussian_path.gaussians_per_frame=3"])
@@ -290,6 +297,7 @@ def test_a_stored_dense_baseline_comes_back_as_such():
         restore_config(tree, ["model=horizon3d"])
 
 
+@pytest.mark.slow
 def test_a_stored_configuration_comes_back_with_the_command_lines_changes():
     _, tree = compose_config(["scale=debug", "model.ocsf.margin_m=1.6", "seed=4"])
     config = restore_config(tree, ["data.split=train", "data.root=/elsewhere"])
@@ -299,6 +307,7 @@ def test_a_stored_configuration_comes_back_with_the_command_lines_changes():
     assert whole.data.world is None and whole.data.version == "v1.2-trainval"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [{"model": {"name": "other"}}, {"phase": {"name": "x"}}, {"phase": None}, {"unknown": 1}, {"seed": math.nan}],
@@ -375,6 +384,7 @@ def exit_code_of(main, monkeypatch):
     return ended.value.code
 
 
+@pytest.mark.slow
 def test_exit_code_of_a_configuration_error():
     result = command("train", "phase=phase3", expect=3)
     assert "phase3" in result.stderr and "phase1" in result.stderr and "phase2" in result.stderr

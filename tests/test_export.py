@@ -11,6 +11,7 @@ from src.streaming import StreamingDetector
 from tests.untrained import write_checkpoint
 
 
+@pytest.mark.slow
 def test_the_file_gives_the_features_of_the_detector(tmp_path, capsys):
     path = write_checkpoint(tmp_path / "model.ckpt", "phase=phase2")
     out = tmp_path / "new" / "encoder.pt2"
@@ -31,6 +32,7 @@ def test_the_file_gives_the_features_of_the_detector(tmp_path, capsys):
     assert about["backbone"] == "small" and len(about["outputs"]) == len(encoders[0].strides)
 
 
+@pytest.mark.slow
 def test_without_a_name_it_is_named_by_the_run(tmp_path, monkeypatch):
     folder = tmp_path / "outputs" / "some-run" / "checkpoints"
     folder.mkdir(parents=True)
@@ -40,6 +42,7 @@ def test_without_a_name_it_is_named_by_the_run(tmp_path, monkeypatch):
     assert (tmp_path / "outputs" / "exports" / "some-run.pt2").is_file()
 
 
+@pytest.mark.slow
 def test_what_cannot_be_exported_is_refused_with_a_reason(tmp_path):
     good = write_checkpoint(tmp_path / "good.ckpt", "phase=phase1")
     blind = write_checkpoint(tmp_path / "radar.ckpt", "phase=phase1", "model.kggi=null", "model.ocsf=null")

@@ -46,7 +46,8 @@ def whole(checkpoints, outputs):
     return outputs / "predictions" / "run-phase2" / "val"
 
 
-@pytest.mark.parametrize("phase", [pytest.param("phase1", marks=pytest.mark.slow), "phase2"])
+@pytest.mark.slow
+@pytest.mark.parametrize("phase", ["phase1", "phase2"])
 def test_boxes_are_those_of_evaluate(checkpoints, outputs, tmp_path, phase):
     base = (f"paths.outputs={outputs}",)
     run(checkpoints[phase], *base, f"out={tmp_path / 'a'}")
@@ -66,6 +67,7 @@ def scene_names(outputs):
     return json.loads((world / "splits.json").read_text())["val"]
 
 
+@pytest.mark.slow
 def test_one_scene_gives_its_samples_with_the_boxes_they_have_in_the_split(checkpoints, outputs, whole, capsys):
     first, second = scene_names(outputs)
     run(checkpoints["phase2"], f"paths.outputs={outputs}", f"scene={second}")
@@ -75,6 +77,7 @@ def test_one_scene_gives_its_samples_with_the_boxes_they_have_in_the_split(check
     assert len(part) == FRAMES and all(everything[token] == boxes for token, boxes in part.items())
 
 
+@pytest.mark.slow
 def test_memory_shows_in_the_boxes_and_its_age_can_be_set(checkpoints, outputs, whole, tmp_path):
     run(checkpoints["phase2"], f"paths.outputs={outputs}", f"out={tmp_path}", "model.dptf.max_age_s=0.3")
     forgetful, everything = results(tmp_path), results(whole)
@@ -94,6 +97,7 @@ def test_pictures_of_the_first_scene(checkpoints, outputs, tmp_path, capsys):
     assert "submission.json, scene.gif, strip.png" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [predict, evaluate])
 def test_without_any_box_there_is_no_submission_not_even_an_older_one(
     checkpoints, outputs, tmp_path, caplog, capsys, command
@@ -107,6 +111,7 @@ def test_without_any_box_there_is_no_submission_not_even_an_older_one(
     assert "submission.json" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_results_under_other_settings_lie_elsewhere(checkpoints, outputs, tmp_path):
     (world,) = (outputs / "worlds").iterdir()
     for own in ("", "trainer.accelerator=cpu", "model.head.score_threshold=0.2", "model.head.score_threshold=0.3"):
@@ -114,6 +119,7 @@ def test_results_under_other_settings_lie_elsewhere(checkpoints, outputs, tmp_pa
     assert len(list((tmp_path / "predictions").iterdir())) == 3  # an accelerator changes no result
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_leaves_what_was_there(checkpoints, outputs, tmp_path, monkeypatch):
     (tmp_path / "submission.json").write_text("older")
     steps, step = [], StreamingDetector.run
@@ -131,6 +137,7 @@ def test_an_interrupted_run_leaves_what_was_there(checkpoints, outputs, tmp_path
     assert (tmp_path / "submission.json").read_text() == "older"
 
 
+@pytest.mark.slow
 def test_bad_input_is_named(checkpoints, outputs, tmp_path):
     good, base = checkpoints["phase1"], (f"paths.outputs={outputs}", f"out={tmp_path / 'out'}")
     with pytest.raises(ConfigError, match="give checkpoint=PATH"):

@@ -72,12 +72,14 @@ def memory_of(detector):
     return leaves(detector.memory.state())
 
 
+@pytest.mark.slow
 def test_boxes_come_best_first_with_scores_in_a_valid_form(phase2):
     boxes = phase2.step(make_frame(phase2, 0.0))
     assert len(boxes) > 5 and boxes.centers.device.type == "cpu"
     assert (boxes.scores.diff() <= 0).all() and torch.isfinite(boxes.centers).all()
 
 
+@pytest.mark.slow
 def test_the_second_frame_remembers_the_first(phase2):
     frames = [make_frame(phase2, 0.5 * k, seed=k) for k in range(4)]
     stepped = [phase2.step(frame) for frame in frames]
@@ -97,6 +99,7 @@ def test_a_single_frame_model_has_no_memory(checkpoints):
     assert same(detector.step(frame), alone(detector, frame)) and detector.memory is None
 
 
+@pytest.mark.slow
 def test_reset_and_a_marked_start_begin_anew(phase2):
     walk(phase2, 0.0, 0.5)
     frame = make_frame(phase2, 1.0, seed=7)
@@ -109,6 +112,7 @@ def test_reset_and_a_marked_start_begin_anew(phase2):
     assert not same(phase2.step(unmarked), alone(phase2, following))
 
 
+@pytest.mark.slow
 def test_frames_that_are_not_in_the_past_are_not_used(phase2):
     walk(phase2, 10.0)
     again = make_frame(phase2, 10.0, seed=1)
@@ -129,6 +133,7 @@ def test_a_frame_given_again_is_detected_as_the_first_time(phase2):
     assert all(torch.equal(*pair) for pair in zip(memory_of(phase2), memory, strict=True))
 
 
+@pytest.mark.slow
 def test_a_gap_beyond_the_age_limit_is_as_a_first_frame(phase2):
     limit = phase2.model.config.dptf.max_age_s
     for gap, forgotten in ((limit - 0.01, False), (limit + 0.01, True)):
@@ -138,6 +143,7 @@ def test_a_gap_beyond_the_age_limit_is_as_a_first_frame(phase2):
         assert same(phase2.step(frame), alone(phase2, frame)) == forgotten
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_pose_is_as_a_first_frame(phase2):
     for distance, forgotten in ((49.0, False), (51.0, True)):  # within 0.5 s
         phase2.reset()
@@ -146,6 +152,7 @@ def test_a_jump_of_the_pose_is_as_a_first_frame(phase2):
         assert same(phase2.step(frame), alone(phase2, frame)) == forgotten
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
 def test_frames_without_radar_points_or_cameras_are_detected_and_remembered(checkpoints, phase):
     detector = StreamingDetector.load(checkpoints[phase])
@@ -155,6 +162,7 @@ def test_frames_without_radar_points_or_cameras_are_detected_and_remembered(chec
         assert torch.isfinite(boxes.centers).all() and torch.isfinite(boxes.scores).all()
 
 
+@pytest.mark.slow
 def test_memory_stays_within_its_bounds(phase2):
     config, sizes = phase2.model.config.dptf, []
     for k in range(30):
@@ -168,6 +176,7 @@ def test_memory_stays_within_its_bounds(phase2):
     assert max(sizes[20:]) < 1.5 * max(sizes[2:10])
 
 
+@pytest.mark.slow
 def test_two_vehicles_can_share_a_model(phase2):
     """The memory is the detector's: nothing passes through the model."""
     frames = [make_frame(phase2, 0.5 * k, seed=k) for k in range(3)]
@@ -252,6 +261,7 @@ def test_loading_says_what_is_wrong(checkpoints, tmp_path):
             StreamingDetector.load(checkpoints["phase1"], device="cuda")
 
 
+@pytest.mark.slow
 def test_bf16_runs_in_autocast(tmp_path):
     path = write_checkpoint(tmp_path / "bf16.ckpt", "phase=phase2", "precision=bf16-mixed")
     detector = StreamingDetector.load(path)

@@ -19,18 +19,18 @@ from src.benchmark.counting import counted_work
 from src.benchmark.machine import Gemm
 from src.benchmark.operation_table import operation_table
 from src.benchmark.spconv_baseline import (
-    SpconvEncoder,
     build_layer,
     largest_difference,
     load_spconv,
+    sorted_map,
     sparse_tensor,
+    spconv_encoder,
     uncached,
 )
-from src.benchmark.timing import MODES, added_bytes, clock, interleaved, milliseconds
+from src.benchmark.timing import MODES, added_mib, clock, interleaved, ratio_columns
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.layers.sparse import SparseConv, SparseKernel, SubmanifoldConv, TemporalConv
-from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
 from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv
 from src.structures.sparse_bev import SparseMap
@@ -47,25 +47,16 @@ SPCONV_TRIALS = 6  # runs on several threads that are checked for spconv's race
 
 @dataclass
 class Layer:
-    """One convolution on a set of sites, with its map."""
+    """One convolution on a set of sites."""
 
     name: str
     sites: Sites
     kernel: SparseKernel
-    stride: tuple[int, ...]
-    padding: tuple[int, ...]
 
     @property
     def temporal(self) -> bool:
         """Whether time shortens without spreading over the plane, which no baseline offers."""
         return isinstance(self.kernel, TemporalConv)
-
-    def map(self, sites: Sites) -> tuple[KernelMap, Sites]:
-        """The kernel map and the sites of the output, cached on the sites."""
-        if isinstance(self.kernel, SubmanifoldConv):
-            return submanifold_map(sites, self.kernel.kernel_size), sites
-        build = temporal_map if self.temporal else strided_map
-        return build(sites, self.kernel.kernel_size, self.stride, self.padding)
 
 
 def layers_of(
@@ -81,24 +72,24 @@ def layers_of(
         stages = encoder.eval().run_stages(voxels)
     previous = voxels.sites
     for number, stage in enumerate(stages):
-        ndim, width, axes = stage.sites.ndim, stage.channels, (1,) * stage.sites.ndim
+        ndim, width = stage.sites.ndim, stage.channels
         if number and number == encoder.bev_stage:
             narrow = stages[number - 1].channels
             down = SparseConv(narrow, width, 3, ndim, bias=False, stride=2, padding=1)
             name = f"stage {number + 1} stride 2, {narrow} to {width} channels"
-            layers.append(Layer(name, previous, down, (2,) * ndim, axes))
+            layers.append(Layer(name, previous, down))
         subm = SubmanifoldConv(width, width, 3, ndim, bias=False)
-        layers.append(Layer(f"stage {number + 1} submanifold {ndim}D, {width} channels", stage.sites, subm, axes, axes))
+        layers.append(Layer(f"stage {number + 1} submanifold {ndim}D, {width} channels", stage.sites, subm))
         previous = stage.sites
     flat = SubmanifoldConv(channels, channels, 3, 2, bias=False)
-    layers.append(Layer(f"BEV submanifold 2D, {channels} channels", bev_sites, flat, (1, 1), (1, 1)))
+    layers.append(Layer(f"BEV submanifold 2D, {channels} channels", bev_sites, flat))
     cube = SubmanifoldConv(channels, channels, 3, 3, bias=False)
-    layers.append(Layer(f"time submanifold (t, y, x), {channels} channels", past_sites, cube, (1, 1, 1), (1, 1, 1)))
+    layers.append(Layer(f"time submanifold (t, y, x), {channels} channels", past_sites, cube))
     halving = SparseConv(channels, channels, 3, 3, bias=False, stride=(2, 1, 1), padding=1)
-    layers.append(Layer(f"time stride (2, 1, 1), {channels} channels", past_sites, halving, (2, 1, 1), (1, 1, 1)))
+    layers.append(Layer(f"time stride (2, 1, 1), {channels} channels", past_sites, halving))
     kept = TemporalConv(channels, channels, dilating=False)
     name = f"time stride (2, 1, 1) on occupied columns, {channels} channels"
-    layers.append(Layer(name, past_sites, kept, (2, 1, 1), (1, 1, 1)))
+    layers.append(Layer(name, past_sites, kept))
     return layers
 
 
@@ -119,14 +110,14 @@ def measure_layer(
     layer: Layer, spconv: ModuleType | None, device: torch.device, gemm: Gemm, threads: int
 ) -> list[dict[str, Any]]:
     """Forward, and forward with both gradients; kernel maps of all are made before, ours timed by themselves."""
-    kernel_map, out_sites = layer.map(layer.sites)
+    kernel_map, out_sites = layer.kernel.map(layer.sites)
     features = torch.randn(len(layer.sites), layer.kernel.in_channels, device=device, requires_grad=True)
     weight = layer.kernel.weight
     flops = 2 * len(kernel_map.inputs) * layer.kernel.in_channels * layer.kernel.out_channels
     functions: dict[str, Callable[[], Tensor]] = {"ours": lambda: sparse_conv(features, weight, kernel_map)}
     leaves: dict[str, list[Tensor]] = {"ours": [features, weight]}
     if spconv is not None and not layer.temporal:
-        baseline = build_layer(spconv, layer.kernel, layer.stride, layer.padding, "pairs").to(device)
+        baseline = build_layer(spconv, layer.kernel, "pairs").to(device)
         empty = sparse_tensor(spconv, SparseMap(layer.sites, features))
         baseline(empty)  # fills the tensor's rulebook
         order = Sites.from_indices(baseline(empty).indices.long(), out_sites.shape)[1]
@@ -152,29 +143,24 @@ def measure_layer(
             wrong = sum(largest_difference([reference], [run]) > AGREEMENT for run in runs)
             agreement["spconv wrong"] = f"{wrong} of {SPCONV_TRIALS}"
     forward = {name: torch.no_grad()(function) for name, function in functions.items()}
-    forward["map"] = lambda: layer.map(Sites(layer.sites.shape, layer.sites.keys))
+    forward["map"] = lambda: layer.kernel.map(Sites(layer.sites.shape, layer.sites.keys))
     rows = []
     for mode, candidates, times in (("forward", forward, 1), ("f+b", both, 3)):
         seconds = interleaved(candidates | {"GEMM": gemm}, clock(device), ROUNDS, LAYER_BUDGET_S)
         sizes = {"sites": len(layer.sites), "outputs": len(out_sites), "pairs": len(kernel_map.inputs)}
         row = {"layer": layer.name, "mode": mode, "threads": threads}
-        row |= ratio_columns(seconds, times * flops, gemm)
-        if mode == "forward":
-            row["map ms"] = 1e3 * statistics.median(seconds["map"])
+        maps = seconds.pop("map", None)
+        row |= rate_columns(seconds, times * flops, gemm)
+        row |= {"map ms": 1e3 * statistics.median(maps)} if maps else {}
         rows.append(row | agreement | sizes)
     return rows
 
 
-def ratio_columns(seconds: dict[str, list[float]], flops: float, gemm: Gemm) -> dict[str, Any]:
-    """How many times faster ours is than its baselines, its share of the GEMM rate beside it, then times."""
-    middle = {name: statistics.median(values) for name, values in seconds.items()}
-    row: dict[str, Any] = {
-        f"x faster than {name}": middle[name] / middle["ours"] for name in ("dense", "spconv") if name in middle
-    }
-    rate = gemm.flops / middle["GEMM"]
-    row |= {"% of GEMM": 100 * flops / middle["ours"] / rate, **milliseconds(seconds["ours"])}
-    row |= {f"{name} ms": 1e3 * middle[name] for name in ("dense", "spconv") if name in middle}
-    return row | {"GEMM GFLOP/s": rate / 1e9}
+def rate_columns(seconds: dict[str, list[float]], flops: float, gemm: Gemm) -> dict[str, float]:
+    """Ours as a share of the GEMM rate beside it, and beside its baselines."""
+    rate = gemm.flops / statistics.median(seconds.pop("GEMM"))
+    share = 100 * flops / statistics.median(seconds["ours"]) / rate
+    return {"% of GEMM": share, **ratio_columns(seconds), "GEMM GFLOP/s": rate / 1e9}
 
 
 def spconv_difference(
@@ -205,7 +191,7 @@ def dense_convolution(layer: Layer, features: Tensor, out_sites: Sites) -> Tenso
     grid = SparseMap(layer.sites, features).to_dense()
     cube = kernel.weight.view(*(kernel.kernel_size,) * ndim, *kernel.weight.shape[1:])
     convolve = F.conv2d if ndim == 2 else F.conv3d
-    dense = convolve(grid, cube.permute(-1, -2, *range(ndim)), stride=layer.stride, padding=layer.padding)
+    dense = convolve(grid, cube.permute(-1, -2, *range(ndim)), stride=kernel.stride, padding=kernel.padding)
     return dense.movedim(1, -1).flatten(0, -2).index_select(0, out_sites.linear())
 
 
@@ -230,8 +216,8 @@ def measure_backbone(
             voxels = encoder.voxelise(points, torch.zeros(len(points), dtype=torch.int64, device=device), 1)
         functions: dict[str, Callable[[], Tensor]] = {"ours": lambda v=voxels: encoder.encode(uncached(v)).features}
         if spconv is not None:
-            twin = SpconvEncoder(spconv, encoder).to(device).train()
-            functions["spconv"] = lambda v=voxels, twin=twin: twin(v)[1]
+            twin = spconv_encoder(spconv, encoder)
+            functions["spconv"] = lambda v=voxels, twin=twin: sorted_map(twin.encode(v).tensor).features
         for count in threads:
             with set_torch_threads(count):
                 found = _backbone_rows(functions, device, gemm, count)
@@ -252,12 +238,9 @@ def _backbone_rows(
         with counted_work() as work:
             candidates["ours"]()
         seconds = interleaved(candidates | {"GEMM": gemm}, clock(device), ROUNDS, BACKBONE_BUDGET_S)
-        row = {"mode": mode, "threads": threads} | ratio_columns(seconds, work.flops, gemm)
+        row = {"mode": mode, "threads": threads} | rate_columns(seconds, work.flops, gemm)
         row |= {"GFLOP": work.flops / 1e9}
-        for kind, function in candidates.items():
-            added = added_bytes(function, device)
-            if added is not None:
-                row[f"{kind} added MiB"] = added / 2**20
+        row |= {f"{kind} added MiB": added_mib(function, device) for kind, function in candidates.items()}
         rows.append(row | agreement)
     return rows
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from src.benchmark.parts import tensors_in
 from src.benchmark.scenes import ROADS, Highway
-from src.benchmark.timing import MODES, added_bytes, clock, interleaved, milliseconds
+from src.benchmark.timing import MODES, added_mib, clock, interleaved, ratio_columns
 from src.config import Config
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import cells_in_boxes
@@ -58,9 +57,9 @@ SIZES = {
 }
 
 
-# ---------------------------------------------------------------- splat
-
 Gaussians = dict[str, Tensor]
+Candidates = tuple[Callable[[], Any], Callable[[], Any]]
+"""Ours and the naive implementation."""
 
 
 def random_gaussians(number: int, channels: int, grid: BEVGrid, device: torch.device) -> Gaussians:
@@ -83,10 +82,9 @@ def random_gaussians(number: int, channels: int, grid: BEVGrid, device: torch.de
     return {name: value.to(device).requires_grad_() for name, value in made.items()}
 
 
-def measure_splat(gaussians: Gaussians, grid: BEVGrid, subset: int, device: torch.device) -> list[dict[str, Any]]:
-    """Ours against every Gaussian at every cell: time and added memory, forward and with backward."""
-    number = len(gaussians["means"])
-    batch = torch.zeros(number, dtype=torch.int64, device=device)
+def splat_candidates(gaussians: Gaussians, grid: BEVGrid, subset: int) -> Candidates:
+    """Every Gaussian at every cell, of a subset of them."""
+    batch = torch.zeros(len(gaussians["means"]), dtype=torch.int64, device=gaussians["means"].device)
     options = {"threshold": 0.1, "max_cells": 32768, "support_sigmas": 3.0}
 
     def ours() -> tuple[Tensor, Tensor]:
@@ -95,29 +93,8 @@ def measure_splat(gaussians: Gaussians, grid: BEVGrid, subset: int, device: torc
 
     few = {name: value[:subset].detach().requires_grad_() for name, value in gaussians.items()}
     with torch.no_grad():
-        whole = splat_gaussians(**gaussians, batch=batch, grid=grid, batch_size=1, **options)
-    occupied = whole.occupied.linear()
-    factor = number / min(subset, number)
-    areas = math.pi * (options["support_sigmas"] / grid.cell_m) ** 2 * gaussians["scales"].detach().prod(1)
-    pairs = round(float(areas.sum()))  # (Gaussian, cell), less those that the edge of the grid cuts off
-
-    def dense() -> tuple[Tensor, Tensor]:
-        return dense_splat(few, occupied, grid, options["support_sigmas"])
-
-    rows = []
-    for mode, wrap in MODES.items():
-        candidates = {"ours": wrap(ours), "dense": wrap(dense)}
-        seconds = interleaved(candidates, clock(device), ROUNDS, BUDGET_S)
-        middle = {name: statistics.median(values) for name, values in seconds.items()}
-        added = {name: added_bytes(function, device) for name, function in candidates.items()}
-        row = {"mode": mode, "x faster than dense": factor * middle["dense"] / middle["ours"]}
-        if None not in added.values():
-            row["x less memory than dense"] = factor * added["dense"] / max(added["ours"], 1)
-            row |= {f"{name} added MiB": value / 2**20 for name, value in added.items()}
-            row["dense added MiB"] *= factor
-        row |= milliseconds(seconds["ours"]) | {"dense ms": 1e3 * factor * middle["dense"]}
-        rows.append(row | {"gaussians": number, "pairs": pairs, "cells": len(whole.support), "occupied": len(occupied)})
-    return rows
+        occupied = splat_gaussians(**gaussians, batch=batch, grid=grid, batch_size=1, **options).occupied.linear()
+    return ours, lambda: dense_splat(few, occupied, grid, options["support_sigmas"])
 
 
 def dense_splat(gaussians: Gaussians, occupied: Tensor, grid: BEVGrid, support_sigmas: float) -> tuple[Tensor, Tensor]:
@@ -138,68 +115,63 @@ def all_centres(grid: BEVGrid, device: torch.device) -> Tensor:  # [rows * cols,
     return grid.centre_of(cells)
 
 
-# ---------------------------------------------------------------- everything else
-
-
-def measure_rest(
+def measure_operations(
     config: Config, sizes: NaiveSizes, grid: BEVGrid, points: Tensor, bev: Sites, device: torch.device
 ) -> list[dict[str, Any]]:
     """Rows of operations that are not bound by matrix products: ours against the naive implementation."""
     draw, channels = torch.Generator(device=device).manual_seed(1), config.model.channels
-    rows = compare("segment sum", *segment_candidates(sizes, channels, draw, device), "index_add", device)
+    gaussians = random_gaussians(sizes.gaussians, channels, grid, device)
+    rows = compare(
+        "splat",
+        "every Gaussian at every cell",
+        splat_candidates(gaussians, grid, sizes.splat_subset),
+        device,
+        times=sizes.gaussians / min(sizes.splat_subset, sizes.gaussians),
+    )
+    rows += compare("segment sum", "index_add", segment_candidates(sizes, channels, draw, device), device)
     sampling = sampling_candidates(sizes, channels, grid, bev, draw)
-    rows += compare("bilinear sampling", *sampling, "densify + grid_sample", device)
+    rows += compare("bilinear sampling", "densify + grid_sample", sampling, device)
     attention = attention_candidates(config, sizes, draw, device)
-    rows += compare("image attention", *attention, "all views grid_sample", device)
-    half = torch.tensor(grid.half_extent_m, device=device)
-    spots = (2 * torch.rand(sizes.gaussians, 2, generator=draw, device=device) - 1) * half
+    rows += compare("image attention", "all views grid_sample", attention, device)
+    spots = 2 * torch.rand(sizes.gaussians, 2, generator=draw, device=device) - 1
+    spots = spots * torch.tensor(grid.half_extent_m, device=device)
     valid = torch.ones(1, sizes.gaussians, dtype=torch.bool, device=device)
     start = torch.zeros(1, dtype=torch.int64, device=device)
-    rows += compare(
-        "farthest points",
+    picking = (
         lambda: farthest_points(spots[None], valid, start, sizes.picks),
         lambda: naive_farthest_points(spots, sizes.picks),
-        "plain loop",
-        device,
     )
+    rows += compare("farthest points", "plain loop", picking, device)
     car = torch.tensor([[4.5, 1.9, 0.4]], device=device)  # length, width, yaw
     boxes = torch.cat([spots[: sizes.boxes], car.expand(min(sizes.boxes, len(spots)), 3)], 1)
-    rows += compare(
-        "box raster",
-        lambda: cells_in_boxes(boxes, grid, 4.8),
-        lambda: dense_raster(boxes, grid, 4.8),
-        "every box at every cell",
-        device,
-    )
+    raster = lambda: cells_in_boxes(boxes, grid, 4.8), lambda: dense_raster(boxes, grid, 4.8)
+    rows += compare("box raster", "every box at every cell", raster, device)
     owners = torch.zeros(len(points), dtype=torch.int64, device=device)
     lower, size = (grid.x_min_m, grid.y_min_m, grid.z_range_m[0]), (0.1, 0.1, 0.2)
     shape = (round((grid.z_range_m[1] - grid.z_range_m[0]) / size[2]), 8 * grid.rows, 8 * grid.cols)
-    rows += compare(
-        "voxels",
+    voxels = (
         lambda: voxelize(points, points[:, :3], owners, lower, size, shape, 1)[1],
         lambda: naive_voxels(points, lower, size),
-        "unique rows + index_add",
-        device,
     )
-    return rows
+    return rows + compare("voxels", "unique rows + index_add", voxels, device)
 
 
 def compare(
-    operation: str, ours: Callable[[], Any], naive: Callable[[], Any], naive_name: str, device: torch.device
+    operation: str, naive_name: str, candidates: Candidates, device: torch.device, times: float = 1.0
 ) -> list[dict[str, Any]]:
-    """Both in turns, forward and, where the result has a gradient, with backward."""
-    trained = any(x.requires_grad for x in tensors_in(ours()))
+    """Both in turns, forward and, where the result has a gradient, with backward; `times` the naive one counts."""
+    trained = any(x.requires_grad for x in tensors_in(candidates[0]()))
     rows = []
     for mode, wrap in MODES.items():
         if mode == "forward" or trained:
-            seconds = interleaved({"ours": wrap(ours), "naive": wrap(naive)}, clock(device), ROUNDS, BUDGET_S)
-            naive_ms, times = 1e3 * statistics.median(seconds["naive"]), milliseconds(seconds["ours"])
-            row = {"operation": operation, "mode": mode, "x faster": naive_ms / times["ms"]}
-            rows.append(row | {"naive implementation": naive_name, **times, "naive ms": naive_ms})
+            wrapped = dict(zip(("ours", "naive"), map(wrap, candidates), strict=True))
+            row = {"operation": operation, "mode": mode, "naive implementation": naive_name}
+            row |= ratio_columns(interleaved(wrapped, clock(device), ROUNDS, BUDGET_S), {"naive": times})
+            row |= {f"{name} added MiB": added_mib(function, device) for name, function in wrapped.items()}
+            if row["naive added MiB"] is not None:
+                row["naive added MiB"] *= times
+            rows.append(row)
     return rows
-
-
-Candidates = tuple[Callable[[], Any], Callable[[], Any]]
 
 
 def segment_candidates(sizes: NaiveSizes, channels: int, draw: torch.Generator, device: torch.device) -> Candidates:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import copy
 import importlib
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.models.backbones.sparse_voxel import RadarEncoder
-from src.models.layers.sparse import ConvNormReLU, ResidualBlock, SparseKernel, SubmanifoldConv
+from src.models.layers.sparse import SparseKernel, SubmanifoldConv
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV, SparseMap
 
@@ -32,7 +32,7 @@ def load_spconv(device: torch.device) -> ModuleType | None:
     return spconv
 
 
-def build_layer(spconv: ModuleType, kernel: SparseKernel, stride: Any, padding: Any, key: str) -> nn.Module:
+def build_layer(spconv: ModuleType, kernel: SparseKernel, key: str) -> nn.Module:
     """spconv's layer with the weights of ours. Ours are [K, in, out], spconv's [out, *k, in]."""
     weight, ndim = kernel.weight, kernel.ndim
     algorithm = importlib.import_module("spconv.core").ConvAlgo.Native if weight.device.type == "cpu" else None
@@ -41,7 +41,7 @@ def build_layer(spconv: ModuleType, kernel: SparseKernel, stride: Any, padding: 
     if isinstance(kernel, SubmanifoldConv):
         layer = getattr(spconv, f"SubMConv{ndim}d")(*sizes, **shared)
     else:
-        layer = getattr(spconv, f"SparseConv{ndim}d")(*sizes, stride=stride, padding=padding, **shared)
+        layer = getattr(spconv, f"SparseConv{ndim}d")(*sizes, stride=kernel.stride, padding=kernel.padding, **shared)
     layer = layer.to(weight.device)
     with torch.no_grad():
         cube = weight.view(*(kernel.kernel_size,) * ndim, *weight.shape[1:])
@@ -56,66 +56,54 @@ def sparse_tensor(spconv: ModuleType, x: SparseMap) -> Any:
     return spconv.SparseConvTensor(x.features, x.indices.int(), list(x.sites.shape[1:]), x.batch_size)
 
 
-def sorted_map(y: Any, shape: tuple[int, ...]) -> tuple[Sites, Tensor]:
+def sorted_map(y: Any) -> SparseMap:
     """spconv's tensor with its rows in our order."""
-    sites, order = Sites.from_indices(y.indices.long(), shape)
-    return sites, y.features.index_select(0, order)
+    sites, order = Sites.from_indices(y.indices.long(), (y.batch_size, *y.spatial_shape))
+    return SparseMap(sites, y.features.index_select(0, order))
 
 
-class SpconvEncoder(nn.Module):
-    """The radar backbone in spconv's layers, with the weights and norms of an encoder of ours."""
+@dataclass
+class SpconvMap:
+    """spconv's tensor where our blocks expect a sparse map."""
 
-    def __init__(self, spconv: ModuleType, encoder: RadarEncoder) -> None:
+    tensor: Any
+
+    @property
+    def features(self) -> Tensor:  # [M, C]
+        """In spconv's order."""
+        return self.tensor.features
+
+    def with_features(self, features: Tensor) -> SpconvMap:
+        """The same sites carrying other features."""
+        return SpconvMap(self.tensor.replace_feature(features))
+
+
+class SpconvLayer(nn.Module):
+    """spconv's layer in the place of one of ours."""
+
+    def __init__(self, spconv: ModuleType, kernel: SparseKernel, key: str) -> None:
         super().__init__()
-        self.spconv, self.ours = spconv, [encoder]  # in a list: no part of this module
-        self.layers = nn.ModuleDict()
-        for name, module in encoder.named_modules():
-            if isinstance(module, SparseKernel):
-                scope = name.split(".")[0:2] if name.startswith("stages") else name.split(".")[:1]
-                # One key per set of sites; a strided layer makes a new one.
-                subm = isinstance(module, SubmanifoldConv)
-                key = ("subm " if subm else "down ") + ".".join(scope)
-                if name.startswith("conv_input"):
-                    key = "subm stages.0"
-                elif subm and scope[0] == "shared_conv" and isinstance(encoder.conv_out.conv, SubmanifoldConv):
-                    key = "subm conv_out"
-                stride, padding = (1, 1) if subm else (module.stride, module.padding)
-                self.layers[name.replace(".", "/")] = build_layer(spconv, module, stride, padding, key)
-            elif isinstance(module, nn.BatchNorm1d):
-                self.layers[name.replace(".", "/")] = copy.deepcopy(module)
+        self.spconv, self.layer = spconv, build_layer(spconv, kernel, key)
 
-    def forward(self, voxels: SparseMap) -> tuple[Sites, Tensor]:
-        """F_R: sites and features in our order."""
-        encoder = self.ours[0]
-        x = self._norm_relu("conv_input", sparse_tensor(self.spconv, voxels), encoder.conv_input)
-        stages = []
-        for number, stage in enumerate(encoder.stages):
-            for place, block in enumerate(stage):
-                x = self._block(f"stages.{number}.{place}", x, block)
-            stages.append(x)
-        kept = stages[encoder.bev_stage :]
-        batch = voxels.batch_size
-        maps = [SparseMap(*sorted_map(stage, (batch, *stage.spatial_shape))) for stage in kept]
-        x = sparse_tensor(self.spconv, encoder.compress(maps))
-        x = self._norm_relu("conv_out", x, encoder.conv_out)
-        x = self._norm_relu("shared_conv", x, encoder.shared_conv)
-        return sorted_map(x, (batch, *x.spatial_shape))
+    def forward(self, x: SparseMap | SpconvMap) -> SpconvMap:
+        return SpconvMap(self.layer(x.tensor if isinstance(x, SpconvMap) else sparse_tensor(self.spconv, x)))
 
-    def _layer(self, name: str) -> nn.Module:
-        return self.layers[name.replace(".", "/")]
 
-    def _block(self, name: str, x: Any, block: nn.Module) -> Any:
-        if isinstance(block, ConvNormReLU):
-            return self._norm_relu(name, x, block)
-        assert isinstance(block, ResidualBlock)
-        y = self._layer(f"{name}.conv1")(x)
-        y = y.replace_feature(F.relu(self._layer(f"{name}.bn1")(y.features)))
-        y = self._layer(f"{name}.conv2")(y)
-        return y.replace_feature(F.relu(self._layer(f"{name}.bn2")(y.features) + x.features))
-
-    def _norm_relu(self, name: str, x: Any, block: ConvNormReLU) -> Any:
-        y = self._layer(f"{name}.conv")(x)
-        return y.replace_feature(F.relu(self._layer(f"{name}.norm")(y.features)))
+def spconv_encoder(spconv: ModuleType, encoder: RadarEncoder) -> RadarEncoder:
+    """The radar backbone in spconv's layers, with the weights and norms of an encoder of ours; it makes a SpconvMap."""
+    twin = copy.deepcopy(encoder)
+    twin.compress = lambda stages: encoder.compress([sorted_map(stage.tensor) for stage in stages])
+    for name, kernel in encoder.named_modules():
+        if isinstance(kernel, SparseKernel):
+            # One key per set of sites; a strided layer makes a new one.
+            scope = ".".join(name.split(".")[: 2 if name.startswith("stages") else 1])
+            subm = isinstance(kernel, SubmanifoldConv)
+            if scope == "conv_input":
+                scope = "stages.0"
+            elif scope == "shared_conv" and isinstance(encoder.conv_out.conv, SubmanifoldConv):
+                scope = "conv_out"
+            twin.set_submodule(name, SpconvLayer(spconv, kernel, f"{'subm' if subm else 'down'} {scope}"))
+    return twin
 
 
 def uncached(x: SparseMap) -> SparseMap:

@@ -18,7 +18,7 @@ from src.benchmark.operation_table import OPERATIONS_NOTE, operation_table
 from src.benchmark.page import gpu_notes
 from src.benchmark.parts import Call, backward_from, is_within, parts_of, record_calls, tensors_in
 from src.benchmark.timing import (
-    added_bytes,
+    added_mib,
     clock,
     interleaved,
     milliseconds,
@@ -135,12 +135,12 @@ def time_columns(mode: str, found: dict[str, Any], rate: float, bandwidth: float
 
 def work_columns(mode: str, found: dict[str, Any]) -> dict[str, Any]:
     """What a part computes, moves and holds."""
-    compulsory, added = found.get("compulsory_bytes"), found["added_bytes"]
+    compulsory = found.get("compulsory_bytes")
     return {
         f"{mode} GFLOP": found["flops"] / 1e9,
         f"{mode} MB": None if compulsory is None else compulsory / 1e6,
         f"{mode} traffic MB": found["traffic_bytes"] / 1e6,
-        f"{mode} added MiB": None if added is None else added / 2**20,
+        f"{mode} added MiB": found["added_mib"],
     }
 
 
@@ -165,7 +165,7 @@ def measure_mode(case: Case, calls: dict[str, list[Call]], backward: bool) -> di
             "flops": work.flops,
             "traffic_bytes": work.bytes,
             "compulsory_bytes": (BACKWARD_PASSES if went_back else 1) * compulsory_bytes(calls[name]),
-            "added_bytes": added_bytes(prepared(name), case.device),
+            "added_mib": added_mib(prepared(name), case.device),
             "seconds": [],
         }
         case.model.zero_grad(set_to_none=True)
@@ -195,7 +195,7 @@ def measure_whole(case: Case) -> dict[str, dict[str, Any]]:
         found[mode] = {
             "flops": work.flops,
             "traffic_bytes": work.bytes,
-            "added_bytes": added_bytes(function, case.device),
+            "added_mib": added_mib(function, case.device),
             "seconds": interleaved({mode: function}, clock(case.device), ROUNDS)[mode],
         }
     return found

@@ -16,7 +16,7 @@ from src.benchmark.convolutions import (
     remembered_sites,
 )
 from src.benchmark.machine import measure_roofline
-from src.benchmark.naive import SIZES, measure_rest, measure_splat, random_gaussians
+from src.benchmark.naive import SIZES, measure_operations
 from src.benchmark.operation_table import OPERATIONS_NOTE
 from src.benchmark.page import gpu_notes
 from src.benchmark.scenes import highway_points
@@ -29,7 +29,7 @@ from src.ops.sites import Sites
 
 
 def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
-    """Tables of sparse convolutions, of the whole radar backbone, of splatting, and of everything else.
+    """Tables of sparse convolutions, of the whole radar backbone, and of everything else.
 
     Raises ConfigError for a model without a sparse radar backbone.
     """
@@ -48,7 +48,6 @@ def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     past = remembered_sites(grid, Sites(bev.shape, bev.keys[::4]), sizes.frames)
     layers = layers_of(encoder, voxels, config.model.channels, bev, past)
     scenes = {"synthetic highway": points.cpu()} | recorded_scene(config)
-    gaussians = random_gaussians(sizes.gaussians, config.model.channels, grid, device)
     spconv = load_spconv(device)
     return {
         "notes": [
@@ -68,8 +67,7 @@ def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
         "sparse convolution": measure_layers(layers, device, threads),
         "radar backbone": measure_backbone(encoder, scenes, device, threads),
         **backbone_operations(encoder, points),
-        "splat": measure_splat(gaussians, grid, sizes.splat_subset, device),
-        "other operations": measure_rest(config, sizes, grid, points, bev, device),
+        "other operations": measure_operations(config, sizes, grid, points, bev, device),
         "roofline": measure_roofline(device),
     }
 

@@ -28,7 +28,7 @@ from src.benchmark.page import gpu_notes, page_name
 from src.benchmark.parts import is_within, parts_of, tensors_in
 from src.benchmark.plots import draw_scaling
 from src.benchmark.scenes import FRAME_SENSORS, ROADS, Highway, highway_frame, highway_points
-from src.benchmark.timing import added_bytes, clock, interleaved, milliseconds, timed_parts
+from src.benchmark.timing import added_mib, clock, interleaved, milliseconds, timed_parts
 from src.config import Config, compose_config
 from src.errors import ConfigError
 from src.models import FAMILIES
@@ -158,9 +158,8 @@ def measure_sweep(
         x = max(gaussians for _, gaussians in made.values()) if name == "gaussians" else point.x
         seconds, parts = measure_cases(cases)
         for model, case in cases.items():
-            added = added_bytes(case.infer, device)
             row = {name: int(x), "model": model, **milliseconds(seconds[model])}
-            row["added MiB"] = None if added is None else added / 2**20
+            row["added MiB"] = added_mib(case.infer, device)
             row["remembered MiB"] = sum(x.nbytes for x in tensors_in(case.memory)) / 2**20
             with counted_work() as work:
                 case.infer()

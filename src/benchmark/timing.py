@@ -48,6 +48,15 @@ def milliseconds(seconds: list[float], prefix: str = "") -> dict[str, float]:
     return {f"{prefix}ms": 1e3 * middle, f"{prefix}± ms": 1e3 * iqr}
 
 
+def ratio_columns(seconds: Mapping[str, list[float]], times: Mapping[str, float] | None = None) -> dict[str, float]:
+    """How many times faster `ours` is than each baseline, then the times; a baseline counts so many `times`."""
+    others = {
+        name: (times or {}).get(name, 1.0) * statistics.median(seconds[name]) for name in seconds if name != "ours"
+    }
+    row = {f"x faster than {name}": value / statistics.median(seconds["ours"]) for name, value in others.items()}
+    return row | milliseconds(seconds["ours"]) | {f"{name} ms": 1e3 * value for name, value in others.items()}
+
+
 def seconds_of(function: Callable[[], Any], now: Callable[[], float]) -> float:
     """Of one call, whose result is freed: its memory would else be fresh instead of reused in the next."""
     begin = now()
@@ -122,7 +131,7 @@ def peak_bytes(device: torch.device) -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def added_bytes(function: Callable[[], Any], device: torch.device) -> int | None:
+def added_mib(function: Callable[[], Any], device: torch.device) -> float | None:
     """The most that a call takes beyond what was held before it; None where the system does not report it.
 
     On a GPU what torch allocates; on a CPU pages of the process (Linux), after the allocator has given back what it
@@ -136,7 +145,7 @@ def added_bytes(function: Callable[[], Any], device: torch.device) -> int | None
         before = torch.cuda.memory_allocated()
         function()
         torch.cuda.synchronize()
-        return torch.cuda.max_memory_allocated() - before
+        return (torch.cuda.max_memory_allocated() - before) / 2**20
     if not trim_heap():
         return None
     try:
@@ -145,7 +154,7 @@ def added_bytes(function: Callable[[], Any], device: torch.device) -> int | None
         return None
     before = status_bytes("VmRSS")
     function()
-    return max(0, status_bytes("VmHWM") - before)
+    return max(0, status_bytes("VmHWM") - before) / 2**20
 
 
 def trim_heap() -> bool:

@@ -8,13 +8,7 @@ averaged over four thresholds; errors are running means over the matches at 2 m.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-import torch
-from torch import Tensor
-from torchmetrics import Metric
-from torchmetrics.utilities import dim_zero_cat
 
 from src.metrics.checks import check_predictions
 from src.metrics.curves import (
@@ -28,7 +22,6 @@ from src.metrics.filtering import (
     RANGE_BINS_M,
     SPEED_CLASSES_MPS,
     ego_distances,
-    expand_ranges,
     official_filter,
     speed_classes,
 )
@@ -40,7 +33,7 @@ from src.metrics.scores import (
     DetectionScores,
     SubsetScores,
 )
-from src.structures.detections import COLUMN_WIDTHS, DetectionTable, EvaluationSet
+from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import CLASS_WITHOUT_ERRORS, CLASSES, SCENE_TAGS, TAGS_WITHOUT_SCORE
 
 Array = np.ndarray
@@ -171,45 +164,3 @@ def _score_speeds(ranking: Ranking, matching: Matching) -> dict[str, SubsetScore
         name: _score_subset(ranking, matching, followed == place, truth == place)
         for place, name in enumerate(SPEED_CLASSES_MPS)
     }
-
-
-class DetectionMetric(Metric):
-    """Collects the boxes of a validation pass on any number of processes.
-
-    A sample that several processes (or a padded batch) saw counts once. The result does not depend on who saw what, nor
-    on the order: boxes come in the order of the evaluation set.
-    """
-
-    full_state_update = False
-    higher_is_better = True
-    is_differentiable = False
-
-    boxes: list[Tensor]  # each [n, 17] float64, the columns of DetectionTable
-    blocks: list[Tensor]  # each [1, 2] int64: sample, number of its boxes in `boxes`
-
-    def __init__(self, evaluation_set: EvaluationSet) -> None:
-        super().__init__()
-        self.evaluation_set = evaluation_set
-        self.add_state("boxes", default=[], dist_reduce_fx="cat")
-        self.add_state("blocks", default=[], dist_reduce_fx="cat")
-
-    def update(self, sample: int, boxes: DetectionTable) -> None:
-        """Add the boxes of one sample, a row of the evaluation set's tokens."""
-        self.boxes.append(torch.from_numpy(replace(boxes, samples=np.full(len(boxes), sample)).rows()).to(self.device))
-        self.blocks.append(torch.tensor([[sample, len(boxes)]], dtype=torch.int64, device=self.device))
-
-    def sync(self, *args: object, **kwargs: object) -> None:
-        """Gather from all processes; one that saw nothing contributes empty tensors of the right shape and type."""
-        self.boxes.append(torch.zeros(0, sum(COLUMN_WIDTHS.values()), dtype=torch.float64, device=self.device))
-        self.blocks.append(torch.zeros(0, 2, dtype=torch.int64, device=self.device))
-        super().sync(*args, **kwargs)
-
-    def compute(self) -> DetectionTable:
-        """The boxes so far of all processes, each sample once and in the order of the evaluation set."""
-        if not len(self.blocks):
-            return DetectionTable.empty()
-        blocks = dim_zero_cat(self.blocks).cpu().numpy()
-        ends = np.cumsum(blocks[:, 1])
-        _, first = np.unique(blocks[:, 0], return_index=True)
-        _, rows = expand_ranges((ends - blocks[:, 1])[first], ends[first])
-        return DetectionTable.from_rows(dim_zero_cat(self.boxes).cpu().numpy()[rows])

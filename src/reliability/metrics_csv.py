@@ -9,8 +9,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from lightning.pytorch.loggers.logger import Logger, rank_zero_experiment
+from lightning.pytorch.loggers.logger import Logger
 from lightning.pytorch.utilities import rank_zero_only
+
+from src.reliability.checkpoints import sync_folder
 
 logger = logging.getLogger(__name__)
 
@@ -28,9 +30,8 @@ class MetricsCSV(Logger):
     def __init__(self, path: Path, resume_step: int) -> None:
         super().__init__()
         self._path = path
-        self._rows: list[dict[str, str]] = []
+        self.rows: list[dict[str, str]] = []  # of the file, oldest first, without empty cells
         self._columns: list[str] = ["step", "epoch"]
-        self._rewrite = True
         self._refused = False
         if path.is_file():
             self._read(resume_step)
@@ -44,21 +45,19 @@ class MetricsCSV(Logger):
                     if step.isascii() and step.isdigit() and int(step) < resume_step:
                         self._add({key: value for key, value in row.items() if key and value})
         except (OSError, ValueError, csv.Error) as error:
-            kept = f"resuming from the {len(self._rows)} rows before that"
+            kept = f"resuming from the {len(self.rows)} rows before that"
             logger.warning("%s: damaged (%s: %s); %s", self._path, type(error).__name__, error, kept)
 
     def _add(self, row: dict[str, str]) -> None:
-        for number in range(len(self._rows) - 1, -1, -1):
-            earlier = self._rows[number]
+        for number in range(len(self.rows) - 1, -1, -1):
+            earlier = self.rows[number]
             if earlier["step"] != row.get("step"):
                 break
             if earlier.keys() == row.keys():
-                self._rows[number], self._rewrite = row, True
+                self.rows[number] = row
                 return
-        new = [key for key in row if key not in self._columns]
-        self._columns += sorted(new)
-        self._rewrite = self._rewrite or bool(new)
-        self._rows.append(row)
+        self._columns += sorted(key for key in row if key not in self._columns)
+        self.rows.append(row)
 
     @property
     def name(self) -> str:
@@ -66,20 +65,9 @@ class MetricsCSV(Logger):
         return "metrics_csv"
 
     @property
-    def rows(self) -> list[dict[str, str]]:
-        """The rows of the file, oldest first, without empty cells."""
-        return list(self._rows)
-
-    @property
     def version(self) -> str:
         """There is one version per run folder."""
         return ""
-
-    @property
-    @rank_zero_experiment
-    def experiment(self) -> MetricsCSV:
-        """The logger itself."""
-        return self
 
     def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
         """Nothing: config.yaml has them."""
@@ -88,16 +76,22 @@ class MetricsCSV(Logger):
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
         """Append one row."""
         row = {key: f"{float(value):.8g}" for key, value in metrics.items() if key != "epoch"}
-        row["step"] = str(step if step is not None else len(self._rows))
+        row["step"] = str(step if step is not None else len(self.rows))
         if "epoch" in metrics:
             row["epoch"] = str(int(metrics["epoch"]))
         self._add(row)
-        self._write()
+        try:
+            self._write_rows()
+        except OSError as error:
+            if not self._refused:
+                logger.warning("%s could not be written (%s); its rows are kept for later", self._path, error.strerror)
+            self._refused = True
 
     def sync(self) -> None:
         """Put the rows onto the disk: no checkpoint shall outlive a power failure without the rows before it."""
         with suppress(OSError), self._path.open("rb") as file:
             os.fsync(file.fileno())
+        sync_folder(self._path.parent)
 
     @rank_zero_only
     def finalize(self, status: str) -> None:
@@ -105,25 +99,12 @@ class MetricsCSV(Logger):
         if status == "success" and self._refused:
             self._write_rows()
 
-    def _write(self) -> None:
-        try:
-            self._write_rows()
-            self._refused = False
-        except OSError as error:
-            if not self._refused:
-                logger.warning("%s could not be written (%s); its rows are kept for later", self._path, error.strerror)
-            self._refused = self._rewrite = True
-
     def _write_rows(self) -> None:
-        """Append the newest row; write the whole file anew when a column was added."""
-        if not self._rewrite:
-            with self._path.open("a", newline="") as file:
-                csv.DictWriter(file, self._columns).writerow(self._rows[-1])
-            return
+        """Put a file with all rows in the place of the one before, so that none is ever cut short."""
         temporary = self._path.with_name(self._path.name + ".tmp")
         with temporary.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._columns)
             writer.writeheader()
-            writer.writerows(self._rows)
+            writer.writerows(self.rows)
         os.replace(temporary, self._path)
-        self._rewrite = False
+        self._refused = False

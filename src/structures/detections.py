@@ -57,23 +57,8 @@ class DetectionTable:
     @staticmethod
     def empty() -> DetectionTable:
         """No boxes."""
-        return DetectionTable.from_rows(np.zeros((0, sum(COLUMN_WIDTHS.values()))))
-
-    def rows(self) -> Array:  # [n, 17] float64, which holds every index exactly
-        """All columns side by side."""
-        return np.column_stack([getattr(self, name).astype(np.float64) for name in COLUMN_WIDTHS])
-
-    @staticmethod
-    def from_rows(
-        rows: Array,  # [n, 17] float64
-    ) -> DetectionTable:
-        """The table that has these `rows`."""
-        parts = np.split(rows, np.cumsum(list(COLUMN_WIDTHS.values()))[:-1], axis=1)
-        columns = {}
-        for part, (name, width) in zip(parts, COLUMN_WIDTHS.items(), strict=True):
-            column = part if width > 1 else part[:, 0]
-            columns[name] = column.astype(np.int64) if name in INTEGER_COLUMNS else column
-        return DetectionTable(**columns)
+        columns = {name: np.zeros((0, width) if width > 1 else 0) for name, width in COLUMN_WIDTHS.items()}
+        return DetectionTable(**columns | {name: columns[name].astype(np.int64) for name in INTEGER_COLUMNS})
 
     @staticmethod
     def concatenate(parts: list[DetectionTable]) -> DetectionTable:

@@ -10,12 +10,13 @@ from typing import Any, ClassVar, Self
 from torch import nn
 
 from src.data.datamodule import DetectionDataModule
-from src.metrics.detection import DetectionMetric, score_detections
+from src.metrics.detection import score_detections
 from src.metrics.score_text import format_scores
 from src.metrics.scores import DetectionScores
 from src.metrics.submission import to_global
 from src.models.detector import Detector
 from src.pictures.comparison import BarPanel, draw_comparison
+from src.reliability.processes import gather_by_rank
 from src.structures.batch import FrameBatch
 from src.structures.detections import DetectionTable, EvaluationSet
 
@@ -66,14 +67,16 @@ class Evaluator(nn.Module, ABC):
 class DetectionEvaluator(Evaluator):
     """3D boxes by the official TruckScenes metric.
 
-    After `compute`, `scores` and `detections` are the same on every process.
+    A sample that several processes (or a padded batch) saw counts once. After `compute`, `scores` and `detections` are
+    the same on every process, boxes in the order of the evaluation set whoever saw what.
     """
 
     headline = "mAP"
 
     def __init__(self, evaluation_set: EvaluationSet) -> None:
         super().__init__()
-        self.metric = DetectionMetric(evaluation_set)
+        self.evaluation_set = evaluation_set
+        self.boxes: dict[int, DetectionTable] = {}  # by sample, a row of the evaluation set's tokens
         self.scores: DetectionScores | None = None
         self.detections: DetectionTable | None = None
 
@@ -84,20 +87,24 @@ class DetectionEvaluator(Evaluator):
 
     def reset(self) -> None:
         """Forget the boxes of an earlier pass."""
-        self.metric.reset()
+        self.boxes.clear()
 
     def update(self, model: Detector, output: Any, batch: FrameBatch) -> None:
-        """Decode, bring the boxes to the global frame, hand them to the metric."""
+        """Decode, bring the boxes to the global frame, keep them by sample."""
         for token, boxes, global_from_ego in zip(
             batch.tokens, model.decode(output), batch.global_from_ego.cpu().numpy(), strict=True
         ):
-            sample = self.metric.evaluation_set.index_of[token]
-            self.metric.update(sample, to_global(boxes.to("cpu"), global_from_ego, sample))
+            sample = self.evaluation_set.index_of[token]
+            self.boxes.setdefault(sample, to_global(boxes.to("cpu"), global_from_ego, sample))
 
     def compute(self) -> dict[str, float]:
         """mAP, NDS and the mean errors."""
-        self.detections = self.metric.compute()
-        self.scores = score_detections(self.metric.evaluation_set, self.detections)
+        tables: dict[int, DetectionTable] = {}
+        for of_rank in gather_by_rank(self.boxes):
+            tables = of_rank | tables
+        in_order = [tables[sample] for sample in sorted(tables)]
+        self.detections = DetectionTable.concatenate([DetectionTable.empty(), *in_order])
+        self.scores = score_detections(self.evaluation_set, self.detections)
         return self.scores.headline()
 
     def as_dict(self) -> dict[str, Any]:
@@ -120,4 +127,4 @@ class DetectionEvaluator(Evaluator):
     def write(self, folder: Path, save: SaveTable) -> list[str]:
         """The submission, where there is any box."""
         path = folder / "submission.json"
-        return [path.name] if save(path, self.metric.evaluation_set.tokens, self.detections) else []
+        return [path.name] if save(path, self.evaluation_set.tokens, self.detections) else []

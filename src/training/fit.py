@@ -85,7 +85,7 @@ def build_loggers(
     """metrics.csv always; Weights & Biases where asked for and able to start."""
     step = -1 if resume is None else int(resume.content["global_step"])
     metrics = MetricsCSV(folder.metrics_csv, resume_step=step)
-    run = start_wandb(wandb, folder, tree or {}, metrics.rows) if wandb is not None else None
+    run = start_wandb(wandb, folder, tree or {}, list(metrics.rows)) if wandb is not None else None
     return [metrics] if run is None else [metrics, run]
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 Array = np.ndarray
 Colour = tuple[int, int, int]
+Edge = tuple[float, float, float]
 
 TYRE: Colour = (24, 24, 26)
 
@@ -50,17 +51,16 @@ class Mesh:
 class MeshMaker:
     """Collects quads of boxes, frustums, discs and panels in an object's own axes (x forward, y left, z up)."""
 
-    corners: list[Array] = field(default_factory=list)
-    colours: list[Colour] = field(default_factory=list)
-    glows: list[bool] = field(default_factory=list)
-    open: list[bool] = field(default_factory=list)
+    quads: list[tuple[Array, Colour, bool, bool]] = field(default_factory=list)  # the rows of a mesh
 
     def quad(self, points: object, colour: Colour, *, glow: bool = False, two_sided: bool = False) -> None:
         """One quad of four corner points."""
-        self.corners.append(np.asarray(points, dtype=np.float64))
-        self.colours.append(colour)
-        self.glows.append(glow)
-        self.open.append(two_sided)
+        self.quads.append((np.asarray(points, dtype=np.float64), colour, glow, two_sided))
+
+    def slope(self, low: Edge, high: Edge, colour: Colour, *, two_sided: bool = False) -> None:
+        """A quad across the object between two edges, each (x, half width, z)."""
+        (x0, y0, z0), (x1, y1, z1) = low, high
+        self.quad([(x0, -y0, z0), (x0, y0, z0), (x1, y1, z1), (x1, -y1, z1)], colour, two_sided=two_sided)
 
     def frustum(
         self,
@@ -74,18 +74,7 @@ class MeshMaker:
         front: Colour | None = None,
     ) -> None:
         """A box with slanted sides; `low` and `high` are (x0, x1, y0, y1) at the heights z0 and z1. No underside."""
-        a0, a1, b0, b1 = low
-        c0, c1, e0, e1 = high
-        p = [
-            (a0, b0, z0),
-            (a1, b0, z0),
-            (a1, b1, z0),
-            (a0, b1, z0),
-            (c0, e0, z1),
-            (c1, e0, z1),
-            (c1, e1, z1),
-            (c0, e1, z1),
-        ]
+        p = [(xy[i], xy[j], z) for xy, z in ((low, z0), (high, z1)) for i, j in ((0, 2), (1, 2), (1, 3), (0, 3))]
         faces = [
             ((0, 1, 5, 4), colour),
             ((1, 2, 6, 5), front or colour),
@@ -139,9 +128,10 @@ class MeshMaker:
 
     def mesh(self) -> Mesh:
         """What was collected."""
+        corners, colours, glows, two_sided = zip(*self.quads, strict=True) if self.quads else ((),) * 4
         return Mesh(
-            corners=np.array(self.corners).reshape(-1, 4, 3),
-            colours=np.array(self.colours, dtype=np.float32).reshape(-1, 3),
-            glows=np.array(self.glows, dtype=bool),
-            open=np.array(self.open, dtype=bool),
+            corners=np.array(corners).reshape(-1, 4, 3),
+            colours=np.array(colours, dtype=np.float32).reshape(-1, 3),
+            glows=np.array(glows, dtype=bool),
+            open=np.array(two_sided, dtype=bool),
         )

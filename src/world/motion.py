@@ -16,7 +16,7 @@ LEAD_IN_S = 0.7
 """Simulated time before the first key frame, for the sweeps that precede it."""
 
 
-@dataclass(kw_only=True)
+@dataclass
 class Tracks:
     """Road coordinates of N objects on a grid of STEP_S that starts LEAD_IN_S before the first key frame."""
 

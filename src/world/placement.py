@@ -19,7 +19,6 @@ Array = np.ndarray
 class Actor:
     """One object of a scene; where it is stands in the row of `Tracks` with the same number."""
 
-    kind: Kind
     name: str  # key of KINDS
     size: Array  # [3] length, width, height in m
     colour: Colour
@@ -27,11 +26,17 @@ class Actor:
     parked: bool
     variant: int  # of its look: sign face, coat, cargo
 
+    @property
+    def kind(self) -> Kind:
+        """What it is one of."""
+        return KINDS[self.name]
+
 
 @dataclass(frozen=True)
-class Start:
-    """Road position at the first key frame, constant rates, heading relative to the road."""
+class Bystander:
+    """An actor with its road position at the first key frame, constant rates, and heading relative to the road."""
 
+    actor: Actor
     s: float
     d: float
     s_rate: float = 0.0
@@ -45,7 +50,6 @@ def make_actor(
     """An object of this size with a look of its own."""
     kind = KINDS[name]
     return Actor(
-        kind=kind,
         name=name,
         size=size,
         colour=kind.colours[int(rng.integers(len(kind.colours)))],
@@ -68,10 +72,8 @@ class _Maker:
         return int(np.floor(mean * self.config.rare_objects + self.rng.random()))
 
 
-def bystanders(
-    config: WorldConfig, road: Road, reach_m: float, rng: np.random.Generator
-) -> Iterator[tuple[Actor, Start]]:
-    """Actors beside the road with their starts; `reach_m` is how far the ego truck will drive."""
+def bystanders(config: WorldConfig, road: Road, reach_m: float, rng: np.random.Generator) -> Iterator[Bystander]:
+    """Actors beside the road; `reach_m` is how far the ego truck will drive."""
     make = _Maker(config, rng)
     yield from _roadworks(make, road, reach_m)
     yield from _side_road(make, road, reach_m)
@@ -81,76 +83,71 @@ def bystanders(
     yield from _lookalikes(make, road, reach_m)
 
 
-def _roadworks(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
+def _roadworks(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
     """Cones along a shoulder, barriers, workers and a machine; on either side of the motorway."""
     rng = make.rng
     side = -1 if rng.random() < 0.65 else 1
     start = rng.uniform(15, max(20.0, reach_m - 60))
     for i in range(make.count(3)):
-        yield (
+        yield Bystander(
             make.actor("cone"),
-            Start(start + 9.0 * i + rng.normal(0, 0.6), side * (road.edge_m + 0.35 + 0.12 * i), turn=rng.uniform(0, 3)),
+            start + 9.0 * i + rng.normal(0, 0.6),
+            side * (road.edge_m + 0.35 + 0.12 * i),
+            turn=rng.uniform(0, 3),
         )
     begin = start + 40
     for i in range(make.count(2.3)):
         across = rng.random() < 0.5
-        yield (
+        yield Bystander(
             make.actor("barrier"),
-            Start(
-                begin + 3.5 * i + rng.normal(0, 0.3),
-                side * (road.edge_m + rng.uniform(0.8, 2.2)),
-                turn=rng.normal(0, 0.12) + (0.0 if across else np.pi / 2),
-            ),
+            begin + 3.5 * i + rng.normal(0, 0.3),
+            side * (road.edge_m + rng.uniform(0.8, 2.2)),
+            turn=rng.normal(0, 0.12) + (0.0 if across else np.pi / 2),
         )
     if make.count(0.8):
-        yield (
-            make.actor("excavator", parked=True),
-            Start(begin + 30, side * (road.edge_m + 5.5), turn=rng.normal(0, 0.3)),
+        yield Bystander(
+            make.actor("excavator", parked=True), begin + 30, side * (road.edge_m + 5.5), turn=rng.normal(0, 0.3)
         )
     for _ in range(make.count(1.1)):
-        yield (
+        yield Bystander(
             make.actor("police_officer" if rng.random() < 0.15 else "worker"),
-            Start(
-                begin + rng.uniform(-30, 40),
-                side * (road.edge_m + rng.uniform(1.2, 5.0)),
-                s_rate=rng.choice([0.0, 0.8, -0.8]),
-                turn=rng.uniform(-3.1, 3.1),
-            ),
+            begin + rng.uniform(-30, 40),
+            side * (road.edge_m + rng.uniform(1.2, 5.0)),
+            s_rate=rng.choice([0.0, 0.8, -0.8]),
+            turn=rng.uniform(-3.1, 3.1),
         )
     for i in range(make.count(1)):
-        yield (
+        yield Bystander(
             make.actor("temporary_sign"),
-            Start(start - 35 * (i + 1), side * (road.edge_m + 1.9), turn=np.pi if side < 0 else 0.0),
+            start - 35 * (i + 1),
+            side * (road.edge_m + 1.9),
+            turn=np.pi if side < 0 else 0.0,
         )
 
 
-def _side_road(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
+def _side_road(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
     """Cyclists, walkers and slow vehicles on the parallel minor road, or on a path where there is none."""
     rng = make.rng
     centre = road.side_road_centre() if road.side_road else road.edge_m + 14.0
     for _ in range(make.count(1.5)):
         way = int(rng.choice([-1, 1]))
         speed = rng.uniform(3.5, 7.5)
-        yield (
+        yield Bystander(
             make.actor("bicycle"),
-            Start(
-                rng.uniform(25, reach_m - 5),
-                centre - way * rng.uniform(2.0, 2.8),
-                s_rate=way * speed,
-                turn=0.0 if way > 0 else np.pi,
-            ),
+            rng.uniform(25, reach_m - 5),
+            centre - way * rng.uniform(2.0, 2.8),
+            s_rate=way * speed,
+            turn=0.0 if way > 0 else np.pi,
         )
     for _ in range(make.count(1.0)):
         way = int(rng.choice([-1, 1]))
         standing = rng.random() < 0.3
-        yield (
+        yield Bystander(
             make.actor("child" if rng.random() < 0.25 else "adult"),
-            Start(
-                rng.uniform(15, reach_m),
-                centre - rng.choice([-1, 1]) * rng.uniform(3.4, 4.4),
-                s_rate=0.0 if standing else way * rng.uniform(0.9, 1.8),
-                turn=0.0 if way > 0 else np.pi,
-            ),
+            rng.uniform(15, reach_m),
+            centre - rng.choice([-1, 1]) * rng.uniform(3.4, 4.4),
+            s_rate=0.0 if standing else way * rng.uniform(0.9, 1.8),
+            turn=0.0 if way > 0 else np.pi,
         )
     if road.side_road:
         for name, speed in (
@@ -161,10 +158,12 @@ def _side_road(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor
             if make.count(0.35):
                 way = int(rng.choice([-1, 1]))
                 s = rng.uniform(-30, 60) if way > 0 else rng.uniform(reach_m - 60, reach_m + 120)
-                yield make.actor(name), Start(s, centre - way * 1.5, s_rate=way * speed, turn=0.0 if way > 0 else np.pi)
+                yield Bystander(
+                    make.actor(name), s, centre - way * 1.5, s_rate=way * speed, turn=0.0 if way > 0 else np.pi
+                )
 
 
-def _apron(make: _Maker, road: Road) -> Iterator[tuple[Actor, Start]]:
+def _apron(make: _Maker, road: Road) -> Iterator[Bystander]:
     """Parked vehicles in slots across the parking area, people and cycles between them."""
     if road.apron is None:
         return
@@ -177,25 +176,23 @@ def _apron(make: _Maker, road: Road) -> Iterator[tuple[Actor, Start]]:
         if make.count(chance[k]):
             actor = make.actor(names[k], parked=True)
             d = far + 0.5 * actor.size[0] + rng.uniform(2.0, 8.0)
-            yield actor, Start(slot, d, turn=float(rng.choice([-1, 1])) * np.pi / 2 + rng.normal(0, 0.04))
+            yield Bystander(actor, slot, d, turn=float(rng.choice([-1, 1])) * np.pi / 2 + rng.normal(0, 0.04))
     for name, mean in (("adult", 0.6), ("motorcycle", 0.3), ("bicycle", 0.4), ("child", 0.2)):
         for _ in range(make.count(mean)):
             walks = name in ("adult", "child") and rng.random() < 0.6
             turn = rng.uniform(-3.1, 3.1)
             speed = rng.uniform(0.7, 1.5) if walks else 0.0
-            yield (
+            yield Bystander(
                 make.actor(name, has_rider=False, parked=name in ("motorcycle", "bicycle")),
-                Start(
-                    rng.uniform(first, last),
-                    rng.uniform(near - 13, near - 1.5),
-                    s_rate=speed * np.cos(turn),
-                    d_rate=speed * np.sin(turn),
-                    turn=turn,
-                ),
+                rng.uniform(first, last),
+                rng.uniform(near - 13, near - 1.5),
+                s_rate=speed * np.cos(turn),
+                d_rate=speed * np.sin(turn),
+                turn=turn,
             )
 
 
-def _fields(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
+def _fields(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
     """Deer and cattle beyond the rails."""
     rng = make.rng
     for name, mean in (("deer", 1.0), ("cow", 0.8)):
@@ -203,19 +200,17 @@ def _fields(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, S
             side = int(rng.choice([-1, 1]))
             turn = rng.uniform(-3.1, 3.1)
             speed = float(rng.choice([0.0, 0.5, 1.1]))
-            yield (
+            yield Bystander(
                 make.actor(name),
-                Start(
-                    rng.uniform(15, reach_m + 10),
-                    side * (road.rail_m + rng.uniform(3, 8)),
-                    s_rate=speed * np.cos(turn),
-                    d_rate=0.3 * speed * np.sin(turn),
-                    turn=turn,
-                ),
+                rng.uniform(15, reach_m + 10),
+                side * (road.rail_m + rng.uniform(3, 8)),
+                s_rate=speed * np.cos(turn),
+                d_rate=0.3 * speed * np.sin(turn),
+                turn=turn,
             )
 
 
-def _signs(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
+def _signs(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
     """Signs face the traffic they are for: own signs stand on the right and look back along the road."""
     rng = make.rng
     for direction in (1, -1):
@@ -223,18 +218,17 @@ def _signs(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, St
         s = rng.uniform(-180, -100)
         while s < reach_m + 230:
             name = "guide_sign" if rng.random() < 0.3 else "sign"
-            yield (
-                make.actor(name),
-                Start(s, -direction * (road.rail_m + rng.uniform(1.0, 2.5)), turn=turn + rng.normal(0, 0.05)),
+            yield Bystander(
+                make.actor(name), s, -direction * (road.rail_m + rng.uniform(1.0, 2.5)), turn=turn + rng.normal(0, 0.05)
             )
             s += rng.uniform(150, 380)
     gantry = rng.uniform(40, reach_m + 60)
     for lane in range(road.lanes):
         if lane == 0 or rng.random() < 0.4:
-            yield make.actor("gantry_sign"), Start(gantry, road.lane_centre(1, lane), turn=np.pi)
+            yield Bystander(make.actor("gantry_sign"), gantry, road.lane_centre(1, lane), turn=np.pi)
 
 
-def _lookalikes(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Actor, Start]]:
+def _lookalikes(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
     """Things that reflect like cones, barriers, signs, animals, people or parked vehicles and are not labelled."""
     rng, clutter = make.rng, make.config.clutter_density
     for name, mean, low, high in (
@@ -248,11 +242,9 @@ def _lookalikes(make: _Maker, road: Road, reach_m: float) -> Iterator[tuple[Acto
     ):
         for _ in range(int(mean * clutter + rng.random())):
             side = int(rng.choice([-1, 1]))
-            yield (
+            yield Bystander(
                 make.actor(name, parked=True),
-                Start(
-                    rng.uniform(-160, reach_m + 180),
-                    side * (road.rail_m + rng.uniform(low, high)),
-                    turn=rng.normal(0, 0.25) + float(rng.choice([0.0, 0.0, 1.57])),
-                ),
+                rng.uniform(-160, reach_m + 180),
+                side * (road.rail_m + rng.uniform(low, high)),
+                turn=rng.normal(0, 0.25) + float(rng.choice([0.0, 0.0, 1.57])),
             )

@@ -299,13 +299,8 @@ class SceneWriter:
             "last_sample_token": samples[-1]["token"],
             "weather_annotation_token": weather["token"],
         }
-        return {
-            "scene": [row],
-            "sample": samples,
-            "sample_data": data,
-            "ego_pose": poses,
-            "weather_annotation": [weather],
-        }
+        rest = {"sample": samples, "sample_data": data, "ego_pose": poses, "weather_annotation": [weather]}
+        return {"scene": [row], **rest}
 
     def _ego_times(self) -> list[float]:
         step = 1.0 / self.config.ego_rate_hz
@@ -320,14 +315,8 @@ class SceneWriter:
         speed, spin = self.scene.ego.rates(np.array(times))
         accel = np.gradient(speed, np.array(times), axis=0) if len(times) > 1 else np.zeros_like(speed)
         rotations, _ = self.scene.ego.poses(np.array(times))
-        angles = np.stack(
-            [
-                yaw_of(rotations),
-                -np.arcsin(rotations[:, 2, 0]),
-                np.arctan2(rotations[:, 2, 1], rotations[:, 2, 2]),
-            ],
-            1,
-        )
+        pitch, roll = -np.arcsin(rotations[:, 2, 0]), np.arctan2(rotations[:, 2, 1], rotations[:, 2, 2])
+        angles = np.stack([yaw_of(rotations), pitch, roll], 1)
         rng = scene_rng(self.config, self.index, 8)
         silent = np.zeros(len(times), dtype=bool)
         for _ in range(int(rng.integers(0, 4))):

@@ -56,17 +56,16 @@ def make_scenery(
         pieces.append((quads, np.clip(np.array(colour) * shade, 0, 255), layer, False))
 
     edge, rail = road.edge_m, road.rail_m
+    bands = (
+        (160.0, 45.0, GRASS, 0.06),
+        (45.0, rail + 1.0, GRASS, 0.05),
+        (rail + 1.0, edge + SHOULDER_M, VERGE, 0.03),
+        (edge + SHOULDER_M, edge, SHOULDER, 0.015),
+        (edge, MEDIAN_HALF_M - 0.6, ASPHALT, 0.02),
+    )
     for side in (-1, 1):
-        a, b = sorted((side * 160.0, side * 45.0))
-        ground(a, b, GRASS, 1.0, mottle=0.06)
-        a, b = sorted((side * 45.0, side * (rail + 1.0)))
-        ground(a, b, GRASS, 1.0, mottle=0.05)
-        a, b = sorted((side * (rail + 1.0), side * (edge + SHOULDER_M)))
-        ground(a, b, VERGE, 1.0)
-        a, b = sorted((side * (edge + SHOULDER_M), side * edge))
-        ground(a, b, SHOULDER, 1.0, mottle=0.015)
-        a, b = sorted((side * edge, side * (MEDIAN_HALF_M - 0.6)))
-        ground(a, b, ASPHALT, 1.0, mottle=0.02)
+        for outer, inner, colour, mottle in bands:
+            ground(*sorted((side * outer, side * inner)), colour, 1.0, mottle=mottle)
         for d in (side * (edge + 0.1), side * (MEDIAN_HALF_M - 0.1)):
             ground(d - 0.12, d + 0.12, PAINT, 1.006, mottle=0.0)
         for lane in range(1, road.lanes):
@@ -175,29 +174,11 @@ def _clutter(
     rows = [upright]
     for d in (-road.rail_m, road.rail_m, -0.7, 0.7):
         n = int(0.28 * span * config.clutter_density)
-        rows.append(
-            np.stack(
-                [
-                    rng.uniform(first, last, n),
-                    d + rng.normal(0, 0.08, n),
-                    rng.uniform(0.2, 0.8, n),
-                    rng.normal(-3, 4, n),
-                ],
-                1,
-            )
-        )
+        s, across = rng.uniform(first, last, n), d + rng.normal(0, 0.08, n)
+        rows.append(np.stack([s, across, rng.uniform(0.2, 0.8, n), rng.normal(-3, 4, n)], 1))
     n = int(1.1 * span * config.clutter_density)
     side = rng.choice([-1, 1], n)
-    rows.append(
-        np.stack(
-            [
-                rng.uniform(first, last, n),
-                side * (road.rail_m + 1 + rng.gamma(1.3, 12.0, n)),
-                rng.gamma(1.5, 1.1, n),
-                rng.normal(-5, 5, n),
-            ],
-            1,
-        )
-    )
+    s, across = rng.uniform(first, last, n), side * (road.rail_m + 1 + rng.gamma(1.3, 12.0, n))
+    rows.append(np.stack([s, across, rng.gamma(1.5, 1.1, n), rng.normal(-5, 5, n)], 1))
     s, d, height, rcs = np.concatenate(rows).T
     return road.place(s, d, height), rcs

@@ -59,26 +59,15 @@ def make_scene(config: WorldConfig, index: int) -> Scene:
     s, s_rate, d, d_rate = simulate_traffic(fleet, road, steps, rng)
     ego_s = s[:1] - EGO_CENTRE_M
     shift = float(np.interp(LEAD_IN_S, np.arange(steps) * STEP_S, ego_s[0]))
-    ego_tracks = Tracks(
-        road=road, s=ego_s - shift, s_rate=s_rate[:1], d=d[:1], d_rate=d_rate[:1], turn=np.zeros((1, steps))
-    )
+    ego_tracks = Tracks(road, ego_s - shift, s_rate[:1], d[:1], d_rate[:1], np.zeros((1, steps)))
     actors, rows = _split_trains(fleet, s - shift, s_rate, d, d_rate, rng)
     reach = max(float(ego_tracks.s[0, -1]), MIN_REACH_M)
-    for actor, start in bystanders(config, road, reach, rng):
-        time = np.arange(steps) * STEP_S - LEAD_IN_S
-        still = np.ones(steps)
-        rows.append(
-            (
-                start.s + start.s_rate * time,
-                start.s_rate * still,
-                start.d + start.d_rate * time,
-                start.d_rate * still,
-                start.turn * still,
-            )
-        )
-        actors.append(actor)
-    columns = [np.stack(column) for column in zip(*rows, strict=True)]
-    tracks = Tracks(road=road, s=columns[0], s_rate=columns[1], d=columns[2], d_rate=columns[3], turn=columns[4])
+    time, still = np.arange(steps) * STEP_S - LEAD_IN_S, np.ones(steps)
+    for one in bystanders(config, road, reach, rng):
+        s_now, d_now = one.s + one.s_rate * time, one.d + one.d_rate * time
+        rows.append((s_now, one.s_rate * still, d_now, one.d_rate * still, one.turn * still))
+        actors.append(one.actor)
+    tracks = Tracks(road, *(np.stack(column) for column in zip(*rows, strict=True)))
     offset = np.array([7.0e5, 5.3e6, 0.0]) + np.array([rng.uniform(-2e4, 2e4), rng.uniform(-2e4, 2e4), 0.0])
     return Scene(
         conditions=conditions,
@@ -94,13 +83,9 @@ def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.
     """The ego truck first, then a bus, motorcycles and a slow machine near it, then ordinary traffic in every lane."""
     slow = road.lanes - 1
     fleet = [Vehicle("ego", 1, slow, EGO_CENTRE_M - LEAD_IN_S * ego_mps, ego_mps, EGO_LENGTH_M, may_change=False)]
+    bus_lane = slow if road.lanes == 2 else slow - int(rng.integers(0, 2))
     company = [
-        (
-            "bus",
-            slow if road.lanes == 2 else slow - int(rng.integers(0, 2)),
-            rng.uniform(1, 4),
-            rng.choice([-55, -38, 40, 62, 85]),
-        ),
+        ("bus", bus_lane, rng.uniform(1, 4), rng.choice([-55, -38, 40, 62, 85])),
         ("motorcycle", int(rng.integers(0, slow)), rng.uniform(1, 8), rng.uniform(-70, 20)),
         ("motorcycle", int(rng.integers(0, slow + 1)), rng.uniform(-1, 4), rng.choice([-30, 28, 50])),
         ("farm_tractor" if rng.random() < 0.5 else "excavator", slow, rng.uniform(-3.5, -1), rng.uniform(70, 120)),
@@ -182,14 +167,7 @@ def _split_trains(
             across = np.concatenate([np.full(late, d[i, 0]), d[i]])[: d.shape[1]]
             along_rate = s_rate[i] * vehicle.direction
             turn = np.arctan2(sideways * vehicle.direction, np.maximum(along_rate, 2.0))
-            rows.append(
-                (
-                    s[i] + vehicle.direction * offset,
-                    s_rate[i],
-                    across,
-                    sideways,
-                    turn + (np.pi if vehicle.direction < 0 else 0.0),
-                )
-            )
+            turn = turn + (np.pi if vehicle.direction < 0 else 0.0)
+            rows.append((s[i] + vehicle.direction * offset, s_rate[i], across, sideways, turn))
             actors.append(make_actor(name, size, rng))
     return actors, rows

@@ -32,15 +32,8 @@ def add_motorcycle(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None
     m.box(0.35 * l, 0.45 * l, -w, w, 0.62 * h, 0.68 * h, STEEL)
     m.lights(0.6 * l, -0.85 * l, 0.14, 0.42 * h, 0.16)
     if a.has_rider:
-        _rider(
-            m,
-            -0.12 * l,
-            0.5 * h,
-            h,
-            0.25,
-            (44, 46, 54),
-            ((240, 240, 240), (200, 30, 30), (250, 200, 20))[a.variant % 3],
-        )
+        helmets: tuple[Colour, ...] = ((240, 240, 240), (200, 30, 30), (250, 200, 20))
+        _rider(m, -0.12 * l, 0.5 * h, h, 0.25, (44, 46, 54), helmets[a.variant % 3])
 
 
 def add_bicycle(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
@@ -114,14 +107,8 @@ def add_animal(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(0.55 * l, l, -0.35 * w, 0.35 * w, 0.78 * h, h, shade(a.colour, 0.9), front=shade(a.colour, 0.6))
     if a.name == "cow":
         for side in (-1, 1):
-            m.side_panel(
-                side * (0.85 * w + 0.01),
-                -0.6 * l,
-                -0.05 * l,
-                0.5 * h,
-                0.78 * h,
-                (40, 36, 34) if a.colour[0] > 150 else (230, 225, 220),
-            )
+            spots: Colour = (40, 36, 34) if a.colour[0] > 150 else (230, 225, 220)
+            m.side_panel(side * (0.85 * w + 0.01), -0.6 * l, -0.05 * l, 0.5 * h, 0.78 * h, spots)
 
 
 def _pole(m: MeshMaker, y: float, floor: float) -> None:
@@ -149,11 +136,8 @@ def add_sign(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
         layers = ((1.0, (25, 80, 180)), (0.35, (246, 246, 246)))
     else:
         layers = ()
-        m.quad([(0.02, -w, 0.0), (0.02, w, 0.0), (0.02, 0.02, h), (0.02, -0.02, h)], (205, 20, 25))
-        m.quad(
-            [(0.03, -0.62 * w, 0.14 * h), (0.03, 0.62 * w, 0.14 * h), (0.03, 0.02, 0.74 * h), (0.03, -0.02, 0.74 * h)],
-            (248, 248, 248),
-        )
+        m.slope((0.02, w, 0.0), (0.02, 0.02, h), (205, 20, 25))
+        m.slope((0.03, 0.62 * w, 0.14 * h), (0.03, 0.02, 0.74 * h), (248, 248, 248))
     for k, (share, colour) in enumerate(layers):
         _disc(m, 0.02 + 0.01 * k, middle, share * radius, colour)
     if face == 0:
@@ -186,14 +170,8 @@ def add_gantry_sign(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> Non
 def add_temporary_sign(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-0.03, 0.0, -w, w, 0.0, h, POST)
     m.panel(0.01, -w, w, 0.0, h, 1, a.colour)
-    m.quad(
-        [(0.03, -0.8 * w, 0.12 * h), (0.03, 0.8 * w, 0.12 * h), (0.03, 0.02, 0.88 * h), (0.03, -0.02, 0.88 * h)],
-        (205, 20, 25),
-    )
-    m.quad(
-        [(0.04, -0.45 * w, 0.22 * h), (0.04, 0.45 * w, 0.22 * h), (0.04, 0.02, 0.65 * h), (0.04, -0.02, 0.65 * h)],
-        (248, 248, 248),
-    )
+    m.slope((0.03, 0.8 * w, 0.12 * h), (0.03, 0.02, 0.88 * h), (205, 20, 25))
+    m.slope((0.04, 0.45 * w, 0.22 * h), (0.04, 0.02, 0.65 * h), (248, 248, 248))
     for y in (-0.7 * w, 0.7 * w):
         m.box(-0.2, 0.2, y - 0.05, y + 0.05, -a.kind.floor_m, 0.05, STEEL)
 

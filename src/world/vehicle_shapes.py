@@ -32,16 +32,7 @@ def add_car(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
 def add_van(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-l, 0.45 * l, -w, w, 0.12 * h, h, a.colour)
     m.frustum((0.45 * l, l, -w, w), (0.45 * l, 0.62 * l, -0.94 * w, 0.94 * w), 0.12 * h, 0.97 * h, a.colour)
-    m.quad(
-        [
-            (0.845 * l, -0.85 * w, 0.48 * h),
-            (0.845 * l, 0.85 * w, 0.48 * h),
-            (0.66 * l, 0.85 * w, 0.9 * h),
-            (0.66 * l, -0.85 * w, 0.9 * h),
-        ],
-        GLASS,
-        two_sided=True,
-    )
+    m.slope((0.845 * l, 0.85 * w, 0.48 * h), (0.66 * l, 0.85 * w, 0.9 * h), GLASS, two_sided=True)
     for side in (-1, 1):
         m.side_panel(side * (w + 0.01), 0.36 * l, 0.7 * l, 0.52 * h, 0.85 * h, GLASS)
     m.panel(-l - 0.01, -0.8 * w, 0.8 * w, 0.55 * h, 0.85 * h, -1, GLASS)
@@ -53,16 +44,7 @@ def _cab(m: MeshMaker, a: Actor, front: float, depth: float, w: float, h: float)
     """A cab-over driver's cabin that ends at x = front."""
     back = front - depth
     m.frustum((back, front, -w, w), (back, front - 0.25, -w, w), 0.13 * h, h, a.colour)
-    m.quad(
-        [
-            (front - 0.09, -0.9 * w, 0.5 * h),
-            (front - 0.09, 0.9 * w, 0.5 * h),
-            (front - 0.16, 0.9 * w, 0.8 * h),
-            (front - 0.16, -0.9 * w, 0.8 * h),
-        ],
-        GLASS,
-        two_sided=True,
-    )
+    m.slope((front - 0.09, 0.9 * w, 0.5 * h), (front - 0.16, 0.9 * w, 0.8 * h), GLASS, two_sided=True)
     m.panel(front + 0.01, -0.7 * w, 0.7 * w, 0.17 * h, 0.42 * h, 1, (36, 36, 40))
     for side in (-1, 1):
         m.side_panel(side * (w + 0.01), front - 0.6 * depth, front - 0.25, 0.5 * h, 0.78 * h, GLASS)

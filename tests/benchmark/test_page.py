@@ -43,6 +43,7 @@ def test_a_busy_machine_is_warned_of():
     assert f"**{warning}**" in markdown(page)
 
 
+@pytest.mark.slow
 def test_the_machine_says_what_it_is():
     described = describe_machine()
     assert described["processor"] and described["cores"] >= 1 and described["load"] >= 0

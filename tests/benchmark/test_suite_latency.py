@@ -90,6 +90,7 @@ class FakeDetector:
         self.seen.append(self.remembered)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lengths", "depth", "wanted"), [((6, 6), 3, 3), ((3, 2), 8, 2), ((4,), 0, 0), ((1,), 2, 0)])
 def test_frames_count_once_the_memory_is_as_full_as_it_gets(monkeypatch, lengths, depth, wanted):
     """Which frames are measured is seen by a clock that each frame pushes on by what is remembered."""
@@ -110,6 +111,7 @@ def test_frames_count_once_the_memory_is_as_full_as_it_gets(monkeypatch, lengths
     assert len(detector.seen) >= 25  # the first ones warm up
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("load", "warned"), [(1.9, False), (2.1, True)])
 def test_a_busy_machine_is_warned_of(tmp_path, monkeypatch, capsys, load, warned):
     monkeypatch.setattr(latency, "read_checkpoint", lambda path: {"horizon3d": {"config": None}})

@@ -63,6 +63,7 @@ def test_a_stage_counts_without_the_stages_within(monkeypatch):
     assert clock.seconds == {"inner": 10, "outer": 20, "outermost": 0}
 
 
+@pytest.mark.slow
 def test_every_part_of_the_suite(config):
     result = benchmark_reader(config)
     assert result["frames_per_second"] == pytest.approx(4 / result["cpu_seconds"])

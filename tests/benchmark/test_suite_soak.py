@@ -69,6 +69,7 @@ def test_what_a_system_reports_only_at_times_has_no_growth():
     assert "workers MiB / 1000 frames" not in growth_row("some", rows)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not ON_LINUX, reason="RSS and descriptors are read from /proc")
 def test_planted_leaks_are_found(monkeypatch):
     """A detector that keeps every frame's mebibyte, forgets to close a file and takes longer from frame to frame."""
@@ -96,6 +97,7 @@ def test_planted_leaks_are_found(monkeypatch):
     assert growth["last / second quarter"] == pytest.approx((100 + 55.5) / (100 + 23.5), rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not ON_LINUX, reason="RSS is read from /proc")
 def test_planted_pages_are_found():
     """A mebibyte a frame, mapped anew: what the heap hands out may be pages of earlier tests, held already."""

@@ -62,6 +62,7 @@ def test_a_taken_port_is_an_error_with_a_remedy(tmp_path):
     assert "Traceback" not in ended.stderr
 
 
+@pytest.mark.slow
 def test_export_writes_a_page_without_torch(tmp_path):
     target = tmp_path / "new" / "dashboard.html"
     ended = run(f"export={target}", f"paths.reports={tmp_path}", f"paths.outputs={tmp_path / 'none'}")
@@ -79,6 +80,7 @@ def test_export_to_where_nothing_can_be_written(tmp_path):
     assert ended.returncode == 3 and "Traceback" not in ended.stderr and "file" in ended.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_it_serves_until_it_is_told_to_stop(tmp_path, number):
     log = (tmp_path / "log").open("w")

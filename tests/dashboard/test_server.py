@@ -122,6 +122,7 @@ EVIL = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("evil", EVIL.values(), ids=EVIL)
 def test_words_of_strangers_are_shown_and_never_obeyed(world, evil):
     """As title, question, label, plot, axis, command, reason, log, setting, name of data, of a class and of a file."""

@@ -114,6 +114,7 @@ def test_empty_and_full_frames_share_a_batch(data_set):
     assert batch.radar_batch.unique().tolist() == [1] and len(batch.boxes) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_workers", [0, 1])
 def test_what_is_read_follows_from_the_sensors(lidar_set, num_workers, quick_end):
     chosen = {"num_lidar_sweeps": 2, "num_future_frames": 1, "lidar_origins": True, "num_workers": num_workers}
@@ -149,6 +150,7 @@ def test_lidar_is_dropped_with_the_other_sensors(lidar_set):
     assert len(second.future[0].lidar_points)  # what is to be predicted stays
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_workers", [0, 1])
 def test_faults_of_workers_keep_their_message(broken_files, num_workers, quick_end):
     index = load_index(broken_files.root, VERSION, None)
@@ -161,6 +163,7 @@ def test_faults_of_workers_keep_their_message(broken_files, num_workers, quick_e
     assert name in text and "no DATA line" in text and "Traceback" not in text and "\n" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_workers", [0, 1])
 def test_skipped_files_are_counted_and_named_in_the_batch(broken_files, num_workers, quick_end):
     index = load_index(broken_files.root, VERSION, None)
@@ -459,6 +462,7 @@ def fit(data, folder, epochs, checkpoint=None, resume=None, stop_at=None):
     return recorder.seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_workers", [0, 1])
 def test_lightning_epochs_differ_and_resume(data_set, tmp_path, num_workers):
     def make():
@@ -476,6 +480,7 @@ def test_lightning_epochs_differ_and_resume(data_set, tmp_path, num_workers):
     assert first + rest == whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("temporal", "num_workers", "stop_at"),
     [(True, 0, 2), (True, 1, 7), (True, 0, 5), (True, 0, 9), (False, 0, 7), (False, 1, 5)],

@@ -141,6 +141,7 @@ def straightforward(path, source_px, crop):
     return np.asarray(canvas).transpose(2, 0, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", [(114, 240), (228, 480), (301, 633), (943, 1980)])
 def test_pixels_are_those_of_the_straightforward_way(decoders, tmp_path, source):
     """To the last bit: padded above and beside, cropped, mirrored, turned, and all of it outside."""

@@ -41,6 +41,7 @@ def saved(folder, image, **options):
     return folder / "a.jpg"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [SOURCE_PX, (16, 16), (17, 31), (943, 1980)])
 @pytest.mark.parametrize("options", [{}, {"subsampling": "4:4:4"}, {"subsampling": "4:2:2"}, {"progressive": True}])
 def test_pixels_are_pillows(simplejpeg, tmp_path, size, options):

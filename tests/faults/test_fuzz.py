@@ -43,6 +43,7 @@ def check(kind: Kind, seed: int, cases: int, folder: Path) -> None:
     assert outcome.accepted > 0 or cases < 100  # few tables survive a change of a link
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
 def test_a_hundred_damaged_files_of_each_kind(name, tmp_path):
     check(KINDS[name], SEED, FEW // 5 if is_slow(name) else FEW, tmp_path)
@@ -56,6 +57,7 @@ def test_thousands_of_damaged_files_of_each_kind(name, tmp_path):
     check(KINDS[name], seed, MANY // 2 if is_slow(name) else MANY, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
 def test_whole_files_are_read(name, tmp_path):
     """Otherwise every refusal above would prove nothing."""

@@ -280,6 +280,7 @@ def counted_again(path):
 # ---------------------------------------------------------------- configurations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "value"),
     [
@@ -315,6 +316,7 @@ def test_a_stored_configuration_is_values_and_nothing_else(tree, secret, key, va
     assert SECRET not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_stored_configuration_says_no_place_to_write_to(tree, tmp_path):
     own = dict(tree) | {"paths": {"outputs": str(tmp_path / "home"), "reports": str(tmp_path / "etc")}}
     paths = restore_config(own, []).paths
@@ -335,6 +337,7 @@ def test_a_stored_configuration_that_unfolds_without_end_is_refused(tree):
     assert fault_of_tree(tree) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "override",
     [

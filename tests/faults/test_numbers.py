@@ -160,6 +160,7 @@ def replayed(path, capsys, *overrides):
     return capsys.readouterr().out, str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_broken_input_is_reported_and_the_first_module_that_meets_it(dump, capsys):
     printed, error = replayed(dump(spoil_a_point), capsys)
     assert "input: radar point " in printed and "rcs nan" in printed and "step 1: as the test wants it" in printed
@@ -167,6 +168,7 @@ def test_a_broken_input_is_reported_and_the_first_module_that_meets_it(dump, cap
     assert error.startswith("the first that is not finite: the output of radar_encoder"), error
 
 
+@pytest.mark.slow
 def test_an_infinite_gradient_of_a_finite_loss_is_reported(dump, capsys, monkeypatch):
     """The root of zero adds nothing to the loss, and its derivative is infinite."""
 
@@ -181,6 +183,7 @@ def test_an_infinite_gradient_of_a_finite_loss_is_reported(dump, capsys, monkeyp
     assert "not finite" in error
 
 
+@pytest.mark.slow
 def test_a_replay_says_where_the_numbers_are_finite(dump, capsys):
     """The memory and the seed are the step's: the loss is that of the step, to the bit."""
     path = dump()
@@ -206,6 +209,7 @@ def test_a_replay_needs_a_dump(tmp_path):
 # ---------------------------------------------------------------- configuration
 
 
+@pytest.mark.slow
 def test_checkpoints_from_before_the_keys_load():
     _, tree = compose_config(["scale=debug", "trainer.log_every_steps=3"])
     for key in ("on_nonfinite", "deterministic"):
@@ -242,6 +246,7 @@ def steps(module, batches, bf16):
 MODELS = PHASES | {"dense": ("model=dense_bev", *PHASES["phase2"])}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_half_precision_is_as_near_as_its_digits_allow(load, name):
     """The loss within 3 %, its terms within 8 %, the gradient within thrice what half a digit of the weights moves it.

@@ -189,6 +189,7 @@ def slow_error(hits, confidence):
     return 1.0 if last < 11 else float(np.mean(curve[11 : last + 1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_agrees_with_the_evaluation_written_again(seed):
     evaluation_set, predictions = random_problem(4, 90, 160, seed)

@@ -85,6 +85,7 @@ def test_ground_truth_and_missed_ring(tmp_path: Path) -> None:
     assert red[round(centre[0]) - 20 : round(centre[0]) + 20, round(centre[1]) - 20 : round(centre[1]) + 20].any()
 
 
+@pytest.mark.slow
 def test_occupancy_cell_and_gaussian_land_on_their_place(tmp_path: Path) -> None:
     none = PictureGaussians(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
     empty = render(tmp_path / "a.png", BevScene(GRID, gaussians=none))

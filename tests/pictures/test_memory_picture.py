@@ -154,6 +154,7 @@ def render(path: Path, scene: MemoryScene) -> np.ndarray:
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
 
+@pytest.mark.slow
 def test_cells_lie_behind_the_box_without_velocity_and_on_it_with(tmp_path: Path) -> None:
     truth = PictureBoxes([(0, 60, 0)], [(8, 6, 2)], [0.0], [(20, 0)], [0])
     patch = [(x, y) for x in np.arange(-2, 2.5, 0.8) for y in np.arange(58, 62.5, 0.8)]
@@ -177,6 +178,7 @@ def test_cells_lie_behind_the_box_without_velocity_and_on_it_with(tmp_path: Path
     assert green[HEADER_PX:, : 1600 // 2].any() and green[HEADER_PX:, 1600 // 2 :].any()
 
 
+@pytest.mark.slow
 def test_every_kind_of_gap_still_gives_a_picture(tmp_path: Path) -> None:
     truth = boxes([(30, 5, 10, 0), (10, -5, 0, 0)])
     history = gaussians([(30.0, 5.0), (140.0, -20.0)], (12.0, 0.0), 0.5)
@@ -197,6 +199,7 @@ def test_every_kind_of_gap_still_gives_a_picture(tmp_path: Path) -> None:
         assert picture.shape[1] == 1600 and picture.shape[0] > CLOSE_PX, name
 
 
+@pytest.mark.slow
 def test_a_full_memory_stays_small(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     n = 8 * 4096  # all that the paper's settings can remember, along a road

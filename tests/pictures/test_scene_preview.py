@@ -1,6 +1,7 @@
 """Pictures of the synthetic world."""
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from src.pictures.cameras import PictureViews
@@ -22,6 +23,7 @@ def preview(path, boxes, points):
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
 
 
+@pytest.mark.slow
 def test_preview_shows_radar_boxes_and_arrows(tmp_path):
     nothing = preview(tmp_path / "a.png", PictureBoxes.empty(), np.zeros((0, 7)))
     radar = preview(tmp_path / "b.png", PictureBoxes.empty(), np.array([[40.0, 0, 1, 5, 20.0, 0, 0]]))

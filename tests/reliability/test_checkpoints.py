@@ -83,6 +83,7 @@ def test_missing_file(tmp_path):
         read_checkpoint(tmp_path / "nothing.ckpt")
 
 
+@pytest.mark.slow
 def test_a_full_disk_keeps_the_older_checkpoint(tmp_path):
     path = tmp_path / "last.ckpt"
     AtomicCheckpointIO().save_checkpoint(content(nn.Linear(3, 2)), path)

@@ -101,6 +101,7 @@ def kill():
 STOPPED_OFTEN = pytest.mark.filterwarnings("ignore:Checkpoint directory")
 
 
+@pytest.mark.slow
 @STOPPED_OFTEN
 @pytest.mark.parametrize(("validate_every", "ema"), [(1, None), (2, 0.9)])
 def test_stopped_at_every_step(run, validate_every, ema):
@@ -116,6 +117,7 @@ def test_stopped_at_every_step(run, validate_every, ema):
         assert found == expected, step
 
 
+@pytest.mark.slow
 @STOPPED_OFTEN
 def test_stopped_again_and_again(run):
     expected, _ = run("whole")
@@ -126,6 +128,7 @@ def test_stopped_again_and_again(run):
     assert found == expected and module.seen == []
 
 
+@pytest.mark.slow
 @STOPPED_OFTEN
 @pytest.mark.parametrize("fault", ["stop", "kill"])
 def test_ended_in_a_validation(run, fault):
@@ -140,6 +143,7 @@ def test_ended_in_a_validation(run, fault):
         assert found == expected, epoch
 
 
+@pytest.mark.slow
 @STOPPED_OFTEN
 @pytest.mark.parametrize("step", [1, 2, 4, 5, 8])
 def test_killed_between_checkpoints_of_steps(run, step):

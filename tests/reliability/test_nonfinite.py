@@ -110,6 +110,7 @@ WORDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", WORDS)
 def test_the_training_stops_at_the_step_and_says_why(tmp_path, fault):
     module, folder, error = train(tmp_path / "run", fault, skip=False)
@@ -149,6 +150,7 @@ def test_the_dump_holds_the_step(tmp_path, fault):
     assert torch.isfinite(terms["total"]) == (fault != "point")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", WORDS)
 def test_a_skipped_step_leaves_nothing_behind(tmp_path, fault, caplog):
     with caplog.at_level(logging.WARNING):
@@ -196,6 +198,7 @@ def test_training_gives_up_after_too_many_in_a_row(tmp_path, monkeypatch):
     assert dumps(folder) == ["nonfinite-step000001-rank0.pt"]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Checkpoint directory")
 @pytest.mark.parametrize("stop_after", [2, 4, 5])
 def test_a_resumed_run_skips_the_same_steps(tmp_path, stop_after):

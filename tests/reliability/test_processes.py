@@ -183,6 +183,7 @@ def test_the_launcher_says_which_process_failed_and_ends_with_the_code_of_the_ca
         assert [record.message for record in caplog.records if record.levelname == "WARNING"] == warning
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_to_the_launching_process_reaches_all_as_sigterm(number, command, tmp_path):
     def once_both_wait():
@@ -387,7 +388,7 @@ def test_a_stopped_run_resumes_under_torchrun_and_scores_as_one_process_does(pha
 
 
 @needs_proc
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_run_on_two_nodes_survives_the_loss_of_one(phase1, outputs):
     """Temporal training as SLURM starts it; killed without warning on one node, ended by the plain command."""
     command = ["src.train", *overrides(outputs, "phase2"), f"phase.init_from={phase1 / 'checkpoints' / 'last.ckpt'}"]

@@ -52,6 +52,7 @@ def rows(text, heading):
     return {line.split(" | ")[0].strip("| "): line for line in lines}
 
 
+@pytest.mark.slow
 def test_phase_2_is_held_against_phase_1(both_phases, report, tmp_path):
     text = report("phase2")
     summary = rows(text, "| experiment | mAP | NDS | mAVE, m/s |")
@@ -73,12 +74,14 @@ def test_phase_2_is_held_against_phase_1(both_phases, report, tmp_path):
     assert "(pictures/phase2_mini.png)" in text
 
 
+@pytest.mark.slow
 def test_phase_1_keeps_its_own_page(both_phases, report):
     text = report("phase1")
     assert list(rows(text, "| experiment | mAP | NDS | car AP |")) == ["KGGI + OCSF", "radar only"]
     assert "init_from" not in text and "phase2" not in text
 
 
+@pytest.mark.slow
 def test_further_epochs_must_be_as_many(both_phases, write_run, report):
     write_run("longer", [*FURTHER, "phase.epochs=9"], 0, 0.2, epochs=9)
     write_run("weight", ["phase.init_from=phase1"], 0, 0.3)
@@ -90,12 +93,14 @@ def test_further_epochs_must_be_as_many(both_phases, write_run, report):
     ]
 
 
+@pytest.mark.slow
 def test_an_unnamed_setting_shows_itself_last(both_phases, write_run, report):
     write_run("a", ["model.dptf.gaussian_path.sampling=random"], 0, 0.9, phase="phase2")
     names = list(rows(report("phase2"), "| experiment | mAP | NDS | mAVE, m/s |"))
     assert names[-1] == "phase 2, `model.dptf.gaussian_path.sampling=random`"
 
 
+@pytest.mark.slow
 def test_runs_with_sensor_dropout_have_tables_of_their_own(both_phases, write_run, report):
     for seed, (with_velocity, without) in enumerate([(0.3, 0.2), (0.4, 0.2)]):
         write_run(f"with-{seed}", ["data.sensor_dropout=0.25"], seed, with_velocity, phase="phase2")
@@ -114,6 +119,7 @@ def test_phase_2_without_its_plain_run_has_no_gains(write_run, report):
     assert "Gain" not in report("phase2")
 
 
+@pytest.mark.slow
 def test_no_run_of_the_phase_itself(write_run, report):
     write_run("further", FURTHER, 0, 0.3)
     for phase in ("phase1", "phase2"):
@@ -127,6 +133,7 @@ def test_other_data_is_refused(both_phases, write_run, report):
         report("phase2")
 
 
+@pytest.mark.slow
 def test_everything_of_a_scale_is_written(both_phases, report, tmp_path, make_record, exported):
     record = make_record({"4.8 m": {"mAP": 20.3}}, seeds=1)
     write_record(record_path(tmp_path / "reports", "epsilon", "mini"), record)
@@ -143,6 +150,7 @@ def test_everything_of_a_scale_is_written(both_phases, report, tmp_path, make_re
     assert exported == [(reports, tmp_path, reports / "dashboard.html")]
 
 
+@pytest.mark.slow
 def test_results_outlive_their_runs(both_phases, report, tmp_path):
     before = report("phase2")
     for record in tmp_path.glob("*/run.json"):
@@ -150,6 +158,7 @@ def test_results_outlive_their_runs(both_phases, report, tmp_path):
     assert report("phase2") == before
 
 
+@pytest.mark.slow
 def test_what_is_broken_is_named_after_the_rest(both_phases, write_run, tmp_path, report):
     broken = write_run("broken", [], 7, 0.9)
     (broken / "metrics.json").write_text("{")
@@ -166,6 +175,7 @@ def test_what_is_broken_is_named_after_the_rest(both_phases, write_run, tmp_path
     assert "phase 2" in (reports / "phase2_mini.md").read_text()
 
 
+@pytest.mark.slow
 def test_sweeps_with_different_data_stop_no_other(both_phases, write_run, tmp_path, report, make_record):
     for end, root in (("a0", "world"), ("b0", "elsewhere"), ("c0", "world")):
         write_run(end, [f"x={end}"], 0, 0.3, root=root)
@@ -177,6 +187,7 @@ def test_sweeps_with_different_data_stop_no_other(both_phases, write_run, tmp_pa
     assert [path.name for path in (reports / "tables").glob("*.md")] == ["table_pure_mini.md"]
 
 
+@pytest.mark.slow
 def test_rows_of_sweeps_do_not_flood_the_pages(both_phases, write_run, tmp_path, report, make_record):
     write_run("a0", ["model.ocsf.margin_m=0.8"], 0, 0.9)  # a row of the sweep
     write_run("b0", ["model.ocsf.margin_m=4.8"], 2, 0.5)  # its baseline, which is the plain run with another seed

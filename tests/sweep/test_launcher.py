@@ -43,6 +43,7 @@ def test_reasons_in_a_line(code, output, expected):
     assert len(explain(1, "Error: " + "x" * 5000)) < 400
 
 
+@pytest.mark.slow
 def test_a_run_that_does_not_end_when_asked_is_killed_with_its_children(tmp_path, monkeypatch):
     monkeypatch.setattr("src.sweep.launcher.GRACE_PERIOD_S", 0.5)
     script = (

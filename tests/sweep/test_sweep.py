@@ -48,6 +48,7 @@ def places(tmp_path):
     return [f"paths.outputs={tmp_path / 'outputs'}", f"paths.reports={tmp_path / 'reports'}"]
 
 
+@pytest.mark.slow
 def test_run_ids_are_those_of_the_training_command():
     identify = sweep.Identifier()
     for overrides in (
@@ -71,6 +72,7 @@ def test_run_ids_are_those_of_the_training_command():
         identify(["seed=99999999999"])
 
 
+@pytest.mark.slow
 def test_dry_run_prints_commands_and_touches_nothing(sweeps, places, tmp_path, capsys):
     (sweeps / "paths.yaml").write_text(
         "title: t\nquestion: q\nrows:\n"
@@ -91,6 +93,7 @@ def test_dry_run_prints_commands_and_touches_nothing(sweeps, places, tmp_path, c
     assert not (tmp_path / "outputs").exists() and not (tmp_path / "reports").exists()
 
 
+@pytest.mark.slow
 def test_refusals_come_before_anything_starts(sweeps, places, tmp_path):
     def refused(said, *words, kind=ConfigError):
         with pytest.raises(kind, match=said) as caught:
@@ -130,6 +133,7 @@ def test_the_command_ends_with_its_exit_code_and_one_message(tmp_path):
     assert ended.returncode == 3 and "did you mean epsilon?" in ended.stderr and "Traceback" not in ended.stderr
 
 
+@pytest.mark.slow
 def test_latency_is_measured_once_per_row_and_a_failure_is_told(tmp_path, monkeypatch, caplog):
     monkeypatch.chdir(ROOT)
     published = []

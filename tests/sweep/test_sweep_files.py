@@ -131,6 +131,7 @@ def test_numbers_of_all_methods_are_those_reported():
     assert found == wanted
 
 
+@pytest.mark.slow
 def test_the_dense_baseline_is_trained_as_the_method_it_stands_for():
     """Same phase, data, backbone and head settings as the row it is compared with; only the model differs."""
     sweep = load_sweep(OTHER_METHODS)
@@ -158,6 +159,7 @@ def test_tables_show_every_number_of_the_paper_that_a_file_has():
 # ---------------------------------------------------------------- rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
 def test_every_row_composes_and_differs_from_the_others(scale):
     for name in QUESTIONS:
@@ -171,6 +173,7 @@ def test_every_row_composes_and_differs_from_the_others(scale):
         assert not same, f"sweeps/{name}.yaml at scale={scale}: rows {same} train the same"
 
 
+@pytest.mark.slow
 def test_rows_compose_as_on_the_command_line():
     """The short cut of `tree_of` gives what the command gives."""
     for overrides in {tuple(overrides_of(sweep, sweep.rows[0])) for sweep in map(load_sweep, QUESTIONS)}:

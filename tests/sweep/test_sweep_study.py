@@ -57,6 +57,7 @@ def test_a_server_that_does_not_answer_is_told_without_its_password(tmp_path):
     assert "s3cret" not in str(caught.value) and "me:***@127.0.0.1" in str(caught.value)
 
 
+@pytest.mark.slow
 def test_the_lock_is_let_go_while_work_is_done_and_the_worker_is_named(study):
     def work(trial):
         with study.lock():  # another would wait for ever
@@ -70,6 +71,7 @@ def test_the_lock_is_let_go_while_work_is_done_and_the_worker_is_named(study):
     assert (trial.state, trial.value, trial.run_id) == ("done", 0.5, "a")
 
 
+@pytest.mark.slow
 def test_failed_and_interrupted_differ_by_the_reason(study):
     def fail(trial):
         study.set_attr(trial, "reason", "why")
@@ -86,6 +88,7 @@ def test_failed_and_interrupted_differ_by_the_reason(study):
     assert study.trials()[-1].reason == "needs a"
 
 
+@pytest.mark.slow
 def test_what_dead_workers_had_is_free_at_once(study, tmp_path):
     storage = optuna.storages.RDBStorage(default_storage(tmp_path))
     raw = optuna.load_study(study_name="fake-debug", storage=storage)
@@ -110,6 +113,7 @@ def test_what_dead_workers_had_is_free_at_once(study, tmp_path):
     assert states == [TrialState.FAIL, TrialState.FAIL, TrialState.RUNNING, TrialState.FAIL, TrialState.FAIL]
 
 
+@pytest.mark.slow
 def test_a_worker_elsewhere_that_is_silent_too_long_is_dead(study, tmp_path, monkeypatch):
     def freeze(trial):
         deadline = time.monotonic() + 20
@@ -128,6 +132,7 @@ def test_a_worker_elsewhere_that_is_silent_too_long_is_dead(study, tmp_path, mon
     assert [trial.state for trial in study.trials()] == ["interrupted"]
 
 
+@pytest.mark.slow
 def test_a_worker_elsewhere_that_died_before_its_first_heartbeat_is_dead_too(study, tmp_path, monkeypatch):
     raw = optuna.load_study(study_name="fake-debug", storage=optuna.storages.RDBStorage(default_storage(tmp_path)))
     trial = raw.ask()
@@ -137,6 +142,7 @@ def test_a_worker_elsewhere_that_died_before_its_first_heartbeat_is_dead_too(stu
     assert len(study.release_dead()) == 1
 
 
+@pytest.mark.slow
 def test_another_definition_is_refused(study, tmp_path):
     SweepStudy(tmp_path, "fake-debug", default_storage(tmp_path), dict(ROWS))
     with pytest.raises(ConfigError, match=r"format was 1 and is 2.*delete-study --study-name fake-debug"):
@@ -152,6 +158,7 @@ def _create(folder, barrier):
     SweepStudy(Path(folder), "fake-debug", default_storage(Path(folder)), ROWS)
 
 
+@pytest.mark.slow
 def test_many_may_create_the_database_at_once(tmp_path):
     context = multiprocessing.get_context("fork")
     barrier = context.Barrier(4)
@@ -171,6 +178,7 @@ def test_an_address_that_would_be_read_wrongly_is_refused_unseen():
     check_address("postgresql://me:s3%40cret@host/db")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["{x}", "50%20off", "a?b", "a#b @:c", "{SCHEMA_VERSION}"])
 def test_any_folder_can_hold_the_database(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)

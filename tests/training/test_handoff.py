@@ -68,6 +68,7 @@ def test_phase_1_starts_from_fresh_weights():
     assert source_of("phase=phase1")[0] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "own",
     [
@@ -96,6 +97,7 @@ def test_the_run_of_the_same_command_in_phase_1(tmp_path, own):
     assert not source.ready
 
 
+@pytest.mark.slow
 def test_other_settings_mean_another_run():
     assert source_of("phase=phase2")[0].identity != source_of("phase=phase2", "model.channels=32")[0].identity
     assert source_of("phase=phase2")[0].identity != source_of("phase=phase2", "seed=1")[0].identity
@@ -104,6 +106,7 @@ def test_other_settings_mean_another_run():
     assert weights[0][0].identity != weights[1][0].identity
 
 
+@pytest.mark.slow
 def test_further_epochs_of_the_same_phase():
     """What a second phase is to be compared with. The source is the phase's plain run, so nothing goes in circles."""
     source, run = source_of("phase=phase1", "phase.init_from=phase1", "phase.epochs=2")
@@ -115,6 +118,7 @@ def test_further_epochs_of_the_same_phase():
     assert source.overrides == ["phase=phase2", "scale=debug", "model.dptf.max_age_s=0.55"]
 
 
+@pytest.mark.slow
 def test_a_file_counts_by_its_content(tmp_path):
     first, same, other = (tmp_path / name for name in ("a.ckpt", "b.ckpt", "c.ckpt"))
     first.write_bytes(b"weights"), same.write_bytes(b"weights"), other.write_bytes(b"others")
@@ -151,6 +155,7 @@ def test_it_is_not_trained_where_that_is_switched_off_or_impossible(tmp_path):
             assert words in str(raised.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "kind"),
     [
@@ -204,6 +209,7 @@ def test_a_request_to_stop_goes_to_the_earlier_run(tmp_path):
     assert signal.getsignal(signal.SIGTERM) is before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux alone tells a process of its parent's death")
 def test_the_earlier_run_ends_with_a_command_that_is_killed(tmp_path):
     child = (
@@ -273,6 +279,7 @@ def give(path, *overrides):
     return model, before, model.state_dict()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "own",
     [
@@ -295,6 +302,7 @@ def test_every_weight_of_phase_1_arrives_and_what_is_new_keeps_its_own(phase_1, 
     assert not [key for key in given if ADDED.match(key.removeprefix("model."))]  # none of phase 1 may be missing
 
 
+@pytest.mark.slow
 def test_step_0_without_memory_is_phase_1(phase_1):
     """Specification 15.8, through the handoff: the same boxes and maps, bit by bit."""
     from src.structures.batch import FrameBatch
@@ -323,6 +331,7 @@ def test_step_0_without_memory_is_phase_1(phase_1):
     assert torch.equal(first.centers, second.centers) and torch.equal(first.scores, second.scores)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stored", "wanted", "named"),
     [
@@ -349,6 +358,7 @@ def test_a_checkpoint_of_phase_2_into_phase_1_names_the_memory(tmp_path):
         give(path, "phase=phase1")
 
 
+@pytest.mark.slow
 def test_broken_files_are_refused(phase_1, tmp_path):
     content = phase_1.read_bytes()
     half, flipped, text, foreign, nothing = (
@@ -383,6 +393,7 @@ def test_weights_that_are_not_finite_are_refused(phase_1, tmp_path, value):
         give(path, "phase=phase2")
 
 
+@pytest.mark.slow
 def test_settings_without_weights_that_differ_are_logged(phase_1, caplog):
     """A margin or a threshold is no tensor: it fits, but the phases then mean different things."""
     harmless = ("model.loss.ocsf_weight=2", "model.dptf.max_age_s=0.55", "data.num_workers=0")

@@ -6,6 +6,7 @@ from src.config import compose_config
 from src.training.identity import digest_of_changes, is_of, key_of, run_identity, without_keys
 
 
+@pytest.mark.slow
 def test_run_identity_ignores_what_cannot_change_the_result():
     def identity(*overrides):
         return run_identity(compose_config(["scale=debug", *overrides])[1])
@@ -19,6 +20,7 @@ def test_run_identity_ignores_what_cannot_change_the_result():
         assert identity(override) != base, override
 
 
+@pytest.mark.slow
 def test_run_identity_of_phase_2():
     """Every knob of the memory makes another run; so do the weights it starts from, by what they are."""
 
@@ -42,6 +44,7 @@ def test_run_identity_of_phase_2():
         assert identity(override) != base, override
 
 
+@pytest.mark.slow
 def test_run_identity_of_phase_1_ignores_the_memory():
     def identity(*overrides):
         return run_identity(compose_config(["scale=debug", *overrides])[1])

@@ -125,6 +125,7 @@ def config(bev: bool = True, gaussians: bool = True, compensated: bool = True) -
     )
 
 
+@pytest.mark.slow
 def test_clips_are_streamed_and_their_last_frames_drawn(tmp_path: Path) -> None:
     model = Recorder(config()).train()
     clips = [[frame(0), frame(1), frame(2)], [frame(7)]]

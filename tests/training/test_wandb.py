@@ -173,6 +173,7 @@ def test_a_resumed_run_loses_nothing_and_sends_nothing_twice(wandb, folder):
     assert [step for step, _ in wandb.runs[1].rows] == [45]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

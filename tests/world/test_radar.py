@@ -41,7 +41,6 @@ def straight_scene(kind, ahead_m, speed_mps=0.0):
         return Tracks(road=road, s=start + speed * time[None], s_rate=moving, d=still, d_rate=still, turn=still)
 
     actor = Actor(
-        kind=KINDS[kind],
         name=kind,
         size=np.array(KINDS[kind].size_m),
         colour=(0, 0, 0),
@@ -145,6 +144,7 @@ def test_one_radar_hangs_upside_down(make_config):
         assert np.linalg.det(rig[name].rotation) > 0.999
 
 
+@pytest.mark.slow
 def test_static_points_of_a_stored_world_stand_still(world):
     """Own motion from finite differences of the stored poses, independent of the simulator's rates."""
     speeds = []

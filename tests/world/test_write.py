@@ -35,6 +35,7 @@ def fingerprint(root):
     return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
+@pytest.mark.slow
 def test_every_table_is_there_with_its_rows(world, config):
     frames = config.num_scenes * config.key_frames_per_scene
     counts = {name: len(table) for name, table in world.tables.items()}

@@ -8,27 +8,46 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.ops.kernel_maps import strided_map, submanifold_map, temporal_map
+from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
+from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv
 from src.structures.sparse_bev import SparseMap
 
 
 class SparseKernel(nn.Module):
-    """Weight and bias of a sparse convolution, drawn like those of torch's dense one.
+    """A sparse convolution; weight and bias are drawn like those of torch's dense one.
 
     `weight` is [K, in, out], its K = kernel_size ** ndim offsets in C order over the kernel axes.
     """
 
-    def __init__(self, in_channels: int, out_channels: int, kernel_size: int, ndim: int, bias: bool) -> None:
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        kernel_size: int,
+        ndim: int,
+        bias: bool,
+        stride: int | tuple[int, ...] = 1,
+        padding: int | None = None,  # on either side; None: half the kernel
+    ) -> None:
         super().__init__()
         self.in_channels, self.out_channels = in_channels, out_channels
         self.kernel_size, self.ndim = kernel_size, ndim
+        self.stride, self.padding = stride, kernel_size // 2 if padding is None else padding
         self.weight = nn.Parameter(torch.empty(kernel_size**ndim, in_channels, out_channels))
         self.bias = nn.Parameter(torch.empty(out_channels)) if bias else None
         bound = 1 / math.sqrt(kernel_size**ndim * in_channels)
         nn.init.uniform_(self.weight, -bound, bound)
         if self.bias is not None:
             nn.init.uniform_(self.bias, -bound, bound)
+
+    def map(self, sites: Sites) -> tuple[KernelMap, Sites]:
+        """The kernel map and the sites of the output, cached on the sites."""
+        raise NotImplementedError
+
+    def forward(self, x: SparseMap) -> SparseMap:
+        kernel_map, sites = self.map(x.sites)
+        return type(x)(sites, sparse_conv(x.features, self.weight, kernel_map, self.bias))
 
     def extra_repr(self) -> str:
         """Sizes for the printed module."""
@@ -38,43 +57,27 @@ class SparseKernel(nn.Module):
 class SubmanifoldConv(SparseKernel):
     """Convolution whose output sites are its input sites."""
 
-    def forward(self, x: SparseMap) -> SparseMap:
-        kernel_map = submanifold_map(x.sites, self.kernel_size)
-        return x.with_features(sparse_conv(x.features, self.weight, kernel_map, self.bias))
+    def map(self, sites: Sites) -> tuple[KernelMap, Sites]:
+        return submanifold_map(sites, self.kernel_size), sites
 
 
 class SparseConv(SparseKernel):
     """Convolution with an output at every cell that some input site reaches; at stride 1 it dilates the map."""
 
-    def __init__(
-        self,
-        in_channels: int,
-        out_channels: int,
-        kernel_size: int,
-        ndim: int,
-        bias: bool,
-        stride: int,
-        padding: int,
-    ) -> None:
-        super().__init__(in_channels, out_channels, kernel_size, ndim, bias)
-        self.stride, self.padding = stride, padding
-
-    def forward(self, x: SparseMap) -> SparseMap:
-        kernel_map, sites = strided_map(x.sites, self.kernel_size, self.stride, self.padding)
-        return type(x)(sites, sparse_conv(x.features, self.weight, kernel_map, self.bias))
+    def map(self, sites: Sites) -> tuple[KernelMap, Sites]:
+        return strided_map(sites, self.kernel_size, self.stride, self.padding)
 
 
 class TemporalConv(SparseKernel):
     """3x3x3 convolution over (t, y, x) that halves the time axis and, unless dilating, keeps to occupied columns."""
 
     def __init__(self, in_channels: int, out_channels: int, dilating: bool) -> None:
-        super().__init__(in_channels, out_channels, kernel_size=3, ndim=3, bias=False)
+        super().__init__(in_channels, out_channels, kernel_size=3, ndim=3, bias=False, stride=(2, 1, 1))
         self.dilating = dilating
 
-    def forward(self, x: SparseMap) -> SparseMap:
+    def map(self, sites: Sites) -> tuple[KernelMap, Sites]:
         build = strided_map if self.dilating else temporal_map
-        kernel_map, sites = build(x.sites, self.kernel_size, (2, 1, 1), 1)
-        return SparseMap(sites, sparse_conv(x.features, self.weight, kernel_map, self.bias))
+        return build(sites, self.kernel_size, self.stride, self.padding)
 
 
 class RowNorm(nn.BatchNorm1d):

@@ -92,6 +92,7 @@ def test_fpn_adds_the_coarser_level_upwards() -> None:
     assert fine[0, 0, 0].tolist() == [111, 111, 121, 121] and fine[0, 0, 2].tolist() == [111] * 4
 
 
+@pytest.mark.slow
 def test_normalisation_follows_the_backbone() -> None:
     pixel = torch.tensor([124, 116, 104], dtype=torch.uint8).view(1, 3, 1, 1).expand(1, 3, 32, 32)
     rgb = ImageEncoder(SMALL).normalise(pixel)[0, :, 0, 0]
@@ -155,6 +156,7 @@ def test_impossible_settings_are_refused(change: dict, message: str) -> None:
         replace(SMALL, **change)
 
 
+@pytest.mark.slow
 def test_pretrained_weights_fill_the_backbone(tmp_path: Path) -> None:
     config = published(BackboneName.resnet50)
     source = build_backbone(config)

@@ -6,6 +6,7 @@ import torch
 from src.models.backbones.resnet import BasicBlock, Bottleneck, ResNet
 
 
+@pytest.mark.slow
 def test_resnet50_agrees_with_the_recorded_network(golden: Callable) -> None:
     case = golden("resnet50")
     model = ResNet(Bottleneck, [64, 128, 256, 512], [3, 4, 6, 3]).eval()

@@ -143,6 +143,7 @@ def test_one_point_can_be_trained_on(config: RadarEncoderConfig) -> None:
     assert len(bev) > 0 and bev.features.isfinite().all()
 
 
+@pytest.mark.slow
 @both
 def test_samples_do_not_mix(config: RadarEncoderConfig) -> None:
     encoder = encoder_of(config).eval()

@@ -12,6 +12,7 @@ from src.models.backbones.weights import BackboneName, load_backbone_weights
 GOLDEN = Path(__file__).parents[2] / "golden" / "vovnet99"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("origin", ["fcos3d", "dd3d"])
 def test_published_names_load(tmp_path: Path, origin: str) -> None:
     listed = json.loads((GOLDEN / "tensors.json").read_text())
@@ -36,6 +37,7 @@ def test_published_names_load(tmp_path: Path, origin: str) -> None:
         assert torch.equal(found, marked[name]), name
 
 
+@pytest.mark.slow
 def test_vovnet99_agrees_with_the_recorded_network(golden: Callable, tmp_path: Path) -> None:
     case = golden("vovnet99")
     torch.save(case.weights, tmp_path / "weights.pth")
@@ -58,6 +60,7 @@ def test_size_and_batch_norm_mode() -> None:
     assert model.training and model.stages[0].training
 
 
+@pytest.mark.slow
 def test_every_parameter_gets_a_gradient() -> None:
     model = VoVNet99()
     sum((x**2).sum() for x in model(torch.randn(1, 3, 32, 64))).backward()

@@ -54,6 +54,7 @@ def make_batch(points=(120, 80), seed=0) -> FrameBatch:
     )
 
 
+@pytest.mark.slow
 def test_it_reads_lidar_alone():
     config, _ = compose_config(list(LIDAR))
     assert config.model.sensors == ("lidar",) and config.image_size_px is None
@@ -66,6 +67,7 @@ def test_it_reads_lidar_alone():
         make_model()(replace(make_batch(), lidar_points=None, lidar_batch=None))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", [(120, 80), (60, 0), (0, 0)])
 def test_every_parameter_has_a_finite_gradient(points):
     model = make_model().train()

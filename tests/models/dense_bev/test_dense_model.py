@@ -42,6 +42,7 @@ def test_every_parameter_learns(changes):
     assert parameters_that_stay(model, batch, lr=1e-3) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shape",
     [
@@ -182,6 +183,7 @@ def test_the_decoder_comes_back_to_every_cell(strides):
     assert gradients_are_finite(decoder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "low", "high"), [("paper", 36e6, 46e6), ("mini", 2.4e6, 3.0e6), ("debug", 0, 1e6)])
 def test_sizes_stand_beside_horizon3ds(scale, low, high):
     """40.6 M and 2.4 M parameters there (phase 1); the memory adds little."""

@@ -179,6 +179,7 @@ def fill(model, steps):
     return memory
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("training", [False, True])
 @pytest.mark.parametrize("steps", [0, 2, 4])
 def test_untrained_memory_leaves_phase_1_to_the_last_bit(pair, training, steps):

@@ -127,6 +127,7 @@ MODELS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_no_norm_is_left_behind_a_layer_and_the_trained_model_is_untouched(trained, name):
     model = trained(*MODELS[name]).model
@@ -142,6 +143,7 @@ def test_no_norm_is_left_behind_a_layer_and_the_trained_model_is_untouched(train
         prepare_for_inference(prepared)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_a_stream_gives_the_same_detections(trained, name):
     """Choices among near-equals (the farthest Gaussian, a cell at the threshold) may fall otherwise by rounding."""
@@ -160,6 +162,7 @@ def test_a_stream_gives_the_same_detections(trained, name):
     assert min(shares) > 0.97 and exact >= 2, (shares, exact)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["phase 1", "phase 2", "dense"])
 def test_bf16_is_no_further_from_float32_than_the_plain_path_in_bf16(trained, name):
     detector = trained(*MODELS[name])
@@ -210,6 +213,7 @@ def sizes_seen(detector, frames):
     return sizes, encoded
 
 
+@pytest.mark.slow
 def test_the_number_of_gaussians_never_changes_and_images_are_encoded_once(trained):
     detector = trained(*MODELS["phase 2"])
     plain, fast = pair(detector)
@@ -251,6 +255,7 @@ def test_decoding_at_top_cells_equals_codes_of_every_cell(trained):
             assert value is None or torch.allclose(value, getattr(wanted, field.name), rtol=1e-4, atol=1e-4), field.name
 
 
+@pytest.mark.slow
 def test_the_lean_variant_keeps_the_cells(trained):
     lean = trained("phase=phase1", "model.radar_encoder.conv_out=subm")
     full = trained("phase=phase1", "model.radar_encoder.conv_out=sparse")

@@ -39,6 +39,7 @@ def test_every_parameter_learns_within_two_steps(make_model, make_batch, changes
     assert parameters_that_stay(model, batch, lr=1e-2) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shape",
     [
@@ -60,6 +61,7 @@ def test_empty_inputs_give_finite_losses(make_model, make_batch, shape, radar_on
     assert len(model.eval().decode(model(batch)[0])) == len(batch)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missing", [[(0, 1)], [(0, 0), (0, 1), (0, 2), (0, 3)], "all"])
 @pytest.mark.parametrize("mode", list(Initialization))
 def test_missing_cameras(make_model, make_batch, missing, mode):
@@ -159,6 +161,7 @@ def test_gaussian_velocity_is_supervised_in_phase_1_where_asked_for(make_model, 
     assert float(train_step(model, batch)[1]["gaussian_velocity"].detach()) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -291,6 +294,7 @@ def load_config(scale):
 PAPER_GRID = BEVGrid(cells=(384, 384), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
 
 
+@pytest.mark.slow
 def test_parameters_of_the_full_size_agree_with_the_budget():
     config, backbone = load_config("paper")
     model = build_model(config, PAPER_GRID, backbone, {"velocity_code_weight": 0.2})

@@ -151,6 +151,7 @@ def two_steps(model, first, second):
     return output, terms, memory
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TOGGLES)
 def test_every_row_of_the_tables_trains(make_model, make_batch, make_dptf, name):
     changes = TOGGLES[name]

@@ -79,6 +79,7 @@ def fill(model, drive, steps, **changes):
     return memory, drive(steps, **changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in VARIANTS if name != "dilating"])
 @pytest.mark.parametrize("training", [False, True])
 def test_the_first_frame_is_phase_1_to_the_last_bit(pair, drive, name, training):
@@ -118,6 +119,7 @@ def test_a_lane_that_starts_beside_one_with_memory_gives_phase_1s_output(pair, d
     assert (two.dptf.bev.indices[:, 0] == 0).sum() > (two.fused_bev.indices[:, 0] == 0).sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("training", [False, True])
 @pytest.mark.parametrize("autocast", [False, True])
 def test_an_untrained_bev_path_adds_nothing_to_a_full_memory(pair, drive, training, autocast):
@@ -150,6 +152,7 @@ def test_an_untrained_self_attention_adds_nothing_to_a_full_memory(pair, drive):
     assert same(with_attention.ocsf.gaussians, without.ocsf.gaussians)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS.values(), ids=VARIANTS)
 def test_every_parameter_has_had_a_gradient_after_one_step_with_memory(make_model, make_dptf, drive, variant):
     """Zero-initialised outputs hide what is behind them in the first of the two steps."""
@@ -192,6 +195,7 @@ EMPTY = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("now", EMPTY.values(), ids=EMPTY)
 @pytest.mark.parametrize("past", [{}, {"points": (0, 0)}], ids=["a full memory", "a memory without radar"])
 @pytest.mark.parametrize("radar_only", [False, True])
@@ -254,6 +258,7 @@ def test_streams_with_memory_equal_single_streams(pair, drive):
             torch.testing.assert_close(both.head.logits[mine], alone.head.logits, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoilt", ["repeated", "reversed", "too old", "jump"])
 def test_an_unusable_past_is_as_none(pair, drive, spoilt):
     _, model = pair({}, {})
@@ -270,6 +275,7 @@ def test_an_unusable_past_is_as_none(pair, drive, spoilt):
     torch.testing.assert_close(spoilt_output.head.logits, alone.head.logits, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_memory_under_autocast_is_halved_where_it_may_be_and_stays_finite(make_model, make_dptf, drive):
     model, memory = make_model(dptf=make_dptf(**EVERYTHING)), None
     for step in range(3):
@@ -292,6 +298,7 @@ def test_memory_under_autocast_is_halved_where_it_may_be_and_stays_finite(make_m
     assert torch.equal(halved.history.velocities, plain.history.velocities)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_over_30_frames_and_survives_its_state(make_model, make_dptf, drive):
     config = make_dptf(**EVERYTHING)
     model, memory, sizes = make_model(dptf=config).eval(), None, []

@@ -30,6 +30,7 @@ def python(*arguments, **variables):
     )
 
 
+@pytest.mark.slow
 def test_the_interpreter_passes_the_tests_of_the_kernels():
     done = python(
         *("-m", "pytest", "-q", "-p", "no:cacheprovider"),
@@ -50,6 +51,7 @@ def test_the_compiler_takes_the_kernels(tmp_path):
     assert len(set(done.stdout.split())) == 7, done.stdout
 
 
+@pytest.mark.slow
 def test_a_machine_without_cuda_never_imports_triton():
     if torch.cuda.is_available():
         pytest.skip("here is a CUDA device")
