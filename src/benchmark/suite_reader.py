@@ -41,7 +41,7 @@ STAGES = {
     "resample": ("src.data.images:resample",),
     "mirror and rotate": ("src.data.images:turn",),
     "radar files": ("src.data.reader:read_radar_points",),
-    "radar compensation": ("src.data.reader:compensate_sweeps",),
+    "radar compensation": ("src.data.reader:compensate_clouds",),
     "LiDAR files": ("src.data.reader:read_lidar_points",),
     "LiDAR compensation": ("src.data.reader:place_sweep",),
 }

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from src.data.schema import DatasetIndex
 from src.errors import DataError
@@ -13,11 +12,19 @@ from src.geometry.transforms import quaternion_to_matrix, rotation_vector
 from src.structures.batch import LIDAR_POINT_FIELDS, MAX_EGO_SPEED_MPS
 
 Array = np.ndarray
-Placed = tuple[Array, Array | None]
-"""[n, 5] float32 in the order of LIDAR_POINT_FIELDS and, if asked for, [n, 3] float32 where the rays began (m)."""
-
 VELOCITY_WINDOW_US = 100_000
 """Ego velocity is the pose difference over +- this time; the chassis table reads zero for long stretches."""
+
+
+@dataclass(kw_only=True)
+class Sweeps:
+    """S sweeps of one kind of sensor, and the vehicle at each."""
+
+    clouds: list[Array]  # S of [n, 7] in the order of RADAR_FIELDS or [n, 4] of LIDAR_FIELDS, sensor frame
+    ego_from_sensor: Array  # [S, 4, 4] mounts
+    global_from_ego: Array  # [S, 4, 4] ego poses
+    velocity: Array  # [S, 3] m/s of the ego at its pose, its own axes
+    rate: Array  # [S, 3] rad/s, same axes
 
 
 def ego_motion(
@@ -111,7 +118,6 @@ def _rotate(
 
 def place_sweep(
     points: Array,  # [n, 4] float32: x, y, z (m, sensor frame), intensity
-    *,
     ages_s: Array,  # [n] key frame's time less the point's
     offsets_s: Array,  # [n] the point's time less that of the sweep's pose; zeros leave the sweep as it is
     ego_from_sensor: Array,  # [4, 4]
@@ -120,7 +126,7 @@ def place_sweep(
     rate: Array,  # [3] rad/s, same axes
     min_distance_m: float,  # points nearer than this in both x and y of the sensor are dropped
     origins: bool,
-) -> Placed:
+) -> tuple[Array, Array | None]:  # [n, 5] float32 in the order of LIDAR_POINT_FIELDS, [n, 3] float32 m if asked for
     """Points of one sweep, each moved from the ego frame at its own time, and where the sensor was at that time."""
     rows = points.T.astype(np.float32, order="C")  # [4, n]
     near = (np.abs(rows[:2]) < max(min_distance_m, 1e-6)).all(axis=0)
@@ -152,14 +158,3 @@ def deskew(
     cross_rate = np.cross(rate, np.eye(3)).T[..., None].astype(np.float32)  # its product with p is w x p
     moving = _rotate(cross_rate, points) + velocity[:, None].astype(np.float32)
     return points + offsets_s * (moving + (0.5 * offsets_s) * _rotate(cross_rate, moving))
-
-
-def lidar_tensors(sweeps: Sequence[Placed], origins: bool) -> dict[str, torch.Tensor]:
-    """The LiDAR of a batch of one."""
-    nothing = np.zeros((0, len(LIDAR_POINT_FIELDS)), np.float32), np.zeros((0, 3), np.float32)
-    points, starts = zip(*(sweeps or [nothing]), strict=True)
-    tensors = {"lidar_points": torch.from_numpy(np.concatenate(points))}
-    tensors["lidar_batch"] = torch.zeros(len(tensors["lidar_points"]), dtype=torch.int64)
-    if origins:
-        tensors["lidar_origins"] = torch.from_numpy(np.concatenate(starts))
-    return tensors

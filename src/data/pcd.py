@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from dataclasses import dataclass
 from functools import lru_cache
@@ -32,6 +33,9 @@ LARGEST = {
 """Of each field in size, in m, m/s, dB and counts: hundreds of times what a sensor gives, so beyond it is damage."""
 _KINDS = {(kind, size): f"<{kind.lower()}{size}" for kind in "IU" for size in "1248"}
 _KINDS |= {("F", "4"): "<f4", ("F", "8"): "<f8"}
+_DATA_LINE = re.compile(rb"^[ \t]*DATA[ \t][^\n]*\n", re.MULTILINE)
+_RADAR_TYPE = np.dtype([(name, "<f4") for name in RADAR_FIELDS])
+"""Of a point of usual files, whose data are the array."""
 
 
 class LidarCloud(NamedTuple):
@@ -45,12 +49,10 @@ class LidarCloud(NamedTuple):
 class _Layout:
     """What a header says of the data behind it."""
 
-    fields: tuple[str, ...]
     dtype: np.dtype  # of one point
     count: int  # points
     encoding: str
     start: int  # byte at which the data begin
-    plain: bool  # nothing but the wanted fields as float32 in their order: the data are the array
 
 
 def read_radar_points(
@@ -64,7 +66,7 @@ def read_radar_points(
     content = read_whole(path, MAX_FILE_BYTES)
     try:
         layout = _layout(content, RADAR_FIELDS)
-        if layout.plain and layout.encoding == "binary":
+        if layout.dtype == _RADAR_TYPE and layout.encoding == "binary":
             points = _table(content, layout).view("<f4").reshape(layout.count, len(RADAR_FIELDS))
         else:
             points = _floats(_columns(content, layout), RADAR_FIELDS)
@@ -113,13 +115,13 @@ def _times_us(stamps: Array) -> Array:  # [n] int64
 
 def _columns(content: bytes, layout: _Layout) -> dict[str, Array]:  # [n] each
     if layout.encoding == "ascii":
-        table = _ascii_table(content[layout.start :], layout.fields, layout.count)
-        return dict(zip(layout.fields, table.T, strict=True))
+        table = _ascii_table(content[layout.start :], layout.dtype.names, layout.count)
+        return dict(zip(layout.dtype.names, table.T, strict=True))
     if layout.encoding == "binary":
         table = _table(content, layout)
-        return {name: table[name] for name in layout.fields}
+        return {name: table[name] for name in layout.dtype.names}
     data, columns, at = _decompressed(content, layout), {}, 0
-    for name in layout.fields:  # one field after another
+    for name in layout.dtype.names:  # one field after another
         columns[name] = np.frombuffer(data, layout.dtype[name], layout.count, at)
         at += columns[name].nbytes
     return columns
@@ -156,47 +158,28 @@ def _decompressed(content: bytes, layout: _Layout) -> bytes:
 
 def _layout(content: bytes, wanted: tuple[str, ...]) -> _Layout:
     """The header's meaning; files differ in little but their number of points, so most headers were met before."""
-    data = content.find(b"\nDATA ", 0, MAX_HEADER_BYTES)
-    end = content.find(b"\n", data + 1, MAX_HEADER_BYTES) + 1 if data >= 0 else 0
-    return _known_layout(content[:end], wanted) if end else _parse_layout(content, wanted)
+    line = _DATA_LINE.search(content, 0, MAX_HEADER_BYTES)
+    if line is None:
+        raise DataError(f"not a PCD file: no DATA line in the first {min(len(content), MAX_HEADER_BYTES)} bytes")
+    return _known_layout(content[: line.end()], wanted)
 
 
-def _parse_layout(content: bytes, wanted: tuple[str, ...]) -> _Layout:
-    header, start = _header(content)
+@lru_cache(maxsize=2048)  # about a kilobyte each
+def _known_layout(content: bytes, wanted: tuple[str, ...]) -> _Layout:
+    lines = [line.split() for line in content.decode("ascii", "replace").split("\n")]
+    header = {words[0]: words[1:] for words in lines if words and not words[0].startswith("#")}
     names, kinds = _types(header)
     count = _count(header)
     missing = [name for name in wanted if name not in names]
     if missing:
         sensor = "radar" if wanted == RADAR_FIELDS else "lidar"
         raise DataError(f"a {sensor} file has the fields {list(wanted)}, but {missing} are not in {names}")
-    encoding = header.get("DATA", [""])[0]
+    encoding = " ".join(header["DATA"][:1])
     if encoding not in ("binary", "ascii", "binary_compressed"):
         raise DataError(f"DATA must be binary, ascii or binary_compressed, but got {encoding!r}")
     if count * len(names) > MAX_VALUES:
         raise DataError(f"at most {MAX_VALUES} numbers are expected, but got {count} points of {len(names)} fields")
-    dtype = np.dtype(list(zip(names, kinds, strict=True)))
-    plain = names == list(wanted) and set(kinds) == {"<f4"}
-    return _Layout(tuple(names), dtype, count, encoding, start, plain)
-
-
-_known_layout = lru_cache(maxsize=2048)(_parse_layout)  # about a kilobyte each
-
-
-def _header(content: bytes) -> tuple[dict[str, list[str]], int]:
-    """Header entries, and the byte at which the data begin."""
-    entries: dict[str, list[str]] = {}
-    at = 0
-    while at < min(len(content), MAX_HEADER_BYTES):
-        end = content.find(b"\n", at, MAX_HEADER_BYTES)
-        if end < 0:
-            break
-        words = content[at:end].decode("ascii", "replace").split()
-        at = end + 1
-        if words and not words[0].startswith("#"):
-            entries[words[0]] = words[1:]
-            if words[0] == "DATA":
-                return entries, at
-    raise DataError(f"not a PCD file: no DATA line in the first {min(len(content), MAX_HEADER_BYTES)} bytes")
+    return _Layout(np.dtype(list(zip(names, kinds, strict=True))), count, encoding, len(content))
 
 
 def _types(header: dict[str, list[str]]) -> tuple[list[str], list[str]]:

@@ -14,14 +14,14 @@ import numpy as np
 import torch
 
 from src.data.augment import AugmentationConfig, draw_bev_transform, draw_crop, frame_generator
-from src.data.compensation import compensate_clouds, ego_motion, lidar_tensors, place_sweep
+from src.data.compensation import Sweeps, compensate_clouds, ego_motion, place_sweep
 from src.data.images import read_image, width_fit
 from src.data.pcd import LidarCloud, read_lidar_points, read_radar_points
 from src.data.schema import CHANNELS, DatasetIndex
 from src.errors import DataError
 from src.geometry.camera import pixels_from_points
 from src.geometry.transforms import invert_rigid, pose_matrix, quaternion_to_matrix, yaw_of
-from src.structures.batch import RADAR_POINT_FIELDS, FrameBatch
+from src.structures.batch import LIDAR_POINT_FIELDS, RADAR_POINT_FIELDS, FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CAMERAS, LIDARS, RADARS
 
@@ -110,11 +110,7 @@ class FrameReader:
         skipped = _Skipped()
         batch = self._key_frame(sample, aug_from_ego)
         if self.settings.num_sweeps:
-            points = self._radar_points(sample, global_from_ego, aug_from_ego, skipped)
-            batch |= {
-                "radar_points": torch.from_numpy(points),
-                "radar_batch": torch.zeros(len(points), dtype=torch.int64),
-            }
+            batch |= self._radar_points(sample, global_from_ego, aug_from_ego, skipped)
         if self.settings.num_lidar_sweeps:
             sweeps, origins = self.settings.num_lidar_sweeps, self.settings.lidar_origins
             batch |= self._lidar_points(sample, global_from_ego, aug_from_ego, sweeps, origins, skipped)
@@ -147,44 +143,58 @@ class FrameReader:
         global_from_ego: Array,  # [4, 4]
         aug_from_ego: Array,  # [4, 4]
         skipped: _Skipped,
-    ) -> Array:  # [P, 7] float32, see RADAR_POINT_FIELDS
-        """All sweeps, moved to ego(t) and compensated for the ego motion by the full mount (method 1.3)."""
-        read = self._sweeps(
+    ) -> dict[str, torch.Tensor]:
+        rows, clouds = self._clouds(
             sample, RADARS, self.settings.num_sweeps, lambda path, row: read_radar_points(path), skipped
         )
-        rows, clouds = [row for row, _ in read], [cloud for _, cloud in read]
-        if not clouds:
-            return np.zeros((0, len(RADAR_POINT_FIELDS)), np.float32)
-        compensated = compensate_sweeps(
-            self.index, np.array(rows), clouds, int(self.index.frame_times_us[sample]), global_from_ego, self.settings
-        )
-        linear = aug_from_ego[:3, :3]
-        compensated[:, :3] = compensated[:, :3] @ linear.T + aug_from_ego[:3, 3]
-        compensated[:, 4:6] = compensated[:, 4:6] @ linear[:2, :2].T
-        return compensated.astype(np.float32, order="C")
+        times_us = self.index.data_times_us[rows]
+        ages_s = 1e-6 * (self.index.frame_times_us[sample] - times_us)
+        sweeps = self._sweeps(rows, clouds, times_us)
+        return radar_tensors(sweeps, ages_s, global_from_ego, aug_from_ego, self.settings)
 
-    def _sweeps(
+    def _clouds(
         self,
         sample: int,
         channels: tuple[str, ...],
         count: int,
         read: Callable[[str, int], T],  # of the path and the row of the file
         skipped: _Skipped,
-    ) -> list[tuple[int, T]]:
-        """The key frame's and the sweeps before it of each channel, fewer at a scene's start, with their rows."""
-        sweeps = []
+    ) -> tuple[Array, list[T]]:  # [S] int64 rows of the files
+        """The key frame's and the sweeps before it of each channel, fewer at a scene's start."""
+        rows, clouds = [], []
         for channel in channels:
             row = int(self.index.key_data[sample, CHANNELS.index(channel)])
-            if row < 0:
+            if row < 0 and count:
                 skipped.count(f"{channel} (not recorded)")
             for _ in range(count):
                 if row < 0:
                     break
                 cloud = self._guarded(sample, channel, row, partial(read, row=row), skipped)
                 if cloud is not None:
-                    sweeps.append((row, cloud))
+                    rows.append(row)
+                    clouds.append(cloud)
                 row = int(self.index.data_previous[row])
-        return sweeps
+        return np.array(rows, np.int64), clouds
+
+    def _sweeps(
+        self,
+        rows: Array,  # [S]
+        clouds: list[Array],
+        times_us: Array | None,  # [S] at which the ego's motion is that of its sweep; None: it is not asked for
+    ) -> Sweeps:
+        index = self.index
+        poses, calibrations = index.data_poses[rows], index.data_calibrations[rows]
+        global_from_ego = pose_matrix(index.pose_rotations[poses], index.pose_translations[poses])
+        velocity = rate = np.zeros((len(rows), 3))
+        if times_us is not None:
+            velocity, rate = ego_motion(index, times_us, global_from_ego[:, :3, :3])
+        return Sweeps(
+            clouds=clouds,
+            ego_from_sensor=index.ego_from_sensor[calibrations],
+            global_from_ego=global_from_ego,
+            velocity=velocity,
+            rate=rate,
+        )
 
     def _lidar_points(
         self,
@@ -195,31 +205,18 @@ class FrameReader:
         origins: bool,
         skipped: _Skipped,
     ) -> dict[str, torch.Tensor]:
-        """All sweeps in the (augmented) ego frame of the key frame, see LIDAR_POINT_FIELDS."""
-        index, settings = self.index, self.settings
-        read = self._sweeps(sample, LIDARS, num_sweeps, self._lidar_cloud, skipped)
-        rows = np.array([row for row, _ in read], dtype=np.int64)
-        poses, calibrations = index.data_poses[rows], index.data_calibrations[rows]
-        global_from_sweep = pose_matrix(index.pose_rotations[poses], index.pose_translations[poses])
-        aug_from_sweep = aug_from_ego @ invert_rigid(global_from_ego) @ global_from_sweep
-        velocity = rate = np.zeros((len(rows), 3))
-        if settings.deskew_lidar and len(rows):
-            velocity, rate = ego_motion(index, index.pose_times_us[poses], global_from_sweep[:, :3, :3])
-        sweeps = [
-            place_sweep(
-                cloud.points,
-                ages_s=1e-6 * (int(index.frame_times_us[sample]) - cloud.times_us),
-                offsets_s=1e-6 * (cloud.times_us - int(index.pose_times_us[poses[at]])),
-                ego_from_sensor=index.ego_from_sensor[calibrations[at]],
-                aug_from_sweep=aug_from_sweep[at],
-                velocity=velocity[at],
-                rate=rate[at],
-                min_distance_m=settings.min_distance_m,
-                origins=origins,
-            )
-            for at, (_, cloud) in enumerate(read)
-        ]
-        return lidar_tensors(sweeps, origins)
+        index, frame_time_us = self.index, int(self.index.frame_times_us[sample])
+        rows, clouds = self._clouds(sample, LIDARS, num_sweeps, self._lidar_cloud, skipped)
+        pose_times_us = index.pose_times_us[index.data_poses[rows]]
+        points = [cloud.points for cloud in clouds]
+        return lidar_tensors(
+            self._sweeps(rows, points, pose_times_us if self.settings.deskew_lidar else None),
+            [1e-6 * (frame_time_us - cloud.times_us) for cloud in clouds],
+            [1e-6 * (cloud.times_us - time_us) for cloud, time_us in zip(clouds, pose_times_us, strict=True)],
+            aug_from_ego @ invert_rigid(global_from_ego),
+            self.settings.min_distance_m,
+            origins,
+        )
 
     def _lidar_cloud(self, path: str, row: int) -> LidarCloud:
         """One file, its points' times checked against the table's."""
@@ -241,11 +238,9 @@ class FrameReader:
         frames, row = [], sample
         for _ in range(self.settings.num_future_frames):
             row = int(self._following[row]) if row >= 0 else -1
-            if row < 0:
-                points = lidar_tensors([], origins=True)
-            else:
-                points = self._lidar_points(row, self._global_from_ego(row), aug_from_ego, 1, True, skipped)
-            frames.append(FrameBatch(**self._key_frame(sample if row < 0 else row, aug_from_ego), **points))
+            at, sweeps = (row, 1) if row >= 0 else (sample, 0)
+            points = self._lidar_points(at, self._global_from_ego(at), aug_from_ego, sweeps, True, skipped)
+            frames.append(FrameBatch(**self._key_frame(at, aug_from_ego), **points))
         return tuple(frames)
 
     # ---------------------------------------------------------------- cameras
@@ -362,25 +357,49 @@ def _following(index: DatasetIndex) -> Array:  # [N] int64
     return following
 
 
-def compensate_sweeps(
-    index: DatasetIndex,
-    rows: Array,  # [S] rows of sensor files
-    clouds: list[Array],  # S of [n, 7] as stored, sensor frame
-    key_time_us: int,
+def radar_tensors(
+    sweeps: Sweeps,
+    ages_s: Array,  # [S] key frame minus sweep
     global_from_ego: Array,  # [4, 4] ego(t)
+    aug_from_ego: Array,  # [4, 4]
     settings: ReaderSettings,
-) -> Array:  # [P, 7] float64, as `compensate_clouds`
-    """Sweeps of the tables, with mounts, poses and ego motion looked up there; see `compensate_clouds`."""
-    calibrations, poses = index.data_calibrations[rows], index.data_poses[rows]
-    global_from_sweep = pose_matrix(index.pose_rotations[poses], index.pose_translations[poses])
-    velocity, rate = ego_motion(index, index.data_times_us[rows], global_from_sweep[:, :3, :3])  # [S, 3] each
-    return compensate_clouds(
-        clouds,
-        ego_from_sensor=index.ego_from_sensor[calibrations],
-        key_from_sweep=invert_rigid(global_from_ego) @ global_from_sweep,
-        velocity=velocity,
-        rate=rate,
-        elapsed_s=1e-6 * (key_time_us - index.data_times_us[rows]),
-        min_distance_m=settings.min_distance_m,
-        propagate_points=settings.propagate_points,
-    )
+) -> dict[str, torch.Tensor]:
+    """The radar of a batch of one: moved to ego(t), compensated for the ego motion by the full mount (method 1.3)."""
+    points = np.zeros((0, len(RADAR_POINT_FIELDS)))
+    if sweeps.clouds:
+        points = compensate_clouds(
+            sweeps.clouds,
+            sweeps.ego_from_sensor,
+            key_from_sweep=invert_rigid(global_from_ego) @ sweeps.global_from_ego,
+            velocity=sweeps.velocity,
+            rate=sweeps.rate,
+            elapsed_s=ages_s,
+            min_distance_m=settings.min_distance_m,
+            propagate_points=settings.propagate_points,
+        )
+        linear = aug_from_ego[:3, :3]
+        points[:, :3] = points[:, :3] @ linear.T + aug_from_ego[:3, 3]
+        points[:, 4:6] = points[:, 4:6] @ linear[:2, :2].T
+    owners = torch.zeros(len(points), dtype=torch.int64)
+    return {"radar_points": torch.from_numpy(points.astype(np.float32, order="C")), "radar_batch": owners}
+
+
+def lidar_tensors(
+    sweeps: Sweeps,
+    ages_s: list[Array],  # S of [n] key frame's time less the point's
+    offsets_s: list[Array],  # S of [n] the point's time less that of its sweep's pose
+    aug_from_global: Array,  # [4, 4]
+    min_distance_m: float,  # as `ReaderOptions`
+    origins: bool,
+) -> dict[str, torch.Tensor]:
+    """The LiDAR of a batch of one, in the (augmented) ego frame of the key frame."""
+    placed = [(np.zeros((0, len(LIDAR_POINT_FIELDS)), np.float32), np.zeros((0, 3), np.float32))]
+    mounts, targets = sweeps.ego_from_sensor, aug_from_global @ sweeps.global_from_ego
+    columns = (sweeps.clouds, ages_s, offsets_s, mounts, targets, sweeps.velocity, sweeps.rate)
+    placed += [place_sweep(*sweep, min_distance_m, origins) for sweep in zip(*columns, strict=True)]
+    points, starts = zip(*placed, strict=True)
+    tensors = {"lidar_points": torch.from_numpy(np.concatenate(points))}
+    tensors["lidar_batch"] = torch.zeros(len(tensors["lidar_points"]), dtype=torch.int64)
+    if origins:
+        tensors["lidar_origins"] = torch.from_numpy(np.concatenate(starts))
+    return tensors

@@ -10,14 +10,14 @@ import numpy as np
 import torch
 from PIL import Image
 
-from src.data.compensation import compensate_clouds, lidar_tensors, place_sweep
+from src.data.compensation import Sweeps
 from src.data.images import MAX_PIXELS, resample, width_fit
 from src.data.pcd import LIDAR_FIELDS, RADAR_FIELDS
-from src.data.reader import MAX_SCAN_S, ReaderSettings
+from src.data.reader import MAX_SCAN_S, ReaderSettings, lidar_tensors, radar_tensors
 from src.errors import DataError
 from src.geometry.camera import pixels_from_points
 from src.geometry.transforms import invert_rigid
-from src.structures.batch import MAX_EGO_SPEED_MPS, RADAR_POINT_FIELDS, FrameBatch
+from src.structures.batch import MAX_EGO_SPEED_MPS, FrameBatch
 from src.structures.taxonomy import CAMERAS
 
 Array = np.ndarray
@@ -100,11 +100,16 @@ def frame_from_sensors(
         "aug_from_ego": torch.eye(4)[None],
     }
     if settings.num_sweeps:
-        points = _radar_points(timestamp_s, global_from_ego, radars, settings)
-        owners = torch.zeros(len(points), dtype=torch.int64)
-        batch |= {"radar_points": torch.from_numpy(points), "radar_batch": owners}
+        sweeps, ages_s, _ = _newest(RadarSweep, RADAR_FIELDS, settings.num_sweeps, radars, timestamp_s, global_from_ego)
+        batch |= radar_tensors(sweeps, np.array(ages_s), global_from_ego, np.eye(4), settings)
     if settings.num_lidar_sweeps:
-        batch |= _lidar_points(timestamp_s, global_from_ego, lidars or {}, settings)
+        fields, count = LIDAR_FIELDS[:4], settings.num_lidar_sweeps
+        sweeps, ages_s, point_ages_s = _newest(
+            LidarSweep, fields, count, lidars or {}, timestamp_s, global_from_ego, settings.deskew_lidar
+        )
+        offsets_s = [age_s - of_points for age_s, of_points in zip(ages_s, point_ages_s, strict=True)]
+        ego_from_global, least_m = invert_rigid(global_from_ego), settings.min_distance_m
+        batch |= lidar_tensors(sweeps, point_ages_s, offsets_s, ego_from_global, least_m, settings.lidar_origins)
     if settings.image_size_px is not None:
         batch |= _images(global_from_ego, cameras, settings)
     return FrameBatch(**batch)
@@ -113,28 +118,15 @@ def frame_from_sensors(
 Sweep = TypeVar("Sweep", RadarSweep, LidarSweep)
 
 
-@dataclass(frozen=True)
-class _Checked:
-    """A sweep whose numbers are sound, in float64."""
-
-    sweep: RadarSweep | LidarSweep
-    where: str  # for messages
-    age_s: float  # frame's time less the sweep's
-    points: Array  # [n, F]
-    ego_from_sensor: Array  # [4, 4]
-    global_from_ego: Array  # [4, 4]
-    velocity: Array  # [3] m/s
-    rate: Array  # [3] rad/s
-
-
 def _newest(
     kind: type[Sweep],
     fields: tuple[str, ...],  # of a point
     count: int,  # of each sensor
+    sensors: Mapping[str, Sequence[Sweep] | None],
     timestamp_s: float,
     global_from_ego: Array,  # [4, 4]
-    sensors: Mapping[str, Sequence[Sweep] | None],
-) -> list[_Checked]:
+    deskew: bool = False,
+) -> tuple[Sweeps, list[float], list[Array]]:  # frame's time less that of each sweep, and [n] of its points
     """The newest sweeps of each sensor, checked."""
     sensor, checked = kind.__name__.removesuffix("Sweep").lower(), []
     for name, sweeps in sensors.items():
@@ -163,61 +155,25 @@ def _newest(
                 pose = global_from_ego @ _driven(velocity, rate, -age)
             else:
                 pose = _rigid(sweep.global_from_ego, f"{where}: global_from_ego")
-            checked.append(_Checked(sweep, where, age, points, mount, pose, velocity, rate))
-    return checked
-
-
-def _radar_points(
-    timestamp_s: float,
-    global_from_ego: Array,  # [4, 4]
-    radars: Mapping[str, Sequence[RadarSweep] | None],
-    settings: ReaderSettings,
-) -> Array:  # [P, 7] float32, see RADAR_POINT_FIELDS
-    sweeps = _newest(RadarSweep, RADAR_FIELDS, settings.num_sweeps, timestamp_s, global_from_ego, radars)
-    if not sweeps:
-        return np.zeros((0, len(RADAR_POINT_FIELDS)), np.float32)
-    return compensate_clouds(
-        [sweep.points for sweep in sweeps],
-        ego_from_sensor=np.stack([sweep.ego_from_sensor for sweep in sweeps]),
-        key_from_sweep=invert_rigid(global_from_ego) @ np.stack([sweep.global_from_ego for sweep in sweeps]),
-        velocity=np.stack([sweep.velocity for sweep in sweeps]),
-        rate=np.stack([sweep.rate for sweep in sweeps]),
-        elapsed_s=np.array([sweep.age_s for sweep in sweeps]),
-        min_distance_m=settings.min_distance_m,
-        propagate_points=settings.propagate_points,
-    ).astype(np.float32, order="C")
-
-
-def _lidar_points(
-    timestamp_s: float,
-    global_from_ego: Array,  # [4, 4]
-    lidars: Mapping[str, Sequence[LidarSweep] | None],
-    settings: ReaderSettings,
-) -> dict[str, torch.Tensor]:
-    placed = []
-    fields = LIDAR_FIELDS[:4]
-    for sweep in _newest(LidarSweep, fields, settings.num_lidar_sweeps, timestamp_s, global_from_ego, lidars):
-        ages_s = np.full(len(sweep.points), sweep.age_s)
-        if settings.deskew_lidar and sweep.sweep.point_times_s is not None:
-            where = f"{sweep.where}: point_times_s"
-            ages_s = timestamp_s - _seconds(sweep.sweep.point_times_s, where, (len(sweep.points),))
-            away = np.abs(ages_s - sweep.age_s).max(initial=0)
-            if away > MAX_SCAN_S:
-                raise DataError(f"{where} must lie within {MAX_SCAN_S} s of timestamp_s, but one is {away:g} s from it")
-        placed.append(
-            place_sweep(
-                sweep.points.astype(np.float32),
-                ages_s=ages_s,
-                offsets_s=sweep.age_s - ages_s,
-                ego_from_sensor=sweep.ego_from_sensor,
-                aug_from_sweep=invert_rigid(global_from_ego) @ sweep.global_from_ego,
-                velocity=sweep.velocity,
-                rate=sweep.rate,
-                min_distance_m=settings.min_distance_m,
-                origins=settings.lidar_origins,
-            )
-        )
-    return lidar_tensors(placed, settings.lidar_origins)
+            point_ages = np.full(len(points), age)
+            if deskew and sweep.point_times_s is not None:
+                where += ": point_times_s"
+                point_ages = timestamp_s - _seconds(sweep.point_times_s, where, (len(points),))
+                away = np.abs(point_ages - age).max(initial=0)
+                if away > MAX_SCAN_S:
+                    raise DataError(
+                        f"{where} must lie within {MAX_SCAN_S} s of timestamp_s, but one is {away:g} s from it"
+                    )
+            checked.append((points, mount, pose, velocity, rate, age, point_ages))
+    clouds, mounts, poses, velocities, rates, ages, point_ages = zip(*checked, strict=True) if checked else [()] * 7
+    placed = Sweeps(
+        clouds=list(clouds),
+        ego_from_sensor=np.reshape(mounts, (-1, 4, 4)),
+        global_from_ego=np.reshape(poses, (-1, 4, 4)),
+        velocity=np.reshape(velocities, (-1, 3)),
+        rate=np.reshape(rates, (-1, 3)),
+    )
+    return placed, list(ages), list(point_ages)
 
 
 def _driven(

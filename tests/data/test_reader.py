@@ -10,9 +10,9 @@ import torch
 
 from src.data.augment import AugmentationConfig, BevAugmentationConfig, ImageAugmentationConfig
 from src.data.cache import load_index
-from src.data.compensation import compensate_clouds, ego_motion
+from src.data.compensation import Sweeps, compensate_clouds, ego_motion
 from src.data.pcd import read_radar_points
-from src.data.reader import FrameReader, OnBadFile, compensate_sweeps
+from src.data.reader import FrameReader, OnBadFile, radar_tensors
 from src.errors import DataError
 from src.geometry.camera import project
 from src.geometry.transforms import invert_rigid, quaternion_to_matrix, rigid
@@ -170,14 +170,12 @@ def test_real_sweep_is_explained_by_one_speed(data_set):
         pose_times_us=times.astype(np.int64),
         pose_translations=np.stack([23.8 * (1e-6 * times - START_S), *np.zeros((2, 41))], axis=1),
         pose_rotations=np.tile([1.0, 0, 0, 0], (41, 1)),
-        data_times_us=np.array([START_S * 1e6]).astype(np.int64),
-        data_poses=np.array([20]),
-        data_calibrations=np.array([0]),
-        ego_from_sensor=rigid(quaternion_to_matrix([np.cos(turn), 0, 0, np.sin(turn)]), [5.26, 1.23, 2.01])[None],
     )
-    points = compensate_sweeps(
-        index, np.array([0]), [read_radar_points(path)], int(START_S * 1e6), np.eye(4), reader_settings()
-    )
+    velocity, rate = ego_motion(index, np.array([START_S * 1e6]).astype(np.int64), np.eye(3)[None])
+    mounts = rigid(quaternion_to_matrix([np.cos(turn), 0, 0, np.sin(turn)]), [5.26, 1.23, 2.01])[None]
+    sweeps = Sweeps(clouds=[read_radar_points(path)], ego_from_sensor=mounts, global_from_ego=np.eye(4)[None],
+                    velocity=velocity, rate=rate)  # fmt: skip
+    points = radar_tensors(sweeps, np.zeros(1), np.eye(4), np.eye(4), reader_settings())["radar_points"].numpy()
     slow = np.linalg.norm(points[:, 4:6], axis=1) < 0.6
     assert len(points) == 612 and slow.sum() >= 535
 
