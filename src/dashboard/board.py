@@ -33,7 +33,6 @@ class Sweep:
     record: SweepRecord
     tables: list[SweepTable]
     problem: str | None  # why there are no tables
-    taken: dict[str, float]  # seconds that finished runs took, by run id
     written: float  # when the runner or one of its running runs last wrote something, seconds since 1970
     now: float
 
@@ -64,7 +63,7 @@ class Sweep:
     @property
     def left_s(self) -> float | None:
         """Time left, with as many runs side by side as now; None before the first has finished, and when none runs."""
-        return seconds_left(self.record, self.taken, 1, self.now) if self.state == "running" else None
+        return seconds_left(self.record, 1, self.now) if self.state == "running" else None
 
 
 @dataclass(kw_only=True)
@@ -215,12 +214,8 @@ class BoardReader:
             for run_id, planned in record.runs.items():
                 run = runs.setdefault(run_id, Run(run_id=run_id, state=planned.state))
                 run.planned = run.planned or planned
-            labels = [(label, run_id) for label, by_seed in record.rows.items() for run_id in by_seed.values()]
-            rowed = {run_id for _, run_id in labels}
-            labels += [(planned.label, run_id) for run_id, planned in record.runs.items() if run_id not in rowed]
-            for label, run_id in labels:
-                if run_id in runs:
-                    runs[run_id].rows.append((record.stem, label))
+            for label, run_id in record.labelled:
+                runs[run_id].rows.append((record.stem, label))
         for name in names:
             alive = now - (unfinished.get(name) or 0.0) < ALIVE_S
             state = "running" if name in unfinished and alive else "stopped" if name in unfinished else "done"
@@ -239,8 +234,7 @@ class BoardReader:
             tables, problem = sweep_tables(record, results), None
         except (ValueError, DataError) as error:
             tables, problem = [], str(error)
-        taken = {run_id: results[run_id].seconds["all"] for run_id in record.runs if run_id in results}
-        return Sweep(record=record, tables=tables, problem=problem, taken=taken, written=written, now=now)
+        return Sweep(record=record, tables=tables, problem=problem, written=written, now=now)
 
     def _cached(self, path: Path, stamp: Stamp) -> RunResult | SweepRecord | DataError:
         known = self._files.get(path)

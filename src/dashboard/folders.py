@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from src.report.plain_yaml import load_plain_yaml
-from src.report.results import Point, read_curves, without_local_paths
+from src.report.results import Point, is_finished, read_curves, without_local_paths
 
 TAIL_BYTES = 24_000
 CONFIG_BYTES = 1_000_000
@@ -149,7 +149,7 @@ class RunFolders:
     def has_result(self, run_id: str) -> bool:
         """Whether the run has ended with numbers."""
         folder = self.find(run_id)
-        return folder is not None and (folder / "metrics.json").is_file() and (folder / "run.json").is_file()
+        return folder is not None and is_finished(folder)
 
     def _has_config(self, run_id: str) -> bool:
         return (self.outputs / run_id / "config.yaml").is_file()

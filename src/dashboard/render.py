@@ -10,9 +10,7 @@ import functools
 import hashlib
 import logging
 import re
-import shlex
 import time
-import urllib.parse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -146,18 +144,10 @@ class Renderer:
             for run in states.values()
             if run.state == "failed"
         ]
-        listed = [
-            (label, board.runs[run_id], states[run_id])
-            for label, seeds in record.rows.items()
-            for run_id in seeds.values()
-            if run_id in states
-        ]
-        rowed = {run.run_id for _, run, _ in listed}
-        listed += [(state.label, board.runs[run_id], state) for run_id, state in states.items() if run_id not in rowed]
+        listed = [(label, board.runs[run_id], states[run_id]) for label, run_id in record.labelled]
         content = self._content(
-            "sweep.html", board=board, sweep=sweep, failed=failed, runs=listed, study=study_command(record.storage),
-            figures=sweep_figures(board, sweep),
-        )  # fmt: skip
+            "sweep.html", board=board, sweep=sweep, failed=failed, runs=listed, figures=sweep_figures(board, sweep)
+        )
         title = ", ".join([record.sweep.title, record.scale, *record.changes])
         return Page(id=f"sweep-{sweep.key}", title=title, content=content)
 
@@ -241,19 +231,6 @@ def train_command(run: Run) -> str | None:
     """What trains this run."""
     overrides = run.result.overrides if run.result else run.planned.overrides if run.planned else None
     return " ".join(["python -m src.train", *overrides]) if overrides is not None else None
-
-
-def study_command(storage: str) -> str | None:
-    """What shows a study in Optuna's own dashboard, over a copy; None where it is not a file of this machine."""
-    if not storage.startswith("sqlite:///"):
-        return None
-    path = urllib.parse.unquote(storage.removeprefix("sqlite:///")).removeprefix(f"{Path.cwd()}/")
-    copy = "/tmp/study_copy.db"
-    backup = "from sqlite3 import connect; from sys import argv; connect(argv[1]).backup(connect(argv[2]))"
-    return (
-        f'python -c "{backup}" {shlex.quote(path)} {copy}\n'
-        f"optuna-dashboard --host 127.0.0.1 --port 8081 sqlite:///{copy}"
-    )
 
 
 def flat_config(tree: Any, prefix: str = "") -> list[tuple[str, str]]:

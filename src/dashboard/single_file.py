@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 from pathlib import Path
 
 from PIL import Image
@@ -42,19 +43,15 @@ def export_dashboard(reports: Path, outputs: Path | None, path: Path) -> None:
 def embed_pictures(board: Board, budget: int = PICTURE_BUDGET) -> dict[tuple[str, str], str]:
     """Addresses that hold the pictures themselves, by run and name, as many as fit the budget."""
     by_run = [shown_pictures(board, run) for run in board.runs.values() if run.has_folder]
-    rounds = max((len(pictures) for pictures in by_run), default=0)
     embedded: dict[tuple[str, str], str] = {}
-    for place in range(rounds):
-        for pictures in by_run:
-            if place >= len(pictures):
-                continue
-            address = _data_address(pictures[place])
-            if address is None:
-                continue
-            budget -= len(address)
-            if budget < 0:
-                return embedded
-            embedded[pictures[place].run_id, pictures[place].name] = address
+    for picture in filter(None, itertools.chain(*itertools.zip_longest(*by_run))):
+        address = _data_address(picture)
+        if address is None:
+            continue
+        budget -= len(address)
+        if budget < 0:
+            break
+        embedded[picture.run_id, picture.name] = address
     return embedded
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import functools
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -65,6 +65,19 @@ def read_as(kind: type[Format], path: Path, remedy: str) -> Format:
         return parse_as(kind, content)
     except ValueError as error:
         raise DataError(f"{path}: {error}; {remedy}") from error
+
+
+def read_all(
+    folder: Path, read: Callable[[Path], Item], pattern: str = "*.json"
+) -> tuple[list[Item], dict[Path, DataError]]:
+    """What `read` makes of each file of a folder, by name, and what could not be read, by file."""
+    found, broken = [], {}
+    for path in sorted(folder.glob(pattern)):
+        try:
+            found.append(read(path))
+        except DataError as error:
+            broken[path] = error
+    return found, broken
 
 
 @functools.cache

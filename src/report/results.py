@@ -18,7 +18,7 @@ from typing_extensions import TypedDict
 
 from src.errors import DataError
 from src.report.atomic_write import write_whole
-from src.report.json_format import ANY_KEYS, OPEN, Count, Many, Measure, read_as, read_json
+from src.report.json_format import ANY_KEYS, OPEN, Count, Many, Measure, read_all, read_as, read_json
 from src.report.metric_names import DETECTION, METRICS
 from src.report.plain_yaml import load_plain_yaml
 from src.training.identity import OUTSIDE_IDENTITY, is_of, key_of, without_keys
@@ -226,11 +226,16 @@ def result_path(reports: Path, run_id: str) -> Path:
     return reports / "results" / f"{run_id}.json"
 
 
+def is_finished(folder: Path) -> bool:
+    """Whether both files that mark a finished run are there."""
+    return (folder / "run.json").is_file() and (folder / "metrics.json").is_file()
+
+
 def finished_runs(outputs: Path, scale: str) -> Iterator[Path]:
     """Folders of one scale's finished runs, by name, without those that a restart moved aside."""
     for path in sorted(outputs.glob("*/run.json")):
         folder = path.parent
-        if f"-{scale}-" in folder.name and ".before-" not in folder.name and (folder / "metrics.json").is_file():
+        if f"-{scale}-" in folder.name and ".before-" not in folder.name and is_finished(folder):
             yield folder
 
 
@@ -293,17 +298,8 @@ def read_result(path: Path) -> RunResult:
 
 def read_results(reports: Path, scale: str | None = None) -> tuple[dict[str, RunResult], dict[Path, DataError]]:
     """Every result under reports/results, by run id, and what could not be read, by file."""
-    results, broken = {}, {}
-    for path in sorted((reports / "results").glob("*.json")):
-        if scale is not None and f"-{scale}-" not in path.name:
-            continue
-        try:
-            result = read_result(path)
-        except DataError as error:
-            broken[path] = error
-        else:
-            results[result.run_id] = result
-    return results, broken
+    results, broken = read_all(reports / "results", read_result, "*.json" if scale is None else f"*-{scale}-*.json")
+    return {result.run_id: result for result in results}, broken
 
 
 def _numbers(scores: OtherScores, headline: str, path: Path, remedy: str) -> dict[str, float | None]:

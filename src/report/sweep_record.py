@@ -16,7 +16,7 @@ from pydantic import Field, with_config
 
 from src.errors import DataError, HorizonError
 from src.report.atomic_write import write_whole
-from src.report.json_format import CLOSED, Count, Many, parse_as, read_json
+from src.report.json_format import CLOSED, Count, Many, parse_as, read_all, read_json
 from src.report.sweep_file import SweepConfig
 from src.training.identity import digest_of
 
@@ -78,6 +78,13 @@ class SweepRecord:
         return f"{self.name}_{self.scale}{self.suffix}"
 
     @property
+    def labelled(self) -> list[tuple[str, str]]:
+        """Label and run id of every row and seed, then of the runs of no row: of trials, and what rows start from."""
+        rows = [(label, run_id) for label, by_seed in self.rows.items() for run_id in by_seed.values()]
+        rowed = {run_id for _, run_id in rows}
+        return rows + [(run.label, run_id) for run_id, run in self.runs.items() if run_id not in rowed]
+
+    @property
     def unchosen(self) -> int:
         """Trials of a search whose values have not been chosen yet."""
         return max(0, self.sweep.trials - self.trials) if self.sweep.is_search else 0
@@ -130,16 +137,8 @@ def read_record(path: Path) -> SweepRecord:
 
 def read_records(reports: Path, scale: str | None = None) -> tuple[list[SweepRecord], dict[Path, DataError]]:
     """Every record under reports/sweeps, by name, and what could not be read, by file."""
-    records, broken = [], {}
-    for path in sorted((reports / "sweeps").glob("*.json")):
-        try:
-            record = read_record(path)
-        except DataError as error:
-            broken[path] = error
-            continue
-        if scale is None or record.scale == scale:
-            records.append(record)
-    return records, broken
+    records, broken = read_all(reports / "sweeps", read_record)
+    return [record for record in records if scale is None or record.scale == scale], broken
 
 
 def _check(record: SweepRecord, stem: str) -> None:

@@ -86,7 +86,6 @@ class SweepRow:
     baseline: str | None = None  # label of the row that its differences are taken to; its own for a baseline
     runs: dict[int, str] = field(default_factory=dict)  # run id by seed
     overrides: list[str] = field(default_factory=list)  # of a trial: what the search chose
-    x: float | None = None  # place on the plot's horizontal axis
 
     @property
     def is_baseline(self) -> bool:

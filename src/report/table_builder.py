@@ -28,8 +28,7 @@ def sweep_tables(record: SweepRecord, results: dict[str, RunResult]) -> list[Swe
     used = {run_id: results[run_id] for run_id in _run_ids(record) if run_id in results}
     check_same_data(record, used)
     check_rows(record, used)
-    return [_search_table(record, used, table) if record.sweep.is_search else _row_table(record, used, table)
-            for table in _table_configs(record)]  # fmt: skip
+    return [_table(record, used, table) for table in _table_configs(record)]
 
 
 def write_sweep_tables(reports: Path, record: SweepRecord, results: dict[str, RunResult] | None = None) -> list[Path]:
@@ -107,10 +106,6 @@ def _table_configs(record: SweepRecord) -> list[TableConfig]:
     return record.sweep.tables or [TableConfig(name=record.name, title=record.sweep.title, columns=columns)]
 
 
-def _columns(record: SweepRecord, config: TableConfig) -> list[Metric]:
-    return [find_metric(name, config.name, record.sweep.task) for name in config.columns]
-
-
 def _run_ids(record: SweepRecord) -> list[str]:
     """Runs that a table shows, without those that others only start from."""
     if not record.sweep.is_search:
@@ -119,8 +114,33 @@ def _run_ids(record: SweepRecord) -> list[str]:
     return [run_id for run_id in record.runs if run_id not in sources]
 
 
-def _row_table(record: SweepRecord, results: dict[str, RunResult], config: TableConfig) -> SweepTable:
-    columns, sweep = _columns(record, config), record.sweep
+def _table(record: SweepRecord, results: dict[str, RunResult], config: TableConfig) -> SweepTable:
+    sweep, is_search = record.sweep, record.sweep.is_search
+    columns = [find_metric(name, config.name, sweep.task) for name in config.columns]
+    if is_search:
+        objective = find_metric(sweep.objective, record.name, sweep.task)
+        rows, best = _trials(record, results, columns, objective)
+    else:
+        rows = _rows(record, results, config, columns)
+    _mark_best(rows, columns)
+    table = SweepTable(config.name, record.scale, config.title, "", columns, rows, is_search)
+    trained = [row for row in rows if row.state != PAPER]
+    complete = is_search or all(row.state == "done" for row in trained)
+    table.caption = describe_runs(record, results, complete)
+    table.caption += describe_differences(table.baselines, any(map(table.has_paper, range(len(columns)))))
+    table.caption += describe_latency(columns, rows, results.values())
+    if is_search:
+        table.text = describe_search([row.state for row in rows], sweep.trials, objective, best)
+    else:
+        table.text = findings(columns, trained, next(iter(results.values()), None), complete)
+    return table
+
+
+def _rows(
+    record: SweepRecord, results: dict[str, RunResult], config: TableConfig, columns: list[Metric]
+) -> list[SweepRow]:
+    """In the order of the table's file, the paper's own last."""
+    sweep = record.sweep
     rows: dict[str, SweepRow] = {}
     for row in sweep.rows:
         runs = record.rows.get(row.label, {})
@@ -129,28 +149,19 @@ def _row_table(record: SweepRecord, results: dict[str, RunResult], config: Table
         done = sum(_is_done(record, run_id, results) for run_id in runs.values())
         state, note = _state(record, runs, results)
         baseline = sweep.baseline_of(row.label)
-        rows[row.label] = SweepRow(row.label, cells, state, note, len(runs), done, baseline, dict(runs), x=row.x)
+        rows[row.label] = SweepRow(row.label, cells, state, note, len(runs), done, baseline, dict(runs))
     for other in sweep.paper_rows:
         cells = [TableCell(paper=other.paper.get(column.name)) for column in columns]
         rows[other.label] = SweepRow(other.label, cells, PAPER, baseline=sweep.baseline)
     for row in rows.values():
         _take_differences(row, rows.get(row.baseline or ""))
-    shown = [rows[label] for label in config.rows] if config.rows is not None else list(rows.values())
-    _mark_best(shown, columns)
-    table = SweepTable(config.name, record.scale, config.title, "", columns, shown, is_search=False)
-    trained = [row for row in shown if row.state != PAPER]
-    complete = all(row.state == "done" for row in trained)
-    table.caption = describe_runs(record, results, complete)
-    table.caption += describe_differences(table.baselines, any(map(table.has_paper, range(len(columns)))))
-    table.caption += describe_latency(columns, shown, results.values())
-    table.text = findings(columns, trained, next(iter(results.values()), None), complete)
-    return table
+    return list(rows.values()) if config.rows is None else [rows[label] for label in config.rows]
 
 
-def _search_table(record: SweepRecord, results: dict[str, RunResult], config: TableConfig) -> SweepTable:
-    """Trials by objective, the best first; pruned, failed and open ones below."""
-    columns = _columns(record, config)
-    objective = find_metric(record.sweep.objective, record.name, record.sweep.task)
+def _trials(
+    record: SweepRecord, results: dict[str, RunResult], columns: list[Metric], objective: Metric
+) -> tuple[list[SweepRow], tuple[str, list[str], float] | None]:
+    """Trials by objective, the best first; pruned, failed and open ones below. And the best, see `describe_search`."""
     scored: list[tuple[SweepRow, float | None]] = []
     for run_id in _run_ids(record):
         run, result = record.runs[run_id], results.get(run_id)
@@ -165,14 +176,8 @@ def _search_table(record: SweepRecord, results: dict[str, RunResult], config: Ta
         scored.append((row, run.value if result is None else result.metrics.get(objective.name)))
     order = ("done", "pruned", "failed", "running", "waiting")
     scored.sort(key=lambda pair: (order.index(pair[0].state), -pair[1] if pair[1] is not None else float("inf")))
-    rows = [row for row, _ in scored]
-    _mark_best(rows, columns)
-    table = SweepTable(config.name, record.scale, config.title, "", columns, rows, is_search=True)
-    table.caption = describe_runs(record, results, complete=True)
-    table.caption += describe_latency(columns, rows, results.values())
     best = next(((r.label, r.overrides, v) for r, v in scored[:1] if r.state == "done" and v is not None), None)
-    table.text = describe_search([row.state for row in rows], record.sweep.trials, objective, best)
-    return table
+    return [row for row, _ in scored], best
 
 
 def _take_differences(row: SweepRow, baseline: SweepRow | None) -> None:

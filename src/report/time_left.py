@@ -1,24 +1,29 @@
-"""The time that a sweep still needs, and durations as people say them."""
+"""How far a sweep is, the time that it still needs, and durations as people say them."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
 
 from src.report.sweep_record import RunState, SweepRecord
 
 
-def seconds_left(
-    record: SweepRecord,
-    taken: Mapping[str, float],  # seconds by run id, of finished runs
-    workers: int,
-    now: float,  # seconds since 1970
-) -> float | None:
+def progress_line(record: SweepRecord, workers: int, now: float) -> str:
+    """Done, running, left, failed, and the time left as far as finished runs of the same phase tell it."""
+    left = record.count("waiting") + record.unchosen
+    words = [f"{record.count('done')} of {record.planned} done", f"{record.count('running')} running", f"{left} left"]
+    words += [f"{record.count(state)} {state}" for state in ("failed", "pruned") if record.count(state)]
+    if left or record.count("running"):
+        seconds = seconds_left(record, workers, now)
+        words.append("time left unknown yet" if seconds is None else f"about {duration(seconds)} left")
+    return f"{record.study}: {', '.join(words)}"
+
+
+def seconds_left(record: SweepRecord, workers: int, now: float) -> float | None:
     """Mean duration of each phase's finished runs, over the runs that are not; None when none has finished yet."""
     of_phase: dict[str, list[float]] = defaultdict(list)
     for run in record.runs.values():
-        if run.state == "done" and run.run_id in taken:
-            of_phase[_phase(run)].append(taken[run.run_id])
+        if run.state == "done" and run.started is not None and run.ended is not None:
+            of_phase[_phase(run)].append(max(0.0, run.ended - run.started))
     if not of_phase:
         return None
     means = {phase: sum(values) / len(values) for phase, values in of_phase.items()}

@@ -10,6 +10,7 @@ import re
 import shlex
 import signal
 import sys
+import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,17 +26,16 @@ from src.report.results import publish_result
 from src.report.sweep_file import DimensionConfig
 from src.report.sweep_record import SweepRecord
 from src.report.table_builder import write_sweep_tables
-from src.sweep.compose import SweepCommand, compose_sweep
+from src.report.time_left import progress_line
+from src.sweep.compose import compose_sweep
 from src.sweep.latency_runs import measure_latencies
 from src.sweep.launcher import Launcher
 from src.sweep.plan import Plan, RunIdentity, compose_file, join_overrides, make_plan, split_machine
-from src.sweep.progress import progress_line
 from src.sweep.record_writer import RecordWriter
 from src.sweep.run_status import is_done
 from src.sweep.runner import Runner
 from src.sweep.search import Search
-from src.sweep.storage_address import default_storage
-from src.sweep.sweep_study import FORMAT, SweepStudy
+from src.sweep.sweep_study import FORMAT, SweepStudy, default_storage
 from src.training.handoff import find_source
 from src.training.identity import key_of, run_identity
 from src.training.run_folder import make_writable
@@ -65,27 +65,6 @@ def main(overrides: list[str]) -> None:
     make_writable(reports / "sweeps", "paths.reports")
     study = SweepStudy(outputs, plan.study, command.storage or default_storage(outputs), definition(plan, common))
     again = shlex.join(["python", "-m", "src.sweep", *[masked(override) for override in overrides]])
-    writer = RecordWriter(plan, study, again, outputs, reports)
-    runner = build_runner(command, plan, study, writer, common, identify)
-    record = runner.run()
-    if runner.stop.requested:
-        print(progress_line(record, outputs, command.workers))
-        raise InterruptedRunError(f"the sweep was stopped; nothing finished is lost, resume it with\n    {again}")
-    if sweep.latency:
-        measured = measure_latencies(record, outputs, partial(latency_command, outputs), runner)
-        logger.info("latency measured of %d runs", measured)
-    finish(record, runner, outputs, reports, again)
-
-
-def build_runner(
-    command: SweepCommand,
-    plan: Plan,
-    study: SweepStudy,
-    writer: RecordWriter,
-    common: list[str],
-    identify: Identifier,
-) -> Runner:
-    """The runner of a plan, or of a search."""
     launcher = Launcher(
         [sys.executable, "-m", "src.train"],
         study.folder,
@@ -94,8 +73,18 @@ def build_runner(
         in_child=partial(die_with_parent, signal.SIGTERM),  # a killed runner leaves checkpoints, no orphans
         group=plan.study,
     )
-    parts = (plan, study, writer, launcher, partial(publish_result, reports=writer.reports))
-    return Search(*parts, common=common, identify=identify) if plan.sweep.is_search else Runner(*parts)
+    parts = (plan, study, RecordWriter(plan, study, again, outputs, reports), launcher)
+    publish = partial(publish_result, reports=reports)
+    is_search = plan.sweep.is_search
+    runner = Search(*parts, publish, common=common, identify=identify) if is_search else Runner(*parts, publish)
+    record = runner.run()
+    if runner.stop.requested:
+        print(progress_line(record, command.workers, time.time()))
+        raise InterruptedRunError(f"the sweep was stopped; nothing finished is lost, resume it with\n    {again}")
+    if sweep.latency:
+        measured = measure_latencies(record, outputs, partial(latency_command, outputs), runner)
+        logger.info("latency measured of %d runs", measured)
+    finish(record, runner, outputs, reports, again)
 
 
 def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, again: str) -> None:
@@ -123,7 +112,7 @@ def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, ag
         print(f"table: {path}")
     if isinstance(runner, Search) and (best := runner.best()) is not None:
         print(f"best {record.sweep.objective}: {best.value:.4f} with\n    {' '.join(best.attrs['chosen'])}")
-    print(progress_line(record, outputs, 1))
+    print(progress_line(record, 1, time.time()))
     if problems:
         raise HorizonError("\n".join(problems))
 

@@ -32,7 +32,7 @@ from src.report.sweep_file import (
     SweepConfig,
     TableConfig,
 )
-from src.sweep.storage_address import check_address
+from src.sweep.sweep_study import check_address
 from src.training.identity import key_of
 
 SWEEPS = CONF.parent / "sweeps"
@@ -43,14 +43,15 @@ FILE_KEYS = [field.name for part in FILE_PARTS for field in dataclasses.fields(p
 
 
 @dataclass(kw_only=True)
-class RunnerOptions:
-    """Options of the runner itself; the rest of the command line goes to every run."""
+class SweepCommand:
+    """Options of the runner itself and the sweep; the rest of the command line goes to every run."""
 
     seeds: int
     workers: int
     storage: str | None
     dry_run: bool
     trials: int | None
+    sweep: Any = None  # SweepConfig, of a file that Hydra does not read
 
     def __post_init__(self) -> None:
         for name in ("seeds", "workers"):
@@ -58,20 +59,6 @@ class RunnerOptions:
                 raise ConfigError(f"{name} must be at least 1, but got {getattr(self, name)}")
         if self.seeds > MOST_SEEDS:
             raise ConfigError(f"seeds must be at most {MOST_SEEDS}, but got {self.seeds}; seed=... says the first one")
-
-
-@dataclass(kw_only=True)
-class SweepCommand(RunnerOptions):
-    """The runner's options and the sweep."""
-
-    sweep: SweepConfig
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.trials is not None:
-            if not self.sweep.is_search:
-                raise ConfigError(f"trials={self.trials} is for searches; a sweep of rows trains each of them")
-            self.sweep = dataclasses.replace(self.sweep, trials=self.trials)
 
 
 def sweep_files() -> dict[str, Path]:
@@ -159,10 +146,14 @@ def _refuse_interpolation(content: Any, where: str = "") -> None:
 
 
 def _compose(sweep: SweepConfig, overrides: list[str]) -> SweepCommand:
-    ConfigStore.instance().store(name="runner_options", node=RunnerOptions)
+    ConfigStore.instance().store(name="runner_options", node=SweepCommand)
     with initialize_config_dir(str(CONF), version_base="1.3"):
         tree = compose("sweep", overrides=overrides)
     missing = OmegaConf.missing_keys(tree)
     if missing:
         raise ConfigError(f"{min(missing)} has no value")
-    return SweepCommand(**vars(OmegaConf.to_object(tree)), sweep=sweep)
+    command: SweepCommand = OmegaConf.to_object(tree)
+    if command.trials is not None and not sweep.is_search:
+        raise ConfigError(f"trials={command.trials} is for searches; a sweep of rows trains each of them")
+    command.sweep = sweep if command.trials is None else dataclasses.replace(sweep, trials=command.trials)
+    return command

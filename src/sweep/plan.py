@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 from src.errors import ConfigError, HorizonError
 from src.report.metric_names import DETECTION
@@ -32,10 +33,15 @@ class RunSpec:
 
     run_id: str
     overrides: list[str]  # what it is
-    machine: list[str]  # where and how it computes
     seed: int
     label: str  # of its first row; for a run that others only start from: what it is
-    needs: str | None  # run whose weights it starts from
+    needs: str | None = None  # run whose weights it starts from
+    machine: list[str] = field(default_factory=list)  # where and how it computes; stored nowhere
+
+    @property
+    def stored(self) -> dict[str, Any]:
+        """What records and trials keep of it."""
+        return {name: value for name, value in vars(self).items() if name != "machine"}
 
     @property
     def command(self) -> str:
@@ -147,7 +153,8 @@ def run_specs_of(overrides: list[str], seed: int, label: str, identify: Identify
         what = label if label.startswith("weights for ") else f"weights for {label}"
         sources = run_specs_of(found.source, seed, what, identify)
     needs = sources[-1].run_id if sources else None
-    return [*sources, RunSpec(found.run_id, *split_machine(overrides), seed, label, needs)]
+    own, machine = split_machine(overrides)
+    return [*sources, RunSpec(found.run_id, own, seed, label, needs, machine)]
 
 
 def _compose(

@@ -47,7 +47,7 @@ class RecordWriter:
         runs = {spec.run_id: self._state(spec, latest.get(spec.run_id)) for spec in self.plan.specs.values()}
         if self.plan.sweep.is_search:
             for trial in trials:
-                for spec in map(run_spec_from, trial.attrs.get("run_specs", [])):
+                for spec in (RunSpec(**content) for content in trial.attrs.get("run_specs", [])):
                     # The source run of a trial has no trial of its own: that trial trains it.
                     own = latest.get(spec.run_id) or (trial if trial.state == "running" else None)
                     runs[spec.run_id] = self._state(spec, own)
@@ -69,14 +69,7 @@ class RecordWriter:
 
     def _state(self, spec: RunSpec, trial: SweepTrial | None) -> RunState:
         log = self.study.folder / f"{spec.run_id}.log"
-        state = RunState(
-            run_id=spec.run_id,
-            overrides=spec.overrides,
-            seed=spec.seed,
-            label=spec.label,
-            needs=spec.needs,
-            log=str(log.relative_to(self.outputs)) if log.is_file() else None,
-        )
+        state = RunState(**spec.stored, log=str(log.relative_to(self.outputs)) if log.is_file() else None)
         if trial is not None:
             state.started, state.ended = trial.started, trial.ended
             state.value = trial.value if trial.value is not None and math.isfinite(trial.value) else None
@@ -117,15 +110,10 @@ class RecordWriter:
 
     def _current_state(self, known: RunState, latest: dict[str | None, SweepTrial]) -> RunState:
         """The present state of a run of an earlier record."""
-        spec = RunSpec(known.run_id, known.overrides, [], known.seed, known.label, known.needs)
+        spec = RunSpec(known.run_id, known.overrides, known.seed, known.label, known.needs)
         return self._state(spec, latest.get(known.run_id))
 
 
 def _settings(run: RunState) -> set[str]:
     """Overrides of a run without its seed; all are of one scale."""
     return {override for override in run.overrides if not is_of(override, ("seed", "scale"))}
-
-
-def run_spec_from(content: dict) -> RunSpec:
-    """A run spec as a trial stores it."""
-    return RunSpec(machine=[], **content)

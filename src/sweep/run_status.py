@@ -8,13 +8,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from src.report.results import is_finished
+
 LARGEST = 1e9
-"""Of a score or of seconds: a number beyond it, or one that is not finite, is damage."""
-
-
-def is_finished(folder: Path) -> bool:
-    """Whether both files that mark a finished run are there."""
-    return (folder / "run.json").is_file() and (folder / "metrics.json").is_file()
+"""Of a score: a number beyond it, or one that is not finite, is damage."""
 
 
 def is_done(folder: Path) -> bool:
@@ -30,16 +27,7 @@ def read_headline(folder: Path) -> str:
 
 def read_score(folder: Path, metric: str) -> float | None:
     """One number of metrics.json by its dotted name, None where it is not there or not finite."""
-    return _number(_read(folder / "metrics.json", metric))
-
-
-def read_seconds(folder: Path) -> float | None:
-    """How long the run took, None where it does not say."""
-    seconds = _number(_read(folder / "run.json", "seconds.all"))
-    return seconds if seconds is not None and seconds >= 0 else None
-
-
-def _number(value: Any) -> float | None:
+    value = _read(folder / "metrics.json", metric)
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if is_number and abs(value) <= LARGEST else None
 

@@ -20,12 +20,13 @@ from optuna.trial import Trial
 from src.errors import HorizonError
 from src.reliability.command import INTERRUPT_GRACE_S
 from src.report.metric_names import METRICS, Metric
+from src.report.results import is_finished
 from src.report.sweep_record import SweepRecord
+from src.report.time_left import progress_line
 from src.sweep.launcher import ExitStatus, Launcher, StopRequest
 from src.sweep.plan import Plan, RunSpec
-from src.sweep.progress import progress_line
 from src.sweep.record_writer import RecordWriter
-from src.sweep.run_status import is_busy, is_finished, read_headline, read_score
+from src.sweep.run_status import is_busy, read_headline, read_score
 from src.sweep.sweep_study import DatabaseError, SweepStudy, SweepTrial, TrialEndedError
 
 logger = logging.getLogger(__name__)
@@ -223,7 +224,8 @@ class Runner:
         elif not reason and not self.writer.is_done(spec.run_id):
             reason = f"{folder / 'metrics.json'} has no finite {read_headline(folder)}"
         if reason:
-            logger.warning("%s: FAILED after %.0f s: %s; log: %s", name_of(spec), seconds, reason, self._log(spec))
+            log = self.launcher.log_of(spec.run_id)
+            logger.warning("%s: FAILED after %.0f s: %s; log: %s", name_of(spec), seconds, reason, log)
             return replace(status, reason=reason)
         name = read_headline(folder)
         metric = METRICS.get(name, Metric(name, name))
@@ -231,9 +233,6 @@ class Runner:
         logger.info("%s: done after %.0f s, %s %s", name_of(spec), seconds, metric.title, score)
         self._publish(spec.run_id)
         return None
-
-    def _log(self, spec: RunSpec) -> Path:
-        return self.launcher.log_of(spec.run_id)
 
     def _wait_for_others(self, spec: RunSpec, folder: Path) -> None:
         """Wait while a process outside the study trains the run."""
@@ -260,7 +259,7 @@ class Runner:
                 logger.warning("worker %s is gone; %s is released", trial.worker, trial.run_id)
 
     def _show(self, record: SweepRecord) -> None:
-        logger.info("%s", progress_line(record, self.outputs, self.launcher.workers))
+        logger.info("%s", progress_line(record, self.launcher.workers, time.time()))
 
     @contextmanager
     def _handling_signals(self) -> Iterator[None]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -14,7 +13,6 @@ from optuna.trial import Trial
 from src.errors import DivergedError, HorizonError
 from src.report.sweep_file import DimensionConfig
 from src.sweep.plan import Identify, RunSpec, join_overrides, run_specs_of, split_machine
-from src.sweep.record_writer import run_spec_from
 from src.sweep.run_status import read_score, read_validations
 from src.sweep.runner import Runner, name_of
 from src.sweep.sweep_study import SweepStudy, SweepTrial, TrialEndedError, trials_begun
@@ -36,7 +34,7 @@ class Search(Runner):
     def specs(self) -> list[RunSpec]:
         """Every run that trials have chosen, each once."""
         contents = [content for trial in self.study.trials() for content in trial.attrs.get("run_specs", [])]
-        return list({content["run_id"]: run_spec_from(content) for content in contents}.values())
+        return list({content["run_id"]: RunSpec(**content) for content in contents}.values())
 
     def best(self) -> SweepTrial | None:
         """The trial with the best objective so far."""
@@ -88,11 +86,9 @@ class Search(Runner):
         try:
             specs = run_specs_of(overrides, seed, label, self._identify)
         except HorizonError as error:
-            specs = [RunSpec(f"invalid-{trial.number}", overrides, [], seed, label, None)]
+            specs = [RunSpec(f"invalid-{trial.number}", overrides, seed, label)]
             trial.set_user_attr("invalid", str(error))
-        stored = [asdict(spec) for spec in specs]
-        for content in stored:
-            content.pop("machine")
+        stored = [spec.stored for spec in specs]
         for key, value in {"run_id": specs[-1].run_id, "chosen": chosen, "run_specs": stored}.items():
             trial.set_user_attr(key, value)
 
@@ -103,7 +99,7 @@ class Search(Runner):
             self._fail(trial, attrs["invalid"], conclusive=True)
         self._logging_errors(self.writer.write)
         machine = split_machine(join_overrides(self.sweep.overrides, self._common))[1]
-        *sources, spec = [replace(run_spec_from(content), machine=machine) for content in attrs["run_specs"]]
+        *sources, spec = [RunSpec(**content, machine=machine) for content in attrs["run_specs"]]
         for source in sources:
             status = self.train(source, worker)
             if status is not None:

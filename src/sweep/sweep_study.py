@@ -20,13 +20,14 @@ from typing import Any, TextIO
 
 import optuna
 from optuna.storages import RDBStorage
+from optuna.storages._heartbeat import get_heartbeat_thread  # of `Study.optimize`; `ask` and `tell` go without
 from optuna.trial import FrozenTrial, Trial, TrialState
 from sqlalchemy import text
+from sqlalchemy.engine import URL
 from sqlalchemy.exc import SQLAlchemyError
 
 from src.errors import ConfigError
 from src.reliability.passwords import masked, without_secrets
-from src.sweep.storage_address import for_optuna
 
 FORMAT = 1
 HEARTBEAT_S = 60
@@ -35,10 +36,8 @@ GRACE_PERIOD_S = 300
 CONNECT_S = 15
 DATABASE_FAULTS = (
     SQLAlchemyError, optuna.exceptions.StorageInternalError, ImportError, RuntimeError, ValueError, LookupError,
-    UnboundLocalError,
 )  # fmt: skip
-"""What SQLAlchemy, Optuna and a driver raise over an address or a database; the last one where it is away at the end
-of a trial, which Optuna does not expect."""
+"""What SQLAlchemy, Optuna and a driver raise over an address or a database."""
 
 
 class DatabaseError(ConfigError):
@@ -70,6 +69,20 @@ def trials_begun(trials: Iterable[SweepTrial]) -> int:
     return sum(trial.run_id is not None and "retry_of" not in trial.attrs for trial in trials)
 
 
+def default_storage(outputs: Path) -> str:
+    """The SQLite database that studies of one machine share; its path is as relative as `outputs`."""
+    path = str(outputs / "sweeps" / "sweeps.db")
+    return URL.create("sqlite", database=path).render_as_string(hide_password=False)
+
+
+def check_address(url: str) -> None:
+    """Raises ConfigError, without showing the address, for one that SQLAlchemy would misread."""
+    if not url.strip():
+        raise ConfigError("storage is empty; give the address of a database, or leave storage= out for SQLite")
+    if url.count("@") > 1 and not url.startswith("sqlite"):
+        raise ConfigError("storage: its address has more than one @; write @ as %40 within user, password and options")
+
+
 @contextmanager
 def file_lock(path: Path) -> Iterator[TextIO]:
     """Wait for the lock file and hold it; closing the file, or the end of the process, releases it before the block."""
@@ -89,8 +102,6 @@ def database_errors(url: str) -> Iterator[None]:
         cause: BaseException | None = error
         while cause is not None and not isinstance(cause, SQLAlchemyError):
             cause = cause.__cause__ or cause.__context__
-        if cause is None and isinstance(error, UnboundLocalError):
-            raise
         error = cause or error
         message = str(getattr(error, "orig", None) or error).strip().splitlines() or [type(error).__name__]
         message = without_secrets(" ".join(line.strip() for line in message[:2]), url)
@@ -209,48 +220,43 @@ class SweepStudy:
             "pid": os.getpid(),
             "start_time": _start_time_of(os.getpid()),
         }
-        taken: list[int] = []
-        ended: list[bool] = []
-        defects: list[BaseException] = []  # not to be taken for errors of the database
-
-        def objective(trial: Trial) -> float:
-            taken.append(trial._trial_id)
-            try:
-                for key, value in (attrs or {}).items():
+        with database_errors(self.url):
+            study = self._load(sampler, pruner)
+            if params is not None:
+                study.enqueue_trial(params, user_attrs=attrs)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "Heartbeat of storage is supposed")  # the trial has one below
+                trial = study.ask()
+        value, state = None, None
+        try:
+            with database_errors(self.url):
+                for key, attr in (attrs or {}).items():
                     if key not in trial.user_attrs:
-                        trial.set_user_attr(key, value)
+                        trial.set_user_attr(key, attr)
                 if choose is not None:
                     choose(trial)
                 trial.set_user_attr("worker", me)
-            finally:
-                lock.close()
-            try:
-                return work(trial)
-            except (TrialEndedError, optuna.TrialPruned):
-                raise
-            except BaseException as error:
-                defects.append(error)
-                raise TrialEndedError from error
-            finally:
-                ended.append(True)
+            lock.close()
+            with get_heartbeat_thread(trial._trial_id, self._storage):
+                value = work(trial)
+        except optuna.TrialPruned:
+            state = TrialState.PRUNED
+        except TrialEndedError:
+            state = TrialState.FAIL
+        except BaseException:
+            with suppress(DatabaseError):
+                self._end(study, trial, None, TrialState.FAIL)
+            raise
+        self._end(study, trial, value, state)
 
+    def _end(self, study: optuna.Study, trial: Trial, value: float | None, state: TrialState | None) -> None:
+        """Store the end of a trial, unless another worker found this one dead, as after a suspended machine."""
         try:
             with database_errors(self.url):
-                study = self._load(sampler, pruner)
-                if params is not None:
-                    study.enqueue_trial(params, user_attrs=attrs)
-                try:
-                    study.optimize(objective, n_trials=1, catch=(TrialEndedError,))
-                except (AssertionError, optuna.exceptions.UpdateFinishedTrialError):
-                    # Another worker found this one dead, as after a suspended machine; the run folder stays.
-                    if not ended:
-                        raise
+                study.tell(trial, value, state, skip_if_finished=True)
         except DatabaseError:
-            self._lost.update(taken)
-            if not defects:
-                raise
-        if defects:
-            raise defects[0]
+            self._lost.add(trial._trial_id)
+            raise
 
     def reconnect(self) -> None:
         """Close open connections: their database may be gone."""
@@ -286,9 +292,9 @@ def _open_storage(url: str) -> RDBStorage:
         arguments = {"connect_args": {"connect_timeout": CONNECT_S}, "pool_pre_ping": True}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        return RDBStorage(
-            for_optuna(url), engine_kwargs=arguments, heartbeat_interval=HEARTBEAT_S, grace_period=GRACE_PERIOD_S
-        )
+        # Optuna reads braces as places to fill in.
+        address = url.replace("{", "{{").replace("}", "}}")
+        return RDBStorage(address, engine_kwargs=arguments, heartbeat_interval=HEARTBEAT_S, grace_period=GRACE_PERIOD_S)
 
 
 def _sweep_trial(trial: FrozenTrial) -> SweepTrial:

@@ -106,7 +106,7 @@ def test_a_search_is_drawn_trial_by_trial():
     }  # fmt: skip
     record = SweepRecord(sweep=search, scale="mini", command="c", seeds=[0], rows={}, runs=runs, study="s", storage="s")
     now = time.time()
-    by_trial, by_rate = search_figures(Sweep(record=record, tables=[], problem=None, taken={}, written=now, now=now))
+    by_trial, by_rate = search_figures(Sweep(record=record, tables=[], problem=None, written=now, now=now))
     assert notes(by_trial)[:3] == ["trial 0", "trial 1", "trial 2"]
     assert notes(by_trial)[3:] == ["best so far: 30", "best so far: 50", "best so far: 50"]
     assert caption(by_rate) == "NDS by optim.lr" and len(notes(by_rate)) == 3

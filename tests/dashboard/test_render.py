@@ -2,9 +2,6 @@
 
 import dataclasses
 import re
-import shlex
-import sqlite3
-import subprocess
 
 import pytest
 from markupsafe import escape
@@ -17,7 +14,6 @@ from src.dashboard.render import (
     flat_config,
     metric_rows,
     signed,
-    study_command,
 )
 from tests.dashboard.experiments import EVIL
 
@@ -120,17 +116,3 @@ def test_configurations_as_lines():
 
 def test_signs():
     assert [signed(v, 1) for v in (1.25, -0.5)] == ["+1.2", "\N{MINUS SIGN}0.5"]
-
-
-def test_commands_for_optunas_dashboard_copy_the_study(tmp_path):
-    source = tmp_path / "it's a study.db"
-    with sqlite3.connect(source) as connection:
-        connection.execute("create table studies (name text)")
-        connection.execute("insert into studies values ('epsilon')")
-    copying, showing = study_command(f"sqlite:///{source}").splitlines()
-    copying = copying.replace("/tmp/study_copy.db", str(tmp_path / "copy.db"))
-    subprocess.run(["bash", "-c", copying.replace("python", "python3", 1)], check=True)
-    assert sqlite3.connect(tmp_path / "copy.db").execute("select * from studies").fetchall() == [("epsilon",)]
-    words = shlex.split(showing)
-    assert words[0] == "optuna-dashboard" and words[words.index("--host") + 1] == "127.0.0.1"
-    assert study_command("postgresql+psycopg://user:***@host/db") is None

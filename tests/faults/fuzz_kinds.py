@@ -42,7 +42,7 @@ from src.report.results import publish_result, read_result
 from src.report.sweep_file import RowConfig, SweepConfig, TableConfig
 from src.report.sweep_record import RunState, SweepRecord, read_record, write_record
 from src.sweep.compose import load_sweep
-from src.sweep.run_status import read_score, read_seconds, read_validations
+from src.sweep.run_status import read_score, read_validations
 from src.training.run_folder import RunFolder
 from src.world.pcd_writer import LIDAR_TYPE, lidar_pcd
 from src.world.write import _read_stored
@@ -397,8 +397,6 @@ def read_run(path: Path, number: int) -> None:
     for name in ("mAP", "NDS", "classes.car.AP", "ranges.50-100.mAP"):
         score = read_score(folder, name)
         assert score is None or np.isfinite(score)
-    seconds = read_seconds(folder)
-    assert seconds is None or 0 <= seconds < 1e10, f"{seconds} seconds"
     assert all(np.isfinite(value) for value in read_validations(folder, "mAP").values())
     folders = RunFolders(outputs)
     assert isinstance(folders.config(RUN), dict)

@@ -14,8 +14,7 @@ from src.sweep.plan import make_plan
 from src.sweep.record_writer import RecordWriter
 from src.sweep.runner import Runner
 from src.sweep.search import Search
-from src.sweep.storage_address import default_storage
-from src.sweep.sweep_study import SweepStudy
+from src.sweep.sweep_study import SweepStudy, default_storage
 from tests.sweep.fake_train import identify
 
 ROOT = Path(__file__).resolve().parents[2]

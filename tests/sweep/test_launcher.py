@@ -95,7 +95,7 @@ def test_weights_and_biases_is_told_sweep_and_row(tmp_path):
     from src.config import compose_config
 
     launcher = Launcher([], tmp_path, 1, [], group="epsilon-mini")
-    spec = RunSpec("r", ["model.ocsf.margin_m=0"], ["logger=wandb"], 0, 'a "b", 4.8 m = x', None)
+    spec = RunSpec("r", ["model.ocsf.margin_m=0"], 0, 'a "b", 4.8 m = x', machine=["logger=wandb"])
     config, _ = compose_config([*spec.overrides, *spec.machine, *launcher.shown_as(spec)])
     assert (config.logger.wandb.group, config.logger.wandb.row) == ("epsilon-mini", spec.label)
     own = replace(spec, machine=["logger=wandb", "logger.wandb.group=mine"])
