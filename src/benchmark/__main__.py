@@ -17,39 +17,17 @@ suite=reader    frames per second of the reader on one core
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import importlib
 from pathlib import Path
-from typing import Any
 
 from src.benchmark.machine import busy_warning, describe_machine
 from src.benchmark.page import markdown, page_name, page_of, write_page
 from src.benchmark.suite_latency import latency_page, measure_latency
-from src.benchmark.suite_metric import compare_with_devkit
-from src.benchmark.suite_model import benchmark_model
-from src.benchmark.suite_ops import benchmark_ops
-from src.benchmark.suite_reader import benchmark_reader
-from src.benchmark.suite_scaling import benchmark_scaling
-from src.benchmark.suite_soak import benchmark_soak
-from src.benchmark.suite_training import benchmark_training
 from src.config import BenchmarkSuite, Config, compose_config
 from src.errors import DataError
 from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.command import run_command
 from src.training.run_folder import make_writable, write_json
-
-VAL_SIZED = {"num_samples": 3000, "gts": 25, "preds": 300}
-"""About the size of the official val split with a full submission."""
-
-SUITES: dict[BenchmarkSuite, Callable[[Config, dict[str, Any]], dict[str, Any]]] = {
-    BenchmarkSuite.model: benchmark_model,
-    BenchmarkSuite.ops: benchmark_ops,
-    BenchmarkSuite.scaling: benchmark_scaling,
-    BenchmarkSuite.training: benchmark_training,
-    BenchmarkSuite.soak: benchmark_soak,
-    BenchmarkSuite.metric: lambda config, tree: compare_with_devkit(**VAL_SIZED, seed=config.seed),
-    BenchmarkSuite.reader: lambda config, tree: benchmark_reader(config),
-}
-"""What measures each suite, of the configuration and the same as a plain tree."""
 
 
 def main(overrides: list[str]) -> None:
@@ -67,7 +45,8 @@ def main(overrides: list[str]) -> None:
     warning = busy_warning(machine)
     if warning:
         print(warning)
-    page = page_of(config.suite.value, overrides, machine, SUITES[config.suite](config, tree))
+    suite = importlib.import_module(f"src.benchmark.suite_{config.suite.value}")
+    page = page_of(config.suite.value, overrides, machine, suite.measure(config, tree))
     print(markdown(page))
     if config.out:
         name = page_name(config)

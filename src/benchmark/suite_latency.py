@@ -69,14 +69,14 @@ def benchmark_latency(
     frames, measured, seen = endless_stream(datamodule), [], 0
     while len(measured) < MEASURED_FRAMES:
         frame, number = next(frames)
-        frame, timings = frame.to(device), {}
-        with timed_parts(detector.model, parts, timings, device):
+        frame = frame.to(device)
+        with timed_parts(detector.model, parts, now) as seconds:
             begin = now()
             detector.run(frame)
-            total = now() - begin
+            whole = now() - begin
         seen += 1
         if seen > WARM_UP_FRAMES and number >= full:
-            measured.append({name: 1e3 * sum(calls) for name, calls in timings.items()} | {"total": 1e3 * total})
+            measured.append({name: 1e3 * value for name, value in (seconds | {"total": whole}).items()})
     columns = {name: [row[name] for row in measured] for name in (*parts, "total") if name in measured[0]}
     medians = {name: median_iqr(values) for name, values in columns.items()}
     return {

@@ -35,7 +35,7 @@ POINTS = ("radar_points", "lidar_points")  # of a batch, None without the sensor
 WHOLE = "whole: frame to boxes, step to gradients"
 
 
-def benchmark_model(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
+def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """The configured model on the first training batch; see `measure_parts` for the columns."""
     torch.manual_seed(config.seed)
     device = config.trainer.device()

@@ -28,7 +28,7 @@ from src.models.backbones.sparse_voxel import RadarEncoder, RadarEncoderConfig
 from src.ops.sites import Sites
 
 
-def benchmark_ops(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
+def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """Tables of sparse convolutions, of the whole radar backbone, and of everything else.
 
     Raises ConfigError for a model without a sparse radar backbone.

@@ -7,7 +7,6 @@ import resource
 import statistics
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from functools import partial
 from itertools import chain, cycle, islice, repeat
 from pathlib import Path
@@ -18,15 +17,14 @@ import torch
 from PIL import Image
 
 from src.assembly import build_datamodule, data_root
-from src.benchmark.parts import wrapped_parts
-from src.benchmark.timing import interleaved, milliseconds
+from src.benchmark.timing import interleaved, milliseconds, timed_parts
 from src.config import Config
 from src.data import images
 from src.data.augment import AugmentationConfig
 from src.data.datamodule import DetectionDataModule
 from src.data.frame_loader import collate
 from src.data.images import width_fit
-from src.data.jpeg import decode_fast, decoder_name
+from src.data.jpeg import decoder_name
 from src.data.pcd import RADAR_FIELDS, read_radar_points
 from src.data.schema import CHANNELS
 from src.data.splits import split_samples
@@ -50,7 +48,7 @@ STAGES = {
 """Functions of the reader by the names under which it calls them; what is in none of them is `assembling`."""
 
 
-def benchmark_reader(config: Config) -> dict[str, Any]:
+def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """CPU seconds of reading, augmenting and batching in this process, on one thread; then beside a loader's worker.
 
     The frames are the training split's, over and over with other draws of the augmentation, from the system's file
@@ -116,55 +114,28 @@ def sweep_paths(datamodule: DetectionDataModule, sample: int, channels: tuple[st
 # -------------------------------------------------------------------- stages
 
 
-class StageClock:
-    """CPU seconds of nested calls by stage; a stage's own are without those of the stages within it."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._within = [0.0]
-
-    def timed(self, stage: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, which now counts for the stage."""
-
-        def call(*arguments: Any, **named: Any) -> Any:
-            self._within.append(0.0)
-            begin = time.process_time()
-            try:
-                return function(*arguments, **named)
-            finally:
-                elapsed = time.process_time() - begin
-                self.seconds[stage] = self.seconds.get(stage, 0.0) + elapsed - self._within.pop()
-                self._within[-1] += elapsed
-
-        return call
-
-
-def timed_stages(clock: StageClock) -> AbstractContextManager[None]:
-    """Within the context the reader's stages count on the clock."""
-    return wrapped_parts(torch.nn.Module(), STAGES, lambda stage, path, function: clock.timed(stage, function))
-
-
 def time_frames(
     datamodule: DetectionDataModule, samples: list[int], augmentation: AugmentationConfig | None
 ) -> dict[str, list[float]]:
     """CPU seconds of every frame by stage, of `all` stages, and its `wall` seconds; a batch's collation is shared."""
     columns: dict[str, list[float]] = {stage: [] for stage in (*STAGES, "assembling", "collate", "all", "wall")}
-    frames, size = [], datamodule.config.batch_size
+    frames = []
     for number, sample in enumerate(islice(cycle(samples), WARM_UP_FRAMES + READER_FRAMES)):
-        clock = StageClock()
-        with timed_stages(clock):
-            wall = time.perf_counter()
-            read = clock.timed("assembling", datamodule.reader.read)
-            frames.append(read(sample, augmentation, datamodule.seed, number))
-            if len(frames) == size:
-                clock.timed("collate", collate)(frames)
-                frames = []
-            wall = time.perf_counter() - wall
+        wall, begin = time.perf_counter(), time.process_time()
+        with timed_parts(torch.nn.Module(), STAGES, time.process_time) as called:
+            frames.append(datamodule.reader.read(sample, augmentation, datamodule.seed, number))
+        read = time.process_time()
+        if len(frames) == datamodule.config.batch_size:
+            collate(frames)
+            frames = []
+        end, wall = time.process_time(), time.perf_counter() - wall
+        seconds = dict.fromkeys(STAGES, 0.0) | called
+        seconds["resample"] -= seconds["mirror and rotate"]  # which it calls
+        seconds["assembling"] = read - begin - sum(seconds.values())
+        seconds |= {"collate": end - read, "all": end - begin, "wall": wall}
         if number >= WARM_UP_FRAMES:
-            for stage in (*STAGES, "assembling", "collate"):
-                columns[stage].append(clock.seconds.get(stage, 0.0))
-            columns["all"].append(sum(clock.seconds.values()))
-            columns["wall"].append(wall)
+            for stage, column in columns.items():
+                column.append(seconds[stage])
     columns["collate"] = [statistics.mean(columns["collate"])] * READER_FRAMES
     return columns
 
@@ -215,9 +186,9 @@ def compare_decoding(datamodule: DetectionDataModule, sample: int) -> list[dict[
 
     candidates: dict[str, Callable[[], Any]] = {
         "decode, resize, crop": lambda: [naive_image(path, size_px) for path, _ in files],
-        "decode at 1/2^n, resize the crop: Pillow": partial(with_decoder, images.decode_by_pillow),
+        "decode at 1/2^n, resize the crop: Pillow": partial(with_decoder, partial(images.decode, fast=False)),
     }
-    if decode_fast(*files[0], 1) is not None:
+    if not decoder_name().startswith("Pillow"):
         candidates[f"the same: {decoder_name()}"] = partial(with_decoder, images.decode)
     return compare(candidates)
 

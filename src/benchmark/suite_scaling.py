@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import logging
-import math
 import statistics
 from collections.abc import Callable
 from contextlib import suppress
@@ -26,7 +25,7 @@ from src.benchmark.cases import (
 from src.benchmark.counting import counted_work
 from src.benchmark.page import gpu_notes, page_name
 from src.benchmark.parts import is_within, parts_of, tensors_in
-from src.benchmark.plots import draw_scaling
+from src.benchmark.plots import draw_scaling, held_mib
 from src.benchmark.scenes import FRAME_SENSORS, ROADS, Highway, highway_frame, highway_points
 from src.benchmark.timing import added_mib, clock, interleaved, milliseconds, timed_parts
 from src.config import Config, compose_config
@@ -64,7 +63,7 @@ class Point:
     memory_frames: int | None = None  # None: as configured
 
 
-def benchmark_scaling(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
+def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """Time and memory of a frame without its image encoder, at every point of every sweep; growth first.
 
     Raises ConfigError for a model that reads what a made frame does not have.
@@ -172,7 +171,7 @@ def measure_sweep(
 def measure_cases(cases: dict[str, Case]) -> tuple[dict[str, list[float]], dict[str, dict[str, list[float]]]]:
     """Seconds of a frame and of its parts, the models in turns; the frame is timed with its parts' clocks running."""
     parts: dict[str, dict[str, list[float]]] = {model: {} for model in cases}
-    device = next(iter(cases.values())).device
+    now = clock(next(iter(cases.values())).device)
 
     def timed(model: str, case: Case) -> Callable[[], None]:
         paths = {
@@ -182,16 +181,15 @@ def measure_cases(cases: dict[str, Case]) -> tuple[dict[str, list[float]], dict[
         }
 
         def run() -> None:
-            calls: dict[str, list[float]] = {}
-            with timed_parts(case.prepared, paths, calls, device):
+            with timed_parts(case.prepared, paths, now) as seconds:
                 case.infer()
-            for name, values in calls.items():  # several methods of one part
-                parts[model].setdefault(name, []).append(math.fsum(values))
+            for name, value in seconds.items():
+                parts[model].setdefault(name, []).append(value)
 
         return run
 
     candidates = {model: timed(model, case) for model, case in cases.items()}
-    return interleaved(candidates, clock(device), ROUNDS, BUDGET_S), parts
+    return interleaved(candidates, now, ROUNDS, BUDGET_S), parts
 
 
 def make_case(config: Config, point: Point, device: torch.device) -> tuple[Case, int]:
@@ -268,8 +266,3 @@ def growth_rows(measured: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any
                 row |= {ratio: other["ms"] / first["ms"], f"GFLOP {ratio}": other["GFLOP"] / first["GFLOP"]}
         rows.append(row)
     return rows
-
-
-def held_mib(point: dict[str, Any]) -> float:
-    """What a frame adds and what is remembered."""
-    return (point["added MiB"] or 0.0) + point["remembered MiB"]

@@ -47,7 +47,7 @@ DRIVE, CLIPS, TRAINING = "inference, one drive", "inference, clip by clip", "tra
 Row = dict[str, Any]
 
 
-def benchmark_soak(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
+def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """Curves over three long passes, after how much each quantity grows; see `Curve` for what is measured.
 
     Raises ConfigError for a phase without memory.
@@ -271,12 +271,7 @@ def kept_alive_mib(tensors: list[Tensor]) -> float:
 class _Mallinfo(ctypes.Structure):
     """glibc's `struct mallinfo2`."""
 
-    _fields_ = [
-        (name, ctypes.c_size_t)
-        for name in (
-            "arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost",
-        )
-    ]  # fmt: skip
+    _fields_ = [("counts", 10 * ctypes.c_size_t)]  # hblkhd, of mappings, is the fifth; uordblks, of arenas, the eighth
 
 
 def heap_mib() -> float | None:
@@ -286,8 +281,8 @@ def heap_mib() -> float | None:
     except (OSError, AttributeError):
         return None
     mallinfo.restype = _Mallinfo
-    info = mallinfo()
-    return (info.uordblks + info.hblkhd) / 2**20
+    counts = mallinfo().counts
+    return (counts[4] + counts[7]) / 2**20
 
 
 def number_in(folder: str) -> int | None:

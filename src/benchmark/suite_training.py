@@ -26,7 +26,7 @@ MEASURED_STEPS = 40  # enough for quartiles of a step whose work follows the sce
 PROFILED_STEPS = 2  # one to warm up
 
 
-def benchmark_training(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
+def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """Seconds of a step and its four stages, in two passes over the same batches with the same weights.
 
     `with loader` waits for the batches as training does; its workers share the machine. `loaded` finds them in memory.
@@ -112,8 +112,8 @@ def timed_step(
 ) -> dict[str, float]:
     """One optimiser step as the trainer makes it; seconds by stage."""
     now = clock(device)
-    parts: dict[str, list[float]] = {}
-    with warnings.catch_warnings(), timed_parts(module, {"run": ("run",), "loss": ("model.loss",)}, parts, device):
+    paths = {"forward": ("run",), "loss": ("model.loss",)}
+    with warnings.catch_warnings(), timed_parts(module, paths, now) as parts:
         warnings.filterwarnings("ignore", message=".*self.trainer.*")  # nothing is logged without a trainer
         begin = now()
         with torch.autocast(device.type, dtype=torch.bfloat16, enabled=autocast):
@@ -126,11 +126,5 @@ def timed_step(
         optimizer.step()
         schedule.step()
         end = now()
-    (forward,), (loss,) = parts["run"], parts["loss"]
-    return {
-        "forward": forward,
-        "loss": loss,
-        "backward": went_back - computed,
-        "optimiser": end - went_back,
-        "bookkeeping": computed - begin - forward - loss,  # the module's checks and means
-    }
+    rest = computed - begin - sum(parts.values())  # the module's checks and means
+    return {**parts, "backward": went_back - computed, "optimiser": end - went_back, "bookkeeping": rest}

@@ -102,23 +102,21 @@ MODES = {"forward": torch.no_grad(), "f+b": with_gradient}
 
 
 @contextmanager
-def timed_parts(
-    model: nn.Module, parts: Paths, timings: dict[str, list[float]], device: torch.device
-) -> Iterator[None]:
-    """Within the context every call of these parts appends its seconds to `timings` under the part's name."""
-    now = clock(device)
+def timed_parts(model: nn.Module, parts: Paths, now: Callable[[], float]) -> Iterator[dict[str, float]]:
+    """Within the context the calls of every part add their seconds to what it yields, under the part's name."""
+    seconds: dict[str, float] = {}
 
     def timed(name: str, path: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **named: Any) -> Any:
             started = now()
             result = function(*arguments, **named)
-            timings.setdefault(name, []).append(now() - started)
+            seconds[name] = seconds.get(name, 0.0) + now() - started
             return result
 
         return call
 
     with wrapped_parts(model, parts, timed):
-        yield
+        yield seconds
 
 
 # ---------------------------------------------------------------- bytes

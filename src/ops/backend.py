@@ -17,43 +17,26 @@ TRITON = "triton"
 # The environment variable that chooses the backend of a process, and the one of Triton's interpreter.
 VARIABLE = "HORIZON3D_OPS"
 INTERPRETER = "TRITON_INTERPRET"
-# Modules that register kernels, imported when their operation first runs in that backend: Triton is a large import.
+# Modules with an operation's kernel, imported when it first runs in that backend: Triton is a large import.
 KERNELS = {
-    TRITON: {
-        "farthest_points": "src.ops.kernels.farthest_point_triton",
-        "sparse_conv": "src.ops.kernels.sparse_conv_triton",
-        "splat": "src.ops.kernels.splat_triton",
-    }
+    "farthest_points": "src.ops.kernels.farthest_point_triton",
+    "sparse_conv": "src.ops.kernels.sparse_conv_triton",
+    "splat": "src.ops.kernels.splat_triton",
 }
 
-_implementations: dict[str, dict[str, Callable[..., Any]]] = {}
 _chosen: str | None = None  # until the first operation asks
 
 
-def register(operation: str, backend: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: make a function the implementation of `operation` in `backend`."""
-
-    def keep(function: Callable[..., Any]) -> Callable[..., Any]:
-        _implementations.setdefault(operation, {})[backend] = function
-        return function
-
-    return keep
-
-
-def available() -> tuple[str, ...]:
-    """Names of the backends that can run in this process."""
-    names = {name for table in _implementations.values() for name in table} | {REFERENCE, TRITON}
-    return tuple(sorted(names - ({TRITON} if _triton_obstacle() else set())))
-
-
 def use(name: str) -> None:
-    """Choose the backend of this process; operations it lacks stay with the torch reference.
+    """Choose the backend of this process.
 
-    Raises ValueError for a name that is not available.
+    Raises ConfigError, in the words of HORIZON3D_OPS, for a name that is unknown or cannot run here.
     """
     global _chosen
-    if name not in available():
-        raise ValueError(f"backend {name!r}: expected one of {', '.join(available())}")
+    if name not in (REFERENCE, TRITON):
+        raise ConfigError(f"{VARIABLE}={name}: expected {REFERENCE} or {TRITON}, or leave it unset")
+    if name == TRITON and (obstacle := _triton_obstacle()):
+        raise ConfigError(f"{VARIABLE}={name}: {obstacle}; unset it or set {VARIABLE}={REFERENCE}")
     _chosen = name
 
 
@@ -62,19 +45,18 @@ def chosen() -> str:
 
     The first call decides for the process. Raises ConfigError for a HORIZON3D_OPS that is unknown or cannot run here.
     """
-    global _chosen
     if _chosen is None:
-        _chosen = _first_choice()
+        fastest = TRITON if torch.cuda.is_available() and not _triton_obstacle() else REFERENCE
+        use(os.environ.get(VARIABLE) or fastest)
     return _chosen
 
 
-def implementation(operation: str, backend: str | None = None) -> Callable[..., Any]:
-    """The function that runs `operation` in the given backend, by default the chosen one, else its torch reference."""
-    name = chosen() if backend is None else backend
-    table = _implementations[operation]
-    if name not in table and operation in KERNELS.get(name, {}):
-        importlib.import_module(KERNELS[name][operation])
-    return table.get(name, table[REFERENCE])
+def implementation(reference: Callable[..., Any]) -> Callable[..., Any]:
+    """The function that runs an operation in the chosen backend, of its torch reference `<operation>_reference`."""
+    if chosen() == REFERENCE:
+        return reference
+    operation = reference.__name__.removesuffix("_reference")
+    return getattr(importlib.import_module(KERNELS[operation]), f"{operation}_{TRITON}")
 
 
 def runs_kernels(tensor: Tensor) -> bool:
@@ -85,17 +67,6 @@ def runs_kernels(tensor: Tensor) -> bool:
 def interpreted() -> bool:
     """Whether Triton was asked to interpret its kernels on the CPU, which is for tests."""
     return os.environ.get(INTERPRETER) == "1"
-
-
-def _first_choice() -> str:
-    wanted = os.environ.get(VARIABLE, "")
-    if not wanted:
-        return TRITON if torch.cuda.is_available() and not _triton_obstacle() else REFERENCE
-    if wanted not in (REFERENCE, *KERNELS):
-        raise ConfigError(f"{VARIABLE}={wanted}: expected {' or '.join((REFERENCE, *KERNELS))}, or leave it unset")
-    if wanted == TRITON and (obstacle := _triton_obstacle()):
-        raise ConfigError(f"{VARIABLE}={wanted}: {obstacle}; unset it or set {VARIABLE}={REFERENCE}")
-    return wanted
 
 
 def _triton_obstacle() -> str | None:

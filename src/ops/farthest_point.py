@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from src.ops.backend import implementation, register
+from src.ops.backend import implementation
 
 
 @torch.no_grad()
@@ -26,10 +26,9 @@ def farthest_points(
             f"points {list(points.shape)}, valid {list(valid.shape)} and start {list(start.shape)} must be [B, G, 2], "
             "[B, G] and [B]"
         )
-    return implementation("farthest_points")(points, valid, start, count)
+    return implementation(farthest_points_reference)(points, valid, start, count)
 
 
-@register("farthest_points", "reference")
 def farthest_points_reference(points: Tensor, valid: Tensor, start: Tensor, count: int) -> Tensor:
     """One iteration per pick: in numpy on a CPU, a tenth of torch's time, else in torch."""
     if points.device.type != "cpu":

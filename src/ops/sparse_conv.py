@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from src.ops.backend import implementation, register
+from src.ops.backend import implementation
 from src.ops.kernel_maps import KernelMap
 from src.ops.segment_reduce import gather_segment_sum
 from src.ops.sparse_conv_grouped import GROUPED_DTYPES, grouped_sparse_conv
@@ -29,7 +29,7 @@ def sparse_conv(
         features, weight = features.to(dtype), weight.to(dtype)
         bias = None if bias is None else bias.to(dtype)
     _check(features, weight, kernel_map, bias)
-    return implementation("sparse_conv")(features, weight, kernel_map, bias)
+    return implementation(sparse_conv_reference)(features, weight, kernel_map, bias)
 
 
 @torch.no_grad()
@@ -42,7 +42,6 @@ def neighbour_sum(
     return gather_segment_sum(features, kernel_map.inputs.index_select(0, order), starts)
 
 
-@register("sparse_conv", "reference")
 def sparse_conv_reference(
     features: Tensor,  # [M_in, Cin]
     weight: Tensor,  # [K, Cin, Cout]

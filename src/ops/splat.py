@@ -12,13 +12,16 @@ from torch.autograd.function import FunctionCtx
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import rotate_back
-from src.ops.backend import implementation, register
+from src.ops.backend import implementation
 from src.ops.gaussian_cells import GaussianCellPairs, gaussian_cells
 from src.ops.segment_reduce import gather_segment_sum, inverse_rows, rank_per_sample, weighted_segment_sum
 from src.ops.sites import Sites
 
 # A contribution is at most 1 - CAP, so that the logarithm of the free probability stays finite.
 CAP = 1e-4
+
+Choice = tuple[Tensor, float, int, int]
+"""Of the occupied cells: the support, threshold, max_cells and the cells of a sample."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,16 +100,22 @@ def splat_gaussians(
         )
     dtype = torch.float64 if means.dtype == torch.float64 else torch.float32
     with torch.autocast(means.device.type, enabled=False):
-        return implementation("splat")(
-            *(x.to(dtype) for x in (means, scales, directions, opacity_logits, features)),
-            batch,
-            grid,
-            batch_size,
-            threshold,
-            max_cells,
-            support_sigmas,
-            smooth_cap,
+        gaussians = [x.to(dtype) for x in (means, scales, directions, opacity_logits, features)]
+        pairs, support = gaussian_cells(*gaussians[:3], batch, grid, batch_size, support_sigmas)
+        choice = (support, threshold, max_cells, grid.rows * grid.cols)
+        log_free, out, occupied_rows, peak_cell, num_cut = implementation(splat_reference)(
+            *gaussians, pairs, choice, smooth_cap
         )
+    return Splat(
+        support=support,
+        log_free=log_free,
+        occupied=Sites.from_linear(support.index_select(0, occupied_rows), (batch_size, grid.rows, grid.cols)),
+        features=out,
+        occupied_rows=occupied_rows,
+        active=peak_cell >= 0,
+        peak_cell=peak_cell,
+        num_cut=num_cut,
+    )
 
 
 class _LogFree(torch.autograd.Function):
@@ -182,26 +191,21 @@ class _Distance(torch.autograd.Function):
         return grad_means, -sums[:, 2:4] / scales, sums[:, 4:6], None
 
 
-@register("splat", "reference")
 def splat_reference(
     means: Tensor,
     scales: Tensor,
     directions: Tensor,
     opacity_logits: Tensor,
     features: Tensor,
-    batch: Tensor,
-    grid: BEVGrid,
-    batch_size: int,
-    threshold: float,
-    max_cells: int,
-    support_sigmas: float,
+    pairs: GaussianCellPairs,
+    choice: Choice,
     smooth_cap: bool,
-) -> Splat:
-    """Plain torch form over ragged (Gaussian, cell) pairs; arguments as `splat_gaussians`."""
-    pairs, support = gaussian_cells(means, scales, directions, batch, grid, batch_size, support_sigmas)
+) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
+    """Plain torch form: `log_free`, `features`, `occupied_rows`, `peak_cell` and `num_cut` of a `Splat`."""
+    support = choice[0]
     q = _Distance.apply(means, scales, directions, pairs)
     log_free = _LogFree.apply(q, opacity_logits, pairs, smooth_cap)
-    occupied_rows, num_cut = occupied_cells(log_free.detach(), support, threshold, max_cells, grid.rows * grid.cols)
+    occupied_rows, num_cut = occupied_cells(log_free.detach(), *choice)
 
     # Pairs of the occupied cells, and their order by Gaussian.
     cell = inverse_rows(occupied_rows, len(support)).index_select(0, pairs.cell)
@@ -212,18 +216,8 @@ def splat_reference(
     by_gaussian = rank[kept.index_select(0, pairs.by_gaussian)]
     distance = q.index_select(0, chosen)
     out = weighted_segment_sum(features, torch.exp(-0.5 * distance), gaussian, cell, len(occupied_rows), by_gaussian)
-    keys = support.index_select(0, occupied_rows)
-    peak_cell = _nearest_cell(distance.detach(), gaussian, keys.index_select(0, cell), len(means))
-    return Splat(
-        support=support,
-        log_free=log_free,
-        occupied=Sites.from_linear(keys, (batch_size, grid.rows, grid.cols)),
-        features=out,
-        occupied_rows=occupied_rows,
-        active=peak_cell >= 0,
-        peak_cell=peak_cell,
-        num_cut=num_cut,
-    )
+    keys = support.index_select(0, occupied_rows).index_select(0, cell)
+    return log_free, out, occupied_rows, _nearest_cell(distance.detach(), gaussian, keys, len(means)), num_cut
 
 
 def occupied_cells(

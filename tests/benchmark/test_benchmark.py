@@ -5,8 +5,7 @@ import json
 import pytest
 import torch
 
-from src.benchmark import __main__ as benchmark
-from src.benchmark import convolutions, machine, naive
+from src.benchmark import convolutions, machine, naive, suite_metric
 from src.benchmark import operation_table as operations
 from src.benchmark import suite_model as model
 from src.benchmark import suite_scaling as scaling
@@ -189,7 +188,7 @@ def test_scaling(outputs, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_disagreement_of_the_metric_is_an_error_after_the_page(tmp_path, monkeypatch):
-    monkeypatch.setattr(benchmark, "compare_with_devkit", lambda **_: {"agrees": False, "max_difference": 0.5})
+    monkeypatch.setattr(suite_metric, "compare_with_devkit", lambda **_: {"agrees": False, "max_difference": 0.5})
     with pytest.raises(DataError, match="disagree"):
         main(["suite=metric", f"out={tmp_path}"])
     assert "max_difference 0.5" in (tmp_path / "metric.md").read_text()

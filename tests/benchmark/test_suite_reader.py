@@ -5,19 +5,18 @@ import types
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from src.benchmark import suite_reader as suite
 from src.benchmark.suite_reader import (
     STAGES,
-    StageClock,
-    benchmark_reader,
     fields_one_by_one,
     loader_row,
     naive_image,
     time_frames,
-    timed_stages,
 )
+from src.benchmark.timing import timed_parts
 from src.config import compose_config
 from src.data import images, reader
 from src.data.images import read_image, width_fit
@@ -39,33 +38,8 @@ def short(monkeypatch):
         monkeypatch.setattr(suite, name, 4)
 
 
-def test_a_stage_counts_without_the_stages_within(monkeypatch):
-    now = 0.0
-
-    def pass_by(seconds):
-        nonlocal now
-        now += seconds
-
-    monkeypatch.setattr(suite.time, "process_time", lambda: now)
-    clock = StageClock()
-    inner = clock.timed("inner", lambda: pass_by(2))
-    outer = clock.timed("outer", lambda: (pass_by(10), inner(), inner()))
-    outer()
-    assert clock.seconds == {"inner": 4, "outer": 10}
-
-    def fails():
-        inner()
-        raise ValueError
-
-    with pytest.raises(ValueError):
-        clock.timed("outer", fails)()
-    clock.timed("outermost", outer)()
-    assert clock.seconds == {"inner": 10, "outer": 20, "outermost": 0}
-
-
-@pytest.mark.slow
 def test_every_part_of_the_suite(config):
-    result = benchmark_reader(config)
+    result = suite.measure(config, {})
     assert result["frames_per_second"] == pytest.approx(4 / result["cpu_seconds"])
     stages = {row["stage"]: row for row in result["stages"]}
     assert {*STAGES, "assembling", "collate"} - set(stages) == {"LiDAR files", "LiDAR compensation"}
@@ -83,7 +57,7 @@ def test_every_part_of_the_suite(config):
 def test_measuring_leaves_the_reader_as_it_was(config):
     places = [(images, "decode"), (images, "resample"), (images, "turn"), (reader, "read_radar_points")]
     before = [getattr(module, name) for module, name in places]
-    with pytest.raises(RuntimeError), timed_stages(StageClock()):
+    with pytest.raises(RuntimeError), timed_parts(torch.nn.Module(), STAGES, time.process_time):
         assert images.resample is not before[1]
         raise RuntimeError
     assert [getattr(module, name) for module, name in places] == before

@@ -187,7 +187,7 @@ def test_a_drive_over_many_clips_stays_rigid():
 def test_soak_needs_a_memory():
     config, tree = compose_config(["scale=debug", "phase=phase1"])
     with pytest.raises(ConfigError, match="give phase=phase2"):
-        soak.benchmark_soak(config, tree)
+        soak.measure(config, tree)
 
 
 @pytest.mark.slow

@@ -7,14 +7,14 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from src.ops.backend import REFERENCE, TRITON, implementation, register, runs_kernels
+from src.ops.backend import runs_kernels
+from src.ops.farthest_point import farthest_points_reference
 
 # A sample's points and gaps stay in registers: beyond this many they would spill, and the reference takes over.
 MOST_POINTS = 8192
 POINTS_PER_WARP = 512
 
 
-@register("farthest_points", TRITON)
 def farthest_points_triton(
     points: Tensor,  # [B, G, 2] m
     valid: Tensor,  # [B, G] bool
@@ -24,7 +24,7 @@ def farthest_points_triton(
     """The picks of the reference, all of a sample in one launch; takes float32 and at most MOST_POINTS points."""
     b, g = valid.shape
     if points.dtype != torch.float32 or g > MOST_POINTS or not runs_kernels(points):
-        return implementation("farthest_points", REFERENCE)(points, valid, start, count)
+        return farthest_points_reference(points, valid, start, count)
     picks = torch.full((b, count), -1, dtype=start.dtype, device=points.device)
     if picks.numel() == 0 or g == 0:
         return picks

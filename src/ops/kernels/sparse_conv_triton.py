@@ -11,9 +11,10 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from src.ops.backend import REFERENCE, TRITON, implementation, interpreted, register, runs_kernels
+from src.ops.backend import interpreted, runs_kernels
 from src.ops.kernel_maps import KernelMap
 from src.ops.segment_reduce import gather_segment_sum
+from src.ops.sparse_conv import sparse_conv_reference
 from src.ops.sparse_conv_function import SparseConvFunction
 
 DTYPES = (torch.float32, torch.float16, torch.bfloat16)
@@ -46,7 +47,6 @@ class Neighbours:
     num_taps: Tensor  # [blocks] int32, how many those are
 
 
-@register("sparse_conv", TRITON)
 def sparse_conv_triton(
     features: Tensor,  # [M_in, Cin]
     weight: Tensor,  # [K, Cin, Cout]
@@ -55,7 +55,7 @@ def sparse_conv_triton(
 ) -> Tensor:  # [M_out, Cout]
     """The reference's sums in float32, in one launch forward and two or three backward; a linear layer stays one."""
     if kernel_map.identity or features.dtype not in DTYPES or not runs_kernels(features):
-        return implementation("sparse_conv", REFERENCE)(features, weight, kernel_map, bias)
+        return sparse_conv_reference(features, weight, kernel_map, bias)
     return SparseConvFunction.apply(features.contiguous(), weight, bias, kernel_map, _forward, _gradients)
 
 

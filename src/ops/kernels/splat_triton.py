@@ -11,12 +11,10 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from src.geometry.bev_grid import BEVGrid
-from src.ops.backend import REFERENCE, TRITON, implementation, register, runs_kernels
-from src.ops.gaussian_cells import GaussianCellPairs, gaussian_cells
+from src.ops.backend import runs_kernels
+from src.ops.gaussian_cells import GaussianCellPairs
 from src.ops.segment_reduce import inverse_rows
-from src.ops.sites import Sites
-from src.ops.splat import CAP, Splat, occupied_cells
+from src.ops.splat import CAP, Choice, occupied_cells, splat_reference
 
 # Cells a program sums the free probability of, one lane each.
 CELLS = 128
@@ -30,44 +28,23 @@ TILE = 4096
 LN2 = tl.constexpr(math.log(2.0))
 
 
-@register("splat", TRITON)
 def splat_triton(
     means: Tensor,
     scales: Tensor,
     directions: Tensor,
     opacity_logits: Tensor,
     features: Tensor,
-    batch: Tensor,
-    grid: BEVGrid,
-    batch_size: int,
-    threshold: float,
-    max_cells: int,
-    support_sigmas: float,
+    pairs: GaussianCellPairs,
+    choice: Choice,
     smooth_cap: bool,
-) -> Splat:
-    """The reference's pairs, with three kernels over them forward and one backward; arguments as `splat_gaussians`."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
+    """The reference's results by three kernels over the pairs forward and one backward."""
+    gaussians = (means, scales, directions, opacity_logits, features)
     if means.dtype != torch.float32 or not runs_kernels(means):
-        return implementation("splat", REFERENCE)(
-            *(means, scales, directions, opacity_logits, features, batch),
-            *(grid, batch_size, threshold, max_cells, support_sigmas, smooth_cap),
-        )
-    pairs, support = gaussian_cells(means, scales, directions, batch, grid, batch_size, support_sigmas)
+        return splat_reference(*gaussians, pairs, choice, smooth_cap)
     # Any surprise -log a that the cap binds for becomes `least`; the smooth cap adds to all of them instead.
     extra, least = (CAP, 0.0) if smooth_cap else (0.0, -math.log1p(-CAP))
-    choice = (support, threshold, max_cells, grid.rows * grid.cols)
-    log_free, out, occupied_rows, peak_cell, num_cut = _Splat.apply(
-        means, scales, directions, opacity_logits, features, pairs, choice, extra, least
-    )
-    return Splat(
-        support=support,
-        log_free=log_free,
-        occupied=Sites.from_linear(support.index_select(0, occupied_rows), (batch_size, grid.rows, grid.cols)),
-        features=out,
-        occupied_rows=occupied_rows,
-        active=peak_cell >= 0,
-        peak_cell=peak_cell,
-        num_cut=num_cut,
-    )
+    return _Splat.apply(*gaussians, pairs, choice, extra, least)
 
 
 class _Splat(torch.autograd.Function):
@@ -82,7 +59,7 @@ class _Splat(torch.autograd.Function):
         opacity_logits: Tensor,
         features: Tensor,
         pairs: GaussianCellPairs,
-        choice: tuple[Tensor, float, int, int],  # support, threshold, max_cells, cells of a sample
+        choice: Choice,
         extra: float,
         least: float,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:

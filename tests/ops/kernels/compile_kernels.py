@@ -12,6 +12,7 @@ from triton.runtime.jit import JITFunction
 
 from src.geometry.bev_grid import BEVGrid
 from src.ops import Sites, submanifold_map
+from src.ops.gaussian_cells import gaussian_cells
 from src.ops.kernels import farthest_point_triton, sparse_conv_triton, splat_triton
 
 
@@ -58,8 +59,9 @@ def main():
     direction = torch.tensor([[1.0, 0.0]])
     gaussian = (torch.zeros(1, 2), torch.ones(1, 2), direction, torch.zeros(1), torch.zeros(1, 128))
     inputs = [x.requires_grad_() for x in gaussian]
-    out = splat_triton.splat_triton(*inputs, torch.zeros(1).long(), grid, 1, 0.1, 99, 3.0, False)
-    torch.autograd.grad(out.log_free.sum() + out.features.sum(), inputs)
+    pairs, support = gaussian_cells(*inputs[:3], torch.zeros(1).long(), grid, 1, 3.0)
+    log_free, features, *_ = splat_triton.splat_triton(*inputs, pairs, (support, 0.1, 99, 80), False)
+    torch.autograd.grad(log_free.sum() + features.sum(), inputs)
 
 
 if __name__ == "__main__":

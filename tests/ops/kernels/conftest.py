@@ -1,5 +1,6 @@
 """Where kernels run: on a GPU, or on the CPU in the process of Triton's interpreter (see test_without_a_gpu.py)."""
 
+import importlib
 import os
 from importlib.util import find_spec
 
@@ -20,11 +21,10 @@ def device(request, monkeypatch):
     if find_spec("triton") is None:
         pytest.skip("Triton is not installed")
     monkeypatch.setattr(backend, "_chosen", "triton")
-    for operation in backend.KERNELS["triton"]:
-        kernel = backend.implementation(operation)
-        assert kernel.__name__.endswith("_triton")
-        reference = backend.implementation(operation, "reference")
-        monkeypatch.setitem(backend._implementations[operation], "reference", for_float64(reference))
+    for operation, name in backend.KERNELS.items():
+        module, fallback = importlib.import_module(name), f"{operation}_reference"
+        assert backend.implementation(getattr(module, fallback)) is getattr(module, f"{operation}_triton")
+        monkeypatch.setattr(module, fallback, for_float64(getattr(module, fallback)))
     return torch.device(request.param)
 
 
