@@ -85,25 +85,20 @@ def decode(
     path: str | os.PathLike[str],
     source_px: tuple[int, int],  # (height, width) as the tables state it
     reduction: int,  # one of REDUCTIONS
+    fast: bool = True,
 ) -> Image.Image:  # RGB
-    """The whole image at 1/`reduction` of its size, by the fastest decoder at hand; raises DataError as `read_image`.
+    """The whole image at 1/`reduction` of its size, by the fastest decoder at hand unless `fast` is False.
 
-    Whichever it is, the pixels are the same (`src.data.jpeg`).
+    Whichever it is, the pixels are the same (`src.data.jpeg`). Raises DataError as `read_image`.
     """
-    image = decode_fast(path, source_px, reduction) if source_px[0] * source_px[1] <= MAX_PIXELS else None
-    return image if image is not None else decode_by_pillow(path, source_px, reduction)
-
-
-def decode_by_pillow(
-    path: str | os.PathLike[str],
-    source_px: tuple[int, int],  # (height, width) as the tables state it
-    reduction: int,  # one of REDUCTIONS
-) -> Image.Image:  # RGB
-    """As `decode`, and what says what is wrong with a file."""
     content = read_whole(path, MAX_FILE_BYTES)
     damage = damage_of(content)
     if damage:
         raise DataError(f"{path}: not a readable image ({damage})")
+    if fast and source_px[0] * source_px[1] <= MAX_PIXELS:
+        decoded = decode_fast(content, source_px, reduction)
+        if decoded is not None:
+            return decoded
     try:
         # Only JPEG: other decoders of Pillow start programs or unpack without bounds.
         with Image.open(io.BytesIO(content), formats=("JPEG",)) as image:

@@ -8,15 +8,11 @@ from __future__ import annotations
 
 import io
 import logging
-import os
 from functools import cache
 from types import ModuleType
 
 import numpy as np
 from PIL import Image
-
-from src.data.files import read_whole
-from src.errors import DataError
 
 REDUCTIONS = (8, 4, 2, 1)
 """Scales at which a decoder gives a smaller image for less work: 1/8, 1/4, 1/2 and 1."""
@@ -34,23 +30,17 @@ _log = logging.getLogger(__name__)
 
 
 def decode_fast(
-    path: str | os.PathLike[str],
+    content: bytes,
     source_px: tuple[int, int],  # (height, width) as the tables state it
     reduction: int,  # one of REDUCTIONS
 ) -> Image.Image | None:
     """The image that Pillow's `draft` and `load` give, for resizing only, or None where Pillow must read it itself.
 
-    None stands for: no faster decoder, a file that is not there or damaged, another size, and anything but colour in
-    the usual encoding. Pillow then finds the same fault and names it, or overlooks it.
+    None stands for: no faster decoder, a damaged file, another size, and anything but colour in the usual encoding.
+    Pillow then finds the same fault and names it, or overlooks it.
     """
     decoder = _checked_decoder()
-    if decoder is None or min(source_px) < LEAST_PX:
-        return None
-    try:
-        content = read_whole(path, MAX_FILE_BYTES)
-    except DataError:
-        return None
-    return None if damage_of(content) else _decode(decoder, content, source_px, reduction)
+    return None if decoder is None or min(source_px) < LEAST_PX else _decode(decoder, content, source_px, reduction)
 
 
 def damage_of(content: bytes) -> str | None:

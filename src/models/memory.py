@@ -11,6 +11,7 @@ from torch import Tensor
 
 from src.geometry.tensor_transforms import invert_rigid
 from src.structures.batch import MAX_EGO_SPEED_MPS, FrameBatch
+from src.structures.tensor_fields import TensorFields
 
 
 @dataclass
@@ -23,7 +24,7 @@ class Motion:
 
 
 @dataclass
-class RememberedFrame:
+class RememberedFrame(TensorFields):
     """Time and pose of one remembered key frame of each of B streams; models add what they remember of it."""
 
     timestamps_s: Tensor  # [B] float64
@@ -67,15 +68,6 @@ class RememberedFrame:
             present=self.present[rows] & keep,
         )
 
-    def to(self, device: torch.device | str) -> Self:
-        """The same frame on another device; a model's frame moves what it added."""
-        return replace(
-            self,
-            timestamps_s=self.timestamps_s.to(device),
-            global_from_ego=self.global_from_ego.to(device),
-            present=self.present.to(device),
-        )
-
 
 Frame = TypeVar("Frame", bound=RememberedFrame)
 
@@ -88,7 +80,7 @@ def motions(frames: Sequence[RememberedFrame], batch: FrameBatch, max_age_s: flo
 
 
 @dataclass(frozen=True)
-class FrameMemory(Generic[Frame]):
+class FrameMemory(TensorFields, Generic[Frame]):
     """The last key frames of each of B streams, newest first. A value: what changes it makes a new one."""
 
     frames: tuple[Frame, ...]
@@ -120,10 +112,6 @@ class FrameMemory(Generic[Frame]):
     ) -> Self:
         """Memory for a batch whose streams come from these rows; frames that no stream has any more are dropped."""
         return self._shared(frame.select(rows, keep) for frame in self.frames)
-
-    def to(self, device: torch.device | str) -> Self:
-        """The same memory on another device."""
-        return type(self)(tuple(frame.to(device) for frame in self.frames))
 
     @classmethod
     def _shared(cls, frames: Iterable[Frame]) -> Self:

@@ -7,7 +7,7 @@ import logging
 import re
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import lightning as L
 import torch
@@ -69,8 +69,8 @@ class StepGuard:
         for before, now in zip(self._before, self._statistics, strict=True):
             torch._foreach_copy_(now, before)
 
-    def refuse(self, module: GuardedModule, batch: FrameBatch, terms: dict[str, Tensor]) -> None:
-        """Take back what the step did, keep it for a replay, and skip it where that is wanted.
+    def refuse(self, module: L.LightningModule, batch: FrameBatch, terms: dict[str, Tensor]) -> None:
+        """Take back what the step of a `TrainingModule` did, keep it for a replay, and skip it where that is wanted.
 
         The weights have not changed yet; gradients are dropped, so that the optimiser does nothing. All ranks come here
         together. Raises DivergedError on all of them, with the same words, or when too many steps were skipped.
@@ -160,23 +160,8 @@ def describe_gradients(model: nn.Module) -> str:
 # ---------------------------------------------------------------- dumps
 
 
-class GuardedModule(Protocol):
-    """The LightningModule whose steps are guarded, as far as a guard needs it."""
-
-    model: nn.Module
-    config: dict[str, Any]
-    seed: int
-    trainer: L.Trainer
-
-    def memories_before_step(self) -> list[dict[str, Any]]:
-        """What the model remembered before the step, as plain values."""
-
-    def forget_step(self, batch: FrameBatch) -> None:
-        """Drop what a skipped step has left to be remembered."""
-
-
-def dump_step(module: GuardedModule, batch: FrameBatch, found: str) -> Path | None:
-    """Write what `src.replay` needs of the running step; see `write_dump`."""
+def dump_step(module: L.LightningModule, batch: FrameBatch, found: str) -> Path | None:
+    """Write what `src.replay` needs of the running step of a `TrainingModule`; see `write_dump`."""
     trainer = module.trainer
     step, rank = trainer.global_step, trainer.global_rank
     return write_dump(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from src.structures.boxes import Boxes3D
+from src.structures.tensor_fields import TensorFields
 
 MAX_EGO_SPEED_MPS = 100.0
 """Poses further apart than this speed allows are a jump of the localisation, not a drive."""
@@ -16,7 +17,7 @@ LIDAR_POINT_FIELDS = ("x", "y", "z", "intensity", "dt")
 
 
 @dataclass
-class FrameBatch:
+class FrameBatch(TensorFields):
     """B key frames with the sensors that were read, calibration and, where known, annotations.
 
     Frames: `ego` is the vehicle at the LIDAR_LEFT key frame, `aug` the same after BEV augmentation A_t (spec 9).
@@ -104,21 +105,3 @@ class FrameBatch:
     def device(self) -> torch.device:
         """Where the tensors lie."""
         return self.timestamps_s.device
-
-    def _map(self, function: object) -> FrameBatch:
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        for name, value in values.items():
-            if isinstance(value, Tensor):
-                values[name] = function(value)
-        if self.boxes is not None:
-            values["boxes"] = [function(boxes) for boxes in self.boxes]
-        values["future"] = tuple(frame._map(function) for frame in self.future)
-        return FrameBatch(**values)
-
-    def to(self, device: torch.device | str, non_blocking: bool = False) -> FrameBatch:
-        """The same batch on another device."""
-        return self._map(lambda value: value.to(device, non_blocking=non_blocking))
-
-    def pin_memory(self) -> FrameBatch:
-        """The same batch in page-locked memory, for the loader's transfer to a GPU."""
-        return self._map(lambda value: value.pin_memory())

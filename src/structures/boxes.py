@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from src.structures.tensor_fields import TensorFields
+
 
 @dataclass
-class Boxes3D:
+class Boxes3D(TensorFields):
     """K boxes in the ego or augmented ego frame of one sample.
 
     Ground truth carries `num_points` (lidar + radar returns), predictions carry `scores`.
@@ -55,21 +57,9 @@ class Boxes3D:
             **{name: torch.zeros(0, dtype=torch.int64, device=device) for name in integers},
         )
 
-    def _map(self, function: object) -> Boxes3D:
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Boxes3D(**{name: None if value is None else function(value) for name, value in values.items()})
-
-    def to(self, device: torch.device | str, non_blocking: bool = False) -> Boxes3D:
-        """The same boxes on another device."""
-        return self._map(lambda value: value.to(device, non_blocking=non_blocking))
-
-    def pin_memory(self) -> Boxes3D:
-        """The same boxes in page-locked memory."""
-        return self._map(lambda value: value.pin_memory())
-
     def __getitem__(self, rows: Tensor) -> Boxes3D:
         """The boxes at `rows` (a boolean mask or indices)."""
-        return self._map(lambda value: value[rows])
+        return self.map(lambda value: value[rows])
 
     def bev(self) -> Tensor:
         """Footprints [K, 5]: x, y, length, width, yaw."""

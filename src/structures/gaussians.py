@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 
@@ -11,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
+from src.structures.tensor_fields import TensorFields
 
 
 class Source(IntEnum):
@@ -23,7 +23,7 @@ class Source(IntEnum):
 
 
 @dataclass
-class GaussianSet:
+class GaussianSet(TensorFields):
     """G Gaussians for each of B samples (Eq. 1); attributes hold physical values, opacity its logit.
 
     Rows with `valid` False are padding and never take part in attention, splatting or losses.
@@ -78,10 +78,6 @@ class GaussianSet:
             directions=F.normalize(transform_vectors_xy(matrix, self.directions), dim=-1),
             velocities=transform_vectors_xy(matrix, self.velocities),
         )
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> GaussianSet:
-        """The set with `function` applied to every tensor."""
-        return GaussianSet(**{field.name: function(getattr(self, field.name)) for field in fields(self)})
 
     @classmethod
     def empty(cls) -> GaussianSet:

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from src.data import images, jpeg
-from src.data.images import ImageCrop, decode_by_pillow, read_image, width_fit
+from src.data.images import ImageCrop, read_image, width_fit
 from src.data.jpeg import HOLE_BYTES, MAX_SCANS, REDUCTIONS, damage_of, decode_fast, decoder_name
 from src.errors import DataError
 
@@ -47,7 +47,7 @@ def saved(folder, image, **options):
 def test_pixels_are_pillows(simplejpeg, tmp_path, size, options):
     path = saved(tmp_path, picture(*size), **options)
     for reduction in REDUCTIONS:
-        fast, slow = decode_fast(path, size, reduction), decode_by_pillow(path, size, reduction)
+        fast, slow = decode_fast(path.read_bytes(), size, reduction), images.decode(path, size, reduction, fast=False)
         assert fast.size == slow.size == tuple(-(-side // reduction) for side in size[::-1])
         assert fast.tobytes() == slow.tobytes()
 
@@ -66,14 +66,14 @@ def test_what_is_read_does_not_tell_the_decoder(simplejpeg, tmp_path, monkeypatc
 
 
 def test_what_pillow_must_judge_is_left_to_it(simplejpeg, tmp_path):
-    assert decode_fast(tmp_path / "none.jpg", SOURCE_PX, 1) is None
+    assert decode_fast(b"", SOURCE_PX, 1) is None
     for image in (picture(mode="L"), picture(mode="CMYK"), picture(100, 200), picture(8, 9)):
         stated = SOURCE_PX if image.size == (200, 100) else image.size[::-1]
-        assert decode_fast(saved(tmp_path, image), stated, 1) is None
+        assert decode_fast(saved(tmp_path, image).read_bytes(), stated, 1) is None
     path = saved(tmp_path, picture())
     path.write_bytes(path.read_bytes()[:-700])
-    assert decode_fast(path, SOURCE_PX, 1) is None
-    assert decode_fast(saved(tmp_path, picture()), SOURCE_PX, 2) is not None
+    assert decode_fast(path.read_bytes(), SOURCE_PX, 1) is None
+    assert decode_fast(saved(tmp_path, picture()).read_bytes(), SOURCE_PX, 2) is not None
 
 
 def test_a_decoder_with_other_pixels_is_refused_aloud(tmp_path, monkeypatch, caplog):
@@ -88,7 +88,7 @@ def test_a_decoder_with_other_pixels_is_refused_aloud(tmp_path, monkeypatch, cap
     other.__version__, other.decode_jpeg, other.decode_jpeg_header = "0", decode_jpeg, decode_jpeg_header
     monkeypatch.setitem(__import__("sys").modules, "simplejpeg", other)
     path = saved(tmp_path, picture())
-    assert decode_fast(path, SOURCE_PX, 1) is None and decoder_name().startswith("Pillow")
+    assert decode_fast(path.read_bytes(), SOURCE_PX, 1) is None and decoder_name().startswith("Pillow")
     assert caplog.text.count("other pixels than Pillow: not used") == 1
     crop = ImageCrop(1.0, (0, 0), SOURCE_PX)
     np.testing.assert_array_equal(read_image(path, SOURCE_PX, crop), np.asarray(Image.open(path)).transpose(2, 0, 1))
@@ -97,7 +97,7 @@ def test_a_decoder_with_other_pixels_is_refused_aloud(tmp_path, monkeypatch, cap
 def test_without_the_extra_pillow_decodes(tmp_path, monkeypatch, caplog):
     monkeypatch.setitem(__import__("sys").modules, "simplejpeg", None)
     path = saved(tmp_path, picture())
-    assert decode_fast(path, SOURCE_PX, 1) is None and not caplog.text
+    assert decode_fast(path.read_bytes(), SOURCE_PX, 1) is None and not caplog.text
     assert images.decode(path, SOURCE_PX, 2).size == (165, 94)
 
 

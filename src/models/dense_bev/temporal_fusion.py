@@ -57,10 +57,6 @@ class MapFrame(RememberedFrame):
             super().select(rows, keep), aug_from_ego=self.aug_from_ego[rows], cells=self.cells.index_select(0, rows)
         )
 
-    def to(self, device: torch.device | str) -> MapFrame:
-        """The same frame on another device."""
-        return replace(super().to(device), aug_from_ego=self.aug_from_ego.to(device), cells=self.cells.to(device))
-
 
 @dataclass(frozen=True)
 class MapMemory(FrameMemory[MapFrame]):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -11,20 +10,17 @@ from torch import Tensor
 
 from src.models.memory import FrameMemory, RememberedFrame
 from src.structures.gaussians import GaussianSet
+from src.structures.tensor_fields import TensorFields
 
 
 @dataclass
-class StoredCells:
+class StoredCells(TensorFields):
     """Remembered BEV cells of one key frame of every stream: rows of all streams, one after the other."""
 
     xy: Tensor  # [n, 2] m, cell centres in the ego frame of their own time
     velocities: Tensor  # [n, 2] m/s over ground, same axes
     features: Tensor  # [n, C] rows of F_fuse
     rows: Tensor  # [n] int64, row of the batch each cell belongs to, ascending
-
-    def map(self, function: Callable[[Tensor], Tensor]) -> StoredCells:
-        """The cells with `function` applied to every tensor."""
-        return StoredCells(**{field.name: function(getattr(self, field.name)) for field in fields(self)})
 
 
 @dataclass
@@ -53,14 +49,6 @@ class MemoryFrame(RememberedFrame):
             gaussians = gaussians.map(lambda value: value[rows])
             gaussians = replace(gaussians, valid=gaussians.valid & keep[:, None])
         return replace(super().select(rows, keep), cells=cells, gaussians=gaussians)
-
-    def to(self, device: torch.device | str) -> MemoryFrame:
-        """The same frame on another device."""
-        return replace(
-            super().to(device),
-            cells=None if self.cells is None else self.cells.map(lambda value: value.to(device)),
-            gaussians=None if self.gaussians is None else self.gaussians.map(lambda value: value.to(device)),
-        )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,34 @@
+"""Dataclasses of tensors, taken as one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+
+class TensorFields:
+    """Base of a dataclass that holds tensors, others of its kind, lists or tuples of them, and plain values."""
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Self:
+        """The same with `function` applied to every tensor."""
+        return type(self)(**{field.name: _mapped(getattr(self, field.name), function) for field in fields(self)})
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> Self:
+        """The same on another device."""
+        return self.map(lambda value: value.to(device, non_blocking=non_blocking))
+
+    def pin_memory(self) -> Self:
+        """The same in page-locked memory, for the loader's transfer to a GPU."""
+        return self.map(lambda value: value.pin_memory())
+
+
+def _mapped(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
+    if isinstance(value, Tensor):
+        return function(value)
+    if isinstance(value, TensorFields):
+        return value.map(function)
+    return type(value)(_mapped(item, function) for item in value) if isinstance(value, (list, tuple)) else value
