@@ -23,6 +23,8 @@ NEAR_BEHIND_SHARE = 0.35
 def counts_line(scene: BevScene, score_threshold: float) -> str:
     """Numbers of boxes, matches, misses and false positives; of predictions alone where there is no ground truth."""
     predictions, truth = scene.predictions, scene.ground_truth
+    if predictions.scores is None:
+        return f"{len(predictions)} true boxes"
     line = f"{len(predictions)} predictions (score ≥ {score_threshold:.2f})"
     if len(truth) == 0:
         return f"{line}   ·   no ground truth"
@@ -36,7 +38,7 @@ def paint_header(canvas: Canvas, scene: BevScene, title: str, score_threshold: f
     canvas.text(MARGIN_PX, 8, title if len(title) <= 110 else f"{title[:109]}…", 22, bold=True)
     canvas.text(MARGIN_PX, 40, counts_line(scene, score_threshold), 15)
     missed = not match_boxes(scene.predictions, scene.ground_truth)[1].all() and len(scene.predictions) > 0
-    canvas.legend(MARGIN_PX, 66, reading_keys(missed))
+    canvas.legend(MARGIN_PX, 66, reading_keys(missed, truth_alone=scene.predictions.scores is None))
     canvas.legend(MARGIN_PX, 89, class_keys({*scene.predictions.labels, *scene.ground_truth.labels}))
 
 
@@ -92,7 +94,8 @@ def draw_frame(
     """Write one PNG, SHEET_PX wide: header with counts and legend, cameras with projected boxes, BEV panels.
 
     Everything is in ego metres; forward is up in the BEV. Predictions below the score threshold, and boxes or points
-    that are not finite, are left out. Raises OSError when the file cannot be written.
+    that are not finite, are left out. Predictions without scores are true boxes, to be seen in the colours of their
+    classes. Raises OSError when the file cannot be written.
     """
     shown = scene.drawable(score_threshold)
     seen = views is not None and len(views) > 0

@@ -27,12 +27,12 @@ def class_keys(present: set[int]) -> list[Artist]:
     return keys
 
 
-def reading_keys(missed: bool) -> list[Artist]:
+def reading_keys(missed: bool, truth_alone: bool) -> list[Artist]:
     """Legend keys that say how boxes are drawn."""
-    keys: list[Artist] = [
-        Line2D([], [], color=CLASS_COLOURS["car"], linewidth=2.2, label="prediction (class colour, front marked)"),
-        Line2D([], [], color=INK, linewidth=1.4, linestyle=(0, (2.6, 1.6)), label="ground truth"),
-    ]
+    what = f"{'ground truth' if truth_alone else 'prediction'} (class colour, front marked)"
+    keys: list[Artist] = [Line2D([], [], color=CLASS_COLOURS["car"], linewidth=2.2, label=what)]
+    if not truth_alone:
+        keys.append(Line2D([], [], color=INK, linewidth=1.4, linestyle=(0, (2.6, 1.6)), label="ground truth"))
     if missed:
         ring = Line2D([], [], linestyle="none", marker="o", markersize=11, mfc="none", mec=MISSED_COLOUR)
         ring.set_label("missed")

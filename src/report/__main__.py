@@ -21,7 +21,6 @@ from src.report.pages import (
     comparison_page,
     phase_page,
     runs_on_page,
-    task_page,
     without_dropout,
 )
 from src.report.results import RunResult, finished_runs, publish_result, read_results
@@ -104,9 +103,7 @@ def write_pages(
 
 def write_page(reports: Path, name: str, scale: str, runs: list[RunResult]) -> Path:
     """One phase's page; phase 2's holds its runs against phase 1's, and has a picture."""
-    if runs[0].task != DETECTION:
-        text = task_page(runs, scale)
-    elif name in PHASES_OF:
+    if name in PHASES_OF:
         experiments = compared_experiments(runs)
         picture = f"pictures/{name}_{scale}.png"
         draw_comparison(reports / picture, bar_panels(without_dropout(experiments)), f"{name}, scale {scale}")

@@ -121,21 +121,18 @@ def _is_default(key: str, override: str, defaults: dict[str, Any]) -> bool:
 
 
 def phase_page(runs: list[RunResult], scale: str) -> str:
-    """The runs of one phase: summary, AP by class, cost. Raises ValueError when they are of different data."""
-    experiments = group_runs(runs, lambda run: NAMES.get((run.phase, *run.settings)))
-    tables = [score_table(experiments, SUMMARY), class_table(experiments), cost_table(experiments)]
-    epochs = ", ".join(map(str, sorted({run.epochs for run in runs})))
-    return _page(runs[0].phase, scale, f"{epochs} epochs", runs) + "\n\n".join(tables) + "\n"
-
-
-def task_page(runs: list[RunResult], scale: str) -> str:
-    """The runs of one phase and another task than detection: its numbers, cost.
+    """The runs of one phase: summary, AP by class, cost; of another task than detection its numbers and cost.
 
     Raises ValueError when they are of different data.
     """
-    experiments = group_runs(runs, lambda run: None)
-    tables = [score_table(experiments, metrics_of(runs[0])), cost_table(experiments, epochs=True)]
-    return _page(runs[0].phase, scale, f"task {runs[0].task}", runs) + "\n\n".join(tables) + "\n"
+    if runs[0].task == DETECTION:
+        experiments = group_runs(runs, lambda run: NAMES.get((run.phase, *run.settings)))
+        tables = [score_table(experiments, SUMMARY), class_table(experiments), cost_table(experiments)]
+        what = f"{', '.join(map(str, sorted({run.epochs for run in runs})))} epochs"
+    else:
+        experiments, what = group_runs(runs, lambda run: None), f"task {runs[0].task}"
+        tables = [score_table(experiments, metrics_of(runs[0])), cost_table(experiments, epochs=True)]
+    return _page(runs[0].phase, scale, what, runs) + "\n\n".join(tables) + "\n"
 
 
 def compared_experiments(runs: list[RunResult]) -> list[Experiment]:

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable
 
 from src.report.metric_names import Metric
 from src.report.orderings import LEAST_SEEDS, Ordering, describe_test, find_orderings, paired_gains
-from src.report.results import RunResult
+from src.report.results import Latency, RunResult
 from src.report.sweep_record import SweepRecord
-from src.report.sweep_table import SweepRow, format_paper, rounded
+from src.report.sweep_table import SweepRow, SweepTable, format_paper, rounded
 
 SYNTHETIC = "synthetic highway"
 MAIN = ("mAP", "NDS")
 """Columns whose rows are compared one by one; a table without them has its first one compared so."""
 
 
-def describe_runs(record: SweepRecord, results: dict[str, RunResult], complete: bool) -> str:
-    """Data, scale, epochs, seeds, commits and devices of a table."""
+def describe_table(table: SweepTable, record: SweepRecord, results: dict[str, RunResult], complete: bool) -> str:
+    """Data, scale, epochs, seeds, commits and devices of a table, and what its differences are taken to."""
     seeds = sorted({seed for runs in record.rows.values() for seed in runs} or {r.seed for r in record.runs.values()})
     data = "Data: no run has finished yet"
     if results:
@@ -41,24 +40,16 @@ def describe_runs(record: SweepRecord, results: dict[str, RunResult], complete: 
     for words, found in (("code ", code), ("", devices)):
         parts += [words + _listed(sorted(found))] if found else []
     text = "; ".join(parts) + "."
-    return text + ("" if complete else " Bold is the best of the rows whose seeds have all finished.")
+    text += "" if complete else " Bold is the best of the rows whose seeds have all finished."
+    if table.baselines:
+        brackets = "; the paper's in brackets" if any(map(table.has_paper, range(len(table.columns)))) else ""
+        text += f" Differences are to {' or '.join(table.baselines)}, seed by seed{brackets}."
+    return text + _latency(table, [result.latency for result in results.values() if result.latency is not None])
 
 
-def describe_differences(baselines: list[str], has_paper: bool) -> str:
-    """What a table's differences are taken to, to stand after `describe_runs`."""
-    if not baselines:
-        return ""
-    brackets = "; the paper's in brackets" if has_paper else ""
-    return f" Differences are to {' or '.join(baselines)}, seed by seed{brackets}."
-
-
-def describe_latency(columns: list[Metric], rows: list[SweepRow], results: Iterable[RunResult]) -> str:
-    """Where a table's latencies were measured and what stands after their ±; empty for a table without any.
-
-    Stands after `describe_runs`.
-    """
-    timed = [result.latency for result in results if result.latency is not None]
-    if not timed or not any(column.name.startswith("latency.") for column in columns):
+def _latency(table: SweepTable, timed: list[Latency]) -> str:
+    """Where a table's latencies were measured and what stands after their ±; empty for a table without any."""
+    if not timed or not any(column.name.startswith("latency.") for column in table.columns):
         return ""
     places = {
         f"{latency.get('processor') or latency.get('device') or 'an unnamed device'}, "
@@ -68,7 +59,7 @@ def describe_latency(columns: list[Metric], rows: list[SweepRow], results: Itera
     text = f" Latency on {_listed(sorted(places))}"
     if any(is_busy(latency.get("load"), latency.get("cores")) for latency in timed):
         text += ", measured on a busy machine, so rows may differ by what else ran"
-    if all(cell.frames is None for row in rows for cell in row.cells):
+    if all(cell.frames is None for row in table.rows for cell in row.cells):
         return f"{text}."
     return (
         f"{text}; after ± of a latency that one run has stands half the range of the middle half of its frames, and "

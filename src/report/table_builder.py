@@ -12,7 +12,7 @@ from src.report.results import RunResult, read_result, result_path
 from src.report.sweep_file import TableConfig
 from src.report.sweep_record import RunState, SweepRecord
 from src.report.sweep_table import PAPER, SweepRow, SweepTable, TableCell, rounded
-from src.report.sweep_text import describe_differences, describe_latency, describe_runs, describe_search, findings
+from src.report.sweep_text import describe_search, describe_table, findings
 from src.training.identity import key_of, without_keys
 
 EARLIER = "; the number is of an earlier training"
@@ -126,9 +126,7 @@ def _table(record: SweepRecord, results: dict[str, RunResult], config: TableConf
     table = SweepTable(config.name, record.scale, config.title, "", columns, rows, is_search)
     trained = [row for row in rows if row.state != PAPER]
     complete = is_search or all(row.state == "done" for row in trained)
-    table.caption = describe_runs(record, results, complete)
-    table.caption += describe_differences(table.baselines, any(map(table.has_paper, range(len(columns)))))
-    table.caption += describe_latency(columns, rows, results.values())
+    table.caption = describe_table(table, record, results, complete)
     if is_search:
         table.text = describe_search([row.state for row in rows], sweep.trials, objective, best)
     else:

@@ -10,10 +10,12 @@ from src.config import Config, compose_config
 from src.data.cache import load_index
 from src.data.reader import FrameReader
 from src.errors import ConfigError
-from src.pictures.scene_preview import draw_scene_preview
+from src.pictures.contents import PictureBoxes
+from src.pictures.frame import draw_frame
 from src.reliability.command import run_command
+from src.structures.evidence import Evidence
 from src.training.run_folder import make_writable
-from src.training.snapshots import boxes_of, views_of
+from src.training.snapshots import scene_of, views_of
 
 PREVIEW_SWEEPS = 3  # of each radar
 
@@ -42,7 +44,8 @@ def draw_previews(config: Config, root: Path, folder: Path) -> None:
         frame = reader.read(int(samples[round(0.5 * (len(samples) - 1))]), None)
         title = f"{name[:14]}…  " + "  ".join(tag.split(".")[1] for tag in tags.split(";"))
         path = folder / f"scene_{number:03d}.png"
-        draw_scene_preview(path, views_of(frame), boxes_of(frame.boxes[0]), frame.radar_points.numpy(), title)
+        scene = scene_of(frame, frame.boxes[0], Evidence(), config.grid.build())
+        draw_frame(path, replace(scene, ground_truth=PictureBoxes.empty()), views_of(frame), title)
         print(f"picture: {path}")
 
 

@@ -145,6 +145,7 @@ def test_counts_line() -> None:
     line = counts_line(scene, 0.3)
     assert "1 ground truth" in line and "1 matched" in line and "0 missed" in line and "0 false" in line
     assert "no ground truth" in counts_line(BevScene(GRID), 0.3)
+    assert counts_line(BevScene(GRID, box(1, 0, (0, 0), None)), 0.0) == "1 true boxes"
 
 
 @pytest.mark.skipif(not REAL.exists(), reason="the published demo frame is not at hand")
