@@ -17,15 +17,12 @@ from src.benchmark.timing import MODES, added_mib, clock, interleaved, ratio_col
 from src.config import Config
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import cells_in_boxes
-from src.ops import (
-    deform_attend_images,
-    farthest_points,
-    sample_sparse_bev,
-    segment_sum,
-    splat_gaussians,
-    voxelize,
-)
+from src.ops.deform_sample import deform_attend_images, sample_sparse_bev
+from src.ops.farthest_point import farthest_points
+from src.ops.segment_reduce import segment_sum
 from src.ops.sites import Sites
+from src.ops.splat import splat_gaussians
+from src.ops.voxelize import voxelize
 from src.structures.sparse_bev import SparseMap
 
 ROUNDS, BUDGET_S = 9, 8.0

@@ -11,7 +11,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from src.models.detector import Detector
 
@@ -34,9 +34,9 @@ def parts_of(model: Detector) -> Paths:
     return {name: paths for name, paths in parts.items() if paths}
 
 
-def _defines(module: torch.nn.Module, method: str) -> bool:
+def _defines(module: nn.Module, method: str) -> bool:
     found = getattr(type(module), method, None)
-    return found is not None and found is not torch.nn.Module.forward
+    return found is not None and found is not nn.Module.forward
 
 
 def is_within(name: str) -> bool:
@@ -46,7 +46,7 @@ def is_within(name: str) -> bool:
 
 @contextmanager
 def wrapped_parts(
-    model: torch.nn.Module,
+    model: nn.Module,
     parts: Paths,
     wrap: Callable[[str, str, Callable[..., Any]], Callable[..., Any]],  # of part, path and the function
 ) -> Iterator[None]:
@@ -100,30 +100,15 @@ def record_calls(model: Detector, parts: Paths, run: Callable[[], Any]) -> dict[
     return {name: found for name, found in calls.items() if found}
 
 
-def fresh(value: Any, memo: dict[int, Any] | None = None) -> Any:
-    """A copy of nested dataclasses and containers around the same numbers: tensors are leaves that want the gradients
-    they wanted, caches hold what they held, and what was shared stays shared."""
-    memo = {} if memo is None else memo
-    if id(value) in memo:
-        return memo[id(value)]
-    if isinstance(value, Tensor):
-        made: Any = value.detach()
-        if value.requires_grad:
-            made.requires_grad_()
-    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        made = copy.copy(value)
-        memo[id(value)] = made
-        for field in dataclasses.fields(value):
-            object.__setattr__(made, field.name, fresh(getattr(value, field.name), memo))
-    elif isinstance(value, dict):
-        made = {key: fresh(item, memo) for key, item in value.items()}
-    elif isinstance(value, (list, tuple)):
-        items = [fresh(item, memo) for item in value]
-        made = type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
-    else:
-        return value
-    memo[id(value)] = made
-    return made
+def fresh(value: Any) -> Any:
+    """A deep copy around the same numbers: tensors are leaves that want the gradients they wanted, caches hold what
+    they held, and what was shared stays shared."""
+
+    def leaf(tensor: Tensor, memo: dict[int, Any]) -> Tensor:
+        return tensor.detach().requires_grad_(tensor.requires_grad)
+
+    with patch.object(Tensor, "__deepcopy__", leaf), patch.object(nn.Parameter, "__deepcopy__", leaf):
+        return copy.deepcopy(value)
 
 
 def tensors_in(value: Any, seen: set[int] | None = None) -> list[Tensor]:

@@ -120,24 +120,17 @@ def _random_boxes(
 def _import_devkit() -> SimpleNamespace:
     """The parts of truckscenes-devkit that score boxes."""
     try:
-        from truckscenes.eval.common.data_classes import EvalBoxes
-        from truckscenes.eval.common.loaders import add_center_dist, filter_eval_boxes
-        from truckscenes.eval.detection.config import config_factory
-        from truckscenes.eval.detection.data_classes import DetectionBox
-        from truckscenes.eval.detection.evaluate import DetectionEval
+        from truckscenes.eval.common import data_classes as common
+        from truckscenes.eval.common import loaders
+        from truckscenes.eval.detection import config, evaluate
+        from truckscenes.eval.detection import data_classes as detection
     except ImportError as error:
         raise ConfigError(
             f"the metric benchmark compares with truckscenes-devkit, which cannot be imported ({error}); "
             "install it with pip install 'truckscenes-devkit>=1.2,<2' (Python below 3.12)"
         ) from error
-    return SimpleNamespace(
-        EvalBoxes=EvalBoxes,
-        DetectionBox=DetectionBox,
-        DetectionEval=DetectionEval,
-        add_center_dist=add_center_dist,
-        filter_eval_boxes=filter_eval_boxes,
-        config=config_factory("detection_cvpr_2024"),
-    )
+    rules = config.config_factory("detection_cvpr_2024")
+    return SimpleNamespace(common=common, loaders=loaders, detection=detection, evaluate=evaluate, rules=rules)
 
 
 class _Tables:
@@ -175,14 +168,14 @@ class _OfficialEvaluation:
         self.predictions = self._boxes(predictions, tokens)
 
     def _boxes(self, table: DetectionTable, tokens: list[str]) -> object:
-        boxes = self.devkit.EvalBoxes()
+        boxes = self.devkit.common.EvalBoxes()
         of_sample: list[list[object]] = [[] for _ in tokens]
         columns = (table.centers, table.sizes, table.rotations, table.velocities, table.scores)
         integers = (table.samples, table.labels, table.attributes, table.num_points)
         for center, size, rotation, velocity, score, sample, label, attribute, points in zip(
             *(column.tolist() for column in columns + integers), strict=True
         ):
-            box = self.devkit.DetectionBox(
+            box = self.devkit.detection.DetectionBox(
                 sample_token=tokens[sample],
                 translation=tuple(center),
                 size=tuple(size),
@@ -201,13 +194,13 @@ class _OfficialEvaluation:
     def filter(self) -> None:
         """Apply the official filters to both, in place."""
         for boxes in (self.truth, self.predictions):
-            self.devkit.add_center_dist(self.tables, boxes)
-            self.devkit.filter_eval_boxes(self.tables, boxes, self.devkit.config.class_range)
+            self.devkit.loaders.add_center_dist(self.tables, boxes)
+            self.devkit.loaders.filter_eval_boxes(self.tables, boxes, self.devkit.rules.class_range)
 
     def evaluate(self, low_m: float = 0.0, high_m: float = np.inf) -> object:
         """The official scores of the boxes with low <= distance to the ego < high."""
-        evaluator = self.devkit.DetectionEval.__new__(self.devkit.DetectionEval)
-        evaluator.cfg, evaluator.verbose = self.devkit.config, False
+        evaluator = self.devkit.evaluate.DetectionEval.__new__(self.devkit.evaluate.DetectionEval)
+        evaluator.cfg, evaluator.verbose = self.devkit.rules, False
         evaluator.gt_boxes = self._cut(self.truth, low_m, high_m)
         evaluator.pred_boxes = self._cut(self.predictions, low_m, high_m)
         evaluator.gt_boxes_masks, evaluator.pred_boxes_masks = {}, {}
@@ -217,7 +210,7 @@ class _OfficialEvaluation:
     def _cut(self, boxes: object, low_m: float, high_m: float) -> object:
         if low_m <= 0 and np.isinf(high_m):
             return boxes
-        cut = self.devkit.EvalBoxes()
+        cut = self.devkit.common.EvalBoxes()
         for token in boxes.sample_tokens:
             cut.add_boxes(token, [box for box in boxes[token] if low_m <= box.ego_dist < high_m])
         return cut

@@ -16,7 +16,7 @@ from src.benchmark.counting import counted_work, distinct_bytes
 from src.benchmark.machine import gemm_rate, measure_roofline
 from src.benchmark.operation_table import OPERATIONS_NOTE, operation_table
 from src.benchmark.page import gpu_notes
-from src.benchmark.parts import Call, backward_from, is_within, parts_of, record_calls, tensors_in
+from src.benchmark.parts import Call, backward_from, parts_of, record_calls, tensors_in
 from src.benchmark.timing import (
     added_mib,
     clock,
@@ -110,15 +110,11 @@ def measure_parts(
                 work_row |= work_columns(mode, found[name])
         times.append(time_row)
         works.append(work_row)
-    rest: dict[str, Any] = {"part": "sum without the image encoder"}
-    for mode, found in modes.items():
-        counted = [values for name, values in found.items() if not is_within(name) and name != "image_encoder"]
-        rest[f"{mode} ms"] = 1e3 * sum(statistics.median(values["seconds"]) for values in counted)
     time_row, work_row = {"part": WHOLE}, {"part": WHOLE}
     for mode, found in measure_whole(case).items():
         time_row |= milliseconds(found["seconds"], f"{mode} ")
         work_row |= work_columns(mode, found)
-    return {"time by part": [*times, rest, time_row], "work by part": [*works, work_row]}
+    return {"time by part": [*times, time_row], "work by part": [*works, work_row]}
 
 
 def time_columns(mode: str, found: dict[str, Any], rate: float, bandwidth: float) -> dict[str, Any]:
@@ -159,15 +155,9 @@ def measure_mode(case: Case, calls: dict[str, list[Call]], backward: bool) -> di
 
     found: dict[str, dict[str, Any]] = {}
     for name in calls:
-        with counted_work() as work:
-            went_back = prepared(name)()
-        found[name] = {
-            "flops": work.flops,
-            "traffic_bytes": work.bytes,
-            "compulsory_bytes": (BACKWARD_PASSES if went_back else 1) * compulsory_bytes(calls[name]),
-            "added_mib": added_mib(prepared(name), case.device),
-            "seconds": [],
-        }
+        found[name], went_back = measure_work(lambda name=name: prepared(name)(), case.device)
+        passes = BACKWARD_PASSES if went_back else 1
+        found[name] |= {"compulsory_bytes": passes * compulsory_bytes(calls[name]), "seconds": []}
         case.model.zero_grad(set_to_none=True)
     for number in range(1 + ROUNDS):
         logger.info("%s, round %d of %d", "f+b" if backward else "forward", number, ROUNDS)
@@ -176,6 +166,13 @@ def measure_mode(case: Case, calls: dict[str, list[Call]], backward: bool) -> di
             case.model.zero_grad(set_to_none=True)
             found[name]["seconds"] += [seconds] if number else []
     return found
+
+
+def measure_work(function: Callable[[], Any], device: torch.device) -> tuple[dict[str, Any], Any]:
+    """Arithmetic, traffic and added memory of a call, and its result."""
+    with counted_work() as work:
+        result = function()
+    return {"flops": work.flops, "traffic_bytes": work.bytes, "added_mib": added_mib(function, device)}, result
 
 
 def compulsory_bytes(calls: list[Call]) -> int:
@@ -190,12 +187,6 @@ def measure_whole(case: Case) -> dict[str, dict[str, Any]]:
     """All parts in place: a frame to its boxes, and a training step to its gradients with losses and targets."""
     found = {}
     for mode, function in (("forward", case.infer), ("f+b", case.step)):
-        with counted_work() as work:
-            function()
-        found[mode] = {
-            "flops": work.flops,
-            "traffic_bytes": work.bytes,
-            "added_mib": added_mib(function, case.device),
-            "seconds": interleaved({mode: function}, clock(case.device), ROUNDS)[mode],
-        }
+        found[mode], _ = measure_work(function, case.device)
+        found[mode]["seconds"] = interleaved({mode: function}, clock(case.device), ROUNDS)[mode]
     return found

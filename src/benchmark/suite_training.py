@@ -7,7 +7,6 @@ import os
 import statistics
 import warnings
 from collections.abc import Callable, Iterator
-from functools import partial
 from itertools import chain, repeat
 from typing import Any
 
@@ -19,7 +18,7 @@ from src.benchmark.timing import clock, milliseconds, peak_bytes, timed_parts
 from src.config import Config
 from src.structures.batch import FrameBatch
 from src.training.module import TrainingModule
-from src.training.optim import CyclicSchedule, build_optimizer
+from src.training.optim import build_optimizer
 
 WARM_UP_STEPS = 5  # first calls choose algorithms, fill the allocator and the loader's queue
 MEASURED_STEPS = 40  # enough for quartiles of a step whose work follows the scene
@@ -95,36 +94,27 @@ def run_steps(
 def make_stepper(
     module: TrainingModule, num_steps: int, device: torch.device, autocast: bool
 ) -> Callable[[FrameBatch], dict[str, float]]:
-    """`timed_step` with a fresh optimiser."""
+    """One optimiser step as the trainer makes it, with a fresh optimiser; seconds by stage."""
     optimizer, schedule = build_optimizer(
         module.model, module.optim, num_steps, module.model.image_backbone, module.backbone_lr_multiplier
     )
-    return partial(timed_step, module, optimizer, schedule, device, autocast)
+    now, paths = clock(device), {"forward": ("run",), "loss": ("model.loss",)}
 
+    def step(batch: FrameBatch) -> dict[str, float]:
+        with warnings.catch_warnings(), timed_parts(module, paths, now) as parts:
+            warnings.filterwarnings("ignore", message=".*self.trainer.*")  # nothing is logged without a trainer
+            begin = now()
+            with torch.autocast(device.type, dtype=torch.bfloat16, enabled=autocast):
+                objective = module.objective(batch)
+            computed = now()
+            optimizer.zero_grad(set_to_none=True)
+            objective.terms["total"].backward()
+            went_back = now()
+            module.clip_gradients_or_skip(batch, objective)
+            optimizer.step()
+            schedule.step()
+            end = now()
+        rest = computed - begin - sum(parts.values())  # the module's checks and means
+        return {**parts, "backward": went_back - computed, "optimiser": end - went_back, "bookkeeping": rest}
 
-def timed_step(
-    module: TrainingModule,
-    optimizer: torch.optim.Optimizer,
-    schedule: CyclicSchedule,
-    device: torch.device,
-    autocast: bool,
-    batch: FrameBatch,
-) -> dict[str, float]:
-    """One optimiser step as the trainer makes it; seconds by stage."""
-    now = clock(device)
-    paths = {"forward": ("run",), "loss": ("model.loss",)}
-    with warnings.catch_warnings(), timed_parts(module, paths, now) as parts:
-        warnings.filterwarnings("ignore", message=".*self.trainer.*")  # nothing is logged without a trainer
-        begin = now()
-        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=autocast):
-            objective = module.objective(batch)
-        computed = now()
-        optimizer.zero_grad(set_to_none=True)
-        objective.terms["total"].backward()
-        went_back = now()
-        module.clip_gradients_or_skip(batch, objective)
-        optimizer.step()
-        schedule.step()
-        end = now()
-    rest = computed - begin - sum(parts.values())  # the module's checks and means
-    return {**parts, "backward": went_back - computed, "optimiser": end - went_back, "bookkeeping": rest}
+    return step

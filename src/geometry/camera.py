@@ -22,19 +22,9 @@ def image_transform(
     if flip:
         matrix = np.array([[-1.0, 0.0, width], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ matrix
     if rotation_rad:
-        return rotation_about_centre(rotation_rad, size_px) @ matrix
+        c, s, x, y = math.cos(rotation_rad), math.sin(rotation_rad), 0.5 * width, 0.5 * height
+        matrix = np.array([[c, -s, x - c * x + s * y], [s, c, y - s * x - c * y], [0.0, 0.0, 1.0]]) @ matrix
     return matrix
-
-
-def rotation_about_centre(
-    rotation_rad: float,
-    size_px: tuple[int, int],  # (height, width)
-) -> Array:  # [3, 3] float64
-    """Rotation of an image about its centre, in continuous pixel coordinates."""
-    height, width = size_px
-    c, s = math.cos(rotation_rad), math.sin(rotation_rad)
-    x, y = 0.5 * width, 0.5 * height
-    return np.array([[c, -s, x - c * x + s * y], [s, c, y - s * x - c * y], [0.0, 0.0, 1.0]])
 
 
 def pixels_from_points(

@@ -146,7 +146,7 @@ def add_sign(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-0.03, 0.0, -0.9 * radius, 0.9 * radius, middle - 0.8 * radius, middle + 0.8 * radius, POST)
 
 
-def _board(m: MeshMaker, a: Actor, l: float, w: float, h: float, *, poles: bool) -> None:
+def add_gantry_sign(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     ink: Colour = (245, 245, 245) if a.colour[2] > 100 else (20, 20, 20)
     m.box(-0.3 * l, 0.3 * l, -w, w, 0.0, h, POST, front=ink)
     m.panel(0.3 * l + 0.02, -0.96 * w, 0.96 * w, 0.04 * h, 0.96 * h, 1, a.colour)
@@ -154,17 +154,12 @@ def _board(m: MeshMaker, a: Actor, l: float, w: float, h: float, *, poles: bool)
         z = (0.7 - 0.24 * k) * h
         m.panel(0.3 * l + 0.04, y0 * w, y1 * w, z, z + 0.13 * h, 1, ink)
     m.panel(0.3 * l + 0.04, 0.68 * w, 0.8 * w, 0.15 * h, 0.8 * h, 1, ink)
-    if poles:
-        for y in (-0.6 * w, 0.6 * w):
-            _pole(m, y, a.kind.floor_m)
 
 
 def add_guide_sign(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
-    _board(m, a, l, w, h, poles=True)
-
-
-def add_gantry_sign(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
-    _board(m, a, l, w, h, poles=False)
+    add_gantry_sign(m, a, l, w, h)
+    for y in (-0.6 * w, 0.6 * w):
+        _pole(m, y, a.kind.floor_m)
 
 
 def add_temporary_sign(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:

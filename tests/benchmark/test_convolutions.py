@@ -23,7 +23,8 @@ from src.benchmark.spconv_baseline import (
 from src.config import compose_config
 from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.layers.sparse import SparseConv, SubmanifoldConv
-from src.ops import Sites, sparse_conv
+from src.ops.sites import Sites
+from src.ops.sparse_conv import sparse_conv
 from src.structures.sparse_bev import SparseMap
 
 CPU = torch.device("cpu")

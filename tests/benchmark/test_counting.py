@@ -5,7 +5,10 @@ import torch
 import torch.nn.functional as F
 
 from src.benchmark.counting import counted_work, distinct_bytes
-from src.ops import Sites, backend, sparse_conv, submanifold_map
+from src.ops import backend
+from src.ops.kernel_maps import submanifold_map
+from src.ops.sites import Sites
+from src.ops.sparse_conv import sparse_conv
 
 
 def test_a_matrix_product_and_its_gradients():

@@ -2,7 +2,8 @@
 
 import torch
 
-from src.ops import Sites, strided_map, submanifold_map, temporal_map
+from src.ops.kernel_maps import strided_map, submanifold_map, temporal_map
+from src.ops.sites import Sites
 
 
 def random_sites(shape, count, seed=0):

@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from src.errors import ConfigError
-from src.ops import Sites, backend, sparse_conv, submanifold_map
-from src.ops.sparse_conv import sparse_conv_reference
+from src.ops import backend
+from src.ops.kernel_maps import submanifold_map
+from src.ops.sites import Sites
+from src.ops.sparse_conv import sparse_conv, sparse_conv_reference
 
 
 def test_the_chosen_backend_runs(undecided):

@@ -5,7 +5,8 @@ import torch
 import torch.nn.functional as F
 
 from src.geometry.bev_grid import BEVGrid
-from src.ops import Sites, deform_attend_bev, deform_attend_images, sample_sparse_bev
+from src.ops.deform_sample import deform_attend_bev, deform_attend_images, sample_sparse_bev
+from src.ops.sites import Sites
 
 GRID = BEVGrid(cells=(6, 8), cell_m=0.8, centre_m=(0.4, -0.2), z_range_m=(-3.0, 5.0))
 

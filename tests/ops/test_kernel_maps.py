@@ -3,8 +3,8 @@ import itertools
 import pytest
 import torch
 
-from src.ops import Sites, strided_map, submanifold_map, temporal_map
-from src.ops.kernel_maps import KernelMap
+from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
+from src.ops.sites import Sites
 from tests.ops.maps import random_sites
 
 

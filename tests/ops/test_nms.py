@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from src.ops import Sites, maxpool_peaks
-from src.ops.nms import conflicting_pairs, greedy_survivors, pair_iou
+from src.ops.nms import conflicting_pairs, greedy_survivors, maxpool_peaks, pair_iou
+from src.ops.sites import Sites
 
 GOLDEN = np.load(Path(__file__).parents[1] / "golden" / "rotated_iou_nms" / "case.npz")
 

@@ -1,12 +1,13 @@
 import torch
 
-from src.ops import segment_mean, segment_sum
 from src.ops.segment_reduce import (
     gather_segment_sum,
     inverse_rows,
     paired_dot,
     permute_rows,
     rank_per_sample,
+    segment_mean,
+    segment_sum,
     segments,
     topk_per_sample,
     weighted_segment_sum,

@@ -1,8 +1,7 @@
 import pytest
 import torch
 
-from src.ops import Sites, union
-from src.ops.sites import rows_of_keys
+from src.ops.sites import Sites, rows_of_keys, union
 
 SHAPE = (2, 4, 5)
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from src.ops import Sites, neighbour_sum, sparse_conv, strided_map, submanifold_map, temporal_map
-from src.ops.kernel_maps import stacked_map
-from src.ops.sparse_conv import plain_sparse_conv
+from src.ops.kernel_maps import stacked_map, strided_map, submanifold_map, temporal_map
+from src.ops.sites import Sites
+from src.ops.sparse_conv import neighbour_sum, plain_sparse_conv, sparse_conv
 from tests.ops.maps import map_of, random_sites
 
 GOLDEN = np.load(Path(__file__).parents[1] / "golden" / "sparse_conv" / "cases.npz")

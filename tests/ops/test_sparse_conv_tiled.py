@@ -5,7 +5,9 @@ import threading
 import pytest
 import torch
 
-from src.ops import Sites, sparse_conv, submanifold_map
+from src.ops.kernel_maps import submanifold_map
+from src.ops.sites import Sites
+from src.ops.sparse_conv import sparse_conv
 from src.ops.sparse_conv_tiled import scratch
 from src.ops.tiled_rulebook import tiled_rulebook
 from tests.ops.maps import map_of, random_sites

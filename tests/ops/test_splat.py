@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from src.geometry.bev_grid import BEVGrid
-from src.ops import log1mexp
-from src.ops import splat_gaussians as splat
+from src.ops.splat import log1mexp
+from src.ops.splat import splat_gaussians as splat
 
 ROOT = Path(__file__).parents[2]
 GOLDEN = np.load(ROOT / "tests" / "golden" / "splat" / "case.npz")

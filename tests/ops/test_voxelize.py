@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from src.ops import voxelize
+from src.ops.voxelize import voxelize
 
 LOWER, SIZE, SHAPE = (-1.0, -1.0, -0.5), (0.5, 0.5, 1.0), (2, 3, 4)  # x in [-1, 1), y in [-1, 0.5), z in [-0.5, 1.5)
 

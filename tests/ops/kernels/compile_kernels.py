@@ -11,9 +11,10 @@ from triton.runtime import driver
 from triton.runtime.jit import JITFunction
 
 from src.geometry.bev_grid import BEVGrid
-from src.ops import Sites, submanifold_map
 from src.ops.gaussian_cells import gaussian_cells
+from src.ops.kernel_maps import submanifold_map
 from src.ops.kernels import farthest_point_triton, sparse_conv_triton, splat_triton
+from src.ops.sites import Sites
 
 
 class Target:

@@ -1,7 +1,9 @@
 import pytest
 import torch
 
-from src.ops import Sites, sparse_conv, strided_map, submanifold_map, temporal_map
+from src.ops.kernel_maps import strided_map, submanifold_map, temporal_map
+from src.ops.sites import Sites
+from src.ops.sparse_conv import sparse_conv
 
 # Largest error over the largest value against float64 on the same operands: float32 sums, and one rounding to the
 # type of the output (which the interpreter cuts off for bfloat16: a whole unit in the last place instead of half).

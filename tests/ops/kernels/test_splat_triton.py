@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from src.geometry.bev_grid import BEVGrid
-from src.ops import splat_gaussians
+from src.ops.splat import splat_gaussians
 
 GRID = BEVGrid(cells=(9, 11), cell_m=0.8, centre_m=(0.4, -0.2), z_range_m=(-3.0, 5.0))
 splat = partial(splat_gaussians, threshold=0.1, max_cells=32768, support_sigmas=3.0)

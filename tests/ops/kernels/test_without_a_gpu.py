@@ -56,7 +56,7 @@ def test_a_machine_without_cuda_never_imports_triton():
     if torch.cuda.is_available():
         pytest.skip("here is a CUDA device")
     code = (
-        "import sys, torch; from src.ops import farthest_points, backend;"
+        "import sys, torch; from src.ops import backend; from src.ops.farthest_point import farthest_points;"
         "farthest_points(torch.rand(1, 4, 2), torch.ones(1, 4).bool(), torch.zeros(1).long(), 2);"
         "print(backend.chosen(), 'triton' in sys.modules)"
     )
