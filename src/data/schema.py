@@ -134,9 +134,9 @@ def build_index(root: Path, version: str) -> DatasetIndex:
     calibrations = _calibration_columns(folder, parts)
     data_samples, data_key = _data_columns(folder, samples, calibrations, parts)
     _frame_columns(samples, data_samples, data_key, parts)
-    annotations = folder / "sample_annotation.json"
-    annotated = not (without_boxes and (not annotations.is_file() or not len(Table(annotations))))
-    _box_columns(folder, samples, annotated, parts)
+    annotations = Table(folder / "sample_annotation.json", without_boxes)
+    annotated = bool(len(annotations)) or not without_boxes
+    _box_columns(folder, samples, annotations, without_boxes, parts)
     del parts["sample_times_us"]
     return DatasetIndex(root=root, version=version, annotated=annotated, **parts)
 
@@ -163,12 +163,7 @@ def _scene_columns(scenes: Table, samples: Table) -> dict[str, Array]:
     times = samples.times()
     scene_rows = samples.links("scene_token", scenes)
     for field, sign in (("prev", 1), ("next", -1)):
-        links = samples.links(field, samples, optional=True)
-        linked = links >= 0
-        same = ~linked | (scene_rows[links] == scene_rows)
-        samples.check(same, field, samples.values(field), "a sample of the same scene")
-        ordered = ~linked | (sign * (times - times[links]) > 0)
-        samples.check(ordered, field, samples.values(field), f"a sample that is {'earlier' if sign > 0 else 'later'}")
+        samples.chain(field, sign * times, scene_rows, "scene")
     order = np.lexsort((times, scene_rows))
     twins = (np.diff(times[order]) == 0) & (np.diff(scene_rows[order]) == 0)
     if twins.any():
@@ -219,12 +214,8 @@ def _data_columns(
     parts["data_calibrations"] = rows.astype(np.int32)
     channels = parts["data_channels"] = calibrations[1][rows]
     stamps = parts["data_times_us"] = table.times()
-    previous = table.links("prev", table, optional=True)
+    previous = table.chain("prev", stamps, scenes * (len(CHANNELS) + 1) + channels, "channel and scene")
     table.links("next", table, optional=True)
-    tokens = table.values("prev")
-    same = (channels[previous] == channels) & (scenes[previous] == scenes)
-    table.check((previous < 0) | same, "prev", tokens, "a file of the same channel and scene")
-    table.check((previous < 0) | (stamps[previous] < stamps), "prev", tokens, "an earlier file")
     parts["data_previous"] = previous.astype(np.int32)
 
     cameras = np.flatnonzero((channels >= 0) & (channels < len(CAMERAS)))
@@ -286,18 +277,9 @@ def _frame_columns(samples: Table, data_samples: Array, data_key: Array, parts: 
     samples.check(advances, "timestamp", frame_times, expected)
 
 
-def _box_columns(folder: Path, samples: Table, annotated: bool, parts: dict[str, Array]) -> None:
+def _box_columns(folder: Path, samples: Table, table: Table, without_boxes: bool, parts: dict[str, Array]) -> None:
     """Annotations of the 12 classes and bicycle racks, with the devkit's finite-difference velocity."""
-    if not annotated:
-        shapes = {"labels": (), "centers": (3,), "sizes": (3,), "rotations": (4,), "velocities": (3,)}
-        shapes |= {"attributes": (), "points": ()}
-        parts |= {f"box_{name}": np.zeros((0, *shape)) for name, shape in shapes.items()}
-        for name, kind in (("labels", np.int8), ("attributes", np.int8), ("points", np.int32)):
-            parts[f"box_{name}"] = np.zeros(0, kind)
-        parts["box_starts"] = np.zeros(len(samples) + 1, np.int64)
-        return
-    table = Table(folder / "sample_annotation.json")
-    instances, categories = Table(folder / "instance.json"), Table(folder / "category.json")
+    instances, categories = Table(folder / "instance.json", without_boxes), Table(folder / "category.json")
     attributes = Table(folder / "attribute.json")
     sample_rows = table.links("sample_token", samples)
     instance_rows = table.links("instance_token", instances)
@@ -378,13 +360,8 @@ def _box_velocities(
     rows = np.arange(len(table))
     ends = []
     for field, sign in (("prev", 1), ("next", -1)):
-        links = table.links(field, table, optional=True)
-        linked = links >= 0
-        tokens = table.values(field)
-        table.check(~linked | (instance_rows[links] == instance_rows), field, tokens, "a box of the same instance")
-        order = f"a box of {'an earlier' if sign > 0 else 'a later'} sample"
-        table.check(~linked | (sign * (times_s - times_s[links]) > 0), field, tokens, order)
-        ends.append(np.where(linked, links, rows))
+        links = table.chain(field, sign * times_s, instance_rows, "instance")
+        ends.append(np.where(links >= 0, links, rows))
     first, last = ends
     elapsed = times_s[last] - times_s[first]
     limit = MAX_SPEED_INTERVAL_S * np.where((first != rows) & (last != rows), 2, 1)

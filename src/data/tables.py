@@ -30,14 +30,14 @@ _REMEDY = "restore the file from the data set's archive, or write the synthetic 
 class Table:
     """The records of one table, addressed by column.
 
-    Raises DataError when the file is missing, is not JSON (with line and column), is not a list of records, or when a
-    token is missing, empty or used twice.
+    Raises DataError when the file is missing (an `optional` one then has no records), is not JSON (with line and
+    column), is not a list of records, or when a token is missing, empty or used twice.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, optional: bool = False) -> None:
         self.path = path
         self.name = path.stem
-        self.records: list[dict[str, Any]] = _read_list(path)
+        self.records: list[dict[str, Any]] = [] if optional and not path.exists() else _read_list(path)
         self.tokens: list[str] = self.values("token")
         self.rows = {token: row for row, token in enumerate(self.tokens)}
         if len(self.rows) != len(self.tokens):
@@ -124,6 +124,14 @@ class Table:
     def links(self, field: str, other: Table, optional: bool = False) -> Array:  # [n] int64, -1 where ""
         """Rows in `other` that a token field points to."""
         return self.lookup(self.values(field), field, other, optional)
+
+    def chain(self, field: str, times: Array, owners: Array, owner: str) -> Array:  # [n] int64, -1 where ""
+        """Rows of this table that a field links records to, of the same owner and before them in `times` [n]."""
+        links, values = self.links(field, self, optional=True), self.values(field)
+        self.check((links < 0) | (owners[links] == owners), field, values, f"a record of the same {owner}")
+        order = "earlier" if field == "prev" else "later"
+        self.check((links < 0) | (times[links] < times), field, values, f"a record that is {order}")
+        return links
 
     def lookup(self, tokens: list[str], field: str, other: Table, optional: bool = False) -> Array:  # [n] int64
         """Rows in `other` of one token per record."""

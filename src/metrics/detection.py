@@ -59,15 +59,11 @@ def score_detections(
     """
     check_predictions(predictions, evaluation_set.tokens)
     truth = evaluation_set.ground_truth
-    distances = ego_distances(evaluation_set, predictions)
-    truth_distances = ego_distances(evaluation_set, truth)
-    kept = official_filter(evaluation_set, predictions, distances)
-    truth_kept = official_filter(evaluation_set, truth, truth_distances)
-
-    ranking = rank_predictions(evaluation_set, predictions, kept, truth_kept)
+    kept, truth_kept = official_filter(evaluation_set, predictions), official_filter(evaluation_set, truth)
+    ranking = rank_predictions(evaluation_set, predictions[kept], truth[truth_kept])
     pairs = find_candidates(ranking)
     matching = match_predictions(ranking, pairs)
-    everyone, every_truth = np.ones(len(ranking.rows), bool), np.ones(len(ranking.truth_rows), bool)
+    everyone, every_truth = np.ones(len(ranking.predictions), bool), np.ones(len(ranking.truth), bool)
     scores = DetectionScores(
         overall=_score_subset(ranking, matching, everyone, every_truth),
         ranges={},
@@ -78,8 +74,8 @@ def score_detections(
     )
     if by_range:
         edges = [low for low, _ in RANGE_BINS_M[1:]]
-        bins = np.digitize(distances[ranking.rows], edges)
-        truth_bins = np.digitize(truth_distances[ranking.truth_rows], edges)
+        tables = (ranking.predictions, ranking.truth)
+        bins, truth_bins = (np.digitize(ego_distances(evaluation_set, table), edges) for table in tables)
         # Boxes of different bins never meet, so the four bins are matched at once.
         matching_in_bins = match_predictions(ranking, pairs[bins[pairs.predictions] == truth_bins[pairs.ground_truth]])
         scores.ranges = {
@@ -101,7 +97,7 @@ def _score_subset(
 ) -> SubsetScores:
     """Curves and scores of some predictions and ground truth; members that matched did so with one another."""
     num_classes, num_points = len(CLASSES), len(RECALLS)
-    num_gt = np.bincount(ranking.truth_labels[truth_members], minlength=num_classes)
+    num_gt = np.bincount(ranking.truth.labels[truth_members], minlength=num_classes)
     precision = np.zeros((num_classes, len(DISTANCE_THRESHOLDS_M), num_points))
     confidence = np.zeros_like(precision)
     error_curves = np.ones((num_classes, len(ERRORS), num_points))
@@ -110,7 +106,7 @@ def _score_subset(
         if t == 0 or members.ndim == 2:
             of_threshold = members if members.ndim == 1 else members[t]
             places = np.flatnonzero(of_threshold)
-            scores = ranking.scores[places]
+            scores = ranking.predictions.scores[places]
             class_starts = np.searchsorted(places, ranking.class_starts)
         chosen = of_threshold[matching.places[t]]
         matched = np.searchsorted(places, matching.places[t][chosen])  # place within the subset
@@ -140,7 +136,7 @@ def _score_subset(
 def _score_tag(ranking: Ranking, matching: Matching, tag: str) -> SubsetScores:
     """Scores over the samples whose scene carries `tag`; samples do not meet, so the matches stay what they are."""
     tagged = np.array([tag in tags for tags in ranking.evaluation_set.scene_tags], dtype=bool)
-    scores = _score_subset(ranking, matching, tagged[ranking.samples], tagged[ranking.truth_samples])
+    scores = _score_subset(ranking, matching, tagged[ranking.predictions.samples], tagged[ranking.truth.samples])
     if tag in TAGS_WITHOUT_SCORE:
         scores.ap, scores.errors = np.full_like(scores.ap, np.nan), np.full_like(scores.errors, np.nan)
     return scores
@@ -155,8 +151,8 @@ def _score_speeds(ranking: Ranking, matching: Matching) -> dict[str, SubsetScore
     that matches nothing is a false positive in the class of the speed it states; stating none (NaN) it belongs to no
     class, as ground truth of unknown velocity does, and lowers the overall score alone.
     """
-    truth = speed_classes(ranking.evaluation_set.ground_truth.velocities[ranking.truth_rows])
-    stated = speed_classes(ranking.predictions.velocities[ranking.rows])
+    truth = speed_classes(ranking.truth.velocities)
+    stated = speed_classes(ranking.predictions.velocities)
     followed = np.tile(stated, (len(DISTANCE_THRESHOLDS_M), 1))
     for t, places in enumerate(matching.places):
         followed[t, places] = truth[matching.ground_truth[t]]

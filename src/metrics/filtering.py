@@ -29,17 +29,14 @@ def ego_distances(evaluation_set: EvaluationSet, table: DetectionTable) -> Array
     return np.sqrt(x * x + y * y)
 
 
-def official_filter(
-    evaluation_set: EvaluationSet,
-    table: DetectionTable,
-    distances: Array,  # [n] m, from ego_distances
-) -> Array:
+def official_filter(evaluation_set: EvaluationSet, table: DetectionTable) -> Array:
     """Boxes that count, [n] bool: nearer than the class range, not without points, no cycle inside a bicycle rack.
 
     The same filters apply to ground truth and predictions; a prediction that states 0 points is dropped too.
     """
     class_range_m = np.array([CLASS_RANGE_M[name] for name in CLASSES])
-    kept = (distances < class_range_m[table.labels]) & (table.num_points != 0)
+    near = ego_distances(evaluation_set, table) < class_range_m[table.labels]
+    kept = near & (table.num_points != 0)
     if len(evaluation_set.racks):
         cycles = np.flatnonzero(kept & np.isin(table.labels, _CYCLES))
         kept[cycles[_inside_rack(table[cycles], evaluation_set.racks)]] = False

@@ -20,18 +20,13 @@ _HALF_TURN_CLASSES = (CLASSES.index("barrier"), CLASSES.index("traffic_sign"))
 
 @dataclass
 class Ranking:
-    """The predictions that count, by class and then by descending score, and the ground truth that counts."""
+    """The boxes that count, predictions by class and then by descending score."""
 
     evaluation_set: EvaluationSet
-    predictions: DetectionTable
-    rows: Array  # [n] row in `predictions`
-    labels: Array  # [n] ascending
-    scores: Array  # [n]
-    samples: Array  # [n]
+    predictions: DetectionTable  # n
+    truth: DetectionTable  # k
     class_starts: Array  # [13] first place of each class, and n
-    truth_rows: Array  # [k] row in the ground truth
-    truth_labels: Array  # [k]
-    truth_samples: Array  # [k]
+    file_order: Array  # [n] places of the predictions as they stand in the file
 
 
 @dataclass
@@ -39,54 +34,36 @@ class Matching:
     """Matches at every threshold, by place of the prediction, and the errors of those at 2 m."""
 
     places: list[Array]  # 4 x [m] ascending
-    ground_truth: list[Array]  # 4 x [m] row within `Ranking.truth_rows` that the prediction took
+    ground_truth: list[Array]  # 4 x [m] row of `Ranking.truth` that the prediction took
     errors: Array  # [m at 2 m, 5]
 
 
 def rank_predictions(
     evaluation_set: EvaluationSet,
-    predictions: DetectionTable,
-    kept: Array,  # [n] bool, predictions that count
-    truth_kept: Array,  # [k] bool, ground truth that counts
+    predictions: DetectionTable,  # those that count
+    truth: DetectionTable,  # those that count
 ) -> Ranking:
-    """Put the predictions that count into the order in which they are matched."""
-    rows = np.flatnonzero(kept)
+    """Put the predictions into the order in which they are matched."""
     # Reversed ascending stable order: descending scores, and the later in the file first among equal ones.
-    rows = rows[np.argsort(predictions.scores[rows], kind="stable")[::-1]]
-    labels = predictions.labels[rows]
-    by_class = np.argsort(labels.astype(np.uint8), kind="stable")
-    rows, labels = rows[by_class], labels[by_class]
-    truth_rows = np.flatnonzero(truth_kept)
-    truth = evaluation_set.ground_truth
-    return Ranking(
-        evaluation_set=evaluation_set,
-        predictions=predictions,
-        rows=rows,
-        labels=labels,
-        scores=predictions.scores[rows],
-        samples=predictions.samples[rows],
-        class_starts=np.searchsorted(labels, np.arange(len(CLASSES) + 1)),
-        truth_rows=truth_rows,
-        truth_labels=truth.labels[truth_rows],
-        truth_samples=truth.samples[truth_rows],
-    )
+    order = np.argsort(predictions.scores, kind="stable")[::-1]
+    order = order[np.argsort(predictions.labels[order].astype(np.uint8), kind="stable")]
+    ranked = predictions[order]
+    class_starts = np.searchsorted(ranked.labels, np.arange(len(CLASSES) + 1))
+    return Ranking(evaluation_set, ranked, truth, class_starts, np.argsort(order))
 
 
 def find_candidates(ranking: Ranking) -> CandidatePairs:
     """Pairs of one sample and class nearer than the largest threshold; rows count within `ranking`."""
-    truth, ego_x = ranking.evaluation_set.ground_truth, ranking.evaluation_set.ego_centers[:, 0]
-    in_file_order = np.argsort(ranking.rows)  # neighbours in the file share a sample, hence memory
-    xy = ranking.predictions.centers[ranking.rows[in_file_order], :2]
-    samples = ranking.samples[in_file_order]
-    truth_xy = truth.centers[ranking.truth_rows, :2]
+    truth, ego_x = ranking.truth, ranking.evaluation_set.ego_centers[:, 0]
+    predictions = ranking.predictions[ranking.file_order]  # neighbours in the file share a sample, hence memory
     return find_pairs(
-        prediction_groups=samples * len(CLASSES) + ranking.labels[in_file_order],
-        prediction_xy=xy,
-        prediction_offsets=xy[:, 0] - ego_x[samples],
-        prediction_places=in_file_order,
-        truth_groups=ranking.truth_samples * len(CLASSES) + ranking.truth_labels,
-        truth_xy=truth_xy,
-        truth_offsets=truth_xy[:, 0] - ego_x[ranking.truth_samples],
+        prediction_groups=predictions.samples * len(CLASSES) + predictions.labels,
+        prediction_xy=predictions.centers[:, :2],
+        prediction_offsets=predictions.centers[:, 0] - ego_x[predictions.samples],
+        prediction_places=ranking.file_order,
+        truth_groups=truth.samples * len(CLASSES) + truth.labels,
+        truth_xy=truth.centers[:, :2],
+        truth_offsets=truth.centers[:, 0] - ego_x[truth.samples],
         num_groups=len(ranking.evaluation_set.tokens) * len(CLASSES),
         radius_m=max(DISTANCE_THRESHOLDS_M),
     )
@@ -100,7 +77,7 @@ def match_predictions(ranking: Ranking, pairs: CandidatePairs) -> Matching:
     places, ground_truth, errors = [], [], np.zeros((0, len(ERRORS)))
     for threshold in DISTANCE_THRESHOLDS_M:
         near = pairs[pairs.distances < threshold]
-        matches = near[match_greedily(near, len(ranking.truth_rows))]
+        matches = near[match_greedily(near, len(ranking.truth))]
         _check_sizes(ranking, matches)
         places.append(matches.predictions)
         ground_truth.append(matches.ground_truth)
@@ -110,20 +87,20 @@ def match_predictions(ranking: Ranking, pairs: CandidatePairs) -> Matching:
 
 
 def _check_sizes(ranking: Ranking, matches: CandidatePairs) -> None:
-    truth, rows = ranking.evaluation_set.ground_truth, ranking.truth_rows[matches.ground_truth]
-    flat = ~(truth.sizes[rows] > 0).all(axis=1)
+    matched = ranking.truth[matches.ground_truth]
+    flat = ~(matched.sizes > 0).all(axis=1)
     if flat.any():
-        row = rows[np.argmax(flat)]
+        row = int(np.argmax(flat))
         raise DataError(
-            f"ground truth {row} (sample {ranking.evaluation_set.tokens[truth.samples[row]]}): size must be positive "
-            f"to be matched, but got {truth.sizes[row].tolist()}"
+            f"ground truth at {matched.centers[row].tolist()} (sample "
+            f"{ranking.evaluation_set.tokens[matched.samples[row]]}): size must be positive to be matched, but got "
+            f"{matched.sizes[row].tolist()}"
         )
 
 
 def _match_errors(ranking: Ranking, matches: CandidatePairs) -> Array:
     """The five errors of each match, NaN where the ground truth (or a velocity) leaves one undefined: [m, 5]."""
-    predicted = ranking.predictions[ranking.rows[matches.predictions]]
-    truth = ranking.evaluation_set.ground_truth[ranking.truth_rows[matches.ground_truth]]
+    predicted, truth = ranking.predictions[matches.predictions], ranking.truth[matches.ground_truth]
     shared = np.minimum(truth.sizes, predicted.sizes).prod(axis=1)
     overlap = shared / (truth.sizes.prod(axis=1) + predicted.sizes.prod(axis=1) - shared)
     period = np.where(np.isin(truth.labels, _HALF_TURN_CLASSES), np.pi, 2 * np.pi)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
@@ -22,8 +22,11 @@ from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
 from src.structures.taxonomy import ATTRIBUTES, CLASSES, MAX_BOXES_PER_SAMPLE
 
-META_FLAGS = ("use_camera", "use_lidar", "use_radar", "use_map", "use_external", "use_future_frames", "use_tta")
-META_TEXTS = ("method_name", "authors", "affiliation", "description", "code_url", "paper_url")
+EMPTY_META: dict[str, bool | str] = {
+    **dict.fromkeys(("use_camera", "use_lidar", "use_radar", "use_map", "use_external", "use_future_frames"), False),
+    "use_tta": False,
+    **dict.fromkeys(("method_name", "authors", "affiliation", "description", "code_url", "paper_url"), ""),
+}
 
 _LABELS = {name: row for row, name in enumerate(CLASSES)}
 _ATTRIBUTES = {name: row for row, name in enumerate(ATTRIBUTES)} | {"": -1}
@@ -182,15 +185,15 @@ def write_submission(
     path: Path | str,
     tokens: Sequence[str],
     table: DetectionTable,
-    meta: Mapping[str, bool | str],
+    meta: dict[str, bool | str],
 ) -> None:
     """Write predictions as a submission that the official evaluator accepts; numbers keep their full precision.
 
-    `meta` may leave out entries: a flag is then False, a text empty. Samples stand in the order of `tokens`, one a
+    `meta` may leave out entries of EMPTY_META. Samples stand in the order of `tokens`, one a
     line, boxes of a sample in the order of `table`. The file appears complete under its name or not at all.
 
-    Raises DataError for predictions that `check_predictions` refuses, when there is no box at all, for an unknown or
-    mistyped entry of `meta`, or when the file cannot be written.
+    Raises DataError for predictions that `check_predictions` refuses, when there is no box at all, or when the file
+    cannot be written.
     """
     check_predictions(table, tokens)
     if not len(table):
@@ -199,7 +202,7 @@ def write_submission(
         f"{json.dumps(token)}: {json.dumps(rows)}"
         for token, rows in zip(tokens, submission_rows(tokens, table), strict=True)
     )
-    head = f'{{"meta": {json.dumps(_complete_meta(meta))},\n"results": {{\n'
+    head = f'{{"meta": {json.dumps(EMPTY_META | meta)},\n"results": {{\n'
     path = Path(path)
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -235,16 +238,6 @@ def submission_rows(tokens: Sequence[str], table: DetectionTable) -> Iterator[li
             [ATTRIBUTES[attribute] if attribute >= 0 else "" for attribute in boxes.attributes],
         )
         yield [{"sample_token": token} | dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True)]
-
-
-def _complete_meta(meta: Mapping[str, bool | str]) -> dict[str, bool | str]:
-    complete: dict[str, bool | str] = {name: False for name in META_FLAGS} | {name: "" for name in META_TEXTS}
-    for name, value in meta.items():
-        if name not in complete:
-            raise DataError(f"meta: unknown entry {name!r}; it may hold {', '.join(complete)}")
-        if type(value) is not type(complete[name]):
-            raise DataError(f"meta.{name} must be {type(complete[name]).__name__}, but got {_short(value)}")
-    return complete | dict(meta)
 
 
 def to_global(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -28,21 +28,11 @@ class Boxes3D(TensorFields):
     num_points: Tensor | None = None  # [K] int64
 
     def __post_init__(self) -> None:
-        k = self.centers.shape[0]
-        expected = {
-            "centers": (k, 3),
-            "sizes": (k, 3),
-            "yaws": (k,),
-            "velocities": (k, 2),
-            "labels": (k,),
-            "attributes": (k,),
-            "scores": (k,),
-            "num_points": (k,),
-        }
-        for name, shape in expected.items():
-            value = getattr(self, name)
+        widths = {"centers": (3,), "sizes": (3,), "velocities": (2,)}
+        for field in fields(self):
+            value, shape = getattr(self, field.name), (len(self), *widths.get(field.name, ()))
             if value is not None and tuple(value.shape) != shape:
-                raise ValueError(f"Boxes3D.{name} must be {list(shape)}, but got {list(value.shape)}")
+                raise ValueError(f"Boxes3D.{field.name} must be {list(shape)}, but got {list(value.shape)}")
 
     def __len__(self) -> int:
         return self.centers.shape[0]

@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 Array = np.ndarray
 
-COLUMN_WIDTHS = {
-    "samples": 1,
-    "labels": 1,
-    "centers": 3,
-    "sizes": 3,
-    "rotations": 4,
-    "velocities": 2,
-    "attributes": 1,
-    "scores": 1,
-    "num_points": 1,
-}
-"""Columns of a table of boxes in their order; those of width 1 are vectors."""
+WIDTHS = {"centers": 3, "sizes": 3, "rotations": 4, "velocities": 2}
+"""Of the columns that are matrices."""
 INTEGER_COLUMNS = ("samples", "labels", "attributes", "num_points")
 
 
@@ -41,9 +31,8 @@ class DetectionTable:
     num_points: Array  # [n] int64, lidar + radar; -1 where not stated (predictions)
 
     def __post_init__(self) -> None:
-        n = len(self.samples)
-        for name, width in COLUMN_WIDTHS.items():
-            shape, found = (n, width) if width > 1 else (n,), getattr(self, name).shape
+        for name in COLUMNS:
+            shape, found = _shape(name, len(self.samples)), getattr(self, name).shape
             if found != shape:
                 raise ValueError(f"DetectionTable.{name} must be {list(shape)}, but got {found}")
 
@@ -52,18 +41,25 @@ class DetectionTable:
 
     def __getitem__(self, rows: Array) -> DetectionTable:
         """The boxes at `rows` (a boolean mask or indices), in that order."""
-        return DetectionTable(**{name: getattr(self, name)[rows] for name in COLUMN_WIDTHS})
+        return DetectionTable(**{name: getattr(self, name)[rows] for name in COLUMNS})
 
     @staticmethod
     def empty() -> DetectionTable:
         """No boxes."""
-        columns = {name: np.zeros((0, width) if width > 1 else 0) for name, width in COLUMN_WIDTHS.items()}
-        return DetectionTable(**columns | {name: columns[name].astype(np.int64) for name in INTEGER_COLUMNS})
+        kinds = {name: np.int64 if name in INTEGER_COLUMNS else np.float64 for name in COLUMNS}
+        return DetectionTable(**{name: np.zeros(_shape(name, 0), kind) for name, kind in kinds.items()})
 
     @staticmethod
     def concatenate(parts: list[DetectionTable]) -> DetectionTable:
         """Join tables row after row."""
-        return DetectionTable(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in COLUMN_WIDTHS})
+        return DetectionTable(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in COLUMNS})
+
+
+COLUMNS = tuple(field.name for field in fields(DetectionTable))
+
+
+def _shape(name: str, rows: int) -> tuple[int, ...]:
+    return (rows, WIDTHS[name]) if name in WIDTHS else (rows,)
 
 
 @dataclass

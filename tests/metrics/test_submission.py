@@ -207,9 +207,6 @@ def test_what_would_be_refused_is_not_written(golden_set, golden_predictions, tm
     for table, message in ((crowd, "at most 500"), (nan, "prediction 3"), (DetectionTable.empty(), "no sample has")):
         with pytest.raises(DataError, match=message):
             write_submission(path, golden_set.tokens, table, META)
-    for meta, message in (({"use_sonar": True}, "unknown entry 'use_sonar'"), ({"use_map": 1}, "must be bool")):
-        with pytest.raises(DataError, match=message):
-            write_submission(path, golden_set.tokens, golden_predictions, meta)
     assert path.read_text() == "old" and os.listdir(tmp_path) == ["submission.json"]
 
 
