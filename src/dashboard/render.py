@@ -94,23 +94,30 @@ class Renderer:
 
     def sweep(self, board: Board, sweep: Sweep) -> Page:
         """One sweep: tables, figures, runs, failures; or why it cannot be shown."""
-        return self._page_or_error(f"sweep-{sweep.key}", sweep.key, lambda: self._sweep(board, sweep))
+        title = ", ".join([sweep.record.sweep.title, sweep.record.scale, *sweep.record.changes])
+        return self._page_or_error(f"sweep-{sweep.key}", title, lambda: self._sweep(board, sweep))
 
     def run(self, board: Board, run: Run, against: Run | None = None) -> Page:
         """One run, alone beside its baseline's numbers, or side by side with another one; or why it cannot be shown."""
-        return self._page_or_error(f"run-{run.run_id}", run.run_id, lambda: self._run(board, run, against))
+        return self._page_or_error(f"run-{run.run_id}", run_name(run), lambda: self._run(board, run, against))
 
     def compare(self, board: Board) -> Page:
         """Where the exported file puts two runs side by side; or why it cannot be shown."""
-        return self._page_or_error("compare", "Two runs side by side", lambda: self._compare(board))
 
-    def _page_or_error(self, page_id: str, title: str, draw: Callable[[], Page]) -> Page:
+        def draw() -> Markup:
+            runs = sorted((run for run in board.runs.values() if run.result), key=run_name)
+            return self._content("compare.html", runs=runs)
+
+        return self._page_or_error("compare", "Two runs side by side", draw)
+
+    def _page_or_error(self, page_id: str, title: str, draw: Callable[[], Markup]) -> Page:
         """The page, or one with the error message where a record or a result makes it fail: others are still shown."""
         try:
-            return draw()
+            content = draw()
         except Exception as error:
             logger.exception("page %s cannot be shown", page_id)
-            return Page(id=page_id, title=title, content=self._content("broken.html", title=title, fault=fault(error)))
+            content = self._content("broken.html", title=title, fault=fault(error))
+        return Page(id=page_id, title=title, content=content)
 
     def _without_broken(self, board: Board, draw: Callable[[Board], Markup]) -> Markup:
         """What shows the whole board; without sweeps and runs that make it fail, which are among the broken."""
@@ -136,7 +143,7 @@ class Renderer:
                 runs[run_id] = run
         return draw(replace(board, sweeps=sweeps, runs=runs, broken=broken))
 
-    def _sweep(self, board: Board, sweep: Sweep) -> Page:
+    def _sweep(self, board: Board, sweep: Sweep) -> Markup:
         record = sweep.record
         states = record.runs
         failed = [
@@ -145,13 +152,11 @@ class Renderer:
             if run.state == "failed"
         ]
         listed = [(label, board.runs[run_id], states[run_id]) for label, run_id in record.labelled]
-        content = self._content(
+        return self._content(
             "sweep.html", board=board, sweep=sweep, failed=failed, runs=listed, figures=sweep_figures(board, sweep)
         )
-        title = ", ".join([record.sweep.title, record.scale, *record.changes])
-        return Page(id=f"sweep-{sweep.key}", title=title, content=content)
 
-    def _run(self, board: Board, run: Run, against: Run | None) -> Page:
+    def _run(self, board: Board, run: Run, against: Run | None) -> Markup:
         baseline = board.baseline_of(run)
         other, other_name = (against, run_name(against)) if against else baseline or (None, "")
         config = flat_config(run.result.config if run.result else board.folders.config(run.run_id))
@@ -166,7 +171,7 @@ class Renderer:
         log = board.folders.log_tail(f"{run.run_id}/log.txt")
         if log is None and run.planned and run.planned.log:
             log = board.folders.log_tail(run.planned.log)
-        content = self._content(
+        return self._content(
             "run.html", board=board, run=run, against=against, other=other, other_name=other_name, config=config,
             difference=difference, pictures=pictures, pairs=pairs, metrics=metric_rows(run, other), log=log,
             figures=run_figures(board, shown),
@@ -174,11 +179,6 @@ class Renderer:
             progress=_progress(board, run),
             idle=max(0.0, board.now - (board.folders.written(run.run_id) or board.now)),
         )  # fmt: skip
-        return Page(id=f"run-{run.run_id}", title=run_name(run), content=content)
-
-    def _compare(self, board: Board) -> Page:
-        runs = sorted((run for run in board.runs.values() if run.result), key=run_name)
-        return Page(id="compare", title="Two runs side by side", content=self._content("compare.html", runs=runs))
 
     def _content(self, template: str, **values: Any) -> Markup:
         return Markup(self.environment.get_template(template).render(**values))

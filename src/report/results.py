@@ -56,15 +56,11 @@ class Errors(TypedDict):
 
 @with_config(OPEN)
 class ClassScores(TypedDict):
-    """Scores of one class."""
-
     AP: Share
     AVE: NotRequired[Score | None]
 
 
 class RangeScores(Errors):
-    """Scores of one range."""
-
     mAP: Share
     NDS: NotRequired[Share | None]
     mAVE: NotRequired[Score | None]
@@ -94,8 +90,6 @@ class SpeedClasses(TypedDict, extra_items=ClassCount):
 
 @with_config(OPEN)
 class SpeedScores(TypedDict):
-    """Scores of one speed class."""
-
     mAP_present: Share | None
     mAVE_present: Score | None
     classes: SpeedClasses
@@ -370,7 +364,7 @@ def curves_of(path: Path) -> dict[str, list[Point]]:
         raise DataError(f"{path}: not a run's learning curves ({type(error).__name__}: {error}); delete it") from error
 
 
-def read_curves(path: Path, live: bool = False) -> dict[str, list[Point]]:
+def read_curves(path: Path, live: bool = False, over: str = "step") -> dict[str, list[Point]]:
     """The losses and validation scores of metrics.csv, thinned out evenly to at most MAX_POINTS each.
 
     Of a run that still trains (`live`) also the loss by step; a line may be half written, and what is no number is left
@@ -384,7 +378,7 @@ def read_curves(path: Path, live: bool = False) -> dict[str, list[Point]]:
                 if not (name and text and name.startswith(columns)):
                     continue
                 try:
-                    step, value = int(row.get("step")), float(text)
+                    step, value = int(row.get(over)), float(text)
                 except (ValueError, TypeError):
                     if live:
                         continue

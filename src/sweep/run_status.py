@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from src.report.results import is_finished
+from src.report.results import is_finished, read_curves
 
 LARGEST = 1e9
 """Of a score: a number beyond it, or one that is not finite, is damage."""
@@ -65,14 +65,7 @@ def is_busy(folder: Path) -> bool:
 
 def read_validations(folder: Path, metric: str) -> dict[int, float]:
     """Validated values of a metric so far by epoch, from metrics.csv."""
-    values = {}
     try:
-        with (folder / "metrics.csv").open(newline="") as file:
-            for row in csv.DictReader(file):
-                if row.get(f"val/{metric}") and row.get("epoch"):
-                    value = float(row[f"val/{metric}"])
-                    if abs(value) <= LARGEST:
-                        values[int(row["epoch"])] = value
+        return dict(read_curves(folder / "metrics.csv", live=True, over="epoch").get(f"val/{metric}", []))
     except (OSError, ValueError, csv.Error):
-        return values  # a line is being written; the next poll reads it whole
-    return values
+        return {}

@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any, TextIO, TypeVar
+from typing import TextIO, TypeVar
 
 from optuna.trial import Trial
 
@@ -67,7 +67,7 @@ class Runner:
         """Work until every run is done or has failed, or a signal comes. Returns the final record."""
         with self._handling_signals():
             with self.study.lock():
-                self._log_dead(self.study.release_dead())
+                self.study.release_dead()
                 self._first_own = len(self.study.trials())
             self.publish_done()
             self._show(self.writer.write())
@@ -144,7 +144,7 @@ class Runner:
     def _step(self, worker: int) -> bool:
         """Take and train one run, or wait a little. False when no run is left for any worker."""
         with self.study.lock() as lock:
-            self._log_dead(self.study.release_dead())
+            self.study.release_dead()
             took, settled = self._take_next(lock, worker)
         if took:
             self._logging_errors(self.writer.write)
@@ -156,7 +156,7 @@ class Runner:
         """Train the next run, whose taking releases the lock: (whether there was one, else whether all have ended)."""
         spec, settled = self._next(self.study.trials())
         if spec is not None:
-            self.study.take(lock, lambda trial: self._train(spec, worker, trial), attrs=attrs_of(spec), params={})
+            self.study.take(lock, lambda trial: self._train(spec, worker, trial), attrs=spec.stored, params={})
         return spec is not None, settled
 
     def _next(self, trials: list[SweepTrial]) -> tuple[RunSpec | None, bool]:
@@ -176,7 +176,7 @@ class Runner:
                 continue
             if spec.needs in failed:
                 reason = f"{spec.needs}, which it starts from, failed: {failed[spec.needs]}"
-                self.study.add_failed(attrs_of(spec), reason)
+                self.study.add_failed(spec.stored, reason)
                 failed[spec.run_id] = reason
                 continue
             settled = False
@@ -253,11 +253,6 @@ class Runner:
             logger.warning("%s", error)
             return None
 
-    def _log_dead(self, dead: list[SweepTrial]) -> None:
-        for trial in dead:
-            if trial.run_id is not None:
-                logger.warning("worker %s is gone; %s is released", trial.worker, trial.run_id)
-
     def _show(self, record: SweepRecord) -> None:
         logger.info("%s", progress_line(record, self.launcher.workers, time.time()))
 
@@ -287,11 +282,6 @@ class Runner:
             threading.excepthook = hook
             for number, handler in before.items():
                 signal.signal(number, handler)
-
-
-def attrs_of(spec: RunSpec) -> dict[str, Any]:
-    """What a trial says of its run."""
-    return {"run_id": spec.run_id, "label": spec.label, "seed": spec.seed, "overrides": spec.overrides}
 
 
 def name_of(spec: RunSpec) -> str:

@@ -46,12 +46,15 @@ class Search(Runner):
     def _take_next(self, lock: TextIO, worker: int) -> tuple[bool, bool]:
         trials = self.study.trials()
         resumed, new, settled = self._next_trial(trials)
+        retry = {}
+        if resumed is not None:
+            retry = {"retry_of": resumed.number, "first": resumed.attrs.get("first", resumed.number)}
         if resumed is not None or new:
             self.study.take(
                 lock,
                 lambda trial: self._try(trial, worker),
                 choose=self._choose,
-                attrs={} if resumed is None else {"retry_of": resumed.number, "first": _first(resumed)},
+                attrs=retry,
                 params=resumed.params if resumed is not None else None,
                 sampler=self._sampler(len(trials)),
                 pruner=optuna.pruners.MedianPruner(n_startup_trials=STARTUP_TRIALS),
@@ -124,11 +127,6 @@ class Search(Runner):
             self.study.set_attr(trial, "reason", reason)
             self.study.set_attr(trial, "conclusive", conclusive)
         raise TrialEndedError(reason)
-
-
-def _first(trial: SweepTrial) -> int:
-    """Number of the trial that this one resumes."""
-    return trial.attrs.get("first", trial.number)
 
 
 class _PruningWatch:

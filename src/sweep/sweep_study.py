@@ -8,6 +8,7 @@ worker.
 from __future__ import annotations
 
 import fcntl
+import logging
 import os
 import socket
 import time
@@ -28,6 +29,8 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from src.errors import ConfigError
 from src.reliability.passwords import masked, without_secrets
+
+logger = logging.getLogger(__name__)
 
 FORMAT = 1
 HEARTBEAT_S = 60
@@ -171,7 +174,11 @@ class SweepStudy:
                     self._fail(trial)
             optuna.storages.fail_stale_trials(study)
             still = {trial.number for trial in study.get_trials(deepcopy=False, states=open_states)}
-            return [_sweep_trial(trial) for trial in before if trial.number not in still]
+        dead = [_sweep_trial(trial) for trial in before if trial.number not in still]
+        for trial in dead:
+            if trial.run_id is not None:
+                logger.warning("worker %s is gone; %s is released", trial.worker, trial.run_id)
+        return dead
 
     def _fail(self, trial: FrozenTrial) -> None:
         try:
