@@ -16,19 +16,20 @@ ENTRY = {
 # room -> rooms it may import from
 ALLOWED = {
     "errors": set(),
+    "files": {"errors"},
     "geometry": {"errors"},
     "ops": {"errors", "geometry"},
     "structures": {"errors", "geometry", "ops"},
     "losses": {"errors", "ops", "structures"},
     "targets": {"errors", "geometry", "ops", "structures"},
     "models": {"errors", "geometry", "ops", "structures", "losses", "targets"},
-    "data": {"errors", "geometry", "structures"},
-    "metrics": {"errors", "geometry", "structures"},
-    "pictures": {"errors", "geometry", "structures"},
-    "reliability": {"errors", "geometry", "ops", "structures"},
+    "data": {"errors", "files", "geometry", "structures"},
+    "metrics": {"errors", "files", "geometry", "structures"},
+    "pictures": {"errors", "files", "geometry", "structures"},
+    "reliability": {"errors", "files", "geometry", "ops", "structures"},
     "training": {
-        "errors", "geometry", "ops", "structures", "losses", "targets", "models", "data", "metrics", "pictures",
-        "reliability",
+        "errors", "files", "geometry", "ops", "structures", "losses", "targets", "models", "data", "metrics",
+        "pictures", "reliability",
     },
 }  # fmt: skip
 LIGHT = ("report", "dashboard")

@@ -61,11 +61,7 @@ def report_latency(config: Config, overrides: list[str]) -> None:
     content = measure_latency(config, overrides)
     if config.out:  # first: what took long is safe
         write_json(Path(config.out) / "latency.json", content)
-    page = latency_page(content, overrides)
-    warning = busy_warning(page["machine"])
-    if warning:
-        print(warning)
-    print(markdown(page))
+    print(markdown(latency_page(content, overrides)))
     if config.out:
         print(f"written: {Path(config.out) / 'latency.json'}")
 

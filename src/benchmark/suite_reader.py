@@ -52,7 +52,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """CPU seconds of reading, augmenting and batching in this process, on one thread; then beside a loader's worker.
 
     The frames are the training split's, over and over with other draws of the augmentation, from the system's file
-    cache. `frames_per_second` is by CPU time and with the training's augmentation, its inverse the mean over frames.
+    cache.
     """
     torch.set_num_threads(1)
     datamodule = build_datamodule(config, data_root(config))
@@ -61,7 +61,6 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     config.data.batch_size = min(config.data.batch_size, len(split_samples(datamodule.index, config.data.train_split)))
     runs = {"training": config.data.augmentation, "test": None}
     measured = {name: time_frames(datamodule, samples, augmentation) for name, augmentation in runs.items()}
-    total = sum(measured["training"]["all"])
     settings, frame = datamodule.settings, samples[0]
     comparisons = {}
     if settings.image_size_px:
@@ -70,9 +69,6 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
         comparisons["radar files of one frame"] = compare_parsing(datamodule, frame)
     stages = [stage for stage, seconds in measured["training"].items() if stage not in ("all", "wall") and any(seconds)]
     return {
-        "frames": READER_FRAMES,
-        "cpu_seconds": total,
-        "frames_per_second": READER_FRAMES / total,
         "decoder": decoder_name(),
         "image_px": "x".join(map(str, datamodule.index.data_sizes[datamodule.index.key_data[frame, 0]][::-1])),
         "network_px": "x".join(map(str, (settings.image_size_px or (0, 0))[::-1])),

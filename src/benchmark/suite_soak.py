@@ -276,9 +276,8 @@ class _Mallinfo(ctypes.Structure):
 
 def heap_mib() -> float | None:
     """What the C allocator has given out and not got back, in all its arenas and mappings (glibc from 2.33)."""
-    try:
-        mallinfo = ctypes.CDLL(None).mallinfo2
-    except (OSError, AttributeError):
+    mallinfo = getattr(ctypes.CDLL(None), "mallinfo2", None)
+    if mallinfo is None:
         return None
     mallinfo.restype = _Mallinfo
     counts = mallinfo().counts

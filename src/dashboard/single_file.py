@@ -12,7 +12,7 @@ from PIL import Image
 from src.dashboard.board import Board, BoardReader
 from src.dashboard.folders import Picture
 from src.dashboard.render import Renderer, shown_pictures
-from src.report.atomic_write import write_whole
+from src.files.atomic_write import write_whole
 
 PICTURE_BUDGET = 8_000_000
 """Bytes of embedded pictures; those of every run's first frame come first, then of the second, and so on."""

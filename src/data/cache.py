@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
-import tempfile
 from dataclasses import fields
 from pathlib import Path
 
@@ -22,6 +20,7 @@ from src.data.schema import (
     version_folder,
 )
 from src.data.tables import LARGEST, LAST_TIME_US
+from src.files.atomic_write import replacing
 from src.structures.taxonomy import ATTRIBUTES, CLASSES
 
 FORMAT = 3  # raise it when DatasetIndex or a check changes: older caches are then built again
@@ -129,14 +128,7 @@ def _check(index: DatasetIndex) -> None:
 
 
 def _write(path: Path, index: DatasetIndex) -> None:
-    """Write beside the target and rename, so that two starts at once and a full disk leave no half file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     columns = {f.name: getattr(index, f.name) for f in fields(index) if f.name not in _PLAIN}
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, annotated=np.array(index.annotated), **columns)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with replacing(path, "wb") as file:
+        np.savez(file, annotated=np.array(index.annotated), **columns)

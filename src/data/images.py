@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from src.data.files import read_whole
 from src.data.jpeg import MAX_FILE_BYTES, REDUCTIONS, damage_of, decode_fast
 from src.errors import ConfigError, DataError
+from src.files.whole_read import read_whole
 from src.geometry.camera import image_transform
 
 Array = np.ndarray

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import lzf
 import numpy as np
 
-from src.data.files import read_whole
 from src.data.tables import LAST_TIME_US
 from src.errors import DataError
+from src.files.whole_read import read_whole
 
 Array = np.ndarray
 

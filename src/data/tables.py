@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from src.data.files import read_whole
 from src.errors import DataError
+from src.files.whole_read import read_whole
 
 Array = np.ndarray
 

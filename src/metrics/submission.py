@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from operator import itemgetter
@@ -16,6 +14,7 @@ from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationE
 from typing_extensions import TypedDict
 
 from src.errors import DataError
+from src.files.atomic_write import replacing
 from src.geometry.transforms import matrix_to_quaternion
 from src.metrics.checks import LARGEST, SMALLEST_ROTATION, check_predictions
 from src.structures.boxes import Boxes3D
@@ -204,20 +203,14 @@ def write_submission(
     )
     head = f'{{"meta": {json.dumps(EMPTY_META | meta)},\n"results": {{\n'
     path = Path(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(partial, "w", encoding="utf-8") as file:
+        with replacing(path, sync=True) as file:
             file.write(head)
             for row, line in enumerate(lines):
                 file.write((",\n" if row else "") + line)
             file.write("\n}}\n")
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
         raise DataError(f"{path}: cannot be written ({error.strerror})") from error
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -43,24 +44,20 @@ class KernelMap:
         """The offset that joins every row with itself, None for a map that is not submanifold."""
         return self.num_offsets // 2 if self.mirrored else None
 
+    @cached_property
     def ends(self) -> Tensor:  # [K] int32
         """End of each offset's block of pairs."""
-        if "ends" not in self.cache:
-            ends = list(itertools.accumulate(self.counts))
-            self.cache["ends"] = torch.tensor(ends, dtype=torch.int32, device=self.inputs.device)
-        return self.cache["ends"]
+        return torch.tensor(list(itertools.accumulate(self.counts)), dtype=torch.int32, device=self.inputs.device)
 
-    def segments_by_output(self) -> tuple[Tensor, Tensor]:
+    @cached_property
+    def by_output(self) -> tuple[Tensor, Tensor]:
         """Pairs ordered by output row [pairs] int32 and the first pair of each row [num_outputs + 1] int32."""
-        if "by_output" not in self.cache:
-            self.cache["by_output"] = segments(self.outputs, self.num_outputs)
-        return self.cache["by_output"]
+        return segments(self.outputs, self.num_outputs)
 
-    def segments_by_input(self) -> tuple[Tensor, Tensor]:
+    @cached_property
+    def by_input(self) -> tuple[Tensor, Tensor]:
         """Pairs ordered by input row [pairs] int32 and the first pair of each row [num_inputs + 1] int32."""
-        if "by_input" not in self.cache:
-            self.cache["by_input"] = segments(self.inputs, self.num_inputs)
-        return self.cache["by_input"]
+        return segments(self.inputs, self.num_inputs)
 
 
 def submanifold_map(sites: Sites, kernel_size: Size) -> KernelMap:

@@ -98,7 +98,7 @@ def maxpool_peaks(
     if len(sites) == 0:
         return torch.zeros_like(scores, dtype=torch.bool)
     maps = submanifold_map(sites, 3)
-    order, starts = maps.segments_by_output()
+    order, starts = maps.by_output
     picks = maps.inputs.index_select(0, order)
     scores = scores.detach()
     return scores == F.embedding_bag(picks, scores, starts[:-1], mode="max")

@@ -38,7 +38,7 @@ def neighbour_sum(
     kernel_map: KernelMap,
 ) -> Tensor:  # [M_out, C]
     """Sum of the input rows that each output sees: the convolution whose weights are all one. Without gradient."""
-    order, starts = kernel_map.segments_by_output()
+    order, starts = kernel_map.by_output
     return gather_segment_sum(features, kernel_map.inputs.index_select(0, order), starts)
 
 

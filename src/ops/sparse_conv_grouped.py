@@ -25,7 +25,7 @@ def grouped_sparse_conv(
 
 
 def _forward(features: Tensor, weight: Tensor, bias: Tensor | None, kernel_map: KernelMap) -> Tensor:
-    out = _gather_multiply_sum(features, weight, kernel_map.inputs, kernel_map, kernel_map.segments_by_output())
+    out = _gather_multiply_sum(features, weight, kernel_map.inputs, kernel_map, kernel_map.by_output)
     return out if bias is None else out.add_(bias)
 
 
@@ -36,10 +36,10 @@ def _gradients(
     if needed[0] and maps.mirrored:
         # The transposed map is the map itself with reversed offsets, whose segments exist already.
         back = weight.flip(0).transpose(1, 2)
-        grad_features = _gather_multiply_sum(grad, back, maps.inputs, maps, maps.segments_by_output())
+        grad_features = _gather_multiply_sum(grad, back, maps.inputs, maps, maps.by_output)
     elif needed[0]:
         back = weight.transpose(1, 2)
-        grad_features = _gather_multiply_sum(grad, back, maps.outputs, maps, maps.segments_by_input())
+        grad_features = _gather_multiply_sum(grad, back, maps.outputs, maps, maps.by_input)
     return grad_features, _weight_gradient(features, grad, maps) if needed[1] else None
 
 
@@ -55,7 +55,7 @@ def _gather_multiply_sum(
     width = weight.shape[2]
     # Rows of a grouped product must be multiples of 16 bytes.
     rows, weight = _padded(rows, 1), _padded(_padded(weight, 1), 2)
-    products = F.grouped_mm(F.embedding(gathered, rows), weight, offs=kernel_map.ends())
+    products = F.grouped_mm(F.embedding(gathered, rows), weight, offs=kernel_map.ends)
     order, starts = segments
     out = gather_segment_sum(products, order, starts)
     return out if out.shape[1] == width else out[:, :width].contiguous()
@@ -71,7 +71,7 @@ def _weight_gradient(
         return features.new_zeros(kernel_map.num_offsets, c_in, c_out)
     left = F.embedding(kernel_map.inputs, _padded(features, 1))
     right = F.embedding(kernel_map.outputs, _padded(grad, 1))
-    return F.grouped_mm(left.t(), right, offs=kernel_map.ends())[:, :c_in, :c_out]
+    return F.grouped_mm(left.t(), right, offs=kernel_map.ends)[:, :c_in, :c_out]
 
 
 def _padded(x: Tensor, axis: int) -> Tensor:

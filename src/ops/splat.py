@@ -46,11 +46,6 @@ class Splat:
         """alpha = 1 - exp(S) on the support."""
         return -torch.expm1(self.log_free)
 
-    @property
-    def log_occupancy(self) -> Tensor:  # [n]
-        """log(alpha) on the support, exact for small alpha as well."""
-        return log1mexp(-self.log_free)
-
 
 def log1mexp(
     u: Tensor,  # [...] > 0

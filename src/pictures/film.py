@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
+
+from src.files.atomic_write import replacing
 
 WIDTH_PX = 960
 """Width of the animation, and of each picture in the strip."""
@@ -64,9 +65,5 @@ class Film:
 
 
 def _write(path: Path, picture: Image.Image, kind: str, **options: object) -> None:
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        picture.save(temporary, kind, **options)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path, "wb") as file:
+        picture.save(file, kind, **options)

@@ -12,6 +12,7 @@ from typing import Any
 from lightning.pytorch.loggers.logger import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
+from src.files.atomic_write import replacing
 from src.reliability.checkpoints import sync_folder
 
 logger = logging.getLogger(__name__)
@@ -101,10 +102,8 @@ class MetricsCSV(Logger):
 
     def _write_rows(self) -> None:
         """Put a file with all rows in the place of the one before, so that none is ever cut short."""
-        temporary = self._path.with_name(self._path.name + ".tmp")
-        with temporary.open("w", newline="") as file:
+        with replacing(self._path, newline="") as file:
             writer = csv.DictWriter(file, self._columns)
             writer.writeheader()
             writer.writerows(self.rows)
-        os.replace(temporary, self._path)
         self._refused = False

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from src.config import PHASES, Config, compose_config
 from src.errors import DataError
+from src.files.atomic_write import write_whole
 from src.pictures.comparison import BarPanel, draw_comparison
 from src.reliability.command import run_command
-from src.report.atomic_write import write_whole
 from src.report.metric_names import DETECTION, RANGES, SPEEDS
 from src.report.pages import (
     PHASES_OF,

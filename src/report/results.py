@@ -17,7 +17,7 @@ from pydantic_core import from_json
 from typing_extensions import TypedDict
 
 from src.errors import DataError
-from src.report.atomic_write import write_whole
+from src.files.atomic_write import write_whole
 from src.report.json_format import ANY_KEYS, OPEN, Count, Many, Measure, read_all, read_as, read_json
 from src.report.metric_names import DETECTION, METRICS
 from src.report.plain_yaml import load_plain_yaml

@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 from pydantic import Field, with_config
 
 from src.errors import DataError, HorizonError
-from src.report.atomic_write import write_whole
+from src.files.atomic_write import write_whole
 from src.report.json_format import CLOSED, Count, Many, parse_as, read_all, read_json
 from src.report.sweep_file import SweepConfig
 from src.training.identity import digest_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from src.errors import DataError
-from src.report.atomic_write import write_whole
+from src.files.atomic_write import write_whole
 from src.report.metric_names import Metric, find_metric
 from src.report.orderings import paired_gains
 from src.report.results import RunResult

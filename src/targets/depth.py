@@ -7,25 +7,14 @@ from enum import Enum
 import torch
 from torch import Tensor
 
-from src.errors import ConfigError
 from src.geometry.ragged import enumerate_windows
 from src.targets.projection import BoxViews
 
 
 class DepthTarget(Enum):
-    """What supervises depth: the centre depth of annotated boxes, or projected lidar points."""
+    """What supervises depth."""
 
-    box = "box"
-    lidar = "lidar"
-
-
-def check_depth_target(depth_target: DepthTarget) -> None:
-    """Raise ConfigError for a target that the batches cannot supply."""
-    if depth_target is not DepthTarget.box:
-        raise ConfigError(
-            f"model.kggi.depth_target={depth_target.value}: frames carry no lidar points in this version, so there is "
-            "nothing to project; use model.kggi.depth_target=box"
-        )
+    box = "box"  # the centre depth of annotated boxes
 
 
 def lid_edges(

@@ -17,6 +17,7 @@ from typing import Any
 import yaml
 
 from src.errors import BusyError, CheckpointError, ConfigError, DataError
+from src.files.atomic_write import replacing
 from src.reliability.checkpoints import BEST, LAST, PREVIOUS, OpenCheckpoint, open_checkpoint, sync_folder
 
 logger = logging.getLogger(__name__)
@@ -110,7 +111,7 @@ class RunFolder:
 
     def _tidy(self) -> None:
         for folder in (self.path, self.checkpoints):
-            for pattern in ("*.tmp", ".*.part", ".probe-*"):
+            for pattern in ("*.tmp", ".probe-*"):
                 for left_over in folder.glob(pattern):
                     left_over.unlink(missing_ok=True)
         if self.finished:
@@ -183,13 +184,8 @@ def make_writable(folder: Path, key: str) -> None:
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write a JSON file that is never seen half-written, after a power failure neither."""
-    temporary = path.with_name(path.name + ".tmp")
-    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
-    with temporary.open("w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    with replacing(path, sync=True) as file:
+        file.write(json.dumps(content, indent=2, allow_nan=False) + "\n")
     sync_folder(path.parent)
 
 

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from src.world import small_shapes, vehicle_shapes
 from src.world.conditions import Conditions
 from src.world.mesh import Colour, Mesh, MeshMaker
+from src.world.placement import Actor
 from src.world.raster import draw_quads
 from src.world.rig import Mount
 from src.world.scenery import Scenery
-from src.world.shapes import build_mesh
 from src.world.simulate import Scene
 
 Array = np.ndarray
@@ -19,6 +20,13 @@ Array = np.ndarray
 VIEW_M = 250.0
 HEADLIGHT_M = 45.0
 SHADE: Colour = (34, 35, 38)
+
+
+def actor_mesh(actor: Actor) -> Mesh:
+    """The mesh of one actor, in its own axes above the middle of its box's underside."""
+    maker, shapes = MeshMaker(), vars(small_shapes) | vars(vehicle_shapes)
+    shapes[f"add_{actor.kind.shape}"](maker, actor, *(actor.size * [0.5, 0.5, 1.0]))
+    return maker.mesh()
 
 
 @dataclass(kw_only=True)
@@ -35,7 +43,7 @@ class Studio:
 
     def __init__(self, scene: Scene, scenery: Scenery, width: int, height: int, rng: np.random.Generator) -> None:
         self.scene, self.scenery, self.width, self.height = scene, scenery, width, height
-        self.meshes = [build_mesh(actor) for actor in scene.actors]
+        self.meshes = [actor_mesh(actor) for actor in scene.actors]
         self.floors = np.array([actor.kind.floor_m for actor in scene.actors])
         bearing = np.linspace(-np.pi, np.pi, 1441)
         waves = sum(rng.uniform(0.2, 1.0) * np.sin(k * bearing + rng.uniform(0, 6.28)) / k for k in range(2, 9))

@@ -19,7 +19,7 @@ class Kind:
     """One kind of object. Sizes are drawn from normal distributions cut at two standard deviations."""
 
     category: str | None  # None: scenery that looks like an object to the radar but is not labelled
-    shape: str  # which mesh of `shapes.py`
+    shape: str  # which function of `small_shapes` or `vehicle_shapes`
     size_m: list[float]  # mean length, width, height
     spread_m: list[float]  # standard deviations
     floor_m: float  # height of the lower edge above the ground

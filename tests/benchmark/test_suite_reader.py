@@ -40,7 +40,8 @@ def short(monkeypatch):
 
 def test_every_part_of_the_suite(config):
     result = suite.measure(config, {})
-    assert result["frames_per_second"] == pytest.approx(4 / result["cpu_seconds"])
+    pipelines = {row["pipeline"]: row["frames/s (CPU)"] for row in result["frames with and without augmentation"]}
+    assert list(pipelines) == ["training", "test"] and min(pipelines.values()) > 0
     stages = {row["stage"]: row for row in result["stages"]}
     assert {*STAGES, "assembling", "collate"} - set(stages) == {"LiDAR files", "LiDAR compensation"}
     assert all(row["training ms"] > 0 for row in stages.values())

@@ -187,7 +187,7 @@ def test_autocast_computes_in_bfloat16_and_returns_gradients_in_the_type_of_the_
 def test_nothing_the_size_of_the_pairs_is_kept_for_backward():
     sites = random_sites((1, 32, 32), 900)
     kernel_map = submanifold_map(sites, 3)
-    kernel_map.segments_by_output()
+    _ = kernel_map.by_output
     features, weight = torch.randn(900, 8, requires_grad=True), torch.randn(9, 8, 8, requires_grad=True)
     kept = []
     with torch.autograd.graph.saved_tensors_hooks(lambda x: kept.append(x.numel()) or x, lambda x: x):

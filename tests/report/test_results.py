@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from src.errors import DataError
-from src.report import atomic_write as writing
 from src.report import json_format
 from src.report.results import MAX_POINTS, finished_runs, publish_result, read_result, read_results, result_path
 
@@ -291,12 +290,10 @@ def test_a_full_disk_leaves_the_older_result(write_run, reports, monkeypatch):
     before = path.read_text()
     damage(folder / "metrics.json", lambda m: m.update(mAP=0.9))
 
-    def full(self: Path, text: str, encoding: str) -> None:
-        with self.open("w") as file:
-            file.write(text[:100])
+    def full(source: Path, target: Path) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(writing.Path, "write_text", full)
+    monkeypatch.setattr(os, "replace", full)
     with pytest.raises(OSError, match="No space left") as raised:
         publish_result(folder, reports)
     assert raised.value.filename == str(path) and raised.value.errno == errno.ENOSPC  # what command.py tells the user

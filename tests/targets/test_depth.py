@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from src.errors import ConfigError
-from src.targets.depth import DepthTarget, check_depth_target, lid_centres, lid_edges, lid_index, paint_depth
+from src.targets.depth import lid_centres, lid_edges, lid_index, paint_depth
 from src.targets.projection import BoxViews
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "golden" / "lid_bins" / "case.json").read_text())
@@ -50,9 +49,3 @@ def test_no_box_is_all_background() -> None:
     seen = BoxViews(none, none, torch.zeros(0, 2), torch.zeros(0), torch.zeros(0, 4))
     painted = paint_depth(seen, 4, (24, 48), (1.0, 160.0), 80, 8)
     assert painted.shape == (4, 3, 6) and (painted == -1).all()
-
-
-def test_lidar_target_names_what_is_missing() -> None:
-    check_depth_target(DepthTarget.box)
-    with pytest.raises(ConfigError, match="no lidar points"):
-        check_depth_target(DepthTarget.lidar)

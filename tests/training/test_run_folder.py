@@ -112,7 +112,7 @@ def test_what_a_killed_process_was_writing_goes_and_so_does_what_only_resuming_n
         "last.ckpt.tmp",
         "previous.ckpt.tmp",
         ".probe-77",
-        "../.submission.json.77.part",
+        "../.submission.json.77.tmp",
         "../metrics.csv.tmp",
     ):
         (folder.checkpoints / name).write_bytes(b"half")

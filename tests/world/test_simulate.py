@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from src.errors import ConfigError
+from src.world.camera_render import actor_mesh
 from src.world.labels import FrameTruth, count_inside, visibility_level
 from src.world.road import LANE_M, make_road
-from src.world.shapes import build_mesh
 from src.world.simulate import make_scene
 from src.world.traffic import STEP_S, Vehicle, simulate_traffic
 from src.world.world_config import WorldConfig
@@ -86,7 +86,7 @@ def test_vehicles_on_the_road_do_not_stand_in_one_another(config):
 
 def test_labelled_objects_lie_inside_their_boxes(config):
     for actor in make_scene(config, 0).actors:
-        corners = build_mesh(actor).corners.reshape(-1, 3)
+        corners = actor_mesh(actor).corners.reshape(-1, 3)
         if actor.kind.category is None or actor.kind.klass == "traffic_sign":
             continue  # poles reach below the sign
         slack = 0.16

@@ -17,7 +17,7 @@ from src.models.horizon3d.views import CameraViews
 from src.ops.segment_reduce import topk_per_sample
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV
-from src.targets.depth import DepthTarget, check_depth_target, lid_centres
+from src.targets.depth import DepthTarget, lid_centres
 
 INSIDE = 1.0 - 1e-5
 """Random means stay strictly inside the grid, in units of its half extent."""
@@ -60,7 +60,6 @@ class KGGIConfig:
         window = self.keypoint_nms_cells
         if window is not None and (window < 3 or window % 2 == 0):
             raise ConfigError(f"model.kggi.keypoint_nms_cells={window}: must be null or an odd number from 3 on")
-        check_depth_target(self.depth_target)
 
     @property
     def depth_range(self) -> tuple[float, float]:

@@ -2,8 +2,8 @@ import os
 
 import pytest
 
-from src.data.files import read_whole
 from src.errors import DataError
+from src.files.whole_read import read_whole
 
 
 def test_a_file_of_the_longest_size_is_read_whole(tmp_path):
