@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.layers.sparse import SparseKernel, SubmanifoldConv
 from src.ops.sites import Sites
-from src.structures.sparse_bev import SparseBEV, SparseMap
+from src.structures.sparse_bev import SparseMap
 
 
 def load_spconv(device: torch.device) -> ModuleType | None:
@@ -104,12 +104,6 @@ def spconv_encoder(spconv: ModuleType, encoder: RadarEncoder) -> RadarEncoder:
                 scope = "conv_out"
             twin.set_submodule(name, SpconvLayer(spconv, kernel, f"{'subm' if subm else 'down'} {scope}"))
     return twin
-
-
-def uncached(x: SparseMap) -> SparseMap:
-    """The same map without kernel maps."""
-    kind = SparseBEV if isinstance(x, SparseBEV) else SparseMap
-    return kind(Sites(x.sites.shape, x.sites.keys), x.features)
 
 
 def largest_difference(ours: list[Tensor], theirs: list[Tensor]) -> float:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from src.data.splits import split_samples
 from src.errors import ConfigError
 from src.reliability.checkpoints import read_checkpoint
 from src.streaming import StreamingDetector
-from src.structures.batch import FrameBatch
 from src.training.run_folder import current_commit
 
 LATENCY_FORMAT = 1
@@ -66,17 +65,18 @@ def benchmark_latency(
         torch.cuda.reset_peak_memory_stats()
     scenes = scenes_of(datamodule.index, split_samples(datamodule.index, datamodule.config.split))
     full = min(memory_frames, max(map(len, scenes)) - 1)
-    frames, measured, seen = endless_stream(datamodule), [], 0
-    while len(measured) < MEASURED_FRAMES:
-        frame, number = next(frames)
+    measured, number = [], 0  # the frame's place in its scene
+    for seen, frame in enumerate(itertools.chain.from_iterable(datamodule.stream() for _ in itertools.count())):
+        number = 0 if bool(frame.starts[0]) else number + 1
         frame = frame.to(device)
         with timed_parts(detector.model, parts, now) as seconds:
             begin = now()
             detector.run(frame)
             whole = now() - begin
-        seen += 1
-        if seen > WARM_UP_FRAMES and number >= full:
+        if seen >= WARM_UP_FRAMES and number >= full:
             measured.append({name: 1e3 * value for name, value in (seconds | {"total": whole}).items()})
+        if len(measured) == MEASURED_FRAMES:
+            break
     columns = {name: [row[name] for row in measured] for name in (*parts, "total") if name in measured[0]}
     medians = {name: median_iqr(values) for name, values in columns.items()}
     return {
@@ -91,12 +91,3 @@ def benchmark_latency(
         "load": round(load, 2),
         "cores": os.cpu_count() or 1,
     }
-
-
-def endless_stream(datamodule: DetectionDataModule) -> Iterator[tuple[FrameBatch, int]]:
-    """The validation frames over and over, each with its place in its scene."""
-    while True:
-        number = 0
-        for frame in datamodule.stream():
-            number = 0 if bool(frame.starts[0]) else number + 1
-            yield frame, number

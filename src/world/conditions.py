@@ -8,6 +8,9 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+SAME_TAGS = ("structure.regular", "construction.roadworks")
+"""Of every scene of this world."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Conditions:
@@ -42,17 +45,8 @@ class Conditions:
 
     @property
     def tags(self) -> str:
-        """The seven scene tags; structure and construction are the same in every scene of this world."""
-        groups = (
-            self.weather,
-            self.area,
-            self.daytime,
-            self.season,
-            self.lighting,
-            "structure.regular",
-            "construction.roadworks",
-        )
-        return ";".join(groups)
+        """The seven scene tags."""
+        return ";".join((self.weather, self.area, self.daytime, self.season, self.lighting, *SAME_TAGS))
 
 
 _LIGHT = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))

@@ -54,8 +54,6 @@ def frame_truth(scene: Scene, time_s: float, own_pixels: Array, seen_pixels: Arr
 def count_inside(truth: FrameTruth, sizes: Array, points: Array) -> Array:
     """How many of the points [P, 3] (local coordinates) lie in each box, borders included: [N]."""
     counts = np.zeros(len(sizes), dtype=np.int64)
-    if not len(points):
-        return counts
     cos, sin = np.cos(truth.yaws), np.sin(truth.yaws)
     near = np.flatnonzero(truth.distance_m < 260)
     offset = points[None] - truth.centres[near, None]
