@@ -61,11 +61,8 @@ def ego_motion(
 
 
 def compensate_clouds(
-    clouds: list[Array],  # S of [n, 7] in the order of RADAR_FIELDS, sensor frame
-    ego_from_sensor: Array,  # [S, 4, 4]
-    key_from_sweep: Array,  # [S, 4, 4] ego(t) from the ego frame at each sweep
-    velocity: Array,  # [S, 3] m/s of the ego at each sweep, its own axes
-    rate: Array,  # [S, 3] rad/s, same axes
+    sweeps: Sweeps,  # at least one
+    key_from_global: Array,  # [4, 4] global to ego(t)
     elapsed_s: Array,  # [S] key frame minus sweep
     min_distance_m: float,  # points nearer than this in both x and y of the sensor are dropped
     propagate_points: bool,  # move points by their own radial velocity to the key frame's time
@@ -75,7 +72,9 @@ def compensate_clouds(
     r_hat points from the sensor to the target, v_s is the sensor's own velocity, lever arm included:
     v_r = vrel . r_hat + v_s . r_hat, zero for whatever stands still.
     """
-    sensor_velocity = velocity + np.cross(rate, ego_from_sensor[:, :3, 3])
+    clouds, ego_from_sensor = sweeps.clouds, sweeps.ego_from_sensor
+    key_from_sweep = key_from_global @ sweeps.global_from_ego
+    sensor_velocity = sweeps.velocity + np.cross(sweeps.rate, ego_from_sensor[:, :3, 3])
     key_from_sensor = key_from_sweep @ ego_from_sensor
     counts = [len(cloud) for cloud in clouds]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
@@ -45,11 +46,8 @@ class OnBadFile(Enum):
 class _Skipped:
     """What a frame does without."""
 
-    channels: dict[str, int] = field(default_factory=dict)
+    channels: Counter[str] = field(default_factory=Counter)
     files: list[str] = field(default_factory=list)
-
-    def count(self, channel: str) -> None:
-        self.channels[channel] = self.channels.get(channel, 0) + 1
 
 
 @dataclass(kw_only=True)
@@ -120,7 +118,7 @@ class FrameReader:
             batch["future"] = self._future(sample, aug_from_ego, skipped)
         if index.annotated:
             batch["boxes"] = [self._boxes(sample, global_from_ego).transform(torch.from_numpy(aug_from_ego))]
-        return FrameBatch(**batch, skipped=skipped.channels, bad_files=skipped.files)
+        return FrameBatch(**batch, skipped=dict(skipped.channels), bad_files=skipped.files)
 
     def _key_frame(self, sample: int, aug_from_ego: Array) -> dict[str, Any]:
         """What every frame has."""
@@ -165,7 +163,7 @@ class FrameReader:
         for channel in channels:
             row = int(self.index.key_data[sample, CHANNELS.index(channel)])
             if row < 0 and count:
-                skipped.count(f"{channel} (not recorded)")
+                skipped.channels[f"{channel} (not recorded)"] += 1
             for _ in range(count):
                 if row < 0:
                     break
@@ -270,7 +268,7 @@ class FrameReader:
         for view, channel in enumerate(CAMERAS):
             row = int(rows[view])
             if row < 0:
-                skipped.count(f"{channel} (not recorded)")
+                skipped.channels[f"{channel} (not recorded)"] += 1
                 continue
             source_px = tuple(int(n) for n in index.data_sizes[row])
             crop = (
@@ -325,7 +323,7 @@ class FrameReader:
             if self.settings.on_bad_file is OnBadFile.error:
                 remedy = "restore the file, or skip and count such files with data.on_bad_file=skip"
                 raise DataError(f"{error} (sample {self.index.sample_tokens[sample]}); {remedy}") from error
-            skipped.count(channel)
+            skipped.channels[channel] += 1
             skipped.files.append(name)
             if name not in self._reported:
                 self._reported.add(name)
@@ -367,16 +365,8 @@ def radar_tensors(
     """The radar of a batch of one: moved to ego(t), compensated for the ego motion by the full mount (method 1.3)."""
     points = np.zeros((0, len(RADAR_POINT_FIELDS)))
     if sweeps.clouds:
-        points = compensate_clouds(
-            sweeps.clouds,
-            sweeps.ego_from_sensor,
-            key_from_sweep=invert_rigid(global_from_ego) @ sweeps.global_from_ego,
-            velocity=sweeps.velocity,
-            rate=sweeps.rate,
-            elapsed_s=ages_s,
-            min_distance_m=settings.min_distance_m,
-            propagate_points=settings.propagate_points,
-        )
+        least_m, propagated = settings.min_distance_m, settings.propagate_points
+        points = compensate_clouds(sweeps, invert_rigid(global_from_ego), ages_s, least_m, propagated)
         linear = aug_from_ego[:3, :3]
         points[:, :3] = points[:, :3] @ linear.T + aug_from_ego[:3, 3]
         points[:, 4:6] = points[:, 4:6] @ linear[:2, :2].T

@@ -15,7 +15,7 @@ from typing_extensions import TypedDict
 
 from src.errors import DataError
 from src.files.atomic_write import replacing
-from src.geometry.transforms import matrix_to_quaternion
+from src.geometry.transforms import matrix_to_quaternion, rotation_zyx
 from src.metrics.checks import LARGEST, SMALLEST_ROTATION, check_predictions
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
@@ -247,11 +247,7 @@ def to_global(
     columns = {name: None if v is None else v.detach().cpu().double().numpy() for name, v in values.items()}
     rotation, position = global_from_ego[:3, :3].astype(np.float64), global_from_ego[:3, 3].astype(np.float64)
     n = len(boxes)
-    cosine, sine = np.cos(columns["yaws"]), np.sin(columns["yaws"])
-    turns = np.zeros((n, 3, 3))
-    turns[:, 0, 0] = turns[:, 1, 1] = cosine
-    turns[:, 0, 1], turns[:, 1, 0] = -sine, sine
-    turns[:, 2, 2] = 1.0
+    turns = rotation_zyx(columns["yaws"], np.zeros(n), np.zeros(n))
     return DetectionTable(
         samples=np.full(n, sample, dtype=np.int64),
         labels=boxes.labels.cpu().numpy().astype(np.int64),

@@ -1,7 +1,7 @@
 """One frame: radar compensation, projection under augmentation, boxes, bad files (method 15, points 5 to 7)."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -104,7 +104,8 @@ def test_compensation_is_that_of_one_point_after_the_other(propagate_points):
     clouds = [rng.normal(scale=4, size=(n, 7)).astype(np.float32) for n in (5, 0, 40, 1)]
     clouds[2][3, :3] = 0
     settings = {"propagate_points": propagate_points, "min_distance_m": 2.0}
-    found = compensate_clouds(clouds, mounts, key_from_sweep, velocity, rate, elapsed_s, **settings)
+    sweeps = Sweeps(clouds=clouds, ego_from_sensor=mounts, global_from_ego=key_from_sweep, velocity=velocity, rate=rate)
+    found = compensate_clouds(sweeps, np.eye(4), elapsed_s, **settings)
     expected = []
     for cloud, mount_, motion, v, w, lag in zip(clouds, mounts, key_from_sweep, velocity, rate, elapsed_s, strict=True):
         for point in cloud.astype(np.float64):
@@ -119,8 +120,8 @@ def test_compensation_is_that_of_one_point_after_the_other(propagate_points):
             expected.append([*place, point[6], *ground, lag])
     assert found.dtype == np.float64 and 20 < len(expected) < 45
     np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11)
-    nothing = compensate_clouds(clouds[1:2], *(a[1:2] for a in (mounts, key_from_sweep, velocity, rate)), np.zeros(1),
-                                **settings)  # fmt: skip
+    second = Sweeps(**{field.name: getattr(sweeps, field.name)[1:2] for field in fields(sweeps)})
+    nothing = compensate_clouds(second, np.eye(4), np.zeros(1), **settings)
     assert nothing.shape == (0, 7)
 
 
