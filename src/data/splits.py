@@ -7,12 +7,14 @@ import logging
 from pathlib import Path
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from src.data.schema import DatasetIndex
 from src.errors import DataError
 
 OFFICIAL_LISTS = Path(__file__).with_name("truckscenes_splits.json")
 
+_SPLITS = TypeAdapter(dict[str, list[str]])
 _log = logging.getLogger(__name__)
 
 
@@ -49,12 +51,9 @@ def _read_splits(index: DatasetIndex) -> tuple[dict[str, list[str]], Path]:
 
 def _checked(path: Path) -> dict[str, list[str]]:
     try:
-        splits = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: not readable as JSON ({error}); restore or delete it") from None
-    good = isinstance(splits, dict) and all(
-        isinstance(names, list) and all(isinstance(name, str) for name in names) for names in splits.values()
-    )
-    if not good:
-        raise DataError(f'{path}: expected {{"split": [scene names], ...}}; restore or delete it')
-    return splits
+        return _SPLITS.validate_json(path.read_bytes())
+    except (OSError, ValidationError) as error:
+        reason = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error
+        raise DataError(
+            f'{path}: expected JSON of {{"split": [scene names], ...}} ({reason}); restore or delete it'
+        ) from None

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic_core import from_json
 
 from src.errors import DataError
 from src.files.whole_read import read_whole
@@ -63,7 +63,7 @@ class Table:
             self.fail(row, field, value.tolist() if isinstance(value, np.ndarray | np.generic) else value, expected)
 
     def values(self, field: str, kind: type = str, most: int = MAX_TEXT) -> list[Any]:
-        """One field of every record, all of type `kind`; a text of at most `most` characters that UTF-8 can write."""
+        """One field of every record, all of type `kind`; a text of at most `most` characters."""
         try:
             column = [record[field] for record in self.records]
         except KeyError:
@@ -74,22 +74,19 @@ class Table:
                 f"but only {_short(sorted(self.records[row]))}; {_REMEDY}"
             ) from None
         if any(type(value) is not kind for value in column):
-            row = next(row for row, value in enumerate(column) if type(value) is not kind)
+            row = _first(column, lambda value: type(value) is not kind)
             self.fail(row, field, column[row], f"a value of type {kind.__name__}")
-        if kind is str and not _is_plain(column, most):
-            row = next(row for row, value in enumerate(column) if not _is_plain([value], most))
-            self.fail(row, field, column[row], f"a text of at most {most} characters, without NUL and lone surrogates")
+        if kind is str and (max(map(len, column), default=0) > most or "\0" in "".join(column)):
+            row = _first(column, lambda value: len(value) > most or "\0" in value)
+            self.fail(row, field, column[row], f"a text of at most {most} characters, without NUL")
         return column
 
     def integers(self, field: str) -> Array:  # [n] int64
         """An integer field."""
         column = self.values(field, int)
-        try:
-            return np.array(column, np.int64)
-        except OverflowError:
-            row = next(row for row, value in enumerate(column) if not -(2**63) <= value < 2**63)
-            self.fail(row, field, column[row], "an integer of at most 64 bits")
-            raise
+        fits = np.array([-(2**63) <= value < 2**63 for value in column], bool)
+        self.check(fits, field, column, "an integer of at most 64 bits")
+        return np.array(column, np.int64)
 
     def times(self) -> Array:  # [n] int64, microseconds
         """The time stamps."""
@@ -163,16 +160,6 @@ def _short(value: object) -> str:
     return text if len(text) <= 120 else text[:117] + "..."
 
 
-def _is_plain(texts: list[str], most: int) -> bool:
-    """Whether arrays and files can hold these: numpy drops a NUL at the end, UTF-8 has no lone surrogates."""
-    try:
-        whole = "".join(texts)
-        whole.encode()
-    except UnicodeEncodeError:
-        return False
-    return "\0" not in whole and max(map(len, texts), default=0) <= most
-
-
 def _first(column: list[Any], bad: Callable[[Any], bool]) -> int:
     return next((row for row, value in enumerate(column) if bad(value)), 0)
 
@@ -189,15 +176,9 @@ def _read_list(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         raise DataError(f"{path}: this table is missing; {_REMEDY}")
     try:
-        text = read_whole(path, MAX_TABLE_BYTES).decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: cannot be read as UTF-8 text ({error}); {_REMEDY}") from None
-    try:
-        records = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise DataError(f"{path}: line {error.lineno}, column {error.colno}: {error.msg}; {_REMEDY}") from None
-    except (RecursionError, ValueError) as error:  # nested too deeply; a number of too many digits
-        raise DataError(f"{path}: not a table ({error}); {_REMEDY}") from None
+        records = from_json(read_whole(path, MAX_TABLE_BYTES))
+    except ValueError as error:  # with line and column
+        raise DataError(f"{path}: not a table of JSON ({error}); {_REMEDY}") from None
     if not isinstance(records, list):
         raise DataError(f"{path}: expected a list of records, but got {type(records).__name__}; {_REMEDY}")
     for row, record in enumerate(records):

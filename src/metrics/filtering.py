@@ -59,7 +59,8 @@ def _inside_rack(boxes: DetectionTable, racks: DetectionTable) -> Array:
     edge falls between the edge's ends. Summing in the official order keeps points on a border on the same side.
     """
     order = np.argsort(racks.samples, kind="stable")
-    pairs_box, pairs_rack = join_sorted(boxes.samples, racks.samples[order])
+    bounds = (np.searchsorted(racks.samples[order], boxes.samples, side) for side in ("left", "right"))
+    pairs_box, pairs_rack = expand_ranges(*bounds)
     rack = racks[order[pairs_rack]]
     width, length, height = rack.sizes.T
     axes = quaternion_to_matrix(rack.rotations)  # [p, 3, 3]
@@ -75,14 +76,6 @@ def _inside_rack(boxes: DetectionTable, racks: DetectionTable) -> Array:
     result = np.zeros(len(boxes), dtype=bool)
     result[pairs_box[inside]] = True
     return result
-
-
-def join_sorted(
-    queries: Array,  # [q] int
-    keys: Array,  # [k] int, ascending
-) -> tuple[Array, Array]:
-    """All pairs (row of `queries`, row of `keys`) with equal values, ordered by both: two arrays [p] int64."""
-    return expand_ranges(np.searchsorted(keys, queries, "left"), np.searchsorted(keys, queries, "right"))
 
 
 def expand_ranges(

@@ -287,7 +287,10 @@ def read_result(path: Path) -> RunResult:
         numbers = _flat_scores(fields["metrics"])
     else:
         numbers = _numbers(fields["metrics"], fields["headline"], path, remedy)
-    return RunResult(**fields | {"metrics": numbers | _flat_latency(fields["latency"])})
+    if (latency := fields["latency"]) is not None:
+        numbers |= {f"latency.{part}": value for part, value in latency["ms"].items()}
+        numbers |= {f"latency.{name}": latency[name] for name in ("fps", "memory_gb")}
+    return RunResult(**fields | {"metrics": numbers})
 
 
 def read_results(reports: Path, scale: str | None = None) -> tuple[dict[str, RunResult], dict[Path, DataError]]:
@@ -318,13 +321,6 @@ def _flat_scores(scores: Scores) -> dict[str, float | None]:
         for key in ("AP", "AVE"):  # the official numbers of a class without ground truth are 0 and 1, and say nothing
             values[f"{prefix}car.{key}"] = car[key] if car["num_gt"] else None
     return values
-
-
-def _flat_latency(latency: Latency | None) -> dict[str, float]:
-    if latency is None:
-        return {}
-    values = {f"latency.{part}": value for part, value in latency["ms"].items()}
-    return values | {f"latency.{name}": latency[name] for name in ("fps", "memory_gb")}
 
 
 def _slim(scores: dict[str, Any]) -> dict[str, Any]:

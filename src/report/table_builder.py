@@ -8,7 +8,7 @@ from src.errors import DataError
 from src.files.atomic_write import write_whole
 from src.report.metric_names import Metric, find_metric
 from src.report.orderings import paired_gains
-from src.report.results import RunResult, read_result, result_path
+from src.report.results import RunResult
 from src.report.sweep_file import TableConfig
 from src.report.sweep_record import RunState, SweepRecord
 from src.report.sweep_table import PAPER, SweepRow, SweepTable, TableCell, rounded
@@ -31,19 +31,12 @@ def sweep_tables(record: SweepRecord, results: dict[str, RunResult]) -> list[Swe
     return [_table(record, used, table) for table in _table_configs(record)]
 
 
-def write_sweep_tables(reports: Path, record: SweepRecord, results: dict[str, RunResult] | None = None) -> list[Path]:
+def write_sweep_tables(reports: Path, record: SweepRecord, results: dict[str, RunResult]) -> list[Path]:
     """Write `tables/<table>_<scale><suffix of the record>.{md,csv,tex}` under `reports`; returns their paths.
 
-    Results that are not given are read; one that cannot be read is a missing one, and the table says so. Raises as
-    `sweep_tables`, and OSError naming the file for a disk that does not take it.
+    A result that is not among `results` is a missing one, and the table says so. Raises as `sweep_tables`, and OSError
+    naming the file for a disk that does not take it.
     """
-    if results is None:
-        results = {}
-        for run_id in _run_ids(record):
-            try:
-                results[run_id] = read_result(result_path(reports, run_id))
-            except DataError:  # the row's state names the file
-                continue
     written = []
     for table in sweep_tables(record, results):
         stem = reports / "tables" / f"{table.name}_{table.scale}{record.suffix}"

@@ -22,7 +22,7 @@ from src.errors import ConfigError, HorizonError, InterruptedRunError
 from src.reliability.command import run_command
 from src.reliability.passwords import hide_in_process_list, masked
 from src.reliability.processes import die_with_parent
-from src.report.results import publish_result
+from src.report.results import publish_result, read_results
 from src.report.sweep_file import DimensionConfig
 from src.report.sweep_record import SweepRecord
 from src.report.table_builder import write_sweep_tables
@@ -99,7 +99,7 @@ def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, ag
         problems.append(f"the same command retries them:\n    {again}")
     runner.publish_done(strictly=True)
     try:
-        paths = write_sweep_tables(reports, record)
+        paths = write_sweep_tables(reports, record, read_results(reports, record.scale)[0])
     except HorizonError as error:
         if not problems:
             raise
@@ -110,8 +110,6 @@ def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, ag
             print(f"\n{path.read_text()}")
     for path in paths:
         print(f"table: {path}")
-    if isinstance(runner, Search) and (best := runner.best()) is not None:
-        print(f"best {record.sweep.objective}: {best.value:.4f} with\n    {' '.join(best.attrs['chosen'])}")
     print(progress_line(record, 1, time.time()))
     if problems:
         raise HorizonError("\n".join(problems))

@@ -218,7 +218,8 @@ class Runner:
             if self._interruptions[spec.run_id] < MOST_INTERRUPTIONS:
                 logger.info("%s: interrupted after %.0f s; it can be resumed", name_of(spec), seconds)
                 return replace(status, reason="")
-        reason = status.reason
+        # A signal may come when everything is written, as to a search's run that is ended early in its last moment.
+        reason = "" if status.interrupted and self.writer.is_done(spec.run_id) else status.reason
         if not reason and not is_finished(folder):
             reason = f"it ended with exit code 0, but {folder} has no run.json and metrics.json"
         elif not reason and not self.writer.is_done(spec.run_id):

@@ -36,11 +36,6 @@ class Search(Runner):
         contents = [content for trial in self.study.trials() for content in trial.attrs.get("run_specs", [])]
         return list({content["run_id"]: RunSpec(**content) for content in contents}.values())
 
-    def best(self) -> SweepTrial | None:
-        """The trial with the best objective so far."""
-        done = [trial for trial in self.study.trials() if trial.state == "done" and trial.value is not None]
-        return max(done, key=lambda trial: trial.value or 0.0, default=None)
-
     # ---------------------------------------------------------------- a worker
 
     def _take_next(self, lock: TextIO, worker: int) -> tuple[bool, bool]:

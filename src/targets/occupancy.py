@@ -7,7 +7,6 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import cells_in_boxes
-from src.ops.sites import rows_of_keys
 from src.structures.boxes import Boxes3D
 from src.targets.supervision import supervised_boxes
 
@@ -23,14 +22,6 @@ def occupied_cells(
     """
     joined, batch = supervised_boxes(boxes, grid)
     return torch.unique(box_cell_keys(joined, batch, grid, margin_m)[1])
-
-
-def cells_are_occupied(
-    keys: Tensor,  # [M] int64 linear keys of the cells in question
-    occupied: Tensor,  # [P] int64, sorted, unique
-) -> Tensor:  # [M] bool
-    """Mask of the cells that lie in a box."""
-    return rows_of_keys(occupied, keys) >= 0
 
 
 def box_cell_keys(

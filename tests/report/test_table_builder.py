@@ -10,7 +10,7 @@ import pytest
 from src.errors import DataError
 from src.report.escaping import as_code, escape_latex, escape_markdown
 from src.report.metric_names import METRICS
-from src.report.results import result_path
+from src.report.results import read_results, result_path
 from src.report.sweep_file import DimensionConfig, SweepConfig
 from src.report.sweep_record import RunState, SweepRecord
 from src.report.table_builder import sweep_tables, write_sweep_tables
@@ -375,7 +375,7 @@ def test_files_are_written_from_the_results_that_can_be_read(make_record, make_r
     for end, value in (("a0", 0.1), ("b0", 0.2)):
         write_result(make_result(f"{PREFIX}{end}", {"mAP": value, "NDS": value}))
     result_path(reports, f"{PREFIX}b0").write_text("{")
-    paths = write_sweep_tables(reports, record)
+    paths = write_sweep_tables(reports, record, read_results(reports)[0])
     assert [path.name for path in paths] == [f"table_epsilon_mini.{ending}" for ending in ("md", "csv", "tex")]
     text = paths[0].read_text()
     assert "| a | 10.0 |" in text and "result missing or not readable" in text

@@ -16,11 +16,12 @@ from src.models.horizon3d.bev_path import CellPrediction
 from src.models.horizon3d.kggi import KGGIConfig, KGGIOutput
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.horizon3d.views import CameraViews
+from src.ops.sites import rows_of_keys
 from src.structures.boxes import Boxes3D
 from src.structures.sparse_bev import SparseBEV
 from src.targets.depth import paint_depth
 from src.targets.keypoints import keypoint_heatmap
-from src.targets.occupancy import cells_are_occupied, occupied_cells
+from src.targets.occupancy import occupied_cells
 from src.targets.projection import BoxViews, view_boxes
 from src.targets.supervision import supervised_boxes
 from src.targets.velocity import velocity_raster
@@ -62,7 +63,7 @@ def kggi_losses(
     if kggi.camera is None or kggi.objectness_logits is None:
         return terms
     if config.radar_objectness_weight is not None:
-        target = cells_are_occupied(radar_bev.sites.linear(), occupied_cells(boxes, grid, 0.0))  # [M]
+        target = rows_of_keys(occupied_cells(boxes, grid, 0.0), radar_bev.sites.linear()) >= 0  # [M] bool
         total = sigmoid_focal(kggi.objectness_logits, target).sum()
         terms["radar_objectness"] = config.radar_objectness_weight * total / mean_over_ranks(target.sum())
     if config.keypoint_weight is None and config.depth_weight is None:
@@ -128,7 +129,7 @@ def cell_losses(
     """Occupancy and velocity of the cells of F_fuse against the tight boxes (method 6.1, 8.1), weighted."""
     terms: dict[str, Tensor] = {}
     keys, sample = fused.sites.linear(), fused.indices[:, 0]
-    target = cells_are_occupied(keys, occupied_cells(boxes, grid, 0.0))  # [M]
+    target = rows_of_keys(occupied_cells(boxes, grid, 0.0), keys) >= 0  # [M] bool
     if config.cell_focal_weight is not None:
         total = sigmoid_focal(cells.occupancy_logits, target).sum()
         terms["cell_focal"] = config.cell_focal_weight * total / mean_over_ranks(target.sum())
