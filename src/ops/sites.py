@@ -116,11 +116,6 @@ class Sites:
             position = position * size + column
         return position
 
-    def batch_counts(self) -> Tensor:  # [B] int64
-        """Number of sites of every sample."""
-        starts = torch.arange(self.shape[0] + 1, device=self.device) * self.strides[0]
-        return torch.searchsorted(self.keys, starts).diff()
-
     def rows_of(
         self,
         indices: Tensor,  # [q, 1 + d] int64, may lie outside the grid
