@@ -28,10 +28,14 @@ def check_predictions(table: DetectionTable, tokens: Sequence[str]) -> None:
 
     Raises DataError naming the sample, the box (counted within the table) and the value.
     """
+
+    def within(values: Array, low: int, high: int) -> Array:  # [n] int -> [n] bool
+        return (values >= low) & (values < high)
+
     valid = {
-        "samples": (_within(table.samples, 0, len(tokens)), f"0..{len(tokens) - 1}"),
-        "labels": (_within(table.labels, 0, len(CLASSES)), f"0..{len(CLASSES) - 1}"),
-        "attributes": (_within(table.attributes, -1, len(ATTRIBUTES)), f"-1..{len(ATTRIBUTES) - 1}"),
+        "samples": (within(table.samples, 0, len(tokens)), f"0..{len(tokens) - 1}"),
+        "labels": (within(table.labels, 0, len(CLASSES)), f"0..{len(CLASSES) - 1}"),
+        "attributes": (within(table.attributes, -1, len(ATTRIBUTES)), f"-1..{len(ATTRIBUTES) - 1}"),
         "centers": (np.abs(table.centers) <= LARGEST, _FINITE),
         "sizes": ((table.sizes > 0) & (table.sizes <= LARGEST), f"positive and {_FINITE}"),
         "rotations": (_are_rotations(table.rotations), f"{_FINITE}, not all 0"),
@@ -52,14 +56,6 @@ def check_predictions(table: DetectionTable, tokens: Sequence[str]) -> None:
         raise DataError(
             f"sample {tokens[worst]}: at most {MAX_BOXES_PER_SAMPLE} boxes, but got {counts[worst]}; keep the best ones"
         )
-
-
-def _within(
-    values: Array,  # [n] int
-    low: int,
-    high: int,
-) -> Array:
-    return (values >= low) & (values < high)
 
 
 def _are_rotations(

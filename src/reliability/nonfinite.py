@@ -94,7 +94,13 @@ class StepGuard:
 
         self.restore()
         if self.in_a_row == 0:  # the next ones in a row have the same weights
-            path = dump_step(module, batch, text) if trainer.global_rank in named_ranks else None
+            path = None
+            if trainer.global_rank in named_ranks:
+                number, rank = trainer.global_step, trainer.global_rank
+                step = {"global_step": number, "epoch": trainer.current_epoch, "rank": rank, "found": text}
+                step |= {"world_size": trainer.world_size, "seed": step_seed(module.seed, number, rank)}
+                step["memories"] = module.memories_before_step()
+                path = write_dump(Path(trainer.default_root_dir), module.model, module.config, batch, **step)
             kept = [path for path in gather_by_rank(path and str(path)) if path]
             text += f"; run it again with: python -m src.replay checkpoint={kept[0]}" if kept else ""
         module.forget_step(batch)
@@ -158,25 +164,6 @@ def describe_gradients(model: nn.Module) -> str:
 
 
 # ---------------------------------------------------------------- dumps
-
-
-def dump_step(module: L.LightningModule, batch: FrameBatch, found: str) -> Path | None:
-    """Write what `src.replay` needs of the running step of a `TrainingModule`; see `write_dump`."""
-    trainer = module.trainer
-    step, rank = trainer.global_step, trainer.global_rank
-    return write_dump(
-        Path(trainer.default_root_dir),
-        module.model,
-        module.config,
-        batch,
-        global_step=step,
-        epoch=trainer.current_epoch,
-        rank=rank,
-        world_size=trainer.world_size,
-        seed=step_seed(module.seed, step, rank),
-        memories=module.memories_before_step(),
-        found=found,
-    )
 
 
 def write_dump(

@@ -42,14 +42,12 @@ class GaussianSet(TensorFields):
 
     def __post_init__(self) -> None:
         b, g = self.valid.shape
-        pairs = ("means", "scales", "directions", "velocities")
-        expected = {name: (b, g, 2) for name in pairs}
-        expected |= {name: (b, g) for name in ("opacity_logits", "sources", "elapsed_s")}
-        expected["features"] = (b, g, self.features.shape[-1])
-        for name, shape in expected.items():
-            value = getattr(self, name)
+        widths = {name: (2,) for name in ("means", "scales", "directions", "velocities")}
+        widths["features"] = self.features.shape[-1:]
+        for field in fields(self):
+            value, shape = getattr(self, field.name), (b, g, *widths.get(field.name, ()))
             if tuple(value.shape) != shape:
-                raise ValueError(f"GaussianSet.{name} must be {list(shape)}, but got {list(value.shape)}")
+                raise ValueError(f"GaussianSet.{field.name} must be {list(shape)}, but got {list(value.shape)}")
         if self.valid.dtype != torch.bool:
             raise ValueError(f"GaussianSet.valid must be bool, but got {self.valid.dtype}")
 
