@@ -33,14 +33,30 @@ def decode_fast(
     content: bytes,
     source_px: tuple[int, int],  # (height, width) as the tables state it
     reduction: int,  # one of REDUCTIONS
+    decoder: ModuleType | None = None,  # None: the checked one
 ) -> Image.Image | None:
     """The image that Pillow's `draft` and `load` give, for resizing only, or None where Pillow must read it itself.
 
     None stands for: no faster decoder, a damaged file, another size, and anything but colour in the usual encoding.
     Pillow then finds the same fault and names it, or overlooks it.
     """
-    decoder = _checked_decoder()
-    return None if decoder is None or min(source_px) < LEAST_PX else _decode(decoder, content, source_px, reduction)
+    decoder = decoder or _checked_decoder()
+    if decoder is None or min(source_px) < LEAST_PX:
+        return None
+    wanted = [-(-side // reduction) for side in source_px]
+    try:
+        height, width, colours, _ = decoder.decode_jpeg_header(content)
+        if (height, width) != tuple(source_px) or colours != "YCbCr":
+            return None
+        scale = {"min_height": wanted[0], "min_width": wanted[1], "min_factor": reduction}
+        pixels = decoder.decode_jpeg(content, "RGBX", **scale)  # [H, W, 4], as Pillow lays out its own images
+        if list(pixels.shape[:2]) != wanted:
+            return None
+        # What Image.frombuffer does without a copy for RGBX; as RGB it resizes three of the four bytes.
+        memory = Image.core.map_buffer(pixels, (wanted[1], wanted[0]), "raw", 0, ("RGB", 0, 1))
+        return Image.new("RGB", (1, 1))._new(memory)
+    except Exception:  # whatever is wrong with a file, Pillow says it in the words that callers know
+        return None
 
 
 def damage_of(content: bytes) -> str | None:
@@ -100,30 +116,8 @@ def _checked_decoder() -> ModuleType | None:
             expected = Image.open(buffer)
             expected.draft("RGB", (118 // reduction, 83 // reduction))
             expected.load()
-            found = _decode(simplejpeg, buffer.getvalue(), (83, 118), reduction)
+            found = decode_fast(buffer.getvalue(), (83, 118), reduction, simplejpeg)
             if found is None or found.tobytes() != expected.tobytes():
                 _log.warning("simplejpeg %s gives other pixels than Pillow: not used", simplejpeg.__version__)
                 return None
     return simplejpeg
-
-
-def _decode(
-    decoder: ModuleType,
-    content: bytes,
-    source_px: tuple[int, int],  # (height, width)
-    reduction: int,
-) -> Image.Image | None:
-    wanted = [-(-side // reduction) for side in source_px]
-    try:
-        height, width, colours, _ = decoder.decode_jpeg_header(content)
-        if (height, width) != tuple(source_px) or colours != "YCbCr":
-            return None
-        scale = {"min_height": wanted[0], "min_width": wanted[1], "min_factor": reduction}
-        pixels = decoder.decode_jpeg(content, "RGBX", **scale)  # [H, W, 4], as Pillow lays out its own images
-        if list(pixels.shape[:2]) != wanted:
-            return None
-        # What Image.frombuffer does without a copy for RGBX; as RGB it resizes three of the four bytes.
-        memory = Image.core.map_buffer(pixels, (wanted[1], wanted[0]), "raw", 0, ("RGB", 0, 1))
-        return Image.new("RGB", (1, 1))._new(memory)
-    except Exception:  # whatever is wrong with a file, Pillow says it in the words that callers know
-        return None

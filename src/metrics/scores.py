@@ -54,6 +54,11 @@ class SubsetScores:
         total = MEAN_AP_WEIGHT * self.mean_ap + np.maximum(0.0, 1.0 - self.mean_errors).sum()
         return float(total / (MEAN_AP_WEIGHT + len(ERRORS)))
 
+    def headline(self) -> dict[str, float]:
+        """mAP, NDS and the five mean errors."""
+        errors = zip(ERRORS, self.mean_errors.tolist(), strict=True)
+        return {"mAP": self.mean_ap, "NDS": self.nds} | {f"m{name}": value for name, value in errors}
+
     def present_means(self) -> dict[str, float | None]:
         """`mAP_present`, `mATE_present` ...: the means over those classes alone that have ground truth in this part.
 
@@ -69,8 +74,6 @@ class SubsetScores:
 
     def as_dict(self) -> dict[str, object]:
         """Plain numbers for JSON: mAP, NDS, the mean errors and `classes`; NaN becomes None."""
-        result: dict[str, object] = {"mAP": _number(self.mean_ap), "NDS": _number(self.nds)}
-        result |= {f"m{name}": _number(value) for name, value in zip(ERRORS, self.mean_errors, strict=True)}
         classes = {}
         for row, name in enumerate(CLASSES):
             values = {"AP": _number(self.class_ap[row])}
@@ -80,7 +83,7 @@ class SubsetScores:
             }
             values |= {error: _number(value) for error, value in zip(ERRORS, self.errors[row], strict=True)}
             classes[name] = values | {"num_gt": int(self.num_gt[row])}
-        return result | {"classes": classes}
+        return {name: _number(value) for name, value in self.headline().items()} | {"classes": classes}
 
 
 @dataclass
@@ -93,11 +96,6 @@ class DetectionScores:
     speeds: dict[str, SubsetScores]  # empty where not asked for
     truth_kept: Array  # [k] bool, ground truth that survives the official filters
     predictions_kept: Array  # [n] bool
-
-    def headline(self) -> dict[str, float]:
-        """mAP, NDS and the five mean errors over everything."""
-        errors = zip(ERRORS, self.overall.mean_errors.tolist(), strict=True)
-        return {"mAP": self.overall.mean_ap, "NDS": self.overall.nds} | {f"m{name}": value for name, value in errors}
 
     def as_dict(self) -> dict[str, object]:
         """The content of metrics.json: fractions of 1, None where a number is undefined.

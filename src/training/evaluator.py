@@ -105,7 +105,7 @@ class DetectionEvaluator(Evaluator):
         in_order = [tables[sample] for sample in sorted(tables)]
         self.detections = DetectionTable.concatenate([DetectionTable.empty(), *in_order])
         self.scores = score_detections(self.evaluation_set, self.detections)
-        return self.scores.headline()
+        return self.scores.overall.headline()
 
     def as_dict(self) -> dict[str, Any]:
         """See `DetectionScores.as_dict`."""

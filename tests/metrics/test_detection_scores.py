@@ -87,7 +87,7 @@ def test_as_dict_is_plain_json(scores):
     assert content["tags"]["weather.snow"]["mAP"] is None
     assert set(content["ranges"]["0-25"]) == {*numbers, "classes"}
     assert json.loads(json.dumps(content, allow_nan=False)) == content
-    assert {name: content[name] for name in scores.headline()} == scores.headline()
+    assert {name: content[name] for name in scores.overall.headline()} == scores.overall.headline()
 
 
 def test_table_for_the_terminal(scores):

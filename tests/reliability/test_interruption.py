@@ -78,7 +78,7 @@ def result(folder, module):
         "weights": digest(read_checkpoint(folder.checkpoints / "last.ckpt")["state_dict"]),
         "weights in memory": digest(module.model.state_dict()),
         "log": folder.metrics_csv.read_text(),
-        "scores": module.evaluator.scores.headline(),
+        "scores": module.evaluator.scores.overall.headline(),
     }
 
 
