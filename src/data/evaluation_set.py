@@ -29,17 +29,15 @@ def evaluation_set(index: DatasetIndex, split: str) -> EvaluationSet:
 
 def _table(
     index: DatasetIndex,
-    samples: np.ndarray,  # [n]
+    samples: np.ndarray,  # [n] ascending
     wanted: np.ndarray,  # [A] bool
 ) -> DetectionTable:
-    rows = [np.arange(index.box_starts[sample], index.box_starts[sample + 1]) for sample in samples]
-    counts = [len(of_sample) for of_sample in rows]
-    flat = np.concatenate(rows) if rows else np.zeros(0, np.int64)
-    owner = np.repeat(np.arange(len(samples)), counts)
-    keep = wanted[flat]
-    flat, owner = flat[keep], owner[keep]
+    places = np.full(len(index), -1)
+    places[samples] = np.arange(len(samples))
+    owner = np.repeat(places, np.diff(index.box_starts))  # [A], -1 for boxes of other samples
+    flat = np.flatnonzero(wanted & (owner >= 0))
     return DetectionTable(
-        samples=owner.astype(np.int64),
+        samples=owner[flat].astype(np.int64),
         labels=np.maximum(index.box_labels[flat], 0).astype(np.int64),
         centers=index.box_centers[flat],
         sizes=index.box_sizes[flat],
