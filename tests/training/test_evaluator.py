@@ -1,5 +1,6 @@
 """Collecting boxes over batches and processes."""
 
+import pickle
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,10 +9,11 @@ import torch
 
 from src.benchmark.suite_metric import random_problem
 from src.metrics.detection import score_detections
+from src.reliability.processes import process_group
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
-from src.training import evaluator as module
 from src.training.evaluator import DetectionEvaluator
+from tests.training.two_ranks import become, spawn_two
 
 SAMPLES = 6
 
@@ -30,14 +32,32 @@ def same(left, right):
         np.testing.assert_array_equal(getattr(left, name), getattr(right, name), strict=True)
 
 
-def test_ranks_in_any_order_with_repetitions_give_the_table_of_one(problem, monkeypatch):
+def compute_as(rank, port, folder, evaluation_set, shards):
+    """As one of two: score what this rank saw, then that nobody saw anything."""
+    become(rank, 2, port)
+    evaluator, found = DetectionEvaluator(evaluation_set), []
+    with process_group("cpu", 2):
+        for boxes in (shards[rank], {}):
+            evaluator.reset()
+            evaluator.boxes |= boxes
+            evaluator.compute()
+            found.append((evaluator.detections, evaluator.as_dict()))
+    (folder / f"{rank}.pickle").write_bytes(pickle.dumps(found))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [[4], []], ids=["a repeated sample", "no sample"])
+def test_two_processes_in_any_order_give_the_numbers_of_one(problem, tmp_path, first):
     evaluation_set, predictions = problem
-    shards = [by_sample(predictions, [4]), {}, by_sample(predictions, [5, 4, 3, 2, 1, 0])]
-    evaluator = DetectionEvaluator(evaluation_set)
-    monkeypatch.setattr(module, "gather_by_rank", lambda own: [own, *shards])
-    evaluator.compute()
-    same(evaluator.detections, predictions[np.argsort(predictions.samples, kind="stable")])
-    assert evaluator.as_dict() == score_detections(evaluation_set, predictions).as_dict()
+    shards = [by_sample(predictions, first), by_sample(predictions, [5, 4, 3, 2, 1, 0])]
+    spawn_two(compute_as, tmp_path, evaluation_set, shards)
+    expected = score_detections(evaluation_set, predictions).as_dict()
+    nothing = score_detections(evaluation_set, DetectionTable.empty()).as_dict()
+    for rank in range(2):
+        (table, scores), (empty, of_none) = pickle.loads((tmp_path / f"{rank}.pickle").read_bytes())
+        same(table, predictions[np.argsort(predictions.samples, kind="stable")])
+        same(empty, DetectionTable.empty())
+        assert (scores, of_none) == (expected, nothing)
 
 
 def test_nobody_saw_anything(problem):

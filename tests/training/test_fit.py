@@ -30,7 +30,7 @@ from src.training.run_folder import Resume, RunFolder
 from src.training.temporal_module import TemporalModule
 from tests.training.toys import STEPS as TOY_STEPS
 from tests.training.toys import Positions, toy_batch, toy_module, toy_trainer
-from tests.training.two_ranks import spawn_two
+from tests.training.two_ranks import become, spawn_two
 
 STREAMS, STEPS = 4, 3
 FIRST_RANK, SECOND_RANK = (0, 1), (2, 3)
@@ -83,15 +83,6 @@ class Module(TemporalModule):
         optimizer = torch.optim.SGD(self.model.parameters(), lr=1e-3)
         constant = torch.optim.lr_scheduler.ConstantLR(optimizer, factor=1.0)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": constant, "interval": "step"}}
-
-
-def become(rank, world_size, port):
-    """Tell this process who it is, as a launcher does."""
-    torch.set_num_threads(1)
-    if world_size > 1:
-        who = {"LOCAL_RANK": rank, "RANK": rank, "WORLD_SIZE": world_size}
-        who |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
-        os.environ.update({name: str(value) for name, value in who.items()})
 
 
 def work_as(rank, port, world_size, work):

@@ -1,9 +1,11 @@
 """Runs a test's function on two ranks."""
 
+import os
 import pickle
 import socket
 import time
 
+import torch
 import torch.multiprocessing as mp
 
 DEADLINE_S = 300.0
@@ -28,3 +30,12 @@ def spawn_two(function, *arguments):
 
 def _unpack(rank, function, port, packed):
     function(rank, port, *pickle.loads(packed))
+
+
+def become(rank, world_size, port):
+    """Tell this process who it is, as a launcher does."""
+    torch.set_num_threads(1)
+    if world_size > 1:
+        who = {"LOCAL_RANK": rank, "RANK": rank, "WORLD_SIZE": world_size}
+        who |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+        os.environ.update({name: str(value) for name, value in who.items()})
