@@ -208,6 +208,8 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["model.ocsf.margin_m=-1"], "margin_m"),
         (["model.ocsf.margin_m=wide"], "margin_m"),
         (["optim.lr=-1"], "optim.lr must be above 0"),
+        (["phase.monitor=val/xyz"], "phase.monitor=val/xyz: must be one of val/mAP, val/NDS"),
+        (["phase.monitor="], "phase.monitor=: must be one of"),
         (["optim.betas=[]"], "optim.betas"),
         (["trainer.devices=0"], "trainer.devices"),
         (["trainer.devices=3"], "data.batch_size=2.*trainer.devices=3"),

@@ -28,6 +28,7 @@ OVERRIDES = ["phase=phase1", "phase.task=counting", "phase.monitor=val/frames"]
 
 class FrameCount(Evaluator):
     headline = "frames"
+    monitored = ("frames",)
 
     @classmethod
     def of(cls, datamodule):

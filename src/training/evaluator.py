@@ -29,6 +29,8 @@ class Evaluator(nn.Module, ABC):
 
     headline: ClassVar[str]
     """The number at the top of `as_dict` that sweeps and messages go by; larger is better."""
+    monitored: ClassVar[tuple[str, ...]]
+    """Numbers of `compute` that the best checkpoint may be chosen by (`phase.monitor`); larger is better."""
 
     @classmethod
     @abstractmethod
@@ -72,6 +74,7 @@ class DetectionEvaluator(Evaluator):
     """
 
     headline = "mAP"
+    monitored = ("mAP", "NDS")
 
     def __init__(self, evaluation_set: EvaluationSet) -> None:
         super().__init__()

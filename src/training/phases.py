@@ -38,4 +38,7 @@ class PhaseConfig:
                 f"phase.temporal={self.temporal} does not go with phase.module={self.module}, which is for "
                 f"{'streamed clips' if MODULES[self.module].temporal else 'single frames'}"
             )
+        known = [f"val/{name}" for name in EVALUATORS[self.task].monitored]
+        if self.monitor not in known:
+            raise ConfigError(f"phase.monitor={self.monitor}: must be one of {', '.join(known)}, larger being better")
         require_least(self, "phase", {"epochs": 1, "validate_every": 1})
