@@ -269,13 +269,10 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     model, phase = (
         stored[key].get("name") if isinstance(stored.get(key), dict) else None for key in ("model", "phase")
     )
-    if not isinstance(model, str) or model not in FAMILIES:
-        raise CheckpointError(f"the checkpoint is of model {model!r:.80}; this version knows {sorted(FAMILIES)}")
-    if phase not in PHASES:
-        raise CheckpointError(f"the checkpoint is of phase {phase!r:.80}; this version knows {PHASES}")
     scale = stored.get("scale")
-    if scale not in SCALES:
-        raise CheckpointError(f"the checkpoint is of scale {scale!r:.80}; this version knows {SCALES}")
+    for key, value, known in (("model", model, FAMILIES), ("phase", phase, PHASES), ("scale", scale, SCALES)):
+        if not isinstance(value, str) or value not in known:
+            raise CheckpointError(f"the checkpoint is of {key} {value!r:.80}; this version knows {sorted(known)}")
     changes = {change.key_or_group: change for change in OverridesParser.create().parse_overrides(overrides)}
     fixed = {"scale": scale, "model": model, "phase": phase, "phase.temporal": stored["phase"].get("temporal")}
     for key, own in fixed.items():

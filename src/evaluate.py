@@ -7,11 +7,10 @@ from functools import partial
 from pathlib import Path
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
-from src.config import Config, compose_config, restore_config
+from src.config import compose_config, restore_config
 from src.errors import ConfigError, DataError
 from src.metrics.detection import score_detections
 from src.metrics.score_text import format_scores
-from src.metrics.scores import DetectionScores
 from src.metrics.submission import load_submission
 from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.checkpoints import load_model_weights, read_checkpoint
@@ -41,7 +40,8 @@ def main(overrides: list[str]) -> None:
         written += files
         metrics, text = evaluator.as_dict(), evaluator.describe(evaluator.as_dict())
     else:
-        metrics = score_file(source, config).as_dict()
+        evaluation_set = build_datamodule(config, data_root(config, write=False)).evaluation_set()
+        metrics = score_detections(evaluation_set, load_submission(source, evaluation_set.tokens)).as_dict()
         text = format_scores(metrics)
     write_json(out / "metrics.json", metrics)
     print(text)
@@ -53,12 +53,6 @@ def name_of(source: Path) -> str:
     folder = source.resolve().parent
     run = folder.parent.name if folder.name == "checkpoints" else folder.name
     return f"{run}-{source.stem}"
-
-
-def score_file(path: Path, config: Config) -> DetectionScores:
-    """Score an existing submission against the data folder's annotations."""
-    evaluation_set = build_datamodule(config, data_root(config, write=False)).evaluation_set()
-    return score_detections(evaluation_set, load_submission(path, evaluation_set.tokens))
 
 
 def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[Evaluator, list[str]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -97,20 +96,12 @@ def predict(
             found[frame.tokens[0]] = boxes.to("cpu"), frame.global_from_ego[0].numpy()
             skipped.add(frame)
             if film is not None and scenes == 1 and not film.full:
-                picture = Path(folder) / "frame.png"
+                picture, shown = Path(folder) / "frame.png", frame.to(detector.device)
                 title = f"Frame {len(film) + 1}, sample {frame.tokens[0][:12]}"
-                draw_picture(picture, detector, frame, boxes, output, title)
+                scene = scene_of(shown, boxes, detector.model.evidence(output), detector.grid)
+                draw_frame(picture, scene, views_of(shown), title, SHOWN_SCORE)
                 film.add(picture, float(frame.timestamps_s))
     return found, skipped
-
-
-def draw_picture(
-    path: Path, detector: StreamingDetector, frame: FrameBatch, boxes: Boxes3D, output: Any, title: str
-) -> None:
-    """One frame on one sheet: cameras, BEV, Gaussians by source, boxes."""
-    frame = frame.to(detector.device)
-    scene = scene_of(frame, boxes, detector.model.evidence(output), detector.grid)
-    draw_frame(path, scene, views_of(frame), title, SHOWN_SCORE)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -35,11 +33,9 @@ class Case:
     device: torch.device
     autocast: bool  # bfloat16
 
-    @contextmanager
-    def precision(self) -> Iterator[None]:
+    def precision(self) -> torch.autocast:
         """As training and prediction compute."""
-        with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.autocast):
-            yield
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.autocast)
 
     def infer(self) -> tuple[Any, Any]:
         """Forward and decode, without gradients."""

@@ -111,9 +111,9 @@ def measure_parts(
         times.append(time_row)
         works.append(work_row)
     time_row, work_row = {"part": WHOLE}, {"part": WHOLE}
-    for mode, found in measure_whole(case).items():
-        time_row |= milliseconds(found["seconds"], f"{mode} ")
-        work_row |= work_columns(mode, found)
+    for mode, function in (("forward", case.infer), ("f+b", case.step)):
+        work_row |= work_columns(mode, measure_work(function, case.device)[0])
+        time_row |= milliseconds(interleaved({mode: function}, clock(case.device), ROUNDS)[mode], f"{mode} ")
     return {"time by part": [*times, time_row], "work by part": [*works, work_row]}
 
 
@@ -181,12 +181,3 @@ def compulsory_bytes(calls: list[Call]) -> int:
     weights = [p for owner in owners if isinstance(owner, torch.nn.Module) for p in owner.parameters()]
     values = tensors_in([[call.arguments, call.named, call.result] for call in calls])
     return distinct_bytes([*weights, *values])
-
-
-def measure_whole(case: Case) -> dict[str, dict[str, Any]]:
-    """All parts in place: a frame to its boxes, and a training step to its gradients with losses and targets."""
-    found = {}
-    for mode, function in (("forward", case.infer), ("f+b", case.step)):
-        found[mode], _ = measure_work(function, case.device)
-        found[mode]["seconds"] = interleaved({mode: function}, clock(case.device), ROUNDS)[mode]
-    return found

@@ -47,7 +47,9 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     bev = bev_sites(points, grid, sizes.cells)
     past = remembered_sites(grid, Sites(bev.shape, bev.keys[::4]), sizes.frames)
     layers = layers_of(encoder, voxels, config.model.channels, bev, past)
-    scenes = {"synthetic highway": points.cpu()} | recorded_scene(config)
+    config.data.batch_size, config.data.num_workers = 1, 0
+    recorded = next(iter(build_datamodule(config, data_root(config)).train_dataloader())).radar_points
+    scenes = {"synthetic highway": points.cpu(), f"first frame, {len(recorded)} points": recorded}
     spconv = load_spconv(device)
     return {
         "notes": [
@@ -81,13 +83,6 @@ def spconv_note(device: torch.device) -> str:
         "thread. On several threads its gathering shares buffers between threads, so results are wrong at random: "
         "`wrong` counts runs; its times there are of such runs."
     )
-
-
-def recorded_scene(config: Config) -> dict[str, Tensor]:
-    """Radar points of the first training frame of the configured data."""
-    config.data.batch_size, config.data.num_workers = 1, 0
-    batch = next(iter(build_datamodule(config, data_root(config)).train_dataloader()))
-    return {f"first frame, {len(batch.radar_points)} points": batch.radar_points}
 
 
 def bev_sites(points: Tensor, grid: BEVGrid, number: int) -> Sites:

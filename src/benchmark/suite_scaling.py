@@ -202,7 +202,11 @@ def make_case(config: Config, point: Point, device: torch.device) -> tuple[Case,
     cells = [round(number * point.range_m / NOMINAL_M) for number in config.grid.cells]
     batch = highway_frame(highway_points(point.road), tuple(config.backbone.image_size_px)).to(device)
     case = build_case(replace(config, model=settings, grid=replace(config.grid, cells=cells)), batch, device)
-    cache_images(case)
+    encoder = getattr(case.prepared, "image_encoder", None)
+    if encoder is not None:  # it gives the same features every time, without encoding again
+        with torch.no_grad(), case.precision():
+            features = encoder(case.batch.images)
+        encoder.forward = lambda images: features
     output, memory = expect_trained_scores(case)
     if settings.memory_frames:
         fill_memory(case, memory, settings.memory_frames)
@@ -214,15 +218,6 @@ def settings_at(config: Config, point: Point) -> ModelConfig:
     """The model's settings at a point, with as many remembered cells as its traffic fills."""
     vehicles = max(1, round(point.road.num_vehicles * point.road.reach_m / NOMINAL_M))
     return config.model.scaled(point.gaussians, point.memory_frames, vehicles * CELLS_PER_VEHICLE[config.scale])
-
-
-def cache_images(case: Case) -> None:
-    """Give the model the features of its images without encoding them again."""
-    encoder = getattr(case.prepared, "image_encoder", None)
-    if encoder is not None:
-        with torch.no_grad(), case.precision():
-            features = encoder(case.batch.images)
-        encoder.forward = lambda images: features
 
 
 def fill_memory(case: Case, memory: Any, num_frames: int) -> None:

@@ -247,25 +247,21 @@ def held(device: torch.device, memory: Any) -> Row:
     objects = gc.get_objects()
     resident = status_bytes("VmRSS")
     workers = [status_bytes("VmRSS", worker.pid) for worker in multiprocessing.active_children()]
+    storages = [tensor.untyped_storage() for tensor in tensors_in(memory)]  # a small view can hold a large tensor
+    kept = {storage.data_ptr(): storage.nbytes() for storage in storages}
     row = {
         "RSS MiB": None if resident is None else resident / 2**20,
         "heap MiB": heap_mib(),
         "workers MiB": sum(workers) / 2**20 if workers and None not in workers else None,
         "CUDA MiB": torch.cuda.memory_allocated() / 2**20 if device.type == "cuda" else None,
         "CUDA reserved MiB": torch.cuda.memory_reserved() / 2**20 if device.type == "cuda" else None,
-        "remembered MiB": kept_alive_mib(tensors_in(memory)),
+        "remembered MiB": sum(kept.values()) / 2**20,
         "tensors": sum(issubclass(type(value), Tensor) for value in objects),
         "objects": len(objects),
         "descriptors": number_in("/proc/self/fd"),
         "threads": number_in("/proc/self/task"),
     }
     return {name: value for name, value in row.items() if value is not None}
-
-
-def kept_alive_mib(tensors: list[Tensor]) -> float:
-    """What the tensors keep from being freed: a small view can hold a large tensor."""
-    storages = [tensor.untyped_storage() for tensor in tensors]
-    return sum({storage.data_ptr(): storage.nbytes() for storage in storages}.values()) / 2**20
 
 
 class _Mallinfo(ctypes.Structure):
@@ -306,11 +302,11 @@ def growth_row(
     settled = [row for row in rows if row["frames"] > max(SETTLED * last_frame, settled_after)]
     second = [row["ms"] for row in rows if SETTLED * last_frame < row["frames"] <= 0.5 * last_frame]
     last = [row["ms"] for row in rows if row["frames"] > 0.75 * last_frame]
-    pairs = [
-        (before, after)
-        for before, after in itertools.combinations(settled, 2)
-        if is_multiple(after["frames"] - before["frames"], period, last_frame / len(rows))
-    ]
+    pairs = []  # whole periods apart, as nearly as the spacing of the points can tell
+    for before, after in itertools.combinations(settled, 2):
+        apart = after["frames"] - before["frames"]
+        if apart >= period and abs(apart - period * round(apart / period)) < 0.5 * last_frame / len(rows):
+            pairs.append((before, after))
     growth = {
         f"{quantity} / 1000 frames": 1e3 * robust_slope(pairs, quantity)
         for quantity in rows[-1]
@@ -318,12 +314,6 @@ def growth_row(
     }
     ratio = {"last / second quarter": statistics.median(last) / statistics.median(second)}
     return {"pass": name, "frames": last_frame} | ratio | growth
-
-
-def is_multiple(frames: int, period: int, spacing: float) -> bool:
-    """Whether a distance is a whole number of periods, as nearly as points of this spacing can tell."""
-    off = frames % period
-    return frames >= period and min(off, period - off) < 0.5 * spacing
 
 
 def robust_slope(

@@ -88,16 +88,7 @@ def interleaved(
     return seconds
 
 
-def with_gradient(function: Callable[[], Any]) -> Callable[[], None]:
-    """The function and, from gradients of one, its backward pass."""
-
-    def call() -> None:
-        backward_from(function())
-
-    return call
-
-
-MODES = {"forward": torch.no_grad(), "f+b": with_gradient}
+MODES = {"forward": torch.no_grad(), "f+b": lambda function: lambda: backward_from(function())}
 """How an operation is called, by the names that pages use."""
 
 

@@ -241,7 +241,12 @@ class BoardReader:
         if known is not None and known[0] == stamp:
             return known[1]
         try:
-            self._refuse(path)
+            if not path.resolve().is_relative_to(self.reports.resolve()):
+                raise DataError(
+                    f"{path}: a link that leads out of the reports folder, which is not followed; delete it"
+                )
+            if not path.is_file():
+                raise DataError(f"{path}: not a file; delete it")
             content = read_record(path) if path.parent.name == "sweeps" else read_result(path)
         except DataError as error:
             content = error
@@ -250,13 +255,6 @@ class BoardReader:
             content = DataError(f"{path}: not readable ({type(error).__name__}: {error}); delete it")
         self._files[path] = (stamp, content)
         return content
-
-    def _refuse(self, path: Path) -> None:
-        """Raises DataError for a file that is not read."""
-        if not path.resolve().is_relative_to(self.reports.resolve()):
-            raise DataError(f"{path}: a link that leads out of the reports folder, which is not followed; delete it")
-        if not path.is_file():
-            raise DataError(f"{path}: not a file; delete it")
 
 
 def _kind(run: Run) -> tuple[Any, ...]:

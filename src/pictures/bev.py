@@ -165,12 +165,6 @@ def paint_radar(axes: Axes, points: Array | None) -> None:
     axes.scatter(*xy[moving].T, s=7 * size, c=colours, linewidths=0, zorder=2.2)
 
 
-def paint_lidar(axes: Axes, points: Array | None) -> None:
-    """A pixel each: they are many."""
-    if points is not None:
-        axes.plot(*upright(points[:, :2]).T, linestyle="none", marker=",", color=LIDAR_COLOUR, zorder=2)
-
-
 def paint_gaussians(axes: Axes, gaussians: PictureGaussians | None) -> None:
     """One-sigma ellipses in the colour of their source, filled by opacity; history dotted, rare sources on top."""
     if gaussians is None or len(gaussians) == 0:
@@ -260,9 +254,10 @@ def ring_missed(axes: Axes, scene: BevScene) -> None:
 
 def paint_detections(axes: Axes, scene: BevScene) -> None:
     """Detections: radar (else LiDAR) points, true and predicted boxes with velocities."""
-    if scene.radar_points is None:
-        paint_lidar(axes, scene.lidar_points)
-    paint_radar(axes, scene.radar_points)
+    if scene.radar_points is not None:
+        paint_radar(axes, scene.radar_points)
+    elif scene.lidar_points is not None:  # a pixel each: they are many
+        axes.plot(*upright(scene.lidar_points[:, :2]).T, linestyle="none", marker=",", color=LIDAR_COLOUR, zorder=2)
     ring_missed(axes, scene)
     paint_boxes(axes, scene.predictions, predicted=True)
     paint_boxes(axes, scene.ground_truth, predicted=False)

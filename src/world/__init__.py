@@ -1,1 +1,1 @@
-"""The synthetic highway world, written in the TruckScenes layout (see `write.write_world`)."""
+"""The synthetic highway world, written in the TruckScenes layout (see `write.ensure_world`)."""

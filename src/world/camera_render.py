@@ -53,7 +53,7 @@ class Studio:
         sun = np.array([np.cos(scene.conditions.sun_azimuth_rad), np.sin(scene.conditions.sun_azimuth_rad), 0.9])
         self.sun = sun / np.linalg.norm(sun)
 
-    def stage(self, time_s: float, ego_xyz: Array) -> tuple[Mesh, Array, Array]:
+    def _stage(self, time_s: float, ego_xyz: Array) -> tuple[Mesh, Array, Array]:
         """All quads within view in local coordinates, with their layers and the number of the actor (-1: scenery)."""
         positions, _, headings = self.scene.tracks.state(time_s)
         near = np.flatnonzero(np.hypot(*(positions - ego_xyz)[:, :2].T) < VIEW_M)
@@ -71,16 +71,10 @@ class Studio:
                 groups.append(np.full(1, -1))
         return Mesh.join(parts), np.concatenate(layers), np.concatenate(groups)
 
-    def photograph(
-        self,
-        mount: Mount,
-        rotation: Array,
-        translation: Array,
-        stage: tuple[Mesh, Array, Array],
-        rng: np.random.Generator,
-    ) -> Photo:
-        """The image of one camera of an ego truck at this pose (local from ego)."""
-        mesh, layer, group = stage
+    def photograph(self, mount: Mount, time_s: float, rng: np.random.Generator) -> Photo:
+        """The image of one camera of the ego truck."""
+        rotation, translation = self.scene.ego.pose(time_s)
+        mesh, layer, group = self._stage(time_s, translation)
         local_from_cam = rotation @ mount.rotation
         origin = rotation @ mount.translation + translation
         corners = (mesh.corners - origin) @ local_from_cam

@@ -57,16 +57,12 @@ _PLACES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float],
 """By channel the place (m), yaw, pitch and roll (degrees; a camera's of its optical axis) and the delay (s)."""
 
 
-def camera_intrinsic(config: WorldConfig) -> Array:
-    """[3, 3] pinhole matrix; the optical axis meets the middle of the image, pixel centres lie at halves."""
-    focal = 0.5 * config.image_width_px / np.tan(0.5 * np.radians(config.camera_fov_deg))
-    return np.array(
-        [[focal, 0.0, 0.5 * config.image_width_px], [0.0, focal, 0.5 * config.image_height_px], [0.0, 0.0, 1.0]]
-    )
-
-
 def sensor_rig(config: WorldConfig) -> dict[str, Mount]:
     """All 18 channels by name: four cameras, six radars, six lidars, two IMUs."""
+    width, height = config.image_width_px, config.image_height_px
+    focal = 0.5 * width / np.tan(0.5 * np.radians(config.camera_fov_deg))
+    # The optical axis meets the middle of the image, pixel centres lie at halves.
+    intrinsic = np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
     mounts = {}
     for modality, channels in (("camera", CAMERAS), ("radar", RADARS), ("lidar", LIDARS), ("imu", IMUS)):
         for channel in channels:
@@ -77,7 +73,7 @@ def sensor_rig(config: WorldConfig) -> dict[str, Mount]:
                 modality=modality,
                 rotation=rotation @ _EGO_FROM_OPTICAL if modality == "camera" else rotation,
                 translation=np.array(place),
-                intrinsic=camera_intrinsic(config) if modality == "camera" else None,
+                intrinsic=intrinsic if modality == "camera" else None,
                 delay_s=delay_s,
             )
     return mounts

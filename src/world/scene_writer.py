@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from src.world.labels import (
 from src.world.lidar import scan_lidars
 from src.world.motion import LEAD_IN_S
 from src.world.pcd_writer import LIDAR_TYPE, lidar_pcd, radar_pcd
-from src.world.radar import simulate_sweeps
+from src.world.radar import Radars
 from src.world.rig import Mount, sensor_rig
 from src.world.scenery import make_scenery
 from src.world.simulate import Scene, make_scene, scene_rng
@@ -44,17 +44,6 @@ EPOCH_US = 1_695_000_000_000_000
 SCENE_GAP_US = 3_600_000_000
 JITTER_S = 0.0015
 CAMERA_SWEEPS = CAMERA_RATE_HZ // KEY_FRAME_RATE_HZ
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Shot:
-    """One sensor file to come: which sensor fires when, for which key frame."""
-
-    channel: str
-    frame: int
-    is_key: bool
-    time_s: float
-    points: int  # 0 for images
 
 
 class SceneWriter:
@@ -77,7 +66,7 @@ class SceneWriter:
         self.key_times = [
             self._quantised(k / KEY_FRAME_RATE_HZ + self._jitter()) for k in range(config.key_frames_per_scene)
         ]
-        self.shots: list[_Shot] = []
+        self.data: list[tuple[float, str, Row]] = []  # time (s), channel and row of sample_data of every file
         self.name = f"scene-{self._token('drive')}-1"
 
     def write(self) -> Tables:
@@ -100,14 +89,25 @@ class SceneWriter:
     def _stamp(self, time_s: float) -> int:
         return self.start_us + round(time_s * 1e6)
 
-    def _filename(self, shot: _Shot) -> str:
-        kind, ending = "samples" if shot.is_key else "sweeps", "jpg" if shot.channel in CAMERAS else "pcd"
-        return f"{kind}/{shot.channel}/{shot.channel}_{self._stamp(shot.time_s)}.{ending}"
-
-    def _store(self, channel: str, frame: int, is_key: bool, time_s: float, data: bytes, points: int = 0) -> None:
-        shot = _Shot(channel=channel, frame=frame, is_key=is_key, time_s=time_s, points=points)
-        (self.folder / self._filename(shot)).write_bytes(data)
-        self.shots.append(shot)
+    def _store(self, channel: str, frame: int, is_key: bool, time_s: float, content: bytes, points: int = 0) -> None:
+        """Write what a sensor gives at a time, for a key frame, and keep its row; `points` only of point clouds."""
+        camera, stamp = channel in CAMERAS, self._stamp(time_s)
+        ending = "jpg" if camera else "pcd"
+        filename = f"{'samples' if is_key else 'sweeps'}/{channel}/{channel}_{stamp}.{ending}"
+        (self.folder / filename).write_bytes(content)
+        row: Row = {
+            "token": self._token("data", channel, stamp),
+            "sample_token": self._token("sample", frame),
+            "ego_pose_token": self._token("pose", stamp),
+            "calibrated_sensor_token": token(self.config.seed, "calibration", channel),
+            "timestamp": stamp,
+            "fileformat": ending,
+            "is_key_frame": is_key,
+            "width": self.config.image_width_px if camera else points,
+            "height": self.config.image_height_px if camera else 1,
+            "filename": filename,
+        }
+        self.data.append((time_s, channel, row))
 
     def _firings(self, rate_hz: int, sweeps: int) -> Iterator[tuple[int, bool, float]]:
         """Key frame, whether it is the key frame itself, and time of a sensor's sweeps, those before it first."""
@@ -118,22 +118,20 @@ class SceneWriter:
     def _write_radars(self) -> list[Array]:
         """All radar sweeps; returns the points of each key frame in local coordinates."""
         mounts = [self.rig[name] for name in RADARS]
-        rng = scene_rng(self.config, self.index, 4)
+        radars = Radars(self.config, self.scene, self.scenery, mounts, scene_rng(self.config, self.index, 4))
         key_points = []
         for frame, is_key, base in self._firings(RADAR_RATE_HZ, self.config.radar_sweeps_per_key_frame):
             times = [self._quantised(base + m.delay_s + self._jitter()) for m in mounts]
-            sweeps = simulate_sweeps(self.config, self.scene, self.scenery, mounts, times, rng)
+            sweeps = radars.sweep(times)
             for mount, time, points in zip(mounts, times, sweeps, strict=True):
                 self._store(mount.channel, frame, is_key, time, radar_pcd(points), len(points))
             if is_key:
-                here = [self._to_local(*seen) for seen in zip(mounts, times, sweeps, strict=True)]
+                here = [
+                    self._to_local(mount, points[:, :3], np.full(len(points), time))
+                    for mount, time, points in zip(mounts, times, sweeps, strict=True)
+                ]
                 key_points.append(np.concatenate(here))
         return key_points
-
-    def _to_local(self, mount: Mount, time_s: float, points: Array) -> Array:
-        rotation, translation = self.scene.ego.pose(time_s)
-        in_ego = points[:, :3].astype(np.float64) @ mount.rotation.T + mount.translation
-        return in_ego @ rotation.T + translation
 
     def _write_cameras(self) -> list[tuple[Array, Array]]:
         """All images; returns each actor's own and seen pixels over all cameras of each key frame."""
@@ -144,9 +142,7 @@ class SceneWriter:
             for name in CAMERAS:
                 mount = self.rig[name]
                 time = self._quantised(base + mount.delay_s + self._jitter())
-                rotation, translation = self.scene.ego.pose(time)
-                stage = self.studio.stage(time, translation)
-                photo = self.studio.photograph(mount, rotation, translation, stage, rng)
+                photo = self.studio.photograph(mount, time, rng)
                 buffer = io.BytesIO()
                 Image.fromarray(photo.rgb).save(buffer, "JPEG", quality=self.config.jpeg_quality)
                 self._store(name, frame, is_key, time, buffer.getvalue())
@@ -171,13 +167,18 @@ class SceneWriter:
             for name, cloud in clouds.items():
                 self._store(name, frame, is_key, time, lidar_pcd(cloud), len(cloud))
             if is_key:
-                points.append(np.concatenate([self._scan_to_local(self.rig[name], clouds[name]) for name in clouds]))
+                here = []
+                for name, cloud in clouds.items():
+                    xyz = np.stack([cloud["x"], cloud["y"], cloud["z"]], 1)
+                    own_times = 1e-6 * (cloud["timestamp"].astype(np.int64) - self.start_us)
+                    here.append(self._to_local(self.rig[name], xyz, own_times))
+                points.append(np.concatenate(here))
         return points if self.config.lidar else None
 
-    def _scan_to_local(self, mount: Mount, cloud: Array) -> Array:
-        """Each point by the ego pose at its own time."""
-        rotations, translations = self.scene.ego.poses(1e-6 * (cloud["timestamp"].astype(np.int64) - self.start_us))
-        in_ego = np.stack([cloud["x"], cloud["y"], cloud["z"]], 1) @ mount.rotation.T + mount.translation
+    def _to_local(self, mount: Mount, points: Array, times_s: Array) -> Array:
+        """Each point [P, 3] of a sensor by the ego pose at its own time."""
+        rotations, translations = self.scene.ego.poses(times_s)
+        in_ego = points.astype(np.float64) @ mount.rotation.T + mount.translation
         return np.einsum("pij,pj->pi", rotations, in_ego) + translations
 
     def _truths(
@@ -243,32 +244,15 @@ class SceneWriter:
 
     def _sample_tables(self) -> Tables:
         """scene, sample, sample_data, ego_pose and weather_annotation."""
-        config, scene = self.config, self.scene
+        scene = self.scene
         samples: list[Row] = [
             {"token": self._token("sample", k), "timestamp": self._stamp(time), "scene_token": self._token()}
             for k, time in enumerate(self.key_times)
         ]
         link_chain(samples)
-        data: list[Row] = []
-        for shot in sorted(self.shots, key=lambda shot: (shot.time_s, shot.channel)):
-            camera = shot.channel in CAMERAS
-            stamp = self._stamp(shot.time_s)
-            data.append(
-                {
-                    "token": self._token("data", shot.channel, stamp),
-                    "sample_token": samples[shot.frame]["token"],
-                    "ego_pose_token": self._token("pose", stamp),
-                    "calibrated_sensor_token": token(config.seed, "calibration", shot.channel),
-                    "timestamp": stamp,
-                    "fileformat": "jpg" if camera else "pcd",
-                    "is_key_frame": shot.is_key,
-                    "width": config.image_width_px if camera else shot.points,
-                    "height": config.image_height_px if camera else 1,
-                    "filename": self._filename(shot),
-                }
-            )
+        data = [row for *_, row in sorted(self.data, key=itemgetter(0, 1))]
         link_by(data, "calibrated_sensor_token")
-        times = sorted({shot.time_s for shot in self.shots} | set(self._ego_times()))
+        times = sorted({time for time, *_ in self.data} | set(self._ego_times()))
         rotations, translations = scene.ego.poses(np.array(times))
         poses = [
             {

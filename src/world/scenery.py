@@ -37,9 +37,9 @@ class Scenery:
     clutter_s: Array  # [P] m along the road
 
 
-def _strips(road: Road, s: Array, d0: float, d1: float) -> Array:
-    """Quads [len(s) - 1, 4, 3] between two lateral positions, seen from above."""
-    right, left = road.place(s, np.full_like(s, d0)), road.place(s, np.full_like(s, d1))
+def _strips(road: Road, s: Array, d0: float, d1: float, z0: float = 0.0, z1: float = 0.0) -> Array:
+    """Quads [len(s) - 1, 4, 3] between two lateral positions at their heights (m), seen from above."""
+    right, left = road.place(s, np.full_like(s, d0), z0), road.place(s, np.full_like(s, d1), z1)
     return np.stack([right[:-1], right[1:], left[1:], left[:-1]], 1)
 
 
@@ -85,7 +85,7 @@ def make_scenery(
         for slot in lots:
             ground(far, far + 16, PAINT, 1.009, np.array([slot - 0.08, slot + 0.08]), mottle=0.0)
     for d in (-rail, rail, -0.7, 0.7):
-        pieces.append((_rail_quads(road, s, d), np.tile(np.array(RAIL), (len(s) - 1, 1)), 1.0, True))
+        pieces.append((_strips(road, s, d, d, 0.45, 0.78), np.tile(np.array(RAIL), (len(s) - 1, 1)), 1.0, True))
         posts = _post_quads(road, s + 2.0, d)
         pieces.append((posts, np.tile(np.array((120, 122, 124)), (len(posts), 1)), 1.0, True))
     mesh = Mesh(
@@ -113,11 +113,6 @@ def _along(road: Road, points: Array) -> Array:
     coarse = road.xy[::20]
     nearest = np.argmin(((points[:, None, :2] - coarse[None]) ** 2).sum(-1), 1)
     return nearest * 20.0 - 800.0
-
-
-def _rail_quads(road: Road, s: Array, d: float) -> Array:
-    low, high = road.place(s, np.full_like(s, d), 0.45), road.place(s, np.full_like(s, d), 0.78)
-    return np.stack([low[:-1], low[1:], high[1:], high[:-1]], 1)
 
 
 def _post_quads(road: Road, s: Array, d: float) -> Array:

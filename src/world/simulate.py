@@ -93,37 +93,27 @@ def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.
     for kind, lane, faster, place in company:
         chosen = "bendy_bus" if kind == "bus" and rng.random() < 0.3 else kind
         if rng.random() < 0.75 * config.rare_objects:
-            _add(fleet, chosen, 1, lane, float(place), ego_mps + faster, may_change=False)
+            _add(fleet, Vehicle(chosen, 1, lane, float(place), ego_mps + faster, may_change=False))
     for direction, low, high in ((1, -460.0, 620.0), (-1, -980.0, 260.0)):
         for lane in range(road.lanes):
             busy = config.vehicles_per_lane_km * (0.8 if lane == 0 else 1.1)
             place = low + rng.uniform(0, 40)
             while busy > 0 and place < high:
                 kind, wanted = _draw_vehicle(road, lane, rng)
-                _add(fleet, kind, direction, lane, place, wanted, has_trailer=rng.random() < 0.62)
+                has_trailer = rng.random() < 0.62 and kind in HITCH_OVERLAP_M
+                _add(fleet, Vehicle(kind, direction, lane, place, wanted, has_trailer=has_trailer))
                 place += max(rng.exponential(1000.0 / busy), 12 + 0.9 * wanted)
     return fleet
 
 
-def _add(
-    fleet: list[Vehicle],
-    kind: str,
-    direction: int,
-    lane: int,
-    place: float,
-    wanted: float,
-    *,
-    has_trailer: bool = False,
-    may_change: bool = True,
-) -> None:
-    """Put a vehicle into a lane unless something is too close already."""
-    with_trailer = has_trailer and kind in HITCH_OVERLAP_M
-    length = KINDS[kind].size_m[0]
-    if with_trailer:
-        length += KINDS[_trailer_of(kind)].size_m[0] - HITCH_OVERLAP_M[kind]
-    near = (v for v in fleet if v.direction == direction and v.lane == lane)
-    if all(abs(v.along_m - place) > 0.5 * (v.length_m + length) + 7 for v in near):
-        fleet.append(Vehicle(kind, direction, lane, place, wanted, length, with_trailer, may_change))
+def _add(fleet: list[Vehicle], vehicle: Vehicle) -> None:
+    """Put a vehicle into its lane, as long as it is with its trailer, unless something is too close already."""
+    vehicle.length_m = KINDS[vehicle.kind].size_m[0]
+    if vehicle.has_trailer:
+        vehicle.length_m += KINDS[_trailer_of(vehicle.kind)].size_m[0] - HITCH_OVERLAP_M[vehicle.kind]
+    near = (v for v in fleet if v.direction == vehicle.direction and v.lane == vehicle.lane)
+    if all(abs(v.along_m - vehicle.along_m) > 0.5 * (v.length_m + vehicle.length_m) + 7 for v in near):
+        fleet.append(vehicle)
 
 
 def _trailer_of(kind: str) -> str:

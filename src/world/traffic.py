@@ -23,7 +23,7 @@ class Vehicle:
     lane: int  # 0 beside the median
     along_m: float  # position in its own direction at the start
     wanted_mps: float
-    length_m: float
+    length_m: float = 0.0  # with its trailer
     has_trailer: bool = False
     may_change: bool = True
 
@@ -48,6 +48,32 @@ def simulate_traffic(
     brakes[0] = 1e9
     out_s, out_v = np.zeros((n, steps)), np.zeros((n, steps))
     out_dv = np.zeros((n, steps))
+
+    def change_lanes(now: float, gap: Array, closing: Array) -> None:
+        """Let those that are held up pull out to the left, and some free ones return, where that lane has room."""
+        for i in range(1, n):
+            if not fleet[i].may_change or now - move_start[i] < LANE_CHANGE_S + 1.0:
+                continue
+            held_up = closing[i] > 1.0 and gap[i] < 12 + 2.2 * speed[i]
+            if held_up:
+                goal = lane[i] - 1
+            elif rng.random() < 0.015:
+                goal = lane[i] + 1
+            else:
+                continue
+            heavy = length[i] > 7.0
+            if not 0 <= goal < road.lanes or (heavy and goal < road.lanes - 2):
+                continue
+            others = np.array([v.direction == fleet[i].direction for v in fleet]) & (lane == goal)
+            others[i] = False
+            ahead = along[others] - along[i]
+            room = np.abs(ahead) - 0.5 * (length[others] + length[i])
+            need = 6 + np.where(ahead > 0, 1.5 * (speed[i] - speed[others]), 2.5 * (speed[others] - speed[i])).clip(0)
+            if np.all(room > need + 0.4 * speed[i]):
+                lane[i] = goal
+                move_from[i], move_to[i] = move_to[i], road.lane_centre(fleet[i].direction, int(goal))
+                move_start[i] = now
+
     for step in range(steps):
         now = step * STEP_S
         out_s[:, step], out_v[:, step] = along, speed
@@ -60,9 +86,7 @@ def simulate_traffic(
         accel = 1.2 * (1 - (speed / np.maximum(goal, 1.0)) ** 4 - (target / np.maximum(gap, 0.5)) ** 2)
         accel = np.clip(accel, -6.0, 1.5)
         if step % 10 == 0:
-            _change_lanes(
-                fleet, now, along, speed, length, gap, closing, lane, move_from, move_to, move_start, road, rng
-            )
+            change_lanes(now, gap, closing)
         new_speed = np.maximum(speed + accel * STEP_S, 0.0)
         along = along + 0.5 * (speed + new_speed) * STEP_S
         speed = new_speed
@@ -81,43 +105,3 @@ def _leaders(along: Array, speed: Array, length: Array, lane_key: Array) -> tupl
     gap[rear] = along[front] - along[rear] - 0.5 * (length[front] + length[rear])
     closing[rear] = speed[rear] - speed[front]
     return gap, closing
-
-
-def _change_lanes(
-    fleet: list[Vehicle],
-    now: float,
-    along: Array,
-    speed: Array,
-    length: Array,
-    gap: Array,
-    closing: Array,
-    lane: Array,
-    move_from: Array,
-    move_to: Array,
-    move_start: Array,
-    road: Road,
-    rng: np.random.Generator,
-) -> None:
-    """Let vehicles that are held up pull out to the left, and some free ones return, where the other lane has room."""
-    for i in range(1, len(fleet)):
-        if not fleet[i].may_change or now - move_start[i] < LANE_CHANGE_S + 1.0:
-            continue
-        held_up = closing[i] > 1.0 and gap[i] < 12 + 2.2 * speed[i]
-        if held_up:
-            goal = lane[i] - 1
-        elif rng.random() < 0.015:
-            goal = lane[i] + 1
-        else:
-            continue
-        heavy = length[i] > 7.0
-        if not 0 <= goal < road.lanes or (heavy and goal < road.lanes - 2):
-            continue
-        others = np.array([v.direction == fleet[i].direction for v in fleet]) & (lane == goal)
-        others[i] = False
-        ahead = along[others] - along[i]
-        room = np.abs(ahead) - 0.5 * (length[others] + length[i])
-        need = 6 + np.where(ahead > 0, 1.5 * (speed[i] - speed[others]), 2.5 * (speed[others] - speed[i])).clip(0)
-        if np.all(room > need + 0.4 * speed[i]):
-            lane[i] = goal
-            move_from[i], move_to[i] = move_to[i], road.lane_centre(fleet[i].direction, int(goal))
-            move_start[i] = now

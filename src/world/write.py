@@ -28,33 +28,14 @@ CONFIG_FILE = "world.json"
 def ensure_world(config: WorldConfig, root: Path, progress: bool = True) -> Path:
     """The world of this config at `root`, written now unless it is there already.
 
-    Raises ConfigError if the world at `root` has another config, DataError if `root` holds something else or half of
-    a world.
-    """
-    root = Path(root)
-    if not root.exists() or (root.is_dir() and not any(root.iterdir())):
-        return write_world(config, root, progress)
-    stored = _read_stored(root)
-    wanted = json.loads(json.dumps(stored_config(config)))
-    if stored != wanted:
-        differing = sorted(k for k in stored.keys() | wanted.keys() if stored.get(k) != wanted.get(k))
-        pairs = ", ".join(f"{k}: stored {stored.get(k)!r}, asked {wanted.get(k)!r}" for k in differing)
-        raise ConfigError(f"{root} holds a world of another config ({pairs}); choose another folder or remove this one")
-    return root
-
-
-def write_world(config: WorldConfig, root: Path, progress: bool = True) -> Path:
-    """Write a world to `root`, which must not exist or be empty, and return `root`.
-
     Everything goes into a hidden folder beside `root` that is renamed at the end, so an interrupted run leaves no
-    `root`. The bytes depend on the config alone, not on `num_workers`. Raises DataError if `root` is taken or cannot be
-    written.
+    `root`. The bytes depend on the config alone, not on `num_workers`. Raises ConfigError if the world at `root` has
+    another config, DataError if `root` holds something else or half of a world, or cannot be written.
     """
     root = Path(root)
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
-        raise DataError(
-            f"{root}: a world needs a new or empty folder, but this one is in use; choose another or remove it"
-        )
+        _check_stored(config, root)
+        return root
     partial_root = root.parent / f".{root.name}.partial-{uuid.uuid4().hex[:8]}"
     try:
         try:
@@ -71,10 +52,20 @@ def write_world(config: WorldConfig, root: Path, progress: bool = True) -> Path:
             # Another process may have finished the same world in the meantime.
             if not root.exists():
                 raise DataError(f"{root}: the finished world could not be moved here: {error}") from error
-            ensure_world(config, root, progress)
+            _check_stored(config, root)
     finally:
         shutil.rmtree(partial_root, ignore_errors=True)
     return root
+
+
+def _check_stored(config: WorldConfig, root: Path) -> None:
+    """Refuse what lies at `root` unless it is the whole world of this config."""
+    stored = _read_stored(root)
+    wanted = json.loads(json.dumps(stored_config(config)))
+    if stored != wanted:
+        differing = sorted(k for k in stored.keys() | wanted.keys() if stored.get(k) != wanted.get(k))
+        pairs = ", ".join(f"{k}: stored {stored.get(k)!r}, asked {wanted.get(k)!r}" for k in differing)
+        raise ConfigError(f"{root} holds a world of another config ({pairs}); choose another folder or remove this one")
 
 
 def _read_stored(root: Path) -> dict[str, object]:

@@ -13,7 +13,7 @@ from src.data.schema import CHANNELS
 from src.errors import DataError
 from src.geometry.transforms import invert_rigid, rigid
 from src.structures.taxonomy import LIDARS
-from src.world.write import write_world
+from src.world.write import ensure_world
 from tests.data.tiny_set import (
     LIDAR_CHANNELS,
     LIDAR_STEP_US,
@@ -207,7 +207,7 @@ def test_the_worlds_own_lidars_give_the_points_that_its_rays_met(tmp_path):
         num_train_scenes=1, num_val_scenes=0, key_frames_per_scene=2, lidar=True, lidar_sweeps_per_key_frame=3,
         radar_sweeps_per_key_frame=1,
     )  # fmt: skip
-    root = write_world(config, tmp_path / "world", progress=False)
+    root = ensure_world(config, tmp_path / "world", progress=False)
     index = load_index(root, VERSION, None)
     writer = SceneWriter(config, 0, root)
     frame = FrameReader(index, reader_settings(**ONLY_LIDAR, min_distance_m=0.0)).read(1, None)

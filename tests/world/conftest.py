@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from src.world.world_config import WorldConfig
-from src.world.write import VERSION, write_world
+from src.world.write import VERSION, ensure_world
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SMALL = {
@@ -89,7 +89,7 @@ def config():
 
 @pytest.fixture(scope="session")
 def world(config, tmp_path_factory):
-    return StoredWorld(write_world(config, tmp_path_factory.mktemp("worlds") / "small", progress=False))
+    return StoredWorld(ensure_world(config, tmp_path_factory.mktemp("worlds") / "small", progress=False))
 
 
 @pytest.fixture(scope="session")

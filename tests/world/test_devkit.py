@@ -127,12 +127,12 @@ def test_scene_tags_are_known_to_the_devkit(devkit):
 def test_lidar_world_is_read_with_times_and_hits_boxes(make_config, tmp_path):
     from truckscenes.utils.data_classes import LidarPointCloud
 
-    from src.world.write import write_world
+    from src.world.write import ensure_world
 
     config = make_config(
         num_train_scenes=1, num_val_scenes=0, key_frames_per_scene=2, lidar=True, radar_sweeps_per_key_frame=1
     )
-    root = write_world(config, tmp_path / "lidar", progress=False)
+    root = ensure_world(config, tmp_path / "lidar", progress=False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         devkit = truckscenes.TruckScenes("v1.2-trainval", str(root), verbose=False)

@@ -11,7 +11,7 @@ from src.world.catalogue import KINDS
 from src.world.motion import EgoMotion, Tracks
 from src.world.pcd_writer import radar_pcd
 from src.world.placement import Actor
-from src.world.radar import simulate_sweeps
+from src.world.radar import Radars
 from src.world.rig import sensor_rig
 from src.world.road import END_M, START_M, Road
 from src.world.scenery import Scenery
@@ -76,7 +76,7 @@ def sweep_of(make_config, scene, **changes):
     config = make_config(**(quiet | changes))
     rig = sensor_rig(config)
     mounts = [rig[name] for name in RADARS]
-    sweep = simulate_sweeps(config, scene, NOTHING, mounts, [0.0] * 6, np.random.default_rng(1))[0].astype(float)
+    sweep = Radars(config, scene, NOTHING, mounts, np.random.default_rng(1)).sweep([0.0] * 6)[0].astype(float)
     mount = mounts[0]
     sight = sweep[:, :3] / np.linalg.norm(sweep[:, :3], axis=1, keepdims=True)
     own = mount.rotation.T @ np.array([EGO_MPS, 0.0, 0.0])

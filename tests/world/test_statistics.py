@@ -13,7 +13,7 @@ import pytest
 
 from src.structures.taxonomy import CATEGORY_TO_CLASS, CLASS_RANGE_M, CLASSES
 from src.world.world_config import WorldConfig
-from src.world.write import write_world
+from src.world.write import ensure_world
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REAL_SWEEPS = REPOSITORY.parent / "shared" / "real" / "truckscenes_radar"
@@ -77,7 +77,7 @@ def test_a_small_world_looks_like_the_real_frames(make_config, tmp_path, stored_
         ego_rate_hz=10,
         seed=0,
     )
-    world = stored_world(write_world(config, tmp_path / "w", progress=False))
+    world = stored_world(ensure_world(config, tmp_path / "w", progress=False))
     table = table_of(world)
     check(table, 48, slack=1.6)
     assert set(table["klass"]) == set(CLASSES)
@@ -86,7 +86,7 @@ def test_a_small_world_looks_like_the_real_frames(make_config, tmp_path, stored_
 @pytest.fixture(scope="module")
 def default_world(default_values, tmp_path_factory, stored_world):
     config = WorldConfig(**default_values)
-    return config, stored_world(write_world(config, tmp_path_factory.mktemp("default") / "w", progress=False))
+    return config, stored_world(ensure_world(config, tmp_path_factory.mktemp("default") / "w", progress=False))
 
 
 @pytest.mark.exhaustive

@@ -18,7 +18,7 @@ from src.world import write
 from src.world.scene_writer import SceneWriter
 from src.world.simulate import make_scene
 from src.world.world_config import world_digest
-from src.world.write import VERSION, ensure_world, write_world
+from src.world.write import VERSION, ensure_world
 
 TINY = {
     "num_train_scenes": 1,
@@ -190,8 +190,8 @@ def test_chassis_speed_reads_zero_now_and_then_while_the_cabin_moves(make_config
 
 @pytest.mark.slow
 def test_same_bytes_with_one_and_two_workers(tmp_path, make_config):
-    one = write_world(make_config(**TINY, num_workers=1), tmp_path / "one", progress=False)
-    two = write_world(make_config(**TINY, num_workers=2), tmp_path / "two", progress=False)
+    one = ensure_world(make_config(**TINY, num_workers=1), tmp_path / "one", progress=False)
+    two = ensure_world(make_config(**TINY, num_workers=2), tmp_path / "two", progress=False)
     assert fingerprint(one) == fingerprint(two)
     assert world_digest(make_config(num_workers=1)) == world_digest(make_config(num_workers=2))
 
@@ -209,8 +209,6 @@ def test_ensure_reuses_the_same_world_and_refuses_another(tmp_path, make_config)
     assert (root / "world.json").stat().st_mtime_ns == stamp
     with pytest.raises(ConfigError, match="seed"):
         ensure_world(make_config(**TINY, seed=99), root)
-    with pytest.raises(DataError, match="in use"):
-        write_world(config, root)
     (root / VERSION / "sample.json").unlink()
     with pytest.raises(DataError, match="sample"):
         ensure_world(config, root)
@@ -225,7 +223,7 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch, make_config):
 
     monkeypatch.setattr(write, "shared_tables", fail)
     with pytest.raises(DataError, match="disk full.*make room"):
-        write_world(make_config(**TINY), tmp_path / "w", progress=False)
+        ensure_world(make_config(**TINY), tmp_path / "w", progress=False)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -233,7 +231,7 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch, make_config):
 def test_a_killed_write_leaves_nothing_that_looks_complete(tmp_path, make_config):
     root = tmp_path / "w"
     child = multiprocessing.get_context("spawn").Process(
-        target=write_world, args=(make_config(key_frames_per_scene=20), root, False)
+        target=ensure_world, args=(make_config(key_frames_per_scene=20), root, False)
     )
     child.start()
     end = time.monotonic() + 30
@@ -249,7 +247,7 @@ def test_a_killed_write_leaves_nothing_that_looks_complete(tmp_path, make_config
 @pytest.mark.slow
 def test_camera_sweeps_fill_the_time_between_key_frames(tmp_path, make_config, stored_world):
     values = TINY | {"num_val_scenes": 0, "camera_sweeps": True, "radar_sweeps_per_key_frame": 1}
-    world = stored_world(write_world(make_config(**values), tmp_path / "w", progress=False))
+    world = stored_world(ensure_world(make_config(**values), tmp_path / "w", progress=False))
     rows = [row for row in world["sample_data"] if world.channel(row) == CAMERAS[0]]
     assert [row["is_key_frame"] for row in rows] == [False, False, False, False, True] * 2
     np.testing.assert_allclose(np.diff([row["timestamp"] for row in rows]) * 1e-6, 0.1, atol=0.02)
@@ -259,7 +257,7 @@ def test_camera_sweeps_fill_the_time_between_key_frames(tmp_path, make_config, s
 def test_lidar_sweeps_are_a_tenth_of_a_second_apart(make_config, stored_world, tmp_path):
     changes = {"num_train_scenes": 1, "num_val_scenes": 0, "key_frames_per_scene": 2, "radar_sweeps_per_key_frame": 1}
     config = make_config(**changes, lidar=True, lidar_sweeps_per_key_frame=5, lidar_step_deg=4.0)
-    world = stored_world(write_world(config, tmp_path / "lidar", progress=False))
+    world = stored_world(ensure_world(config, tmp_path / "lidar", progress=False))
     chains = defaultdict(list)
     for row in world["sample_data"]:
         if world.channel(row) in LIDARS:
@@ -274,15 +272,15 @@ def test_lidar_sweeps_are_a_tenth_of_a_second_apart(make_config, stored_world, t
         np.testing.assert_allclose(np.diff([row["timestamp"] for row in rows]), 100_000, atol=5_000)
         assert all(row["width"] > 50 for row in rows)
     alone = make_config(**changes, lidar=True, lidar_step_deg=4.0)
-    keys = stored_world(write_world(alone, tmp_path / "keys", progress=False))
+    keys = stored_world(ensure_world(alone, tmp_path / "keys", progress=False))
     assert not any((keys.root / "sweeps").glob("LIDAR*")) and len(keys["sample"]) == 2
 
 
 @pytest.mark.slow
 def test_lidar_does_not_change_what_other_sensors_see(make_config, tmp_path):
     changes = {"num_train_scenes": 1, "num_val_scenes": 0, "key_frames_per_scene": 1, "radar_sweeps_per_key_frame": 1}
-    with_lidar = write_world(make_config(**changes, lidar=True, lidar_step_deg=8.0), tmp_path / "a", progress=False)
-    without = write_world(make_config(**changes), tmp_path / "b", progress=False)
+    with_lidar = ensure_world(make_config(**changes, lidar=True, lidar_step_deg=8.0), tmp_path / "a", progress=False)
+    without = ensure_world(make_config(**changes), tmp_path / "b", progress=False)
     seen = [{name: made for name, made in fingerprint(root).items() if "CAMERA" in name or "RADAR" in name}
             for root in (with_lidar, without)]  # fmt: skip
     assert seen[0] == seen[1] and len(seen[0]) == 10
