@@ -153,6 +153,7 @@ class Config:
             known = ", ".join(PHASES)
             raise ConfigError(f"phase.name={self.phase.name}: must be one of {known}; choose with phase=...")
         read_phase_options(self.model.name, self.phase.options)
+        self.grid.build()
         if self.phase.temporal and not self.model.temporal_part:
             raise ConfigError(
                 f"model={self.model.name} has no memory to train in phase={self.phase.name}; use phase=phase1"

@@ -31,7 +31,7 @@ def run_command(main: Callable[[list[str]], None]) -> None:
     """
     line = "%(asctime)s %(levelname).1s %(name)s: %(message)s"
     logging.basicConfig(level=logging.INFO, format=line, datefmt="%H:%M:%S")
-    for noisy in ("matplotlib", "PIL", "lightning.pytorch.utilities.rank_zero"):
+    for noisy in ("matplotlib", "PIL", "lightning.pytorch"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
     interruptions = _handle_signals()
     try:
