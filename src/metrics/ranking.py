@@ -55,11 +55,13 @@ def rank_predictions(
 def find_candidates(ranking: Ranking) -> CandidatePairs:
     """Pairs of one sample and class nearer than the largest threshold; rows count within `ranking`."""
     truth, ego_x = ranking.truth, ranking.evaluation_set.ego_centers[:, 0]
-    predictions = ranking.predictions[ranking.file_order]  # neighbours in the file share a sample, hence memory
+    columns = (ranking.predictions.samples, ranking.predictions.labels, ranking.predictions.centers)
+    # Neighbours in the file share a sample, hence memory.
+    samples, labels, centers = (column[ranking.file_order] for column in columns)
     return find_pairs(
-        prediction_groups=predictions.samples * len(CLASSES) + predictions.labels,
-        prediction_xy=predictions.centers[:, :2],
-        prediction_offsets=predictions.centers[:, 0] - ego_x[predictions.samples],
+        prediction_groups=samples * len(CLASSES) + labels,
+        prediction_xy=centers[:, :2],
+        prediction_offsets=centers[:, 0] - ego_x[samples],
         prediction_places=ranking.file_order,
         truth_groups=truth.samples * len(CLASSES) + truth.labels,
         truth_xy=truth.centers[:, :2],
