@@ -60,7 +60,7 @@ def score_detections(
     check_predictions(predictions, evaluation_set.tokens)
     truth = evaluation_set.ground_truth
     kept, truth_kept = official_filter(evaluation_set, predictions), official_filter(evaluation_set, truth)
-    ranking = rank_predictions(evaluation_set, predictions[kept], truth[truth_kept])
+    ranking = rank_predictions(evaluation_set, predictions, kept, truth[truth_kept])
     pairs = find_candidates(ranking)
     matching = match_predictions(ranking, pairs)
     everyone, every_truth = np.ones(len(ranking.predictions), bool), np.ones(len(ranking.truth), bool)

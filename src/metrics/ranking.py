@@ -40,14 +40,16 @@ class Matching:
 
 def rank_predictions(
     evaluation_set: EvaluationSet,
-    predictions: DetectionTable,  # those that count
+    predictions: DetectionTable,
+    kept: Array,  # [all predictions] bool, those that count
     truth: DetectionTable,  # those that count
 ) -> Ranking:
     """Put the predictions into the order in which they are matched."""
     # Reversed ascending stable order: descending scores, and the later in the file first among equal ones.
-    order = np.argsort(predictions.scores, kind="stable")[::-1]
-    order = order[np.argsort(predictions.labels[order].astype(np.uint8), kind="stable")]
-    ranked = predictions[order]
+    rows = np.flatnonzero(kept)
+    order = np.argsort(predictions.scores[rows], kind="stable")[::-1]
+    order = order[np.argsort(predictions.labels[rows[order]].astype(np.uint8), kind="stable")]
+    ranked = predictions[rows[order]]
     class_starts = np.searchsorted(ranked.labels, np.arange(len(CLASSES) + 1))
     return Ranking(evaluation_set, ranked, truth, class_starts, np.argsort(order))
 
