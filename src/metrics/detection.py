@@ -63,7 +63,7 @@ def score_detections(
     ranking = rank_predictions(evaluation_set, predictions, kept, truth[truth_kept])
     pairs = find_candidates(ranking)
     matching = match_predictions(ranking, pairs)
-    everyone, every_truth = np.ones(len(ranking.predictions), bool), np.ones(len(ranking.truth), bool)
+    everyone, every_truth = np.ones(len(ranking.rows), bool), np.ones(len(ranking.truth), bool)
     scores = DetectionScores(
         overall=_score_subset(ranking, matching, everyone, every_truth),
         ranges={},
@@ -74,8 +74,8 @@ def score_detections(
     )
     if by_range:
         edges = [low for low, _ in RANGE_BINS_M[1:]]
-        tables = (ranking.predictions, ranking.truth)
-        bins, truth_bins = (np.digitize(ego_distances(evaluation_set, table), edges) for table in tables)
+        bins = np.digitize(ego_distances(evaluation_set, predictions), edges)[ranking.rows]
+        truth_bins = np.digitize(ego_distances(evaluation_set, ranking.truth), edges)
         # Boxes of different bins never meet, so the four bins are matched at once.
         matching_in_bins = match_predictions(ranking, pairs[bins[pairs.predictions] == truth_bins[pairs.ground_truth]])
         scores.ranges = {
@@ -106,7 +106,7 @@ def _score_subset(
         if t == 0 or members.ndim == 2:
             of_threshold = members if members.ndim == 1 else members[t]
             places = np.flatnonzero(of_threshold)
-            scores = ranking.predictions.scores[places]
+            scores = ranking.scores[places]
             class_starts = np.searchsorted(places, ranking.class_starts)
         chosen = of_threshold[matching.places[t]]
         matched = np.searchsorted(places, matching.places[t][chosen])  # place within the subset
@@ -136,7 +136,7 @@ def _score_subset(
 def _score_tag(ranking: Ranking, matching: Matching, tag: str) -> SubsetScores:
     """Scores over the samples whose scene carries `tag`; samples do not meet, so the matches stay what they are."""
     tagged = np.array([tag in tags for tags in ranking.evaluation_set.scene_tags], dtype=bool)
-    scores = _score_subset(ranking, matching, tagged[ranking.predictions.samples], tagged[ranking.truth.samples])
+    scores = _score_subset(ranking, matching, tagged[ranking.samples], tagged[ranking.truth.samples])
     if tag in TAGS_WITHOUT_SCORE:
         scores.ap, scores.errors = np.full_like(scores.ap, np.nan), np.full_like(scores.errors, np.nan)
     return scores
@@ -152,7 +152,7 @@ def _score_speeds(ranking: Ranking, matching: Matching) -> dict[str, SubsetScore
     class, as ground truth of unknown velocity does, and lowers the overall score alone.
     """
     truth = speed_classes(ranking.truth.velocities)
-    stated = speed_classes(ranking.predictions.velocities)
+    stated = speed_classes(ranking.predictions.velocities)[ranking.rows]
     followed = np.tile(stated, (len(DISTANCE_THRESHOLDS_M), 1))
     for t, places in enumerate(matching.places):
         followed[t, places] = truth[matching.ground_truth[t]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -20,13 +21,27 @@ _HALF_TURN_CLASSES = (CLASSES.index("barrier"), CLASSES.index("traffic_sign"))
 
 @dataclass
 class Ranking:
-    """The boxes that count, predictions by class and then by descending score."""
+    """The boxes that count, predictions by class and then by descending score.
+
+    They are named by their rows: a whole table in that order would be copied column by column to read a few.
+    """
 
     evaluation_set: EvaluationSet
-    predictions: DetectionTable  # n
+    predictions: DetectionTable  # as in the file, those that do not count among them
+    rows: Array  # [n] row of `predictions` at each place of the order
     truth: DetectionTable  # k
     class_starts: Array  # [13] first place of each class, and n
     file_order: Array  # [n] places of the predictions as they stand in the file
+
+    @cached_property
+    def samples(self) -> Array:
+        """Sample at each place [n]."""
+        return self.predictions.samples[self.rows]
+
+    @cached_property
+    def scores(self) -> Array:
+        """Score at each place [n]."""
+        return self.predictions.scores[self.rows]
 
 
 @dataclass
@@ -49,17 +64,16 @@ def rank_predictions(
     rows = np.flatnonzero(kept)
     order = np.argsort(predictions.scores[rows], kind="stable")[::-1]
     order = order[np.argsort(predictions.labels[rows[order]].astype(np.uint8), kind="stable")]
-    ranked = predictions[rows[order]]
-    class_starts = np.searchsorted(ranked.labels, np.arange(len(CLASSES) + 1))
-    return Ranking(evaluation_set, ranked, truth, class_starts, np.argsort(order))
+    class_starts = np.searchsorted(predictions.labels[rows[order]], np.arange(len(CLASSES) + 1))
+    return Ranking(evaluation_set, predictions, rows[order], truth, class_starts, np.argsort(order))
 
 
 def find_candidates(ranking: Ranking) -> CandidatePairs:
     """Pairs of one sample and class nearer than the largest threshold; rows count within `ranking`."""
     truth, ego_x = ranking.truth, ranking.evaluation_set.ego_centers[:, 0]
     columns = (ranking.predictions.samples, ranking.predictions.labels, ranking.predictions.centers)
-    # Neighbours in the file share a sample, hence memory.
-    samples, labels, centers = (column[ranking.file_order] for column in columns)
+    in_file = ranking.rows[ranking.file_order]  # neighbours in the file share a sample, hence memory
+    samples, labels, centers = (column[in_file] for column in columns)
     return find_pairs(
         prediction_groups=samples * len(CLASSES) + labels,
         prediction_xy=centers[:, :2],
@@ -91,20 +105,21 @@ def match_predictions(ranking: Ranking, pairs: CandidatePairs) -> Matching:
 
 
 def _check_sizes(ranking: Ranking, matches: CandidatePairs) -> None:
-    matched = ranking.truth[matches.ground_truth]
-    flat = ~(matched.sizes > 0).all(axis=1)
+    truth = ranking.truth
+    flat = ~(truth.sizes[matches.ground_truth] > 0).all(axis=1)
     if flat.any():
-        row = int(np.argmax(flat))
+        row = matches.ground_truth[np.argmax(flat)]
         raise DataError(
-            f"ground truth at {matched.centers[row].tolist()} (sample "
-            f"{ranking.evaluation_set.tokens[matched.samples[row]]}): size must be positive to be matched, but got "
-            f"{matched.sizes[row].tolist()}"
+            f"ground truth at {truth.centers[row].tolist()} (sample "
+            f"{ranking.evaluation_set.tokens[truth.samples[row]]}): size must be positive to be matched, but got "
+            f"{truth.sizes[row].tolist()}"
         )
 
 
 def _match_errors(ranking: Ranking, matches: CandidatePairs) -> Array:
     """The five errors of each match, NaN where the ground truth (or a velocity) leaves one undefined: [m, 5]."""
-    predicted, truth = ranking.predictions[matches.predictions], ranking.truth[matches.ground_truth]
+    predicted = ranking.predictions[ranking.rows[matches.predictions]]
+    truth = ranking.truth[matches.ground_truth]
     shared = np.minimum(truth.sizes, predicted.sizes).prod(axis=1)
     overlap = shared / (truth.sizes.prod(axis=1) + predicted.sizes.prod(axis=1) - shared)
     period = np.where(np.isin(truth.labels, _HALF_TURN_CLASSES), np.pi, 2 * np.pi)
