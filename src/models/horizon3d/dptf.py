@@ -103,7 +103,8 @@ class DPTF(nn.Module):
         if self.bev_path is not None:
             cells = self.bev_path.store(fused, output.cells, batch)
         if self.gaussian_path is not None:
-            gaussians = self.gaussian_path.store(ocsf.gaussians, ocsf.splat.active, batch)
+            active = ocsf.splat.active(self.config.gaussian_path.min_contribution)
+            gaussians = self.gaussian_path.store(ocsf.gaussians, active, batch)
         frame = MemoryFrame(
             batch.timestamps_s,
             batch.global_from_ego,

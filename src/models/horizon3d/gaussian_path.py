@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import require_least
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.time_embedding import TimeEmbedding
@@ -45,6 +45,7 @@ class GaussianPathConfig:
 
     num_frames: int  # remembered key frames
     gaussians_per_frame: int
+    min_contribution: float  # of a Gaussian to an occupied cell, to be active; 0: its support reaches one
     sampling: Sampling
     velocity_compensation: bool  # move history by its own velocity; off: by the ego motion alone (Table 6)
     self_attention: SelfAttentionConfig | None
@@ -52,6 +53,10 @@ class GaussianPathConfig:
     def __post_init__(self) -> None:
         own = {"num_frames": 1, "gaussians_per_frame": 1}
         require_least(self, "model.dptf.gaussian_path", own, "; gaussian_path=null switches the path off")
+        if not 0 <= self.min_contribution < 1:
+            raise ConfigError(
+                f"model.dptf.gaussian_path.min_contribution={self.min_contribution}: must be at least 0 and below 1"
+            )
 
     @property
     def num_history_gaussians(self) -> int:
@@ -128,7 +133,7 @@ class GaussianPath(nn.Module):
     def store(
         self,
         gaussians: GaussianSet,  # G_L
-        active: Tensor,  # [B, G] bool, the Gaussian reaches an occupied cell
+        active: Tensor,  # [B, G] bool
         batch: FrameBatch,
     ) -> GaussianSet:  # [B, gaussians_per_frame] in the unaugmented ego frame
         """A subset of the active Gaussians of any source; padding where fewer are active."""

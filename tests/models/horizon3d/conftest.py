@@ -174,6 +174,7 @@ def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, **changes):
     gaussian = {
         "num_frames": 2,
         "gaussians_per_frame": 8,
+        "min_contribution": 0.0,
         "sampling": Sampling.farthest_point,
         "velocity_compensation": True,
         "self_attention": SelfAttentionConfig(num_heads=4),

@@ -37,7 +37,7 @@ def make_parts(make_dptf):
                 elapsed_s=zeros,
                 valid=torch.ones(b, 1, dtype=torch.bool),
             )
-            ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, gaussians.valid, zeros.long()), fused)
+            ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, zeros.long(), zeros + 0.2), fused)
             predicted = CellPrediction(torch.ones(b), torch.zeros(b, 2)) if dptf.bev_path is not None else None
             past = dptf.recall(memory, batch).past
             return dptf.remember(past, batch, fused, DPTFOutput(None, None, predicted, fused), ocsf)
@@ -89,6 +89,14 @@ def test_without_the_bev_path_the_head_reads_f_fuse(make_parts):
     assert output.bev is fused and output.cells is None and output.warped is None and output.history is None
 
 
+def test_what_contributes_too_little_is_not_remembered(make_parts):
+    """The Gaussian of these frames contributes 0.2 to its cell."""
+    for least, number in ((0.2, 1), (0.21, 0)):
+        dptf, remember = make_parts(min_contribution=least)
+        memory = remember(None, bare_frame(0.0, [pose()]))
+        assert counts(dptf.recall(memory, bare_frame(0.5, [pose()])), 0) == (1, number)
+
+
 def test_neither_path_looks_past_the_age_limit(make_parts):
     dptf, remember = make_parts(max_age_s=0.55)
     memory = None
@@ -114,6 +122,8 @@ def test_a_jump_of_the_pose_forgets_its_lane_for_good_and_no_other(make_parts):
 
 
 def test_impossible_settings_are_refused(make_dptf):
+    with pytest.raises(ConfigError, match="min_contribution=1.0"):
+        make_dptf(min_contribution=1.0)
     with pytest.raises(ConfigError, match="nothing to remember"):
         make_dptf(bev_path=False, gaussian_path=False)
     for age in (0.0, -1.0, float("nan")):

@@ -22,6 +22,7 @@ def make_path(**changes):
     values = {
         "num_frames": 4,
         "gaussians_per_frame": 5,
+        "min_contribution": 0.0,
         "sampling": Sampling.farthest_point,
         "velocity_compensation": True,
         "self_attention": None,

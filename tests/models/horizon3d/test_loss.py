@@ -126,7 +126,7 @@ def test_gaussian_velocity_by_hand(settings):
         valid=torch.ones(1, 5, dtype=torch.bool),
     )
     peaks = torch.tensor([[2 * 6 + 2, 1 * 6 + 2, 4 * 6 + 3, 0, -1]])
-    ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, peaks >= 0, peaks), None)
+    ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, peaks, zeros), None)
     boxes = [boxes_of((0.0, 0.0, 2.0, 1.0, 7.0, -2.0), (-2.5, -2.0, 1.0, 1.0, NAN, NAN))]
     # Margin 2 m in total: rows 1..3 around the first box, rows and columns 0..1 around the second.
     terms = gaussian_velocity_loss(ocsf, boxes, TINY, 2.0, settings(dptf_weight=3.0, gaussian_velocity_weight=2.0))

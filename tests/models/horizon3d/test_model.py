@@ -90,7 +90,7 @@ def test_no_visible_gaussian(make_model, make_batch):
         for layer in model.ocsf.encoder.layers:
             layer.refinement.output.bias[6] = -30.0  # opacity: nothing opens a cell
     output, terms = train_step(model, batch)
-    assert len(output.ocsf.splat.bev) == 0 and not output.ocsf.splat.active.any()
+    assert len(output.ocsf.splat.bev) == 0 and not output.ocsf.splat.active().any()
     assert all(value.isfinite() for value in terms.values()) and gradients_are_finite(model)
 
 

@@ -81,7 +81,7 @@ def test_history_is_seen_by_what_follows(with_past):
     with torch.no_grad():
         without, joined = model(batch)[0], model(batch, memory)[0]
     assert (joined.ocsf.gaussians.features[:, :CURRENT] - without.ocsf.gaussians.features).abs().max() > 1e-3
-    assert joined.ocsf.splat.active[:, CURRENT:].any()  # it opens cells of its own
+    assert joined.ocsf.splat.active()[:, CURRENT:].any()  # it opens cells of its own
     assert model.diagnostics(joined)["gaussians_history"] > 0
 
 
@@ -107,7 +107,7 @@ def test_padding_of_history_contributes_nothing(with_past, path, change):
     for pick in (lambda o: o.ocsf.splat.bev, lambda o: o.fused_bev, lambda o: o.dptf.bev):
         assert torch.equal(pick(padded).indices, pick(without).indices)
         torch.testing.assert_close(pick(padded).features, pick(without).features, atol=1e-4, rtol=1e-4)
-    assert not padded.ocsf.splat.active[:, CURRENT:].any()
+    assert not padded.ocsf.splat.active()[:, CURRENT:].any()
 
 
 def test_some_padding_beside_real_history_contributes_nothing(with_past):
