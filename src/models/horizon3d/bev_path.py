@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
+from src.models.backbones.doppler import VelocityStart
 from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.layers.merging import block_diagonal, joined_convs
@@ -37,6 +38,7 @@ class BEVPathConfig:
     num_frames: int  # remembered key frames
     memory_threshold: float  # tau_mem, occupancy from which a cell is remembered
     max_cells_per_frame: int  # guard: the most occupied cells of a frame
+    velocity_start: VelocityStart  # what the predicted velocity of a cell is added to
     velocity_compensation: bool  # move cells by their own velocity; off: by the ego motion alone (Table 6)
     spatial_dilation: bool  # literal strided convolutions, which spread every cell to its neighbours
 
@@ -107,8 +109,8 @@ class BEVPath(nn.Module):
         self.occupancy = nn.ModuleList([occupancy, block_diagonal([first, second])])
         self.velocity = None
 
-    def predict(self, fused: SparseBEV) -> CellPrediction:
-        """Occupancy and velocity of every cell of F_fuse."""
+    def predict(self, fused: SparseBEV, doppler: SparseBEV | None = None) -> CellPrediction:
+        """Occupancy and velocity of every cell of F_fuse; the velocity may start from what the radar measures there."""
         values: list[Tensor] = []
         for head in (self.occupancy, self.velocity):
             if head is not None:
@@ -117,7 +119,10 @@ class BEVPath(nn.Module):
                     values.append(head[1](hidden.float()))
         if self.velocity is None:
             values = list(values[0].split([1, 2], dim=1))
-        return CellPrediction(values[0].squeeze(1), VELOCITY_UNIT_MPS * values[1])
+        velocities = VELOCITY_UNIT_MPS * values[1]
+        if self.config.velocity_start is VelocityStart.doppler:
+            velocities = velocities + doppler.lookup(fused.indices)
+        return CellPrediction(values[0].squeeze(1), velocities)
 
     @torch.no_grad()
     def store(self, fused: SparseBEV, cells: CellPrediction, batch: FrameBatch) -> StoredCells:

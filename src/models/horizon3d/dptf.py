@@ -82,11 +82,11 @@ class DPTF(nn.Module):
             warped = self.bev_path.recall(memory, batch, self.config.max_age_s)
         return WarpedMemory(memory, history, warped)
 
-    def aggregate(self, fused: SparseBEV, warped_memory: WarpedMemory) -> DPTFOutput:
+    def aggregate(self, fused: SparseBEV, warped_memory: WarpedMemory, doppler: SparseBEV | None = None) -> DPTFOutput:
         """F_fuse and the remembered cells into F_out."""
         cells, bev = None, fused
         if self.bev_path is not None:
-            cells = self.bev_path.predict(fused)
+            cells = self.bev_path.predict(fused, doppler)
             bev = self.bev_path.aggregate(fused, warped_memory.warped)
         return DPTFOutput(warped_memory.history, warped_memory.warped, cells, bev)
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.doppler import VelocityStart
 from src.models.backbones.image import ImageEncoderConfig, NeckName
 from src.models.backbones.sparse_voxel import ConvOut, RadarEncoderConfig
 from src.models.backbones.weights import BackboneName
@@ -16,7 +17,7 @@ from src.models.horizon3d.kggi import Initialization, KGGIConfig
 from src.models.horizon3d.loss import Horizon3DLossConfig
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
-from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom
+from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom, VelocityUpdate
 from src.models.horizon3d.views import CameraViews
 from src.structures.batch import FrameBatch
 from src.targets.depth import DepthTarget
@@ -103,6 +104,7 @@ def make_config():
             "depth_target": DepthTarget.box,
             "keypoint_nms_cells": None,
             "property_head": True,
+            "initial_velocity": VelocityStart.zero,
         }
         ocsf = {
             "num_layers": 2,
@@ -113,6 +115,8 @@ def make_config():
             "scale_range_m": [0.2, 3.2],
             "max_mean_shift_m": 4.0,
             "max_speed_mps": 60.0,
+            "velocity_unit_mps": 1.0,
+            "velocity_update": VelocityUpdate.anew,
             "support_sigmas": 3.0,
             "cross_attention": CrossAttention.parallel,
             "refine_from": RefineFrom.self_encoding,
@@ -168,6 +172,7 @@ def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, **changes):
         "num_frames": 3,
         "memory_threshold": 0.1,
         "max_cells_per_frame": 200,
+        "velocity_start": VelocityStart.zero,
         "velocity_compensation": True,
         "spatial_dilation": False,
     }
