@@ -169,14 +169,14 @@ FULL_SIZE_PHASE_2 = {
         "train_missing": True, "temporal": True,
     },
     "phase.options": {"velocity_code_weight": 1.0},
-    "model.dptf": {"max_age_s": 6.0},
+    "model.dptf": {"max_age_s": 6.0, "min_speed_mps": 0.0},
     "model.dptf.bev_path": {
         "num_frames": 8, "memory_threshold": 0.1, "max_cells_per_frame": 4096, "velocity_start": "zero",
         "velocity_compensation": True, "spatial_dilation": False,
     },
     "model.dptf.gaussian_path": {
         "num_frames": 4, "gaussians_per_frame": 256, "min_contribution": 0.0, "sampling": "farthest_point",
-        "velocity_compensation": True, "self_attention": {"num_heads": 8},
+        "velocity_from": "gaussian", "velocity_compensation": True, "self_attention": {"num_heads": 8},
     },
 }  # fmt: skip
 

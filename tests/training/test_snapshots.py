@@ -17,7 +17,7 @@ from src.models.backbones.doppler import VelocityStart
 from src.models.detector import Detector, Objective
 from src.models.horizon3d.bev_path import BEVPathConfig, WarpedCells
 from src.models.horizon3d.dptf import DPTFConfig, DPTFOutput, warped_evidence
-from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling
+from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling, VelocityFrom
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
@@ -119,10 +119,13 @@ def config(bev: bool = True, gaussians: bool = True, compensated: bool = True) -
     )  # fmt: skip
     gaussian_path = GaussianPathConfig(
         num_frames=4, gaussians_per_frame=9, min_contribution=0.0, sampling=Sampling.random,
-        velocity_compensation=compensated, self_attention=None,
+        velocity_from=VelocityFrom.gaussian, velocity_compensation=compensated, self_attention=None,
     )  # fmt: skip
     return DPTFConfig(
-        max_age_s=6.0, bev_path=bev_path if bev else None, gaussian_path=gaussian_path if gaussians else None
+        max_age_s=6.0,
+        min_speed_mps=0.0,
+        bev_path=bev_path if bev else None,
+        gaussian_path=gaussian_path if gaussians else None,
     )
 
 

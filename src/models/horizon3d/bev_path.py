@@ -16,7 +16,7 @@ from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.layers.merging import block_diagonal, joined_convs
 from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv, TemporalConv
-from src.models.memory import motions
+from src.models.memory import motions, moving
 from src.ops.segment_reduce import segment_mean, topk_per_sample
 from src.ops.sites import Sites
 from src.structures.batch import FrameBatch
@@ -145,10 +145,13 @@ class BEVPath(nn.Module):
         )
 
     @torch.no_grad()
-    def recall(self, memory: Memory, batch: FrameBatch, max_age_s: float) -> WarpedCells | None:
+    def recall(
+        self, memory: Memory, batch: FrameBatch, max_age_s: float, min_speed_mps: float = 0.0
+    ) -> WarpedCells | None:
         """Remembered cells in the batch's augmented frame (Eq. 8); None when nothing is remembered.
 
-        x' = A_t T (x + u dt), always from the original frame, so positions are quantised once.
+        x' = A_t T (x + u dt), always from the original frame, so positions are quantised once; slower ones than
+        `min_speed_mps` stay where they were.
         """
         ages = [age for age, frame in enumerate(memory.frames) if frame.cells is not None]
         if not ages:
@@ -165,7 +168,7 @@ class BEVPath(nn.Module):
             torch.cat([getattr(past, name) for past in cells]) for name in ("xy", "velocities", "features", "rows")
         )
         if self.config.velocity_compensation:
-            xy = xy + velocities * elapsed[:, None]
+            xy = xy + moving(velocities, min_speed_mps) * elapsed[:, None]
         xy = transform_points_xy(matrix, xy)
         kept = (motion.usable.flatten()[frame] & self.grid.contains(xy)).nonzero().squeeze(1)
         indices = torch.cat([rows[:, None], torch.cat(slots)[:, None], self.grid.cell_of(xy)], dim=1)

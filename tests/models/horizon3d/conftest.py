@@ -12,7 +12,7 @@ from src.models.heads.center_head import BoxOptions, HeadConfig, TrainRegression
 from src.models.heads.decode import AttributeSource, Suppression
 from src.models.horizon3d.bev_path import BEVPathConfig
 from src.models.horizon3d.dptf import DPTFConfig
-from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling, SelfAttentionConfig
+from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling, SelfAttentionConfig, VelocityFrom
 from src.models.horizon3d.kggi import Initialization, KGGIConfig
 from src.models.horizon3d.loss import Horizon3DLossConfig
 from src.models.horizon3d.model import Horizon3D
@@ -166,7 +166,7 @@ def make_config():
     return build
 
 
-def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, **changes):
+def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, min_speed_mps=0.0, **changes):
     """A small memory with both paths; keyword arguments replace values of either path by name."""
     bev = {
         "num_frames": 3,
@@ -181,6 +181,7 @@ def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, **changes):
         "gaussians_per_frame": 8,
         "min_contribution": 0.0,
         "sampling": Sampling.farthest_point,
+        "velocity_from": VelocityFrom.gaussian,
         "velocity_compensation": True,
         "self_attention": SelfAttentionConfig(num_heads=4),
     }
@@ -189,6 +190,7 @@ def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, **changes):
     assert changes.keys() <= bev.keys() | gaussian.keys()
     return DPTFConfig(
         max_age_s=max_age_s,
+        min_speed_mps=min_speed_mps,
         bev_path=BEVPathConfig(**bev) if bev_path else None,
         gaussian_path=GaussianPathConfig(**gaussian) if gaussian_path else None,
     )

@@ -240,6 +240,15 @@ def test_nothing_comes_back_from_an_unusable_frame(elapsed_s, x):
     assert warped.xy.isfinite().all()
 
 
+def test_what_is_slower_than_the_least_speed_stays():
+    path, cells = make_path(), torch.tensor([[0, 40, 40], [0, 40, 60], [0, 60, 40]])
+    velocities = torch.tensor([[0.6, 0.7], [0.8, 0.7], [0.0, -20.0]])
+    memory = Memory((remember(path, bare_frame(5.0, [pose()]), cells, velocities),))
+    found = path.recall(memory, bare_frame(7.0, [pose()]), 6.0, min_speed_mps=1.0)
+    moved = found.xy - path.grid.centre_of(cells[:, 1:])
+    torch.testing.assert_close(moved, torch.tensor([[0.0, 0.0], [1.6, 1.4], [0.0, -40.0]]), atol=1e-4, rtol=0)
+
+
 def test_cells_that_leave_the_grid_vanish():
     path = make_path()
     edge = torch.tensor([[0, 0, 0], [0, 95, 127], [0, 0, 127], [0, 95, 0]])
