@@ -135,7 +135,7 @@ FULL_SIZE = {
         "depth_weight": 1.0, "radar_objectness_weight": 1.0, "occupancy_focal_weight": 1.0,
         "occupancy_dice_weight": 1.0, "gaussian_velocity_weight": 0.25, "gaussian_velocity_in_phase1": False,
         "dptf_weight": 1.0, "cell_focal_weight": 1.0, "cell_dice_weight": 1.0, "cell_lovasz_weight": 1.0,
-        "cell_velocity_weight": 0.25,
+        "cell_velocity_weight": 0.25, "velocity_groups": "boxes",
     },
     "phase": {
         "epochs": 24, "module": "TrainingModule", "task": "detection", "monitor": "val/mAP", "init_from": None,

@@ -12,7 +12,7 @@ from src.ops.segment_reduce import inverse_rows
 from src.ops.sites import rows_of_keys
 from src.structures.boxes import Boxes3D
 from src.targets.occupancy import box_cell_keys
-from src.targets.supervision import supervised_boxes
+from src.targets.supervision import join_boxes, supervised_boxes
 
 
 @dataclass
@@ -44,6 +44,19 @@ def velocity_raster(
     joined, batch = supervised_boxes(boxes, grid)
     keys, owners = box_of_cells(joined, batch, grid, margin_m)
     return VelocityRaster(keys, joined.velocities[owners])
+
+
+def on_open_ground(
+    keys: Tensor,  # [q] int64 linear keys; -1 for none
+    boxes: list[Boxes3D],  # B, augmented ego frame
+    grid: BEVGrid,
+    margin_m: float,
+) -> Tensor:  # [q] bool
+    """Which cells no enlarged box covers, supervised or not: whatever returns are there, nothing annotated moves."""
+    joined = join_boxes(boxes)
+    batch = torch.repeat_interleave(torch.tensor([len(sample) for sample in boxes], device=keys.device))
+    covered = torch.unique(box_cell_keys(joined, batch, grid, margin_m)[1])
+    return (keys >= 0) & (rows_of_keys(covered, keys) < 0)
 
 
 def box_of_cells(

@@ -126,7 +126,8 @@ class Horizon3D(Detector):
             if config.dptf is not None or weights.gaussian_velocity_in_phase1:
                 terms |= gaussian_velocity_loss(output.ocsf, boxes, self.grid, config.ocsf.margin_m, weights)
         if output.dptf is not None and output.dptf.cells is not None:
-            terms |= cell_losses(output.dptf.cells, output.fused_bev, boxes, self.grid, weights)
+            margin_m = config.ocsf.margin_m if config.ocsf is not None else 0.0
+            terms |= cell_losses(output.dptf.cells, output.fused_bev, boxes, self.grid, margin_m, weights)
         return Objective(terms, counts)
 
     def decode(self, output: Horizon3DOutput) -> list[Boxes3D]:

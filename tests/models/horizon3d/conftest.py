@@ -14,7 +14,7 @@ from src.models.horizon3d.bev_path import BEVPathConfig
 from src.models.horizon3d.dptf import DPTFConfig
 from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling, SelfAttentionConfig, VelocityFrom
 from src.models.horizon3d.kggi import Initialization, KGGIConfig
-from src.models.horizon3d.loss import Horizon3DLossConfig
+from src.models.horizon3d.loss import Horizon3DLossConfig, VelocityGroups
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom, VelocityUpdate
@@ -138,6 +138,7 @@ def make_config():
             "cell_lovasz_weight": 1.0,
             "cell_velocity_weight": 0.25,
             "gaussian_velocity_weight": 0.25,
+            "velocity_groups": VelocityGroups.boxes,
             "gaussian_velocity_in_phase1": False,
         }
         for part in (kggi, ocsf, loss):
