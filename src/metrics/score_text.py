@@ -27,6 +27,8 @@ def format_scores(metrics: Mapping[str, Any]) -> str:
     tables = [summary, classes]
     if metrics.get("speeds"):
         tables.append(_speeds(metrics["speeds"]))
+    if metrics.get("measures", {}).get("radar_gaussians") is not None:
+        tables.append(_gaussians(metrics["measures"]))
     return "\n\n".join(map(_align, tables))
 
 
@@ -38,6 +40,17 @@ def _speeds(parts: Mapping[str, Any]) -> list[list[str]]:
         cars = [_percent(car["AP"]), _plain(car["AVE"])] if car["num_gt"] else ["-", "-"]
         rows.append([name, _percent(part["mAP_present"]), *errors, *cars, str(there), _boxes(part)])
     return rows
+
+
+def _gaussians(measures: Mapping[str, float | None]) -> list[list[str]]:
+    """By source; and of how many objects the remembered ones cover."""
+    rows = [["Gaussians", "per frame", "near an object", "opacity < 0.1", "velocity error of movers (m/s)"]]
+    for source in (name.removesuffix("_gaussians") for name in measures if name.endswith("_gaussians")):
+        number, wrong = measures[f"{source}_gaussians"], measures[f"{source}_velocity_error"]
+        shares = [_percent(measures[f"{source}_{what}"]) for what in ("near", "faint")]
+        rows.append([source, f"{number:.0f}", *shares, _plain(wrong)])
+    covered = measures.get("remembered_objects")
+    return rows + ([["objects covered by history", "", _percent(covered), "", ""]] if covered is not None else [])
 
 
 def _boxes(part: Mapping[str, Any]) -> str:

@@ -11,6 +11,7 @@ from torch import nn
 
 from src.data.datamodule import DetectionDataModule
 from src.metrics.detection import score_detections
+from src.metrics.diagnostics import FrameDiagnosis, diagnose, measures_of, sums_by_sample
 from src.metrics.score_text import format_scores
 from src.metrics.scores import DetectionScores
 from src.metrics.submission import to_global
@@ -80,8 +81,10 @@ class DetectionEvaluator(Evaluator):
         super().__init__()
         self.evaluation_set = evaluation_set
         self.boxes: dict[int, DetectionTable] = {}  # by sample, a row of the evaluation set's tokens
+        self.diagnoses: dict[int, FrameDiagnosis] = {}  # by sample as well
         self.scores: DetectionScores | None = None
         self.detections: DetectionTable | None = None
+        self.measures: dict[str, float | None] = {}
 
     @classmethod
     def of(cls, datamodule: DetectionDataModule) -> DetectionEvaluator:
@@ -91,28 +94,31 @@ class DetectionEvaluator(Evaluator):
     def reset(self) -> None:
         """Forget the boxes of an earlier pass."""
         self.boxes.clear()
+        self.diagnoses.clear()
 
     def update(self, model: Detector, output: Any, batch: FrameBatch) -> None:
-        """Decode, bring the boxes to the global frame, keep them by sample."""
-        for token, boxes, global_from_ego in zip(
-            batch.tokens, model.decode(output), batch.global_from_ego.cpu().numpy(), strict=True
-        ):
+        """Decode, bring the boxes to the global frame, keep them by sample beside what they were made of."""
+        poses, diagnoses = batch.global_from_ego.cpu().numpy(), diagnose(model.evidence(output), batch)
+        for token, boxes, pose, diagnosis in zip(batch.tokens, model.decode(output), poses, diagnoses, strict=True):
             sample = self.evaluation_set.index_of[token]
-            self.boxes.setdefault(sample, to_global(boxes.to("cpu"), global_from_ego, sample))
+            self.boxes.setdefault(sample, to_global(boxes.to("cpu"), pose, sample))
+            self.diagnoses.setdefault(sample, diagnosis)
 
     def compute(self) -> dict[str, float]:
         """mAP, NDS and the mean errors."""
         tables: dict[int, DetectionTable] = {}
-        for of_rank in gather_by_rank(self.boxes):
-            tables = of_rank | tables
+        diagnoses: dict[int, FrameDiagnosis] = {}
+        for boxes_of_rank, diagnoses_of_rank in gather_by_rank((self.boxes, self.diagnoses)):
+            tables, diagnoses = boxes_of_rank | tables, diagnoses_of_rank | diagnoses
         in_order = [tables[sample] for sample in sorted(tables)]
         self.detections = DetectionTable.concatenate([DetectionTable.empty(), *in_order])
         self.scores = score_detections(self.evaluation_set, self.detections)
+        self.measures = measures_of(sums_by_sample(diagnoses, self.evaluation_set, self.scores.truth_kept))
         return self.scores.overall.headline()
 
     def as_dict(self) -> dict[str, Any]:
         """See `DetectionScores.as_dict`."""
-        return self.scores.as_dict()
+        return self.scores.as_dict() | {"measures": self.measures}
 
     @staticmethod
     def describe(metrics: Mapping[str, Any]) -> str:
