@@ -30,6 +30,11 @@ FAINT_OPACITY = 0.1
 """A Gaussian of less opacity hardly says anything."""
 FAST_MPS = 10.0
 """From here on matter moves fast enough for a wrong velocity to cost more than a cell in a frame."""
+SEEN_POINTS = 3
+"""An object with fewer returns in the accumulated input is hardly seen."""
+SEEN_S = 4.1
+"""How long before it must have been seen to be remembered: eight key frames, whose times jitter by milliseconds."""
+UNKNOWN_POINTS = -1
 
 
 @dataclass
@@ -42,12 +47,14 @@ class FrameDiagnosis:
     sums: dict[str, tuple[float, float]]  # total and count of each mean over Gaussians
 
 
-def diagnose(evidence: Evidence, batch: FrameBatch) -> list[FrameDiagnosis]:
-    """Compare what a batch's samples were made of with their annotations. Raises ValueError for a batch without."""
-    if batch.boxes is None:
-        raise ValueError("FrameBatch.boxes is None: without annotations there is nothing to compare with")
+def diagnose(
+    evidence: Evidence,
+    batch: FrameBatch,
+    truth: list[Boxes3D],  # B, aug frame
+) -> list[FrameDiagnosis]:
+    """Compare what a batch's samples were made of with their annotations."""
     found = []
-    for sample, boxes in enumerate(batch.boxes):
+    for sample, boxes in enumerate(truth):
         occupied = None if evidence.cells is None else _hold_occupied_cells(evidence.cells, sample, boxes)
         remembered, sums = None, {}
         if evidence.gaussians is not None:
@@ -60,39 +67,74 @@ def sums_by_sample(
     diagnoses: Mapping[int, FrameDiagnosis],  # by row of the set's tokens
     evaluation_set: EvaluationSet,
     truth_kept: Array,  # [k] bool, ground truth that counts
+    found: Array,  # [k] bool, ground truth that is matched at 2 m
 ) -> dict[str, Array]:  # [S, 2] each
-    """Total and count of every measure in each sample; the measure is the ratio of their sums, see `measures_of`.
+    """Total and count of every measure in each sample; the measure is the ratio of their sums, see `ratios`.
 
+    `hidden_recall`: share that is found, at whatever score, of the objects that hide but were seen before (`hidden`);
+    `unoccupied_recall`: of those without an occupied cell inside. `remembered_share`: share of the objects that a
+    remembered Gaussian covers. Of all three only ground truth that counts.
     `<source>_gaussians`: how many a frame has; `<source>_near`: share of them near an object; `<source>_faint`: share
-    below FAINT_OPACITY; `<source>_velocity_error`: m/s, of those near a box that moves faster than FAST_MPS, to its
-    velocity; the sources are those of `Source`. `remembered_objects`: share of the objects that count which a
-    remembered Gaussian covers; a model that remembers none throughout has no such number.
-    Raises ValueError when a sample's boxes are not those of the set.
+    below FAINT_OPACITY; `<source>_velocity_error`: m/s, of those near a box that moves at FAST_MPS or faster, to its
+    velocity; the sources are those of `Source`.
     """
-    num_samples, samples = len(evaluation_set.tokens), evaluation_set.ground_truth.samples
-    names = {name for diagnosis in diagnoses.values() for name in diagnosis.sums}
-    found = {name: np.zeros((num_samples, 2)) for name in sorted(names)}
-    remembered = np.zeros((num_samples, 2))
+    truth, num_samples = evaluation_set.ground_truth, len(evaluation_set.tokens)
+    points = np.full(len(truth), UNKNOWN_POINTS)
+    occupied, remembered = (np.full(len(truth), np.nan) for _ in range(2))  # 0 or 1, NaN where not known
+    of_gaussians: dict[str, Array] = {}
     for sample, diagnosis in diagnoses.items():
-        kept = truth_kept[samples == sample]
-        if len(kept) != len(diagnosis.points):
-            raise ValueError(
-                f"sample {evaluation_set.tokens[sample]}: {len(diagnosis.points)} boxes in its batch, but {len(kept)} "
-                "in the evaluation set"
-            )
+        rows = np.flatnonzero(truth.samples == sample)
+        points[rows] = diagnosis.points
+        for column, values in ((occupied, diagnosis.occupied), (remembered, diagnosis.remembered)):
+            if values is not None:
+                column[rows] = values
         for name, sums in diagnosis.sums.items():
-            found[name][sample] = sums
-        if diagnosis.remembered is not None:
-            remembered[sample] = diagnosis.remembered[kept].sum(), kept.sum()
-    if remembered[:, 0].any():
-        found["remembered_objects"] = remembered
+            of_gaussians.setdefault(name, np.zeros((num_samples, 2)))[sample] = sums
+
+    def of_objects(total: Array, among: Array) -> Array:  # [k] bool each -> [S, 2]
+        columns = (total & among & truth_kept, among & truth_kept)
+        return np.stack([np.bincount(truth.samples[rows], minlength=num_samples) for rows in columns], axis=1)
+
+    sums: dict[str, Array] = {}
+    if diagnoses:
+        sums["hidden_recall"] = of_objects(found, hidden(points, evaluation_set))
+    if not np.isnan(occupied).all():
+        sums["unoccupied_recall"] = of_objects(found, occupied == 0)
+    if "history_gaussians" in of_gaussians and of_gaussians["history_gaussians"][:, 0].any():
+        sums["remembered_share"] = of_objects(remembered == 1, ~np.isnan(remembered))
+    return sums | dict(sorted(of_gaussians.items()))
+
+
+def hidden(
+    points: Array,  # [k] int64, returns inside each box of the ground truth, UNKNOWN_POINTS where not counted
+    evaluation_set: EvaluationSet,
+) -> Array:  # [k] bool
+    """Objects with fewer than SEEN_POINTS returns now, but as many or more at an earlier key frame within SEEN_S."""
+    samples = evaluation_set.ground_truth.samples
+    times_s = evaluation_set.times_s[samples]
+    order = np.lexsort((times_s, evaluation_set.instances))
+    rank = np.arange(len(order))
+    starts = np.diff(evaluation_set.instances[order], prepend=-1) != 0
+    first = np.maximum.accumulate(np.where(starts, rank, 0))  # of the same object
+    last_seen = np.maximum.accumulate(np.where(points[order] >= SEEN_POINTS, rank, -1))
+    before = np.concatenate([[-1], last_seen[:-1]]) if len(order) else last_seen
+    known = before >= first
+    recent = times_s[order] - times_s[order][np.where(known, before, 0)] <= SEEN_S
+    result = np.zeros(len(order), bool)
+    result[order] = known & recent & (points[order] < SEEN_POINTS) & (points[order] != UNKNOWN_POINTS)
+    return result
+
+
+def ratios(
+    sums: Mapping[str, Array],  # [S, 2] each
+    weights: Array,  # [R, S] how often each sample counts
+) -> dict[str, Array]:  # [R] each
+    """Sum of the totals over that of the counts, NaN where there is nothing to count."""
+    found = {}
+    for name, of_samples in sums.items():
+        total, count = (weights @ of_samples).T
+        found[name] = np.divide(total, count, out=np.full(len(weights), np.nan), where=count > 0)
     return found
-
-
-def measures_of(sums: Mapping[str, Array]) -> dict[str, float | None]:
-    """Ratio of the totals and counts [S, 2] of all samples by name, None where there is nothing to count."""
-    totals = {name: of_samples.sum(axis=0) for name, of_samples in sums.items()}
-    return {name: float(total / count) if count else None for name, (total, count) in totals.items()}
 
 
 def _count_returns(batch: FrameBatch, sample: int, boxes: Boxes3D) -> Array:  # [k] int64
@@ -146,5 +188,5 @@ def _velocity_errors(
         return velocities.new_full((len(velocities),), torch.nan)
     nearest, box = distances.min(dim=1)
     errors = (velocities - boxes.velocities[box]).norm(dim=1)
-    counted = (nearest <= NEAR_M) & (boxes.velocities[box].norm(dim=1) > FAST_MPS)
+    counted = (nearest <= NEAR_M) & (boxes.velocities[box].norm(dim=1) >= FAST_MPS)
     return torch.where(counted, errors, torch.nan)

@@ -7,12 +7,20 @@ from typing import Any
 
 from src.metrics.scores import ERRORS
 
+MEASURES = {
+    "moving_AP": "AP of moving vehicles",
+    "hidden_recall": "recall of hidden objects, seen before",
+    "unoccupied_recall": "recall of objects without an occupied cell",
+    "remembered_share": "objects that history covers",
+}
+
 
 def format_scores(metrics: Mapping[str, Any]) -> str:
-    """Tables of the content of metrics.json: a summary by distance bin, every class by distance bin, speed classes.
+    """Tables of the content of metrics.json: a summary by distance bin, every class by distance bin, speed classes,
+    measures.
 
-    `metrics` is `DetectionScores.as_dict()`, fresh or read back; a file written before there were speed classes has
-    no table of them. mAP, NDS and AP in percent, errors in their own units (m, 1 - IoU, rad, m/s, 1 - accuracy); "-"
+    `metrics` is `DetectionScores.as_dict()`, fresh or read back; a file written before there were speed classes or
+    measures has no table of them. mAP, NDS and AP in percent, errors in their own units (m, 1 - IoU, rad, m/s, 1 - accuracy); "-"
     where a number is undefined. By speed, means are over the classes that have ground truth there.
     """
     parts = {"all": metrics} | metrics["ranges"]
@@ -27,8 +35,11 @@ def format_scores(metrics: Mapping[str, Any]) -> str:
     tables = [summary, classes]
     if metrics.get("speeds"):
         tables.append(_speeds(metrics["speeds"]))
-    if metrics.get("measures", {}).get("radar_gaussians") is not None:
-        tables.append(_gaussians(metrics["measures"]))
+    measures = metrics.get("measures", {})
+    if measures:
+        tables.append(_measures(measures))
+    if measures.get("radar_gaussians") is not None:
+        tables.append(_gaussians(measures))
     return "\n\n".join(map(_align, tables))
 
 
@@ -42,15 +53,22 @@ def _speeds(parts: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
+def _measures(measures: Mapping[str, float | None]) -> list[list[str]]:
+    rows = [["measure", "%", "boxes"]]
+    for name, words in MEASURES.items():
+        if name in measures:
+            boxes = measures.get(f"{name.rpartition('_')[0]}_boxes")
+            rows.append([words, _percent(measures[name]), "" if boxes is None else str(boxes)])
+    return rows
+
+
 def _gaussians(measures: Mapping[str, float | None]) -> list[list[str]]:
-    """By source; and of how many objects the remembered ones cover."""
-    rows = [["Gaussians", "per frame", "near an object", "opacity < 0.1", "velocity error of movers (m/s)"]]
+    rows = [["Gaussians", "per frame", "near an object, %", "opacity < 0.1, %", "velocity error of movers (m/s)"]]
     for source in (name.removesuffix("_gaussians") for name in measures if name.endswith("_gaussians")):
         number, wrong = measures[f"{source}_gaussians"], measures[f"{source}_velocity_error"]
         shares = [_percent(measures[f"{source}_{what}"]) for what in ("near", "faint")]
         rows.append([source, f"{number:.0f}", *shares, _plain(wrong)])
-    covered = measures.get("remembered_objects")
-    return rows + ([["objects covered by history", "", _percent(covered), "", ""]] if covered is not None else [])
+    return rows
 
 
 def _boxes(part: Mapping[str, Any]) -> str:

@@ -11,10 +11,10 @@ from torch import nn
 
 from src.data.datamodule import DetectionDataModule
 from src.metrics.detection import score_detections
-from src.metrics.diagnostics import FrameDiagnosis, diagnose, measures_of, sums_by_sample
+from src.metrics.diagnostics import FrameDiagnosis, diagnose
 from src.metrics.score_text import format_scores
 from src.metrics.scores import DetectionScores
-from src.metrics.submission import to_global
+from src.metrics.submission import to_ego, to_global
 from src.models.detector import Detector
 from src.pictures.comparison import BarPanel, draw_comparison
 from src.reliability.processes import gather_by_rank
@@ -84,7 +84,6 @@ class DetectionEvaluator(Evaluator):
         self.diagnoses: dict[int, FrameDiagnosis] = {}  # by sample as well
         self.scores: DetectionScores | None = None
         self.detections: DetectionTable | None = None
-        self.measures: dict[str, float | None] = {}
 
     @classmethod
     def of(cls, datamodule: DetectionDataModule) -> DetectionEvaluator:
@@ -98,9 +97,12 @@ class DetectionEvaluator(Evaluator):
 
     def update(self, model: Detector, output: Any, batch: FrameBatch) -> None:
         """Decode, bring the boxes to the global frame, keep them by sample beside what they were made of."""
-        poses, diagnoses = batch.global_from_ego.cpu().numpy(), diagnose(model.evidence(output), batch)
-        for token, boxes, pose, diagnosis in zip(batch.tokens, model.decode(output), poses, diagnoses, strict=True):
-            sample = self.evaluation_set.index_of[token]
+        samples = [self.evaluation_set.index_of[token] for token in batch.tokens]
+        poses, truth = batch.global_from_ego.cpu().numpy(), self.evaluation_set.ground_truth
+        in_ego = [to_ego(truth[truth.samples == sample], pose) for sample, pose in zip(samples, poses, strict=True)]
+        in_aug = [boxes.to(batch.device).transform(a) for boxes, a in zip(in_ego, batch.aug_from_ego, strict=True)]
+        diagnoses = diagnose(model.evidence(output), batch, in_aug)
+        for sample, boxes, pose, diagnosis in zip(samples, model.decode(output), poses, diagnoses, strict=True):
             self.boxes.setdefault(sample, to_global(boxes.to("cpu"), pose, sample))
             self.diagnoses.setdefault(sample, diagnosis)
 
@@ -112,13 +114,12 @@ class DetectionEvaluator(Evaluator):
             tables, diagnoses = boxes_of_rank | tables, diagnoses_of_rank | diagnoses
         in_order = [tables[sample] for sample in sorted(tables)]
         self.detections = DetectionTable.concatenate([DetectionTable.empty(), *in_order])
-        self.scores = score_detections(self.evaluation_set, self.detections)
-        self.measures = measures_of(sums_by_sample(diagnoses, self.evaluation_set, self.scores.truth_kept))
+        self.scores = score_detections(self.evaluation_set, self.detections, diagnoses)
         return self.scores.overall.headline()
 
     def as_dict(self) -> dict[str, Any]:
         """See `DetectionScores.as_dict`."""
-        return self.scores.as_dict() | {"measures": self.measures}
+        return self.scores.as_dict()
 
     @staticmethod
     def describe(metrics: Mapping[str, Any]) -> str:

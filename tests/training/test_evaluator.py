@@ -1,7 +1,6 @@
 """Collecting boxes over batches and processes."""
 
 import pickle
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -61,8 +60,10 @@ def test_two_processes_in_any_order_give_the_numbers_of_one(problem, tmp_path, f
     evaluation_set, predictions = problem
     shards = [by_sample(predictions, first), by_sample(predictions, [5, 4, 3, 2, 1, 0])]
     spawn_two(compute_as, tmp_path, evaluation_set, shards)
-    expected = score_detections(evaluation_set, predictions).as_dict() | {"measures": {"radar_near": 15 / 60}}
-    nothing = score_detections(evaluation_set, DetectionTable.empty()).as_dict() | {"measures": {}}
+    diagnoses = diagnoses_of(evaluation_set, range(SAMPLES))
+    expected = score_detections(evaluation_set, predictions, diagnoses).as_dict()
+    assert expected["measures"]["radar_near"] == 15 / 60
+    nothing = score_detections(evaluation_set, DetectionTable.empty()).as_dict()
     for rank in range(2):
         (table, scores), (empty, of_none) = pickle.loads((tmp_path / f"{rank}.pickle").read_bytes())
         same(table, predictions[np.argsort(predictions.samples, kind="stable")])
@@ -80,7 +81,7 @@ def test_nobody_saw_anything(problem):
 
 def test_a_batch_goes_to_its_samples_and_a_repeated_one_counts_once(problem):
     evaluation_set, _ = problem
-    evaluator = DetectionEvaluator(replace(evaluation_set, ground_truth=DetectionTable.empty()))
+    evaluator = DetectionEvaluator(evaluation_set)
     box = Boxes3D(torch.zeros(1, 3), torch.ones(1, 3), *torch.zeros(1, 1), torch.zeros(1, 2), *torch.zeros(2, 1).long())
     model = SimpleNamespace(decode=lambda output: output, evidence=lambda output: Evidence())
     batch = FrameBatch(
@@ -88,7 +89,6 @@ def test_a_batch_goes_to_its_samples_and_a_repeated_one_counts_once(problem):
         timestamps_s=torch.zeros(2).double(),
         global_from_ego=torch.eye(4).repeat(2, 1, 1).double(),
         aug_from_ego=torch.eye(4).repeat(2, 1, 1),
-        boxes=[Boxes3D.empty()] * 2,
     )
     for _ in range(2):
         evaluator.update(model, [box, Boxes3D.empty()], batch)
