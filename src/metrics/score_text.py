@@ -20,8 +20,8 @@ def format_scores(metrics: Mapping[str, Any]) -> str:
     measures.
 
     `metrics` is `DetectionScores.as_dict()`, fresh or read back; a file written before there were speed classes or
-    measures has no table of them. mAP, NDS and AP in percent, errors in their own units (m, 1 - IoU, rad, m/s, 1 - accuracy); "-"
-    where a number is undefined. By speed, means are over the classes that have ground truth there.
+    measures has no table of them. mAP, NDS and AP in percent, errors in their own units (m, 1 - IoU, rad, m/s,
+    1 - accuracy); "-" where a number is undefined. By speed, means are over the classes that have ground truth there.
     """
     parts = {"all": metrics} | metrics["ranges"]
     summary = [["range (m)", "mAP", "NDS", *(f"m{name}" for name in ERRORS), "boxes"]]
