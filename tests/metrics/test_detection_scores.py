@@ -12,6 +12,7 @@ from src.metrics.score_text import format_scores
 from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERRORS
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import ATTRIBUTES, CLASSES, SCENE_TAGS, TAGS_WITHOUT_SCORE
+from tests.evaluation_sets import set_of
 
 OFFICIAL_ERRORS = ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
 
@@ -80,7 +81,7 @@ def test_filters_keep_the_official_boxes(golden, golden_set, golden_predictions,
 def test_as_dict_is_plain_json(scores):
     content = scores.as_dict()
     numbers = ["mAP", "NDS", "mATE", "mASE", "mAOE", "mAVE", "mAAE"]
-    assert list(content) == [*numbers, "classes", "ranges", "tags", "speeds"]
+    assert list(content) == [*numbers, "classes", "ranges", "tags", "speeds", "measures"]
     car = ["AP", "AP@0.5", "AP@1.0", "AP@2.0", "AP@4.0", *ERRORS, "num_gt"]
     assert list(content["classes"]) == list(CLASSES) and list(content["classes"]["car"]) == car
     assert content["classes"]["traffic_cone"]["AVE"] is None
@@ -117,7 +118,7 @@ def boxes(xy, label="car", scores=None, points=10, samples=None) -> DetectionTab
 
 
 def one_sample(truth, racks=None, tags=("weather.clear",)) -> EvaluationSet:
-    return EvaluationSet(["a"], np.zeros((1, 3)), [tags], truth, racks or DetectionTable.empty())
+    return set_of(truth, tags=tags, racks=racks or DetectionTable.empty())
 
 
 def class_ap(evaluation_set, predictions, label="car", **options):

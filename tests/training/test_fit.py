@@ -28,6 +28,7 @@ from src.training.module import TrainingModule
 from src.training.optim import OptimConfig
 from src.training.run_folder import Resume, RunFolder
 from src.training.temporal_module import TemporalModule
+from tests.evaluation_sets import set_of
 from tests.training.toys import STEPS as TOY_STEPS
 from tests.training.toys import Positions, toy_batch, toy_module, toy_trainer
 from tests.training.two_ranks import become, spawn_two
@@ -174,7 +175,7 @@ def work(make_model, frames, tmp_path):
 
 
 def truth_of(tokens, boxes):
-    return EvaluationSet(tokens, np.zeros((len(tokens), 3)), [()] * len(tokens), boxes, DetectionTable.empty())
+    return set_of(boxes, tokens)
 
 
 def table_of(detections):

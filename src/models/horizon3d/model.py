@@ -135,7 +135,7 @@ class Horizon3D(Detector):
         return self.head.decode(output.head)
 
     def evidence(self, output: Horizon3DOutput) -> Evidence:
-        """Refined Gaussians, the occupied cells of their splat, and the warped memory."""
+        """Refined Gaussians, the cells of their splat, and the warped memory."""
         return output.evidence(self.config, self.grid)
 
     def diagnostics(self, output: Horizon3DOutput) -> dict[str, Tensor | float]:
