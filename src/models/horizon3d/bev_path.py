@@ -14,6 +14,7 @@ from src.geometry.tensor_transforms import transform_points_xy, transform_vector
 from src.models.backbones.doppler import VelocityStart
 from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
+from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.merging import block_diagonal, joined_convs
 from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv, TemporalConv
 from src.models.memory import motions, moving
@@ -73,8 +74,6 @@ class WarpedCells:
 class BEVPath(nn.Module):
     """Sparse memory of occupied BEV cells (method 6.1)."""
 
-    full_precision_parts = ("occupancy.1",)
-
     def __init__(self, config: BEVPathConfig, channels: int, grid: BEVGrid) -> None:
         super().__init__()
         self.config, self.grid = config, grid
@@ -114,9 +113,7 @@ class BEVPath(nn.Module):
         values: list[Tensor] = []
         for head in (self.occupancy, self.velocity):
             if head is not None:
-                hidden = head[0](fused).features
-                with torch.autocast(hidden.device.type, enabled=False):
-                    values.append(head[1](hidden.float()))
+                values.append(head[1](head[0](fused).features))
         if self.velocity is None:
             values = list(values[0].split([1, 2], dim=1))
         velocities = VELOCITY_UNIT_MPS * values[1]
@@ -207,4 +204,4 @@ def _cell_head(channels: int, outputs: int) -> nn.ModuleList:
     """Submanifold 3x3, norm, ReLU, then one linear layer per cell."""
     hidden = channels // 2
     conv = SubmanifoldConv(channels, hidden, 3, 2, bias=False)
-    return nn.ModuleList([ConvNormReLU(conv, **NORM), nn.Linear(hidden, outputs)])
+    return nn.ModuleList([ConvNormReLU(conv, **NORM), FullPrecisionLinear(hidden, outputs)])

@@ -15,6 +15,7 @@ from src.models.backbones.doppler import VelocityStart
 from src.models.heads.keypoint_head import KEYPOINT_BIAS, CameraKeypointHead, CameraMaps, keypoint_scores
 from src.models.horizon3d.gaussian_encoder import RAW_ATTRIBUTES, GaussianBounds
 from src.models.horizon3d.views import CameraViews
+from src.models.layers.full_precision import FullPrecisionLinear
 from src.ops.segment_reduce import topk_per_sample
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV
@@ -124,25 +125,22 @@ class KGGI(nn.Module):
             # In units of the half extent, so that one step of Adam is of the order of a metre.
             self.random_means = nn.Parameter(torch.empty(counts[Source.RANDOM], 2).uniform_(-1.0, 1.0))
         if config.uses_keypoints:
-            self.objectness = nn.Sequential(nn.Linear(channels, channels // 2), nn.ReLU(), nn.Linear(channels // 2, 1))
+            self.objectness = nn.Sequential(
+                nn.Linear(channels, channels // 2), nn.ReLU(), FullPrecisionLinear(channels // 2, 1)
+            )
             nn.init.constant_(self.objectness[-1].bias, KEYPOINT_BIAS)
             self.camera_head = CameraKeypointHead(image_channels, channels, config.num_depth_bins)
             centres = lid_centres(config.depth_range, config.num_depth_bins)
             self.register_buffer("depth_centres_m", centres, persistent=False)
         if config.uses_keypoints and config.property_head:
             self.property_heads = nn.ModuleDict(
-                {name: nn.Linear(channels, channels + len(RAW_ATTRIBUTES)) for name in ("radar", "camera")}
+                {name: FullPrecisionLinear(channels, channels + len(RAW_ATTRIBUTES)) for name in ("radar", "camera")}
             )
             for head in self.property_heads.values():
                 nn.init.zeros_(head.weight)
                 nn.init.zeros_(head.bias)
         self.register_buffer("centre_m", torch.tensor(grid.centre_m), persistent=False)
         self.register_buffer("half_extent_m", torch.tensor(grid.half_extent_m), persistent=False)
-
-    @property
-    def full_precision_parts(self) -> tuple[str, ...]:
-        """Positions and velocities come from the property heads."""
-        return ("property_heads",) if hasattr(self, "property_heads") else ()
 
     def forward(
         self,
@@ -155,7 +153,7 @@ class KGGI(nn.Module):
         parts: list[GaussianSet] = []
         logits = camera = None
         if self.config.uses_keypoints:
-            logits = self.objectness(radar_bev.features).squeeze(-1).float()  # [M]
+            logits = self.objectness(radar_bev.features).squeeze(-1)  # [M]
             camera = self.camera_head(views.levels[0])
             parts += [
                 self._radar_gaussians(logits.detach(), radar_bev, doppler),
@@ -213,8 +211,7 @@ class KGGI(nn.Module):
         features = self.slots[name].features + self.source_embedding.weight[source]  # [K, C]
         features, raw = features.expand(*valid.shape, -1), self.slots[name].attributes.expand(*valid.shape, -1)
         if local is not None and self.config.property_head:
-            with torch.autocast(local.device.type, enabled=False):  # attributes are float32 also under autocast
-                change = self.property_heads[name](local.float())
+            change = self.property_heads[name](local)
             features, raw = features + change[..., : features.shape[-1]], raw + change[..., features.shape[-1] :]
         means, start = torch.where(valid[..., None], means.float(), self.centre_m), None
         if self.config.initial_velocity is VelocityStart.doppler:

@@ -225,6 +225,9 @@ def test_autocast_keeps_attributes_and_losses_in_float32(make_model, make_batch)
     for name in ("means", "scales", "directions", "opacity_logits", "velocities"):
         assert getattr(gaussians, name).dtype == torch.float32, name
     assert output.ocsf.splat.cells.log_free.dtype == torch.float32
+    camera = output.kggi.camera
+    for value in (output.kggi.objectness_logits, camera.keypoint_logits, camera.depth_logits, output.head.logits):
+        assert (value != value.bfloat16()).float().mean() > 0.8  # what is ranked, or read in metres, is not rounded
     assert all(value.dtype == torch.float32 and value.isfinite() for value in terms.values())
     assert gradients_are_finite(model)
 
