@@ -121,13 +121,14 @@ FULL_SIZE = {
     "model.kggi": {
         "initialization": "both", "num_radar_keypoints": 1024, "num_camera_keypoints": 256,
         "num_random_keypoints": 256, "num_depth_bins": 80, "depth_range_m": [1.0, 160.0], "depth_target": "box",
-        "keypoint_nms_cells": None, "property_head": True, "initial_velocity": "zero",
+        "keypoint_nms_cells": None, "property_head": True, "initial_velocity": "zero", "source_embedding_std": 1.0,
     },
     "model.ocsf": {
         "num_layers": 2, "num_learnable_points": 6, "margin_m": 4.8, "occupancy_threshold": 0.1,
         "max_occupied_cells": 32768, "scale_range_m": [0.2, 3.2], "max_mean_shift_m": 4.0, "max_speed_mps": 60.0,
         "velocity_unit_mps": 1.0, "velocity_update": "anew", "support_sigmas": 3.0, "cross_attention": "parallel",
         "refine_from": "self_encoding", "gate_kernel_size": 1,
+        "identity_start": False,
     },
     "model.head": {"nms": "per_group", "score_threshold": 0.1, "max_boxes": 500, "attributes": "rule"},
     "model.loss": {

@@ -47,10 +47,12 @@ class KGGIConfig:
     keypoint_nms_cells: int | None  # odd window of local maxima in the keypoint map; null = every pixel competes
     property_head: bool  # local features correct the learnable attributes
     initial_velocity: VelocityStart  # what the learnable velocity is added to
+    source_embedding_std: float  # of the source embedding's random start
 
     def __post_init__(self) -> None:
         least = 0 if self.initialization is Initialization.random else 1
         own = {"num_radar_keypoints": least, "num_camera_keypoints": least, "num_depth_bins": 1}
+        own["source_embedding_std"] = 0
         require_least(self, "model.kggi", own)
         if self.num_random_keypoints < 0 or sum(self.counts.values()) < 1:
             raise ConfigError(
@@ -121,6 +123,7 @@ class KGGI(nn.Module):
         counts = config.counts
         self.slots = nn.ModuleDict({source.name.lower(): GaussianSlots(n, channels) for source, n in counts.items()})
         self.source_embedding = nn.Embedding(len(Source), channels)
+        nn.init.normal_(self.source_embedding.weight, std=config.source_embedding_std)
         if Source.RANDOM in counts:
             # In units of the half extent, so that one step of Adam is of the order of a metre.
             self.random_means = nn.Parameter(torch.empty(counts[Source.RANDOM], 2).uniform_(-1.0, 1.0))

@@ -57,6 +57,7 @@ class OCSFConfig:
     cross_attention: CrossAttention
     refine_from: RefineFrom
     gate_kernel_size: int  # of psi: 1 or 3
+    identity_start: bool  # untrained, the fusion passes the radar map through
 
     def __post_init__(self) -> None:
         own = {"num_layers": 1, "num_learnable_points": 0, "max_occupied_cells": 1, "margin_m": 0}
@@ -124,7 +125,7 @@ class OCSF(nn.Module):
             temporal_heads=temporal_heads,
         )
         self.encoder = GaussianEncoder(channels, image_channels, grid, config.bounds, config.num_layers, layer)
-        self.fusion = SparseFusion(channels, config.gate_kernel_size)
+        self.fusion = SparseFusion(channels, config.gate_kernel_size, config.identity_start)
 
     def forward(self, gaussians: GaussianSet, radar_bev: SparseBEV, views: CameraViews) -> OCSFOutput:
         """G_0 to F_fuse."""

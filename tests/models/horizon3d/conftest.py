@@ -105,6 +105,7 @@ def make_config():
             "keypoint_nms_cells": None,
             "property_head": True,
             "initial_velocity": VelocityStart.zero,
+            "source_embedding_std": 1.0,
         }
         ocsf = {
             "num_layers": 2,
@@ -121,6 +122,7 @@ def make_config():
             "cross_attention": CrossAttention.parallel,
             "refine_from": RefineFrom.self_encoding,
             "gate_kernel_size": 1,
+            "identity_start": False,
         }
         loss = {
             "kggi_weight": 1.0,
