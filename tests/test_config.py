@@ -150,8 +150,8 @@ FULL_SIZE = {
     "data": {
         "train_split": "train", "split": "val", "batch_size": 8, "num_sweeps": 10, "min_distance_m": 1.0,
         "propagate_points": False, "on_bad_file": "error", "test_resize_offset": 0.0, "groups_per_scene": 2,
-        "stream_sets": 1, "sensor_dropout": 0.0, "num_lidar_sweeps": 5, "lidar_origins": False, "deskew_lidar": True,
-        "num_future_frames": 0,
+        "stream_sets": 1, "past_frames": 0, "sensor_dropout": 0.0, "num_lidar_sweeps": 5, "lidar_origins": False,
+        "deskew_lidar": True, "num_future_frames": 0,
     },
     "data.augmentation.image": {"resize": [-0.06, 0.11], "rotation_deg": 5.4, "flip_probability": 0.5},
     "data.augmentation.bev": {"scale": [0.95, 1.05], "rotation_rad": 0.3925, "flip_probability": 0.5},
@@ -256,6 +256,7 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["phase=phase2", "model.dptf.gaussian_path.selfattention=null"], "did you mean .*self_attention"),
         (["data.groups_per_scene=0"], "groups_per_scene"),
         (["data.stream_sets=0"], "stream_sets"),
+        (["data.past_frames=-1"], "past_frames"),
         (["phase.init_from="], "phase.init_from is empty"),
     ],
 )

@@ -82,6 +82,8 @@ class FrameReader:
         self._folders: dict[str, str] = {}  # where the folders of files lead to
         self._reported: set[str] = set()
         self._following = _following(index)  # [N] row of the scene's next sample, -1 for none
+        self._preceding = inverse = np.full_like(self._following, -1)
+        inverse[self._following[self._following >= 0]] = np.flatnonzero(self._following >= 0)
 
     def read(
         self,
@@ -119,6 +121,13 @@ class FrameReader:
         if index.annotated:
             batch["boxes"] = [self._boxes(sample, global_from_ego).transform(torch.from_numpy(aug_from_ego))]
         return FrameBatch(**batch, skipped=dict(skipped.channels), bad_files=skipped.files)
+
+    def before(self, sample: int, count: int) -> list[int]:
+        """Rows of the scene's `count` samples before this one, the oldest first; -1 where it had not begun."""
+        rows = [sample]
+        for _ in range(count):
+            rows.append(int(self._preceding[rows[-1]]) if rows[-1] >= 0 else -1)
+        return rows[:0:-1]
 
     def _key_frame(self, sample: int, aug_from_ego: Array) -> dict[str, Any]:
         """What every frame has."""

@@ -20,14 +20,14 @@ from src.errors import CheckpointError, ConfigError, DataError, DivergedError, H
 from src.models.detector import Detector
 from src.reliability.checkpoints import OpenCheckpoint, load_model_weights, open_checkpoint
 from src.reliability.processes import die_with_parent
-from src.training.identity import is_of, run_identity
+from src.training.identity import TEMPORAL_DATA_KEYS, is_of, run_identity
 from src.training.run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
 
 OF_THIS_RUN = ("phase", "resume")
 """Overrides that never concern the run whose weights are taken."""
-OF_STREAMED_DATA = ("data.groups_per_scene", "data.stream_sets", "data.sensor_dropout")
+OF_STREAMED_DATA = tuple(f"data.{key}" for key in TEMPORAL_DATA_KEYS)
 """Nor do these and the model's `keys_of_temporal_phase`, where that run is of the phase before."""
 INPUT_SETTINGS = (
     *("num_sweeps", "num_lidar_sweeps", "deskew_lidar"),

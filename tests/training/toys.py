@@ -30,6 +30,10 @@ class ToyMemory:
 
     values: torch.Tensor  # [B]
 
+    @property
+    def present(self):
+        return self.values[None] != 0
+
     def select(self, rows, keep):
         return ToyMemory(torch.where(keep, self.values[rows], 0.0))
 
