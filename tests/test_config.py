@@ -140,7 +140,7 @@ FULL_SIZE = {
     },
     "phase": {
         "epochs": 24, "module": "TrainingModule", "task": "detection", "monitor": "val/mAP", "init_from": None,
-        "train_missing": True,
+        "train_missing": True, "frozen_statistics": False,
     },
     "phase.options": {"velocity_code_weight": 0.2},
     "optim": {

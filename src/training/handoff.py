@@ -16,6 +16,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from torch import nn
+from torch.nn.modules.batchnorm import _BatchNorm
+
 from src.errors import CheckpointError, ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
 from src.models.detector import Detector
 from src.reliability.checkpoints import OpenCheckpoint, load_model_weights, open_checkpoint
@@ -149,6 +152,16 @@ def hand_over(model: Detector, weights: OpenCheckpoint, tree: dict[str, Any]) ->
     stored = checkpoint["horizon3d"]["config"]
     for key, (old, now) in differing_settings(stored, tree, model.config.temporal_part).items():
         logger.warning("%s was %s in the run these weights come from and is %s now", key, old, now)
+
+
+def norms_handed_over(model: Detector) -> list[nn.Module]:
+    """The batch norms whose statistics an earlier phase has gathered."""
+    added = model.config.new_in_temporal_phase
+    return [
+        module
+        for name, module in model.named_modules()
+        if isinstance(module, _BatchNorm) and not (added and re.match(added, f"{name}."))
+    ]
 
 
 def differing_settings(

@@ -64,7 +64,7 @@ def _norm_statistics(
     weight: Tensor,  # [H, C]
 ) -> tuple[Tensor, Tensor]:  # [H], [H]
     """Mean and variance that the norms divide by: the batch's in training, where the running ones learn from them."""
-    if not parts[0].training or len(x) < 2:
+    if not parts[0].norm.training or len(x) < 2:
         return torch.cat([p.norm.running_mean for p in parts]), torch.cat([p.norm.running_var for p in parts])
     mean, variance = projected_statistics(full_precision(x), weight)
     with torch.no_grad():
