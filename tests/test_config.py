@@ -121,7 +121,7 @@ FULL_SIZE = {
     "model.kggi": {
         "initialization": "both", "num_radar_keypoints": 1024, "num_camera_keypoints": 256,
         "num_random_keypoints": 256, "num_depth_bins": 80, "depth_range_m": [1.0, 160.0], "depth_target": "box",
-        "keypoint_nms_cells": None, "property_head": True, "initial_velocity": "zero", "source_embedding_std": 1.0,
+        "keypoint_nms_cells": None, "property_head": True, "source_embedding_std": 1.0,
     },
     "model.ocsf": {
         "num_layers": 2, "num_learnable_points": 6, "margin_m": 4.8, "occupancy_threshold": 0.1,
@@ -130,6 +130,7 @@ FULL_SIZE = {
         "refine_from": "self_encoding", "gate_kernel_size": 1,
         "identity_start": False,
     },
+    "model.doppler": {"gaussians": False, "cells": False, "boxes": False},
     "model.head": {"nms": "per_group", "score_threshold": 0.1, "max_boxes": 500, "attributes": "rule"},
     "model.loss": {
         "kggi_weight": 1.0, "ocsf_weight": 5.0, "heatmap_weight": 1.0, "box_weight": 0.25, "keypoint_weight": 1.0,
@@ -172,8 +173,8 @@ FULL_SIZE_PHASE_2 = {
     "phase.options": {"velocity_code_weight": 1.0},
     "model.dptf": {"max_age_s": 6.0, "min_speed_mps": 0.0},
     "model.dptf.bev_path": {
-        "num_frames": 8, "memory_threshold": 0.1, "max_cells_per_frame": 4096, "velocity_start": "zero",
-        "velocity_compensation": True, "spatial_dilation": False,
+        "num_frames": 8, "memory_threshold": 0.1, "max_cells_per_frame": 4096, "velocity_compensation": True,
+        "spatial_dilation": False,
     },
     "model.dptf.gaussian_path": {
         "num_frames": 4, "gaussians_per_frame": 256, "min_contribution": 0.0, "sampling": "farthest_point",

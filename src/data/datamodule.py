@@ -29,7 +29,7 @@ from src.data.clips import (
 from src.data.data_config import DataConfig
 from src.data.evaluation_set import evaluation_set
 from src.data.frame_loader import FrameLoader, collate, collate_in_worker, init_worker
-from src.data.reader import FrameReader
+from src.data.reader import FrameReader, OnBadFile
 from src.data.schema import DatasetIndex
 from src.data.splits import split_samples
 from src.errors import ConfigError, DataError, HorizonError
@@ -150,7 +150,7 @@ class DetectionDataModule(L.LightningDataModule):
         A clip has `length` consecutive frames in batches of one, fewer where its scene begins later than that.
         """
         samples = split_samples(self.index, self.config.split)
-        scenes = scenes_of(self.index, samples)
+        scenes = self._scenes_of(samples)
         clips = []
         for sample in _evenly_spread(samples, count):
             (scene,) = (scene for scene in scenes if sample in scene)
@@ -178,9 +178,12 @@ class DetectionDataModule(L.LightningDataModule):
         wanted = known if scenes is None else scenes
         return (frame for name in wanted for frame in self._in_order(known[name]))
 
+    def _scenes_of(self, samples: np.ndarray) -> list[np.ndarray]:
+        return scenes_of(self.index, samples, self.config.on_bad_file is OnBadFile.skip)
+
     def _scenes(self) -> dict[str, np.ndarray]:
         """Frames of the validation split's scenes by name."""
-        scenes = scenes_of(self.index, split_samples(self.index, self.config.split))
+        scenes = self._scenes_of(split_samples(self.index, self.config.split))
         return {str(self.index.scene_names[self.index.sample_scenes[scene[0]]]): scene for scene in scenes}
 
     def _in_order(self, samples: np.ndarray) -> Iterator[FrameBatch]:
@@ -206,7 +209,7 @@ class DetectionDataModule(L.LightningDataModule):
             raise DataError(f"{index.root / index.version}: has no annotations to train on")
         schedule: Callable[[int], Schedule]
         if self.temporal and not config.past_frames:
-            scenes = scenes_of(index, samples)
+            scenes = self._scenes_of(samples)
             cut = (config.groups_per_scene, config.batch_size, config.stream_sets)
             schedule = partial(streamed_groups, scenes, *cut, seed)
         else:
@@ -219,7 +222,7 @@ class DetectionDataModule(L.LightningDataModule):
         samples = split_samples(self.index, self.config.split)
         rank, world_size = self._rank()
         if self.temporal:
-            schedule = whole_scenes(scenes_of(self.index, samples), self.config.batch_size, world_size)
+            schedule = whole_scenes(self._scenes_of(samples), self.config.batch_size, world_size)
         else:
             schedule = frames_in_order(samples, self.config.batch_size)
         return self._loader(ScheduleSampler(lambda epoch: schedule, rank, world_size), None)

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
-from src.models.backbones.doppler import VelocityStart
 from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
+from src.models.layers.doppler import Doppler
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.merging import block_diagonal, joined_convs
 from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv, TemporalConv
@@ -39,7 +39,6 @@ class BEVPathConfig:
     num_frames: int  # remembered key frames
     memory_threshold: float  # tau_mem, occupancy from which a cell is remembered
     max_cells_per_frame: int  # guard: the most occupied cells of a frame
-    velocity_start: VelocityStart  # what the predicted velocity of a cell is added to
     velocity_compensation: bool  # move cells by their own velocity; off: by the ego motion alone (Table 6)
     spatial_dilation: bool  # literal strided convolutions, which spread every cell to its neighbours
 
@@ -108,8 +107,8 @@ class BEVPath(nn.Module):
         self.occupancy = nn.ModuleList([occupancy, block_diagonal([first, second])])
         self.velocity = None
 
-    def predict(self, fused: SparseBEV, doppler: SparseBEV | None = None) -> CellPrediction:
-        """Occupancy and velocity of every cell of F_fuse; the velocity may start from what the radar measures there."""
+    def predict(self, fused: SparseBEV, doppler: Doppler | None = None) -> CellPrediction:
+        """Occupancy and velocity of every cell of F_fuse; with `doppler` the radial part is the measured one."""
         values: list[Tensor] = []
         for head in (self.occupancy, self.velocity):
             if head is not None:
@@ -117,8 +116,8 @@ class BEVPath(nn.Module):
         if self.velocity is None:
             values = list(values[0].split([1, 2], dim=1))
         velocities = VELOCITY_UNIT_MPS * values[1]
-        if self.config.velocity_start is VelocityStart.doppler:
-            velocities = velocities + doppler.lookup(fused.indices)
+        if doppler is not None:
+            velocities = doppler.impose(velocities, fused.sites.linear())
         return CellPrediction(values[0].squeeze(1), velocities)
 
     @torch.no_grad()

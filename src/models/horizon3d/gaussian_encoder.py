@@ -20,6 +20,7 @@ from src.models.horizon3d.cross_attention import (
 )
 from src.models.horizon3d.temporal_attention import TemporalSelfAttention
 from src.models.horizon3d.views import CameraViews
+from src.models.layers.doppler import Doppler
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.sparse import SubmanifoldConv
 from src.ops.segment_reduce import segment_mean
@@ -260,14 +261,28 @@ class GaussianEncoder(nn.Module):
         self.image_value = nn.Conv2d(image_channels, channels, 1)
         self.layers = nn.ModuleList(make_layer() for _ in range(num_layers))
 
-    def forward(self, gaussians: GaussianSet, radar_bev: SparseBEV, views: CameraViews) -> GaussianSet:
-        """G_0 -> G_L."""
+    def forward(
+        self, gaussians: GaussianSet, radar_bev: SparseBEV, views: CameraViews, doppler: Doppler | None = None
+    ) -> GaussianSet:
+        """G_0 -> G_L; with `doppler` the radial part of their velocities is always the measured one."""
         values = [
             self.image_value(level.flatten(0, 1)).unflatten(0, level.shape[:2]) for level in views.levels
         ]  # L x [B, N, C, h, w]
+        gaussians = _measured(gaussians, doppler)
         for layer in self.layers:
-            gaussians = layer(gaussians, self.anchor(gaussians), radar_bev, views, values)
+            gaussians = _measured(layer(gaussians, self.anchor(gaussians), radar_bev, views, values), doppler)
         return gaussians
+
+
+def _measured(gaussians: GaussianSet, doppler: Doppler | None) -> GaussianSet:
+    """With what the radar measures of their velocities."""
+    if doppler is None:
+        return gaussians
+    row, col = doppler.grid.cell_of(gaussians.means.detach()).unbind(-1)  # [B, G]
+    sample = torch.arange(len(row), device=row.device)[:, None]
+    cells = (sample * doppler.grid.rows + row) * doppler.grid.cols + col
+    velocities = doppler.impose(gaussians.velocities.flatten(0, 1), cells.flatten())
+    return replace(gaussians, velocities=velocities.unflatten(0, row.shape))
 
 
 def _feed_forward(channels: int) -> nn.Sequential:

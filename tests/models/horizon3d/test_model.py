@@ -10,13 +10,13 @@ from omegaconf import OmegaConf
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models import FAMILIES, build_model
-from src.models.backbones.doppler import VelocityStart, doppler_map
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.heads.center_head import BoxOptions
 from src.models.horizon3d.kggi import Initialization
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
-from src.models.horizon3d.ocsf import CrossAttention, RefineFrom, VelocityUpdate
+from src.models.horizon3d.ocsf import CrossAttention, RefineFrom
+from src.models.layers.doppler import Doppler
 from src.structures.boxes import Boxes3D
 from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
 
@@ -163,19 +163,26 @@ def test_gaussian_velocity_is_supervised_in_phase_1_where_asked_for(make_model, 
 
 
 def test_an_untrained_model_knows_the_radial_velocities(make_model, make_batch):
-    """They start from the Doppler of their cell and are changed by steps, which an untrained layer hardly makes."""
-    start = {"initial_velocity": VelocityStart.doppler, "velocity_update": VelocityUpdate.residual}
-    model, batch = make_model(**start).eval(), make_batch()
+    """Those of Gaussians, cells and boxes alike are measured; the rest is learnt."""
+    model, batch = make_model(doppler=("gaussians", "boxes")), make_batch(boxes=(12, 12))
+    model.eval()
     with torch.no_grad():
         output, _ = model(batch)
-    measured = doppler_map(output.radar_bev, model.grid, batch.radar_points, batch.radar_batch)
-    first, last = output.kggi.gaussians, output.ocsf.gaussians
-    sample, gaussian = first.valid.nonzero().unbind(1)
-    cells = model.grid.cell_of(first.means[sample, gaussian])
-    wanted = measured.lookup(torch.cat([sample[:, None], cells], dim=1))
-    assert wanted.abs().max() > 5
-    torch.testing.assert_close(last.velocities[sample, gaussian], wanted, atol=0.5, rtol=0)
-    assert parameters_that_stay(make_model(**start, velocity_unit_mps=10.0), make_batch(boxes=(12, 12)), lr=1e-2) == []
+    doppler = Doppler.measure(batch.radar_points, batch.radar_batch, 2, model.grid)
+    gaussians = output.ocsf.gaussians
+    sample, _ = gaussians.valid.nonzero().unbind(1)
+    row, col = model.grid.cell_of(gaussians.means[gaussians.valid]).unbind(1)
+    every = torch.arange(len(output.head.bev))
+    codes = model.head.regress(output.head, every, 0 * every)
+    for cells, velocities in (
+        ((sample * model.grid.rows + row) * model.grid.cols + col, gaussians.velocities[gaussians.valid]),
+        (output.head.bev.sites.linear(), codes[:, 8:]),
+    ):
+        fast = doppler.seen[cells] & (doppler.velocities[cells].norm(dim=1) > 3)
+        measured = doppler.velocities[cells][fast]
+        assert fast.sum() > 10
+        torch.testing.assert_close((velocities[fast] * measured).sum(1), measured.square().sum(1), rtol=1e-4, atol=1e-3)
+    assert parameters_that_stay(make_model(doppler=("gaussians", "boxes")), batch, lr=1e-2) == []
 
 
 @pytest.mark.slow
