@@ -19,6 +19,18 @@ def test_the_faster_box_wins_and_an_unknown_one_over_all() -> None:
     torch.testing.assert_close(speeds, torch.tensor(expected, dtype=torch.float32), equal_nan=True)
 
 
+def test_a_box_comes_before_the_margin_of_a_faster_one() -> None:
+    """A standing sign beside a lane: its own cells stand, the rest of its margin belongs to the car."""
+    nan = float("nan")
+    sign, car = (0.5, 0.5, 1, 1, 0, 0.2, 0), (0.5, 2.5, 5, 1, 0, 30, 0)
+    raster = velocity_raster([boxes_of(car, sign)], GRID, 4.0)
+    found = raster.at(torch.tensor([key(0, 10, 15), key(0, 10, 14), key(0, 12, 15), key(0, 8, 15)]))
+    torch.testing.assert_close(found, torch.tensor([[0.2, 0], [30, 0], [30, 0], [0.2, 0]]))
+    unknown = velocity_raster([boxes_of((0.5, 2.5, 5, 1, 0, nan, nan), sign)], GRID, 4.0)
+    found = unknown.at(torch.tensor([key(0, 10, 15), key(0, 10, 14)]))
+    torch.testing.assert_close(found, torch.tensor([[0.2, 0], [nan, nan]]), equal_nan=True)
+
+
 def test_velocity_raster_without_boxes() -> None:
     raster = velocity_raster([Boxes3D.empty()], GRID, 4.8)
     assert raster.at(torch.tensor([3, -1])).isnan().all()

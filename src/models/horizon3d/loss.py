@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
+import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
@@ -24,7 +26,22 @@ from src.targets.keypoints import keypoint_heatmap
 from src.targets.occupancy import occupied_cells
 from src.targets.projection import BoxViews, view_boxes
 from src.targets.supervision import supervised_boxes
-from src.targets.velocity import velocity_raster
+from src.targets.velocity import on_open_ground, velocity_raster
+
+MOVING_MPS = 1.0
+"""A box that is faster moves."""
+
+
+class VelocityGroups(Enum):
+    """Over what velocity errors are averaged; means of several groups are added.
+
+    `boxes`: all that lies in boxes, where moving ones have 95 % of the cells. `motion`: what moves, and what stands.
+    `motion_and_ground`: these, and what lies outside all boxes, which stands.
+    """
+
+    boxes = "boxes"
+    motion = "motion"
+    motion_and_ground = "motion_and_ground"
 
 
 @dataclass(kw_only=True)
@@ -46,6 +63,7 @@ class Horizon3DLossConfig(LossWeights):
     cell_lovasz_weight: float | None
     cell_velocity_weight: float | None
     gaussian_velocity_weight: float | None
+    velocity_groups: VelocityGroups  # of cells and of Gaussians
     gaussian_velocity_in_phase1: bool  # supervise Gaussian velocities (Eq. 9) already without memory
 
 
@@ -113,9 +131,11 @@ def gaussian_velocity_loss(
     """Velocities of Gaussians against the enlarged box at the cell where each contributes most (Eq. 9), weighted."""
     if config.gaussian_velocity_weight is None:
         return {}
-    target = velocity_raster(boxes, grid, margin_m).at(ocsf.splat.peak_cells.flatten())  # [B*G, 2]
+    cells = ocsf.splat.peak_cells.flatten()
+    target = velocity_raster(boxes, grid, margin_m).at(cells)  # [B*G, 2]
+    target, group = _velocity_groups(target, cells, boxes, grid, margin_m, config.velocity_groups)
     errors = masked_smooth_l1(ocsf.gaussians.velocities.flatten(0, 1), target)
-    value = config.gaussian_velocity_weight * errors.sum() / mean_over_ranks((~target.isnan()).sum())
+    value = config.gaussian_velocity_weight * _sum_of_means(errors, target, group)
     return _times({"gaussian_velocity": value}, config.dptf_weight)
 
 
@@ -124,6 +144,7 @@ def cell_losses(
     fused: SparseBEV,
     boxes: list[Boxes3D],  # B, aug frame
     grid: BEVGrid,
+    margin_m: float,  # around the boxes, in which nothing says whether a cell moves
     config: Horizon3DLossConfig,
 ) -> dict[str, Tensor]:
     """Occupancy and velocity of the cells of F_fuse against the tight boxes (method 6.1, 8.1), weighted."""
@@ -140,10 +161,40 @@ def cell_losses(
         terms["cell_lovasz"] = config.cell_lovasz_weight * lovasz_foreground(score, target, sample, len(boxes))
     if config.cell_velocity_weight is not None:
         wanted = velocity_raster(boxes, grid, 0.0).at(keys)  # [M, 2]
+        wanted, group = _velocity_groups(wanted, keys, boxes, grid, margin_m, config.velocity_groups)
         errors = masked_l1(cells.velocities, wanted)
-        normalizer = mean_over_ranks((~wanted.isnan()).sum())
-        terms["cell_velocity"] = config.cell_velocity_weight * errors.sum() / normalizer
+        terms["cell_velocity"] = config.cell_velocity_weight * _sum_of_means(errors, wanted, group)
     return _times(terms, config.dptf_weight)
+
+
+def _velocity_groups(
+    target: Tensor,  # [n, 2] m/s, NaN where unknown and outside the boxes
+    cells: Tensor,  # [n] int64 linear keys; -1 for none
+    boxes: list[Boxes3D],  # B, aug frame
+    grid: BEVGrid,
+    margin_m: float,
+    groups: VelocityGroups,
+) -> tuple[Tensor, Tensor]:  # [n, 2], [n] int64 group
+    """The target, zero on open ground if that is a group: 0 stands or is not told apart, 1 moves, 2 is ground."""
+    group = torch.zeros_like(cells)
+    if groups is not VelocityGroups.boxes:
+        group = (target.norm(dim=1) > MOVING_MPS).long()  # not of NaN, whose errors are 0 and not counted
+    if groups is VelocityGroups.motion_and_ground:
+        ground = on_open_ground(cells, boxes, grid, margin_m)
+        target = torch.where(ground[:, None], 0.0, target)
+        group = torch.where(ground, 2, group)
+    return target, group
+
+
+def _sum_of_means(
+    errors: Tensor,  # [n, 2]
+    target: Tensor,  # [n, 2], NaN where unknown
+    group: Tensor,  # [n] int64 in 0..2
+) -> Tensor:  # []
+    """Sum over the groups of their mean error over known components."""
+    zeros = errors.new_zeros(3)
+    counts = zeros.index_add(0, group, (~target.isnan()).sum(1).to(zeros.dtype))
+    return (zeros.index_add(0, group, errors.sum(1)) / mean_over_ranks(counts)).sum()
 
 
 def _keypoint_loss(kggi: KGGIOutput, views: CameraViews, seen: BoxViews, settings: KGGIConfig) -> Tensor:

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.doppler import doppler_map
 from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.detector import Detector, Objective
@@ -87,15 +88,17 @@ class Horizon3D(Detector):
             raise ValueError(f"the memory holds {memory.batch_size} streams, but the batch {len(batch)} frames")
         warped_memory = self.dptf.recall(memory, batch) if self.dptf is not None else None
         radar_bev = fused = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
-        views = kggi = ocsf = None
+        doppler = views = kggi = ocsf = None
+        if self.config.uses_doppler:
+            doppler = doppler_map(radar_bev, self.grid, batch.radar_points, batch.radar_batch)
         if self.image_encoder is not None:
             views = self._encode_views(batch)
-            kggi = self.kggi(radar_bev, views, warped_memory.history if warped_memory is not None else None)
+            kggi = self.kggi(radar_bev, views, warped_memory.history if warped_memory is not None else None, doppler)
             ocsf = self.ocsf(kggi.gaussians, radar_bev, views)
             fused = ocsf.fused_bev
         if self.dptf is None:
             return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, None, self.head(fused)), None
-        dptf = self.dptf.aggregate(fused, warped_memory)
+        dptf = self.dptf.aggregate(fused, warped_memory, doppler)
         output = Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, dptf, self.head(dptf.bev))
         return output, self.dptf.remember(warped_memory.past, batch, fused, dptf, ocsf)
 
@@ -123,7 +126,8 @@ class Horizon3D(Detector):
             if config.dptf is not None or weights.gaussian_velocity_in_phase1:
                 terms |= gaussian_velocity_loss(output.ocsf, boxes, self.grid, config.ocsf.margin_m, weights)
         if output.dptf is not None and output.dptf.cells is not None:
-            terms |= cell_losses(output.dptf.cells, output.fused_bev, boxes, self.grid, weights)
+            margin_m = config.ocsf.margin_m if config.ocsf is not None else 0.0
+            terms |= cell_losses(output.dptf.cells, output.fused_bev, boxes, self.grid, margin_m, weights)
         return Objective(terms, counts)
 
     def decode(self, output: Horizon3DOutput) -> list[Boxes3D]:
