@@ -34,7 +34,6 @@ from src.metrics.scores import (
     DISTANCE_THRESHOLDS_M,
     ERROR_THRESHOLD_M,
     ERRORS,
-    DetectionScores,
     SubsetScores,
     plain_number,
 )
@@ -59,8 +58,33 @@ class MatchedParts:
     speeds: dict[str, Part]
     moving: Part | None  # None where speeds are not asked for
     sums: dict[str, Array]  # [S, 2] see `sums_by_sample`
-    truth_kept: Array  # [k] bool
+    truth_kept: Array  # [k] bool, ground truth that survives the official filters
     predictions_kept: Array  # [n] bool
+
+
+@dataclass
+class DetectionScores:
+    """An evaluation: over everything, by distance bin (`"0-25"` ...), scene tag and speed class (`"0.5-10"` ...)."""
+
+    overall: SubsetScores
+    ranges: dict[str, SubsetScores]  # empty where not asked for
+    tags: dict[str, SubsetScores]  # empty where not asked for
+    speeds: dict[str, SubsetScores]  # empty where not asked for
+    measures: dict[str, float | None]  # see `measure_parts`
+    parts: MatchedParts  # what they were read from
+
+    def as_dict(self) -> dict[str, object]:
+        """The content of metrics.json but for intervals: fractions of 1, None where a number is undefined.
+
+        A part counts a class without ground truth as the official score does (AP 0, errors 1); entries of `speeds`
+        also hold the means over the classes that are there, see `PartScores.present_means`.
+        """
+        return self.overall.as_dict(plain_number) | {
+            "ranges": {name: scores.as_dict(plain_number) for name, scores in self.ranges.items()},
+            "tags": {name: scores.as_dict(plain_number) for name, scores in self.tags.items()},
+            "speeds": {name: scores.as_dict(plain_number, True) for name, scores in self.speeds.items()},
+            "measures": self.measures,
+        }
 
 
 def score_detections(
@@ -87,8 +111,7 @@ def score_detections(
         tags={tag: _score_tag(parts, tag) for tag in SCENE_TAGS} if by_tag else {},
         speeds={name: _score(part) for name, part in parts.speeds.items()},
         measures=measure_parts(parts),
-        truth_kept=parts.truth_kept,
-        predictions_kept=parts.predictions_kept,
+        parts=parts,
     )
 
 

@@ -104,32 +104,6 @@ class SubsetScores(PartScores):
         return content
 
 
-@dataclass
-class DetectionScores:
-    """An evaluation: over everything, by distance bin (`"0-25"` ...), scene tag and speed class (`"0.5-10"` ...)."""
-
-    overall: SubsetScores
-    ranges: dict[str, SubsetScores]  # empty where not asked for
-    tags: dict[str, SubsetScores]  # empty where not asked for
-    speeds: dict[str, SubsetScores]  # empty where not asked for
-    measures: dict[str, float | None]  # see `measure_parts`
-    truth_kept: Array  # [k] bool, ground truth that survives the official filters
-    predictions_kept: Array  # [n] bool
-
-    def as_dict(self) -> dict[str, object]:
-        """The content of metrics.json: fractions of 1, None where a number is undefined.
-
-        A part counts a class without ground truth as the official score does (AP 0, errors 1); entries of `speeds`
-        also hold the means over the classes that are there, see `PartScores.present_means`.
-        """
-        return self.overall.as_dict(plain_number) | {
-            "ranges": {name: scores.as_dict(plain_number) for name, scores in self.ranges.items()},
-            "tags": {name: scores.as_dict(plain_number) for name, scores in self.tags.items()},
-            "speeds": {name: scores.as_dict(plain_number, True) for name, scores in self.speeds.items()},
-            "measures": self.measures,
-        }
-
-
 def plain_number(value: Array) -> float | None:
     """For JSON."""
     return None if np.isnan(value) else float(value)

@@ -10,10 +10,10 @@ from typing import Any, ClassVar, Self
 from torch import nn
 
 from src.data.datamodule import DetectionDataModule
-from src.metrics.detection import score_detections
+from src.metrics.bootstrap import with_intervals
+from src.metrics.detection import DetectionScores, score_detections
 from src.metrics.diagnostics import FrameDiagnosis, diagnose
 from src.metrics.score_text import format_scores
-from src.metrics.scores import DetectionScores
 from src.metrics.submission import to_ego, to_global
 from src.models.detector import Detector
 from src.pictures.comparison import BarPanel, draw_comparison
@@ -84,6 +84,7 @@ class DetectionEvaluator(Evaluator):
         self.diagnoses: dict[int, FrameDiagnosis] = {}  # by sample as well
         self.scores: DetectionScores | None = None
         self.detections: DetectionTable | None = None
+        self.content: dict[str, Any] | None = None  # of metrics.json
 
     @classmethod
     def of(cls, datamodule: DetectionDataModule) -> DetectionEvaluator:
@@ -114,12 +115,14 @@ class DetectionEvaluator(Evaluator):
             tables, diagnoses = boxes_of_rank | tables, diagnoses_of_rank | diagnoses
         in_order = [tables[sample] for sample in sorted(tables)]
         self.detections = DetectionTable.concatenate([DetectionTable.empty(), *in_order])
-        self.scores = score_detections(self.evaluation_set, self.detections, diagnoses)
+        self.scores, self.content = score_detections(self.evaluation_set, self.detections, diagnoses), None
         return self.scores.overall.headline()
 
     def as_dict(self) -> dict[str, Any]:
-        """See `DetectionScores.as_dict`."""
-        return self.scores.as_dict()
+        """See `with_intervals`, which is asked once: a validation in the middle of a training does without."""
+        if self.content is None:
+            self.content = with_intervals(self.scores)
+        return self.content
 
     @staticmethod
     def describe(metrics: Mapping[str, Any]) -> str:
@@ -129,9 +132,13 @@ class DetectionEvaluator(Evaluator):
     def draw(self, folder: Path, title: str) -> None:
         """Bars by class and distance."""
         scores, panels = self.as_dict(), []
+        bounds = scores["intervals"]["bounds"]
         for what, group, metric in (("AP by class, %", "classes", "AP"), ("mAP by distance, %", "ranges", "mAP")):
-            names = [name.replace("_", " ") for name in scores[group]]
-            panels.append(BarPanel(what, names, {title: [(100 * of[metric], 0.0) for of in scores[group].values()]}))
+            bars = []
+            for name, values in scores[group].items():
+                low, high = bounds.get(f"{group}.{name}.{metric}", 2 * [values[metric]])
+                bars.append((100 * values[metric], 100 * low, 100 * high))
+            panels.append(BarPanel(what, [name.replace("_", " ") for name in scores[group]], {title: bars}))
         draw_comparison(folder / "scores.png", panels, title)
 
     def write(self, folder: Path, save: SaveTable) -> list[str]:

@@ -225,7 +225,7 @@ def test_agrees_with_the_evaluation_written_again(seed):
         ego = evaluation_set.ego_centers[table.samples]
         table.centers = ego + (table.centers - ego) * 0.1
     scores = score_detections(evaluation_set, predictions)
-    truth, predictions = truth[scores.truth_kept], predictions[scores.predictions_kept]
+    truth, predictions = truth[scores.parts.truth_kept], predictions[scores.parts.predictions_kept]
     seen = 0
     for (low, high), part in zip(
         [(0, 0.5), (0.5, 10), (10, 25), (25, np.inf)], (scores.speeds[name] for name in NAMES), strict=True
@@ -244,6 +244,6 @@ def test_agrees_with_the_evaluation_written_again(seed):
 def test_classes_of_speed_share_out_all_ground_truth_of_known_velocity():
     evaluation_set, predictions = random_problem(10, 40, 80, seed=7)
     scores = score_detections(evaluation_set, predictions)
-    known = ~np.isnan(evaluation_set.ground_truth.velocities).any(axis=1) & scores.truth_kept
-    assert sum(part.num_gt.sum() for part in scores.speeds.values()) == known.sum() < scores.truth_kept.sum()
+    known = ~np.isnan(evaluation_set.ground_truth.velocities).any(axis=1) & scores.parts.truth_kept
+    assert sum(part.num_gt.sum() for part in scores.speeds.values()) == known.sum() < scores.parts.truth_kept.sum()
     assert score_detections(evaluation_set, predictions, by_speed=False).speeds == {}

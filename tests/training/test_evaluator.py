@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from src.benchmark.suite_metric import random_problem
+from src.metrics.bootstrap import with_intervals
 from src.metrics.detection import score_detections
 from src.metrics.diagnostics import FrameDiagnosis
 from src.reliability.processes import process_group
@@ -61,9 +62,9 @@ def test_two_processes_in_any_order_give_the_numbers_of_one(problem, tmp_path, f
     shards = [by_sample(predictions, first), by_sample(predictions, [5, 4, 3, 2, 1, 0])]
     spawn_two(compute_as, tmp_path, evaluation_set, shards)
     diagnoses = diagnoses_of(evaluation_set, range(SAMPLES))
-    expected = score_detections(evaluation_set, predictions, diagnoses).as_dict()
+    expected = with_intervals(score_detections(evaluation_set, predictions, diagnoses))
     assert expected["measures"]["radar_near"] == 15 / 60
-    nothing = score_detections(evaluation_set, DetectionTable.empty()).as_dict()
+    nothing = with_intervals(score_detections(evaluation_set, DetectionTable.empty()))
     for rank in range(2):
         (table, scores), (empty, of_none) = pickle.loads((tmp_path / f"{rank}.pickle").read_bytes())
         same(table, predictions[np.argsort(predictions.samples, kind="stable")])

@@ -25,6 +25,7 @@ from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
 from src.structures.taxonomy import CAMERAS
+from src.targets.box_raster import BoxRaster
 
 
 class Horizon3D(Detector):
@@ -127,14 +128,14 @@ class Horizon3D(Detector):
         """Terms of Eq. 10 as weighted."""
         config, boxes, weights = self.config, batch.boxes, self.config.loss
         terms, counts = self.head.loss(output.head, boxes, weights.heatmap_weight, weights.box_weight)
+        raster = BoxRaster(boxes, self.grid, config.ocsf.margin_m if config.ocsf is not None else 0.0)
         if output.kggi is not None and output.ocsf is not None:
-            terms |= kggi_losses(output.kggi, output.radar_bev, output.views, boxes, self.grid, config.kggi, weights)
-            terms |= ocsf_losses(output.ocsf, boxes, self.grid, config.ocsf.margin_m, weights)
+            terms |= kggi_losses(output.kggi, output.radar_bev, output.views, raster, config.kggi, weights)
+            terms |= ocsf_losses(output.ocsf, raster, weights)
             if config.dptf is not None or weights.gaussian_velocity_in_phase1:
-                terms |= gaussian_velocity_loss(output.ocsf, boxes, self.grid, config.ocsf.margin_m, weights)
+                terms |= gaussian_velocity_loss(output.ocsf, raster, weights)
         if output.dptf is not None and output.dptf.cells is not None:
-            margin_m = config.ocsf.margin_m if config.ocsf is not None else 0.0
-            terms |= cell_losses(output.dptf.cells, output.fused_bev, boxes, self.grid, margin_m, weights)
+            terms |= cell_losses(output.dptf.cells, output.fused_bev, raster, weights)
         return Objective(terms, counts)
 
     def decode(self, output: Horizon3DOutput) -> list[Boxes3D]:
