@@ -111,7 +111,7 @@ class Horizon3D(Detector):
         wanted = vars(self.config.doppler)
         measured = None
         if any(wanted.values()):
-            measured = Doppler.measure(batch.radar_points, batch.radar_batch, len(batch), self.grid)
+            measured = Doppler.measure(batch.radar_points, batch.radar_batch, self.grid)
         return {name: measured if its else None for name, its in wanted.items()}
 
     def _encode_views(self, batch: FrameBatch) -> CameraViews:
