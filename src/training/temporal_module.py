@@ -76,18 +76,18 @@ class TemporalModule(TrainingModule):
     def objective(self, batch: FrameBatch) -> Objective:
         """As the base, with how many frames the memory held and how many steps ago they were written, on average."""
         objective = super().objective(batch)
-        present = self._used.present if self._used is not None else batch.timestamps_s.new_zeros(0, len(batch))
-        objective.diagnostics["memory_frames"] = present.sum().float() / len(batch)
-        if self._used is not None:
-            age = torch.arange(1, len(present) + 1, device=present.device)[:, None]
-            turns = (age * present).sum() / present.sum().clamp(min=1)
-            objective.diagnostics["memory_steps"] = turns * (0 if batch.past else len(self.memories))
+        present = self._used.present if self._used is not None else batch.timestamps_s.new_zeros(1, len(batch))
+        turns = torch.arange(1, len(present) + 1, device=present.device)[:, None]
+        steps = 0 if batch.past else len(self.memories)  # between two turns of a stream
+        objective.diagnostics["memory_frames"] = present.sum() / len(batch)
+        objective.diagnostics["memory_steps"] = steps * (turns * present).sum() / present.sum().clamp(min=1)
         return objective
 
     def forget(self) -> None:
         """Drop the memory of all streams."""
         self.memories.clear()
         self._before_step.clear()
+        self._used = None
 
     def forget_step(self, batch: FrameBatch) -> None:
         """Let the streams of a step that counts for nothing begin anew: what they remember may not be finite."""
