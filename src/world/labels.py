@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from src.structures.taxonomy import CLASS_RANGE_M
+from src.world.dataset_statistics import count_inside
 from src.world.simulate import Scene
 from src.world.world_config import WorldConfig
 
@@ -51,17 +52,11 @@ def frame_truth(scene: Scene, time_s: float, own_pixels: Array, seen_pixels: Arr
     )
 
 
-def count_inside(truth: FrameTruth, sizes: Array, points: Array) -> Array:
+def count_points(truth: FrameTruth, sizes: Array, points: Array) -> Array:
     """How many of the points [P, 3] (local coordinates) lie in each box, borders included: [N]."""
     counts = np.zeros(len(sizes), dtype=np.int64)
-    cos, sin = np.cos(truth.yaws), np.sin(truth.yaws)
     near = np.flatnonzero(truth.distance_m < 260)
-    offset = points[None] - truth.centres[near, None]
-    x = cos[near, None] * offset[..., 0] + sin[near, None] * offset[..., 1]
-    y = cos[near, None] * offset[..., 1] - sin[near, None] * offset[..., 0]
-    half = 0.5 * sizes[near, None]
-    inside = (np.abs(x) <= half[..., 0]) & (np.abs(y) <= half[..., 1]) & (np.abs(offset[..., 2]) <= half[..., 2])
-    counts[near] = inside.sum(1)
+    counts[near] = count_inside(truth.centres[near], 0.5 * sizes[near], truth.yaws[near], points)
     return counts
 
 

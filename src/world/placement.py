@@ -144,10 +144,13 @@ def _side_road(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
     for _ in range(make.count(1.0)):
         way = int(rng.choice([-1, 1]))
         standing = rng.random() < 0.3
+        place, across = rng.uniform(15, reach_m), centre - rng.choice([-1, 1]) * rng.uniform(3.4, 4.4)
+        if rng.random() < 0.7:  # hidden until the truck comes near
+            yield Bystander(make.actor("bush", parked=True), place - 3.0, across - np.sign(centre) * 0.5)
         yield Bystander(
             make.actor("child" if rng.random() < 0.25 else "adult"),
-            rng.uniform(15, reach_m),
-            centre - rng.choice([-1, 1]) * rng.uniform(3.4, 4.4),
+            place,
+            across,
             s_rate=0.0 if standing else way * rng.uniform(0.9, 1.8),
             turn=0.0 if way > 0 else np.pi,
         )
@@ -226,7 +229,7 @@ def _signs(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
             s += rng.uniform(70, 220)
     gantry = rng.uniform(40, reach_m + 60)
     for lane in range(road.lanes):
-        if rng.random() < 0.45:
+        if rng.random() < 0.3:
             yield Bystander(make.actor("gantry_sign"), gantry, road.lane_centre(1, lane), turn=np.pi)
 
 

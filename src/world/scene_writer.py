@@ -16,7 +16,7 @@ from src.world.camera_render import Studio
 from src.world.catalogue import attribute_of
 from src.world.labels import (
     FrameTruth,
-    count_inside,
+    count_points,
     estimate_lidar_points,
     frame_truth,
     labelled,
@@ -197,11 +197,11 @@ class SceneWriter:
         frames = []
         for k, time in enumerate(self.key_times):
             truth = frame_truth(self.scene, time, *pixels[k])
-            truth.radar_points = count_inside(truth, sizes, radar[k])
+            truth.radar_points = count_points(truth, sizes, radar[k])
             if lidar is None:
                 truth.lidar_points = estimate_lidar_points(truth, sizes, self.scene.ego.pose(time)[1], rng)
             else:
-                truth.lidar_points = count_inside(truth, sizes, lidar[k])
+                truth.lidar_points = count_points(truth, sizes, lidar[k])
             frames.append(truth)
         return frames
 

@@ -15,7 +15,7 @@ from src.world.world_config import WorldConfig
 
 Array = np.ndarray
 
-RAIL_POINTS, VERGE_POINTS, FAR_POINTS = 0.8, 4.0, 16.0
+RAIL_POINTS, VERGE_POINTS, FAR_POINTS = 0.8, 4.5, 20.0
 """Reflecting points per metre of road at a clutter_density of 1: of each rail, of both verges, of the land beyond."""
 STEP_M = 8.0
 BEFORE_M = 300.0
@@ -206,6 +206,6 @@ def _clutter(
         FAR_POINTS,
         lambda n: rng.choice([-1, 1], n) * rng.uniform(edge + 15, 190.0, n),
         lambda n: rng.gamma(1.5, 2.2, n),
-        8.0,
+        6.0,
     )
     return np.concatenate(rows).T

@@ -25,7 +25,9 @@ HITCH_OVERLAP_M = {"tractor_unit": 1.9, "rigid_truck": -1.2}
 """How far a trailer reaches over its truck; negative for a drawbar."""
 
 
-TRAILER_CHANCE = {"tractor_unit": 0.9, "rigid_truck": 0.3}
+COMFORTABLE_MPS2 = 3.0
+"""Vehicles start so far apart that braking like this avoids a collision."""
+TRAILER_CHANCE = {"tractor_unit": 0.9, "rigid_truck": 0.5}
 
 
 @dataclass(kw_only=True)
@@ -105,34 +107,49 @@ def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.
             busy = config.vehicles_per_lane_km * (0.8 if lane == 0 else 1.1)
             place = low + rng.uniform(0, 40)
             while busy > 0 and place < high:
-                kind, wanted = _draw_vehicle(road, lane, rng)
-                has_trailer = rng.random() < TRAILER_CHANCE.get(kind, 0.0)
+                kind, wanted = _draw_vehicle(road, direction, lane, rng)
+                has_trailer = direction > 0 and rng.random() < TRAILER_CHANCE.get(kind, 0.0)
                 _add(fleet, Vehicle(kind, direction, lane, place, wanted, has_trailer=has_trailer))
                 place += max(rng.exponential(1000.0 / busy), 12 + 0.9 * wanted)
     return fleet
 
 
 def _add(fleet: list[Vehicle], vehicle: Vehicle) -> None:
-    """Put a vehicle into its lane, as long as it is with its trailer, unless something is too close already."""
+    """Put a vehicle into its lane, as long as it is with its trailer, unless something is too close for their speeds."""
     vehicle.length_m = KINDS[vehicle.kind].size_m[0]
     if vehicle.has_trailer:
         vehicle.length_m += KINDS[_trailer_of(vehicle.kind)].size_m[0] - HITCH_OVERLAP_M[vehicle.kind]
-    near = (v for v in fleet if v.direction == vehicle.direction and v.lane == vehicle.lane)
-    if all(abs(v.along_m - vehicle.along_m) > 0.5 * (v.length_m + vehicle.length_m) + 7 for v in near):
+    near = [v for v in fleet if v.direction == vehicle.direction and v.lane == vehicle.lane]
+    if all(_gap(v, vehicle) > 7 + _closing(v, vehicle) ** 2 / (2 * COMFORTABLE_MPS2) for v in near):
         fleet.append(vehicle)
+
+
+def _gap(one: Vehicle, other: Vehicle) -> float:
+    return abs(one.along_m - other.along_m) - 0.5 * (one.length_m + other.length_m)
+
+
+def _closing(one: Vehicle, other: Vehicle) -> float:
+    """Speed at which the rear one of two vehicles in a lane comes nearer, 0 where it falls behind."""
+    rear, front = sorted((one, other), key=lambda vehicle: vehicle.along_m)
+    return max(0.0, rear.wanted_mps - front.wanted_mps)
 
 
 def _trailer_of(kind: str) -> str:
     return "semi_trailer" if kind == "tractor_unit" else "drawbar_trailer"
 
 
-def _draw_vehicle(road: Road, lane: int, rng: np.random.Generator) -> tuple[str, float]:
-    """Kind and wanted speed (m/s) of ordinary traffic in a lane; up to 50 m/s (180 km/h) on the left."""
+def _draw_vehicle(road: Road, direction: int, lane: int, rng: np.random.Generator) -> tuple[str, float]:
+    """Kind and wanted speed (m/s) of ordinary traffic in a lane; up to 50 m/s (180 km/h) on the left.
+
+    Oncoming articulated lorries are one box, as behind their cabs nobody sees two.
+    """
     from_right = road.lanes - 1 - lane
     kinds = ("car", "lorry", "tractor_unit", "rigid_truck", "van", "bus", "motorcycle")
-    chances = ((0.53, 0.17, 0.05, 0.11, 0.1, 0.02, 0.02), (0.83, 0.02, 0.01, 0.03, 0.08, 0.015, 0.015),
+    chances = ((0.53, 0.15, 0.07, 0.11, 0.1, 0.02, 0.02), (0.83, 0.02, 0.01, 0.03, 0.08, 0.015, 0.015),
                (0.94, 0.0, 0.0, 0.0, 0.04, 0.0, 0.02))  # fmt: skip
     kind = str(rng.choice(kinds, p=chances[min(from_right, 2)]))
+    if direction < 0 and kind == "tractor_unit":
+        kind = "lorry"
     if kind in ("lorry", "tractor_unit", "rigid_truck"):
         return kind, float(np.clip(rng.normal(23.5, 1.0), 20, 27))
     if kind == "bus":

@@ -32,7 +32,7 @@ def real_sweep():
 def straight_scene(kind, ahead_m, speed_mps=0.0):
     """One object straight ahead of a truck on a straight road along x, at time 0."""
     s = np.arange(START_M, END_M + 1)
-    road = Road(xy=np.stack([s, 0 * s], 1), heading_rad=0 * s, z=0 * s, lanes=2, side_road=0, apron=None)
+    road = Road(xy=np.stack([s, 0 * s], 1), heading_rad=0 * s, z=0 * s, lanes=2, side_road=0, apron=None, screen_m=0.0)
     time = np.arange(STEPS) * 0.05 - 0.7
 
     def track(start, speed):
@@ -60,7 +60,8 @@ def straight_scene(kind, ahead_m, speed_mps=0.0):
 
 
 NOTHING = Scenery(
-    mesh=None, layer=None, s=None, clutter=np.zeros((0, 3)), clutter_rcs_db=np.zeros(0), clutter_s=np.zeros(0)
+    mesh=None, layer=None, s=None, clutter=np.zeros((0, 3)),
+    **{f"clutter_{name}": np.zeros(0) for name in ("rcs_db", "s", "d", "height")},
 )
 
 
@@ -72,7 +73,10 @@ def front_sweep(make_config):
 
 def sweep_of(make_config, scene, **changes):
     """The front left radar's returns in the ego frame: points, radial speeds over ground, sweep."""
-    quiet = {"ghost_fraction": 0.0, "false_alarms_per_sweep": 0.0, "clutter_density": 0.0}
+    quiet = dict.fromkeys(
+        ("ghost_fraction", "mirror_fraction", "false_alarms_per_sweep", "clutter_density", "aliased_fraction", "gain_db",
+         "scatter_m", "mount_error_deg"), 0.0,
+    )  # fmt: skip
     config = make_config(**(quiet | changes))
     rig = sensor_rig(config)
     mounts = [rig[name] for name in RADARS]
