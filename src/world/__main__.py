@@ -1,6 +1,4 @@
-"""`python -m src.world [preview=true] [compare=true] [data.world.*=...]`: write the synthetic highway, pictures of it, or
-its figures beside the real ones.
-"""
+"""`python -m src.world [preview=true] [compare=true] [data.world.*=...]`: the synthetic highway, pictures and figures."""
 
 from __future__ import annotations
 

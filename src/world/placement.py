@@ -226,7 +226,7 @@ def _signs(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
             beside = name == "sign" and rng.random() < 0.2  # on the median
             across = -direction * (0.3 if beside else road.rail_m + rng.uniform(1.0, 2.5))
             yield Bystander(make.actor(name), s, across, turn=turn + rng.normal(0, 0.05))
-            s += rng.uniform(70, 220)
+            s += rng.uniform(100, 300) if direction > 0 else rng.uniform(40, 150)
     gantry = rng.uniform(40, reach_m + 60)
     for lane in range(road.lanes):
         if rng.random() < 0.3:

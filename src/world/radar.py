@@ -100,9 +100,7 @@ class Radars:
             self.gain_db = kept * self.gain_db + np.sqrt(1.0 - kept**2) * fresh
         self.time_s = time_s
 
-    def _objects(
-        self, times_s: list[float], rotation: Array, origin: Array
-    ) -> tuple[_Returns, _Returns, _Hiding]:
+    def _objects(self, times_s: list[float], rotation: Array, origin: Array) -> tuple[_Returns, _Returns, _Hiding]:
         """Returns from the faces of actors that each radar can see, those that the outer rails mirror, and what the
         actors hide.
         """

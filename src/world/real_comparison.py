@@ -1,15 +1,14 @@
-"""A data set's figures beside those known of MAN TruckScenes: one table for each of `real_statistics.yaml`, and more."""
+"""A data set's figures beside those known of MAN TruckScenes: one table for each of `real_statistics.yaml`, and one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from src.structures.taxonomy import CLASS_RANGE_M, CLASSES, RADARS
+from src.structures.taxonomy import CLASS_RANGE_M, RADARS
 from src.world.dataset_statistics import DatasetCounts
 
 Array = np.ndarray
@@ -239,7 +238,9 @@ class _Tables:
         for group in groups:
             chosen = {band: self._of(group) & self._band(band) for band in columns}
             rows[group] = {
-                band: (float(np.median(self.counts.lidar[of])), int(of.sum())) for band, of in chosen.items() if of.any()
+                band: (float(np.median(self.counts.lidar[of])), int(of.sum()))
+                for band, of in chosen.items()
+                if of.any()
             }
         return rows
 

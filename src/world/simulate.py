@@ -107,8 +107,9 @@ def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.
             busy = config.vehicles_per_lane_km * (0.8 if lane == 0 else 1.1)
             place = low + rng.uniform(0, 40)
             while busy > 0 and place < high:
-                kind, wanted = _draw_vehicle(road, direction, lane, rng)
-                has_trailer = direction > 0 and rng.random() < TRAILER_CHANCE.get(kind, 0.0)
+                rear_seen = direction > 0 and place > 0
+                kind, wanted = _draw_vehicle(road, lane, rear_seen, rng)
+                has_trailer = rear_seen and rng.random() < TRAILER_CHANCE.get(kind, 0.0)
                 _add(fleet, Vehicle(kind, direction, lane, place, wanted, has_trailer=has_trailer))
                 place += max(rng.exponential(1000.0 / busy), 12 + 0.9 * wanted)
     return fleet
@@ -138,17 +139,17 @@ def _trailer_of(kind: str) -> str:
     return "semi_trailer" if kind == "tractor_unit" else "drawbar_trailer"
 
 
-def _draw_vehicle(road: Road, direction: int, lane: int, rng: np.random.Generator) -> tuple[str, float]:
+def _draw_vehicle(road: Road, lane: int, rear_seen: bool, rng: np.random.Generator) -> tuple[str, float]:
     """Kind and wanted speed (m/s) of ordinary traffic in a lane; up to 50 m/s (180 km/h) on the left.
 
-    Oncoming articulated lorries are one box, as behind their cabs nobody sees two.
+    An articulated lorry is one box unless its rear is seen: behind a cab nobody tells two.
     """
     from_right = road.lanes - 1 - lane
     kinds = ("car", "lorry", "tractor_unit", "rigid_truck", "van", "bus", "motorcycle")
     chances = ((0.53, 0.15, 0.07, 0.11, 0.1, 0.02, 0.02), (0.83, 0.02, 0.01, 0.03, 0.08, 0.015, 0.015),
                (0.94, 0.0, 0.0, 0.0, 0.04, 0.0, 0.02))  # fmt: skip
     kind = str(rng.choice(kinds, p=chances[min(from_right, 2)]))
-    if direction < 0 and kind == "tractor_unit":
+    if kind == "tractor_unit" and not rear_seen:
         kind = "lorry"
     if kind in ("lorry", "tractor_unit", "rigid_truck"):
         return kind, float(np.clip(rng.normal(23.5, 1.0), 20, 27))
