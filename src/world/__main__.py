@@ -1,4 +1,4 @@
-"""`python -m src.world [preview=true] [compare=true] [data.world.*=...]`: the synthetic highway, pictures and figures."""
+"""`python -m src.world [preview=true] [compare=true] [data.world.*=...]`: the synthetic highway, seen and counted."""
 
 from __future__ import annotations
 

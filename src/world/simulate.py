@@ -116,7 +116,7 @@ def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.
 
 
 def _add(fleet: list[Vehicle], vehicle: Vehicle) -> None:
-    """Put a vehicle into its lane, as long as it is with its trailer, unless something is too close for their speeds."""
+    """Put a vehicle into its lane, with its trailer's length, unless something is too close for their speeds."""
     vehicle.length_m = KINDS[vehicle.kind].size_m[0]
     if vehicle.has_trailer:
         vehicle.length_m += KINDS[_trailer_of(vehicle.kind)].size_m[0] - HITCH_OVERLAP_M[vehicle.kind]
