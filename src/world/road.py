@@ -15,7 +15,7 @@ MEDIAN_HALF_M = 2.0
 SHOULDER_M = 2.8
 START_M = -800.0
 END_M = 1500.0
-SLAT_M, SLAT_STEP_M = 0.3, 2.0
+SLAT_M, SLAT_STEP_M = 0.36, 2.0
 """Width across the road and distance of the slats of an anti-glare screen: opaque along the road, open across it."""
 SIDE_ROAD_GAP_M = 13.0
 SIDE_ROAD_HALF_M = 3.2
