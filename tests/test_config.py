@@ -121,12 +121,13 @@ FULL_SIZE = {
     "model.kggi": {
         "initialization": "both", "num_radar_keypoints": 1024, "num_camera_keypoints": 256,
         "num_random_keypoints": 256, "num_depth_bins": 80, "depth_range_m": [1.0, 160.0], "depth_target": "box",
-        "keypoint_nms_cells": None, "property_head": True,
+        "keypoint_nms_cells": None, "property_head": True, "initial_velocity": "zero",
     },
     "model.ocsf": {
         "num_layers": 2, "num_learnable_points": 6, "margin_m": 4.8, "occupancy_threshold": 0.1,
         "max_occupied_cells": 32768, "scale_range_m": [0.2, 3.2], "max_mean_shift_m": 4.0, "max_speed_mps": 60.0,
-        "support_sigmas": 3.0, "cross_attention": "parallel", "refine_from": "self_encoding", "gate_kernel_size": 1,
+        "velocity_unit_mps": 1.0, "velocity_update": "anew", "support_sigmas": 3.0, "cross_attention": "parallel",
+        "refine_from": "self_encoding", "gate_kernel_size": 1,
     },
     "model.head": {"nms": "per_group", "score_threshold": 0.1, "max_boxes": 500, "attributes": "rule"},
     "model.loss": {
@@ -134,7 +135,7 @@ FULL_SIZE = {
         "depth_weight": 1.0, "radar_objectness_weight": 1.0, "occupancy_focal_weight": 1.0,
         "occupancy_dice_weight": 1.0, "gaussian_velocity_weight": 0.25, "gaussian_velocity_in_phase1": False,
         "dptf_weight": 1.0, "cell_focal_weight": 1.0, "cell_dice_weight": 1.0, "cell_lovasz_weight": 1.0,
-        "cell_velocity_weight": 0.25,
+        "cell_velocity_weight": 0.25, "velocity_groups": "boxes",
     },
     "phase": {
         "epochs": 24, "module": "TrainingModule", "task": "detection", "monitor": "val/mAP", "init_from": None,
@@ -168,14 +169,14 @@ FULL_SIZE_PHASE_2 = {
         "train_missing": True, "temporal": True,
     },
     "phase.options": {"velocity_code_weight": 1.0},
-    "model.dptf": {"max_age_s": 6.0},
+    "model.dptf": {"max_age_s": 6.0, "min_speed_mps": 0.0},
     "model.dptf.bev_path": {
-        "num_frames": 8, "memory_threshold": 0.1, "max_cells_per_frame": 4096, "velocity_compensation": True,
-        "spatial_dilation": False,
+        "num_frames": 8, "memory_threshold": 0.1, "max_cells_per_frame": 4096, "velocity_start": "zero",
+        "velocity_compensation": True, "spatial_dilation": False,
     },
     "model.dptf.gaussian_path": {
-        "num_frames": 4, "gaussians_per_frame": 256, "sampling": "farthest_point", "velocity_compensation": True,
-        "self_attention": {"num_heads": 8},
+        "num_frames": 4, "gaussians_per_frame": 256, "min_contribution": 0.0, "sampling": "farthest_point",
+        "velocity_from": "gaussian", "velocity_compensation": True, "self_attention": {"num_heads": 8},
     },
 }  # fmt: skip
 

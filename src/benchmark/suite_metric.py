@@ -86,9 +86,11 @@ def random_problem(num_samples: int, gts: int, preds: int, seed: int) -> tuple[E
     racks = _random_boxes(rng, ego, 1)
     racks.labels[:] = 0
     racks.sizes[:] = (30.0, 30.0, 6.0)
-    scenes = [tuple(rng.choice(SCENE_TAGS, 3, replace=False)) for _ in range(max(1, num_samples // 40))]
-    tags = [scenes[row * len(scenes) // num_samples] for row in range(num_samples)]
-    return EvaluationSet(tokens, ego, tags, truth, racks), predictions
+    tags = [tuple(rng.choice(SCENE_TAGS, 3, replace=False)) for _ in range(max(1, num_samples // 40))]
+    scenes = np.arange(num_samples) * len(tags) // num_samples
+    of_samples = [tags[scene] for scene in scenes]
+    times_s = 0.5 * np.arange(num_samples)
+    return EvaluationSet(tokens, ego, of_samples, truth, racks, scenes, times_s, np.arange(len(truth))), predictions
 
 
 def _random_boxes(

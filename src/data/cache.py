@@ -23,7 +23,7 @@ from src.data.tables import LARGEST, LAST_TIME_US
 from src.files.atomic_write import replacing
 from src.structures.taxonomy import ATTRIBUTES, CLASSES
 
-FORMAT = 3  # raise it when DatasetIndex or a check changes: older caches are then built again
+FORMAT = 4  # raise it when DatasetIndex or a check changes: older caches are then built again
 
 _log = logging.getLogger(__name__)
 _PLAIN = ("root", "version", "annotated")
@@ -114,6 +114,7 @@ def _check(index: DatasetIndex) -> None:
         "data_channels": (-1, len(CHANNELS)), "data_poses": (0, poses), "data_previous": (-1, files),
         "data_calibrations": (0, len(index.ego_from_sensor)), "box_labels": (LABEL_RACK, len(CLASSES)),
         "box_attributes": (-1, len(ATTRIBUTES)), "box_points": (-2, 2 * MAX_POINTS_OF_BOX + 1),
+        "box_instances": (0, 2**31),
         **{f"{name}_times_us": (1, LAST_TIME_US) for name in ("frame", "data", "pose")},
     }  # fmt: skip
     for name, (low, high) in bounds.items():

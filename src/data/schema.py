@@ -97,6 +97,7 @@ class DatasetIndex:
     box_velocities: Array  # [A, 3] m/s, NaN where unknown
     box_attributes: Array  # [A] int8, index into ATTRIBUTES, -1 for none
     box_points: Array  # [A] int32, lidar + radar returns
+    box_instances: Array  # [A] int32, row of the object that was annotated
 
     def __len__(self) -> int:
         return len(self.sample_tokens)
@@ -305,6 +306,7 @@ def _box_columns(folder: Path, samples: Table, table: Table, without_boxes: bool
     parts["box_starts"] = np.searchsorted(sample_rows[kept], np.arange(len(samples) + 1))
     columns = {"labels": labels, "centers": centers, "sizes": sizes, "rotations": rotations}
     columns |= {"velocities": velocities, "attributes": attribute_ids, "points": points.astype(np.int32)}
+    columns["instances"] = instance_rows.astype(np.int32)
     parts |= {f"box_{name}": column[kept] for name, column in columns.items()}
 
 

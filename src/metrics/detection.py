@@ -8,6 +8,9 @@ averaged over four thresholds; errors are running means over the matches at 2 m.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import numpy as np
 
 from src.metrics.checks import check_predictions
@@ -18,6 +21,7 @@ from src.metrics.curves import (
     mean_error,
     precision_and_confidence,
 )
+from src.metrics.diagnostics import FAST_MPS, FrameDiagnosis, ratios, sums_by_sample
 from src.metrics.filtering import (
     RANGE_BINS_M,
     SPEED_CLASSES_MPS,
@@ -25,25 +29,68 @@ from src.metrics.filtering import (
     official_filter,
     speed_classes,
 )
-from src.metrics.ranking import Matching, Ranking, find_candidates, match_predictions, rank_predictions
+from src.metrics.ranking import Matching, Part, Ranking, find_candidates, match_predictions, rank_predictions
 from src.metrics.scores import (
     DISTANCE_THRESHOLDS_M,
     ERROR_THRESHOLD_M,
     ERRORS,
-    DetectionScores,
     SubsetScores,
+    plain_number,
 )
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import CLASS_WITHOUT_ERRORS, CLASSES, SCENE_TAGS, TAGS_WITHOUT_SCORE
 
 Array = np.ndarray
 
-_UNDEFINED = np.array([[error in CLASS_WITHOUT_ERRORS[name] for error in ERRORS] for name in CLASSES])
+UNDEFINED_ERRORS = np.array([[error in CLASS_WITHOUT_ERRORS[name] for error in ERRORS] for name in CLASSES])
+MOVING = [CLASSES.index(name) for name in ("car", "truck", "bus", "trailer", "motorcycle")]
+"""Classes whose boxes above FAST_MPS are the moving vehicles."""
+
+
+@dataclass
+class MatchedParts:
+    """Predictions of an evaluation set, matched once: what scores, and their intervals, are read from."""
+
+    ranking: Ranking
+    matching: Matching
+    overall: Part
+    ranges: dict[str, Part]
+    speeds: dict[str, Part]
+    moving: Part | None  # None where speeds are not asked for
+    sums: dict[str, Array]  # [S, 2] see `sums_by_sample`
+    truth_kept: Array  # [k] bool, ground truth that survives the official filters
+    predictions_kept: Array  # [n] bool
+
+
+@dataclass
+class DetectionScores:
+    """An evaluation: over everything, by distance bin (`"0-25"` ...), scene tag and speed class (`"0.5-10"` ...)."""
+
+    overall: SubsetScores
+    ranges: dict[str, SubsetScores]  # empty where not asked for
+    tags: dict[str, SubsetScores]  # empty where not asked for
+    speeds: dict[str, SubsetScores]  # empty where not asked for
+    measures: dict[str, float | None]  # see `measure_parts`
+    parts: MatchedParts  # what they were read from
+
+    def as_dict(self) -> dict[str, object]:
+        """The content of metrics.json but for intervals: fractions of 1, None where a number is undefined.
+
+        A part counts a class without ground truth as the official score does (AP 0, errors 1); entries of `speeds`
+        also hold the means over the classes that are there, see `PartScores.present_means`.
+        """
+        return self.overall.as_dict(plain_number) | {
+            "ranges": {name: scores.as_dict(plain_number) for name, scores in self.ranges.items()},
+            "tags": {name: scores.as_dict(plain_number) for name, scores in self.tags.items()},
+            "speeds": {name: scores.as_dict(plain_number, True) for name, scores in self.speeds.items()},
+            "measures": self.measures,
+        }
 
 
 def score_detections(
     evaluation_set: EvaluationSet,
     predictions: DetectionTable,
+    diagnoses: Mapping[int, FrameDiagnosis] | None = None,  # by sample
     by_range: bool = True,
     by_tag: bool = True,
     by_speed: bool = True,
@@ -52,11 +99,30 @@ def score_detections(
 
     A sample of the set without predictions is scored as empty. Tags follow the official rule: samples whose scene
     carries the tag, NaN for the tags in TAGS_WITHOUT_SCORE. Distance bins are our own: see RANGE_BINS_M; so are speed
-    classes: see `_score_speeds`.
+    classes: see `_speed_parts`, and measures: see `measure_parts`.
 
     Raises DataError for predictions that cannot be scored (see `check_predictions`) and for matched ground truth
     whose size is not positive, as the official evaluator does.
     """
+    parts = match_parts(evaluation_set, predictions, diagnoses or {}, by_range, by_speed)
+    return DetectionScores(
+        overall=_score(parts.overall),
+        ranges={name: _score(part) for name, part in parts.ranges.items()},
+        tags={tag: _score_tag(parts, tag) for tag in SCENE_TAGS} if by_tag else {},
+        speeds={name: _score(part) for name, part in parts.speeds.items()},
+        measures=measure_parts(parts),
+        parts=parts,
+    )
+
+
+def match_parts(
+    evaluation_set: EvaluationSet,
+    predictions: DetectionTable,
+    diagnoses: Mapping[int, FrameDiagnosis],  # by sample
+    by_range: bool = True,
+    by_speed: bool = True,
+) -> MatchedParts:
+    """Rank and match, and say which boxes are scored together. Raises as `score_detections`."""
     check_predictions(predictions, evaluation_set.tokens)
     truth = evaluation_set.ground_truth
     kept, truth_kept = official_filter(evaluation_set, predictions), official_filter(evaluation_set, truth)
@@ -64,86 +130,96 @@ def score_detections(
     pairs = find_candidates(ranking)
     matching = match_predictions(ranking, pairs)
     everyone, every_truth = np.ones(len(ranking.rows), bool), np.ones(len(ranking.truth), bool)
-    scores = DetectionScores(
-        overall=_score_subset(ranking, matching, everyone, every_truth),
-        ranges={},
-        tags={},
-        speeds={},
-        truth_kept=truth_kept,
-        predictions_kept=kept,
-    )
+    ranges: dict[str, Part] = {}
+    speeds: dict[str, Part] = {}
+    moving = None
     if by_range:
         edges = [low for low, _ in RANGE_BINS_M[1:]]
         bins = np.digitize(ego_distances(evaluation_set, predictions), edges)[ranking.rows]
         truth_bins = np.digitize(ego_distances(evaluation_set, ranking.truth), edges)
         # Boxes of different bins never meet, so the four bins are matched at once.
-        matching_in_bins = match_predictions(ranking, pairs[bins[pairs.predictions] == truth_bins[pairs.ground_truth]])
-        scores.ranges = {
-            f"{low:.0f}-{high:.0f}": _score_subset(ranking, matching_in_bins, bins == i, truth_bins == i)
+        in_bins = match_predictions(ranking, pairs[bins[pairs.predictions] == truth_bins[pairs.ground_truth]])
+        ranges = {
+            f"{low:.0f}-{high:.0f}": Part(ranking, in_bins, bins == i, truth_bins == i)
             for i, (low, high) in enumerate(RANGE_BINS_M)
         }
-    if by_tag:
-        scores.tags = {tag: _score_tag(ranking, matching, tag) for tag in SCENE_TAGS}
     if by_speed:
-        scores.speeds = _score_speeds(ranking, matching)
-    return scores
+        speeds, moving = _speed_parts(ranking, matching)
+    found = np.zeros(len(truth), bool)
+    found[np.flatnonzero(truth_kept)[matching.ground_truth[DISTANCE_THRESHOLDS_M.index(ERROR_THRESHOLD_M)]]] = True
+    return MatchedParts(
+        ranking=ranking,
+        matching=matching,
+        overall=Part(ranking, matching, everyone, every_truth),
+        ranges=ranges,
+        speeds=speeds,
+        moving=moving,
+        sums=sums_by_sample(diagnoses, evaluation_set, truth_kept, found),
+        truth_kept=truth_kept,
+        predictions_kept=kept,
+    )
 
 
-def _score_subset(
-    ranking: Ranking,
-    matching: Matching,
-    members: Array,  # [n] or, by threshold, [4, n] bool over the ranked predictions
-    truth_members: Array,  # [k] bool over the ground truth that counts
-) -> SubsetScores:
-    """Curves and scores of some predictions and ground truth; members that matched did so with one another."""
+def measure_parts(parts: MatchedParts) -> dict[str, float | None]:
+    """What sees the claim of a memory, beside the official scores; each with the number of boxes it stands on.
+
+    `moving_AP`: AP of MOVING above FAST_MPS as one class, so that every box weighs the same; each is matched within its
+    own, and predictions follow the rule of `_speed_parts`. The others: see `sums_by_sample`.
+    """
+    measures: dict[str, float | None] = {}
+    if parts.moving is not None:
+        boxes = int(parts.moving.truth_members.sum())
+        precision = np.zeros((len(DISTANCE_THRESHOLDS_M), len(RECALLS)))
+        for listed in parts.moving.pooled_lists():
+            scores = parts.ranking.scores[listed.places]
+            precision[listed.threshold], _ = precision_and_confidence(listed.matched, scores, boxes)
+        measures = {"moving_AP": float(average_precision(precision).mean()) if boxes else None, "moving_boxes": boxes}
+    for name, ratio in ratios(parts.sums, np.ones((1, len(parts.ranking.evaluation_set.tokens)))).items():
+        measures[name] = plain_number(ratio[0])
+        if name.endswith("_recall"):
+            measures[name.replace("_recall", "_boxes")] = int(parts.sums[name][:, 1].sum())
+    return measures
+
+
+def _score(part: Part) -> SubsetScores:
+    """Curves and scores."""
     num_classes, num_points = len(CLASSES), len(RECALLS)
-    num_gt = np.bincount(ranking.truth.labels[truth_members], minlength=num_classes)
+    num_gt = np.bincount(part.ranking.truth.labels[part.truth_members], minlength=num_classes)
     precision = np.zeros((num_classes, len(DISTANCE_THRESHOLDS_M), num_points))
     confidence = np.zeros_like(precision)
     error_curves = np.ones((num_classes, len(ERRORS), num_points))
     errors = np.ones((num_classes, len(ERRORS)))
-    for t, threshold in enumerate(DISTANCE_THRESHOLDS_M):
-        if t == 0 or members.ndim == 2:
-            of_threshold = members if members.ndim == 1 else members[t]
-            places = np.flatnonzero(of_threshold)
-            scores = ranking.scores[places]
-            class_starts = np.searchsorted(places, ranking.class_starts)
-        chosen = of_threshold[matching.places[t]]
-        matched = np.searchsorted(places, matching.places[t][chosen])  # place within the subset
-        match_starts = np.searchsorted(matched, class_starts)
-        match_errors = matching.errors[chosen] if threshold == ERROR_THRESHOLD_M else None
-        for c in np.flatnonzero(np.diff(match_starts)):
-            begin, end = class_starts[c], class_starts[c + 1]
-            of_class = slice(match_starts[c], match_starts[c + 1])
-            ranks, class_scores = matched[of_class] - begin, scores[begin:end]
-            precision[c, t], confidence[c, t] = precision_and_confidence(ranks, class_scores, int(num_gt[c]))
-            if match_errors is None:
-                continue
-            match_scores = class_scores[ranks]
-            for e, values in enumerate(match_errors[of_class].T):
-                error_curves[c, e] = error_curve(values, match_scores, confidence[c, t])
-                errors[c, e] = mean_error(error_curves[c, e], confidence[c, t])
+    for listed in part.lists():
+        c, t, scores = listed.label, listed.threshold, part.ranking.scores[listed.places]
+        precision[c, t], confidence[c, t] = precision_and_confidence(listed.matched, scores, int(num_gt[c]))
+        if listed.errors is None:
+            continue
+        match_scores = scores[listed.matched]
+        for e, values in enumerate(listed.errors.T):
+            error_curves[c, e] = error_curve(values, match_scores, confidence[c, t])
+            errors[c, e] = mean_error(error_curves[c, e], confidence[c, t])
     return SubsetScores(
         num_gt=num_gt,
         ap=average_precision(precision),
-        errors=np.where(_UNDEFINED, np.nan, errors),
+        errors=np.where(UNDEFINED_ERRORS, np.nan, errors),
         precision=precision,
         confidence=confidence,
         error_curves=error_curves,
     )
 
 
-def _score_tag(ranking: Ranking, matching: Matching, tag: str) -> SubsetScores:
+def _score_tag(parts: MatchedParts, tag: str) -> SubsetScores:
     """Scores over the samples whose scene carries `tag`; samples do not meet, so the matches stay what they are."""
+    ranking = parts.ranking
     tagged = np.array([tag in tags for tags in ranking.evaluation_set.scene_tags], dtype=bool)
-    scores = _score_subset(ranking, matching, tagged[ranking.samples], tagged[ranking.truth.samples])
+    scores = _score(Part(ranking, parts.matching, tagged[ranking.samples], tagged[ranking.truth.samples]))
     if tag in TAGS_WITHOUT_SCORE:
         scores.ap, scores.errors = np.full_like(scores.ap, np.nan), np.full_like(scores.errors, np.nan)
     return scores
 
 
-def _score_speeds(ranking: Ranking, matching: Matching) -> dict[str, SubsetScores]:
-    """Scores by speed class, from the matches of the overall score.
+def _speed_parts(ranking: Ranking, matching: Matching) -> tuple[dict[str, Part], Part]:
+    """Parts by speed class, and the moving vehicles, with the matches of the overall score.
 
     A ground truth belongs to the class of its own speed, one of unknown velocity (NaN) to none. A prediction follows
     the ground truth it matches at that threshold, whatever speed it states: matched within the class it is a true
@@ -156,7 +232,10 @@ def _score_speeds(ranking: Ranking, matching: Matching) -> dict[str, SubsetScore
     followed = np.tile(stated, (len(DISTANCE_THRESHOLDS_M), 1))
     for t, places in enumerate(matching.places):
         followed[t, places] = truth[matching.ground_truth[t]]
-    return {
-        name: _score_subset(ranking, matching, followed == place, truth == place)
-        for place, name in enumerate(SPEED_CLASSES_MPS)
+    speeds = {
+        name: Part(ranking, matching, followed == place, truth == place) for place, name in enumerate(SPEED_CLASSES_MPS)
     }
+    fast = list(SPEED_CLASSES_MPS.values()).index(FAST_MPS)
+    labels = ranking.predictions.labels[ranking.rows]
+    moving = (followed >= fast) & np.isin(labels, MOVING), (truth >= fast) & np.isin(ranking.truth.labels, MOVING)
+    return speeds, Part(ranking, matching, *moving)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -51,6 +52,55 @@ class Matching:
     places: list[Array]  # 4 x [m] ascending
     ground_truth: list[Array]  # 4 x [m] row of `Ranking.truth` that the prediction took
     errors: Array  # [m at 2 m, 5]
+
+
+@dataclass
+class RankedList:
+    """What one AP is read from: the predictions of a class, or of several, at one threshold by descending score."""
+
+    label: int  # the class, -1 for several
+    threshold: int  # index into DISTANCE_THRESHOLDS_M
+    places: Array  # [n] in the ranking
+    matched: Array  # [m] ascending, which of the n matched
+    errors: Array | None  # [m, 5], at 2 m only
+
+
+@dataclass
+class Part:
+    """Some predictions and ground truth that are scored together; members that matched did so with one another."""
+
+    ranking: Ranking
+    matching: Matching
+    members: Array  # [n] or, by threshold, [4, n] bool over the ranked predictions
+    truth_members: Array  # [k] bool over the ground truth that counts
+
+    def lists(self) -> Iterator[RankedList]:
+        """One for every threshold and class with a match."""
+        for t, matched_places in enumerate(self.matching.places):
+            if t == 0 or self.members.ndim == 2:
+                members = self.members if self.members.ndim == 1 else self.members[t]
+                places = np.flatnonzero(members)
+                class_starts = np.searchsorted(places, self.ranking.class_starts)
+            chosen = members[matched_places]
+            matched = np.searchsorted(places, matched_places[chosen])
+            match_starts = np.searchsorted(matched, class_starts)
+            errors = self.matching.errors[chosen] if DISTANCE_THRESHOLDS_M[t] == ERROR_THRESHOLD_M else None
+            for c in np.flatnonzero(np.diff(match_starts)):
+                begin, of_class = class_starts[c], slice(match_starts[c], match_starts[c + 1])
+                yield RankedList(
+                    label=int(c),
+                    threshold=t,
+                    places=places[begin : class_starts[c + 1]],
+                    matched=matched[of_class] - begin,
+                    errors=None if errors is None else errors[of_class],
+                )
+
+    def pooled_lists(self) -> Iterator[RankedList]:
+        """One for every threshold over the predictions of all classes; each was matched within its own."""
+        for t, matched_places in enumerate(self.matching.places):
+            places = np.flatnonzero(self.members if self.members.ndim == 1 else self.members[t])
+            places = places[np.argsort(-self.ranking.scores[places], kind="stable")]
+            yield RankedList(-1, t, places, np.flatnonzero(np.isin(places, matched_places)), None)
 
 
 def rank_predictions(

@@ -7,13 +7,21 @@ from typing import Any
 
 from src.metrics.scores import ERRORS
 
+MEASURES = {
+    "moving_AP": "AP of moving vehicles",
+    "hidden_recall": "recall of hidden objects, seen before",
+    "unoccupied_recall": "recall of objects without an occupied cell",
+    "remembered_share": "objects that history covers",
+}
+
 
 def format_scores(metrics: Mapping[str, Any]) -> str:
-    """Tables of the content of metrics.json: a summary by distance bin, every class by distance bin, speed classes.
+    """Tables of the content of metrics.json: a summary by distance bin, every class by distance bin, speed classes,
+    measures.
 
-    `metrics` is `DetectionScores.as_dict()`, fresh or read back; a file written before there were speed classes has
-    no table of them. mAP, NDS and AP in percent, errors in their own units (m, 1 - IoU, rad, m/s, 1 - accuracy); "-"
-    where a number is undefined. By speed, means are over the classes that have ground truth there.
+    `metrics` is `DetectionScores.as_dict()`, fresh or read back; a file written before there were speed classes or
+    measures has no table of them. mAP, NDS and AP in percent, errors in their own units (m, 1 - IoU, rad, m/s,
+    1 - accuracy); "-" where a number is undefined. By speed, means are over the classes that have ground truth there.
     """
     parts = {"all": metrics} | metrics["ranges"]
     summary = [["range (m)", "mAP", "NDS", *(f"m{name}" for name in ERRORS), "boxes"]]
@@ -27,6 +35,11 @@ def format_scores(metrics: Mapping[str, Any]) -> str:
     tables = [summary, classes]
     if metrics.get("speeds"):
         tables.append(_speeds(metrics["speeds"]))
+    measures = metrics.get("measures", {})
+    if measures:
+        tables.append(_measures(measures))
+    if measures.get("radar_gaussians") is not None:
+        tables.append(_gaussians(measures))
     return "\n\n".join(map(_align, tables))
 
 
@@ -37,6 +50,24 @@ def _speeds(parts: Mapping[str, Any]) -> list[list[str]]:
         car, there = part["classes"]["car"], sum(values["num_gt"] > 0 for values in part["classes"].values())
         cars = [_percent(car["AP"]), _plain(car["AVE"])] if car["num_gt"] else ["-", "-"]
         rows.append([name, _percent(part["mAP_present"]), *errors, *cars, str(there), _boxes(part)])
+    return rows
+
+
+def _measures(measures: Mapping[str, float | None]) -> list[list[str]]:
+    rows = [["measure", "%", "boxes"]]
+    for name, words in MEASURES.items():
+        if name in measures:
+            boxes = measures.get(f"{name.rpartition('_')[0]}_boxes")
+            rows.append([words, _percent(measures[name]), "" if boxes is None else str(boxes)])
+    return rows
+
+
+def _gaussians(measures: Mapping[str, float | None]) -> list[list[str]]:
+    rows = [["Gaussians", "per frame", "near an object, %", "opacity < 0.1, %", "velocity error of movers (m/s)"]]
+    for source in (name.removesuffix("_gaussians") for name in measures if name.endswith("_gaussians")):
+        number, wrong = measures[f"{source}_gaussians"], measures[f"{source}_velocity_error"]
+        shares = [_percent(measures[f"{source}_{what}"]) for what in ("near", "faint")]
+        rows.append([source, f"{number:.0f}", *shares, _plain(wrong)])
     return rows
 
 

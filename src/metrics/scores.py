@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,101 +24,99 @@ MEAN_AP_WEIGHT = 5
 
 
 @dataclass
-class SubsetScores:
-    """Scores of one part of an evaluation: everything, a distance bin, a scene tag or a speed class. Fractions of 1."""
+class PartScores:
+    """Scores of one part of an evaluation: everything, a distance bin, a scene tag or a speed class. Fractions of 1.
 
-    num_gt: Array  # [12] int64, ground-truth boxes after the filters
-    ap: Array  # [12, 4] by class and distance threshold
-    errors: Array  # [12, 5] by class and error, NaN where undefined for the class
-    precision: Array  # [12, 4, 101] over recall
-    confidence: Array  # [12, 4, 101]
-    error_curves: Array  # [12, 5, 101] at 2 m
+    All may have leading axes, of evaluations that were made alike.
+    """
+
+    num_gt: Array  # [..., 12] int64, ground-truth boxes after the filters
+    ap: Array  # [..., 12, 4] by class and distance threshold
+    errors: Array  # [..., 12, 5] by class and error, NaN where undefined for the class
 
     @property
     def class_ap(self) -> Array:
-        """AP of each class: mean over the four thresholds, [12]."""
-        return self.ap.mean(axis=1)
+        """AP of each class: mean over the four thresholds, [..., 12]."""
+        return self.ap.mean(axis=-1)
 
     @property
-    def mean_ap(self) -> float:
+    def mean_ap(self) -> Array:
         """mAP: mean over all 12 classes; a class without ground truth counts 0."""
-        return float(self.class_ap.mean())
+        return self.class_ap.mean(axis=-1)
 
     @property
     def mean_errors(self) -> Array:
-        """mATE, mASE, mAOE, mAVE, mAAE, [5]: mean over the classes for which the error is defined."""
+        """mATE, mASE, mAOE, mAVE, mAAE, [..., 5]: mean over the classes for which the error is defined."""
         return _mean_defined(self.errors)
 
     @property
-    def nds(self) -> float:
+    def nds(self) -> Array:
         """nuScenes detection score: (5 mAP + sum of max(0, 1 - error)) / 10."""
-        total = MEAN_AP_WEIGHT * self.mean_ap + np.maximum(0.0, 1.0 - self.mean_errors).sum()
-        return float(total / (MEAN_AP_WEIGHT + len(ERRORS)))
+        total = MEAN_AP_WEIGHT * self.mean_ap + np.maximum(0.0, 1.0 - self.mean_errors).sum(axis=-1)
+        return total / (MEAN_AP_WEIGHT + len(ERRORS))
 
-    def headline(self) -> dict[str, float]:
+    def headline(self) -> dict[str, Array]:
         """mAP, NDS and the five mean errors."""
-        errors = zip(ERRORS, self.mean_errors.tolist(), strict=True)
+        errors = zip(ERRORS, np.moveaxis(self.mean_errors, -1, 0), strict=True)
         return {"mAP": self.mean_ap, "NDS": self.nds} | {f"m{name}": value for name, value in errors}
 
-    def present_means(self) -> dict[str, float | None]:
+    def present_means(self) -> dict[str, Array]:
         """`mAP_present`, `mATE_present` ...: the means over those classes alone that have ground truth in this part.
 
         They are what to read where most classes cannot occur, as in a speed class: cones and signs stand still, so
         above 0.5 m/s they take the mAP over all 12 classes down whatever the detector does, and their errors of 1
-        take the mean errors towards 1. None where no such class is there. A class that is there but never reaches
+        take the mean errors towards 1. NaN where no such class is there. A class that is there but never reaches
         recall 0.1 keeps the official error of 1, which for velocity (1 m/s) may flatter: read it beside the AP.
         """
-        present = self.num_gt > 0
-        values = np.concatenate([_mean_defined(self.class_ap[present, None]), _mean_defined(self.errors[present])])
+        values = np.concatenate([self.class_ap[..., None], self.errors], axis=-1)  # [..., 12, 6]
+        means = _mean_defined(np.where(self.num_gt[..., None] > 0, values, np.nan))
         names = ("AP", *ERRORS)
-        return {f"m{name}_present": _number(value) for name, value in zip(names, values, strict=True)}
+        return {f"m{name}_present": mean for name, mean in zip(names, np.moveaxis(means, -1, 0), strict=True)}
 
-    def as_dict(self) -> dict[str, object]:
-        """Plain numbers for JSON: mAP, NDS, the mean errors and `classes`; NaN becomes None."""
-        classes = {}
-        for row, name in enumerate(CLASSES):
-            values = {"AP": _number(self.class_ap[row])}
-            values |= {
-                f"AP@{threshold}": _number(value)
-                for threshold, value in zip(DISTANCE_THRESHOLDS_M, self.ap[row], strict=True)
-            }
-            values |= {error: _number(value) for error, value in zip(ERRORS, self.errors[row], strict=True)}
-            classes[name] = values | {"num_gt": int(self.num_gt[row])}
-        return {name: _number(value) for name, value in self.headline().items()} | {"classes": classes}
+    def by_class(self) -> dict[str, dict[str, Array]]:
+        """AP, its parts by threshold and the errors of each class."""
+        names = ("AP", *(f"AP@{threshold}" for threshold in DISTANCE_THRESHOLDS_M), *ERRORS)
+        values = np.concatenate([self.class_ap[..., None], self.ap, self.errors], axis=-1)  # [..., 12, 10]
+        rows = zip(CLASSES, np.moveaxis(values, (-2, -1), (0, 1)), strict=True)
+        return {label: dict(zip(names, of_class, strict=True)) for label, of_class in rows}
+
+    def as_dict(self, number: Callable[[Array], object], by_speed: bool = False) -> dict[str, object]:
+        """For JSON: mAP, NDS, the mean errors and `classes`, each as `number` says it; of a speed class also the means
+        over the classes that are there."""
+        values = self.headline() | (self.present_means() if by_speed else {})
+        classes = {label: _each(of_class, number) for label, of_class in self.by_class().items()}
+        return _each(values, number) | {"classes": classes}
 
 
 @dataclass
-class DetectionScores:
-    """An evaluation: over everything, by distance bin (`"0-25"` ...), scene tag and speed class (`"0.5-10"` ...)."""
+class SubsetScores(PartScores):
+    """The scores of one evaluation with the curves they are read from."""
 
-    overall: SubsetScores
-    ranges: dict[str, SubsetScores]  # empty where not asked for
-    tags: dict[str, SubsetScores]  # empty where not asked for
-    speeds: dict[str, SubsetScores]  # empty where not asked for
-    truth_kept: Array  # [k] bool, ground truth that survives the official filters
-    predictions_kept: Array  # [n] bool
+    precision: Array  # [12, 4, 101] over recall
+    confidence: Array  # [12, 4, 101]
+    error_curves: Array  # [12, 5, 101] at 2 m
 
-    def as_dict(self) -> dict[str, object]:
-        """The content of metrics.json: fractions of 1, None where a number is undefined.
+    def as_dict(self, number: Callable[[Array], object], by_speed: bool = False) -> dict[str, object]:
+        """As the base, with the number of boxes of each class."""
+        content = super().as_dict(number, by_speed)
+        for row, values in enumerate(content["classes"].values()):
+            values["num_gt"] = int(self.num_gt[row])
+        return content
 
-        A part counts a class without ground truth as the official score does (AP 0, errors 1); entries of `speeds`
-        also hold the means over the classes that are there, see `SubsetScores.present_means`.
-        """
-        return self.overall.as_dict() | {
-            "ranges": {name: scores.as_dict() for name, scores in self.ranges.items()},
-            "tags": {name: scores.as_dict() for name, scores in self.tags.items()},
-            "speeds": {name: scores.as_dict() | scores.present_means() for name, scores in self.speeds.items()},
-        }
+
+def plain_number(value: Array) -> float | None:
+    """For JSON."""
+    return None if np.isnan(value) else float(value)
+
+
+def _each(values: dict[str, Array], number: Callable[[Array], object]) -> dict[str, object]:
+    return {name: number(value) for name, value in values.items()}
 
 
 def _mean_defined(
-    values: Array,  # [classes, m]
+    values: Array,  # [..., classes, m]
 ) -> Array:
-    """Mean over the classes of what is not NaN, NaN where nothing is: [m]."""
+    """Mean over the classes of what is not NaN, NaN where nothing is: [..., m]."""
     defined = ~np.isnan(values)
-    counts = defined.sum(axis=0)
-    return np.where(counts > 0, np.where(defined, values, 0.0).sum(axis=0) / np.maximum(counts, 1), np.nan)
-
-
-def _number(value: float) -> float | None:
-    return None if np.isnan(value) else float(value)
+    counts = defined.sum(axis=-2)
+    return np.where(counts > 0, np.where(defined, values, 0.0).sum(axis=-2) / np.maximum(counts, 1), np.nan)

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired
 
 import numpy as np
+import torch
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, with_config
 from typing_extensions import TypedDict
 
 from src.errors import DataError
 from src.files.atomic_write import replacing
-from src.geometry.transforms import matrix_to_quaternion, rotation_zyx
+from src.geometry.transforms import invert_rigid, matrix_to_quaternion, quaternion_to_matrix, rotation_zyx, yaw_of
 from src.metrics.checks import LARGEST, SMALLEST_ROTATION, check_predictions
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
@@ -260,4 +261,25 @@ def to_global(
         num_points=np.full(n, -1, dtype=np.int64)
         if columns["num_points"] is None
         else columns["num_points"].astype(np.int64),
+    )
+
+
+def to_ego(
+    table: DetectionTable,
+    global_from_ego: Array,  # [4, 4] float64 rotation and translation
+) -> Boxes3D:
+    """Rows of a table, of one sample, in its ego frame: what `to_global` undoes."""
+    ego_from_global = invert_rigid(global_from_ego)
+    rotation = ego_from_global[:3, :3]
+    floats = {
+        "centers": table.centers @ rotation.T + ego_from_global[:3, 3],
+        "sizes": table.sizes[:, [1, 0, 2]],
+        "yaws": yaw_of(rotation @ quaternion_to_matrix(table.rotations)),
+        "velocities": table.velocities @ rotation[:2, :2].T,
+        "scores": table.scores,
+    }
+    integers = {"labels": table.labels, "attributes": table.attributes, "num_points": table.num_points}
+    return Boxes3D(
+        **{name: torch.from_numpy(values.astype(np.float32)) for name, values in floats.items()},
+        **{name: torch.from_numpy(values) for name, values in integers.items()},
     )

@@ -147,5 +147,5 @@ class Detector(nn.Module, ABC):
         return {}
 
     def evidence(self, output: Any) -> Evidence:
-        """What pictures of a frame can show beside its boxes."""
+        """What pictures of a frame can show and measures can compare with the truth, beside its boxes."""
         return Evidence()

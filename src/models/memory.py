@@ -79,6 +79,16 @@ def motions(frames: Sequence[RememberedFrame], batch: FrameBatch, max_age_s: flo
     return stacked.motion(batch, max_age_s)
 
 
+def moving(
+    velocities: Tensor,  # [..., 2] m/s
+    min_speed_mps: float,
+) -> Tensor:  # [..., 2]
+    """The velocities, zero where they are slower: what stands must not drift on the error of its speed."""
+    if min_speed_mps == 0:
+        return velocities
+    return velocities * (velocities.norm(dim=-1, keepdim=True) >= min_speed_mps)
+
+
 @dataclass(frozen=True)
 class FrameMemory(TensorFields, Generic[Frame]):
     """The last key frames of each of B streams, newest first. A value: what changes it makes a new one."""

@@ -37,9 +37,14 @@ class Splat:
     occupied: Sites  # Omega, the cells with alpha above the threshold, shape (B, rows, cols)
     features: Tensor  # [w, C] F_G at the occupied cells
     occupied_rows: Tensor  # [w] int64, row of each occupied cell in the support
-    active: Tensor  # [G] bool, the Gaussian reaches an occupied cell
-    peak_cell: Tensor  # [G] int64, linear key of the occupied cell where it contributes most, -1 if not active
+    peak_cell: Tensor  # [G] int64, linear key of the occupied cell where it contributes most, -1 if it reaches none
+    peak_contribution: Tensor  # [G] a_i there, 0 if it reaches none
     num_cut: int  # occupied cells dropped by the max_cells guard
+
+    @property
+    def active(self) -> Tensor:  # [G] bool
+        """The Gaussian reaches an occupied cell."""
+        return self.peak_cell >= 0
 
     @property
     def occupancy(self) -> Tensor:  # [n]
@@ -98,17 +103,19 @@ def splat_gaussians(
         gaussians = [x.to(dtype) for x in (means, scales, directions, opacity_logits, features)]
         pairs, support = gaussian_cells(*gaussians[:3], batch, grid, batch_size, support_sigmas)
         choice = (support, threshold, max_cells, grid.rows * grid.cols)
-        log_free, out, occupied_rows, peak_cell, num_cut = implementation(splat_reference)(
+        log_free, out, occupied_rows, peak_cell, peak_q, num_cut = implementation(splat_reference)(
             *gaussians, pairs, choice, smooth_cap
         )
+        with torch.no_grad():
+            peak_contribution = gaussians[3].sigmoid() * torch.exp(-0.5 * peak_q)
     return Splat(
         support=support,
         log_free=log_free,
         occupied=Sites.from_linear(support.index_select(0, occupied_rows), (batch_size, grid.rows, grid.cols)),
         features=out,
         occupied_rows=occupied_rows,
-        active=peak_cell >= 0,
         peak_cell=peak_cell,
+        peak_contribution=peak_contribution,
         num_cut=num_cut,
     )
 
@@ -195,8 +202,8 @@ def splat_reference(
     pairs: GaussianCellPairs,
     choice: Choice,
     smooth_cap: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
-    """Plain torch form: `log_free`, `features`, `occupied_rows`, `peak_cell` and `num_cut` of a `Splat`."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, int]:
+    """Plain torch form: `log_free`, `features`, `occupied_rows`, `peak_cell`, its q (inf for none) and `num_cut`."""
     support = choice[0]
     q = _Distance.apply(means, scales, directions, pairs)
     log_free = _LogFree.apply(q, opacity_logits, pairs, smooth_cap)
@@ -212,7 +219,7 @@ def splat_reference(
     distance = q.index_select(0, chosen)
     out = weighted_segment_sum(features, torch.exp(-0.5 * distance), gaussian, cell, len(occupied_rows), by_gaussian)
     keys = support.index_select(0, occupied_rows).index_select(0, cell)
-    return log_free, out, occupied_rows, _nearest_cell(distance.detach(), gaussian, keys, len(means)), num_cut
+    return log_free, out, occupied_rows, *_nearest_cell(distance.detach(), gaussian, keys, len(means)), num_cut
 
 
 def occupied_cells(
@@ -237,13 +244,13 @@ def _nearest_cell(
     gaussian: Tensor,  # [pairs]
     key: Tensor,  # [pairs]
     num: int,
-) -> Tensor:  # [num] int64
-    """Key of the cell with the smallest q per Gaussian (the largest contribution), lowest key on ties, -1 if none."""
+) -> tuple[Tensor, Tensor]:  # [num] int64, [num]
+    """Key of the cell with the smallest q per Gaussian (the largest contribution), lowest on ties, -1 if none; q."""
     least = q.new_full((num,), math.inf).scatter_reduce_(0, gaussian, q, "amin")
     none = torch.iinfo(torch.int64).max
     candidates = torch.where(q == least.index_select(0, gaussian), key, none)
     peak = key.new_full((num,), none).scatter_reduce_(0, gaussian, candidates, "amin")
-    return torch.where(peak == none, -1, peak)
+    return torch.where(peak == none, -1, peak), least
 
 
 def _gaussian_sum(values: Tensor, pairs: GaussianCellPairs) -> Tensor:

@@ -67,6 +67,7 @@ class EvaluationSet:
     """The samples of one split in scoring (table) order, with everything a score needs.
 
     `ground_truth` holds the 12 classes before any filter, `racks` the bicycle racks (labels are all 0 there).
+    Raises ValueError when the columns' lengths disagree.
     """
 
     tokens: list[str]  # S sample tokens
@@ -74,11 +75,18 @@ class EvaluationSet:
     scene_tags: list[tuple[str, ...]]  # S: the tags of each sample's scene
     ground_truth: DetectionTable
     racks: DetectionTable
+    scenes: Array  # [S] int64, the same number for samples of one scene
+    times_s: Array  # [S] float64, of the key frames
+    instances: Array  # [k] int64, the same number for annotations of one object
 
     def __post_init__(self) -> None:
-        if self.ego_centers.shape != (len(self.tokens), 3) or len(self.scene_tags) != len(self.tokens):
+        samples = (len(self.tokens),)
+        wanted = {"ego_centers": (*samples, 3), "scenes": samples, "times_s": samples}
+        wanted["instances"] = (len(self.ground_truth),)
+        found = {name: getattr(self, name).shape for name in wanted}
+        if found != wanted or len(self.scene_tags) != len(self.tokens):
             raise ValueError(
-                f"EvaluationSet of {len(self.tokens)} samples: ego_centers {self.ego_centers.shape} and "
-                f"{len(self.scene_tags)} tag lists do not match"
+                f"EvaluationSet of {len(self.tokens)} samples: {found} and {len(self.scene_tags)} tag lists do not "
+                f"match {wanted}"
             )
         self.index_of = {token: row for row, token in enumerate(self.tokens)}

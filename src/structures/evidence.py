@@ -1,4 +1,4 @@
-"""What a detector shows of its inner state, for pictures: its Gaussians, where it looks, what it remembers."""
+"""What a detector shows of its inner state, for pictures and measures: its Gaussians, where it looks, its memory."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from src.geometry.bev_grid import BEVGrid
 from src.structures.gaussians import GaussianSet
 
 
@@ -21,11 +22,20 @@ class WarpedPoints:
 
 
 @dataclass
-class Evidence:
-    """Of the first sample of a batch; None for what a model does not have."""
+class SplattedCells:
+    """The cells that the Gaussians of a batch reach."""
 
-    gaussians: GaussianSet | None = None
-    occupied_cells: Tensor | None = None  # [n, 2] int64 (row, col)
-    occupancy: Tensor | None = None  # [n] of these cells, 0..1
+    grid: BEVGrid
+    indices: Tensor  # [n, 3] int64 (sample, row, col)
+    occupancy: Tensor  # [n] 0..1
+    occupied: Tensor  # [n] bool, the model goes on with the cell
+
+
+@dataclass
+class Evidence:
+    """Of a batch, the warped memory of its first sample; None for what a model does not have."""
+
+    gaussians: GaussianSet | None = None  # refined, history among them
+    cells: SplattedCells | None = None
     warped_gaussians: WarpedPoints | None = None  # empty where nothing is remembered yet
     warped_cells: WarpedPoints | None = None  # empty where nothing is remembered yet

@@ -10,10 +10,11 @@ from typing import Any, ClassVar, Self
 from torch import nn
 
 from src.data.datamodule import DetectionDataModule
-from src.metrics.detection import score_detections
+from src.metrics.bootstrap import with_intervals
+from src.metrics.detection import DetectionScores, score_detections
+from src.metrics.diagnostics import FrameDiagnosis, diagnose
 from src.metrics.score_text import format_scores
-from src.metrics.scores import DetectionScores
-from src.metrics.submission import to_global
+from src.metrics.submission import to_ego, to_global
 from src.models.detector import Detector
 from src.pictures.comparison import BarPanel, draw_comparison
 from src.reliability.processes import gather_by_rank
@@ -80,8 +81,10 @@ class DetectionEvaluator(Evaluator):
         super().__init__()
         self.evaluation_set = evaluation_set
         self.boxes: dict[int, DetectionTable] = {}  # by sample, a row of the evaluation set's tokens
+        self.diagnoses: dict[int, FrameDiagnosis] = {}  # by sample as well
         self.scores: DetectionScores | None = None
         self.detections: DetectionTable | None = None
+        self.content: dict[str, Any] | None = None  # of metrics.json
 
     @classmethod
     def of(cls, datamodule: DetectionDataModule) -> DetectionEvaluator:
@@ -91,28 +94,35 @@ class DetectionEvaluator(Evaluator):
     def reset(self) -> None:
         """Forget the boxes of an earlier pass."""
         self.boxes.clear()
+        self.diagnoses.clear()
 
     def update(self, model: Detector, output: Any, batch: FrameBatch) -> None:
-        """Decode, bring the boxes to the global frame, keep them by sample."""
-        for token, boxes, global_from_ego in zip(
-            batch.tokens, model.decode(output), batch.global_from_ego.cpu().numpy(), strict=True
-        ):
-            sample = self.evaluation_set.index_of[token]
-            self.boxes.setdefault(sample, to_global(boxes.to("cpu"), global_from_ego, sample))
+        """Decode, bring the boxes to the global frame, keep them by sample beside what they were made of."""
+        samples = [self.evaluation_set.index_of[token] for token in batch.tokens]
+        poses, truth = batch.global_from_ego.cpu().numpy(), self.evaluation_set.ground_truth
+        in_ego = [to_ego(truth[truth.samples == sample], pose) for sample, pose in zip(samples, poses, strict=True)]
+        in_aug = [boxes.to(batch.device).transform(a) for boxes, a in zip(in_ego, batch.aug_from_ego, strict=True)]
+        diagnoses = diagnose(model.evidence(output), batch, in_aug)
+        for sample, boxes, pose, diagnosis in zip(samples, model.decode(output), poses, diagnoses, strict=True):
+            self.boxes.setdefault(sample, to_global(boxes.to("cpu"), pose, sample))
+            self.diagnoses.setdefault(sample, diagnosis)
 
     def compute(self) -> dict[str, float]:
         """mAP, NDS and the mean errors."""
         tables: dict[int, DetectionTable] = {}
-        for of_rank in gather_by_rank(self.boxes):
-            tables = of_rank | tables
+        diagnoses: dict[int, FrameDiagnosis] = {}
+        for boxes_of_rank, diagnoses_of_rank in gather_by_rank((self.boxes, self.diagnoses)):
+            tables, diagnoses = boxes_of_rank | tables, diagnoses_of_rank | diagnoses
         in_order = [tables[sample] for sample in sorted(tables)]
         self.detections = DetectionTable.concatenate([DetectionTable.empty(), *in_order])
-        self.scores = score_detections(self.evaluation_set, self.detections)
+        self.scores, self.content = score_detections(self.evaluation_set, self.detections, diagnoses), None
         return self.scores.overall.headline()
 
     def as_dict(self) -> dict[str, Any]:
-        """See `DetectionScores.as_dict`."""
-        return self.scores.as_dict()
+        """See `with_intervals`, which is asked once: a validation in the middle of a training does without."""
+        if self.content is None:
+            self.content = with_intervals(self.scores)
+        return self.content
 
     @staticmethod
     def describe(metrics: Mapping[str, Any]) -> str:

@@ -78,8 +78,9 @@ def scene_of(
     )
     if evidence.gaussians is not None:
         scene.gaussians = _gaussians(evidence.gaussians)
-    if evidence.occupied_cells is not None:
-        scene.occupancy = (_numpy(evidence.occupied_cells), _numpy(evidence.occupancy))
+    if evidence.cells is not None:
+        shown = evidence.cells.indices[:, 0] == 0
+        scene.occupancy = (_numpy(evidence.cells.indices[shown, 1:]), _numpy(evidence.cells.occupancy[shown]))
     return scene
 
 

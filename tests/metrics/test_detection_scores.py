@@ -12,6 +12,7 @@ from src.metrics.score_text import format_scores
 from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERRORS
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import ATTRIBUTES, CLASSES, SCENE_TAGS, TAGS_WITHOUT_SCORE
+from tests.evaluation_sets import set_of
 
 OFFICIAL_ERRORS = ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
 
@@ -70,8 +71,8 @@ def test_curves_agree_with_official_curves(golden, scores):
 
 def test_filters_keep_the_official_boxes(golden, golden_set, golden_predictions, scores):
     for table, kept, expected in (
-        (golden_set.ground_truth, scores.truth_kept, golden["expected"]["gt_kept"]),
-        (golden_predictions, scores.predictions_kept, golden["expected"]["pred_kept"]),
+        (golden_set.ground_truth, scores.parts.truth_kept, golden["expected"]["gt_kept"]),
+        (golden_predictions, scores.parts.predictions_kept, golden["expected"]["pred_kept"]),
     ):
         for sample, token in enumerate(golden_set.tokens):
             assert np.flatnonzero(kept[table.samples == sample]).tolist() == expected[token]
@@ -80,7 +81,7 @@ def test_filters_keep_the_official_boxes(golden, golden_set, golden_predictions,
 def test_as_dict_is_plain_json(scores):
     content = scores.as_dict()
     numbers = ["mAP", "NDS", "mATE", "mASE", "mAOE", "mAVE", "mAAE"]
-    assert list(content) == [*numbers, "classes", "ranges", "tags", "speeds"]
+    assert list(content) == [*numbers, "classes", "ranges", "tags", "speeds", "measures"]
     car = ["AP", "AP@0.5", "AP@1.0", "AP@2.0", "AP@4.0", *ERRORS, "num_gt"]
     assert list(content["classes"]) == list(CLASSES) and list(content["classes"]["car"]) == car
     assert content["classes"]["traffic_cone"]["AVE"] is None
@@ -117,7 +118,7 @@ def boxes(xy, label="car", scores=None, points=10, samples=None) -> DetectionTab
 
 
 def one_sample(truth, racks=None, tags=("weather.clear",)) -> EvaluationSet:
-    return EvaluationSet(["a"], np.zeros((1, 3)), [tags], truth, racks or DetectionTable.empty())
+    return set_of(truth, tags=tags, racks=racks or DetectionTable.empty())
 
 
 def class_ap(evaluation_set, predictions, label="car", **options):
@@ -156,10 +157,10 @@ def test_a_match_is_nearer_than_the_threshold():
 
 def test_range_is_exclusive_and_zero_points_are_dropped():
     truth = boxes([(150, 0), (149.9, 0)])
-    kept = score_detections(one_sample(truth), boxes([(150, 0)], scores=[0.5])).truth_kept
+    kept = score_detections(one_sample(truth), boxes([(150, 0)], scores=[0.5])).parts.truth_kept
     assert kept.tolist() == [False, True]
     found = score_detections(one_sample(truth), boxes([(10, 0)], scores=[0.5], points=0))
-    assert found.predictions_kept.tolist() == [False]
+    assert found.parts.predictions_kept.tolist() == [False]
 
 
 def test_a_rack_holds_its_border_in_all_three_directions():
@@ -170,7 +171,7 @@ def test_a_rack_holds_its_border_in_all_three_directions():
     cycles.centers[4, 2] = 1.001
     cars = boxes([(10, 0)], scores=[0.5])
     found = score_detections(one_sample(boxes([(50, 0)]), rack), DetectionTable.concatenate([cycles, cars]))
-    assert found.predictions_kept.tolist() == [False, True, False, True, True, True]
+    assert found.parts.predictions_kept.tolist() == [False, True, False, True, True, True]
 
 
 def test_ranges_match_within_the_bin_only():

@@ -10,8 +10,9 @@ from src.metrics.detection import score_detections
 from src.metrics.filtering import speed_classes
 from src.metrics.score_text import format_scores
 from src.metrics.scores import DISTANCE_THRESHOLDS_M
-from src.structures.detections import DetectionTable, EvaluationSet
+from src.structures.detections import DetectionTable
 from src.structures.taxonomy import ATTRIBUTES, CLASSES
+from tests.evaluation_sets import set_of
 
 NAMES = ["0-0.5", "0.5-10", "10-25", "25+"]
 NAN = float("nan")
@@ -37,7 +38,7 @@ def boxes(rows, label="car", **columns) -> DetectionTable:
 
 
 def speeds_of(truth, predictions):
-    evaluation_set = EvaluationSet(["a"], np.zeros((1, 3)), [()], truth, DetectionTable.empty())
+    evaluation_set = set_of(truth)
     return score_detections(evaluation_set, predictions).speeds
 
 
@@ -86,6 +87,28 @@ def test_matching_is_done_once_over_all_speeds():
     assert speeds["0.5-10"].class_ap[0] == 0 and speeds["0.5-10"].num_gt[0] == 1
 
 
+def measures_of(truth, predictions):
+    return score_detections(set_of(truth), predictions).measures
+
+
+def test_moving_vehicles_are_ranked_as_one_class():
+    truth = DetectionTable.concatenate(
+        [
+            boxes([(10, 30, 0)]),
+            boxes([(40, 12, 0)], "truck"),
+            boxes([(60, 9, 0)], "bus"),
+            boxes([(30, 20, 0)], "bicycle"),
+        ]
+    )
+    # A false positive of a truck between the two hits: precision is 1 to recall 0.5, then rises to 2/3 at 1.
+    found = [boxes([(10, 1, 0.9)]), boxes([(90, 15, 0.8), (40, 12, 0.7)], "truck"), boxes([(60, 9, 0.95)], "bus")]
+    measures = measures_of(truth, DetectionTable.concatenate(found))
+    recall = np.linspace(0, 1, 101)[11:]
+    precision = np.where(recall < 0.5, 1.0, 0.5 + (2 / 3 - 0.5) * (recall - 0.5) / 0.5)
+    assert measures == {"moving_AP": pytest.approx((precision - 0.1).mean() / 0.9), "moving_boxes": 2}
+    assert measures_of(boxes([(60, 9, 0)]), boxes([(60, 9, 0.9)])) == {"moving_AP": None, "moving_boxes": 0}
+
+
 def test_unknown_velocities():
     truth = boxes([(10, NAN, 0), (40, 5, 0), (60, 5, 0)])
     predictions = boxes([(10, 5, 0.9), (80, NAN, 0.85), (40, 5, 0.8), (60, NAN, 0.7)])
@@ -108,7 +131,7 @@ def test_means_over_the_classes_that_are_there():
 
 def test_means_where_nothing_is_there_are_undefined():
     cones = boxes([(10, 0, 0.5)], label="traffic_cone")
-    evaluation_set = EvaluationSet(["a"], np.zeros((1, 3)), [()], cones, DetectionTable.empty())
+    evaluation_set = set_of(cones)
     content = score_detections(evaluation_set, cones).as_dict()
     assert set(content["speeds"]["25+"].keys() - content["ranges"]["0-25"].keys()) == {
         f"m{name}_present" for name in ("AP", "ATE", "ASE", "AOE", "AVE", "AAE")
@@ -121,13 +144,14 @@ def test_means_where_nothing_is_there_are_undefined():
 
 def test_table_for_the_terminal():
     truth = boxes([(10, 5, 0)])
-    evaluation_set = EvaluationSet(["a"], np.zeros((1, 3)), [()], truth, DetectionTable.empty())
+    evaluation_set = set_of(truth)
     content = score_detections(evaluation_set, boxes([(10, 7, 0.9)])).as_dict()
     table = [line.split() for line in format_scores(content).split("\n\n")[2].splitlines()]
     assert table[3] == ["0.5-10", "100.0", "0.000", "0.000", "0.000", "2.000", "0.000", "100.0", "2.000", "1", "1"]
     assert table[4] == ["10-25", *["-"] * 8, "0", "0"]
-    del content["speeds"]
-    assert len(format_scores(content).split("\n\n")) == 2, "files written before speed classes existed can be shown"
+    assert format_scores(content).splitlines()[-1].split() == ["AP", "of", "moving", "vehicles", "-", "0"]
+    del content["speeds"], content["measures"]
+    assert len(format_scores(content).split("\n\n")) == 2, "files written before there were such tables can be shown"
 
 
 # ------------------------------------------------------------------ written again, box by box
@@ -201,7 +225,7 @@ def test_agrees_with_the_evaluation_written_again(seed):
         ego = evaluation_set.ego_centers[table.samples]
         table.centers = ego + (table.centers - ego) * 0.1
     scores = score_detections(evaluation_set, predictions)
-    truth, predictions = truth[scores.truth_kept], predictions[scores.predictions_kept]
+    truth, predictions = truth[scores.parts.truth_kept], predictions[scores.parts.predictions_kept]
     seen = 0
     for (low, high), part in zip(
         [(0, 0.5), (0.5, 10), (10, 25), (25, np.inf)], (scores.speeds[name] for name in NAMES), strict=True
@@ -220,6 +244,6 @@ def test_agrees_with_the_evaluation_written_again(seed):
 def test_classes_of_speed_share_out_all_ground_truth_of_known_velocity():
     evaluation_set, predictions = random_problem(10, 40, 80, seed=7)
     scores = score_detections(evaluation_set, predictions)
-    known = ~np.isnan(evaluation_set.ground_truth.velocities).any(axis=1) & scores.truth_kept
-    assert sum(part.num_gt.sum() for part in scores.speeds.values()) == known.sum() < scores.truth_kept.sum()
+    known = ~np.isnan(evaluation_set.ground_truth.velocities).any(axis=1) & scores.parts.truth_kept
+    assert sum(part.num_gt.sum() for part in scores.speeds.values()) == known.sum() < scores.parts.truth_kept.sum()
     assert score_detections(evaluation_set, predictions, by_speed=False).speeds == {}

@@ -11,7 +11,7 @@ import torch
 from src.errors import DataError
 from src.geometry.transforms import pose_matrix
 from src.metrics.detection import score_detections
-from src.metrics.submission import load_submission, to_global, write_submission
+from src.metrics.submission import load_submission, to_ego, to_global, write_submission
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
 
@@ -267,3 +267,25 @@ def test_a_tilted_ego_tilts_its_boxes():
 
 def test_no_boxes_reach_the_global_frame():
     assert len(to_global(Boxes3D.empty(), np.eye(4), 0)) == 0
+
+
+def test_boxes_come_back_to_the_ego_frame():
+    tilt, place = np.array([0.98, 0.02, -0.03, 0.2]), np.array([7.0e5, 5.3e6, 0.25])
+    level = np.array([0.9, 0, 0, -0.4])
+    rng = np.random.default_rng(1)
+    boxes = Boxes3D(
+        centers=torch.from_numpy(rng.uniform(-150, 150, (5, 3)).astype(np.float32)),
+        sizes=torch.rand(5, 3) + 0.5,
+        yaws=torch.linspace(-3, 3, 5),
+        velocities=torch.tensor([[20.0, -3.0]]).repeat(5, 1),
+        labels=torch.arange(5),
+        attributes=torch.arange(-1, 4),
+        scores=torch.linspace(0, 1, 5),
+        num_points=torch.arange(5),
+    )
+    for rotation, names in ((tilt, ("centers", "sizes", "yaws")), (level, ("velocities",))):
+        pose = pose_matrix(rotation, place)
+        back = to_ego(to_global(boxes, pose, 0), pose)
+        for name in (*names, "labels", "attributes", "scores", "num_points"):
+            torch.testing.assert_close(getattr(back, name), getattr(boxes, name), rtol=0, atol=1e-5)
+    assert len(to_ego(DetectionTable.empty(), np.eye(4))) == 0

@@ -99,6 +99,7 @@ def test_equals_brute_force_with_two_samples(sigmas):
     best = torch.where(occupied[batch], contribution, -1.0).max(1)
     assert torch.equal(out.active, best.values > 0)
     assert torch.equal(out.peak_cell, torch.where(best.values > 0, best.indices + batch * 48, -1))
+    torch.testing.assert_close(out.peak_contribution, best.values.clamp(min=0), rtol=0, atol=1e-4)  # uncapped
 
 
 @pytest.mark.parametrize("smooth_cap", [False, True])

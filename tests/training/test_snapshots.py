@@ -13,10 +13,11 @@ import torch
 from torch import nn
 
 from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.doppler import VelocityStart
 from src.models.detector import Detector, Objective
 from src.models.horizon3d.bev_path import BEVPathConfig, WarpedCells
 from src.models.horizon3d.dptf import DPTFConfig, DPTFOutput, warped_evidence
-from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling
+from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling, VelocityFrom
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
@@ -113,15 +114,18 @@ def evidence_of(settings: DPTFConfig | None, dptf: DPTFOutput | None) -> Evidenc
 
 def config(bev: bool = True, gaussians: bool = True, compensated: bool = True) -> DPTFConfig:
     bev_path = BEVPathConfig(
-        num_frames=8, memory_threshold=0.1, max_cells_per_frame=9, velocity_compensation=compensated,
-        spatial_dilation=False,
+        num_frames=8, memory_threshold=0.1, max_cells_per_frame=9, velocity_start=VelocityStart.zero,
+        velocity_compensation=compensated, spatial_dilation=False,
     )  # fmt: skip
     gaussian_path = GaussianPathConfig(
-        num_frames=4, gaussians_per_frame=9, sampling=Sampling.random, velocity_compensation=compensated,
-        self_attention=None,
+        num_frames=4, gaussians_per_frame=9, min_contribution=0.0, sampling=Sampling.random,
+        velocity_from=VelocityFrom.gaussian, velocity_compensation=compensated, self_attention=None,
     )  # fmt: skip
     return DPTFConfig(
-        max_age_s=6.0, bev_path=bev_path if bev else None, gaussian_path=gaussian_path if gaussians else None
+        max_age_s=6.0,
+        min_speed_mps=0.0,
+        bev_path=bev_path if bev else None,
+        gaussian_path=gaussian_path if gaussians else None,
     )
 
 

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import lightning as L
-import numpy as np
 import torch
 from torch import nn
 from torch.utils.data import DataLoader, Sampler
@@ -12,13 +11,14 @@ from src.models.detector import Detector, Objective
 from src.reliability.processes import is_main_process
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
-from src.structures.detections import DetectionTable, EvaluationSet
+from src.structures.detections import DetectionTable
 from src.training.evaluator import DetectionEvaluator
 from src.training.fit import build_loggers, build_trainer
 from src.training.optim import OptimConfig
 from src.training.phases import PhaseConfig
 from src.training.temporal_module import TemporalModule
 from src.training.trainer_config import Accelerator, OnNonfinite, TrainerConfig
+from tests.evaluation_sets import set_of
 
 STEPS = 3  # of one epoch
 EPOCHS = 3
@@ -84,9 +84,7 @@ def toy_batch(streams, starts, number=0):
 
 def toy_evaluation_set():
     tokens = [f"frame {number} {row}" for number in range(100, 103) for row in range(2)]
-    return EvaluationSet(
-        tokens, np.zeros((len(tokens), 3)), [()] * len(tokens), DetectionTable.empty(), DetectionTable.empty()
-    )
+    return set_of(DetectionTable.empty(), tokens)
 
 
 class Positions(Sampler):

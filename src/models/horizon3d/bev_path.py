@@ -11,11 +11,12 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
+from src.models.backbones.doppler import VelocityStart
 from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.layers.merging import block_diagonal, joined_convs
 from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv, TemporalConv
-from src.models.memory import motions
+from src.models.memory import motions, moving
 from src.ops.segment_reduce import segment_mean, topk_per_sample
 from src.ops.sites import Sites
 from src.structures.batch import FrameBatch
@@ -37,6 +38,7 @@ class BEVPathConfig:
     num_frames: int  # remembered key frames
     memory_threshold: float  # tau_mem, occupancy from which a cell is remembered
     max_cells_per_frame: int  # guard: the most occupied cells of a frame
+    velocity_start: VelocityStart  # what the predicted velocity of a cell is added to
     velocity_compensation: bool  # move cells by their own velocity; off: by the ego motion alone (Table 6)
     spatial_dilation: bool  # literal strided convolutions, which spread every cell to its neighbours
 
@@ -107,8 +109,8 @@ class BEVPath(nn.Module):
         self.occupancy = nn.ModuleList([occupancy, block_diagonal([first, second])])
         self.velocity = None
 
-    def predict(self, fused: SparseBEV) -> CellPrediction:
-        """Occupancy and velocity of every cell of F_fuse."""
+    def predict(self, fused: SparseBEV, doppler: SparseBEV | None = None) -> CellPrediction:
+        """Occupancy and velocity of every cell of F_fuse; the velocity may start from what the radar measures there."""
         values: list[Tensor] = []
         for head in (self.occupancy, self.velocity):
             if head is not None:
@@ -117,7 +119,10 @@ class BEVPath(nn.Module):
                     values.append(head[1](hidden.float()))
         if self.velocity is None:
             values = list(values[0].split([1, 2], dim=1))
-        return CellPrediction(values[0].squeeze(1), VELOCITY_UNIT_MPS * values[1])
+        velocities = VELOCITY_UNIT_MPS * values[1]
+        if self.config.velocity_start is VelocityStart.doppler:
+            velocities = velocities + doppler.lookup(fused.indices)
+        return CellPrediction(values[0].squeeze(1), velocities)
 
     @torch.no_grad()
     def store(self, fused: SparseBEV, cells: CellPrediction, batch: FrameBatch) -> StoredCells:
@@ -140,10 +145,13 @@ class BEVPath(nn.Module):
         )
 
     @torch.no_grad()
-    def recall(self, memory: Memory, batch: FrameBatch, max_age_s: float) -> WarpedCells | None:
+    def recall(
+        self, memory: Memory, batch: FrameBatch, max_age_s: float, min_speed_mps: float = 0.0
+    ) -> WarpedCells | None:
         """Remembered cells in the batch's augmented frame (Eq. 8); None when nothing is remembered.
 
-        x' = A_t T (x + u dt), always from the original frame, so positions are quantised once.
+        x' = A_t T (x + u dt), always from the original frame, so positions are quantised once; slower ones than
+        `min_speed_mps` stay where they were.
         """
         ages = [age for age, frame in enumerate(memory.frames) if frame.cells is not None]
         if not ages:
@@ -160,7 +168,7 @@ class BEVPath(nn.Module):
             torch.cat([getattr(past, name) for past in cells]) for name in ("xy", "velocities", "features", "rows")
         )
         if self.config.velocity_compensation:
-            xy = xy + velocities * elapsed[:, None]
+            xy = xy + moving(velocities, min_speed_mps) * elapsed[:, None]
         xy = transform_points_xy(matrix, xy)
         kept = (motion.usable.flatten()[frame] & self.grid.contains(xy)).nonzero().squeeze(1)
         indices = torch.cat([rows[:, None], torch.cat(slots)[:, None], self.grid.cell_of(xy)], dim=1)

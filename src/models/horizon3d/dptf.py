@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.bev_path import BEVPath, BEVPathConfig, CellPrediction, WarpedCells
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
-from src.models.horizon3d.gaussian_path import GaussianPath, GaussianPathConfig
+from src.models.horizon3d.gaussian_path import GaussianPath, GaussianPathConfig, VelocityFrom
 from src.models.horizon3d.ocsf import OCSFOutput
+from src.ops.sites import rows_of_keys
 from src.structures.batch import FrameBatch
 from src.structures.evidence import WarpedPoints
 from src.structures.gaussians import GaussianSet
@@ -24,16 +25,23 @@ class DPTFConfig:
     """Settings of the temporal part (`model.dptf`). Raises ConfigError when there is nothing to remember."""
 
     max_age_s: float  # older memory is not used
+    min_speed_mps: float  # what is slower is moved by the ego motion alone
     bev_path: BEVPathConfig | None
     gaussian_path: GaussianPathConfig | None
 
     def __post_init__(self) -> None:
         if not self.max_age_s > 0:
             raise ConfigError(f"model.dptf.max_age_s={self.max_age_s}: must be positive")
+        require_least(self, "model.dptf", {"min_speed_mps": 0})
         if self.bev_path is None and self.gaussian_path is None:
             raise ConfigError(
                 "model.dptf.bev_path=null and model.dptf.gaussian_path=null leave nothing to remember; use "
                 "model.dptf=null for a model without memory"
+            )
+        if self.bev_path is None and self.gaussian_path.velocity_from is VelocityFrom.cells:
+            raise ConfigError(
+                "model.dptf.gaussian_path.velocity_from=cells, but model.dptf.bev_path=null predicts no velocities of "
+                "cells; use velocity_from=gaussian"
             )
 
     @property
@@ -75,18 +83,19 @@ class DPTF(nn.Module):
     def recall(self, memory: Memory | None, batch: FrameBatch) -> WarpedMemory:
         """Bring the memory to the batch's time and frame."""
         history = warped = None
+        limits = (self.config.max_age_s, self.config.min_speed_mps)
         memory = Memory(()) if memory is None else memory.before(batch)
         if self.gaussian_path is not None:
-            history = self.gaussian_path.recall(memory, batch, self.config.max_age_s)
+            history = self.gaussian_path.recall(memory, batch, *limits)
         if self.bev_path is not None:
-            warped = self.bev_path.recall(memory, batch, self.config.max_age_s)
+            warped = self.bev_path.recall(memory, batch, *limits)
         return WarpedMemory(memory, history, warped)
 
-    def aggregate(self, fused: SparseBEV, warped_memory: WarpedMemory) -> DPTFOutput:
+    def aggregate(self, fused: SparseBEV, warped_memory: WarpedMemory, doppler: SparseBEV | None = None) -> DPTFOutput:
         """F_fuse and the remembered cells into F_out."""
         cells, bev = None, fused
         if self.bev_path is not None:
-            cells = self.bev_path.predict(fused)
+            cells = self.bev_path.predict(fused, doppler)
             bev = self.bev_path.aggregate(fused, warped_memory.warped)
         return DPTFOutput(warped_memory.history, warped_memory.warped, cells, bev)
 
@@ -103,7 +112,11 @@ class DPTF(nn.Module):
         if self.bev_path is not None:
             cells = self.bev_path.store(fused, output.cells, batch)
         if self.gaussian_path is not None:
-            gaussians = self.gaussian_path.store(ocsf.gaussians, ocsf.splat.active, batch)
+            active = ocsf.splat.active(self.config.gaussian_path.min_contribution)
+            gaussians = ocsf.gaussians
+            if self.config.gaussian_path.velocity_from is VelocityFrom.cells:
+                gaussians = _with_cell_velocities(gaussians, ocsf.splat.peak_cells, fused, output.cells)
+            gaussians = self.gaussian_path.store(gaussians, active, batch)
         frame = MemoryFrame(
             batch.timestamps_s,
             batch.global_from_ego,
@@ -113,6 +126,18 @@ class DPTF(nn.Module):
         )
         paths = (self.config.bev_path, self.config.gaussian_path)
         return past.push(frame, *(path.num_frames if path is not None else 0 for path in paths))
+
+
+def _with_cell_velocities(
+    gaussians: GaussianSet,
+    peak_cells: Tensor,  # [B, G] int64 linear keys, -1 for none
+    fused: SparseBEV,
+    cells: CellPrediction,
+) -> GaussianSet:
+    """Each Gaussian with the velocity of the cell where it contributes most, whose target it shares (Eq. 9)."""
+    rows = rows_of_keys(fused.sites.linear(), peak_cells)
+    known = rows[..., None] >= 0
+    return replace(gaussians, velocities=torch.where(known, cells.velocities[rows], gaussians.velocities))
 
 
 def warped_evidence(config: DPTFConfig, output: DPTFOutput) -> dict[str, WarpedPoints | None]:

@@ -10,11 +10,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import require_least
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.time_embedding import TimeEmbedding
-from src.models.memory import motions
+from src.models.memory import motions, moving
 from src.ops.farthest_point import farthest_points
 from src.structures.batch import FrameBatch
 from src.structures.gaussians import GaussianSet, Source
@@ -26,6 +26,13 @@ class Sampling(Enum):
     farthest_point = "farthest_point"
     top_opacity = "top_opacity"
     random = "random"
+
+
+class VelocityFrom(Enum):
+    """Whose velocity a remembered Gaussian has: its own, or that of the cell of F_fuse where it contributes most."""
+
+    gaussian = "gaussian"
+    cells = "cells"
 
 
 @dataclass(kw_only=True)
@@ -45,13 +52,19 @@ class GaussianPathConfig:
 
     num_frames: int  # remembered key frames
     gaussians_per_frame: int
+    min_contribution: float  # of a Gaussian to an occupied cell, to be active; 0: its support reaches one
     sampling: Sampling
+    velocity_from: VelocityFrom
     velocity_compensation: bool  # move history by its own velocity; off: by the ego motion alone (Table 6)
     self_attention: SelfAttentionConfig | None
 
     def __post_init__(self) -> None:
         own = {"num_frames": 1, "gaussians_per_frame": 1}
         require_least(self, "model.dptf.gaussian_path", own, "; gaussian_path=null switches the path off")
+        if not 0 <= self.min_contribution < 1:
+            raise ConfigError(
+                f"model.dptf.gaussian_path.min_contribution={self.min_contribution}: must be at least 0 and below 1"
+            )
 
     @property
     def num_history_gaussians(self) -> int:
@@ -73,20 +86,25 @@ class GaussianPath(nn.Module):
         """History keeps a fixed number of places."""
         self.fixed_capacity = True
 
-    def recall(self, memory: Memory, batch: FrameBatch, max_age_s: float) -> GaussianSet | None:
+    def recall(
+        self, memory: Memory, batch: FrameBatch, max_age_s: float, min_speed_mps: float = 0.0
+    ) -> GaussianSet | None:
         """History Gaussians in the batch's augmented frame, newest first; None when nothing is remembered, unless the
         capacity is fixed.
 
-        m' = A_t T (m + v dt); what is too old, not in the past or outside the grid is padding.
+        m' = A_t T (m + v dt), slower ones than `min_speed_mps` stay where they were; what is too old, not in the past
+        or outside the grid is padding.
         """
         frames = [frame for frame in memory.frames if frame.gaussians is not None]
-        parts = [self._warp(frames, batch, max_age_s)] if frames else []
+        parts = [self._warp(frames, batch, max_age_s, min_speed_mps)] if frames else []
         missing = self.config.num_history_gaussians - sum(map(len, parts))
         if self.fixed_capacity and missing > 0:
             parts.append(self._padding(len(batch), missing))
         return GaussianSet.concatenate(parts) if parts else None
 
-    def _warp(self, frames: list[MemoryFrame], batch: FrameBatch, max_age_s: float) -> GaussianSet:
+    def _warp(
+        self, frames: list[MemoryFrame], batch: FrameBatch, max_age_s: float, min_speed_mps: float
+    ) -> GaussianSet:
         """The Gaussians of T frames in one batch: launches cost more than the arithmetic."""
         motion = motions(frames, batch, max_age_s)
         sets = [frame.gaussians for frame in frames]
@@ -95,7 +113,7 @@ class GaussianPath(nn.Module):
         )  # [T * B, n]
         elapsed = motion.elapsed_s.flatten()[:, None].expand_as(past.valid)
         if self.config.velocity_compensation:
-            past = replace(past, means=past.means + past.velocities * elapsed[..., None])
+            past = replace(past, means=past.means + moving(past.velocities, min_speed_mps) * elapsed[..., None])
         moved = past.transform(motion.aug_from_past.flatten(0, 1))
         valid = moved.valid & motion.usable.flatten()[:, None] & self.grid.contains(moved.means)
         moved = replace(
@@ -128,7 +146,7 @@ class GaussianPath(nn.Module):
     def store(
         self,
         gaussians: GaussianSet,  # G_L
-        active: Tensor,  # [B, G] bool, the Gaussian reaches an occupied cell
+        active: Tensor,  # [B, G] bool
         batch: FrameBatch,
     ) -> GaussianSet:  # [B, gaussians_per_frame] in the unaugmented ego frame
         """A subset of the active Gaussians of any source; padding where fewer are active."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.doppler import VelocityStart
 from src.models.heads.keypoint_head import KEYPOINT_BIAS, CameraKeypointHead, CameraMaps, keypoint_scores
 from src.models.horizon3d.gaussian_encoder import RAW_ATTRIBUTES, GaussianBounds
 from src.models.horizon3d.views import CameraViews
@@ -44,6 +45,7 @@ class KGGIConfig:
     depth_target: DepthTarget  # what supervises the depth head
     keypoint_nms_cells: int | None  # odd window of local maxima in the keypoint map; null = every pixel competes
     property_head: bool  # local features correct the learnable attributes
+    initial_velocity: VelocityStart  # what the learnable velocity is added to
 
     def __post_init__(self) -> None:
         least = 0 if self.initialization is Initialization.random else 1
@@ -142,19 +144,28 @@ class KGGI(nn.Module):
         """Positions and velocities come from the property heads."""
         return ("property_heads",) if hasattr(self, "property_heads") else ()
 
-    def forward(self, radar_bev: SparseBEV, views: CameraViews, history: GaussianSet | None = None) -> KGGIOutput:
+    def forward(
+        self,
+        radar_bev: SparseBEV,
+        views: CameraViews,
+        history: GaussianSet | None = None,
+        doppler: SparseBEV | None = None,  # needed where velocities start from it
+    ) -> KGGIOutput:
         """G_0: radar, camera, random, then history Gaussians with their own attributes and features (method 4.4)."""
         parts: list[GaussianSet] = []
         logits = camera = None
         if self.config.uses_keypoints:
             logits = self.objectness(radar_bev.features).squeeze(-1).float()  # [M]
             camera = self.camera_head(views.levels[0])
-            parts += [self._radar_gaussians(logits.detach(), radar_bev), self._camera_gaussians(camera, views)]
+            parts += [
+                self._radar_gaussians(logits.detach(), radar_bev, doppler),
+                self._camera_gaussians(camera, views, doppler),
+            ]
         if Source.RANDOM in self.config.counts:
             means = self.centre_m + self.half_extent_m * self.random_means.clamp(-INSIDE, INSIDE)
             means = means.expand(radar_bev.batch_size, -1, -1)
             valid = torch.ones(means.shape[:2], dtype=torch.bool, device=means.device)
-            parts.append(self._gaussians(Source.RANDOM, means, valid, None))
+            parts.append(self._gaussians(Source.RANDOM, means, valid, None, doppler))
         if history is not None:
             parts.append(replace(history, features=history.features + self.source_embedding.weight[Source.HISTORY]))
         return KGGIOutput(GaussianSet.concatenate(parts), logits, camera)
@@ -163,6 +174,7 @@ class KGGI(nn.Module):
         self,
         scores: Tensor,  # [M]
         radar_bev: SparseBEV,
+        doppler: SparseBEV | None,
     ) -> GaussianSet:
         rows = topk_per_sample(scores, radar_bev.indices[:, 0], radar_bev.batch_size, self.config.num_radar_keypoints)
         valid = rows >= 0
@@ -170,9 +182,9 @@ class KGGI(nn.Module):
         features = F.pad(radar_bev.features, (0, 0, 0, 1))
         picks = torch.where(valid, rows, len(radar_bev))  # [B, K]
         means = self.grid.centre_of(cells[picks][..., 1:])  # [B, K, 2]
-        return self._gaussians(Source.RADAR, means, valid, F.embedding(picks, features))
+        return self._gaussians(Source.RADAR, means, valid, F.embedding(picks, features), doppler)
 
-    def _camera_gaussians(self, camera: CameraMaps, views: CameraViews) -> GaussianSet:
+    def _camera_gaussians(self, camera: CameraMaps, views: CameraViews, doppler: SparseBEV | None) -> GaussianSet:
         with torch.no_grad():
             depth, confidence = most_likely_depth(camera.depth_logits, self.depth_centres_m)  # [B, N, h, w] each
             xy = views.lift(depth)[..., :2]
@@ -186,7 +198,7 @@ class KGGI(nn.Module):
             means = xy.flatten(1, 3).gather(1, picks[..., None].expand(-1, -1, 2))
         local = camera.features.movedim(2, -1).flatten(1, 3)  # [B, N*h*w, C]
         local = local.gather(1, picks[..., None].expand(-1, -1, local.shape[-1]))
-        return self._gaussians(Source.CAMERA, means, best > 0, local)
+        return self._gaussians(Source.CAMERA, means, best > 0, local, doppler)
 
     def _gaussians(
         self,
@@ -194,6 +206,7 @@ class KGGI(nn.Module):
         means: Tensor,  # [B, K, 2] m
         valid: Tensor,  # [B, K] bool
         local: Tensor | None,  # [B, K, C] features at the keypoints
+        doppler: SparseBEV | None = None,
     ) -> GaussianSet:
         """Slot attributes, corrected by the property head where there is one."""
         name = source.name.lower()
@@ -203,13 +216,18 @@ class KGGI(nn.Module):
             with torch.autocast(local.device.type, enabled=False):  # attributes are float32 also under autocast
                 change = self.property_heads[name](local.float())
             features, raw = features + change[..., : features.shape[-1]], raw + change[..., features.shape[-1] :]
+        means, start = torch.where(valid[..., None], means.float(), self.centre_m), None
+        if self.config.initial_velocity is VelocityStart.doppler:
+            sample = torch.arange(len(means), device=means.device)[:, None, None].expand(*valid.shape, 1)
+            cells = torch.cat([sample, self.grid.cell_of(means.detach())], dim=-1)
+            start = doppler.lookup(cells.flatten(0, 1)).unflatten(0, valid.shape)
         return GaussianSet(
-            means=torch.where(valid[..., None], means.float(), self.centre_m),
+            means=means,
             features=features,
             sources=torch.full_like(valid, int(source), dtype=torch.int64),
             elapsed_s=torch.zeros_like(valid, dtype=torch.float32),
             valid=valid,
-            **self.bounds.activate(raw),
+            **self.bounds.activate(raw, start),
         )
 
 

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.doppler import doppler_map
 from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.detector import Detector, Objective
@@ -24,6 +25,7 @@ from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
 from src.structures.taxonomy import CAMERAS
+from src.targets.box_raster import BoxRaster
 
 
 class Horizon3D(Detector):
@@ -87,15 +89,17 @@ class Horizon3D(Detector):
             raise ValueError(f"the memory holds {memory.batch_size} streams, but the batch {len(batch)} frames")
         warped_memory = self.dptf.recall(memory, batch) if self.dptf is not None else None
         radar_bev = fused = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
-        views = kggi = ocsf = None
+        doppler = views = kggi = ocsf = None
+        if self.config.uses_doppler:
+            doppler = doppler_map(radar_bev, self.grid, batch.radar_points, batch.radar_batch)
         if self.image_encoder is not None:
             views = self._encode_views(batch)
-            kggi = self.kggi(radar_bev, views, warped_memory.history if warped_memory is not None else None)
+            kggi = self.kggi(radar_bev, views, warped_memory.history if warped_memory is not None else None, doppler)
             ocsf = self.ocsf(kggi.gaussians, radar_bev, views)
             fused = ocsf.fused_bev
         if self.dptf is None:
             return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, None, self.head(fused)), None
-        dptf = self.dptf.aggregate(fused, warped_memory)
+        dptf = self.dptf.aggregate(fused, warped_memory, doppler)
         output = Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, dptf, self.head(dptf.bev))
         return output, self.dptf.remember(warped_memory.past, batch, fused, dptf, ocsf)
 
@@ -117,13 +121,14 @@ class Horizon3D(Detector):
         """Terms of Eq. 10 as weighted."""
         config, boxes, weights = self.config, batch.boxes, self.config.loss
         terms, counts = self.head.loss(output.head, boxes, weights.heatmap_weight, weights.box_weight)
+        raster = BoxRaster(boxes, self.grid, config.ocsf.margin_m if config.ocsf is not None else 0.0)
         if output.kggi is not None and output.ocsf is not None:
-            terms |= kggi_losses(output.kggi, output.radar_bev, output.views, boxes, self.grid, config.kggi, weights)
-            terms |= ocsf_losses(output.ocsf, boxes, self.grid, config.ocsf.margin_m, weights)
+            terms |= kggi_losses(output.kggi, output.radar_bev, output.views, raster, config.kggi, weights)
+            terms |= ocsf_losses(output.ocsf, raster, weights)
             if config.dptf is not None or weights.gaussian_velocity_in_phase1:
-                terms |= gaussian_velocity_loss(output.ocsf, boxes, self.grid, config.ocsf.margin_m, weights)
+                terms |= gaussian_velocity_loss(output.ocsf, raster, weights)
         if output.dptf is not None and output.dptf.cells is not None:
-            terms |= cell_losses(output.dptf.cells, output.fused_bev, boxes, self.grid, weights)
+            terms |= cell_losses(output.dptf.cells, output.fused_bev, raster, weights)
         return Objective(terms, counts)
 
     def decode(self, output: Horizon3DOutput) -> list[Boxes3D]:
@@ -131,7 +136,7 @@ class Horizon3D(Detector):
         return self.head.decode(output.head)
 
     def evidence(self, output: Horizon3DOutput) -> Evidence:
-        """Refined Gaussians, the occupied cells of their splat, and the warped memory."""
+        """Refined Gaussians, the cells of their splat, and the warped memory."""
         return output.evidence(self.config, self.grid)
 
     def diagnostics(self, output: Horizon3DOutput) -> dict[str, Tensor | float]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 from src.errors import ConfigError
+from src.models.backbones.doppler import VelocityStart
 from src.models.backbones.sparse_voxel import RadarEncoderConfig
 from src.models.detector import ModelConfig
 from src.models.heads.center_head import HeadConfig
@@ -61,6 +62,13 @@ class Horizon3DConfig(ModelConfig):
     def sensors(self) -> tuple[str, ...]:
         """Radar, and cameras where there are Gaussians."""
         return ("radar",) if self.ocsf is None else ("camera", "radar")
+
+    @property
+    def uses_doppler(self) -> bool:
+        """Whether a velocity starts from what the radar measures."""
+        cells = self.dptf.bev_path if self.dptf is not None else None
+        starts = [self.kggi and self.kggi.initial_velocity, cells and cells.velocity_start]
+        return VelocityStart.doppler in starts
 
     @property
     def keys_of_temporal_phase(self) -> tuple[str, ...]:

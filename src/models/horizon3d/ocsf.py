@@ -32,6 +32,13 @@ class RefineFrom(Enum):
     cross_attention = "cross_attention"
 
 
+class VelocityUpdate(Enum):
+    """How a layer changes a Gaussian's velocity: regressed anew as Eq. 3 has it, or a step from the one before."""
+
+    anew = "anew"
+    residual = "residual"
+
+
 @dataclass(kw_only=True)
 class OCSFConfig:
     """Settings of OCSF (`model.ocsf`). Raises ConfigError for values that cannot work."""
@@ -44,6 +51,8 @@ class OCSFConfig:
     scale_range_m: list[float]  # [smallest, largest] standard deviation
     max_mean_shift_m: float  # bound of one refinement step per axis
     max_speed_mps: float  # bound of a Gaussian's velocity per axis
+    velocity_unit_mps: float  # in which the network states it
+    velocity_update: VelocityUpdate
     support_sigmas: float  # a Gaussian ends at this many standard deviations
     cross_attention: CrossAttention
     refine_from: RefineFrom
@@ -52,7 +61,7 @@ class OCSFConfig:
     def __post_init__(self) -> None:
         own = {"num_layers": 1, "num_learnable_points": 0, "max_occupied_cells": 1, "margin_m": 0}
         require_least(self, "model.ocsf", own)
-        for name in ("max_mean_shift_m", "max_speed_mps", "support_sigmas"):
+        for name in ("max_mean_shift_m", "max_speed_mps", "velocity_unit_mps", "support_sigmas"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"model.ocsf.{name}={getattr(self, name)}: must be positive")
         if not 0 < self.occupancy_threshold < 1:
@@ -72,7 +81,9 @@ class OCSFConfig:
     @property
     def bounds(self) -> GaussianBounds:
         """Ranges of the attributes."""
-        return GaussianBounds(tuple(self.scale_range_m), self.max_mean_shift_m, self.max_speed_mps)
+        return GaussianBounds(
+            tuple(self.scale_range_m), self.max_mean_shift_m, self.max_speed_mps, self.velocity_unit_mps
+        )
 
 
 @dataclass
@@ -109,6 +120,7 @@ class OCSF(nn.Module):
             config.bounds,
             chained_attention=config.cross_attention is CrossAttention.chained,
             refine_before_self_encoding=config.refine_from is RefineFrom.cross_attention,
+            residual_velocity=config.velocity_update is VelocityUpdate.residual,
             temporal_heads=temporal_heads,
         )
         self.encoder = GaussianEncoder(channels, image_channels, grid, config.bounds, config.num_layers, layer)

@@ -14,7 +14,7 @@ from src.models.horizon3d.kggi import KGGIOutput
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.horizon3d.views import CameraViews
-from src.structures.evidence import Evidence
+from src.structures.evidence import Evidence, SplattedCells
 from src.structures.sparse_bev import SparseBEV
 
 
@@ -31,14 +31,15 @@ class Horizon3DOutput:
     head: HeadOutput
 
     def evidence(self, config: Horizon3DConfig, grid: BEVGrid) -> Evidence:
-        """Refined Gaussians, the occupied cells of their splat, and the warped memory."""
+        """Refined Gaussians, the cells of their splat, and the warped memory."""
         evidence = Evidence()
         if self.ocsf is not None:
             cells = self.ocsf.splat.cells
-            rows = cells.support % (grid.rows * grid.cols)
+            sample, cell = cells.support // (grid.rows * grid.cols), cells.support % (grid.rows * grid.cols)
+            indices = torch.stack([sample, cell // grid.cols, cell % grid.cols], dim=1)
+            occupied = torch.zeros_like(sample, dtype=torch.bool).index_fill(0, cells.occupied_rows, True)
             evidence.gaussians = self.ocsf.gaussians
-            evidence.occupied_cells = torch.stack([rows // grid.cols, rows % grid.cols], dim=1)
-            evidence.occupancy = cells.occupancy
+            evidence.cells = SplattedCells(grid, indices, cells.occupancy, occupied)
         if self.dptf is not None:
             evidence = replace(evidence, **warped_evidence(config.dptf, self.dptf))
         return evidence

@@ -15,12 +15,16 @@ from src.structures.sparse_bev import SparseBEV
 
 @dataclass
 class GaussianSplat:
-    """The splat of a GaussianSet; per-Gaussian results are back in [B, G], padding inactive."""
+    """The splat of a GaussianSet; per-Gaussian results are back in [B, G], padding as what reaches no occupied cell."""
 
     cells: Splat  # occupancy on every cell that a Gaussian reaches
     bev: SparseBEV  # F_G on the occupied cells
-    active: Tensor  # [B, G] bool, the Gaussian reaches an occupied cell
-    peak_cells: Tensor  # [B, G] int64 linear cell key where the Gaussian contributes most, -1 if not active
+    peak_cells: Tensor  # [B, G] int64 linear key of the occupied cell where the Gaussian contributes most, -1 for none
+    peak_contributions: Tensor  # [B, G] a_i there, 0 for none
+
+    def active(self, min_contribution: float = 0.0) -> Tensor:  # [B, G] bool
+        """The Gaussian contributes that much to an occupied cell; 0: its support reaches one."""
+        return (self.peak_cells >= 0) & (self.peak_contributions >= min_contribution)
 
 
 def splat_set(
@@ -46,6 +50,7 @@ def splat_set(
         max_cells=max_occupied_cells,
         support_sigmas=support_sigmas,
     )
-    active = torch.zeros(b * g, dtype=torch.bool, device=picks.device).index_copy(0, picks, cells.active)
-    peak_cells = picks.new_full((b * g,), -1).index_copy(0, picks, cells.peak_cell)
-    return GaussianSplat(cells, SparseBEV(cells.occupied, cells.features), active.view(b, g), peak_cells.view(b, g))
+    peaks = picks.new_full((b * g,), -1).index_copy(0, picks, cells.peak_cell)
+    contributions = cells.peak_contribution.new_zeros(b * g).index_copy(0, picks, cells.peak_contribution)
+    bev = SparseBEV(cells.occupied, cells.features)
+    return GaussianSplat(cells, bev, peaks.view(b, g), contributions.view(b, g))

@@ -37,7 +37,7 @@ def splat_triton(
     pairs: GaussianCellPairs,
     choice: Choice,
     smooth_cap: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, int]:
     """The reference's results by three kernels over the pairs forward and one backward."""
     gaussians = (means, scales, directions, opacity_logits, features)
     if means.dtype != torch.float32 or not runs_kernels(means):
@@ -62,7 +62,7 @@ class _Splat(torch.autograd.Function):
         choice: Choice,
         extra: float,
         least: float,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, int]:
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, int]:
         support = choice[0]
         features = features.contiguous()
         surprise = F.softplus(-opacity_logits)  # [G] -log sigmoid(o)
@@ -90,17 +90,19 @@ class _Splat(torch.autograd.Function):
                     enable_fp_fusion=True,
                 )
             peak_cell = torch.full((len(means),), -1, dtype=torch.int64, device=means.device)
+            peak_q = means.new_full((len(means),), math.inf)
             if len(support) > 0:
                 _nearest_cell[(len(means),)](
-                    *(pairs.q, pairs.cell, pairs.by_gaussian, pairs.gaussian_starts, place, support, peak_cell),
+                    *(pairs.q, pairs.cell, pairs.by_gaussian, pairs.gaussian_starts, place, support),
+                    *(peak_cell, peak_q),
                     BLOCK=PAIRS_OF_GAUSSIAN,
                     num_warps=1,
                     enable_fp_fusion=True,
                 )
         ctx.save_for_backward(scales, directions, opacity_logits, surprise, features, place)
         ctx.pairs, ctx.extra, ctx.least = pairs, extra, least
-        ctx.mark_non_differentiable(occupied_rows, peak_cell)
-        return log_free, out, occupied_rows, peak_cell, num_cut
+        ctx.mark_non_differentiable(occupied_rows, peak_cell, peak_q)
+        return log_free, out, occupied_rows, peak_cell, peak_q, num_cut
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad_log_free: Tensor, grad_out: Tensor, *_: None) -> tuple[Tensor | None, ...]:
@@ -198,10 +200,10 @@ def _cell_features(  # noqa: ANN202
 
 @triton.jit
 def _nearest_cell(  # noqa: ANN202
-    q, cell, by_gaussian, starts, place, support, peak,  # noqa: ANN001
+    q, cell, by_gaussian, starts, place, support, peak, peak_q,  # noqa: ANN001
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Key of the occupied cell with the smallest q of one Gaussian, the first on ties; left alone if there is none."""
+    """The occupied cell with the smallest q of one Gaussian, the first on ties, and q; left alone if there is none."""
     gaussian = tl.program_id(0)
     lane = tl.arange(0, BLOCK)
     last = tl.load(starts + gaussian + 1).to(tl.int32)
@@ -219,6 +221,7 @@ def _nearest_cell(  # noqa: ANN202
         least = tl.minimum(nearest, least)
     if where >= 0:
         tl.store(peak + gaussian, tl.load(support + where))
+        tl.store(peak_q + gaussian, least)
 
 
 @triton.jit

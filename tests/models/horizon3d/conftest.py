@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.doppler import VelocityStart
 from src.models.backbones.image import ImageEncoderConfig, NeckName
 from src.models.backbones.sparse_voxel import ConvOut, RadarEncoderConfig
 from src.models.backbones.weights import BackboneName
@@ -11,12 +12,12 @@ from src.models.heads.center_head import BoxOptions, HeadConfig, TrainRegression
 from src.models.heads.decode import AttributeSource, Suppression
 from src.models.horizon3d.bev_path import BEVPathConfig
 from src.models.horizon3d.dptf import DPTFConfig
-from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling, SelfAttentionConfig
+from src.models.horizon3d.gaussian_path import GaussianPathConfig, Sampling, SelfAttentionConfig, VelocityFrom
 from src.models.horizon3d.kggi import Initialization, KGGIConfig
-from src.models.horizon3d.loss import Horizon3DLossConfig
+from src.models.horizon3d.loss import Horizon3DLossConfig, VelocityGroups
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
-from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom
+from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom, VelocityUpdate
 from src.models.horizon3d.views import CameraViews
 from src.structures.batch import FrameBatch
 from src.targets.depth import DepthTarget
@@ -103,6 +104,7 @@ def make_config():
             "depth_target": DepthTarget.box,
             "keypoint_nms_cells": None,
             "property_head": True,
+            "initial_velocity": VelocityStart.zero,
         }
         ocsf = {
             "num_layers": 2,
@@ -113,6 +115,8 @@ def make_config():
             "scale_range_m": [0.2, 3.2],
             "max_mean_shift_m": 4.0,
             "max_speed_mps": 60.0,
+            "velocity_unit_mps": 1.0,
+            "velocity_update": VelocityUpdate.anew,
             "support_sigmas": 3.0,
             "cross_attention": CrossAttention.parallel,
             "refine_from": RefineFrom.self_encoding,
@@ -134,6 +138,7 @@ def make_config():
             "cell_lovasz_weight": 1.0,
             "cell_velocity_weight": 0.25,
             "gaussian_velocity_weight": 0.25,
+            "velocity_groups": VelocityGroups.boxes,
             "gaussian_velocity_in_phase1": False,
         }
         for part in (kggi, ocsf, loss):
@@ -162,19 +167,22 @@ def make_config():
     return build
 
 
-def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, **changes):
+def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, min_speed_mps=0.0, **changes):
     """A small memory with both paths; keyword arguments replace values of either path by name."""
     bev = {
         "num_frames": 3,
         "memory_threshold": 0.1,
         "max_cells_per_frame": 200,
+        "velocity_start": VelocityStart.zero,
         "velocity_compensation": True,
         "spatial_dilation": False,
     }
     gaussian = {
         "num_frames": 2,
         "gaussians_per_frame": 8,
+        "min_contribution": 0.0,
         "sampling": Sampling.farthest_point,
+        "velocity_from": VelocityFrom.gaussian,
         "velocity_compensation": True,
         "self_attention": SelfAttentionConfig(num_heads=4),
     }
@@ -183,6 +191,7 @@ def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, **changes):
     assert changes.keys() <= bev.keys() | gaussian.keys()
     return DPTFConfig(
         max_age_s=max_age_s,
+        min_speed_mps=min_speed_mps,
         bev_path=BEVPathConfig(**bev) if bev_path else None,
         gaussian_path=GaussianPathConfig(**gaussian) if gaussian_path else None,
     )

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import cells_in_boxes
+from src.models.backbones.doppler import VelocityStart
 from src.models.horizon3d.bev_path import CellPrediction
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
 from tests.models.horizon3d.cells import FULL, GRID, TINY, C, bev_of, make_path, random_cells
@@ -239,6 +240,15 @@ def test_nothing_comes_back_from_an_unusable_frame(elapsed_s, x):
     assert warped.xy.isfinite().all()
 
 
+def test_what_is_slower_than_the_least_speed_stays():
+    path, cells = make_path(), torch.tensor([[0, 40, 40], [0, 40, 60], [0, 60, 40]])
+    velocities = torch.tensor([[0.6, 0.7], [0.8, 0.7], [0.0, -20.0]])
+    memory = Memory((remember(path, bare_frame(5.0, [pose()]), cells, velocities),))
+    found = path.recall(memory, bare_frame(7.0, [pose()]), 6.0, min_speed_mps=1.0)
+    moved = found.xy - path.grid.centre_of(cells[:, 1:])
+    torch.testing.assert_close(moved, torch.tensor([[0.0, 0.0], [1.6, 1.4], [0.0, -40.0]]), atol=1e-4, rtol=0)
+
+
 def test_cells_that_leave_the_grid_vanish():
     path = make_path()
     edge = torch.tensor([[0, 0, 0], [0, 95, 127], [0, 0, 127], [0, 95, 0]])
@@ -357,6 +367,16 @@ def test_heads_predict_metres_per_second_in_float32_and_take_gradients():
     assert cells.occupancy_logits.shape == (60,) and cells.occupancy_logits.dtype == torch.float32
     torch.testing.assert_close(cells.velocities, torch.tensor([25.0, -10.0]).expand(60, 2))
     assert cells.occupancy_logits.requires_grad and cells.velocities.requires_grad
+
+
+def test_a_cells_velocity_may_start_from_what_the_radar_measures_there():
+    """Doppler of 20 m/s in the first cell; the radar map has no site at the second."""
+    fused, _ = bev_of(torch.tensor([[0, 2, 2], [0, 3, 4]]), TINY)
+    doppler, _ = bev_of(torch.tensor([[0, 1, 1], [0, 2, 2]]), TINY)
+    doppler = doppler.with_features(torch.tensor([[9.0, 9.0], [20.0, -1.0]]))
+    plain, started = make_path(TINY).eval(), make_path(TINY, velocity_start=VelocityStart.doppler).eval()
+    change = started.predict(fused, doppler).velocities - plain.predict(fused).velocities
+    torch.testing.assert_close(change, torch.tensor([[20.0, -1.0], [0.0, 0.0]]))
 
 
 def test_a_path_without_frames_or_with_an_impossible_threshold_is_refused():

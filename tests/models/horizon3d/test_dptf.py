@@ -6,11 +6,12 @@ import torch
 from src.errors import ConfigError
 from src.models.horizon3d.bev_path import CellPrediction
 from src.models.horizon3d.dptf import DPTF, DPTFOutput
+from src.models.horizon3d.gaussian_path import VelocityFrom
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.horizon3d.splatting import GaussianSplat
 from src.structures.gaussians import GaussianSet
 from tests.models.horizon3d.cells import GRID, C, bev_of
-from tests.models.moving import bare_frame, pose
+from tests.models.moving import bare_frame, bda, pose
 
 
 @pytest.fixture
@@ -37,8 +38,10 @@ def make_parts(make_dptf):
                 elapsed_s=zeros,
                 valid=torch.ones(b, 1, dtype=torch.bool),
             )
-            ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, gaussians.valid, zeros.long()), fused)
-            predicted = CellPrediction(torch.ones(b), torch.zeros(b, 2)) if dptf.bev_path is not None else None
+            peaks = fused.sites.linear()[:, None]
+            ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, peaks, zeros + 0.2), fused)
+            velocities = torch.tensor([[0.0, -4.0]]).expand(b, 2)
+            predicted = CellPrediction(torch.ones(b), velocities) if dptf.bev_path is not None else None
             past = dptf.recall(memory, batch).past
             return dptf.remember(past, batch, fused, DPTFOutput(None, None, predicted, fused), ocsf)
 
@@ -89,6 +92,24 @@ def test_without_the_bev_path_the_head_reads_f_fuse(make_parts):
     assert output.bev is fused and output.cells is None and output.warped is None and output.history is None
 
 
+def test_what_contributes_too_little_is_not_remembered(make_parts):
+    """The Gaussian of these frames contributes 0.2 to its cell."""
+    for least, number in ((0.2, 1), (0.21, 0)):
+        dptf, remember = make_parts(min_contribution=least)
+        memory = remember(None, bare_frame(0.0, [pose()]))
+        assert counts(dptf.recall(memory, bare_frame(0.5, [pose()])), 0) == (1, number)
+
+
+def test_a_remembered_gaussian_may_move_as_the_cell_under_it(make_parts):
+    """The cell where the Gaussian of these frames contributes most moves at (0, -4); a path alone has no such cell."""
+    now = bare_frame(1.0, [pose()], [bda(torch.pi / 2)])  # the augmented axes are turned
+    for changes, expected in (({}, [0.0, 0.0]), ({"velocity_from": VelocityFrom.cells}, [-4.0, 0.0])):
+        stored = make_parts(**changes)[1](None, now).frames[0].gaussians
+        torch.testing.assert_close(stored.velocities[stored.valid], torch.tensor([expected]), atol=1e-5, rtol=0)
+    with pytest.raises(ConfigError, match="velocity_from=cells.*bev_path=null"):
+        make_parts(bev_path=False, velocity_from=VelocityFrom.cells)
+
+
 def test_neither_path_looks_past_the_age_limit(make_parts):
     dptf, remember = make_parts(max_age_s=0.55)
     memory = None
@@ -114,8 +135,12 @@ def test_a_jump_of_the_pose_forgets_its_lane_for_good_and_no_other(make_parts):
 
 
 def test_impossible_settings_are_refused(make_dptf):
+    with pytest.raises(ConfigError, match="min_contribution=1.0"):
+        make_dptf(min_contribution=1.0)
     with pytest.raises(ConfigError, match="nothing to remember"):
         make_dptf(bev_path=False, gaussian_path=False)
     for age in (0.0, -1.0, float("nan")):
         with pytest.raises(ConfigError, match="max_age_s"):
             make_dptf(max_age_s=age)
+    with pytest.raises(ConfigError, match="min_speed_mps=-1.0"):
+        make_dptf(min_speed_mps=-1.0)

@@ -9,7 +9,13 @@ import torch
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
-from src.models.horizon3d.gaussian_path import GaussianPath, GaussianPathConfig, Sampling, SelfAttentionConfig
+from src.models.horizon3d.gaussian_path import (
+    GaussianPath,
+    GaussianPathConfig,
+    Sampling,
+    SelfAttentionConfig,
+    VelocityFrom,
+)
 from src.structures.gaussians import GaussianSet, Source
 from tests.models.moving import UTM, bare_frame, bda, pose
 
@@ -22,7 +28,9 @@ def make_path(**changes):
     values = {
         "num_frames": 4,
         "gaussians_per_frame": 5,
+        "min_contribution": 0.0,
         "sampling": Sampling.farthest_point,
+        "velocity_from": VelocityFrom.gaussian,
         "velocity_compensation": True,
         "self_attention": None,
     }
@@ -247,6 +255,15 @@ def test_without_compensation_only_the_ego_motion_counts():
     moved = make_path().recall(memory, now, 6.0)
     for name in ("velocities", "directions", "scales", "features", "elapsed_s"):  # the velocities are still carried
         assert torch.equal(getattr(found, name), getattr(moved, name)), name
+
+
+def test_what_is_slower_than_the_least_speed_stays():
+    past = make_gaussians(g=3, velocities=torch.tensor([[[0.6, 0.7], [0.8, 0.7], [0.0, -20.0]]]))
+    memory, now = remembered(make_frame([5.0]), past), make_frame([7.0])
+    found = make_path().recall(memory, now, 6.0, min_speed_mps=1.0)
+    moved = (found.means - past.means)[0]
+    torch.testing.assert_close(moved, torch.tensor([[0.0, 0.0], [1.6, 1.4], [0.0, -40.0]]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(found.velocities, past.velocities)
 
 
 @pytest.mark.parametrize("then_aug", [bda(0.3, 1.04, flip_x=True), bda(-0.39, 0.95)])

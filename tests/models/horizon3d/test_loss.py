@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from src.models.horizon3d.bev_path import CellPrediction
-from src.models.horizon3d.loss import cell_losses, gaussian_velocity_loss
+from src.models.horizon3d.loss import VelocityGroups, cell_losses, gaussian_velocity_loss
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.horizon3d.splatting import GaussianSplat
 from src.structures.boxes import Boxes3D
 from src.structures.gaussians import GaussianSet
+from src.targets.box_raster import BoxRaster
 from tests.models.horizon3d.cells import TINY, bev_of
 
 NAMES = ["cell_focal", "cell_dice", "cell_lovasz", "cell_velocity"]
@@ -48,11 +49,11 @@ def scene():
     boxes = [boxes_of((0.0, 0.0, 2.0, 1.0, 7.0, -2.0), (-2.5, -2.0, 1.0, 1.0, NAN, NAN)), boxes_of()]
     scores = torch.tensor([0.8, 0.3, 0.6, 0.1])
     prediction = CellPrediction(torch.logit(scores), torch.tensor([[9.0, 9], [4, 1], [9, 9], [9, 9]]))
-    return prediction, fused, boxes
+    return prediction, fused, BoxRaster(boxes, TINY, 0.0)
 
 
 def test_each_term_by_hand(settings, scene):
-    found = cell_losses(*scene, TINY, settings())
+    found = cell_losses(*scene, settings())
     assert list(found) == NAMES
     # Positives 0.8 and 0.3, negatives 0.6 and 0.1; divided by the two positives.
     focal = -0.25 * (0.2**2 * math.log(0.8) + 0.7**2 * math.log(0.3))
@@ -66,44 +67,44 @@ def test_each_term_by_hand(settings, scene):
 
 
 def test_inner_and_outer_weights_multiply_and_null_switches_off(settings, scene):
-    plain = cell_losses(*scene, TINY, settings())
+    plain = cell_losses(*scene, settings())
     weights = dict(zip(NAMES, (2.0, 3.0, 5.0, 7.0), strict=True))
     changed = cell_losses(
-        *scene, TINY, settings(dptf_weight=0.5, **{f"{name}_weight": value for name, value in weights.items()})
+        *scene, settings(dptf_weight=0.5, **{f"{name}_weight": value for name, value in weights.items()})
     )
     for name, weight in weights.items():
         torch.testing.assert_close(changed[name], 0.5 * weight * plain[name])
-        assert set(cell_losses(*scene, TINY, settings(**{f"{name}_weight": None}))) == set(NAMES) - {name}
+        assert set(cell_losses(*scene, settings(**{f"{name}_weight": None}))) == set(NAMES) - {name}
 
 
 def test_velocity_is_supervised_only_in_boxes_of_known_velocity(settings, scene):
-    prediction, fused, boxes = scene
+    prediction, fused, raster = scene
     prediction.velocities.requires_grad_()
-    cell_losses(prediction, fused, boxes, TINY, settings())["cell_velocity"].backward()
+    cell_losses(prediction, fused, raster, settings())["cell_velocity"].backward()
     assert prediction.velocities.grad.tolist() == [[0, 0], [-0.5, 0.5], [0, 0], [0, 0]]
-    unknown = [boxes_of((0.0, 0.0, 2.0, 1.0, NAN, NAN)), boxes_of()]
-    assert not cell_losses(prediction, fused, unknown, TINY, settings())["cell_velocity"].any()
+    unknown = BoxRaster([boxes_of((0.0, 0.0, 2.0, 1.0, NAN, NAN)), boxes_of()], TINY, 0.0)
+    assert not cell_losses(prediction, fused, unknown, settings())["cell_velocity"].any()
 
 
 def test_boxes_are_tight(settings, scene):
     """A cell next to the box is background, however large the margin of the splatted mask."""
     prediction, fused, _ = scene
     near = [boxes_of((0.0, 1.0, 2.0, 1.0, 7.0, -2.0)), boxes_of()]  # one row above cell (2, 2)
-    found = cell_losses(prediction, fused, near, TINY, settings())
+    found = cell_losses(prediction, fused, BoxRaster(near, TINY, 4.0), settings())
     assert not found["cell_velocity"].any() and not found["cell_lovasz"].any()
 
 
 @pytest.mark.parametrize("empty", ["boxes", "cells", "both"])
 def test_nothing_to_supervise_is_finite_with_finite_gradients(settings, scene, empty):
-    prediction, fused, boxes = scene
+    prediction, fused, raster = scene
     if empty != "boxes":
         fused, _ = bev_of(torch.zeros(0, 3, dtype=torch.int64), TINY, batch_size=2)
         prediction = CellPrediction(torch.zeros(0), torch.zeros(0, 2))
     if empty != "cells":
-        boxes = [boxes_of(), boxes_of()]
+        raster = BoxRaster([boxes_of(), boxes_of()], TINY, 0.0)
     prediction.occupancy_logits.requires_grad_()
     prediction.velocities.requires_grad_()
-    found = cell_losses(prediction, fused, boxes, TINY, settings())
+    found = cell_losses(prediction, fused, raster, settings())
     assert list(found) == NAMES and all(value.isfinite() for value in found.values())
     sum(found.values()).backward()
     assert prediction.occupancy_logits.grad.isfinite().all() and not prediction.velocities.grad.any()
@@ -126,16 +127,37 @@ def test_gaussian_velocity_by_hand(settings):
         valid=torch.ones(1, 5, dtype=torch.bool),
     )
     peaks = torch.tensor([[2 * 6 + 2, 1 * 6 + 2, 4 * 6 + 3, 0, -1]])
-    ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, peaks >= 0, peaks), None)
+    ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, peaks, zeros), None)
     boxes = [boxes_of((0.0, 0.0, 2.0, 1.0, 7.0, -2.0), (-2.5, -2.0, 1.0, 1.0, NAN, NAN))]
+    wide, narrow = (BoxRaster(boxes, TINY, margin_m) for margin_m in (2.0, 0.0))
     # Margin 2 m in total: rows 1..3 around the first box, rows and columns 0..1 around the second.
-    terms = gaussian_velocity_loss(ocsf, boxes, TINY, 2.0, settings(dptf_weight=3.0, gaussian_velocity_weight=2.0))
+    terms = gaussian_velocity_loss(ocsf, wide, settings(dptf_weight=3.0, gaussian_velocity_weight=2.0))
     expected = 3.0 * 2.0 * (0.5 * 0.5**2 + (3.0 - 0.5)) / 4
     assert {name: float(value.detach()) for name, value in terms.items()} == {
         "gaussian_velocity": pytest.approx(expected)
     }
     terms["gaussian_velocity"].backward()
     assert velocities.grad[0, 2:].abs().sum() == 0 and velocities.grad[0, :2].abs().sum() > 0
-    tight = gaussian_velocity_loss(ocsf, boxes, TINY, 0.0, settings())
+    tight = gaussian_velocity_loss(ocsf, narrow, settings())
     assert float(tight["gaussian_velocity"].detach()) == pytest.approx(0.5 * 0.5**2 / 2)
-    assert gaussian_velocity_loss(ocsf, boxes, TINY, 2.0, settings(gaussian_velocity_weight=None)) == {}
+    assert gaussian_velocity_loss(ocsf, wide, settings(gaussian_velocity_weight=None)) == {}
+
+
+def test_what_stands_and_the_ground_have_their_own_means(settings):
+    """Cells of a moving box (2, 2), (2, 3), a standing one (4, 0), its margin (3, 0), an unseen box (0, 5), ground."""
+    cells = torch.tensor([[0, 0, 2], [0, 0, 5], [0, 2, 2], [0, 2, 3], [0, 3, 0], [0, 4, 0]])
+    fused, _ = bev_of(cells, TINY)
+    boxes = boxes_of((0.0, 0.0, 2.0, 1.0, 7.0, -2.0), (-2.5, 2.0, 1.0, 1.0, 0.5, 0.0), (2.5, -2.0, 1.0, 1.0, 9.0, 0.0))
+    boxes.num_points = torch.tensor([1, 1, 0])
+    found = torch.tensor([[3.0, -1.0], [50.0, 50.0], [7.0, -1.0], [9.0, -2.0], [60.0, 0.0], [0.5, 4.0]])
+    moving, standing, ground = (1 + 2) / 4, 4 / 2, (3 + 1) / 2
+    prediction = CellPrediction(torch.zeros(6), found)
+    for groups, expected in (
+        (VelocityGroups.boxes, (1 + 2 + 4) / 6),
+        (VelocityGroups.motion, moving + standing),
+        (VelocityGroups.motion_and_ground, moving + standing + ground),
+    ):
+        terms = cell_losses(prediction, fused, BoxRaster([boxes], TINY, 2.0), settings(velocity_groups=groups))
+        assert terms["cell_velocity"].item() == pytest.approx(expected), groups
+    alone = cell_losses(prediction, fused, BoxRaster([boxes_of()], TINY, 2.0), settings(velocity_groups=groups))
+    assert alone["cell_velocity"].item() == pytest.approx(found.abs().mean().item())  # all of it is ground

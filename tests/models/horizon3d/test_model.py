@@ -10,12 +10,13 @@ from omegaconf import OmegaConf
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models import FAMILIES, build_model
+from src.models.backbones.doppler import VelocityStart, doppler_map
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.heads.center_head import BoxOptions
 from src.models.horizon3d.kggi import Initialization
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
-from src.models.horizon3d.ocsf import CrossAttention, RefineFrom
+from src.models.horizon3d.ocsf import CrossAttention, RefineFrom, VelocityUpdate
 from src.structures.boxes import Boxes3D
 from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
 
@@ -90,7 +91,7 @@ def test_no_visible_gaussian(make_model, make_batch):
         for layer in model.ocsf.encoder.layers:
             layer.refinement.output.bias[6] = -30.0  # opacity: nothing opens a cell
     output, terms = train_step(model, batch)
-    assert len(output.ocsf.splat.bev) == 0 and not output.ocsf.splat.active.any()
+    assert len(output.ocsf.splat.bev) == 0 and not output.ocsf.splat.active().any()
     assert all(value.isfinite() for value in terms.values()) and gradients_are_finite(model)
 
 
@@ -159,6 +160,22 @@ def test_gaussian_velocity_is_supervised_in_phase_1_where_asked_for(make_model, 
     for boxes in batch.boxes:
         boxes.velocities[:] = torch.nan
     assert float(train_step(model, batch)[1]["gaussian_velocity"].detach()) == 0.0
+
+
+def test_an_untrained_model_knows_the_radial_velocities(make_model, make_batch):
+    """They start from the Doppler of their cell and are changed by steps, which an untrained layer hardly makes."""
+    start = {"initial_velocity": VelocityStart.doppler, "velocity_update": VelocityUpdate.residual}
+    model, batch = make_model(**start).eval(), make_batch()
+    with torch.no_grad():
+        output, _ = model(batch)
+    measured = doppler_map(output.radar_bev, model.grid, batch.radar_points, batch.radar_batch)
+    first, last = output.kggi.gaussians, output.ocsf.gaussians
+    sample, gaussian = first.valid.nonzero().unbind(1)
+    cells = model.grid.cell_of(first.means[sample, gaussian])
+    wanted = measured.lookup(torch.cat([sample[:, None], cells], dim=1))
+    assert wanted.abs().max() > 5
+    torch.testing.assert_close(last.velocities[sample, gaussian], wanted, atol=0.5, rtol=0)
+    assert parameters_that_stay(make_model(**start, velocity_unit_mps=10.0), make_batch(boxes=(12, 12)), lr=1e-2) == []
 
 
 @pytest.mark.slow
@@ -274,6 +291,7 @@ def test_impossible_combinations_are_refused(make_config, make_batch, make_model
         ({"gate_kernel_size": 2}, "gate_kernel_size=2"),
         ({"margin_m": -1.0}, "margin_m=-1.0"),
         ({"max_speed_mps": 0.0}, "max_speed_mps=0.0"),
+        ({"velocity_unit_mps": 0.0}, "velocity_unit_mps=0.0"),
         ({"ocsf_weight": -1.0}, "ocsf_weight=-1.0"),
     ],
 )

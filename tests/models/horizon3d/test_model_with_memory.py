@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from src.errors import ConfigError
+from src.models.backbones.doppler import VelocityStart
 from src.models.horizon3d.gaussian_path import Sampling, SelfAttentionConfig
 from src.structures.gaussians import GaussianSet, Source
 from tests.models.moving import pose
@@ -22,6 +23,7 @@ TOGGLES = {  # Tables 5, 6, 7 and 13
     "Gaussian not compensated": GAUSSIAN_ONLY | {"velocity_compensation": False},
     "random": GAUSSIAN_ONLY | {"sampling": Sampling.random},
     "top opacity": GAUSSIAN_ONLY | {"sampling": Sampling.top_opacity},
+    "cells and radar": {"velocity_start": VelocityStart.doppler},
     "no self-attention": {"self_attention": None},
     "one head": {"self_attention": SelfAttentionConfig(num_heads=1)},
 }
@@ -81,7 +83,7 @@ def test_history_is_seen_by_what_follows(with_past):
     with torch.no_grad():
         without, joined = model(batch)[0], model(batch, memory)[0]
     assert (joined.ocsf.gaussians.features[:, :CURRENT] - without.ocsf.gaussians.features).abs().max() > 1e-3
-    assert joined.ocsf.splat.active[:, CURRENT:].any()  # it opens cells of its own
+    assert joined.ocsf.splat.active()[:, CURRENT:].any()  # it opens cells of its own
     assert model.diagnostics(joined)["gaussians_history"] > 0
 
 
@@ -107,7 +109,7 @@ def test_padding_of_history_contributes_nothing(with_past, path, change):
     for pick in (lambda o: o.ocsf.splat.bev, lambda o: o.fused_bev, lambda o: o.dptf.bev):
         assert torch.equal(pick(padded).indices, pick(without).indices)
         torch.testing.assert_close(pick(padded).features, pick(without).features, atol=1e-4, rtol=1e-4)
-    assert not padded.ocsf.splat.active[:, CURRENT:].any()
+    assert not padded.ocsf.splat.active()[:, CURRENT:].any()
 
 
 def test_some_padding_beside_real_history_contributes_nothing(with_past):
@@ -172,7 +174,7 @@ def test_every_row_of_the_tables_trains(make_model, make_batch, make_dptf, name)
 
 
 def test_radar_only_with_the_bev_path(make_model, make_batch, make_dptf):
-    model = make_model(radar_only=True, dptf=make_dptf(gaussian_path=False))
+    model = make_model(radar_only=True, dptf=make_dptf(gaussian_path=False, velocity_start=VelocityStart.doppler))
     batches = [at(make_batch(seed=i, images=False), 10.0 + 0.5 * i, 5.0 * i) for i in range(2)]
     output, terms, memory = two_steps(model, *batches)
     assert set(terms) == {"heatmap", "box", "total"} | CELL_TERMS

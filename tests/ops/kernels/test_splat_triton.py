@@ -46,6 +46,7 @@ def compare(gaussians, batch, batch_size, **choices):
         assert torch.equal(value, wanted) if isinstance(value, torch.Tensor) else value == wanted, name
     assert torch.equal(found.occupied.keys, expected.occupied.keys)
     torch.testing.assert_close(found.log_free.double(), expected.log_free, rtol=2e-5, atol=1e-7)
+    torch.testing.assert_close(found.peak_contribution.double(), expected.peak_contribution, rtol=2e-5, atol=1e-7)
     torch.testing.assert_close(found.features.double(), expected.features, rtol=0, atol=2e-5)
     for name, grad, wanted in zip(NAMES, grads, expected_grads, strict=True):
         assert grad.shape == wanted.shape

@@ -1,0 +1,99 @@
+"""Rasters of boxes: which cells they cover, and the velocity of those (Eq. 9; method 5.6, 6.1, 6.2, 8.2)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from src.geometry.bev_grid import BEVGrid
+from src.geometry.box_cells import cells_in_boxes
+from src.ops.segment_reduce import inverse_rows
+from src.ops.sites import rows_of_keys
+from src.structures.boxes import Boxes3D
+from src.targets.supervision import join_boxes, supervised_boxes
+
+
+class BoxRaster:
+    """The cells of a batch that its supervised boxes cover, length and width enlarged by `margin_m` in total (epsilon).
+
+    A cell takes its velocity from one box. A box itself comes before the margin of another, so that a sign does not
+    learn the speed of the car that passes it. Among boxes, and among margins, the faster one wins (CRT-Fusion), and one
+    of unknown velocity over all. Linear keys are (b * rows + row) * cols + col, -1 for no cell.
+    """
+
+    keys: Tensor  # [P] int64, covered cells, sorted, unique
+    inside: Tensor  # [P] bool, in a box itself, not only in a margin
+    velocities: Tensor  # [P, 2] m/s over ground, augmented axes; NaN where unknown
+    boxes: Boxes3D  # K supervised boxes of all samples
+    sample: Tensor  # [K] int64, the sample of each, ascending
+
+    def __init__(
+        self,
+        annotated: list[Boxes3D],  # B, augmented ego frame
+        grid: BEVGrid,
+        margin_m: float,
+    ) -> None:
+        self.annotated, self.grid, self.margin_m = annotated, grid, margin_m
+        self.boxes, self.sample = supervised_boxes(annotated, grid)
+        num = max(len(self.boxes), 1)
+        order = self.boxes.velocities.norm(dim=1).nan_to_num(nan=torch.inf).argsort(descending=True, stable=True)
+        rank = inverse_rows(order, len(self.boxes))
+        codes = []  # (cell, whether only in the margin, rank) as one number
+        for in_margin, enlarged_m in enumerate(sorted({0.0, margin_m})):
+            owners, keys = _box_cell_keys(self.boxes, self.sample, grid, enlarged_m)
+            codes.append((2 * keys + in_margin) * num + rank[owners])
+        code = torch.cat(codes).sort().values
+        keys = torch.div(code, 2 * num, rounding_mode="floor")
+        first = torch.ones_like(keys, dtype=torch.bool)
+        first[1:] = keys[1:] != keys[:-1]
+        self.keys, code = keys[first], code[first]
+        self.inside = code % (2 * num) < num
+        self.velocities = self.boxes.velocities[order[code % num]]
+
+    def in_boxes(
+        self,
+        keys: Tensor,  # [q] int64
+    ) -> Tensor:  # [q] bool
+        """Which cells lie in a box itself."""
+        return self._at(self.inside, keys, False)
+
+    def velocities_in_boxes(
+        self,
+        keys: Tensor,  # [q] int64
+    ) -> Tensor:  # [q, 2]
+        """Target velocity at cells; NaN, that is unsupervised, outside every box itself and where it is unknown."""
+        return self._at(self.velocities.where(self.inside[:, None], torch.nan), keys, torch.nan)
+
+    def velocities_in_margins(
+        self,
+        keys: Tensor,  # [q] int64
+    ) -> Tensor:  # [q, 2]
+        """Target velocity at cells; NaN outside every enlarged box and where it is unknown.
+
+        At p*_i, the cell where Gaussian i contributes most, it is the target of Eq. 9.
+        """
+        return self._at(self.velocities, keys, torch.nan)
+
+    def on_open_ground(
+        self,
+        keys: Tensor,  # [q] int64
+    ) -> Tensor:  # [q] bool
+        """Which cells no enlarged box covers, supervised or not: whatever returns there, nothing annotated moves."""
+        sample = torch.repeat_interleave(torch.tensor([len(boxes) for boxes in self.annotated], device=keys.device))
+        covered = torch.unique(_box_cell_keys(join_boxes(self.annotated), sample, self.grid, self.margin_m)[1])
+        return (keys >= 0) & (rows_of_keys(covered, keys) < 0)
+
+    def _at(self, values: Tensor, keys: Tensor, elsewhere: float) -> Tensor:
+        rows = rows_of_keys(self.keys, keys)
+        return torch.cat([values, values.new_full((1, *values.shape[1:]), elsewhere)])[rows]  # row -1 is the last
+
+
+def _box_cell_keys(
+    boxes: Boxes3D,  # K boxes of a batch
+    batch: Tensor,  # [K] int64
+    grid: BEVGrid,
+    margin_m: float,
+) -> tuple[Tensor, Tensor]:  # [pairs], [pairs] int64
+    """All (box, cell) pairs, the cell as a linear key."""
+    owners, cells, _ = cells_in_boxes(boxes.bev(), grid, margin_m)
+    return owners, batch[owners] * (grid.rows * grid.cols) + cells
