@@ -27,7 +27,7 @@ HITCH_OVERLAP_M = {"tractor_unit": 1.9, "rigid_truck": -1.2}
 
 COMFORTABLE_MPS2 = 3.0
 """Vehicles start so far apart that braking like this avoids a collision."""
-TRAILER_CHANCE = {"tractor_unit": 0.9, "rigid_truck": 0.5}
+TRAILER_CHANCE = {"tractor_unit": 0.9, "rigid_truck": 0.3}
 
 
 @dataclass(kw_only=True)
@@ -96,10 +96,10 @@ def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.
         ("farm_tractor" if rng.random() < 0.5 else "excavator", slow, rng.uniform(-3.5, -1), rng.uniform(70, 120)),
     ]
     for side in (1, -1):  # trucks drive in convoys: most often one close ahead of the ego truck, one close behind it
-        if rng.random() < 0.7:
+        if rng.random() < 0.6:
             _add(fleet, Vehicle("lorry", 1, slow, side * rng.uniform(32, 65), ego_mps, may_change=False))
-    if rng.random() < 0.35:  # one that takes its time to overtake the ego truck
-        place, wanted = rng.uniform(-40, 10), ego_mps + rng.uniform(0.5, 2.0)
+    if rng.random() < 0.12:  # one that takes its time to overtake the ego truck
+        place, wanted = rng.uniform(4, 28), ego_mps + rng.uniform(0.5, 2.0)
         _add(fleet, Vehicle("tractor_unit", 1, slow - 1, place, wanted, has_trailer=True, may_change=False))
     for kind, lane, faster, place in company:
         chosen = "bendy_bus" if kind == "bus" and rng.random() < 0.3 else kind
@@ -110,7 +110,7 @@ def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.
             busy = config.vehicles_per_lane_km * (0.8 if lane == 0 else 1.1)
             place = low + rng.uniform(0, 40)
             while busy > 0 and place < high:
-                rear_seen = direction > 0 and place > -120
+                rear_seen = direction > 0 and place > -200
                 kind, wanted = _draw_vehicle(road, lane, rear_seen, rng)
                 has_trailer = rear_seen and rng.random() < TRAILER_CHANCE.get(kind, 0.0)
                 _add(fleet, Vehicle(kind, direction, lane, place, wanted, has_trailer=has_trailer))
@@ -149,7 +149,7 @@ def _draw_vehicle(road: Road, lane: int, rear_seen: bool, rng: np.random.Generat
     """
     from_right = road.lanes - 1 - lane
     kinds = ("car", "lorry", "tractor_unit", "rigid_truck", "van", "bus", "motorcycle")
-    chances = ((0.53, 0.15, 0.07, 0.11, 0.1, 0.02, 0.02), (0.83, 0.02, 0.01, 0.03, 0.08, 0.015, 0.015),
+    chances = ((0.53, 0.17, 0.05, 0.11, 0.1, 0.02, 0.02), (0.83, 0.02, 0.01, 0.03, 0.08, 0.015, 0.015),
                (0.94, 0.0, 0.0, 0.0, 0.04, 0.0, 0.02))  # fmt: skip
     kind = str(rng.choice(kinds, p=chances[min(from_right, 2)]))
     if kind == "tractor_unit" and not rear_seen:
