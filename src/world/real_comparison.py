@@ -27,7 +27,7 @@ SEEN_S = 4.0
 
 
 @dataclass(kw_only=True)
-class Comparison:
+class FigureTable:
     """One table: rows of figures of the world and, where there are any, of the real data."""
 
     name: str
@@ -79,7 +79,7 @@ def _first_number(name: str) -> float:
     return float(head) if head.isdigit() else -1.0
 
 
-def compare(counts: DatasetCounts, num_sweeps: int) -> list[Comparison]:
+def compare(counts: DatasetCounts, num_sweeps: int) -> list[FigureTable]:
     """Every table of the real data beside the same of this data set, then those that only it has."""
     known = yaml.safe_load(REAL_STATISTICS.read_text(encoding="utf-8"))
     ours = _Tables(counts, num_sweeps)
@@ -88,7 +88,7 @@ def compare(counts: DatasetCounts, num_sweeps: int) -> list[Comparison]:
         real = {group: {column: _cell(cell) for column, cell in row.items()} for group, row in table["rows"].items()}
         bands = list(dict.fromkeys(column for row in real.values() for column in row))
         tables.append(
-            Comparison(
+            FigureTable(
                 name=name,
                 title=table["title"],
                 unit=table["unit"],
@@ -312,7 +312,7 @@ class _Tables:
             "boxes above 10 m/s": {"share %": (100.0 * float(np.mean(speed > MOVING_MPS)), None)},
         }
 
-    def remembered(self) -> Comparison:
+    def remembered(self) -> FigureTable:
         """Moving boxes within their class's range that the accumulated radar hardly or no longer shows."""
         limit = np.array([CLASS_RANGE_M.get(name, 0.0) for name in self.counts.classes])
         movers = (self.counts.speed_mps > MOVING_MPS) & (self.counts.distance_m < limit)
@@ -325,7 +325,7 @@ class _Tables:
                 "now %": _share(few[movers]),
                 f"seen with {least} in the last {SEEN_S:g} s %": _share((few & seen)[movers]),
             }
-        return Comparison(
+        return FigureTable(
             name="remembered",
             title=f"Boxes above {MOVING_MPS:g} m/s by their radar points in {self.num_sweeps} sweeps",
             unit="percent of those boxes",

@@ -11,7 +11,7 @@ from src.files.atomic_write import write_whole
 from src.pictures.canvas import SHEET_PX, Canvas
 from src.pictures.contents import INK
 from src.pictures.learning_curves import LINE_COLOURS, style_axes
-from src.world.real_comparison import FEWEST_BOXES, Cell, Comparison
+from src.world.real_comparison import FEWEST_BOXES, Cell, FigureTable
 
 PLOTTED = {
     "support": "Boxes with a radar point, %",
@@ -23,7 +23,7 @@ WORLD_COLOUR, REAL_COLOUR = LINE_COLOURS[0], INK
 PANEL_PX, PANELS_PER_ROW = 250, 4
 
 
-def write_page(folder: Path, tables: list[Comparison], what: str, command: str) -> Path:
+def write_page(folder: Path, tables: list[FigureTable], what: str, command: str) -> Path:
     """`statistics.md` in a folder with its pictures; `what` says which data set it is, `command` how to measure it."""
     for table in tables:
         if table.name in PLOTTED:
@@ -33,7 +33,7 @@ def write_page(folder: Path, tables: list[Comparison], what: str, command: str) 
     return path
 
 
-def page_text(tables: list[Comparison], what: str, command: str) -> str:
+def page_text(tables: list[FigureTable], what: str, command: str) -> str:
     """The page in Markdown."""
     lines = [
         "# The synthetic highway beside MAN TruckScenes",
@@ -62,7 +62,7 @@ def page_text(tables: list[Comparison], what: str, command: str) -> str:
     return "\n".join(lines)
 
 
-def verdict(tables: list[Comparison]) -> list[str]:
+def verdict(tables: list[FigureTable]) -> list[str]:
     """For each table with an allowance how many cells keep it, and those that do not."""
     lines = []
     for table in tables:
@@ -78,7 +78,7 @@ def verdict(tables: list[Comparison]) -> list[str]:
     return lines
 
 
-def table_lines(table: Comparison) -> list[str]:
+def table_lines(table: FigureTable) -> list[str]:
     """One table in Markdown."""
     columns, beyond = table.columns(), {(group, column) for group, column, *_ in table.beyond()}
     lines = ["| | " + " | ".join(columns) + " |", "|---|" + "---|" * len(columns)]
@@ -104,7 +104,7 @@ def _number(cell: Cell | None) -> str:
     return text if boxes is None else f"{text} ({boxes})"
 
 
-def draw_table(path: Path, table: Comparison, title: str) -> None:
+def draw_table(path: Path, table: FigureTable, title: str) -> None:
     """One panel per row: the world's curve and the real one over distance."""
     groups, columns = table.groups(), table.columns()
     rows = -(-len(groups) // PANELS_PER_ROW)

@@ -6,7 +6,7 @@ import yaml
 
 from src.structures.taxonomy import CLASSES
 from src.world.dataset_statistics import DatasetCounts
-from src.world.real_comparison import REAL_STATISTICS, Comparison, compare
+from src.world.real_comparison import REAL_STATISTICS, FigureTable, compare
 
 
 def counts_of(tracks, frames=12):
@@ -91,7 +91,7 @@ def test_remembered_are_fast_boxes_in_range_that_were_seen_within_four_seconds()
 
 
 def test_only_real_figures_on_enough_boxes_are_held_against_a_data_set():
-    table = Comparison(
+    table = FigureTable(
         name="support", title="", unit="", sources=[], trust="", allowed=15, allowed_heavy=10,
         world={"car": {"0-25": (50.0, 9), "25-50": (50.0, 9)}, "truck": {"0-25": (50.0, 9)}},
         real={

@@ -2,10 +2,10 @@
 
 from PIL import Image
 
-from src.world.real_comparison import Comparison
+from src.world.real_comparison import FigureTable
 from src.world.statistics_page import page_text, table_lines, verdict, write_page
 
-SUPPORT = Comparison(
+SUPPORT = FigureTable(
     name="support", title="Boxes with a point", unit="percent", sources=["a/b@c"], trust="high", allowed=15,
     allowed_heavy=10,
     world={"car": {"0-25": (50.0, 900), "150+": (4.4, 30)}, "traffic_sign": {"0-25": (1.0, 8)}},
@@ -23,7 +23,7 @@ def test_cells_hold_both_figures_with_their_boxes_and_are_bold_where_they_differ
     assert verdict([SUPPORT]) == [
         "- Boxes with a point: 1 of 2 cells within 15 (truck, bus, trailer: 10) points; beyond: car 0-25 m 50 / 66"
     ]
-    alone = Comparison(name="x", title="", unit="", sources=[], trust="", world={"all": {"now": (5.0, 3)}}, real={})
+    alone = FigureTable(name="x", title="", unit="", sources=[], trust="", world={"all": {"now": (5.0, 3)}}, real={})
     assert table_lines(alone)[-1] == "| all | 5 (3) |"
 
 
