@@ -140,6 +140,7 @@ class Config:
     out: str | None
     scene: str | None
     preview: bool
+    compare: bool
     suite: BenchmarkSuite
 
     def __post_init__(self) -> None:

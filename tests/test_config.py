@@ -159,7 +159,7 @@ FULL_SIZE = {
     "paths": {"outputs": "outputs", "reports": "reports"},
     "": {
         "precision": "bf16-mixed", "seed": 0, "resume": "auto", "checkpoint": None, "predictions": None, "out": None,
-        "preview": False, "suite": "model",
+        "preview": False, "compare": False, "suite": "model",
     },
 }  # fmt: skip
 

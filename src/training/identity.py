@@ -18,6 +18,7 @@ OUTSIDE_IDENTITY = (
     "out",
     "scene",
     "preview",
+    "compare",
     "suite",
     "phase.train_missing",
     "data.num_workers",
