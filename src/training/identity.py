@@ -19,6 +19,7 @@ OUTSIDE_IDENTITY = (
     "scene",
     "preview",
     "suite",
+    "oracle",
     "phase.train_missing",
     "data.num_workers",
     "data.root",

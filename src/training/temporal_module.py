@@ -11,6 +11,7 @@ from torch import Tensor
 from src.models.detector import TemporalMemory
 from src.structures.batch import FrameBatch
 from src.training.module import TrainingModule
+from src.training.true_motion import TrueMotion
 
 logger = logging.getLogger(__name__)
 
@@ -29,6 +30,7 @@ class TemporalModule(TrainingModule):
         # Sets of streams take turns (`data.stream_sets`): the streams [B] int64 of each last batch, and their memory.
         self.memories: list[tuple[Tensor, TemporalMemory]] = []
         self._before_step: list[tuple[Tensor, TemporalMemory]] = []
+        self.oracle: TrueMotion | None = None  # of an evaluation
 
     def run(self, batch: FrameBatch) -> Any:
         """The model's output for the next frames of the batch's streams; they are remembered.
@@ -36,6 +38,8 @@ class TemporalModule(TrainingModule):
         Raises ValueError for a batch without streams.
         """
         past = self.recall(batch)
+        if self.oracle is not None and past is not None:
+            past = self.oracle.correct(past, batch)
         # Before the forward pass: on a GPU the look at the streams would otherwise wait for all of it.
         self.memories = [entry for entry in self.memories if not _common(batch.streams, entry[0]).any()]
         output, memory = self.model(batch, past)
