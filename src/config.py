@@ -141,6 +141,7 @@ class Config:
     out: str | None
     scene: str | None
     preview: bool
+    compare: bool
     suite: BenchmarkSuite
     oracle: Oracle
 

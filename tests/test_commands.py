@@ -133,9 +133,13 @@ def test_a_killed_run_resumes_and_ends_with_the_same_weights(trained, outputs, t
     assert lines[0] == lines[1]
 
 
-def test_world_preview(outputs, tmp_path):
-    result = call("world.__main__", "scale=debug", "preview=true", f"paths.outputs={outputs}", f"out={tmp_path}")
-    assert list(tmp_path.glob("*.png")) and "picture:" in result.stdout
+def test_world_preview_and_comparison(outputs, tmp_path):
+    paths = [f"paths.outputs={outputs}", f"out={tmp_path}"]
+    result = call("world.__main__", "scale=debug", "preview=true", "compare=true", *paths)
+    assert list(tmp_path.glob("scene_*.png")) and "picture:" in result.stdout
+    assert "Boxes with at least one radar point: " in result.stdout
+    page = (tmp_path / "statistics.md").read_text()
+    assert "2 scenes of 3 key frames" in page and "compare=true" in page and str(outputs) not in page
 
 
 def test_make_names_its_targets_and_a_wrong_phase():

@@ -111,6 +111,11 @@ class FrameMemory(TensorFields, Generic[Frame]):
         """B, 0 for an empty memory."""
         return len(self.frames[0].present) if self.frames else 0
 
+    @property
+    def present(self) -> Tensor:  # [T, B] bool
+        """Which streams remember their last, last but one, ... frame; not of an empty memory."""
+        return torch.stack([frame.present for frame in self.frames])
+
     def before(self, batch: FrameBatch) -> Self:
         """What of the memory is in the past of the batch, stream by stream; the rest is forgotten for good.
 
