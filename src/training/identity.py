@@ -20,6 +20,7 @@ OUTSIDE_IDENTITY = (
     "preview",
     "compare",
     "suite",
+    "oracle",
     "phase.train_missing",
     "data.num_workers",
     "data.root",

@@ -14,6 +14,7 @@ from torch import Tensor
 from src.models.detector import Objective, TemporalMemory
 from src.structures.batch import FrameBatch
 from src.training.module import TrainingModule
+from src.training.true_motion import TrueMotion
 
 logger = logging.getLogger(__name__)
 
@@ -33,6 +34,7 @@ class TemporalModule(TrainingModule):
         self.memories: list[tuple[Tensor, TemporalMemory]] = []
         self._before_step: list[tuple[Tensor, TemporalMemory]] = []
         self._used: TemporalMemory | None = None  # by the last batch
+        self.oracle: TrueMotion | None = None  # of an evaluation
 
     def run(self, batch: FrameBatch) -> Any:
         """The model's output for the next frames of the batch's streams, to be remembered, or for frames with a past.
@@ -42,6 +44,8 @@ class TemporalModule(TrainingModule):
         past = self._used = self.remember(batch.past) if batch.past else self.recall(batch)
         if batch.past:
             return self.model(batch, past)[0]
+        if self.oracle is not None and past is not None:
+            past = self.oracle.correct(past, batch)
         # Before the forward pass: on a GPU the look at the streams would otherwise wait for all of it.
         self.memories = [entry for entry in self.memories if not _common(batch.streams, entry[0]).any()]
         output, memory = self.model(batch, past)
