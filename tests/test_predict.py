@@ -46,6 +46,10 @@ def whole(checkpoints, outputs):
     return outputs / "predictions" / "run-phase2" / "val"
 
 
+def by_place(box):
+    return box["detection_name"], box["translation"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
 def test_boxes_are_those_of_evaluate(checkpoints, outputs, tmp_path, phase):
@@ -56,7 +60,9 @@ def test_boxes_are_those_of_evaluate(checkpoints, outputs, tmp_path, phase):
     assert list(ours) == list(theirs) and len(ours) == 2 * FRAMES
     for token, boxes in ours.items():
         assert len(boxes) == len(theirs[token]) > 20
-        for mine, other in zip(boxes, theirs[token], strict=True):
+        # By place: scores of an untrained head may be a rounding apart, and batches of other sizes round differently.
+        pairs = zip(sorted(boxes, key=by_place), sorted(theirs[token], key=by_place), strict=True)
+        for mine, other in pairs:
             for name in ("translation", "size", "rotation", "velocity", "detection_score"):
                 np.testing.assert_allclose(mine[name], other[name], atol=1e-4)
             assert all(mine[name] == other[name] for name in ("sample_token", "detection_name", "attribute_name"))

@@ -249,12 +249,13 @@ MODELS = PHASES | {"dense": ("model=dense_bev", *PHASES["phase2"])}
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_half_precision_is_as_near_as_its_digits_allow(load, name):
-    """The loss within 3 %, its terms within 8 %, the gradient within thrice what half a digit of the weights moves it.
+    """The loss within 3 %, its terms within 8 % or thrice what half a digit of the weights moves them, as the gradient.
 
     bfloat16 has 8 bits: a rounding moves a number by up to 2^-9 = 0.2 %, and some forty layers one after the other, by
     chance up and down, by 1.2 %. A term moves further where one of its few cells or Gaussians is chosen otherwise.
     The gradient of a fresh model depends on such choices far more than on digits, so that it is measured against
-    float32 with weights moved by up to 2^-9; half precision rounds activations and their gradients too: three times.
+    float32 with weights moved by up to 2^-9, and so is a term; half precision rounds activations and their gradients
+    too: three times.
     """
     module, _, batches = load(*MODELS[name])
     plain = list(steps(module, batches, bf16=False))
@@ -265,10 +266,12 @@ def test_half_precision_is_as_near_as_its_digits_allow(load, name):
         for parameter in moved.model.parameters():
             parameter.mul_(1 + 2.0**-9 * (2 * torch.rand(parameter.shape, generator=generator) - 1))
     moved = list(steps(moved, batches, bf16=False))
-    for (terms, gradient), (rounded, its_gradient), (_, moved_gradient) in zip(plain, half, moved, strict=True):
+    for (terms, gradient), (rounded, its_gradient), (shaken, moved_gradient) in zip(plain, half, moved, strict=True):
         assert rounded["total"] != terms["total"]
         assert rounded["total"] == pytest.approx(terms["total"], rel=0.03)
-        assert rounded == pytest.approx(terms, rel=0.08, abs=1e-6)
+        for term, value in terms.items():
+            allowed = max(0.08 * abs(value), 3 * abs(shaken[term] - value), 1e-6)
+            assert abs(rounded[term] - value) <= allowed, (term, value, rounded[term], shaken[term])
         sensitivity = float((moved_gradient - gradient).norm() / gradient.norm())
         assert float((its_gradient - gradient).norm() / gradient.norm()) < 3 * sensitivity, sensitivity
 
