@@ -14,6 +14,9 @@ MEASURES = {
     "remembered_share": "objects that history covers",
 }
 
+IN_WORDS = {"mAP": "mAP", "NDS": "NDS", "classes.car.AP": "car AP", "measures.moving_AP": "AP of moving vehicles"}
+"""Numbers whose intervals are shown, by their paths."""
+
 
 def format_scores(metrics: Mapping[str, Any]) -> str:
     """Tables of the content of metrics.json: a summary by distance bin, every class by distance bin, speed classes,
@@ -40,7 +43,14 @@ def format_scores(metrics: Mapping[str, Any]) -> str:
         tables.append(_measures(measures))
     if measures.get("radar_gaussians") is not None:
         tables.append(_gaussians(measures))
-    return "\n\n".join(map(_align, tables))
+    return "\n\n".join([*map(_align, tables), *_intervals(metrics.get("intervals", {"bounds": {}}))])
+
+
+def _intervals(intervals: Mapping[str, Any]) -> list[str]:
+    """How sure the main numbers are, in a line; none of a single scene."""
+    known = {words: intervals["bounds"].get(name) for name, words in IN_WORDS.items()}
+    shown = [f"{words} {_percent(found[0])} to {_percent(found[1])}" for words, found in known.items() if found]
+    return [f"95 % intervals over {intervals['scenes']} scenes: {', '.join(shown)}"] if shown else []
 
 
 def _speeds(parts: Mapping[str, Any]) -> list[list[str]]:

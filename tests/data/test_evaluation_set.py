@@ -49,6 +49,23 @@ def test_ground_truth_is_the_devkits_to_the_last_bit(golden, golden_set):
     assert table.num_points.tolist() == [box["num_pts"] for _, box in boxes]
 
 
+def test_scenes_times_and_objects_are_those_of_the_tables(golden, golden_set):
+    tables = {name: {record["token"]: record for record in records} for name, records in golden["tables"].items()}
+    scene_of = {token: tables["sample"][token]["scene_token"] for token in golden_set.tokens}
+    pairs = set(zip(golden_set.scenes.tolist(), scene_of.values(), strict=True))
+    assert len(pairs) == len(set(scene_of.values())) == len({number for number, _ in pairs}) > 1
+    times = {token: 1e-6 * tables["sample"][token]["timestamp"] for token in golden_set.tokens}
+    np.testing.assert_allclose(golden_set.times_s, list(times.values()), rtol=0, atol=0.1)  # of the key frame's LiDAR
+    annotations = {(r["sample_token"], tuple(r["translation"])): r for r in golden["tables"]["sample_annotation"]}
+    truth = golden_set.ground_truth
+    objects = [
+        annotations[golden_set.tokens[sample], tuple(center)]["instance_token"]
+        for sample, center in zip(truth.samples, truth.centers.tolist(), strict=True)
+    ]
+    pairs = set(zip(golden_set.instances.tolist(), objects, strict=True))
+    assert len(pairs) == len(set(objects)) == len({number for number, _ in pairs}) > 1
+
+
 def test_racks(golden, golden_set):
     racks = [(row, box) for row, token in enumerate(golden_set.tokens) for box in golden["bicycle_racks"][token]]
     assert racks and golden_set.racks.samples.tolist() == [row for row, _ in racks]

@@ -10,6 +10,7 @@ from src.benchmark.suite_metric import random_problem
 from src.metrics.bootstrap import interval, score_draws, with_intervals
 from src.metrics.detection import score_detections
 from src.metrics.diagnostics import FrameDiagnosis
+from src.metrics.score_text import format_scores
 from src.metrics.scores import plain_number
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import CLASSES
@@ -145,6 +146,15 @@ def test_metrics_with_intervals_are_plain_json(problem):
     measured = {name for name in content["measures"] if not name.endswith("_boxes")}
     assert {name for name in bounds if name.startswith("measures.")} == {f"measures.{name}" for name in measured}
     assert bounds["ranges.0-25.classes.traffic_cone.AP"] == [0.0, 0.0] and "classes.barrier.AVE" not in bounds
+
+
+def test_the_terminal_says_how_sure_scores_are(problem):
+    content = with_intervals(score_detections(*problem))
+    low, high = content["intervals"]["bounds"]["mAP"]
+    line = format_scores(content).splitlines()[-1]
+    assert line.startswith(f"95 % intervals over 5 scenes: mAP {100 * low:.1f} to {100 * high:.1f}, NDS ")
+    del content["intervals"]
+    assert "intervals" not in format_scores(content), "files written before there were any can be shown"
 
 
 def test_one_scene_says_nothing_of_others(problem):

@@ -62,7 +62,10 @@ def straight_scene(kind, ahead_m, speed_mps=0.0, aside_m=0.0, own_m=0.0, screen_
 
 
 NOTHING = Scenery(
-    mesh=None, layer=None, s=None, clutter=np.zeros((0, 3)),
+    mesh=None,
+    layer=None,
+    s=None,
+    clutter=np.zeros((0, 3)),
     **{f"clutter_{name}": np.zeros(0) for name in ("rcs_db", "s", "d", "height")},
 )
 
