@@ -17,6 +17,7 @@ from src.models.detector import Detector
 from src.reliability.checkpoints import load_model_weights
 from src.structures.detections import DetectionTable
 from src.structures.taxonomy import SENSORS
+from src.training.handoff import norms_handed_over
 from src.training.module import TrainingModule
 from src.training.phases import EVALUATORS, MODULES
 from src.training.trainer_config import OnNonfinite
@@ -98,12 +99,14 @@ def save_submission(config: Config, path: Path, tokens: list[str], table: Detect
 
 def build_module(config: Config, tree: dict[str, Any], datamodule: DetectionDataModule) -> TrainingModule:
     """The LightningModule of a run; `tree` is the configuration as plain values."""
+    model = build_model(config)
     return MODULES[config.phase.module](
-        build_model(config),
+        model,
         optim=config.optim,
         backbone_lr_multiplier=config.backbone.lr_multiplier,
         evaluator=EVALUATORS[config.phase.task].of(datamodule),
         seed=config.seed,
         config=tree,
         skip_nonfinite=config.trainer.on_nonfinite is OnNonfinite.skip,
+        frozen_norms=norms_handed_over(model) if config.phase.frozen_statistics else (),
     )

@@ -34,6 +34,7 @@ from src.training.optim import OptimConfig
 from src.training.phases import PhaseConfig
 from src.training.run_folder import Resume
 from src.training.trainer_config import TrainerConfig
+from src.training.true_motion import Oracle
 from src.training.wandb import WandbConfig
 from src.world.world_config import WorldConfig
 
@@ -140,7 +141,9 @@ class Config:
     out: str | None
     scene: str | None
     preview: bool
+    compare: bool
     suite: BenchmarkSuite
+    oracle: Oracle
 
     def __post_init__(self) -> None:
         if not isinstance(self.precision, str) or self.precision not in [p.value for p in Precision]:
@@ -260,7 +263,7 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
 
     A group choice (`data=truckscenes`) replaces that whole group, at the checkpoint's scale and phase; `model=` only
     says whose keys may follow. A key of `trainer` that is younger than the checkpoint has today's value. `paths` are
-    the command's own: where it reads and writes is not for a file to say, least of all for a stranger's.
+    the command's own: where it reads and writes is not for a file to say, least of all a stranger's; so is `oracle`.
     Raises CheckpointError when the stored tree does not fit this version of the code, ConfigError for another model,
     scale or phase and for a key below a part that the checkpoint does not have.
     """
@@ -281,7 +284,7 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
             raise ConfigError(f"{key}={changes[key].value()}: the checkpoint is of {key}={own}; leave {key}= out")
     own = [f"{key}={fixed[key]}" for key in ("scale", "model", "phase")]
     tree, fresh = OmegaConf.create(stored), _compose([*own, *overrides])
-    tree.paths = fresh.paths
+    tree.paths, tree.oracle = fresh.paths, fresh.oracle
     changes.pop("model", None)  # only says whose keys may follow: the checkpoint's own values stay
     for key in sorted(changes, key=lambda key: key.count(".")):  # a part before what lies in it
         part = key.rpartition(".")[0]

@@ -1,4 +1,7 @@
-"""`python -m src.evaluate checkpoint=PATH | predictions=FILE [data.root=DIR data.version=V data.split=S] [out=DIR]`."""
+"""`python -m src.evaluate checkpoint=PATH | predictions=FILE [data.root=DIR data.version=V data.split=S] [out=DIR]`.
+
+`oracle=velocity|motion` tells the memory of a checkpoint how everything really moves, see `Oracle`.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +23,8 @@ from src.training.evaluator import Evaluator
 from src.training.fit import build_evaluation_trainer
 from src.training.identity import digest_of_changes
 from src.training.run_folder import make_writable, write_json
+from src.training.temporal_module import TemporalModule
+from src.training.true_motion import Oracle, TrueMotion
 
 logger = logging.getLogger(__name__)
 
@@ -29,6 +34,8 @@ def main(overrides: list[str]) -> None:
     config, _ = compose_config(overrides)
     if (config.checkpoint is None) == (config.predictions is None):
         raise ConfigError("give either checkpoint=PATH or predictions=FILE.json")
+    if config.oracle is not Oracle.none and config.predictions is not None:
+        raise ConfigError(f"oracle={config.oracle.value}: a file of boxes has no memory; give checkpoint=PATH")
     source = Path(config.checkpoint or config.predictions)
     if config.predictions and not source.is_file():  # before a world is written for it
         raise DataError(f"predictions={source}: there is no such file")
@@ -69,6 +76,10 @@ def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[Evalu
     datamodule = build_datamodule(config, data_root(config, write=False))
     module = build_module(config, tree, datamodule)
     load_model_weights(module.model, checkpoint, path)
+    if config.oracle is not Oracle.none:
+        if not isinstance(module, TemporalModule):
+            raise ConfigError(f"oracle={config.oracle.value}: this checkpoint is of single frames and has no memory")
+        module.oracle = TrueMotion(datamodule.evaluation_set(), config.oracle)
     build_evaluation_trainer(config.precision, config.trainer.accelerator.value).validate(
         module, datamodule=datamodule, verbose=False
     )

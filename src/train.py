@@ -15,6 +15,7 @@ import lightning as L
 from src.assembly import build_datamodule, build_module, data_root, save_submission
 from src.config import PHASES, Config, compose_config
 from src.data.datamodule import DetectionDataModule
+from src.errors import ConfigError
 from src.pictures.learning_curves import draw_curves
 from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.checkpoints import OpenCheckpoint, open_checkpoint
@@ -38,6 +39,7 @@ from src.training.module import TrainingModule
 from src.training.result import print_result, run_record, show_finished
 from src.training.run_folder import Resume, RunFolder, write_json
 from src.training.snapshots import draw_frames
+from src.training.true_motion import Oracle
 from src.training.wandb import WandbRun
 
 logger = logging.getLogger(__name__)
@@ -47,6 +49,8 @@ def main(overrides: list[str]) -> None:
     """Train one run, or show it when it has finished; start its processes first when there are to be several."""
     started = time.monotonic()
     config, tree = compose_config(overrides)
+    if config.oracle is not Oracle.none:
+        raise ConfigError(f"oracle={config.oracle.value}: an option of python -m src.evaluate; leave it out")
     check_devices(*config.trainer.processes)
     source = find_source(config, overrides, compose_config, PHASES)
     folder = RunFolder(Path(config.paths.outputs), run_identity(tree, source.identity if source is not None else None))

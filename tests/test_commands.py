@@ -71,6 +71,25 @@ def test_evaluate_agrees_with_training_from_checkpoint_and_from_file(trained, ou
     assert from_file == expected
 
 
+def test_an_oracle_tells_a_memory_how_things_move(trained, outputs, tmp_path):
+    from tests.untrained import write_checkpoint
+
+    folder, _ = trained
+    (world,) = (outputs / "worlds").iterdir()
+    data = (f"data.root={world}", f"paths.outputs={outputs}")
+    checkpoint = write_checkpoint(tmp_path / "memory.ckpt", "phase=phase2")
+    found = set()
+    for oracle in ("none", "velocity", "motion"):
+        call("evaluate", f"checkpoint={checkpoint}", *data, f"out={tmp_path / oracle}", f"oracle={oracle}")
+        found.add((tmp_path / oracle / "submission.json").read_text())
+    assert len(found) == 3, "what is remembered lies elsewhere each time"
+    single, boxes = folder / "checkpoints" / "last.ckpt", tmp_path / "none" / "submission.json"
+    told = ("oracle=velocity", *data, f"out={tmp_path / 'no'}")
+    assert "of single frames" in call("evaluate", f"checkpoint={single}", *told, expect=3).stderr
+    assert "no memory" in call("evaluate", f"predictions={boxes}", *told, expect=3).stderr
+    assert "option of python -m src.evaluate" in call("train", *told[:1], "scale=debug", expect=3).stderr
+
+
 def test_evaluate_refuses_what_it_cannot_score(trained, outputs, tmp_path):
     folder, _ = trained
     (world,) = (outputs / "worlds").iterdir()
@@ -114,9 +133,13 @@ def test_a_killed_run_resumes_and_ends_with_the_same_weights(trained, outputs, t
     assert lines[0] == lines[1]
 
 
-def test_world_preview(outputs, tmp_path):
-    result = call("world.__main__", "scale=debug", "preview=true", f"paths.outputs={outputs}", f"out={tmp_path}")
-    assert list(tmp_path.glob("*.png")) and "picture:" in result.stdout
+def test_world_preview_and_comparison(outputs, tmp_path):
+    paths = [f"paths.outputs={outputs}", f"out={tmp_path}"]
+    result = call("world.__main__", "scale=debug", "preview=true", "compare=true", *paths)
+    assert list(tmp_path.glob("scene_*.png")) and "picture:" in result.stdout
+    assert "Boxes with at least one radar point: " in result.stdout
+    page = (tmp_path / "statistics.md").read_text()
+    assert "2 scenes of 3 key frames" in page and "compare=true" in page and str(outputs) not in page
 
 
 def test_make_names_its_targets_and_a_wrong_phase():

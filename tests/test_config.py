@@ -116,19 +116,21 @@ FULL_SIZE = {
     "model": {"channels": 128},
     "model.radar_encoder": {
         "voxel_size_m": [0.1, 0.1, 0.2], "stage_channels": [16, 32, 64, 128, 128, 128], "max_voxels": 60000,
-        "conv_out": "sparse",
+        "conv_out": "sparse", "height_tolerance_deg": 0.0,
     },
     "model.kggi": {
         "initialization": "both", "num_radar_keypoints": 1024, "num_camera_keypoints": 256,
         "num_random_keypoints": 256, "num_depth_bins": 80, "depth_range_m": [1.0, 160.0], "depth_target": "box",
-        "keypoint_nms_cells": None, "property_head": True, "initial_velocity": "zero",
+        "keypoint_nms_cells": None, "property_head": True, "source_embedding_std": 1.0,
     },
     "model.ocsf": {
         "num_layers": 2, "num_learnable_points": 6, "margin_m": 4.8, "occupancy_threshold": 0.1,
         "max_occupied_cells": 32768, "scale_range_m": [0.2, 3.2], "max_mean_shift_m": 4.0, "max_speed_mps": 60.0,
         "velocity_unit_mps": 1.0, "velocity_update": "anew", "support_sigmas": 3.0, "cross_attention": "parallel",
         "refine_from": "self_encoding", "gate_kernel_size": 1,
+        "identity_start": False,
     },
+    "model.doppler": {"gaussians": False, "cells": False, "boxes": False},
     "model.head": {"nms": "per_group", "score_threshold": 0.1, "max_boxes": 500, "attributes": "rule"},
     "model.loss": {
         "kggi_weight": 1.0, "ocsf_weight": 5.0, "heatmap_weight": 1.0, "box_weight": 0.25, "keypoint_weight": 1.0,
@@ -139,7 +141,7 @@ FULL_SIZE = {
     },
     "phase": {
         "epochs": 24, "module": "TrainingModule", "task": "detection", "monitor": "val/mAP", "init_from": None,
-        "train_missing": True,
+        "train_missing": True, "frozen_statistics": False,
     },
     "phase.options": {"velocity_code_weight": 0.2},
     "optim": {
@@ -149,15 +151,15 @@ FULL_SIZE = {
     "data": {
         "train_split": "train", "split": "val", "batch_size": 8, "num_sweeps": 10, "min_distance_m": 1.0,
         "propagate_points": False, "on_bad_file": "error", "test_resize_offset": 0.0, "groups_per_scene": 2,
-        "stream_sets": 1, "sensor_dropout": 0.0, "num_lidar_sweeps": 5, "lidar_origins": False, "deskew_lidar": True,
-        "num_future_frames": 0,
+        "stream_sets": 1, "past_frames": 0, "sensor_dropout": 0.0, "num_lidar_sweeps": 5, "lidar_origins": False,
+        "deskew_lidar": True, "num_future_frames": 0,
     },
     "data.augmentation.image": {"resize": [-0.06, 0.11], "rotation_deg": 5.4, "flip_probability": 0.5},
     "data.augmentation.bev": {"scale": [0.95, 1.05], "rotation_rad": 0.3925, "flip_probability": 0.5},
     "paths": {"outputs": "outputs", "reports": "reports"},
     "": {
         "precision": "bf16-mixed", "seed": 0, "resume": "auto", "checkpoint": None, "predictions": None, "out": None,
-        "preview": False, "suite": "model",
+        "preview": False, "compare": False, "suite": "model",
     },
 }  # fmt: skip
 
@@ -171,8 +173,8 @@ FULL_SIZE_PHASE_2 = {
     "phase.options": {"velocity_code_weight": 1.0},
     "model.dptf": {"max_age_s": 6.0, "min_speed_mps": 0.0},
     "model.dptf.bev_path": {
-        "num_frames": 8, "memory_threshold": 0.1, "max_cells_per_frame": 4096, "velocity_start": "zero",
-        "velocity_compensation": True, "spatial_dilation": False,
+        "num_frames": 8, "memory_threshold": 0.1, "max_cells_per_frame": 4096, "velocity_compensation": True,
+        "spatial_dilation": False,
     },
     "model.dptf.gaussian_path": {
         "num_frames": 4, "gaussians_per_frame": 256, "min_contribution": 0.0, "sampling": "farthest_point",
@@ -255,6 +257,7 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["phase=phase2", "model.dptf.gaussian_path.selfattention=null"], "did you mean .*self_attention"),
         (["data.groups_per_scene=0"], "groups_per_scene"),
         (["data.stream_sets=0"], "stream_sets"),
+        (["data.past_frames=-1"], "past_frames"),
         (["phase.init_from="], "phase.init_from is empty"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Figures as inline SVG: lines with error bars, points, bars and dots by category.
+"""Figures as inline SVG: lines with intervals, points, bars and dots by category.
 
 Text and axes take the page's colour, so figures follow light and dark; colours stand in the style sheet (classes s0 to
 s7). Series differ by marker and dash as well as by colour, and every point says its number when pointed at.
@@ -33,7 +33,7 @@ class ChartPoint(NamedTuple):
 
     x: float
     y: float
-    spread: float = 0.0  # half the length of its error bar
+    bounds: tuple[float, float] | None = None  # of its interval
     note: str = ""  # what it says; empty: label and number
 
 
@@ -49,10 +49,10 @@ class Series:
 
 @dataclass(frozen=True, kw_only=True)
 class Bars:
-    """One value and its spread for every category; None where there is none."""
+    """A value with the bounds of its interval for every category; None where there is none."""
 
     label: str
-    values: Sequence[tuple[float, float] | None]
+    values: Sequence[tuple[float, float, float] | None]
     style: int = 0
 
 
@@ -101,7 +101,7 @@ def line_chart(
     points = [point for one in drawn for point in one.points]
     xs = [point.x for point in points] + [x for x, _ in x_ticks or ()]
     xs = [math.log10(x) for x in xs] if log_x else xs
-    ends = [point.y + sign * point.spread for point in points for sign in (-1, 1)]
+    ends = [end for point in points for end in (point.y, *(point.bounds or ()))]
     y_low, y_high = _padded(min(ends), max(ends), 0.08, y_span)
     x_low, x_high = _padded(min(xs), max(xs), 0.06 if markers else 0.0)
     y_marks = nice_ticks(y_low, y_high)
@@ -134,7 +134,7 @@ def category_chart(
     dots: bool = False,
 ) -> Markup:
     """Horizontal bars from zero with their numbers, or (`dots`) one marker per series on a line for each category."""
-    ends = [sum(found) for one in series for found in one.values if found is not None]
+    ends = [max(found) for one in series for found in one.values if found is not None]
     if not ends or not categories:
         return _nothing(title)
     top_value = max(ends) if max(ends) > 0 else 1.0
@@ -158,9 +158,10 @@ def category_chart(
             f"{escape(shown)}<title>{escape(name)}</title></text>"
         )
         for number, one in enumerate(series):
-            value, spread = one.values[place] or (0.0, 0.0)
+            value, low, high = one.values[place] or (0.0, 0.0, 0.0)
             text = "\N{EN DASH}" if one.values[place] is None else f"{value:.{digits}f}"
-            said = "no value" if one.values[place] is None else text + (f" ± {spread:.{digits}f}" if spread else "")
+            said = text + (f" [{low:.{digits}f}, {high:.{digits}f}]" if high > low else "")
+            said = "no value" if one.values[place] is None else said
             note = f"{name}{', ' if one.label else ''}{one.label}: {said}"
             if dots:
                 if one.values[place] is not None:
@@ -168,9 +169,9 @@ def category_chart(
                     parts.append(_marker(one.style, x_of(value), y + 8 + aside, note))
                 continue
             parts.append(_bar(one.style, left, y + step * number, step - 2, x_of(value), note))
-            if spread:
-                parts.append(_whisker(x_of(value - spread), x_of(value + spread), y + step * number + 5.5))
-            after = x_of(value + spread) + 5
+            if high > low:
+                parts.append(_whisker(x_of(low), x_of(high), y + step * number + 5.5))
+            after = x_of(max(value, high)) + 5
             parts.append(f'<text class="number" x="{after:.1f}" y="{y + step * number + 9.5:.1f}">{text}</text>')
     entries = [(one.label, one.style) for one in series]
     legend, height = _legend(entries, bottom + 38, False, dots, bars=not dots)
@@ -244,9 +245,9 @@ def _line(one: Series, x_of: Scale, y_of: Scale, markers: bool) -> str:
     if one.joined and len(places) > 1:
         path = "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
         parts.append(f'<path class="line" d="M{path}"{_dashed(one.style)}/>')
-    for (x, _), (_, y, spread, _) in zip(places, one.points, strict=True):
-        if spread:
-            parts.append(_whisker(y_of(y - spread), y_of(y + spread), x, upright=True))
+    for (x, _), point in zip(places, one.points, strict=True):
+        if point.bounds is not None:
+            parts.append(_whisker(*map(y_of, point.bounds), x, upright=True))
     if markers or len(places) == 1:
         for (x, y), point in zip(places, one.points, strict=True):
             note = point.note or f"{one.label}{': ' if one.label else ''}{point.y:.6g}"

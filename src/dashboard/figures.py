@@ -8,11 +8,11 @@ from markupsafe import Markup
 
 from src.dashboard.board import Board, Run, Sweep
 from src.dashboard.charts import Bars, ChartPoint, Series, category_chart, line_chart, nice_ticks
-from src.report.metric_names import RANGES, SPEEDS, Metric, find_metric
+from src.report.metric_names import RANGES, SPEEDS, find_metric
 from src.report.results import RunResult
-from src.report.score_tables import mean_and_spread
+from src.report.score_tables import Estimate, estimate
 from src.report.sweep_file import PlotConfig
-from src.report.sweep_table import PAPER, format_here, format_paper, rounded
+from src.report.sweep_table import PAPER, format_here, format_paper, format_score
 from src.structures.taxonomy import CLASSES
 
 CURVES = (
@@ -47,11 +47,13 @@ def knob_figures(sweep: Sweep, plot: PlotConfig, results: dict[str, list[RunResu
     metric = find_metric(plot.metric, sweep.key, sweep.record.sweep.task)
     rows = sweep.record.sweep.rows
     labels = [row.label for row in rows]
-    here = {label: _mean_and_spread(results.get(label, ()), metric) for label in labels}
+    here = {label: estimate(results.get(label, ()), metric) for label in labels}
     stated = {row.label: row.paper.get(metric.name) for row in rows}
-    paper = {label: None if value is None else (value, 0.0) for label, value in stated.items()}
-    spread = any(value is not None and value[1] > 0 for value in here.values())
-    sides = {f"{metric.title} here, scale {sweep.record.scale}{', ± deviation over seeds' if spread else ''}": here}
+    paper = {label: None if value is None else Estimate(value, value, value) for label, value in stated.items()}
+    known = any(found is not None and found.high > found.low for found in here.values())
+    sides = {
+        f"{metric.title} here, scale {sweep.record.scale}{', with 95 % intervals over scenes' if known else ''}": here
+    }
     if any(value is not None for value in stated.values()):
         sides[f"{metric.title} in the paper, TruckScenes"] = paper
     if any(row.x is None for row in rows):
@@ -65,12 +67,12 @@ def knob_figures(sweep: Sweep, plot: PlotConfig, results: dict[str, list[RunResu
     series = []
     for style, side in enumerate(sides.values()):
         points = [
-            ChartPoint(row.x, *found, f"{row.label}: {found[0]:.{metric.digits}f}"
-                  + (f" ± {found[1]:.{metric.digits}f}" if side is here else ""))
+            ChartPoint(row.x, found.mean, _bounds(found),
+                       f"{row.label}: {format_score(found.mean, _bounds(found), metric)}")
             for row in ordered if (found := side[row.label]) is not None
         ]  # fmt: skip
         series.append(Series(label="", points=points, style=style))
-    ends = [[y + sign * s for _, y, s, _ in one.points for sign in (-1, 1)] for one in series]
+    ends = [[end for point in one.points for end in (point.y, *(point.bounds or ()))] for one in series]
     span = max((max(values) - min(values) for values in ends if values), default=0.0)
     ticks = list({row.x: f"{row.x:g}" for row in ordered}.items())
     charts = zip(sides, series, strict=True)
@@ -86,7 +88,7 @@ def search_figures(sweep: Sweep) -> list[Markup]:
     metric = find_metric(search.objective, sweep.key, search.task)
     tried.sort(key=lambda run: run.ended or 0.0)
     values = [run.value * metric.scale for run in tried]
-    by_trial = [ChartPoint(place, value, 0.0, tried[place - 1].label) for place, value in enumerate(values, start=1)]
+    by_trial = [ChartPoint(place, value, None, tried[place - 1].label) for place, value in enumerate(values, start=1)]
     trials = Series(label="trial", points=by_trial, joined=False)
     best = [ChartPoint(place, max(values[:place])) for place in range(1, len(values) + 1)]
     so_far = Series(label="best so far", points=best, style=1)
@@ -110,10 +112,11 @@ def latency_figures(sweep: Sweep, results: dict[str, list[RunResult]]) -> list[M
     accuracy, latency = find_metric(ACCURACY, sweep.key), find_metric(LATENCY, sweep.key)
     points = []
     for style, (label, runs) in enumerate(results.items()):
-        score, time = _mean_and_spread(runs, accuracy), _mean_and_spread(runs, latency)
+        score, time = estimate(runs, accuracy), estimate(runs, latency)
         if score is not None and time is not None:
-            note = f"{label}: {time[0]:.1f} ms, {score[0]:.1f} {accuracy.title}"
-            points.append(Series(label=label, points=[ChartPoint(time[0], *score, note)], style=style, joined=False))
+            note = f"{label}: {time.mean:.1f} ms, {score.mean:.1f} {accuracy.title}"
+            point = ChartPoint(time.mean, score.mean, _bounds(score), note)
+            points.append(Series(label=label, points=[point], style=style, joined=False))
     if len(points) < 2:
         return []
     return [line_chart(f"{ACCURACY} over latency", points, "milliseconds per frame", f"{ACCURACY}, %")]
@@ -128,11 +131,11 @@ def distance_figures(results: dict[str, list[RunResult]]) -> list[Markup]:
     ):
         lines = []
         for style, (label, runs) in enumerate(results.items()):
-            found = [_mean_and_spread(runs, find_metric(name.format(part), title)) for part in parts]
+            metrics = [find_metric(name.format(part), title) for part in parts]
             points = [
-                ChartPoint(float(place), value[0], 0.0,
-                      f"{label}, {parts[place]} {axis.rpartition(' ')[2]}: {value[0]:.1f} ± {value[1]:.1f}")
-                for place, value in enumerate(found) if value is not None
+                ChartPoint(float(place), found.mean, None, f"{label}, {parts[place]} {axis.rpartition(' ')[2]}: "
+                           + format_score(found.mean, _bounds(found), metric))
+                for place, metric in enumerate(metrics) if (found := estimate(runs, metric)) is not None
             ]  # fmt: skip
             if points:
                 lines.append(Series(label=label, points=points, style=style))
@@ -146,9 +149,9 @@ def class_figures(results: dict[str, list[RunResult]]) -> list[Markup]:
     """AP by class: bars with numbers for one or two, dots for more."""
     rows = []
     for style, (label, runs) in enumerate(results.items()):
-        found = [_mean_and_spread(runs, find_metric(f"classes.{name}.AP", "by class")) for name in CLASSES]
+        found = [estimate(runs, find_metric(f"classes.{name}.AP", "by class")) for name in CLASSES]
         if any(value is not None for value in found):
-            rows.append(Bars(label=label, values=[value and (value[0], 0.0) for value in found], style=style))
+            rows.append(Bars(label=label, values=found, style=style))
     names = [name.replace("_", " ") for name in CLASSES]
     return [category_chart("AP by class", names, rows, "AP, %", dots=len(rows) > 2)] if rows else []
 
@@ -218,30 +221,27 @@ def results_by_row(board: Board, sweep: Sweep) -> dict[str, list[RunResult]]:
     return {label: [run.result for run in runs if run.result is not None] for label, runs in rows.items()}
 
 
-def _mean_and_spread(results: Iterable[RunResult], metric: Metric) -> tuple[float, float] | None:
-    """Of the runs that have the number, as tables have it."""
-    found = [value for result in results if (value := result.metrics.get(metric.name)) is not None]
-    return mean_and_spread(found, metric)
+def _bounds(found: Estimate) -> tuple[float, float] | None:
+    return (found.low, found.high) if found.high > found.low else None
 
 
 def headline(sweep: Sweep) -> str:
-    """The best row here by the sweep's first metric, and the paper's; nothing before there are numbers."""
+    """The row that is decided against all others here by the sweep's first metric, and the paper's best; nothing before
+    there are numbers."""
     table = next(iter(sweep.tables), None)
     if table is None or not table.columns:
         return ""
     metric, rows = table.columns[0], [(row, row.cells[0]) for row in table.rows]
-    best = max if metric.higher_is_better else min
-    here = [(rounded(cell.mean, metric), row, cell) for row, cell in rows if cell.mean is not None]
-    here = [found for found in here if found[1].state == "done"] or here
-    paper = [(cell.paper, row.label) for row, cell in rows if cell.paper is not None and row.state != PAPER]
+    here = [(row, cell) for row, cell in rows if cell.mean is not None]
     if not here:
         return ""
-    top = best(value for value, _, _ in here)
-    tied = [(row, cell) for value, row, cell in here if value == top]
-    line = f"Best {metric.title} here: {' and '.join(row.label for row, _ in tied)}, "
-    line += format_here(tied[0][1], metric, tied[0][0].done) if len(tied) == 1 else f"{top:.{metric.digits}f}"
+    best = [f"{row.label}, {format_here(cell, metric, row.done)}" for row, cell in here if cell.best]
+    if len(here) == 1:
+        best = [f"{here[0][0].label}, {format_here(here[0][1], metric, here[0][0].done)}"]
+    line = f"Best {metric.title} here: {best[0] if best else 'undecided'}"
+    paper = [(cell.paper, row.label) for row, cell in rows if cell.paper is not None and row.state != PAPER]
     if paper:
-        value, label = best(paper)
+        value, label = (max if metric.higher_is_better else min)(paper)
         line += f". In the paper: {label}, {format_paper(value, metric)}"
     return line + "."
 

@@ -28,8 +28,8 @@ from src.report.time_left import duration
 
 TEMPLATES = Path(__file__).parent / "templates"
 SUMMARY = tuple(METRICS[name] for name in ("mAP", "NDS", "mAVE"))
-GROUPS = (("Summary", ""), ("By distance", "ranges."), ("By speed", "speeds."), ("By class", "classes."),
-          ("Latency", "latency."))  # fmt: skip
+GROUPS = (("Summary", ""), ("What a memory is for", "measures."), ("By distance", "ranges."), ("By speed", "speeds."),
+          ("By class", "classes."), ("Latency", "latency."))  # fmt: skip
 DRAWN_BY_PAGES = ("curves", "scores")
 """Pictures of a run folder that pages draw themselves, from the numbers."""
 Address = Callable[..., str]
@@ -51,9 +51,9 @@ class MetricRow:
     metric: Metric
     raw: float
     value: str
+    interval: str  # over scenes
     other: str
     difference: str
-    verdict: str  # `better`, `worse` or nothing
 
 
 logger = logging.getLogger(__name__)
@@ -269,12 +269,11 @@ def metric_rows(run: Run, other: Run | None) -> dict[str, list[MetricRow]]:
         group = next(title for title, prefix in reversed(GROUPS) if metric.name.startswith(prefix))
         against = theirs.get(metric.name)
         change = "" if against is None else signed((value - against) * metric.scale, metric.digits)
-        verdict = ""
-        if change and float(change.replace("\N{MINUS SIGN}", "-")):
-            verdict = "better" if (value > against) == metric.higher_is_better else "worse"
+        bounds = run.result.intervals.get(metric.name)
+        between = "" if bounds is None else " – ".join(number(bound, metric) for bound in bounds)
         groups.setdefault(group, []).append(
-            MetricRow(metric=metric, raw=round(value * metric.scale, 6), value=number(value, metric),
-                      other=number(against, metric), difference=change, verdict=verdict)
+            MetricRow(metric=metric, raw=round(value * metric.scale, 6), value=number(value, metric), interval=between,
+                      other=number(against, metric), difference=change)
         )  # fmt: skip
     return groups
 

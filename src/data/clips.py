@@ -44,10 +44,11 @@ class Schedule:
     stream_sets: int = 1  # sets of L streams that take turns: step t reads those of set t % stream_sets
 
 
-def scenes_of(index: DatasetIndex, samples: Array) -> list[Array]:
+def scenes_of(index: DatasetIndex, samples: Array, jumps_allowed: bool = False) -> list[Array]:
     """The frames of each scene in the order of time; scenes in the order in which the sample table begins them.
 
-    Raises DataError where the truck would have to jump from one frame to the next.
+    Raises DataError where the truck would have to jump from one frame to the next, unless that is allowed: a memory
+    forgets what lies before a jump.
     """
     owners = index.sample_scenes[samples]
     names, first = np.unique(owners, return_index=True)
@@ -55,7 +56,7 @@ def scenes_of(index: DatasetIndex, samples: Array) -> list[Array]:
     for name in names[np.argsort(first)]:
         rows = samples[owners == name]
         scenes.append(rows[np.argsort(index.frame_times_us[rows], kind="stable")])
-    for scene in scenes:
+    for scene in () if jumps_allowed else scenes:
         shift = np.diff(index.pose_translations[index.frame_poses[scene]], axis=0)
         speed = np.linalg.norm(shift, axis=1) / (1e-6 * np.diff(index.frame_times_us[scene]))
         if not (speed <= MAX_EGO_SPEED_MPS).all():
@@ -64,7 +65,7 @@ def scenes_of(index: DatasetIndex, samples: Array) -> list[Array]:
             raise DataError(
                 f"{index.root / index.version}/ego_pose.json: from sample {before!s} to the next, {after!s}, the ego "
                 f"moves at {speed[at]:.0f} m/s; a truck stays below {MAX_EGO_SPEED_MPS:.0f}, so the pose table is "
-                "damaged there; unpack the release again"
+                "damaged there; unpack the release again, or skip and count what is wrong with data.on_bad_file=skip"
             )
     return scenes
 

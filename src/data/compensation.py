@@ -14,6 +14,8 @@ from src.structures.batch import LIDAR_POINT_FIELDS, MAX_EGO_SPEED_MPS
 Array = np.ndarray
 VELOCITY_WINDOW_US = 100_000
 """Ego velocity is the pose difference over +- this time; the chassis table reads zero for long stretches."""
+POSE_NOISE_M = 1.0
+"""Two poses of one moment may lie so far apart."""
 
 
 @dataclass(kw_only=True)
@@ -36,12 +38,9 @@ def ego_motion(
 
     Raises DataError when poses are too sparse for a difference or jump.
     """
-    stamps = index.pose_times_us
-    first = np.searchsorted(stamps, times_us - VELOCITY_WINDOW_US, side="left")
-    last = np.searchsorted(stamps, times_us + VELOCITY_WINDOW_US, side="right") - 1
-    elapsed_s = 1e-6 * (stamps[last.clip(0)] - stamps[first.clip(max=len(stamps) - 1)])
-    if (last <= first).any() or (elapsed_s <= 0).any():
-        at = int(np.argmax((last <= first) | (elapsed_s <= 0)))
+    first, last, elapsed_s, speed = _window(index, times_us)
+    if np.isnan(elapsed_s).any():
+        at = int(np.argmax(np.isnan(elapsed_s)))
         raise DataError(
             f"{index.root / index.version}/ego_pose.json: fewer than two ego poses within 0.1 s of time "
             f"{int(times_us[at])} us, so the ego velocity is unknown; unpack the release again"
@@ -50,14 +49,43 @@ def ego_motion(
     shift = (index.pose_translations[last] - index.pose_translations[first]) / elapsed_s[:, None]
     velocity = np.einsum("sji,sj->si", global_from_ego, shift)
     rate = rotation_vector(np.swapaxes(start, -1, -2) @ end) / elapsed_s[:, None]
-    speed = np.linalg.norm(velocity, axis=1)
     if not (speed <= MAX_EGO_SPEED_MPS).all():
-        at = int(np.argmax(speed))
+        at = int(np.argmax(~(speed <= MAX_EGO_SPEED_MPS)))
         raise DataError(
             f"{index.root / index.version}/ego_pose.json: the poses around time {int(times_us[at])} us move at "
             f"{speed[at]:.0f} m/s; a truck stays below {MAX_EGO_SPEED_MPS:.0f}, so the pose table is damaged there"
         )
     return velocity, rate
+
+
+def motion_known(
+    index: DatasetIndex,
+    times_us: Array,  # [S] int64
+) -> Array:  # [S] bool
+    """Whether `ego_motion` has an answer."""
+    return _window(index, times_us)[3] <= MAX_EGO_SPEED_MPS
+
+
+def reached(
+    index: DatasetIndex,
+    poses: Array,  # [S] rows of the pose table
+    key_pose: int,
+) -> Array:  # [S] bool
+    """Whether a truck can drive from each pose to that of the key frame, or back, in the time between them."""
+    distance = np.linalg.norm(index.pose_translations[poses] - index.pose_translations[key_pose], axis=1)
+    elapsed_s = 1e-6 * np.abs(index.pose_times_us[poses] - index.pose_times_us[key_pose])
+    return distance <= MAX_EGO_SPEED_MPS * elapsed_s + POSE_NOISE_M
+
+
+def _window(index: DatasetIndex, times_us: Array) -> tuple[Array, Array, Array, Array]:
+    """First and last pose [S] within +-0.1 s of each time, seconds between them, m/s; NaN where there are not two."""
+    stamps = index.pose_times_us
+    first = np.searchsorted(stamps, times_us - VELOCITY_WINDOW_US, side="left").clip(max=len(stamps) - 1)
+    last = (np.searchsorted(stamps, times_us + VELOCITY_WINDOW_US, side="right") - 1).clip(0)
+    elapsed_s = 1e-6 * (stamps[last] - stamps[first])
+    elapsed_s = np.where((last > first) & (elapsed_s > 0), elapsed_s, np.nan)
+    shift = index.pose_translations[last] - index.pose_translations[first]
+    return first, last, elapsed_s, np.linalg.norm(shift, axis=1) / elapsed_s
 
 
 def compensate_clouds(

@@ -22,7 +22,8 @@ class DataConfig(ReaderOptions):
     batch_size: int  # total over all devices; the streams when clips are streamed
     groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; method 6.4
     stream_sets: int  # at most so many sets of streams take turns when clips are streamed; 1: all streams at every step
-    sensor_dropout: float  # share of streamed frames, never a clip's first, that come without any sensor data
+    past_frames: int  # 0: clips are streamed; else frames are shuffled, each with a memory of so many before it
+    sensor_dropout: float  # share of frames with a past that come without any sensor data
     num_workers: int  # loader processes per device
     augmentation: AugmentationConfig | None
 
@@ -31,6 +32,7 @@ class DataConfig(ReaderOptions):
             "batch_size": 1,
             "groups_per_scene": 1,
             "stream_sets": 1,
+            "past_frames": 0,
             "num_workers": 0,
             "num_sweeps": 1,
             "num_lidar_sweeps": 1,

@@ -29,7 +29,7 @@ from src.data.clips import (
 from src.data.data_config import DataConfig
 from src.data.evaluation_set import evaluation_set
 from src.data.frame_loader import FrameLoader, collate, collate_in_worker, init_worker
-from src.data.reader import FrameReader
+from src.data.reader import FrameReader, OnBadFile
 from src.data.schema import DatasetIndex
 from src.data.splits import split_samples
 from src.errors import ConfigError, DataError, HorizonError
@@ -45,22 +45,40 @@ class FrameDataset(Dataset[FrameBatch]):
     """
 
     def __init__(
-        self, reader: FrameReader, augmentation: AugmentationConfig | None, seed: int, sensor_dropout: float = 0.0
+        self,
+        reader: FrameReader,
+        augmentation: AugmentationConfig | None,
+        seed: int,
+        sensor_dropout: float = 0.0,
+        past_frames: int = 0,  # of a frame that is in no stream
     ) -> None:
         self.reader, self.augmentation, self.seed, self.sensor_dropout = reader, augmentation, seed, sensor_dropout
+        self.past_frames = past_frames
 
     def __getitem__(self, key: FrameKey) -> FrameBatch | HorizonError:
         clip = None if key.clip is None else str(self.reader.index.sample_tokens[key.clip])
         try:
             frame = self.reader.read(key.sample, self.augmentation, self.seed, key.epoch, clip)
+            if self.past_frames:
+                frame = self._with_past(frame, key)
         except HorizonError as error:
             return error
-        if key.stream is None:
-            return frame
-        frame = in_stream(frame, key.stream, key.starts)
         # Without augmentation the same frames in every run and epoch, so that scores compare.
         draw = (key.sample,) if self.augmentation is None else (key.sample, self.seed, key.epoch)
-        return drop_sensors(frame, self.sensor_dropout, draw)
+        if key.stream is None:
+            return drop_sensors(frame, self.sensor_dropout, draw) if self.past_frames else frame
+        return drop_sensors(in_stream(frame, key.stream, key.starts), self.sensor_dropout, draw)
+
+    def _with_past(self, frame: FrameBatch, key: FrameKey) -> FrameBatch:
+        """The frame with the key frames before it, augmented as it is; they supervise nothing."""
+        (token,), nothing = frame.tokens, replace(without_sensors(frame), boxes=None, skipped={}, bad_files=[])
+        past = [
+            replace(self.reader.read(row, self.augmentation, self.seed, key.epoch, token), boxes=None)
+            if row >= 0
+            else nothing
+            for row in self.reader.before(key.sample, self.past_frames)
+        ]
+        return replace(frame, past=tuple(past))
 
 
 def in_stream(frame: FrameBatch, stream: int, starts: bool) -> FrameBatch:
@@ -69,9 +87,15 @@ def in_stream(frame: FrameBatch, stream: int, starts: bool) -> FrameBatch:
 
 
 def drop_sensors(frame: FrameBatch, share: float, draw: tuple[int, ...]) -> FrameBatch:
-    """The frame, or with the probability `share` the same without points and images, unless it starts a clip."""
-    if frame.starts[0] or np.random.default_rng(draw).random() >= share:
+    """The frame, or with the probability `share` the same without points and images, unless nothing came before it."""
+    first = frame.past[-1].tokens == frame.tokens if frame.past else frame.starts[0]
+    if first or np.random.default_rng(draw).random() >= share:
         return frame
+    return without_sensors(frame)
+
+
+def without_sensors(frame: FrameBatch) -> FrameBatch:
+    """The frame without points and images."""
     names = ("radar_points", "radar_batch", "lidar_points", "lidar_batch", "lidar_origins")
     changes = {name: getattr(frame, name)[:0] for name in names if getattr(frame, name) is not None}
     if frame.images is not None:
@@ -126,7 +150,7 @@ class DetectionDataModule(L.LightningDataModule):
         A clip has `length` consecutive frames in batches of one, fewer where its scene begins later than that.
         """
         samples = split_samples(self.index, self.config.split)
-        scenes = scenes_of(self.index, samples)
+        scenes = self._scenes_of(samples)
         clips = []
         for sample in _evenly_spread(samples, count):
             (scene,) = (scene for scene in scenes if sample in scene)
@@ -154,9 +178,12 @@ class DetectionDataModule(L.LightningDataModule):
         wanted = known if scenes is None else scenes
         return (frame for name in wanted for frame in self._in_order(known[name]))
 
+    def _scenes_of(self, samples: np.ndarray) -> list[np.ndarray]:
+        return scenes_of(self.index, samples, self.config.on_bad_file is OnBadFile.skip)
+
     def _scenes(self) -> dict[str, np.ndarray]:
         """Frames of the validation split's scenes by name."""
-        scenes = scenes_of(self.index, split_samples(self.index, self.config.split))
+        scenes = self._scenes_of(split_samples(self.index, self.config.split))
         return {str(self.index.scene_names[self.index.sample_scenes[scene[0]]]): scene for scene in scenes}
 
     def _in_order(self, samples: np.ndarray) -> Iterator[FrameBatch]:
@@ -181,20 +208,21 @@ class DetectionDataModule(L.LightningDataModule):
         if not index.annotated:
             raise DataError(f"{index.root / index.version}: has no annotations to train on")
         schedule: Callable[[int], Schedule]
-        if self.temporal:
-            scenes = scenes_of(index, samples)
+        if self.temporal and not config.past_frames:
+            scenes = self._scenes_of(samples)
             cut = (config.groups_per_scene, config.batch_size, config.stream_sets)
             schedule = partial(streamed_groups, scenes, *cut, seed)
         else:
             schedule = partial(shuffled_frames, samples, config.batch_size, seed)
-        return self._loader(ScheduleSampler(schedule, *self._rank(), self._position), config.augmentation)
+        sampler = ScheduleSampler(schedule, *self._rank(), self._position)
+        return self._loader(sampler, config.augmentation, config.past_frames if self.temporal else 0)
 
     def val_dataloader(self) -> DataLoader:
         """Batches of the validation split, each frame once over all ranks: in table order, or scene by scene."""
         samples = split_samples(self.index, self.config.split)
         rank, world_size = self._rank()
         if self.temporal:
-            schedule = whole_scenes(scenes_of(self.index, samples), self.config.batch_size, world_size)
+            schedule = whole_scenes(self._scenes_of(samples), self.config.batch_size, world_size)
         else:
             schedule = frames_in_order(samples, self.config.batch_size)
         return self._loader(ScheduleSampler(lambda epoch: schedule, rank, world_size), None)
@@ -215,10 +243,12 @@ class DetectionDataModule(L.LightningDataModule):
             return 0, 0
         return divmod(self.trainer.global_step, min(steps, self.trainer.num_training_batches))
 
-    def _loader(self, sampler: ScheduleSampler, augmentation: AugmentationConfig | None) -> DataLoader:
+    def _loader(
+        self, sampler: ScheduleSampler, augmentation: AugmentationConfig | None, past_frames: int = 0
+    ) -> DataLoader:
         workers = self.config.num_workers
         return FrameLoader(
-            FrameDataset(self.reader, augmentation, self.seed, self.config.sensor_dropout),
+            FrameDataset(self.reader, augmentation, self.seed, self.config.sensor_dropout, past_frames),
             batch_sampler=sampler,
             num_workers=workers,
             collate_fn=collate_in_worker if workers else collate,

@@ -73,7 +73,9 @@ def collate(frames: list[FrameBatch | HorizonError]) -> FrameBatch | HorizonErro
         if clouds[0] is not None:
             counts = torch.tensor([len(cloud) for cloud in clouds])
             values[f"{sensor}_batch"] = torch.repeat_interleave(torch.arange(len(frames)), counts)
-    values["future"] = tuple(collate(list(parts)) for parts in zip(*(frame.future for frame in frames), strict=True))
+    for name in ("future", "past"):
+        parts = zip(*(getattr(frame, name) for frame in frames), strict=True)
+        values[name] = tuple(collate(list(part)) for part in parts)
     values["skipped"] = {
         name: sum(frame.skipped.get(name, 0) for frame in frames) for frame in frames for name in frame.skipped
     }

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from src.data.augment import AugmentationConfig, draw_bev_transform, draw_crop, frame_generator
-from src.data.compensation import Sweeps, compensate_clouds, ego_motion, place_sweep
+from src.data.compensation import Sweeps, compensate_clouds, ego_motion, motion_known, place_sweep, reached
 from src.data.images import read_image, width_fit
 from src.data.pcd import LidarCloud, read_lidar_points, read_radar_points
 from src.data.schema import CHANNELS, DatasetIndex
@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 
 
 class OnBadFile(Enum):
-    """What an unreadable sensor file does."""
+    """What an unreadable sensor file, or one whose ego pose no truck can have, does."""
 
     error = "error"
     skip = "skip"  # counted; a radar or LiDAR file gives no points, an image a masked camera
@@ -48,6 +48,7 @@ class _Skipped:
 
     channels: Counter[str] = field(default_factory=Counter)
     files: list[str] = field(default_factory=list)
+    lost: bool = False  # the key frame's own pose is wrong, so that no annotation is where it says
 
 
 @dataclass(kw_only=True)
@@ -82,6 +83,8 @@ class FrameReader:
         self._folders: dict[str, str] = {}  # where the folders of files lead to
         self._reported: set[str] = set()
         self._following = _following(index)  # [N] row of the scene's next sample, -1 for none
+        self._preceding = inverse = np.full_like(self._following, -1)
+        inverse[self._following[self._following >= 0]] = np.flatnonzero(self._following >= 0)
 
     def read(
         self,
@@ -105,7 +108,7 @@ class FrameReader:
         if bev is not None and clip is not None:
             aug_from_ego = draw_bev_transform(bev, frame_generator(seed, epoch, clip))
         global_from_ego = self._global_from_ego(sample)
-        skipped = _Skipped()
+        skipped = _Skipped(lost=self._lost(sample))
         batch = self._key_frame(sample, aug_from_ego)
         if self.settings.num_sweeps:
             batch |= self._radar_points(sample, global_from_ego, aug_from_ego, skipped)
@@ -117,8 +120,16 @@ class FrameReader:
         if self.settings.num_future_frames:
             batch["future"] = self._future(sample, aug_from_ego, skipped)
         if index.annotated:
-            batch["boxes"] = [self._boxes(sample, global_from_ego).transform(torch.from_numpy(aug_from_ego))]
+            boxes = self._boxes(sample, global_from_ego).transform(torch.from_numpy(aug_from_ego))
+            batch["boxes"] = [Boxes3D.empty() if skipped.lost else boxes]
         return FrameBatch(**batch, skipped=dict(skipped.channels), bad_files=skipped.files)
+
+    def before(self, sample: int, count: int) -> list[int]:
+        """Rows of the scene's `count` samples before this one, the oldest first; -1 where it had not begun."""
+        rows = [sample]
+        for _ in range(count):
+            rows.append(int(self._preceding[rows[-1]]) if rows[-1] >= 0 else -1)
+        return rows[:0:-1]
 
     def _key_frame(self, sample: int, aug_from_ego: Array) -> dict[str, Any]:
         """What every frame has."""
@@ -159,7 +170,7 @@ class FrameReader:
         skipped: _Skipped,
     ) -> tuple[Array, list[T]]:  # [S] int64 rows of the files
         """The key frame's and the sweeps before it of each channel, fewer at a scene's start."""
-        rows, clouds = [], []
+        rows, owners = [], []
         for channel in channels:
             row = int(self.index.key_data[sample, CHANNELS.index(channel)])
             if row < 0 and count:
@@ -167,12 +178,18 @@ class FrameReader:
             for _ in range(count):
                 if row < 0:
                     break
-                cloud = self._guarded(sample, channel, row, partial(read, row=row), skipped)
-                if cloud is not None:
-                    rows.append(row)
-                    clouds.append(cloud)
+                rows.append(row)
+                owners.append(channel)
                 row = int(self.index.data_previous[row])
-        return np.array(rows, np.int64), clouds
+        kept, clouds = [], []
+        for row, channel in zip(
+            *self._with_known_poses(sample, np.array(rows, np.int64), owners, skipped), strict=True
+        ):
+            cloud = self._guarded(sample, channel, row, partial(read, row=row), skipped)
+            if cloud is not None:
+                kept.append(row)
+                clouds.append(cloud)
+        return np.array(kept, np.int64), clouds
 
     def _sweeps(
         self,
@@ -270,6 +287,8 @@ class FrameReader:
             if row < 0:
                 skipped.channels[f"{channel} (not recorded)"] += 1
                 continue
+            if not self._with_known_poses(sample, rows[view : view + 1], [channel], skipped)[1]:
+                continue
             source_px = tuple(int(n) for n in index.data_sizes[row])
             crop = (
                 width_fit(source_px, settings.image_size_px, settings.test_resize_offset)
@@ -329,6 +348,45 @@ class FrameReader:
                 self._reported.add(name)
                 _log.warning("skipped: %s", error)
             return None
+
+    def _with_known_poses(
+        self,
+        sample: int,
+        rows: Array,  # [S] int64, of files
+        channels: list[str],  # S
+        skipped: _Skipped,
+    ) -> tuple[list[int], list[str]]:
+        """Files that the truck can have recorded where their poses say; for others raise or count, as `on_bad_file`."""
+        index, poses = self.index, self.index.data_poses[rows]
+        good = reached(index, poses, index.frame_poses[sample])
+        if self.settings.on_bad_file is OnBadFile.error:
+            if not good.all():
+                name = index.filename(int(rows[np.argmin(good)]))
+                raise DataError(
+                    f"{index.root / index.version}/ego_pose.json: from the pose of {name} a truck cannot have come to "
+                    f"that of its key frame, sample {index.sample_tokens[sample]}, so the table is damaged there; "
+                    "unpack the release again, or skip and count such files with data.on_bad_file=skip"
+                )
+            return rows.tolist(), channels  # where the poses around a sweep jump `ego_motion` says so
+        if set(channels) <= set(RADARS):
+            good &= motion_known(index, index.data_times_us[rows])
+        elif set(channels) <= set(LIDARS) and self.settings.deskew_lidar:
+            good &= motion_known(index, index.pose_times_us[poses])
+        for row, channel in zip(rows[~good].tolist(), np.array(channels)[~good].tolist(), strict=True):
+            name = index.filename(row)
+            skipped.channels[f"{channel} (ego pose)"] += 1
+            skipped.files.append(name)
+            if name not in self._reported:
+                self._reported.add(name)
+                _log.warning("skipped: the ego pose of %s is not one that a truck can have driven to", name)
+        return rows[good].tolist(), np.array(channels)[good].tolist()
+
+    def _lost(self, sample: int) -> bool:
+        """Whether none of a key frame's files was recorded where a truck could have come from its pose."""
+        rows = self.index.key_data[sample]
+        poses = self.index.data_poses[rows[rows >= 0]]
+        poses = poses[poses != self.index.frame_poses[sample]]
+        return len(poses) > 0 and not reached(self.index, poses, self.index.frame_poses[sample]).any()
 
     def _inside(self, name: str) -> str:
         """The file's path, refused when a symbolic link leads out of the data set.

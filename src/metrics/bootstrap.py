@@ -8,6 +8,7 @@ to end. (Where predictions have equal scores, those of a scene's copies stand to
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,20 +30,23 @@ CHUNK = 4_000_000
 
 
 def with_intervals(scores: DetectionScores) -> dict[str, object]:
-    """The content of metrics.json: the scores, and as `intervals` the same tree with [low, high] for each number.
+    """The content of metrics.json: the scores and `intervals`.
 
-    `intervals` also holds `scenes`, `draws` and `level`, and of a single scene nothing else: it says nothing of others.
+    These hold `scenes`, `draws`, `level` and `bounds`, [low, high] of a number by its path, as in `ranges.0-25.mAP`.
+    A number without any is undefined; a single scene says nothing of others, so there are no bounds at all.
     """
-    scenes = np.unique(scores.parts.ranking.evaluation_set.scenes)
-    intervals: dict[str, object] = {"scenes": len(scenes), "draws": NUM_DRAWS, "level": LEVEL}
-    if len(scenes) > 1:
-        draws = np.random.default_rng(SEED).multinomial(len(scenes), np.full(len(scenes), 1 / len(scenes)), NUM_DRAWS)
+    num_scenes = len(np.unique(scores.parts.ranking.evaluation_set.scenes))
+    bounds: dict[str, list[float]] = {}
+    if num_scenes > 1:
+        draws = np.random.default_rng(SEED).multinomial(num_scenes, np.full(num_scenes, 1 / num_scenes), NUM_DRAWS)
         drawn = score_draws(scores.parts, draws)
-        intervals |= drawn.overall.as_dict(interval)
-        for name in ("ranges", "speeds"):
-            parts = getattr(drawn, name).items()
-            intervals[name] = {key: part.as_dict(interval, name == "speeds") for key, part in parts}
-        intervals["measures"] = {name: interval(values) for name, values in drawn.measures.items()}
+        tree = drawn.overall.as_dict(interval) | {
+            "ranges": {name: part.as_dict(interval) for name, part in drawn.ranges.items()},
+            "speeds": {name: part.as_dict(interval, True) for name, part in drawn.speeds.items()},
+            "measures": {name: interval(values) for name, values in drawn.measures.items()},
+        }
+        bounds = dict(_paths(tree))
+    intervals = {"scenes": num_scenes, "draws": NUM_DRAWS, "level": LEVEL, "bounds": bounds}
     return scores.as_dict() | {"intervals": intervals}
 
 
@@ -54,6 +58,15 @@ def interval(
     if not len(values):
         return None
     return np.quantile(values, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2]).tolist()
+
+
+def _paths(tree: dict[str, object], prefix: str = "") -> Iterator[tuple[str, list[float]]]:
+    """Every interval of a tree with its dotted path."""
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _paths(value, f"{prefix}{name}.")
+        elif value is not None:
+            yield prefix + name, value
 
 
 @dataclass

@@ -64,6 +64,10 @@ class ModelConfig:
 class TemporalMemory(Protocol):
     """What a temporal detector carries from frame to frame, detached, one row per stream."""
 
+    @property
+    def present(self) -> Tensor:  # [T, B] bool
+        """Which streams remember their last, last but one, ... frame."""
+
     def select(
         self,
         rows: Tensor,  # [B'] int64, row of each stream of the next batch in this memory

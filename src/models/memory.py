@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Self, TypeVar
 
 import torch
 from torch import Tensor
 
+from src.errors import ConfigError
 from src.geometry.tensor_transforms import invert_rigid
 from src.structures.batch import MAX_EGO_SPEED_MPS, FrameBatch
 from src.structures.tensor_fields import TensorFields
@@ -68,6 +69,16 @@ class RememberedFrame(TensorFields):
             present=self.present[rows] & keep,
         )
 
+    def with_velocities(
+        self,
+        velocities: Callable[[int, Tensor, Tensor], Tensor],  # of a stream's row, [n, 2] m and [n, 2] m/s as remembered
+    ) -> Self:
+        """The frame with other velocities, in the ego frame of its own time; for a model that remembers some.
+
+        Raises ConfigError for one that does not.
+        """
+        raise ConfigError(f"{type(self).__name__} holds no velocities that an oracle could replace; leave oracle= out")
+
 
 Frame = TypeVar("Frame", bound=RememberedFrame)
 
@@ -100,6 +111,11 @@ class FrameMemory(TensorFields, Generic[Frame]):
         """B, 0 for an empty memory."""
         return len(self.frames[0].present) if self.frames else 0
 
+    @property
+    def present(self) -> Tensor:  # [T, B] bool
+        """Which streams remember their last, last but one, ... frame; not of an empty memory."""
+        return torch.stack([frame.present for frame in self.frames])
+
     def before(self, batch: FrameBatch) -> Self:
         """What of the memory is in the past of the batch, stream by stream; the rest is forgotten for good.
 
@@ -122,6 +138,10 @@ class FrameMemory(TensorFields, Generic[Frame]):
     ) -> Self:
         """Memory for a batch whose streams come from these rows; frames that no stream has any more are dropped."""
         return self._shared(frame.select(rows, keep) for frame in self.frames)
+
+    def mapped(self, change: Callable[[Frame], Frame]) -> Self:
+        """The memory with every frame changed."""
+        return replace(self, frames=tuple(map(change, self.frames)))
 
     @classmethod
     def _shared(cls, frames: Iterable[Frame]) -> Self:

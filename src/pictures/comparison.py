@@ -1,4 +1,4 @@
-"""Grouped bars with their spread over seeds: several experiments side by side, or one."""
+"""Grouped bars with their intervals: several experiments side by side, or one."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ KEYS_PER_ROW = 4
 
 @dataclass
 class BarPanel:
-    """One panel: for each experiment a mean and a spread per group, None where it has no number."""
+    """One panel: for each experiment a mean and its interval per group, None where it has no number."""
 
     title: str
     groups: Sequence[str]  # g names along the axis
-    bars: Mapping[str, Sequence[tuple[float, float] | None]]  # experiment -> g (mean, standard deviation)
+    bars: Mapping[str, Sequence[tuple[float, float, float] | None]]  # experiment -> g (mean, low, high)
     digits: int = 1
 
 
 def paint_groups(axes: Axes, panel: BarPanel) -> None:
-    """Bars of all experiments side by side in each group, the spread as a whisker, the mean above it."""
+    """Bars of all experiments side by side in each group, the interval as a whisker, the mean above it."""
     count = max(len(panel.bars), 1)
     width = 0.86 / count
     top = 0.0
@@ -42,13 +42,14 @@ def paint_groups(axes: Axes, panel: BarPanel) -> None:
             if value is None:
                 axes.annotate("-", (place, 0), (0, 2), textcoords="offset points", ha="center", fontsize=8, color=MUTED)
                 continue
-            mean, spread = value
-            top = max(top, mean + spread)
+            mean, low, high = value
+            end = max(mean, high)
+            top = max(top, end)
             axes.bar(place, mean, width * 0.88, color=colour)
-            if spread > 0:
-                axes.errorbar(place, mean, spread, color=INK, linewidth=1, capsize=2)
+            if high > low:
+                axes.vlines(place, low, high, color=INK, linewidth=1)
             axes.annotate(
-                f"{mean:.{panel.digits}f}", (place, mean + spread), (0, 2), textcoords="offset points", ha="center",
+                f"{mean:.{panel.digits}f}", (place, end), (0, 2), textcoords="offset points", ha="center",
                 fontsize=8, color=INK,
             )  # fmt: skip
     axes.set_xticks(range(len(panel.groups)), panel.groups, fontsize=9, parse_math=False)

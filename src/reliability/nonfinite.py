@@ -209,7 +209,8 @@ def read_dump(path: Path) -> tuple[dict[str, Any], FrameBatch]:
         values = dict(step["batch"])
         if values["boxes"] is not None:
             values["boxes"] = [Boxes3D(**boxes) for boxes in values["boxes"]]
-        values["future"] = tuple(FrameBatch(**(frame | {"future": ()})) for frame in values["future"])
+        for name in ("future", "past"):
+            values[name] = tuple(FrameBatch(**(frame | {"future": (), "past": ()})) for frame in values[name])
         return content, FrameBatch(**values)
     except (TypeError, ValueError, KeyError, AttributeError) as error:
         raise CheckpointError(f"{path}: its batch is not as written ({error})") from error

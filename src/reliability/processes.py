@@ -32,6 +32,7 @@ from lightning.fabric.plugins.environments import (
 )
 from lightning.fabric.plugins.environments.lightning import find_free_network_port
 from lightning.pytorch.strategies import DDPStrategy, Strategy
+from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 from src.errors import ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
@@ -299,7 +300,7 @@ def decided_by_main(decide: Callable[[], T]) -> T:
     Every process must call it at the same place. What `decide` raises ends all of them: the main process with the error
     itself, the others silently with its exit code. The result must be a plain value.
     """
-    if not _several():
+    if not several_processes():
         return decide()
     answer: list[Any] = [None]
     failure: BaseException | None = None
@@ -318,7 +319,8 @@ def decided_by_main(decide: Callable[[], T]) -> T:
     return value
 
 
-def _several() -> bool:
+def several_processes() -> bool:
+    """Whether this is one of several ranks."""
     return dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
 
 
@@ -347,7 +349,7 @@ def build_strategy(accelerator: str, devices: int, num_nodes: int = 1) -> Strate
     if devices * num_nodes == 1:
         return "auto"
     # Batch statistics are per device, and in validation the processes may have different numbers of batches: DDP must
-    # not exchange buffers in its forward. `SharedBuffers` does it where it matters. (Older torch: another name.)
+    # not exchange buffers in its forward. `SharedStatistics` does it where it matters. (Older torch: another name.)
     known = inspect.signature(DistributedDataParallel).parameters
     sync = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"
     return DDPStrategy(
@@ -359,26 +361,36 @@ def build_strategy(accelerator: str, devices: int, num_nodes: int = 1) -> Strate
     )
 
 
-class SharedBuffers(L.Callback):
-    """Before validation every process takes the main process's buffers, which are what a checkpoint holds.
+class SharedStatistics(L.Callback):
+    """Before validation, and at the end of an epoch, all processes take the mean of their norms' running statistics.
 
-    Then several processes score the model that one process would find in the checkpoint. Belongs behind callbacks that
-    exchange the weights for validation.
+    Then several processes score the model that one process would find in the checkpoint, and its statistics are those
+    of the whole batch. Belongs behind callbacks that exchange the weights for validation.
     """
 
-    @torch.no_grad()
     def on_validation_epoch_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        """Copy them; every process comes here once per validation."""
-        if _several():
-            for buffer in module.buffers():
-                value = buffer.contiguous()
-                dist.broadcast(value, src=0)
-                buffer.copy_(value)
+        """Every process comes here once per validation."""
+        self.on_train_epoch_end(trainer, module)
+
+    @torch.no_grad()
+    def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Before the checkpoint of the epoch is written."""
+        values = list(running_statistics(module).values()) if several_processes() else []
+        if values:
+            mean = torch.cat(values) / dist.get_world_size()
+            dist.all_reduce(mean)
+            for value, shared in zip(values, mean.split([len(value) for value in values]), strict=True):
+                value.copy_(shared)
+
+
+def running_statistics(module: nn.Module) -> dict[str, torch.Tensor]:
+    """Mean and variance of every batch norm, by name."""
+    return {name: value for name, value in module.named_buffers() if name.endswith(("running_mean", "running_var"))}
 
 
 def gather_by_rank(value: Any) -> list[Any]:
     """The `value`s of all ranks in their order; every rank must call it. One value without a process group."""
-    if not _several():
+    if not several_processes():
         return [value]
     values: list[Any] = [None] * dist.get_world_size()
     dist.all_gather_object(values, value)

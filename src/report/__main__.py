@@ -24,7 +24,7 @@ from src.report.pages import (
     without_dropout,
 )
 from src.report.results import RunResult, finished_runs, publish_result, read_results
-from src.report.score_tables import BY_RANGE, BY_SPEED, ERROR_BY_SPEED, Experiment, mean_and_spread
+from src.report.score_tables import BY_RANGE, BY_SPEED, ERROR_BY_SPEED, Experiment, estimate
 from src.report.sweep_record import read_records
 from src.report.table_builder import write_sweep_tables
 from src.training.run_folder import make_writable
@@ -123,7 +123,7 @@ def bar_panels(experiments: list[Experiment]) -> list[BarPanel]:
         ("mAP by speed, %, over the classes that occur there", BY_SPEED, SPEEDS, "m/s"),
         ("mAVE by speed, m/s, over the classes that occur there (less is better)", ERROR_BY_SPEED, SPEEDS, "m/s"),
     ):
-        bars = {e.label: [mean_and_spread(e.values(c.name), c) for c in columns] for e in experiments}
+        bars = {e.label: [estimate(e.runs, c) for c in columns] for e in experiments}
         panels.append(BarPanel(title, [f"{name} {unit}" for name in names], bars, columns[0].digits))
     return panels
 

@@ -12,6 +12,8 @@ DETECTION = "detection"
 """The task (`phase.task`) whose numbers have names here."""
 RANGES = ("0-25", "25-50", "50-100", "100-150")
 SPEEDS = ("0-0.5", "0.5-10", "10-25", "25+")
+SOURCES = ("radar", "camera", "random", "history")
+"""Where Gaussians come from."""
 PARTS = ("image_encoder", "radar_encoder", "kggi", "ocsf", "dptf", "detection_head", "total")
 """What a frame's latency is made of (Table 15)."""
 FURTHER_PARTS = ("gaussian_encoder", "view_transform", "temporal_fusion", "lidar_encoder")
@@ -58,6 +60,20 @@ for _speed in SPEEDS:
         ("car.AVE", "car AVE", "m/s", 1.0, 2, False),
     ):
         METRICS[f"speeds.{_speed}.{_key}"] = Metric(f"speeds.{_speed}.{_key}", f"{_words} {_speed} m/s", *_rest)
+for _key, _words, *_rest in (
+    ("moving_AP", "AP of moving vehicles", "%", 100.0, 1, True),
+    ("hidden_recall", "recall of hidden objects", "%", 100.0, 1, True),
+    ("unoccupied_recall", "recall without an occupied cell", "%", 100.0, 1, True),
+    ("remembered_share", "objects that history covers", "%", 100.0, 1, True),
+):
+    METRICS[f"measures.{_key}"] = Metric(f"measures.{_key}", _words, *_rest)
+for _source in SOURCES:
+    for _key, _words, *_rest in (
+        ("near", "Gaussians near an object", "%", 100.0, 1, True),
+        ("faint", "Gaussians of opacity below 0.1", "%", 100.0, 1, False),
+        ("velocity_error", "Gaussians' velocity error on movers", "m/s", 1.0, 2, False),
+    ):
+        METRICS[f"measures.{_source}_{_key}"] = Metric(f"measures.{_source}_{_key}", f"{_source} {_words}", *_rest)
 for _part in PARTS + FURTHER_PARTS:
     METRICS[f"latency.{_part}"] = Metric(f"latency.{_part}", _part.replace("_", " "), "ms", 1.0, 1, False)
 METRICS["latency.fps"] = Metric("latency.fps", "frames per second", "1/s", 1.0, 2, True)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import yaml
 
 from src.report.escaping import as_code
-from src.report.metric_names import DETECTION, SPEEDS
+from src.report.metric_names import DETECTION, SPEEDS, Metric
 from src.report.plain_yaml import load_plain_yaml
 from src.report.results import RunResult
 from src.report.score_tables import (
@@ -18,8 +18,9 @@ from src.report.score_tables import (
     CAR_BY_SPEED,
     CAR_ERROR_BY_SPEED,
     ERROR_BY_SPEED,
+    OF_HISTORY,
+    OF_MEMORY,
     SUMMARY,
-    SUMMARY_WITH_VELOCITY,
     Experiment,
     class_table,
     cost_table,
@@ -55,8 +56,10 @@ NAMES_OF_COMPARISON = {
 
 DROPOUT = "data.sensor_dropout="
 
-SPREAD = "mean ± standard deviation over seeds."
-METRIC = f"official TruckScenes metric on the validation split; percent, {SPREAD}"
+SCORES = (
+    "means over seeds, in brackets 95 % intervals over the validation scenes; bold is decided against every other row."
+)
+METRIC = f"official TruckScenes metric on the validation split; {SCORES}"
 
 BY_SPEED_TEXT = """By speed of the ground truth (a match follows its ground truth whatever speed it states, a false
 positive the speed it states). Means over the classes that occur at that speed; the velocity error (m/s, at 2 m) of a
@@ -67,8 +70,13 @@ DROPOUT_TEXT = """From the share `data.sensor_dropout` of the frames, never a cl
 away, in training and in validation: what is found there comes from the memory alone. These rows compare with one
 another only."""
 
-GAIN_TEXT = """Differences between runs of the same seed, mean ± standard deviation: points of percent, and m/s for the
-velocity error, where less is better."""
+GAIN_TEXT = """Differences between runs of the same seed with Student's 95 % interval; what holds zero is undecided, and
+so is one seed. Points of percent, and m/s for velocity errors, where less is better."""
+
+MEMORY_TEXT = """Recall at 2 m, whatever the score, of objects with fewer than 3 returns in the accumulated input that
+had 3 or more at most eight key frames before (hidden), and of objects without an occupied cell inside; the share of
+objects within 2.4 m of a remembered Gaussian. Of remembered Gaussians: the share within 2.4 m of an object, the share
+of opacity below 0.1, and the error of their velocity beside objects of 10 m/s and more."""
 
 
 def runs_on_page(
@@ -127,7 +135,8 @@ def phase_page(runs: list[RunResult], scale: str) -> str:
     """
     if runs[0].task == DETECTION:
         experiments = group_runs(runs, lambda run: NAMES.get((run.phase, *run.settings)))
-        tables = [score_table(experiments, SUMMARY), class_table(experiments), cost_table(experiments)]
+        tables = [score_table(experiments, columns) for columns in (SUMMARY, BY_RANGE)]
+        tables += [class_table(experiments), cost_table(experiments)]
         what = f"{', '.join(map(str, sorted({run.epochs for run in runs})))} epochs"
     else:
         experiments, what = group_runs(runs, lambda run: None), f"task {runs[0].task}"
@@ -167,24 +176,32 @@ def comparison_page(experiments: list[Experiment], scale: str, picture: str) -> 
     dropout = [experiment for experiment in experiments if experiment not in without_dropout(experiments)]
     experiments = without_dropout(experiments)
     text = _page("phase2", scale, "a row of phase 2, and one of further epochs, starts from its seed's phase 1", runs)
-    text += f"![Scores by distance and by speed]({picture})\n\n{score_table(experiments, SUMMARY_WITH_VELOCITY)}\n\n"
-    by_speed, errors = BY_SPEED + CAR_BY_SPEED, ERROR_BY_SPEED + CAR_ERROR_BY_SPEED
-    text += f"## By speed\n\n{BY_SPEED_TEXT}{_boxes_by_speed(runs)}\n\n{score_table(experiments, by_speed)}\n\n"
-    text += f"{score_table(experiments, errors)}\n\n## AP by class\n\n{class_table(experiments)}\n\n"
+    summary, by_speed = (SUMMARY, BY_RANGE), (BY_SPEED, CAR_BY_SPEED, ERROR_BY_SPEED, CAR_ERROR_BY_SPEED)
+    text += f"![Scores by distance and by speed]({picture})\n\n{_tables(experiments, summary)}\n\n"
+    if memory := score_table(experiments, OF_MEMORY + OF_HISTORY):
+        text += f"## What is remembered\n\n{MEMORY_TEXT}\n\n{memory}\n\n"
+    text += f"## By speed\n\n{BY_SPEED_TEXT}{_boxes_by_speed(runs)}\n\n{_tables(experiments, by_speed)}\n\n"
+    text += f"## AP by class\n\n{class_table(experiments)}\n\n"
     text += (
         f"## Cost\n\nOf the phase itself, without the one it starts from.\n\n{cost_table(experiments, epochs=True)}\n"
     )
     subject = next((experiment for experiment in experiments if experiment.key == ("phase2",)), None)
     others = [experiment for experiment in experiments if experiment is not subject]
-    parts = (SUMMARY_WITH_VELOCITY[:4], BY_RANGE, by_speed, errors)
+    parts = (SUMMARY, BY_RANGE, OF_MEMORY + OF_HISTORY, *by_speed)
     if subject is not None and others:
-        gains = "\n\n".join(gain_table(subject, others, columns) for columns in parts)
-        text += f"\n## Gain of phase 2\n\n{GAIN_TEXT}\n\n{gains}\n"
+        text += f"\n## Gain of phase 2\n\n{GAIN_TEXT}\n\n{_gains(subject, others, parts)}\n"
     if dropout:
-        scores = [score_table(dropout, columns) for columns in (SUMMARY_WITH_VELOCITY, by_speed, errors)]
-        gains = [gain_table(dropout[0], dropout[1:], columns) for columns in parts if dropout[1:]]
-        text += f"\n## With sensor dropout\n\n{DROPOUT_TEXT}\n\n" + "\n\n".join([*scores, *gains]) + "\n"
+        text += f"\n## With sensor dropout\n\n{DROPOUT_TEXT}\n\n{_tables(dropout, (SUMMARY, *by_speed))}\n"
+        text += f"\n{_gains(dropout[0], dropout[1:], parts)}\n" if dropout[1:] else ""
     return text
+
+
+def _tables(experiments: list[Experiment], parts: Sequence[list[Metric]]) -> str:
+    return "\n\n".join(filter(None, (score_table(experiments, columns) for columns in parts)))
+
+
+def _gains(subject: Experiment, others: list[Experiment], parts: Sequence[list[Metric]]) -> str:
+    return "\n\n".join(filter(None, (gain_table(subject, others, columns) for columns in parts)))
 
 
 def without_dropout(experiments: list[Experiment]) -> list[Experiment]:
@@ -214,7 +231,7 @@ def _page(phase: str, scale: str, epochs: str, runs: list[RunResult]) -> str:
     """Title, conventions and the commands of the runs."""
     text = (
         f"# {phase}, scale {scale}\n\n"
-        f"Data: {runs[0].dataset}; {epochs}; {METRIC if runs[0].task == DETECTION else SPREAD} Written by "
+        f"Data: {runs[0].dataset}; {epochs}; {METRIC if runs[0].task == DETECTION else SCORES} Written by "
         f"`python -m src.report phase={phase} scale={scale}` from the runs\n\n```\n"
     )
     for run in sorted(runs, key=lambda run: (run.phase, run.settings, run.seed)):

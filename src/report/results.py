@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, NotRequired
 
@@ -95,6 +95,18 @@ class SpeedScores(TypedDict):
     classes: SpeedClasses
 
 
+Bounds = Annotated[list[Score], Field(min_length=2, max_length=2)]
+"""[low, high] of a score."""
+
+
+@with_config(OPEN)
+class Intervals(TypedDict):
+    """How sure scores are, by their paths in metrics.json."""
+
+    scenes: Count
+    bounds: dict[str, Bounds]
+
+
 class Scores(Errors):
     """What tables read of a detection run's metrics.json."""
 
@@ -103,7 +115,9 @@ class Scores(Errors):
     mAVE: Score
     classes: dict[str, ClassScores]
     ranges: dict[str, RangeScores]
-    speeds: NotRequired[dict[str, SpeedScores]]  # older runs have none
+    speeds: NotRequired[dict[str, SpeedScores]]  # older runs have none of these
+    measures: NotRequired[dict[str, Score | None]]
+    intervals: NotRequired[Intervals]
 
 
 @with_config(OPEN)
@@ -183,6 +197,9 @@ class RunResult(RunRecord):
     curves: dict[str, Many[Annotated[list[Measure], Field(min_length=2, max_length=2)]]]
     """[step, value] by column of metrics.csv: loss/*, val/*."""
     latency: Latency | None
+    intervals: dict[str, Bounds] = field(default_factory=dict)
+    """95 % interval of a metric over the scenes it was scored on; older runs and runs on one scene have none."""
+    scenes: Count = 0  # behind the intervals
 
     @property
     def settings(self) -> tuple[str, ...]:
@@ -285,6 +302,8 @@ def read_result(path: Path) -> RunResult:
         raise DataError(f"{path}: run_id must be {path.stem}, the file's name, but is {fields['run_id']}; {remedy}")
     if is_detection:
         numbers = _flat_scores(fields["metrics"])
+        if (found := fields["metrics"].get("intervals")) is not None:
+            fields |= {"intervals": _named(found["bounds"]), "scenes": found["scenes"]}
     else:
         numbers = _numbers(fields["metrics"], fields["headline"], path, remedy)
     if (latency := fields["latency"]) is not None:
@@ -308,7 +327,7 @@ def _numbers(scores: OtherScores, headline: str, path: Path, remedy: str) -> dic
 
 def _flat_scores(scores: Scores) -> dict[str, float | None]:
     """See RunResult.metrics."""
-    groups = {"": scores}
+    groups = {"": scores, "measures.": scores.get("measures", {})}
     groups |= {f"classes.{name}.": part for name, part in scores["classes"].items()}
     groups |= {f"ranges.{name}.": part for name, part in scores["ranges"].items()}
     values = {prefix + key: value for prefix, part in groups.items() for key, value in part.items()}
@@ -323,8 +342,20 @@ def _flat_scores(scores: Scores) -> dict[str, float | None]:
     return values
 
 
+def _named(bounds: dict[str, Bounds]) -> dict[str, Bounds]:
+    """By the names of src/report/metric_names.py, those that have one."""
+    named = {
+        path.replace(".classes.", ".") if path.startswith("speeds.") else path: values
+        for path, values in bounds.items()
+    }
+    return {name: values for name, values in named.items() if name in METRICS}
+
+
 def _slim(scores: dict[str, Any]) -> dict[str, Any]:
-    """metrics.json without the scores by tag, and by range and speed with less of each class: many are read fast."""
+    """metrics.json without the scores by tag, and by range and speed with less of each class: many are read fast.
+
+    Of intervals only those that have a name in tables.
+    """
 
     def shortened(part: dict[str, Any]) -> dict[str, Any]:
         classes = {
@@ -337,6 +368,9 @@ def _slim(scores: dict[str, Any]) -> dict[str, Any]:
     for split in ("ranges", "speeds"):
         if split in slim:
             slim[split] = {name: shortened(part) for name, part in slim[split].items()}
+    if "intervals" in slim:
+        bounds = {path: values for path, values in slim["intervals"]["bounds"].items() if _named({path: values})}
+        slim["intervals"] = slim["intervals"] | {"bounds": bounds}
     return slim
 
 

@@ -1,14 +1,18 @@
-"""Runs into Markdown: one row per experiment, mean and spread over seeds."""
+"""Runs into Markdown: one row per experiment, means over seeds with intervals over scenes."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
+from src.report.comparisons import compare
 from src.report.escaping import as_code
 from src.report.metric_names import DETECTION, METRICS, RANGES, SPEEDS, Metric
 from src.report.results import RunResult
+from src.report.sweep_file import MAX_COLUMNS
+from src.report.sweep_table import format_score
 
 CAR_AP = METRICS["classes.car.AP"]
 BY_RANGE = [METRICS[f"ranges.{name}.mAP"] for name in RANGES]
@@ -16,8 +20,9 @@ BY_SPEED = [METRICS[f"speeds.{name}.mAP_present"] for name in SPEEDS]
 CAR_BY_SPEED = [METRICS[f"speeds.{name}.car.AP"] for name in SPEEDS]
 ERROR_BY_SPEED = [METRICS[f"speeds.{name}.mAVE_present"] for name in SPEEDS]
 CAR_ERROR_BY_SPEED = [METRICS[f"speeds.{name}.car.AVE"] for name in SPEEDS]
-SUMMARY = [METRICS["mAP"], METRICS["NDS"], CAR_AP, *BY_RANGE]
-SUMMARY_WITH_VELOCITY = [*SUMMARY[:2], replace(METRICS["mAVE"], title="mAVE, m/s"), *SUMMARY[2:]]
+SUMMARY = [METRICS["mAP"], METRICS["NDS"], METRICS["mAVE"], CAR_AP, METRICS["measures.moving_AP"]]
+OF_MEMORY = [METRICS[f"measures.{name}"] for name in ("hidden_recall", "unoccupied_recall", "remembered_share")]
+OF_HISTORY = [METRICS[f"measures.history_{name}"] for name in ("near", "faint", "velocity_error")]
 
 
 @dataclass
@@ -32,10 +37,10 @@ class Experiment:
         """The phase and the settings."""
         return (self.runs[0].phase, *self.runs[0].settings)
 
-    def values(self, metric: str) -> list[float]:
-        """The metric of each run; empty unless every run has it, as means over different seeds do not compare."""
-        found = [run.metrics.get(metric) for run in self.runs]
-        return [] if None in found else found
+    def values(self, column: Metric) -> dict[int, float]:
+        """By seed, as the column states it; empty unless every run has it: means over other seeds do not compare."""
+        found = {run.seed: run.metrics.get(column.name) for run in self.runs}
+        return {} if None in found.values() else {seed: column.scale * value for seed, value in found.items()}
 
 
 def metrics_of(run: RunResult) -> list[Metric]:
@@ -69,27 +74,61 @@ def group_runs(runs: list[RunResult], name_of: Callable[[RunResult], str | None]
     return experiments
 
 
-def mean_and_spread(values: list[float], column: Metric) -> tuple[float, float] | None:
-    """Mean and standard deviation (0 for one value) as the column states them; None of no values."""
-    if not values:
+class Estimate(NamedTuple):
+    """A mean over runs as a column states it, with its 95 % interval over scenes; of no length where unknown."""
+
+    mean: float
+    low: float
+    high: float
+
+
+def estimate(runs: Sequence[RunResult], column: Metric) -> Estimate | None:
+    """Of the runs that have the number; None of none."""
+    having = [run for run in runs if run.metrics.get(column.name) is not None]
+    if not having:
         return None
-    scaled = [column.scale * value for value in values]
-    return statistics.mean(scaled), statistics.stdev(scaled) if len(scaled) > 1 else 0.0
+    mean = column.scale * statistics.mean(run.metrics[column.name] for run in having)
+    return Estimate(mean, *(mean_bounds(having, column) or (mean, mean)))
+
+
+def mean_bounds(runs: Sequence[RunResult], column: Metric) -> tuple[float, float] | None:
+    """95 % interval over scenes of runs' mean as the column states it, the mean of their bounds; None unless each run
+    has one."""
+    bounds = [run.intervals.get(column.name) for run in runs]
+    if not bounds or None in bounds:
+        return None
+    low, high = (column.scale * statistics.mean(ends) for ends in zip(*bounds, strict=True))
+    return low, high
 
 
 def score_table(experiments: list[Experiment], columns: list[Metric]) -> str:
-    """Mean ± standard deviation over seeds, the best mean of a column in bold, a dash where a run lacks the number."""
-    values = [[experiment.values(column.name) for column in columns] for experiment in experiments]
-    cells = [[_cell(found, column) for found, column in zip(row, columns, strict=True)] for row in values]
-    for place, column in enumerate(columns):
-        means = {line: statistics.mean(row[place]) for line, row in enumerate(values) if row[place]}
-        if len(experiments) == 1 or not means:
-            continue
-        for line, mean in means.items():
-            if mean == (max if column.higher_is_better else min)(means.values()):
-                cells[line][place] = f"**{cells[line][place]}**"
-    titles = [column.title for column in columns]
-    return _markdown("experiment", titles, [experiment.label for experiment in experiments], cells)
+    """Mean over seeds with its interval over scenes; bold is decided against every other row.
+
+    A dash stands where a run lacks the number. Wide tables are cut, and what no run has is left out.
+    """
+    known = [column for column in columns if any(experiment.values(column) for experiment in experiments)]
+    parts = -(-len(known) // (MAX_COLUMNS - 1))
+    cut = [known[round(k * len(known) / parts) : round((k + 1) * len(known) / parts)] for k in range(parts)]
+    labels = [experiment.label for experiment in experiments]
+    return "\n\n".join(
+        _markdown("experiment", [column.heading for column in some], labels, _score_cells(experiments, some))
+        for some in cut
+    )
+
+
+def _score_cells(experiments: list[Experiment], columns: list[Metric]) -> list[list[str]]:
+    lines: list[list[str]] = [[] for _ in experiments]
+    for column in columns:
+        values = [experiment.values(column) for experiment in experiments]
+        for line, experiment, own in zip(lines, experiments, values, strict=True):
+            if not own:
+                line.append("-")
+                continue
+            text = format_score(statistics.mean(own.values()), mean_bounds(experiment.runs, column), column)
+            others = [compare(own, other, column.digits) for other in values if other and other is not own]
+            best = bool(others) and all(found is not None and found.favours(column) for found in others)
+            line.append(f"**{text}**" if best else text)
+    return lines
 
 
 def class_table(experiments: list[Experiment]) -> str:
@@ -112,31 +151,19 @@ def cost_table(experiments: list[Experiment], epochs: bool = False) -> str:
 
 
 def gain_table(subject: Experiment, others: list[Experiment], columns: list[Metric]) -> str:
-    """What `subject` gains over each of `others`: the difference of runs of the same seed, mean ± deviation.
+    """What `subject` has more than each of `others`: differences of runs of the same seed, see `Comparison.text`.
 
-    Positive is more, so a gain in an error is negative. A dash where no seed has both numbers; a seed that only one of
-    them has does not count.
+    A dash where no seed has both numbers; a seed that only one of them has does not count.
     """
-    by_seed = {run.seed: run for run in subject.runs}
+    seeds = {run.seed for run in subject.runs}
+    known = [column for column in columns if subject.values(column)]
     cells = []
     for other in others:
-        pairs = [(by_seed[run.seed].metrics, run.metrics) for run in other.runs if run.seed in by_seed]
-        row = []
-        for column in columns:
-            both = [(a.get(column.name), b.get(column.name)) for a, b in pairs]
-            differences = [a - b for a, b in both if a is not None and b is not None]
-            row.append(_cell(differences, column, signed=True))
-        cells.append([str(len(pairs)), *row])
-    titles = ["seeds", *(column.title for column in columns)]
-    return _markdown(f"{subject.label} over", titles, [other.label for other in others], cells)
-
-
-def _cell(values: list[float], column: Metric, signed: bool = False) -> str:
-    found = mean_and_spread(values, column)
-    if found is None:
-        return "-"
-    text = f"{found[0]:{'+' if signed else ''}.{column.digits}f}"
-    return text + (f" ± {found[1]:.{column.digits}f}" if len(values) > 1 else "")
+        found = [compare(subject.values(column), other.values(column), column.digits) for column in known]
+        pairs = sum(run.seed in seeds for run in other.runs)
+        cells.append([str(pairs), *("-" if gain is None else gain.text for gain in found)])
+    titles = ["seeds", *(column.heading for column in known)]
+    return _markdown(f"{subject.label} over", titles, [other.label for other in others], cells) if known else ""
 
 
 def _markdown(corner: str, titles: list[str], labels: list[str], cells: list[list[str]]) -> str:

@@ -19,6 +19,9 @@ from src.training.identity import key_of
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """Of sweeps and tables: they are file names, parts of addresses and names of studies."""
 
+MAX_COLUMNS = 8
+"""Of a table, its heads included."""
+
 
 @with_config(CLOSED)
 @dataclass(kw_only=True)
@@ -153,6 +156,12 @@ class SweepConfig:
                 raise ConfigError(f"{where}, table {table.name}: there is no row {', '.join(unknown)}")
             if not table.columns:
                 raise ConfigError(f"{where}, table {table.name}: columns is empty; name at least one metric")
+            num_rows = len(table.rows or labels)
+            if len(table.columns) >= MAX_COLUMNS and (num_rows >= MAX_COLUMNS or self.space):
+                raise ConfigError(
+                    f"{where}, table {table.name}: {len(table.columns)} metrics of {num_rows} rows fit no table of "
+                    f"{MAX_COLUMNS} columns, heads included, either way round; name fewer columns or rows"
+                )
         for plot in self.plots:
             find_metric(plot.metric, f"{where}, plots", self.task)
         for key, dimension in self.space.items():

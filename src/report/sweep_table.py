@@ -5,17 +5,19 @@ from __future__ import annotations
 import csv
 import io
 import statistics
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from src.report.comparisons import Comparison, compare
 from src.report.escaping import escape_latex, escape_markdown
 from src.report.metric_names import Metric
+from src.report.sweep_file import MAX_COLUMNS
 
 MISSING = "–"
 PAPER = "paper"
-"""State of a row that only the paper has, and its part of a column."""
-HERE, BASELINE = "here", "to baseline"
-"""The other parts of a column."""
+"""State of a row that only the paper has."""
+BETWEEN = " | "
+"""Between the paper's number and ours."""
 
 
 @dataclass
@@ -24,10 +26,11 @@ class TableCell:
 
     paper: float | None = None
     values: dict[int, float] = field(default_factory=dict)  # here, by seed
-    differences: dict[int, float] = field(default_factory=dict)  # to the baseline with the same seed
+    bounds: tuple[float, float] | None = None  # 95 % over scenes: the mean of the runs' bounds, where all have some
+    comparison: Comparison | None = None  # to the baseline
     paper_difference: float | None = None
     frames: float | None = None  # of a latency that one run has: half the range of the middle half of its frames
-    best: bool = False  # of the finished rows here; each of those that tie at the digits shown
+    best: bool = False  # decided against every other finished row
     paper_best: bool = False
 
     @property
@@ -38,39 +41,37 @@ class TableCell:
     @property
     def mean(self) -> float | None:
         """Over seeds; None without any."""
-        return _mean(self.values)
+        return statistics.mean(self.values.values()) if self.values else None
 
-    @property
-    def spread(self) -> float | None:
-        """Standard deviation over seeds; None of fewer than two."""
-        return _spread(self.values)
+    def compared_with(self, other: TableCell, metric: Metric) -> Comparison | None:
+        """What this row has more than the other; None where they share no seed.
 
-    @property
-    def uncertainty(self) -> float:
-        """What stands after ±: over seeds, or of one run's frames; 0 where neither is known."""
-        spread = self.spread if self.spread is not None else self.frames
-        return spread if spread is not None else 0.0
-
-    @property
-    def difference(self) -> float | None:
-        """Mean over seeds of what this row has more than the baseline; None where no seed has both."""
-        return _mean(self.differences)
-
-    @property
-    def difference_spread(self) -> float | None:
-        """Standard deviation of the differences; None of fewer than two."""
-        return _spread(self.differences)
+        Frames decide between latencies of one run each: what is trained does not change them, what else runs does.
+        """
+        if self.frames is None or other.frames is None:
+            return compare(self.values, other.values, metric.digits)
+        gap, half = self.mean - other.mean, self.frames + other.frames
+        return Comparison(gap, gap - half, gap + half, 1, metric.digits)
 
 
 @dataclass(frozen=True)
 class ShownCell:
-    """One number of a row, as every form of the table shows it."""
+    """One cell as every form of the table shows it: the paper's part, None where its column has none, and ours."""
 
-    part: str  # see SweepTable.parts
-    text: str
-    value: float | None  # sorting goes by it
+    paper: str | None
+    here: str
+    value: float | None = None  # sorting goes by it
     best: bool = False
-    verdict: str = ""  # `better` or `worse` than the baseline at the digits shown
+    paper_best: bool = False
+    verdict: str = ""  # of a difference that is decided: `better` or `worse` than the baseline
+
+    def text(self, escape: Callable[[str], str], bold: Callable[[str], str]) -> str:
+        """*paper | here*, escaped."""
+        here = bold(escape(self.here)) if self.best else escape(self.here)
+        if self.paper is None:
+            return here
+        paper = bold(escape(self.paper)) if self.paper_best else escape(self.paper)
+        return f"{paper}{escape(BETWEEN)}{here}"
 
 
 @dataclass
@@ -93,6 +94,16 @@ class SweepRow:
         return self.label == self.baseline
 
 
+@dataclass(frozen=True)
+class Head:
+    """What stands over a column or before a line: a row of the sweep, a metric, or the difference in one."""
+
+    text: str
+    note: str = ""
+    row: SweepRow | None = None
+    metric: Metric | None = None
+
+
 @dataclass
 class SweepTable:
     """One table as plain data; whoever shows it shows this."""
@@ -104,11 +115,21 @@ class SweepTable:
     columns: list[Metric]
     rows: list[SweepRow]
     is_search: bool
-    text: list[str] = field(default_factory=list)  # what the numbers say: a frame, then one finding each
+    text: list[str] = field(default_factory=list)  # what was checked, and in one sentence what was found
 
     def has_paper(self, column: int) -> bool:
         """Whether the paper has a number in this column."""
         return any(row.cells[column].paper is not None for row in self.rows)
+
+    @property
+    def transposed(self) -> bool:
+        """Whether metrics are the lines, as there are too many for columns."""
+        return not self.is_search and len(self.columns) >= MAX_COLUMNS
+
+    @property
+    def shows_differences(self) -> bool:
+        """Whether each metric has a second column; a wide table has no room for them."""
+        return bool(self.baselines) and 1 + 2 * len(self.columns) <= MAX_COLUMNS
 
     @property
     def baselines(self) -> list[str]:
@@ -117,53 +138,76 @@ class SweepTable:
         return list(dict.fromkeys(row.baseline for row in compared if row.baseline is not None))
 
     @property
-    def has_notes(self) -> bool:
-        """Whether some row lacks numbers for a reason."""
-        return any(row.note for row in self.rows)
+    def corner(self) -> str:
+        """Head of the heads."""
+        what = "trial" if self.is_search else "metric" if self.transposed else "row"
+        return f"{what}: {PAPER}{BETWEEN}here" if any(map(self.has_paper, range(len(self.columns)))) else what
 
     @property
-    def corner(self) -> str:
-        """Head of the labels."""
-        return "trial" if self.is_search else "row"
+    def heads(self) -> list[Head]:
+        """Over the columns after the corner."""
+        if self.transposed:
+            return [self._row_head(row) for row in self.rows]
+        heads = []
+        for column in self.columns:
+            heads.append(Head(column.heading, metric=column))
+            heads += [Head(f"{column.title} to baseline", metric=column)] if self.shows_differences else []
+        return heads + ([Head("chosen")] if self.is_search else [])
 
-    def parts(self, column: int) -> list[str]:
-        """What stands under a metric's name: the paper's number and the difference where there are any."""
-        parts = [PAPER] if self.has_paper(column) else []
-        return [*parts, HERE, *([BASELINE] if self.baselines else [])]
+    @property
+    def lines(self) -> list[tuple[Head, list[ShownCell]]]:
+        """Every line with what stands before it."""
+        by_row = [[self._shown(row, place) for place in range(len(self.columns))] for row in self.rows]
+        if self.transposed:
+            metrics = (Head(column.heading, metric=column) for column in self.columns)
+            return [(head, [cells[place][0] for cells in by_row]) for place, head in enumerate(metrics)]
+        lines = [(self._row_head(row), [cell for cells in of_row for cell in cells])
+                 for row, of_row in zip(self.rows, by_row, strict=True)]  # fmt: skip
+        if self.is_search:
+            for head, cells in lines:
+                cells.append(ShownCell(None, " ".join(head.row.overrides)))
+        return lines
 
-    def shown(self, row: SweepRow) -> Iterator[ShownCell]:
-        """The row's numbers, as many for each column as it has parts."""
-        for place, (column, cell) in enumerate(zip(self.columns, row.cells, strict=True)):
-            gain = rounded(cell.difference or 0.0, column) * (1 if column.higher_is_better else -1)
-            verdict = "better" if gain > 0 else "worse" if gain < 0 else ""
-            difference = ShownCell(BASELINE, format_difference(cell, column, row.done), cell.difference, False, verdict)
-            cells = {
-                PAPER: ShownCell(PAPER, format_paper(cell.paper, column), cell.paper, cell.paper_best),
-                HERE: ShownCell(HERE, format_here(cell, column, row.done), cell.mean, cell.best),
-                BASELINE: ShownCell(BASELINE, "baseline", 0.0) if row.is_baseline else difference,
-            }
-            yield from map(cells.__getitem__, self.parts(place))
+    def _row_head(self, row: SweepRow) -> Head:
+        notes = [row.note] if row.note else []
+        counts = {other.done for other in self.rows if other.state != PAPER}
+        if row.state != PAPER and not self.is_search and (row.done != row.planned or len(counts) > 1):
+            of = f" of {row.planned}" if row.done != row.planned else ""
+            notes.insert(0, f"{row.done}{of} seed{'s' if max(row.done, row.planned) != 1 else ''}")
+        return Head(row.label, "; ".join(notes), row)
+
+    def _shown(self, row: SweepRow, place: int) -> list[ShownCell]:
+        """The cell, and its difference where there is a column for it."""
+        column, cell, has_paper = self.columns[place], row.cells[place], self.has_paper(place)
+        paper = format_paper(cell.paper, column) if has_paper else None
+        shown = [ShownCell(paper, format_here(cell, column, row.done), cell.mean, cell.best, cell.paper_best)]
+        if self.shows_differences and row.is_baseline:
+            shown.append(ShownCell(None, "baseline", 0.0))
+        elif self.shows_differences:
+            found, paper = cell.comparison, format_paper(cell.paper_difference, column, signed=True)
+            verdict = "" if found is None or not found.decided else "better" if found.favours(column) else "worse"
+            text = MISSING if found is None else format_difference(found, row.done)
+            value = None if found is None else found.mean
+            shown.append(ShownCell(paper if has_paper else None, text, value, verdict=verdict))
+        return shown
 
     def to_markdown(self) -> str:
         """Title, table, caption, text."""
-        header = [self.corner]
-        for place, column in enumerate(self.columns):
-            header += [f"{column.heading}: {name}" for name in self.parts(place)]
-        header += self._ends
-        lines = [f"| {' | '.join(map(escape_markdown, header))} |", "|---" * len(header) + "|"]
-        lines += [f"| {' | '.join(self._line(row, escape_markdown, '**{}**'.format))} |" for row in self.rows]
-        frame, *points = map(escape_markdown, self.text or [""])
-        title, caption = escape_markdown(self.title), escape_markdown(self.caption)
-        parts = [f"# {title}", "\n".join(lines), caption, frame, "\n".join(f"- {point}" for point in points)]
+        lines = [[self.corner, *(_headed(head) for head in self.heads)]]
+        lines = [[escape_markdown(cell) for cell in lines[0]], ["---"] * len(lines[0])]
+        for head, cells in self.lines:
+            shown = [cell.text(escape_markdown, "**{}**".format) for cell in cells]
+            lines.append([escape_markdown(_headed(head)), *shown])
+        parts = [f"# {escape_markdown(self.title)}", "\n".join(f"| {' | '.join(line)} |" for line in lines)]
+        parts += map(escape_markdown, [self.caption, *self.text])
         return "\n\n".join(part for part in parts if part) + "\n"
 
     def to_csv(self) -> str:
         """Plain numbers, one column each, in the table's units; empty where there is none."""
-        header = [self.corner, "state", "note", "seeds done", "seeds planned"]
+        header = ["trial" if self.is_search else "row", "state", "note", "seeds done", "seeds planned"]
         header += ["overrides"] if self.is_search else []
-        for column in self.columns:
-            header += [f"{column.name} {part}" for part in ("paper", "mean", "std", "n", "diff", "diff std", "diff n")]
-            header.append(f"{column.name} paper diff")
+        names = ("paper", "mean", "low", "high", "n", "diff", "diff low", "diff high", "diff n", "paper diff")
+        header += [f"{column.name} {name}" for column in self.columns for name in names]
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(header)
@@ -171,49 +215,34 @@ class SweepTable:
             line: list[object] = [row.label, row.state, row.note, row.done, row.planned]
             line += [" ".join(row.overrides)] if self.is_search else []
             for cell in row.cells:
-                here = [cell.mean, cell.spread, cell.seeds, cell.difference, cell.difference_spread]
-                line += [cell.paper, *here, len(cell.differences), cell.paper_difference]
+                low, high = cell.bounds or (None, None)
+                found = cell.comparison
+                gain = [None, None, None, 0] if found is None else [found.mean, found.low, found.high, found.pairs]
+                line += [cell.paper, cell.mean, low, high, cell.seeds, *gain, cell.paper_difference]
             writer.writerow([round(value, 6) if isinstance(value, float) else value for value in line])
         return text.getvalue()
 
     def to_latex(self) -> str:
-        """A table environment for booktabs."""
+        """A table environment for booktabs, shrunk to the line where it is wider."""
         bold = "\\textbf{{{}}}".format
-        first, second, rules, at = [""], [self.corner], [], 2
-        for place, column in enumerate(self.columns):
-            parts = self.parts(place)
-            first.append(f"\\multicolumn{{{len(parts)}}}{{c}}{{{escape_latex(column.heading)}}}")
-            rules.append(f"\\cmidrule(lr){{{at}-{at + len(parts) - 1}}}")
-            second += parts
-            at += len(parts)
-        first += [""] * len(self._ends)
-        second += self._ends
-        kinds = "l" + "r" * (at - 2) + "l" * len(self._ends)
-        lines = [" & ".join(self._line(row, escape_latex, bold)) + r" \\" for row in self.rows]
+        lines = [
+            [escape_latex(_headed(head)), *(cell.text(escape_latex, bold) for cell in cells)]
+            for head, cells in self.lines
+        ]
+        heads = [self.corner, *(_headed(head) for head in self.heads)]
         text = [f"\\par\\medskip\\footnotesize {' '.join(map(escape_latex, self.text))}"] if self.text else []
         return "\n".join(
             [
-                "% needs \\usepackage{booktabs}", "\\begin{table}", "\\centering",
+                "% needs \\usepackage{adjustbox,booktabs}", "\\begin{table}", "\\centering",
                 f"\\caption{{{escape_latex(self.title)}. {escape_latex(self.caption)}}}",
                 f"\\label{{tab:{''.join(c if c.isalnum() else '-' for c in self.name)}}}",
-                f"\\begin{{tabular}}{{{kinds}}}", "\\toprule", " & ".join(first) + r" \\", " ".join(rules),
-                " & ".join(map(escape_latex, second)) + r" \\", "\\midrule", *lines, "\\bottomrule",
-                "\\end{tabular}", *text, "\\end{table}", "",
+                "\\begin{adjustbox}{max width=\\linewidth}",
+                f"\\begin{{tabular}}{{l{'r' * (len(heads) - 1)}}}", "\\toprule",
+                " & ".join(map(escape_latex, heads)) + r" \\", "\\midrule",
+                *(" & ".join(line) + r" \\" for line in lines), "\\bottomrule",
+                "\\end{tabular}", "\\end{adjustbox}", *text, "\\end{table}", "",
             ]
         )  # fmt: skip
-
-    @property
-    def _ends(self) -> list[str]:
-        return ["seeds", *(["chosen"] if self.is_search else []), *(["state"] if self.has_notes else [])]
-
-    def _line(self, row: SweepRow, escape: Callable[[str], str], bold: Callable[[str], str]) -> list[str]:
-        """The row's cells, escaped."""
-        line = [escape(row.label)]
-        line += [bold(escape(cell.text)) if cell.best else escape(cell.text) for cell in self.shown(row)]
-        seeds = f"{row.done}" if row.done == row.planned else f"{row.done} of {row.planned}"
-        line.append(escape(MISSING if row.state == PAPER else seeds))
-        line += [escape(" ".join(row.overrides))] if self.is_search else []
-        return line + ([escape(row.note)] if self.has_notes else [])
 
 
 def rounded(value: float, metric: Metric) -> float:
@@ -230,30 +259,24 @@ def format_paper(value: float | None, metric: Metric, signed: bool = False) -> s
 
 
 def format_here(cell: TableCell, metric: Metric, done: int) -> str:
-    """Mean ± standard deviation; of one run's latency ± `TableCell.frames`; n where not all `done` have it."""
+    """Mean with its interval, or with a latency's ± `TableCell.frames`; n where not all `done` runs have it."""
     if cell.mean is None:
         return MISSING
-    text = f"{rounded(cell.mean, metric):.{metric.digits}f}"
-    known = cell.spread is not None or cell.frames is not None
-    text += f" ± {cell.uncertainty:.{metric.digits}f}" if known else ""
+    text = format_score(cell.mean, cell.bounds, metric)
+    text += f" ± {cell.frames:.{metric.digits}f}" if cell.frames is not None else ""
     return text + (f" (n = {cell.seeds})" if cell.seeds != done else "")
 
 
-def format_difference(cell: TableCell, metric: Metric, done: int | None = None) -> str:
-    """What the row has more than the baseline; in brackets the paper's, and n where not all `done` runs have both."""
-    text, notes = MISSING, []
-    if cell.difference is not None:
-        text = f"{rounded(cell.difference, metric):+.{metric.digits}f}"
-        text += f" ± {cell.difference_spread:.{metric.digits}f}" if cell.difference_spread is not None else ""
-        notes += [f"n = {len(cell.differences)}"] if done not in (None, len(cell.differences)) else []
-    if cell.paper_difference is not None:
-        notes.append(f"paper {format_paper(cell.paper_difference, metric, signed=True)}")
-    return f"{text} ({', '.join(notes)})" if notes else text
+def format_score(value: float, bounds: tuple[float, float] | None, metric: Metric) -> str:
+    """A number in the table's unit with its interval."""
+    numbers = [f"{rounded(number, metric):.{metric.digits}f}" for number in (value, *(bounds or ()))]
+    return numbers[0] + (f" [{numbers[1]}, {numbers[2]}]" if bounds is not None else "")
 
 
-def _mean(values: dict[int, float]) -> float | None:
-    return statistics.mean(values.values()) if values else None
+def format_difference(found: Comparison, done: int) -> str:
+    """See `Comparison.text`; n where not all `done` runs have a partner."""
+    return found.text + (f" (n = {found.pairs})" if found.pairs != done else "")
 
 
-def _spread(values: dict[int, float]) -> float | None:
-    return statistics.stdev(values.values()) if len(values) > 1 else None
+def _headed(head: Head) -> str:
+    return f"{head.text} ({head.note})" if head.note else head.text

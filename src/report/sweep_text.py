@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import statistics
+from typing import NamedTuple
 
+from src.report.comparisons import Comparison
 from src.report.metric_names import Metric
-from src.report.orderings import LEAST_SEEDS, Ordering, describe_test, find_orderings, paired_gains
 from src.report.results import Latency, RunResult
 from src.report.sweep_record import SweepRecord
-from src.report.sweep_table import SweepRow, SweepTable, format_paper, rounded
+from src.report.sweep_table import SweepRow, SweepTable
 
 SYNTHETIC = "synthetic highway"
 MAIN = ("mAP", "NDS")
-"""Columns whose rows are compared one by one; a table without them has its first one compared so."""
+"""Metrics that the finding is about; in a table without them it is about all."""
+NAMED = 3
+"""Orderings that hold are named up to this number."""
 
 
 def describe_table(table: SweepTable, record: SweepRecord, results: dict[str, RunResult], complete: bool) -> str:
@@ -30,8 +32,7 @@ def describe_table(table: SweepTable, record: SweepRecord, results: dict[str, Ru
             by_phase.setdefault(result.phase, set()).add(result.epochs)
         for phase, epochs in sorted(by_phase.items()):
             parts.append(f"{phase}: {_listed(sorted(epochs))} epoch{'' if epochs == {1} else 's'}")
-    spread = "mean ± standard deviation" if len(seeds) > 1 else "one seed, so no spread"
-    parts.append(f"seed{'s' if len(seeds) > 1 else ''} {_listed(seeds)}: {spread}")
+    parts.append(f"seed{'s' if len(seeds) > 1 else ''} {_listed(seeds)}{', of which means' if len(seeds) > 1 else ''}")
     code, devices = set(), set()
     for result in results.values():
         code.add(result.commit[:10] + ("+" if result.commit.endswith("+") else ""))
@@ -40,11 +41,17 @@ def describe_table(table: SweepTable, record: SweepRecord, results: dict[str, Ru
     for words, found in (("code ", code), ("", devices)):
         parts += [words + _listed(sorted(found))] if found else []
     text = "; ".join(parts) + "."
-    text += "" if complete else " Bold is the best of the rows whose seeds have all finished."
-    if table.baselines:
-        brackets = "; the paper's in brackets" if any(map(table.has_paper, range(len(table.columns)))) else ""
-        text += f" Differences are to {' or '.join(table.baselines)}, seed by seed{brackets}."
+    text += _scene_intervals(results)
+    if table.shows_differences:
+        text += f" Differences are to {' or '.join(table.baselines)}, seed by seed, with Student's 95 % interval."
+    if not table.is_search:
+        text += " Bold is decided against every other row" + ("." if complete else " whose seeds have all finished.")
     return text + _latency(table, [result.latency for result in results.values() if result.latency is not None])
+
+
+def _scene_intervals(results: dict[str, RunResult]) -> str:
+    counts = sorted({result.scenes for result in results.values() if result.intervals})
+    return f" In brackets 95 % intervals over the {_listed(counts)} validation scenes." if counts else ""
 
 
 def _latency(table: SweepTable, timed: list[Latency]) -> str:
@@ -63,7 +70,7 @@ def _latency(table: SweepTable, timed: list[Latency]) -> str:
         return f"{text}."
     return (
         f"{text}; after ± of a latency that one run has stands half the range of the middle half of its frames, and "
-        "none is bold where the best and the next are no further apart than these."
+        "two rows no further apart than the sum of theirs are undecided."
     )
 
 
@@ -73,35 +80,81 @@ def is_busy(load: float | None, cores: int | None) -> bool:
 
 
 def findings(columns: list[Metric], rows: list[SweepRow], result: RunResult | None, complete: bool) -> list[str]:
-    """What the numbers of trained rows say: a frame, then a sentence each. `result` is any of the table's."""
+    """What trained rows were checked for, and in one sentence what was found. `result` is any of the table's."""
     if result is None:
         return ["No run has finished yet."]
-    main = [name for name in MAIN if name in [column.name for column in columns]] or [columns[0].name]
-    baselines = {row.label: row.baseline for row in rows if row.baseline is not None}
-    sentences, tested = [], []  # `tested`: common seeds of each comparison
-    for place, column in enumerate(columns):
-        paper = {row.label: row.cells[place].paper for row in rows if row.cells[place].paper is not None}
-        values = {row.label: row.cells[place].values for row in rows}
-        orderings = find_orderings(paper, values, column.higher_is_better, column.digits)
-        if orderings:
-            sentences.append(_count(column, orderings, complete))
-        if column.name in main:
-            for first, second in _pairs(orderings, values, baselines):
-                sentences.append(_comparison(column, first, second, paper, values))
-                tested.append(len(paired_gains(values[first], values[second])))
-    decisive = sum(seeds >= LEAST_SEEDS for seeds in tested)
-    if tested and not decisive:
-        sentences.append(
-            f"With {_counted(max(tested), 'seed')} no sign test can decide at 5 %, however clear the numbers look: "
-            f"that takes {LEAST_SEEDS} seeds."
-        )
-    if decisive > 1:
-        sentences.append(f"The p-values of these {decisive} sign tests are not corrected for their number.")
-    if not sentences:
+    frame = _frame(result, any(cell.paper is not None for row in rows for cell in row.cells))
+    main = [place for place, column in enumerate(columns) if column.name in MAIN]
+    groups = [(columns[place].title, [place]) for place in main] or [("Over all metrics", list(range(len(columns))))]
+    judged = {where: _judge(columns, rows, places) for where, places in groups}
+    parts = [_found(where, found) for where, found in judged.items() if found]
+    if not parts:
         alone = "One row is trained here, so there is nothing to compare it with."
-        sentences.append("No two of the rows can be compared yet." if len(rows) > 1 else alone)
-    has_paper = any(cell.paper is not None for row in rows for cell in row.cells)
-    return [_frame(result, has_paper), *sentences]
+        return [frame, "No two of the rows can be compared yet." if len(rows) > 1 else alone]
+    text = f"{'' if complete else 'So far: '}{'; '.join(parts)}"
+    text += (
+        ": one seed never decides" if all(one.found.low is None for found in judged.values() for one in found) else ""
+    )
+    return [frame, f"{text}."]
+
+
+class Judged(NamedTuple):
+    """Two rows beside one another."""
+
+    first: str  # label, with the metric where there are several
+    second: str
+    better: bool | None  # the first one here; None if undecided
+    found: Comparison
+    stated: bool  # the paper has the first one before the other
+
+    @property
+    def words(self) -> str:
+        """The paper's order."""
+        return f"{self.first} before {self.second}"
+
+
+def _judge(columns: list[Metric], rows: list[SweepRow], places: list[int]) -> list[Judged]:
+    """Every two rows that the paper tells apart, its better one first; without numbers of it, rows and baselines."""
+    judged = []
+    by_label = {row.label: row for row in rows}
+    for place in places:
+        column = columns[place]
+        prefix = f"{column.title}: " if len(places) > 1 else ""
+        stated = [row for row in rows if row.cells[place].paper is not None]
+        stated.sort(key=lambda row: row.cells[place].paper, reverse=column.higher_is_better)
+        pairs = [
+            (first, second)
+            for rank, first in enumerate(stated)
+            for second in stated[rank + 1 :]
+            if first.cells[place].paper != second.cells[place].paper
+        ]
+        if not stated:
+            pairs = [(row, by_label[row.baseline]) for row in rows if row.baseline in by_label and not row.is_baseline]
+        for first, second in pairs:
+            found = first.cells[place].compared_with(second.cells[place], column)
+            if found is not None:
+                better = found.favours(column) if found.decided else None
+                judged.append(Judged(prefix + first.label, second.label, better, found, bool(stated)))
+    return judged
+
+
+def _found(where: str, judged: list[Judged]) -> str:
+    """How many of the paper's orderings hold, are the other way round and are undecided; or which rows are better."""
+    left = sum(one.better is None for one in judged)
+    of_paper = all(one.stated for one in judged)
+    one, many = ("ordering of two rows", "orderings of two rows") if of_paper else ("comparison", "comparisons")
+    if left == len(judged):
+        return f"{where}: {f'the one {one}' if left == 1 else f'all {left} {many}'} undecided"
+    held = [pair for pair in judged if pair.better]
+    turned = [pair for pair in judged if pair.better is False]
+    if of_paper:
+        parts = [f"{len(held)} of {len(judged)} {one if len(judged) == 1 else many} hold{'s' * (len(held) == 1)} here"]
+        parts[0] += f" ({_listed([pair.words for pair in held])})" if 0 < len(held) <= NAMED else ""
+        parts += [f"{len(turned)} the other way round ({_listed([pair.words for pair in turned])})"] if turned else []
+    else:
+        parts = [f"{pair.first} better than {pair.second}" for pair in held]
+        parts += [f"{pair.first} worse than {pair.second}" for pair in turned]
+    return f"{where}: {', '.join([*parts, *([f'{left} undecided'] if left else [])])}"
 
 
 def describe_search(
@@ -122,72 +175,14 @@ def describe_search(
 
 
 def _frame(result: RunResult, has_paper: bool) -> str:
+    """What the numbers can say, and what they cannot."""
     synthetic = result.data["name"] == SYNTHETIC
     where = f"{f'the {SYNTHETIC}' if synthetic else result.data['name']}, scale {result.scale}"
     if not has_paper:
-        text = f"Seen on {where}; the paper has no numbers for these rows."
-        return text + (" It says nothing about results on TruckScenes." if synthetic else "")
-    if synthetic:
-        return (
-            f"A check on {where}, of what the paper found on TruckScenes: it can show whether the paper's orderings "
-            "appear here. Its numbers are not results on TruckScenes, and how large they are does not compare with the "
-            "paper's."
-        )
+        return f"Seen on {where}; the paper has no numbers for these rows."
     size = "" if result.scale == "paper" else ", which is not the paper's size of model and training"
-    return f"A check on {where}{size}, of the paper's orderings."
-
-
-def _pairs(
-    orderings: list[Ordering], values: dict[str, dict[int, float]], baselines: dict[str, str]
-) -> list[tuple[str, str]]:
-    """Rows to compare one by one: each with its baseline; without any, each of the paper's with its next one."""
-    if baselines:
-        pairs = [(label, base) for label, base in baselines.items() if label != base and base in values]
-        return [(label, base) for label, base in pairs if paired_gains(values[label], values[base])]
-    nearest: dict[str, str] = {}
-    for ordering in orderings:  # the first one of a row stands nearest
-        nearest.setdefault(ordering.better, ordering.worse)
-    return list(nearest.items())
-
-
-def _count(column: Metric, orderings: list[Ordering], complete: bool) -> str:
-    ties = sum(ordering.ties for ordering in orderings)
-    holding = sum(ordering.holds for ordering in orderings)
-    broken = [f"{o.better} before {o.worse}" for o in orderings if not (o.holds or o.ties)]
-    so_far = "" if complete else "so far "
-    if len(orderings) == 1:
-        verb = "ties at the digits shown" if ties else "does not hold here" if broken else "holds here"
-        return f"{column.title}: {so_far}the paper's one ordering of two rows {verb} in the mean."
-    text = f"{column.title}: {so_far}{holding} of the paper's {len(orderings)} orderings of two "
-    text += f"rows {'holds' if holding == 1 else 'hold'} here in the mean"
-    text += f", {ties} {'ties' if ties == 1 else 'tie'} at the digits shown" if ties else ""
-    return text + (f"; those that do not: {', '.join(broken)}." if broken else ".")
-
-
-def _comparison(
-    column: Metric, first: str, second: str, paper: dict[str, float], values: dict[str, dict[int, float]]
-) -> str:
-    """One row against another: the paper's difference, the one here, and the sign test over seeds."""
-    differences = list(paired_gains(values[first], values[second]).values())
-    mean, digits = rounded(statistics.mean(differences), column), column.digits
-    here = f"here {mean:+.{digits}f}"
-    here += f" ± {statistics.stdev(differences):.{digits}f}" if len(differences) > 1 else ""
-    toward = 1.0 if column.higher_is_better else -1.0
-    text, of_paper = f"{column.title}, {first} against {second}: ", 0.0
-    if first in paper and second in paper:
-        of_paper = round(paper[first] - paper[second], 6) + 0.0
-        text += f"paper {format_paper(of_paper, column, signed=True)}, "
-    if of_paper:
-        toward = 1.0 if of_paper > 0 else -1.0
-        verdict = ", in the paper's order" if mean * toward > 0 else ", not in the paper's order"
-        side = "on the paper's side"
-    else:
-        verdict, side = "", "better"
-    if mean == 0:
-        verdict = ", no difference at the digits shown"
-    wins, losses = (sum(sign * toward * d > 0 for d in differences) for sign in (1, -1))
-    seeds = f"{wins} of {_counted(len(differences), 'seed')} {side} ({describe_test(wins, losses)})"
-    return f"{text}{here}{verdict}; {seeds}."
+    end = ": neither results on TruckScenes nor comparable with the paper's in size" if synthetic else size
+    return f"A check whether the paper's orderings appear on {where}{end}."
 
 
 def _listed(items: list[object]) -> str:

@@ -7,11 +7,11 @@ from pathlib import Path
 from src.errors import DataError
 from src.files.atomic_write import write_whole
 from src.report.metric_names import Metric, find_metric
-from src.report.orderings import paired_gains
 from src.report.results import RunResult
+from src.report.score_tables import mean_bounds
 from src.report.sweep_file import TableConfig
 from src.report.sweep_record import RunState, SweepRecord
-from src.report.sweep_table import PAPER, SweepRow, SweepTable, TableCell, rounded
+from src.report.sweep_table import PAPER, SweepRow, SweepTable, TableCell
 from src.report.sweep_text import describe_search, describe_table, findings
 from src.training.identity import key_of, without_keys
 
@@ -145,7 +145,7 @@ def _rows(
         cells = [TableCell(paper=other.paper.get(column.name)) for column in columns]
         rows[other.label] = SweepRow(other.label, cells, PAPER, baseline=sweep.baseline)
     for row in rows.values():
-        _take_differences(row, rows.get(row.baseline or ""))
+        _take_differences(row, rows.get(row.baseline or ""), columns)
     return list(rows.values()) if config.rows is None else [rows[label] for label in config.rows]
 
 
@@ -171,38 +171,24 @@ def _trials(
     return [row for row, _ in scored], best
 
 
-def _take_differences(row: SweepRow, baseline: SweepRow | None) -> None:
+def _take_differences(row: SweepRow, baseline: SweepRow | None, columns: list[Metric]) -> None:
     if baseline is None or row is baseline:
         return
-    for cell, base in zip(row.cells, baseline.cells, strict=True):
-        cell.differences = paired_gains(cell.values, base.values)
+    for cell, base, column in zip(row.cells, baseline.cells, columns, strict=True):
+        cell.comparison = cell.compared_with(base, column)
         if cell.paper is not None and base.paper is not None:
             cell.paper_difference = round(cell.paper - base.paper, 6)  # 18.6 - 20.3 is -1.6999999999999993
 
 
 def _mark_best(rows: list[SweepRow], columns: list[Metric]) -> None:
-    """The best mean of the finished rows and the paper's best number, column by column; none where all are equal.
-
-    Of means that tie at the digits shown all are best. Latencies have none where the best and the next are no further
-    apart than what stands after their ±.
-    """
+    """The finished row that is decided against each other one, and the paper's best number, column by column."""
     for place, column in enumerate(columns):
         best = max if column.higher_is_better else min
         finished = [row.cells[place] for row in rows if row.state == "done" and row.cells[place].mean is not None]
-        means = {rounded(cell.mean, column) for cell in finished}
         papers = {row.cells[place].paper for row in rows} - {None}
         for cell in finished:
-            cell.best = len(means) > 1 and rounded(cell.mean, column) == best(means)
-        if column.name.startswith("latency.") and len(means) > 1:
-            next_best = best(means - {best(means)})
-            gap = abs(best(means) - next_best)
-            apart = all(
-                gap > first.uncertainty + second.uncertainty
-                for first in finished if first.best
-                for second in finished if rounded(second.mean, column) == next_best
-            )  # fmt: skip
-            for cell in finished:
-                cell.best = cell.best and apart
+            against = [cell.compared_with(other, column) for other in finished if other is not cell]
+            cell.best = bool(against) and all(found is not None and found.favours(column) for found in against)
         for row in rows:
             row.cells[place].paper_best = len(papers) > 1 and row.cells[place].paper == best(papers)
 
@@ -211,7 +197,8 @@ def _cell(results: dict[int, RunResult | None], metric: Metric, paper: float | N
     found = {seed: result.metrics.get(metric.name) for seed, result in results.items() if result is not None}
     values = {seed: metric.scale * value for seed, value in found.items() if value is not None}
     frames = [_frames(results[seed], metric.name) for seed in values]
-    return TableCell(paper=paper, values=values, frames=frames[0] if len(frames) == 1 else None)
+    bounds = mean_bounds([results[seed] for seed in values], metric)
+    return TableCell(paper=paper, values=values, bounds=bounds, frames=frames[0] if len(frames) == 1 else None)
 
 
 def _frames(result: RunResult, metric: str) -> float | None:

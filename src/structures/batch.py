@@ -51,6 +51,11 @@ class FrameBatch(TensorFields):
     Each is in its own ego frame, with the A_t of this batch: aug_from_future = A_t inv(G) G_future inv(A_t), G being
     `global_from_ego`. Where a scene has ended, the row repeats this frame's token, time and pose and has no points.
     """
+    past: tuple[FrameBatch, ...] = ()
+    """The key frames before these, the oldest first, with the A_t of this batch, for a memory made in this step alone.
+
+    Where a scene had not begun, the row repeats this frame's token, time and pose and sees nothing.
+    """
 
     def __post_init__(self) -> None:
         b = len(self.tokens)
@@ -77,8 +82,10 @@ class FrameBatch(TensorFields):
                 raise ValueError(f"FrameBatch.streams must be unique, but got {self.streams.tolist()}")
         if self.boxes is not None and len(self.boxes) != b:
             raise ValueError(f"FrameBatch.boxes must hold {b} entries, one per sample, but got {len(self.boxes)}")
-        if any(len(frame) != b for frame in self.future):
-            raise ValueError(f"FrameBatch.future must hold batches of {b}, but got {[len(f) for f in self.future]}")
+        for name in ("future", "past"):
+            sizes = [len(frame) for frame in getattr(self, name)]
+            if sizes != [b] * len(sizes):
+                raise ValueError(f"FrameBatch.{name} must hold batches of {b}, but got {sizes}")
 
     def _check_points(self, sensor: str, width: int) -> None:
         points, owners = getattr(self, f"{sensor}_points"), getattr(self, f"{sensor}_batch")

@@ -23,9 +23,10 @@ class SkippedFiles:
         return bool(self.channels)
 
     def add(self, batch: FrameBatch) -> None:
-        """Count the skipped files of a batch."""
-        self.channels.update(batch.skipped)
-        self.files.update(batch.bad_files)
+        """Count the skipped files of a batch and of its past."""
+        for frame in (batch, *batch.past):
+            self.channels.update(frame.skipped)
+            self.files.update(frame.bad_files)
 
     def clear(self) -> None:
         """Forget everything."""

@@ -132,9 +132,13 @@ class DetectionEvaluator(Evaluator):
     def draw(self, folder: Path, title: str) -> None:
         """Bars by class and distance."""
         scores, panels = self.as_dict(), []
+        bounds = scores["intervals"]["bounds"]
         for what, group, metric in (("AP by class, %", "classes", "AP"), ("mAP by distance, %", "ranges", "mAP")):
-            names = [name.replace("_", " ") for name in scores[group]]
-            panels.append(BarPanel(what, names, {title: [(100 * of[metric], 0.0) for of in scores[group].values()]}))
+            bars = []
+            for name, values in scores[group].items():
+                low, high = bounds.get(f"{group}.{name}.{metric}", 2 * [values[metric]])
+                bars.append((100 * values[metric], 100 * low, 100 * high))
+            panels.append(BarPanel(what, [name.replace("_", " ") for name in scores[group]], {title: bars}))
         draw_comparison(folder / "scores.png", panels, title)
 
     def write(self, folder: Path, save: SaveTable) -> list[str]:

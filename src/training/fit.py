@@ -16,7 +16,7 @@ from src.errors import InterruptedRunError
 from src.reliability.checkpoints import BEST, LAST, AtomicCheckpointIO, OpenCheckpoint
 from src.reliability.interruption import Interruption
 from src.reliability.metrics_csv import MetricsCSV
-from src.reliability.processes import SharedBuffers, build_strategy
+from src.reliability.processes import SharedStatistics, build_strategy
 from src.training.module import TrainingModule
 from src.training.phases import PhaseConfig
 from src.training.progress_bar import LossProgressBar
@@ -55,7 +55,7 @@ def build_trainer(
     ]
     if ema_decay is not None:
         callbacks.append(EMAWeightAveraging(decay=ema_decay))
-    callbacks.append(SharedBuffers())  # behind the moving average
+    callbacks.append(SharedStatistics())  # behind the moving average
     return L.Trainer(
         max_epochs=phase.epochs,
         check_val_every_n_epoch=phase.validate_every,

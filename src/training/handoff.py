@@ -16,18 +16,21 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from torch import nn
+from torch.nn.modules.batchnorm import _BatchNorm
+
 from src.errors import CheckpointError, ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
 from src.models.detector import Detector
 from src.reliability.checkpoints import OpenCheckpoint, load_model_weights, open_checkpoint
 from src.reliability.processes import die_with_parent
-from src.training.identity import is_of, run_identity
+from src.training.identity import TEMPORAL_DATA_KEYS, is_of, run_identity
 from src.training.run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
 
 OF_THIS_RUN = ("phase", "resume")
 """Overrides that never concern the run whose weights are taken."""
-OF_STREAMED_DATA = ("data.groups_per_scene", "data.stream_sets", "data.sensor_dropout")
+OF_STREAMED_DATA = tuple(f"data.{key}" for key in TEMPORAL_DATA_KEYS)
 """Nor do these and the model's `keys_of_temporal_phase`, where that run is of the phase before."""
 INPUT_SETTINGS = (
     *("num_sweeps", "num_lidar_sweeps", "deskew_lidar"),
@@ -149,6 +152,16 @@ def hand_over(model: Detector, weights: OpenCheckpoint, tree: dict[str, Any]) ->
     stored = checkpoint["horizon3d"]["config"]
     for key, (old, now) in differing_settings(stored, tree, model.config.temporal_part).items():
         logger.warning("%s was %s in the run these weights come from and is %s now", key, old, now)
+
+
+def norms_handed_over(model: Detector) -> list[nn.Module]:
+    """The batch norms whose statistics an earlier phase has gathered."""
+    added = model.config.new_in_temporal_phase
+    return [
+        module
+        for name, module in model.named_modules()
+        if isinstance(module, _BatchNorm) and not (added and re.match(added, f"{name}."))
+    ]
 
 
 def differing_settings(

@@ -18,7 +18,9 @@ OUTSIDE_IDENTITY = (
     "out",
     "scene",
     "preview",
+    "compare",
     "suite",
+    "oracle",
     "phase.train_missing",
     "data.num_workers",
     "data.root",
@@ -28,6 +30,10 @@ OUTSIDE_IDENTITY = (
 
 They are left out of its identity, of its result, and of what a sweep records of it.
 """
+
+
+TEMPORAL_DATA_KEYS = ("groups_per_scene", "stream_sets", "past_frames", "sensor_dropout")
+"""Of `data`: what changes nothing of a phase without memory."""
 
 
 def key_of(override: str) -> str:
@@ -78,7 +84,7 @@ def run_identity(tree: dict[str, Any], source: str | None = None) -> str:
     if source is not None:
         tree["phase"]["init_from"] = source
     if not tree["phase"]["temporal"]:
-        for key in ("groups_per_scene", "stream_sets", "sensor_dropout"):
+        for key in TEMPORAL_DATA_KEYS:
             tree["data"].pop(key)
     digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:8]
     return f"{tree['model']['name']}-{tree['phase']['name']}-{tree['scale']}-{digest}"

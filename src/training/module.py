@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Self
 
 import lightning as L
 import torch
@@ -10,7 +11,7 @@ from torch import nn
 
 from src.models.detector import Detector, Objective
 from src.reliability.nonfinite import StepGuard, finite_everywhere, gradient_norm, step_seed
-from src.reliability.processes import gather_by_rank
+from src.reliability.processes import gather_by_rank, running_statistics, several_processes
 from src.structures.batch import FrameBatch
 from src.structures.skipped import SkippedFiles
 from src.training.epoch_means import EpochMeans
@@ -40,6 +41,7 @@ class TrainingModule(L.LightningModule):
         seed: int,
         config: dict[str, Any],
         skip_nonfinite: bool = False,
+        frozen_norms: Sequence[nn.Module] = (),  # of the model: in training, too, they use their running statistics
     ) -> None:
         super().__init__()
         self.automatic_optimization = False  # a step reads from top to bottom in `training_step`
@@ -53,6 +55,14 @@ class TrainingModule(L.LightningModule):
         self.evaluated_step = -1
         self.skipped = SkippedFiles()
         self.guard = StepGuard(skip_nonfinite)
+        self.frozen_norms = frozen_norms
+
+    def train(self, mode: bool = True) -> Self:
+        """As the base, but for the frozen norms."""
+        super().train(mode)
+        for norm in self.frozen_norms:
+            norm.eval()
+        return self
 
     def run(self, batch: FrameBatch) -> Any:
         """The model's own output for a batch, in training and validation."""
@@ -165,7 +175,10 @@ class TrainingModule(L.LightningModule):
         if states and "nonfinite" in states[0]:
             self.guard.restore_counts(states[0]["nonfinite"])
         if same:
-            self.restore_rank(states[self.trainer.global_rank])
+            own = states[self.trainer.global_rank]
+            if "statistics" in own:
+                checkpoint["state_dict"] |= own["statistics"]  # those that it holds are rank 0's
+            self.restore_rank(own)
         elif self.trainer.global_rank == 0:
             self.adopt_ranks(states)
 
@@ -176,6 +189,8 @@ class TrainingModule(L.LightningModule):
             state["nonfinite"] = self.guard.state()
         if self.skipped:
             state["skipped"] = self.skipped.state()
+        if several_processes():
+            state["statistics"] = {name: value.to("cpu", copy=True) for name, value in running_statistics(self).items()}
         return state
 
     def restore_rank(self, state: dict[str, Any]) -> None:

@@ -25,6 +25,7 @@ class PhaseConfig:
     temporal: bool  # clips in order with memory; false: shuffled single frames, and the model has no temporal part
     init_from: str | None  # a phase, that is the run of the same command in that phase; or the path of a checkpoint
     train_missing: bool  # train the run that init_from names when it has not finished yet
+    frozen_statistics: bool  # norms that came with the weights of `init_from` use their running statistics in training
     epochs: int
     validate_every: int  # epochs
     options: dict[str, Any]  # what the phase says to the model's family

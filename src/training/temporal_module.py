@@ -1,4 +1,7 @@
-"""Phase 2: a detector with memory, trained and validated on streams of consecutive key frames (method 6)."""
+"""Phase 2: a detector with memory, trained and validated on streams of consecutive key frames (method 6).
+
+Or trained on shuffled frames, each of which brings its past along (`data.past_frames`).
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.models.detector import TemporalMemory
+from src.models.detector import Objective, TemporalMemory
 from src.structures.batch import FrameBatch
 from src.training.module import TrainingModule
+from src.training.true_motion import TrueMotion
 
 logger = logging.getLogger(__name__)
 
@@ -29,19 +33,35 @@ class TemporalModule(TrainingModule):
         # Sets of streams take turns (`data.stream_sets`): the streams [B] int64 of each last batch, and their memory.
         self.memories: list[tuple[Tensor, TemporalMemory]] = []
         self._before_step: list[tuple[Tensor, TemporalMemory]] = []
+        self._used: TemporalMemory | None = None  # by the last batch
+        self.oracle: TrueMotion | None = None  # of an evaluation
 
     def run(self, batch: FrameBatch) -> Any:
-        """The model's output for the next frames of the batch's streams; they are remembered.
+        """The model's output for the next frames of the batch's streams, to be remembered, or for frames with a past.
 
-        Raises ValueError for a batch without streams.
+        Raises ValueError for a batch without either.
         """
-        past = self.recall(batch)
+        past = self._used = self.remember(batch.past) if batch.past else self.recall(batch)
+        if batch.past:
+            return self.model(batch, past)[0]
+        if self.oracle is not None and past is not None:
+            past = self.oracle.correct(past, batch)
         # Before the forward pass: on a GPU the look at the streams would otherwise wait for all of it.
         self.memories = [entry for entry in self.memories if not _common(batch.streams, entry[0]).any()]
         output, memory = self.model(batch, past)
         if memory is not None:
             self.memories.append((batch.streams, memory))
         return output
+
+    @torch.no_grad()
+    def remember(self, frames: tuple[FrameBatch, ...]) -> TemporalMemory | None:
+        """What the model, as it is used later, remembers of the key frames before a batch."""
+        training, memory = self.model.training, None
+        self.model.eval()
+        for frame in frames:
+            _, memory = self.model(frame, memory)
+        self.model.train(training)
+        return memory
 
     def recall(self, batch: FrameBatch) -> TemporalMemory | None:
         """Memory of the batch's streams, row by row, or None where none of them has any."""
@@ -57,13 +77,26 @@ class TemporalModule(TrainingModule):
                 return memory.select(same.int().argmax(dim=1), keep) if keep.any() else None
         return None
 
+    def objective(self, batch: FrameBatch) -> Objective:
+        """As the base, with how many frames the memory held and how many steps ago they were written, on average."""
+        objective = super().objective(batch)
+        present = self._used.present if self._used is not None else batch.timestamps_s.new_zeros(1, len(batch))
+        turns = torch.arange(1, len(present) + 1, device=present.device)[:, None]
+        steps = 0 if batch.past else len(self.memories)  # between two turns of a stream
+        objective.diagnostics["memory_frames"] = present.sum() / len(batch)
+        objective.diagnostics["memory_steps"] = steps * (turns * present).sum() / present.sum().clamp(min=1)
+        return objective
+
     def forget(self) -> None:
         """Drop the memory of all streams."""
         self.memories.clear()
         self._before_step.clear()
+        self._used = None
 
     def forget_step(self, batch: FrameBatch) -> None:
         """Let the streams of a step that counts for nothing begin anew: what they remember may not be finite."""
+        if batch.streams is None:
+            return
         self.memories = [entry for entry in self.memories if not _common(batch.streams, entry[0]).any()]
 
     def memories_before_step(self) -> list[dict[str, Any]]:

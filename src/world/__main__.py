@@ -1,4 +1,4 @@
-"""`python -m src.world [preview=true] [data.world.*=...]`: write the synthetic highway, or pictures of it."""
+"""`python -m src.world [preview=true] [compare=true] [data.world.*=...]`: the synthetic highway, seen and counted."""
 
 from __future__ import annotations
 
@@ -16,21 +16,45 @@ from src.reliability.command import run_command
 from src.structures.evidence import Evidence
 from src.training.run_folder import make_writable
 from src.training.snapshots import scene_of, views_of
+from src.world.dataset_statistics import count_dataset
+from src.world.real_comparison import compare
+from src.world.statistics_page import table_lines, verdict, write_page
 
 PREVIEW_SWEEPS = 3  # of each radar
 
 
 def main(overrides: list[str]) -> None:
-    """Write the configured world unless it is there; with preview=true draw one picture per scene into out=DIR."""
+    """Write the configured world unless it is there.
+
+    With preview=true draw one picture per scene into out=DIR; with compare=true print its figures beside those of MAN
+    TruckScenes and write them as a page into out=DIR (default: the folder world of paths.reports). The comparison also
+    takes recorded data.
+    """
     config, _ = compose_config(overrides)
-    if config.data.world is None:
+    if config.data.world is None and not config.compare:
         raise ConfigError("data.world is null: this configuration reads recorded data, there is no world to write")
     root = data_root(config)
     print(f"world: {root}")
+    if config.compare:
+        folder = Path(config.out) if config.out else Path(config.paths.reports) / "world"
+        make_writable(folder, "out")
+        compare_with_real(config, root, folder, overrides)
     if config.preview:
         folder = Path(config.out) if config.out else Path(config.paths.outputs) / "previews" / root.name
         make_writable(folder, "out")
         draw_previews(config, root, folder)
+
+
+def compare_with_real(config: Config, root: Path, folder: Path, overrides: list[str]) -> None:
+    """Count the data at `root` and show it beside the real figures, here and as a page."""
+    index = load_index(root, config.data.version, None)
+    tables = compare(count_dataset(index, config.data.num_sweeps), config.data.num_sweeps)
+    for table in tables:
+        print("\n".join(["", table.title, *table_lines(table)]))
+    print("\n".join(["", *verdict(tables)]))
+    command = " ".join(["python -m src.world", *(text for text in overrides if not text.startswith("paths."))])
+    what = f"{len(index.scene_names)} scenes of {len(index) / len(index.scene_names):g} key frames"
+    print(f"page: {write_page(folder, tables, what, command)}")
 
 
 def draw_previews(config: Config, root: Path, folder: Path) -> None:

@@ -86,7 +86,7 @@ def bystanders(config: WorldConfig, road: Road, reach_m: float, rng: np.random.G
 def _roadworks(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
     """Cones along a shoulder, barriers, workers and a machine; on either side of the motorway."""
     rng = make.rng
-    side = -1 if rng.random() < 0.65 else 1
+    side = -1 if rng.random() < 0.85 else 1
     start = rng.uniform(15, max(20.0, reach_m - 60))
     for i in range(make.count(3)):
         yield Bystander(
@@ -108,6 +108,8 @@ def _roadworks(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
         yield Bystander(
             make.actor("excavator", parked=True), begin + 30, side * (road.edge_m + 5.5), turn=rng.normal(0, 0.3)
         )
+        if rng.random() < 0.5:  # the site's hut stands before it
+            yield Bystander(make.actor("container", parked=True), begin + 22, side * (road.edge_m + 4.2))
     for _ in range(make.count(1.1)):
         yield Bystander(
             make.actor("police_officer" if rng.random() < 0.15 else "worker"),
@@ -142,10 +144,13 @@ def _side_road(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
     for _ in range(make.count(1.0)):
         way = int(rng.choice([-1, 1]))
         standing = rng.random() < 0.3
+        place, across = rng.uniform(15, reach_m), centre - rng.choice([-1, 1]) * rng.uniform(3.4, 4.4)
+        if rng.random() < 0.7:  # hidden until the truck comes near
+            yield Bystander(make.actor("bush", parked=True), place - 3.0, across - np.sign(centre) * 0.5)
         yield Bystander(
             make.actor("child" if rng.random() < 0.25 else "adult"),
-            rng.uniform(15, reach_m),
-            centre - rng.choice([-1, 1]) * rng.uniform(3.4, 4.4),
+            place,
+            across,
             s_rate=0.0 if standing else way * rng.uniform(0.9, 1.8),
             turn=0.0 if way > 0 else np.pi,
         )
@@ -217,14 +222,14 @@ def _signs(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
         turn = np.pi if direction > 0 else 0.0
         s = rng.uniform(-180, -100)
         while s < reach_m + 230:
-            name = "guide_sign" if rng.random() < 0.3 else "sign"
-            yield Bystander(
-                make.actor(name), s, -direction * (road.rail_m + rng.uniform(1.0, 2.5)), turn=turn + rng.normal(0, 0.05)
-            )
-            s += rng.uniform(150, 380)
+            name = "guide_sign" if rng.random() < 0.2 else "sign"
+            beside = name == "sign" and rng.random() < 0.2  # on the median
+            across = -direction * (0.3 if beside else road.rail_m + rng.uniform(1.0, 2.5))
+            yield Bystander(make.actor(name), s, across, turn=turn + rng.normal(0, 0.05))
+            s += rng.uniform(100, 300) if direction > 0 else rng.uniform(40, 150)
     gantry = rng.uniform(40, reach_m + 60)
     for lane in range(road.lanes):
-        if lane == 0 or rng.random() < 0.4:
+        if rng.random() < 0.3:
             yield Bystander(make.actor("gantry_sign"), gantry, road.lane_centre(1, lane), turn=np.pi)
 
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from src.world.world_config import WorldConfig
+
 Array = np.ndarray
 
 LANE_M = 3.6
@@ -13,6 +15,8 @@ MEDIAN_HALF_M = 2.0
 SHOULDER_M = 2.8
 START_M = -800.0
 END_M = 1500.0
+SLAT_M, SLAT_STEP_M = 0.36, 2.0
+"""Width across the road and distance of the slats of an anti-glare screen: opaque along the road, open across it."""
 SIDE_ROAD_GAP_M = 13.0
 SIDE_ROAD_HALF_M = 3.2
 APRON_GAP_M = 10.0
@@ -33,6 +37,7 @@ class Road:
     lanes: int  # each way
     side_road: int
     apron: tuple[float, float] | None
+    screen_m: float  # height of the anti-glare screen on the median, 0 for a median with rails alone
 
     @property
     def edge_m(self) -> float:
@@ -88,13 +93,13 @@ class Road:
         return np.concatenate([xy, (self.height_at(s) + height)[..., None]], -1)
 
 
-def make_road(rng: np.random.Generator) -> Road:
-    """Draw a road: radius above about 900 m, slope within 2 %, heading anywhere."""
+def make_road(config: WorldConfig, rng: np.random.Generator) -> Road:
+    """Draw a road: radius above `least_radius_m`, slope within 2 %, heading anywhere."""
     s = np.arange(START_M, END_M + 1.0)
     waves = np.array([rng.uniform(500, 900), rng.uniform(900, 1600), rng.uniform(300, 500)])
     phases = rng.uniform(0, 2 * np.pi, 3)
     shares = rng.dirichlet(np.ones(3))
-    strength = rng.uniform(1 / 3000, 1 / 1000)
+    strength = np.exp(rng.uniform(np.log(1 / 8000), np.log(1 / config.least_radius_m)))
     curvature = strength * (shares * np.sin(2 * np.pi * s[:, None] / waves + phases)).sum(1)
     heading = rng.uniform(-np.pi, np.pi) + np.cumsum(curvature)
     xy = np.stack([np.cumsum(np.cos(heading)), np.cumsum(np.sin(heading))], 1)
@@ -109,4 +114,5 @@ def make_road(rng: np.random.Generator) -> Road:
         lanes=int(rng.integers(2, 5)),
         side_road=int(rng.choice([-1, 1, 1, 0])) if rng.random() < 0.85 else 0,
         apron=(apron_start, apron_start + rng.uniform(70, 110)),
+        screen_m=float(rng.uniform(1.8, 3.4)) if rng.random() < config.screened_fraction else 0.0,
     )

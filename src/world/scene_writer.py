@@ -16,7 +16,7 @@ from src.world.camera_render import Studio
 from src.world.catalogue import attribute_of
 from src.world.labels import (
     FrameTruth,
-    count_inside,
+    count_points,
     estimate_lidar_points,
     frame_truth,
     labelled,
@@ -28,6 +28,7 @@ from src.world.pcd_writer import LIDAR_TYPE, lidar_pcd, radar_pcd
 from src.world.radar import Radars
 from src.world.rig import Mount, sensor_rig
 from src.world.scenery import make_scenery
+from src.world.sensor_faults import SensorFaults
 from src.world.simulate import Scene, make_scene, scene_rng
 from src.world.table_rows import Row, Tables, link_by, link_chain, rounded, token
 from src.world.world_config import (
@@ -66,6 +67,7 @@ class SceneWriter:
         self.key_times = [
             self._quantised(k / KEY_FRAME_RATE_HZ + self._jitter()) for k in range(config.key_frames_per_scene)
         ]
+        self.faults = SensorFaults(config, self.rig, scene_rng(config, index, 9))
         self.data: list[tuple[float, str, Row]] = []  # time (s), channel and row of sample_data of every file
         self.name = f"scene-{self._token('drive')}-1"
 
@@ -118,11 +120,15 @@ class SceneWriter:
     def _write_radars(self) -> list[Array]:
         """All radar sweeps; returns the points of each key frame in local coordinates."""
         mounts = [self.rig[name] for name in RADARS]
-        radars = Radars(self.config, self.scene, self.scenery, mounts, scene_rng(self.config, self.index, 4))
+        really = [self.faults.mounts[name] for name in RADARS]
+        radars = Radars(self.config, self.scene, self.scenery, really, scene_rng(self.config, self.index, 4))
         key_points = []
         for frame, is_key, base in self._firings(RADAR_RATE_HZ, self.config.radar_sweeps_per_key_frame):
             times = [self._quantised(base + m.delay_s + self._jitter()) for m in mounts]
-            sweeps = radars.sweep(times)
+            sweeps = [
+                points[: 0 if self.faults.is_out(mount.channel, time) else None]
+                for mount, time, points in zip(mounts, times, radars.sweep(times), strict=True)
+            ]
             for mount, time, points in zip(mounts, times, sweeps, strict=True):
                 self._store(mount.channel, frame, is_key, time, radar_pcd(points), len(points))
             if is_key:
@@ -140,11 +146,13 @@ class SceneWriter:
         for frame, is_key, base in self._firings(CAMERA_RATE_HZ, CAMERA_SWEEPS if self.config.camera_sweeps else 1):
             photos = []
             for name in CAMERAS:
-                mount = self.rig[name]
+                mount = self.faults.mounts[name]
                 time = self._quantised(base + mount.delay_s + self._jitter())
                 photo = self.studio.photograph(mount, time, rng)
+                dark = self.faults.is_out(name, time)
+                shown = np.zeros_like(photo.rgb) if dark else self.faults.soil(name, photo.rgb)
                 buffer = io.BytesIO()
-                Image.fromarray(photo.rgb).save(buffer, "JPEG", quality=self.config.jpeg_quality)
+                Image.fromarray(shown).save(buffer, "JPEG", quality=self.config.jpeg_quality)
                 self._store(name, frame, is_key, time, buffer.getvalue())
                 photos.append(photo)
             if is_key:
@@ -189,11 +197,11 @@ class SceneWriter:
         frames = []
         for k, time in enumerate(self.key_times):
             truth = frame_truth(self.scene, time, *pixels[k])
-            truth.radar_points = count_inside(truth, sizes, radar[k])
+            truth.radar_points = count_points(truth, sizes, radar[k])
             if lidar is None:
                 truth.lidar_points = estimate_lidar_points(truth, sizes, self.scene.ego.pose(time)[1], rng)
             else:
-                truth.lidar_points = count_inside(truth, sizes, lidar[k])
+                truth.lidar_points = count_points(truth, sizes, lidar[k])
             frames.append(truth)
         return frames
 
@@ -219,11 +227,11 @@ class SceneWriter:
                         "sample_token": self._token("sample", k),
                         "instance_token": self._token("instance", n),
                         "attribute_tokens": [] if attribute is None else [token(seed, "attribute", attribute)],
-                        "visibility_token": "" if level is None else token(seed, "visibility", level),
+                        "visibility_token": token(seed, "visibility", level),
                         "translation": rounded(truth.centres[n] + scene.utm_offset, 4),
                         "size": rounded(np.array([width, length, height]), 4),
                         "rotation": rounded(np.array([np.cos(half), 0.0, 0.0, np.sin(half)]), 12),
-                        "num_lidar_pts": int(truth.lidar_points[n]),
+                        "num_lidar_pts": max(1, int(truth.lidar_points[n])),  # as every label of the released data
                         "num_radar_pts": int(truth.radar_points[n]),
                     }
                 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,11 +10,13 @@ import numpy as np
 from src.world.catalogue import GREENS
 from src.world.mesh import Colour, Mesh, MeshMaker
 from src.world.placement import Actor
-from src.world.road import LANE_M, MEDIAN_HALF_M, SHOULDER_M, SIDE_ROAD_HALF_M, Road
+from src.world.road import LANE_M, MEDIAN_HALF_M, SHOULDER_M, SIDE_ROAD_HALF_M, SLAT_M, SLAT_STEP_M, Road
 from src.world.world_config import WorldConfig
 
 Array = np.ndarray
 
+RAIL_POINTS, VERGE_POINTS, FAR_POINTS = 0.8, 4.5, 20.0
+"""Reflecting points per metre of road at a clutter_density of 1: of each rail, of both verges, of the land beyond."""
 STEP_M = 8.0
 BEFORE_M = 300.0
 AFTER_M = 300.0
@@ -23,6 +26,7 @@ GRASS: Colour = (98, 124, 62)
 VERGE: Colour = (116, 132, 74)
 PAINT: Colour = (232, 232, 226)
 RAIL: Colour = (176, 180, 184)
+HEDGE: Colour = (62, 88, 46)
 
 
 @dataclass(kw_only=True)
@@ -35,6 +39,8 @@ class Scenery:
     clutter: Array  # [P, 3] m, points that reflect radar
     clutter_rcs_db: Array  # [P]
     clutter_s: Array  # [P] m along the road
+    clutter_d: Array  # [P] m to the left of its centre line
+    clutter_height: Array  # [P] m above the ground
 
 
 def _strips(road: Road, s: Array, d0: float, d1: float, z0: float = 0.0, z1: float = 0.0) -> Array:
@@ -88,6 +94,10 @@ def make_scenery(
         pieces.append((_strips(road, s, d, d, 0.45, 0.78), np.tile(np.array(RAIL), (len(s) - 1, 1)), 1.0, True))
         posts = _post_quads(road, s + 2.0, d)
         pieces.append((posts, np.tile(np.array((120, 122, 124)), (len(posts), 1)), 1.0, True))
+    if road.screen_m > 0:
+        slats = _slats(road, np.arange(s[0], s[-1], SLAT_STEP_M))
+        shade = 1.0 + 0.08 * rng.standard_normal((len(slats), 1))
+        pieces.append((slats, np.clip(np.array(HEDGE) * shade, 0, 255), 1.0, True))
     mesh = Mesh(
         corners=np.concatenate([p[0] for p in pieces]),
         colours=np.concatenate([p[1] for p in pieces]).astype(np.float32),
@@ -97,14 +107,16 @@ def make_scenery(
     layer = np.concatenate([np.full(len(p[0]), p[2]) for p in pieces])
     upright, upright_points = _upright(road, actors, starts, s[0], s[-1], rng)
     whole = Mesh.join([mesh, upright])
-    clutter, rcs = _clutter(config, road, s[0], s[-1], upright_points, rng)
+    along, across, height, rcs = _clutter(config, road, s[0], s[-1], upright_points, rng)
     return Scenery(
         mesh=whole,
         layer=np.concatenate([layer, np.ones(len(upright))]),
         s=_along(road, whole.corners.mean(1)),
-        clutter=clutter,
+        clutter=road.place(along, across, height),
         clutter_rcs_db=rcs,
-        clutter_s=_along(road, clutter),
+        clutter_s=along,
+        clutter_d=across,
+        clutter_height=height,
     )
 
 
@@ -118,6 +130,12 @@ def _along(road: Road, points: Array) -> Array:
 def _post_quads(road: Road, s: Array, d: float) -> Array:
     a, b = np.full_like(s, d - 0.08), np.full_like(s, d + 0.08)
     return np.stack([road.place(s, a), road.place(s, b), road.place(s, b, 0.75), road.place(s, a, 0.75)], 1)
+
+
+def _slats(road: Road, s: Array) -> Array:
+    a, b = np.full_like(s, -0.5 * SLAT_M), np.full_like(s, 0.5 * SLAT_M)
+    top = road.screen_m
+    return np.stack([road.place(s, a), road.place(s, b), road.place(s, b, top), road.place(s, a, top)], 1)
 
 
 def _upright(
@@ -163,17 +181,31 @@ def _tree(height: float, rng: np.random.Generator) -> Mesh:
 
 def _clutter(
     config: WorldConfig, road: Road, first: float, last: float, upright: Array, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Points that reflect radar without being an actor: rail posts, vegetation, uprights. Positions and RCS in dB."""
-    span = last - first
+) -> Array:
+    """Points that reflect radar without being an actor: along, across, height (m) and RCS (dB), [4, P].
+
+    Rail posts, vegetation of the verge, and beyond it trees, fences and buildings.
+    """
     rows = [upright]
+
+    def scatter(per_m: float, across: Callable[[int], Array], height: Callable[[int], Array], rcs: float) -> None:
+        n = int(per_m * (last - first) * config.clutter_density)
+        columns = rng.uniform(first, last, n), across(n), height(n), rng.normal(rcs, 5, n)
+        rows.append(np.stack(columns, 1))
+
     for d in (-road.rail_m, road.rail_m, -0.7, 0.7):
-        n = int(0.28 * span * config.clutter_density)
-        s, across = rng.uniform(first, last, n), d + rng.normal(0, 0.08, n)
-        rows.append(np.stack([s, across, rng.uniform(0.2, 0.8, n), rng.normal(-3, 4, n)], 1))
-    n = int(1.1 * span * config.clutter_density)
-    side = rng.choice([-1, 1], n)
-    s, across = rng.uniform(first, last, n), side * (road.rail_m + 1 + rng.gamma(1.3, 12.0, n))
-    rows.append(np.stack([s, across, rng.gamma(1.5, 1.1, n), rng.normal(-5, 5, n)], 1))
-    s, d, height, rcs = np.concatenate(rows).T
-    return road.place(s, d, height), rcs
+        scatter(RAIL_POINTS, lambda n, d=d: d + rng.normal(0, 0.08, n), lambda n: rng.uniform(0.2, 0.8, n), -3.0)
+    edge = road.rail_m
+    scatter(
+        VERGE_POINTS,
+        lambda n: rng.choice([-1, 1], n) * (edge + 1 + rng.gamma(1.3, 22.0, n)),
+        lambda n: rng.gamma(1.5, 1.1, n),
+        -2.0,
+    )
+    scatter(
+        FAR_POINTS,
+        lambda n: rng.choice([-1, 1], n) * rng.uniform(edge + 15, 190.0, n),
+        lambda n: rng.gamma(1.5, 2.2, n),
+        6.0,
+    )
+    return np.concatenate(rows).T

@@ -25,6 +25,11 @@ HITCH_OVERLAP_M = {"tractor_unit": 1.9, "rigid_truck": -1.2}
 """How far a trailer reaches over its truck; negative for a drawbar."""
 
 
+COMFORTABLE_MPS2 = 3.0
+"""Vehicles start so far apart that braking like this avoids a collision."""
+TRAILER_CHANCE = {"tractor_unit": 0.9, "rigid_truck": 0.3}
+
+
 @dataclass(kw_only=True)
 class Scene:
     """Everything that the sensors look at, in local coordinates (metres; the writer adds the UTM offset)."""
@@ -52,7 +57,7 @@ def make_scene(config: WorldConfig, index: int) -> Scene:
     rng = scene_rng(config, index, 0)
     first_of_split = 0 if index < config.num_train_scenes else config.num_train_scenes
     conditions = draw_conditions(rng, index - first_of_split)
-    road = make_road(rng)
+    road = make_road(config, rng)
     steps = int(np.ceil((config.duration_s + 2 * LEAD_IN_S) / STEP_S)) + 2
     ego_mps = rng.uniform(60, 90) / 3.6
     fleet = _draw_fleet(config, road, ego_mps, rng)
@@ -90,6 +95,12 @@ def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.
         ("motorcycle", int(rng.integers(0, slow + 1)), rng.uniform(-1, 4), rng.choice([-30, 28, 50])),
         ("farm_tractor" if rng.random() < 0.5 else "excavator", slow, rng.uniform(-3.5, -1), rng.uniform(70, 120)),
     ]
+    for side in (1, -1):  # trucks drive in convoys: most often one close ahead of the ego truck, one close behind it
+        if rng.random() < 0.6:
+            _add(fleet, Vehicle("lorry", 1, slow, side * rng.uniform(32, 65), ego_mps, may_change=False))
+    if rng.random() < 0.12:  # one that takes its time to overtake the ego truck
+        place, wanted = rng.uniform(4, 28), ego_mps + rng.uniform(0.5, 2.0)
+        _add(fleet, Vehicle("tractor_unit", 1, slow - 1, place, wanted, has_trailer=True, may_change=False))
     for kind, lane, faster, place in company:
         chosen = "bendy_bus" if kind == "bus" and rng.random() < 0.3 else kind
         if rng.random() < 0.75 * config.rare_objects:
@@ -99,46 +110,56 @@ def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.
             busy = config.vehicles_per_lane_km * (0.8 if lane == 0 else 1.1)
             place = low + rng.uniform(0, 40)
             while busy > 0 and place < high:
-                kind, wanted = _draw_vehicle(road, lane, rng)
-                has_trailer = rng.random() < 0.62 and kind in HITCH_OVERLAP_M
+                rear_seen = direction > 0 and place > -200
+                kind, wanted = _draw_vehicle(road, lane, rear_seen, rng)
+                has_trailer = rear_seen and rng.random() < TRAILER_CHANCE.get(kind, 0.0)
                 _add(fleet, Vehicle(kind, direction, lane, place, wanted, has_trailer=has_trailer))
                 place += max(rng.exponential(1000.0 / busy), 12 + 0.9 * wanted)
     return fleet
 
 
 def _add(fleet: list[Vehicle], vehicle: Vehicle) -> None:
-    """Put a vehicle into its lane, as long as it is with its trailer, unless something is too close already."""
+    """Put a vehicle into its lane, with its trailer's length, unless something is too close for their speeds."""
     vehicle.length_m = KINDS[vehicle.kind].size_m[0]
     if vehicle.has_trailer:
         vehicle.length_m += KINDS[_trailer_of(vehicle.kind)].size_m[0] - HITCH_OVERLAP_M[vehicle.kind]
-    near = (v for v in fleet if v.direction == vehicle.direction and v.lane == vehicle.lane)
-    if all(abs(v.along_m - vehicle.along_m) > 0.5 * (v.length_m + vehicle.length_m) + 7 for v in near):
+    near = [v for v in fleet if v.direction == vehicle.direction and v.lane == vehicle.lane]
+    if all(_gap(v, vehicle) > 7 + _closing(v, vehicle) ** 2 / (2 * COMFORTABLE_MPS2) for v in near):
         fleet.append(vehicle)
+
+
+def _gap(one: Vehicle, other: Vehicle) -> float:
+    return abs(one.along_m - other.along_m) - 0.5 * (one.length_m + other.length_m)
+
+
+def _closing(one: Vehicle, other: Vehicle) -> float:
+    """Speed at which the rear one of two vehicles in a lane comes nearer, 0 where it falls behind."""
+    rear, front = sorted((one, other), key=lambda vehicle: vehicle.along_m)
+    return max(0.0, rear.wanted_mps - front.wanted_mps)
 
 
 def _trailer_of(kind: str) -> str:
     return "semi_trailer" if kind == "tractor_unit" else "drawbar_trailer"
 
 
-def _draw_vehicle(road: Road, lane: int, rng: np.random.Generator) -> tuple[str, float]:
-    """Kind and wanted speed (m/s) of ordinary traffic in a lane; up to 50 m/s (180 km/h) on the left."""
+def _draw_vehicle(road: Road, lane: int, rear_seen: bool, rng: np.random.Generator) -> tuple[str, float]:
+    """Kind and wanted speed (m/s) of ordinary traffic in a lane; up to 50 m/s (180 km/h) on the left.
+
+    An articulated lorry is one box unless its rear is seen: behind a cab nobody tells two.
+    """
     from_right = road.lanes - 1 - lane
-    if from_right == 0:
-        kind = rng.choice(
-            ["car", "tractor_unit", "rigid_truck", "van", "bus", "motorcycle"], p=[0.5, 0.24, 0.12, 0.1, 0.02, 0.02]
-        )
-    elif from_right == 1:
-        kind = rng.choice(
-            ["car", "tractor_unit", "rigid_truck", "van", "bus", "motorcycle"], p=[0.83, 0.03, 0.03, 0.08, 0.015, 0.015]
-        )
-    else:
-        kind = rng.choice(["car", "van", "motorcycle"], p=[0.94, 0.04, 0.02])
-    if kind in ("tractor_unit", "rigid_truck"):
-        return str(kind), float(np.clip(rng.normal(23.5, 1.0), 20, 27))
+    kinds = ("car", "lorry", "tractor_unit", "rigid_truck", "van", "bus", "motorcycle")
+    chances = ((0.53, 0.17, 0.05, 0.11, 0.1, 0.02, 0.02), (0.83, 0.02, 0.01, 0.03, 0.08, 0.015, 0.015),
+               (0.94, 0.0, 0.0, 0.0, 0.04, 0.0, 0.02))  # fmt: skip
+    kind = str(rng.choice(kinds, p=chances[min(from_right, 2)]))
+    if kind == "tractor_unit" and not rear_seen:
+        kind = "lorry"
+    if kind in ("lorry", "tractor_unit", "rigid_truck"):
+        return kind, float(np.clip(rng.normal(23.5, 1.0), 20, 27))
     if kind == "bus":
         return "bendy_bus" if rng.random() < 0.25 else "bus", float(np.clip(rng.normal(26, 1.5), 22, 29))
     mean = {0: 35.0, 1: 44.0}.get(from_right, 46.5)
-    return str(kind), float(np.clip(rng.normal(mean, 3.2), 25, 50))
+    return kind, float(np.clip(rng.normal(mean, 3.2), 25, 50))
 
 
 def _split_trains(

@@ -67,6 +67,18 @@ def add_rigid_truck(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> Non
     m.panel(-l - 0.01, -0.04, 0.04, 0.32 * h, 0.98 * h, -1, shade(cargo, 0.55))
 
 
+def add_lorry(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
+    cargo: Colour = ((238, 238, 236), (60, 110, 170), (205, 200, 190), (190, 70, 50))[a.variant % 4]
+    _cab(m, a, l, 2.3, w, 0.94 * h)
+    m.box(-l, l - 2.9, -w, w, 0.28 * h, h, cargo, top=shade(cargo, 0.9))
+    m.box(-l, l - 2.3, -0.4 * w, 0.4 * w, 0.14 * h, 0.28 * h, STEEL)
+    for side in (-1, 1):
+        m.side_panel(side * (w + 0.01), -0.7 * l, 0.4 * l, 0.5 * h, 0.78 * h, shade(cargo, 0.62))
+    m.wheels([l - 1.4, l - 5.0, -l + 2.2, -l + 3.5, -l + 4.8], w - 0.02, 0.5)
+    m.lights(l, -l, 0.94 * w, 0.2 * h, 0.2)
+    m.panel(-l - 0.01, -0.05, 0.05, 0.3 * h, 0.98 * h, -1, shade(cargo, 0.45))
+
+
 def add_trailer(m: MeshMaker, a: Actor, l: float, w: float, h: float) -> None:
     m.box(-l, l, -w, w, 0.28 * h, h, a.colour, top=shade(a.colour, 0.9))
     m.box(-l, 0.3 * l, -0.4 * w, 0.4 * w, 0.16 * h, 0.28 * h, STEEL)

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 
 from src.errors import ConfigError
 
-GENERATOR = "highway-1"
+GENERATOR = "highway-2"
 """Changes whenever the same config would give other bytes, so that old worlds are not mistaken for new ones."""
 
 RADAR_RATE_HZ = 20
@@ -28,15 +28,30 @@ LIMITS = {
     "camera_fov_deg": (10.0, 150.0),
     "jpeg_quality": (1, 95),
     "radar_sweeps_per_key_frame": (1, RADAR_RATE_HZ // KEY_FRAME_RATE_HZ),
+    "radar_reach_m": (10.0, 1000.0),
     "returns_density": (0.0, 100_000.0),
+    "scattering_centres": (1, 100),
+    "scatter_m": (0.0, 10.0),
+    "gain_db": (0.0, 40.0),
+    "gain_s": (0.001, math.inf),
+    "past_occluder": (0.0, 1.0),
     "clutter_density": (0.0, 100.0),
+    "tarmac_returns": (0.0, 1000.0),
     "ghost_fraction": (0.0, 1.0),
+    "mirror_fraction": (0.0, 1.0),
     "false_alarms_per_sweep": (0.0, 1000.0),
+    "aliased_fraction": (0.0, 1.0),
+    "doppler_span_mps": (1.0, 1000.0),
     "range_noise_m": (0.0, math.inf),
     "azimuth_noise_deg": (0.0, math.inf),
     "elevation_noise_deg": (0.0, math.inf),
     "doppler_noise_mps": (0.0, math.inf),
+    "mount_error_deg": (0.0, 10.0),
+    "outage_fraction": (0.0, 0.9),
+    "soiled_fraction": (0.0, 1.0),
     "vehicles_per_lane_km": (0.0, 40.0),
+    "least_radius_m": (200.0, math.inf),
+    "screened_fraction": (0.0, 1.0),
     "rare_objects": (0.0, 10.0),
     "annotation_range_m": (1.0, 250.0),
     "lidar_sweeps_per_key_frame": (1, LIDAR_RATE_HZ // KEY_FRAME_RATE_HZ),
@@ -63,16 +78,32 @@ class WorldConfig:
     camera_sweeps: bool  # also write the 10 Hz images between key frames
 
     radar_sweeps_per_key_frame: int  # sweeps written up to and including a key frame, 10 = all of the 20 Hz
-    returns_density: float  # scales the returns of objects and of clutter; about 6 for the real sensor's density
-    clutter_density: float  # scales the number of clutter points and of look-alikes
+    radar_reach_m: float  # nothing comes back from farther away
+    returns_density: float  # scales the returns of objects; 1 = the real sensor's
+    scattering_centres: int  # fixed places on each face of an object that returns come from
+    scatter_m: float  # of these places about the label's faces, standard deviation of x and of y
+    gain_db: float  # of what an object reflects over time, standard deviation
+    gain_s: float  # time constant of that: within it a dropout stays one
+    past_occluder: float  # share of returns that arrive past something in the way, mostly under it
+    clutter_density: float  # scales the number of clutter points and of look-alikes; 1 = the real sensor's
+    tarmac_returns: float  # mean number of returns of the road close by, per sweep at a clutter_density of 1
     ghost_fraction: float  # multipath copies per real return
+    mirror_fraction: float  # copies behind the outer guard rail per return of something that moves
     false_alarms_per_sweep: float  # mean number of returns from nowhere
+    aliased_fraction: float  # of returns whose Doppler is off by doppler_span_mps either way
+    doppler_span_mps: float
     range_noise_m: float
     azimuth_noise_deg: float
     elevation_noise_deg: float  # real radars know height poorly
     doppler_noise_mps: float
 
+    mount_error_deg: float  # standard deviation of each angle of cameras and radars about the stored calibration
+    outage_fraction: float  # of the time in which a camera shows nothing, or a radar, for 0.5 to 2 s at a stretch
+    soiled_fraction: float  # of scenes in which one camera is dirty
+
     vehicles_per_lane_km: float  # traffic density
+    least_radius_m: float  # of curves
+    screened_fraction: float  # of scenes with an opaque median
     rare_objects: float  # scales how many of the rare classes a scene gets
     annotation_range_m: float  # objects farther away are not labelled
     lidar: bool  # ray-cast six lidars; otherwise only the empty LIDAR_LEFT key frames

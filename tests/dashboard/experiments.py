@@ -54,6 +54,8 @@ def write_run(outputs: Path, run_id: str, seed: int, value: float, margin: float
     metrics = {
         "mAP": value, "NDS": value, "mAVE": 2 - value, "classes": classes,
         "ranges": dict.fromkeys(RANGES, part), "speeds": dict.fromkeys(SPEEDS, part),
+        "measures": {"moving_AP": value, "moving_boxes": 7, "history_near": None},
+        "intervals": {"scenes": 20, "bounds": {"mAP": [value - 0.02, value + 0.03]}},
     }  # fmt: skip
     config = {"model": {"name": "horizon3d", "ocsf": {"margin_m": margin}}, "phase": {"name": phase}, "seed": seed,
               "data": {"root": "/nowhere", "sensor_dropout": None}, "paths": {"outputs": str(outputs)}}  # fmt: skip

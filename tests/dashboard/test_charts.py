@@ -57,8 +57,8 @@ def test_tick_texts_are_short():
     ]  # fmt: skip
 
 
-def test_points_stand_in_proportion_and_error_bars_have_their_length():
-    series = Series(label="here", points=points_of((0, 10, 5.0), (1, 20), (3, 40)))
+def test_points_stand_in_proportion_and_intervals_have_their_length():
+    series = Series(label="here", points=points_of((0, 10, (2.0, 12.0)), (1, 20), (3, 40)))
     figure = line_chart("t", [series], "x", "y")
     (x0, y0), (x1, y1), (x3, y3) = places(figure)
     assert (x3 - x0) / (x1 - x0) == pytest.approx(3, rel=0.01)
@@ -66,7 +66,7 @@ def test_points_stand_in_proportion_and_error_bars_have_their_length():
     (whisker,) = parts(figure, "path", "whisker")
     low, high = map(float, re.match(r"M\S+ (\S+)V(\S+?)M", whisker.get("d")).groups())
     assert (low - high) / (y0 - y1) == pytest.approx(1.0, rel=0.02)  # ten units, as from 10 to 20
-    assert low > y0 > high
+    assert low > y0 > high and (low - y0) / (y0 - high) == pytest.approx(4.0, rel=0.05)
 
 
 def test_two_figures_of_one_span_have_one_measure():
@@ -79,7 +79,7 @@ def test_two_figures_of_one_span_have_one_measure():
 
 
 def test_what_is_no_number_is_left_out():
-    series = Series(label="", points=points_of((0, math.nan), (1, 5, 0.0, "b"), (2, math.inf), (3, 6, 0.0, "d")))
+    series = Series(label="", points=points_of((0, math.nan), (1, 5, None, "b"), (2, math.inf), (3, 6, None, "d")))
     figure = line_chart("t", [series], "x", "y")
     assert [mark.find("title").text for mark in parts(figure, "path", "mark")] == ["b", "d"]
     assert "nan" not in str(figure) and "inf" not in str(figure)
@@ -146,10 +146,10 @@ def test_series_differ_without_colour():
 def test_figures_have_names_and_escape_them():
     evil = "<script>alert('x')</script>&"
     lines = [
-        Series(label=evil, points=[ChartPoint(0, 1, 0.0, evil)]),
+        Series(label=evil, points=[ChartPoint(0, 1, None, evil)]),
         Series(label="b", points=points_of((1, 1)), style=1),
     ]
-    bars = [Bars(label=evil, values=[(1.0, 0.0), (2.0, 0.0)])]
+    bars = [Bars(label=evil, values=[(1.0, 1.0, 1.0), (2.0, 2.0, 2.0)])]
     for figure in (line_chart(evil, lines, evil, evil), category_chart(evil, [evil, "b"], bars, evil)):
         assert "<script" not in figure
         svg = next(ET.fromstring(str(figure)).iter("svg"))
@@ -157,7 +157,7 @@ def test_figures_have_names_and_escape_them():
 
 
 def test_bars_have_their_lengths_and_numbers():
-    bars = [Bars(label="a", values=[(10.0, 1.0), None, (40.0, 0.0)])]
+    bars = [Bars(label="a", values=[(10.0, 8.0, 11.0), None, (40.0, 40.0, 40.0)])]
     figure = category_chart("t", ["x", "y", "z"], bars, "AP, %")
     widths = [float(bar.get("width")) for bar in parts(figure, "rect", "bar")]
     assert widths[2] / widths[0] == pytest.approx(4, rel=0.01) and widths[1] == 0
@@ -167,6 +167,6 @@ def test_bars_have_their_lengths_and_numbers():
 
 
 def test_dots_are_one_for_each_value():
-    rows = [Bars(label=str(n), values=[(1.0 * n, 0.0), None, (3.0, 0.0)], style=n) for n in range(3)]
+    rows = [Bars(label=str(n), values=[(1.0 * n, n, n), None, (3.0, 3.0, 3.0)], style=n) for n in range(3)]
     figure = category_chart("t", ["x", "y", "z"], rows, "AP, %", dots=True)
     assert [len(places(figure, style)) for style in range(3)] == [2, 2, 2]

@@ -40,7 +40,7 @@ def test_a_knob_has_two_figures_and_never_one_axis_for_two_data_sets(board):
     sweep = board.sweep("epsilon_mini")
     here, paper = knob_figures(sweep, sweep.record.sweep.plots[0], results_by_row(board, sweep))
     assert "here, scale mini" in caption(here) and "paper" in caption(paper)
-    assert notes(here) == ["0.8 m: 31.0 ± 1.4", f"{EVIL}: 35.0 ± 0.0", "4.8 m: 41.0 ± 1.4"]
+    assert notes(here) == ["0.8 m: 31.0 [29.0, 34.0]", f"{EVIL}: 35.0 [33.0, 38.0]", "4.8 m: 41.0 [39.0, 44.0]"]
     assert notes(paper) == ["0.8 m: 18.8", f"{EVIL}: 21.2", "4.8 m: 22.8"]
 
 
@@ -49,7 +49,7 @@ def test_rows_without_a_place_are_bars(board):
     results, plot = results_by_row(board, sweep), sweep.record.sweep.plots[0]
     sweep.record.sweep.rows[1].x = None
     here, paper = knob_figures(sweep, plot, results)
-    assert notes(here) == ["0.8 m: 31.0 ± 1.4", f"{EVIL}: 35.0", "4.8 m: 41.0 ± 1.4"]
+    assert notes(here) == ["0.8 m: 31.0 [29.0, 34.0]", f"{EVIL}: 35.0 [33.0, 38.0]", "4.8 m: 41.0 [39.0, 44.0]"]
     for row in sweep.record.sweep.rows:
         row.paper = {}
     assert len(knob_figures(sweep, plot, results)) == 1  # the paper says nothing

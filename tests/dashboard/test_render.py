@@ -15,6 +15,7 @@ from src.dashboard.render import (
     metric_rows,
     signed,
 )
+from src.report.escaping import escape_markdown
 from tests.dashboard.experiments import EVIL
 
 
@@ -31,20 +32,35 @@ def renderer():
 def test_tables_hold_the_numbers_of_the_files(board, renderer):
     sweep = board.sweep("epsilon_mini")
     (table,) = sweep.tables
-    assert [table.parts(0), table.parts(1)] == [["paper", "here", "to baseline"], ["here", "to baseline"]]
-    # Rows 30 and 32, 35 alone (the other seed failed), 40 and 42: means 31, 35, 41; deviation 1.4.
-    rows = [list(table.shown(row)) for row in table.rows]
-    assert [cells[1].text for cells in rows] == ["31.0 ± 1.4", "35.0", "41.0 ± 1.4"]
-    assert [cells[1].best for cells in rows] == [False, False, True]
-    assert [cells[2].text for cells in rows][::2] == ["-10.0 ± 0.0 (paper -4.0)", "baseline"]
-    assert [cells[2].verdict for cells in rows] == ["worse", "worse", ""]
-    assert rows[0][4].verdict == "worse"  # a larger error
+    assert [head.text for head in table.heads] == ["mAP, %", "mAP to baseline", "mAVE, m/s", "mAVE to baseline"]
+    # Rows 30 and 32, 35 alone (the other seed failed), 40 and 42: means 31, 35, 41, two pairs of seeds that agree.
+    rows = [cells for _, cells in table.lines]
+    assert [cells[0].here for cells in rows] == ["31.0 [29.0, 34.0]", "35.0 [33.0, 38.0]", "41.0 [39.0, 44.0]"]
+    assert [cells[0].best for cells in rows] == [False, False, True], "of those whose seeds have all finished"
+    assert [(cells[1].paper, cells[1].here) for cells in rows] == [
+        ("-4.0", "-10.0 [-10.0, -10.0]"), ("-1.6", "-5.0 undecided"), (None, "baseline")
+    ]  # fmt: skip
+    assert [cells[1].verdict for cells in rows] == ["worse", "", ""]
+    assert rows[0][3].verdict == "worse"  # a larger error
     markdown, page = table.to_markdown(), str(renderer.sweep(board, sweep).content)
-    assert '<td class="difference worse"' in page and '\N{MINUS SIGN}10.0 ± 0.0<span class="note">paper' in page
-    assert '<span class="note">1 of 2</span>' in page and "loss/total is &lt;nan&gt;" in page
+    assert '<td class="worse"' in page and "1 of 2 seeds" in page and "loss/total is &lt;nan&gt;" in page
     for cell in (cell for cells in rows for cell in cells):
-        assert cell.text in markdown
-        assert cell.text.replace("-", "\N{MINUS SIGN}").partition(" (")[0] in page
+        assert cell.text(escape_markdown, "**{}**".format) in markdown
+        value, _, interval = cell.here.partition(" [")
+        assert value in page and (not interval or f'<span class="note">[{interval}</span>' in page)
+
+
+def test_wide_tables_have_metrics_as_lines_on_pages_too(board, renderer):
+    sweep = board.sweep("epsilon_mini")
+    (table,) = sweep.tables
+    wide = dataclasses.replace(
+        table, columns=table.columns * 4, rows=[dataclasses.replace(row, cells=row.cells * 4) for row in table.rows]
+    )
+    assert wide.transposed
+    page = str(renderer.sweep(board, dataclasses.replace(sweep, tables=[wide])).content)
+    head = page[page.index("<thead>") : page.index("</thead>")]
+    assert head.count("<th ") == 1 + 3 and "4.8 m" in head and 'title="run of seed 0"' in head
+    assert page[page.index("<tbody>") : page.index("</tbody>")].count("<tr ") == 8
 
 
 def test_rows_with_baselines_of_their_own_show_their_differences(board):
@@ -54,12 +70,18 @@ def test_rows_with_baselines_of_their_own_show_their_differences(board):
         dataclasses.replace(row, baseline=baseline)
         for row, baseline in ((first, second.label), (second, second.label), (third, third.label))
     ])  # fmt: skip
-    texts = [list(table.shown(row))[2].text for row in table.rows]
+    texts = [cells[1].here for _, cells in table.lines]
     assert texts[0].startswith("-10.0") and texts[1:] == ["baseline", "baseline"]
 
 
 def test_headline(board):
-    assert headline(board.sweep("epsilon_mini")) == "Best mAP here: 4.8 m, 41.0 ± 1.4. In the paper: 4.8 m, 22.8."
+    sweep = board.sweep("epsilon_mini")
+    assert headline(sweep) == "Best mAP here: 4.8 m, 41.0 [39.0, 44.0]. In the paper: 4.8 m, 22.8."
+    (table,) = sweep.tables
+    table.rows[2].cells[0].best = False
+    assert headline(sweep) == "Best mAP here: undecided. In the paper: 4.8 m, 22.8."
+    alone = dataclasses.replace(table, rows=table.rows[:1])
+    assert headline(dataclasses.replace(sweep, tables=[alone])).startswith("Best mAP here: 0.8 m, 31.0 [29.0, 34.0].")
 
 
 def test_labels_are_never_markup(board, renderer):
@@ -97,11 +119,11 @@ def test_metrics_beside_another_run(board, shared_world):
     run, other = board.runs[shared_world.run_id(0, 0)], board.runs[shared_world.run_id(2, 0)]
     rows = {row.metric.name: row for group in metric_rows(run, other).values() for row in group}
     assert (rows["mAP"].value, rows["mAP"].other, rows["mAP"].difference) == ("30.0", "40.0", "\N{MINUS SIGN}10.0")
-    assert rows["mAP"].verdict == "worse"
-    assert (rows["mAVE"].value, rows["mAVE"].difference, rows["mAVE"].verdict) == ("1.70", "+0.10", "worse")
-    assert set(metric_rows(run, None)) == {"Summary", "By distance", "By speed", "By class"}
-    same = metric_rows(run, run)["Summary"][0]
-    assert (same.difference, same.verdict) == ("+0.0", "")
+    assert (rows["mAVE"].value, rows["mAVE"].difference) == ("1.70", "+0.10")
+    assert (rows["mAP"].interval, rows["mAVE"].interval) == ("28.0 – 33.0", "")
+    assert "measures.history_near" not in rows and rows["measures.moving_AP"].value == "30.0"
+    assert set(metric_rows(run, None)) == {"Summary", "What a memory is for", "By distance", "By speed", "By class"}
+    assert metric_rows(run, run)["Summary"][0].difference == "+0.0"
     assert metric_rows(board.runs[shared_world.run_id(1, 1)], other) == {}  # it failed
 
 

@@ -38,7 +38,7 @@ def test_without_run_folders(world, tmp_path):
     path = tmp_path / "dashboard.html"
     export_dashboard(world.reports, None, path)
     text = path.read_text()
-    assert "41.0 ± 1.4" in text and "data:image" not in text and "Pictures and the log lie in" in text
+    assert "[39.0, 44.0]" in text and "data:image" not in text and "Pictures and the log lie in" in text
 
 
 def test_pictures_are_smaller_copies(world, monkeypatch):

@@ -202,6 +202,7 @@ def test_jump_between_two_frames_of_a_scene(x_m):
     index = index_of([0, 0, 0], [1.0, 1.5, 2.0], [0.0, 10.0, x_m])
     with pytest.raises(DataError, match=r"ego_pose.json: from sample t1 to the next, t2, the ego moves at (120|nan)"):
         scenes_of(index, np.arange(3))
+    assert [scene.tolist() for scene in scenes_of(index, np.arange(3), jumps_allowed=True)] == [[0, 1, 2]]
     assert len(scenes_of(index_of([0, 0, 1], [1.0, 1.5, 2.0], [0.0, 10.0, 70.0]), np.arange(3))) == 2
 
 

@@ -14,7 +14,7 @@ import torch
 
 from src.data.augment import AugmentationConfig, BevAugmentationConfig, ImageAugmentationConfig
 from src.data.cache import load_index
-from src.data.clips import shuffled_frames
+from src.data.clips import scenes_of, shuffled_frames
 from src.data.data_config import DataConfig
 from src.data.datamodule import DetectionDataModule
 from src.data.frame_loader import collate, dead_workers_named
@@ -29,7 +29,7 @@ BEV = BevAugmentationConfig(scale=[0.95, 1.05], rotation_rad=0.4, flip_probabili
 def config(**changes):
     values = dict(
         root=None, version=VERSION, train_split="train", split="val", batch_size=2, groups_per_scene=2, stream_sets=1,
-        sensor_dropout=0.0, num_workers=0, num_sweeps=2, min_distance_m=1.0, propagate_points=False,
+        past_frames=0, sensor_dropout=0.0, num_workers=0, num_sweeps=2, min_distance_m=1.0, propagate_points=False,
         on_bad_file=OnBadFile.error, test_resize_offset=0.0, num_lidar_sweeps=1, lidar_origins=False,
         deskew_lidar=True, num_future_frames=0,
         augmentation=AugmentationConfig(image=None, bev=BEV),
@@ -322,6 +322,36 @@ def test_sensor_dropout_spares_a_clips_first_frame_and_is_always_the_same_in_val
     frames = [frame.tokens[0] for frame in made[0].stream() if len(frame.radar_points) == 0]
     assert sorted(frames) == sorted(in_validation[0]) and len(frames) > 0
     assert dropped(made[0].train_dataloader()) and not dropped(module(data_set, **streamed).train_dataloader())
+
+
+def test_shuffled_frames_bring_their_past(drives):
+    """Scenes of 5, 3 and 7 frames; where a scene had not begun, a frame repeats itself."""
+    data = module(drives, ("radar",), temporal=True, past_frames=3)
+    scenes = [data.index.sample_tokens[scene].tolist() for scene in scenes_of(data.index, np.arange(len(data.index)))]
+    batches = list(data.train_dataloader())
+    assert len(batches) == 7
+    for batch in batches:
+        assert batch.streams is None and len(batch.past) == 3
+        for row, name in enumerate(batch.tokens):
+            (scene,) = (scene for scene in scenes if name in scene)
+            at = scene.index(name)
+            before = [scene[at - k] if at >= k else name for k in (3, 2, 1)]
+            assert [frame.tokens[row] for frame in batch.past] == before
+            for frame in batch.past:
+                assert torch.equal(frame.aug_from_ego[row], batch.aug_from_ego[row]) and frame.boxes is None
+    assert not next(iter(data.val_dataloader())).past
+    assert not next(iter(module(drives, ("radar",), past_frames=3).train_dataloader())).past
+
+
+def test_the_past_of_a_first_frame_sees_nothing(data_set):
+    data = module(data_set, temporal=True, past_frames=2, batch_size=1, sensor_dropout=0.99)
+    (first,) = (batch for batch in data.train_dataloader() if batch.past[1].tokens == batch.tokens)
+    assert len(first.radar_points) and first.image_valid.all()  # never without sensors, having no past
+    for frame in first.past:
+        assert len(frame.radar_points) == 0 and not frame.image_valid.any() and not frame.skipped
+        assert torch.equal(frame.timestamps_s, first.timestamps_s)
+    others = [batch for batch in data.train_dataloader() if batch.past[1].tokens != batch.tokens]
+    assert others and all(len(batch.radar_points) == 0 and len(batch.past[1].radar_points) for batch in others)
 
 
 def test_stream_of_scenes(drives):

@@ -159,6 +159,75 @@ def test_jumping_and_sparse_poses_are_refused(broken_tables):
         ego_motion(replace(index, pose_times_us=index.pose_times_us * 100), stamp * 100, rotations)
 
 
+def with_poses_moved(index, poses):
+    """The index with these rows of the pose table half a kilometre off."""
+    translations = index.pose_translations.copy()
+    translations[poses] += [500.0, 0.0, 0.0]
+    return replace(index, pose_translations=translations)
+
+
+def files_of(index, sample, poses):
+    """Files that a frame of ten sweeps reads and that have one of these poses."""
+    rows = [int(row) for row in index.key_data[sample, : len(CAMERAS)]]
+    for row in index.key_data[sample, len(CAMERAS) : len(CAMERAS) + len(RADARS)]:
+        for _ in range(10):
+            rows.append(int(row))
+            row = index.data_previous[row]
+    return sorted(index.filename(row) for row in rows if index.data_poses[row] in poses)
+
+
+def test_files_whose_pose_no_truck_can_have_stop_or_are_counted(data_set):
+    """A past sweep of one radar, the picture of one camera, and what was recorded at the same moments."""
+    index = load_index(data_set.root, VERSION, None)
+    sweep = int(index.data_previous[index.key_data[1, len(CAMERAS) + 2]])
+    picture = int(index.key_data[1, 1])
+    moved = with_poses_moved(index, index.data_poses[[sweep, picture]])
+    for settings in ({"image_size_px": None}, {"num_sweeps": 0}):
+        with pytest.raises(DataError, match="ego_pose.json: from the pose of s.*data.on_bad_file=skip"):
+            FrameReader(moved, reader_settings(**settings)).read(1, None)
+    whole = data_set.reader().read(1, None)
+    frame = FrameReader(moved, reader_settings(on_bad_file=OnBadFile.skip)).read(1, None)
+    affected = files_of(index, 1, index.data_poses[[sweep, picture]])
+    also = set(frame.bad_files) - set(affected)  # sweeps 0.1 s from a wrong pose, which would get a wrong velocity
+    assert set(affected) <= set(frame.bad_files) and len(affected) >= 2 and len(also) <= 4
+    assert not any(name.startswith("samples/CAMERA") for name in also)
+    assert sum(frame.skipped.values()) == len(frame.bad_files) and frame.skipped[f"{CAMERAS[1]} (ego pose)"] == 1
+    sweeps = sum(name.endswith(".pcd") for name in frame.bad_files)
+    assert len(whole.radar_points) - len(frame.radar_points) == sweeps * (len(STATIC) + 1)
+    assert not frame.image_valid[0, 1] and not frame.images[0, 1].any() and frame.image_valid[0, 0]
+    assert len(frame.boxes[0]) == len(whole.boxes[0]) > 0
+
+
+def test_a_key_frame_of_a_wrong_pose_shows_and_teaches_nothing(data_set):
+    index = load_index(data_set.root, VERSION, None)
+    pose = index.frame_poses[1]
+    moved = with_poses_moved(index, [pose])
+    frame = FrameReader(moved, reader_settings(on_bad_file=OnBadFile.skip)).read(1, None)
+    shared = files_of(index, 1, [pose])  # wrong in the same way, so it seems to be right
+    assert len(frame.bad_files) == 6 * 10 + len(CAMERAS) - len(shared)
+    assert len(frame.radar_points) == sum(name.endswith(".pcd") for name in shared) * (len(STATIC) + 1)
+    assert len(frame.boxes[0]) == 0
+    following = FrameReader(moved, reader_settings(on_bad_file=OnBadFile.skip)).read(2, None)
+    assert len(following.radar_points) > 0 and len(following.boxes[0]) > 0
+
+
+def test_sweeps_where_the_poses_jump_are_skipped(data_set):
+    """All poses after the key frame are 30 m on: its newest sweeps would have a speed of more than 100 m/s."""
+    index = load_index(data_set.root, VERSION, None)
+    translations = index.pose_translations.copy()
+    translations[index.pose_times_us > index.frame_times_us[1]] += [30.0, 0.0, 0.0]
+    jumped = replace(index, pose_translations=translations)
+    with pytest.raises(DataError, match="ego_pose.json"):
+        FrameReader(jumped, reader_settings()).read(1, None)
+    whole = data_set.reader().read(1, None)
+    frame = FrameReader(jumped, reader_settings(on_bad_file=OnBadFile.skip)).read(1, None)
+    assert 0 < len(frame.radar_points) < len(whole.radar_points) and set(frame.skipped) >= {
+        "RADAR_LEFT_FRONT (ego pose)"
+    }
+    old = whole.radar_points[whole.radar_points[:, 6] > 0.15]
+    torch.testing.assert_close(frame.radar_points[frame.radar_points[:, 6] > 0.15], old)
+
+
 def test_real_sweep_is_explained_by_one_speed(data_set):
     if not REAL.is_dir():
         pytest.skip(f"{REAL} is not there")

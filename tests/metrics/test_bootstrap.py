@@ -138,18 +138,20 @@ def test_metrics_with_intervals_are_plain_json(problem):
     intervals = content.pop("intervals")
     assert content == scores.as_dict()
     assert (intervals["scenes"], intervals["level"]) == (5, 0.95)
+    bounds = intervals["bounds"]
     for name in ("mAP", "NDS", "mAVE"):
-        low, high = intervals[name]
+        low, high = bounds[name]
         assert low < content[name] < high
-    assert set(intervals["measures"]) == {name for name in content["measures"] if not name.endswith("_boxes")}
-    cones = intervals["ranges"]["0-25"]["classes"]["traffic_cone"]
-    assert cones["AP"] == [0.0, 0.0] and cones["AVE"] is None
+    measured = {name for name in content["measures"] if not name.endswith("_boxes")}
+    assert {name for name in bounds if name.startswith("measures.")} == {f"measures.{name}" for name in measured}
+    assert bounds["ranges.0-25.classes.traffic_cone.AP"] == [0.0, 0.0] and "classes.barrier.AVE" not in bounds
 
 
 def test_one_scene_says_nothing_of_others(problem):
     evaluation_set, predictions, diagnoses = problem
     single = replace(evaluation_set, scenes=np.zeros(20, np.int64))
-    assert set(with_intervals(score_detections(single, predictions))["intervals"]) == {"scenes", "draws", "level"}
+    intervals = with_intervals(score_detections(single, predictions))["intervals"]
+    assert intervals["scenes"] == 1 and intervals["bounds"] == {}
 
 
 def test_the_middle_of_the_draws():
@@ -164,4 +166,5 @@ def test_no_boxes_at_all():
         content = with_intervals(
             score_detections(replace(evaluation_set, ground_truth=truth, instances=np.arange(len(truth))), predictions)
         )
-        assert content["intervals"]["mAP"] == [0.0, 0.0] and content["intervals"]["measures"] == {"moving_AP": None}
+        bounds = content["intervals"]["bounds"]
+        assert bounds["mAP"] == [0.0, 0.0] and "measures.moving_AP" not in bounds

@@ -29,13 +29,15 @@ def test_half_precision_sums_gradients_in_full():
     assert w.grad.item() == pytest.approx(100_000, rel=0.01)
 
 
-def test_autocast_computes_in_its_type():
-    values = operands(9, torch.float32)
+def test_autocast_halves_the_hidden_layer_and_not_the_outputs():
+    values = x, w, b, v, c = operands(9, torch.float32)
     with torch.autocast("cpu", torch.bfloat16):
         out = checkpointed_mlp(*values)
-    assert out.dtype == torch.bfloat16
-    out.float().sum().backward()
-    assert values[0].grad.dtype == torch.float32
+    hidden = torch.addmm(b.bfloat16(), x.bfloat16(), w.bfloat16()).relu()
+    torch.testing.assert_close(out, hidden.float() @ v + c)
+    assert not torch.equal(out, (x @ w + b).relu() @ v + c)
+    out.sum().backward()
+    assert all(value.grad.dtype == torch.float32 for value in values)
 
 
 def test_statistics_of_a_projection_never_made():

@@ -47,6 +47,42 @@ def test_a_run_is_published_and_read(published, reports):
     assert read_results(reports, "mini") == ({result.run_id: result}, {}) and read_results(reports, "debug") == ({}, {})
 
 
+def with_intervals(folder, bounds, scenes=20):
+    path = folder / "metrics.json"
+    metrics = json.loads(path.read_text()) | {"measures": {"moving_AP": 0.4, "moving_boxes": 9, "history_near": None}}
+    path.write_text(
+        json.dumps(metrics | {"intervals": {"scenes": scenes, "draws": 500, "level": 0.95, "bounds": bounds}})
+    )
+    return folder
+
+
+def test_intervals_and_measures_are_read_by_name(write_run, reports):
+    bounds = {"mAP": [0.2, 0.4], "measures.moving_AP": [0.3, 0.5], "speeds.25+.classes.car.AP": [0.1, 0.9],
+              "ranges.0-25.mAP": [0.0, 1.0], "classes.car.ATE": [1.0, 2.0], "speeds.25+.classes.bus.AP": [0.0, 0.1],
+              "tags.rain.mAP": [0.0, 0.1]}  # fmt: skip
+    path = publish_result(with_intervals(write_run("a", [], 0, 0.3, speeds=True), bounds), reports)
+    result = read_result(path)
+    assert result.intervals == {"mAP": [0.2, 0.4], "measures.moving_AP": [0.3, 0.5], "speeds.25+.car.AP": [0.1, 0.9],
+                                "ranges.0-25.mAP": [0.0, 1.0]}  # fmt: skip
+    assert result.scenes == 20 and result.metrics["measures.moving_AP"] == 0.4
+    assert result.metrics["measures.history_near"] is None
+    assert "tags.rain.mAP" not in path.read_text() and "classes.car.ATE" not in path.read_text(), "nobody reads them"
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [
+        ({"mAP": [0.1]}, "bounds.mAP"),
+        ({"mAP": 0.1}, "bounds.mAP"),
+        ({"mAP": [0.1, "0.2"]}, "bounds.mAP"),
+        ([0.1], "intervals.bounds"),
+    ],
+)
+def test_bounds_that_are_none_are_named(write_run, reports, bounds, message):
+    with pytest.raises(DataError, match=rf"metrics.json: intervals.*{message}|metrics.json: {message}"):
+        publish_result(with_intervals(write_run("a", [], 0, 0.3), bounds), reports)
+
+
 def test_publishing_again_changes_nothing_until_the_run_does(write_run, reports):
     folder = write_run("a", [], 0, 0.3)
     path = publish_result(folder, reports)

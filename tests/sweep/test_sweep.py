@@ -169,7 +169,7 @@ def test_a_real_sweep_ends_with_its_table_and_goes_on_from_there(sweeps, places,
     (path,) = (tmp_path / "reports" / "sweeps").glob("*.json")
     record = read_record(path)
     assert record.changes == ["phase.epochs=1"] and record.stem == path.stem == f"two_debug{record.suffix}"
-    assert "| small | 18.6 |" in out and f"two-debug{record.suffix}: 2 of 2 done" in out
+    assert "| small | 18.6 \\| " in out and f"two-debug{record.suffix}: 2 of 2 done" in out
     assert "scale debug; with phase.epochs=1;" in out
     assert record.count("done") == 2 and record.command.startswith("python -m src.sweep +sweep=two scale=debug")
     outputs = tmp_path / "outputs"

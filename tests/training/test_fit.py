@@ -7,6 +7,7 @@ import os
 import signal
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import lightning as L
 import numpy as np
@@ -21,7 +22,13 @@ from src.errors import InterruptedRunError
 from src.metrics.bootstrap import with_intervals
 from src.metrics.detection import score_detections
 from src.models.horizon3d.kggi import Initialization
-from src.reliability.processes import SharedBuffers, build_strategy, is_main_process, process_group
+from src.reliability.processes import (
+    SharedStatistics,
+    build_strategy,
+    is_main_process,
+    process_group,
+    running_statistics,
+)
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.training.evaluator import DetectionEvaluator
 from src.training.fit import fit
@@ -102,7 +109,7 @@ def work_as(rank, port, world_size, work):
     with process_group("cpu", world_size):
         trainer = L.Trainer(
             max_epochs=1, accelerator="cpu", devices=world_size, strategy=build_strategy("cpu", world_size),
-            callbacks=[SharedBuffers()], logger=False, enable_checkpointing=False, enable_progress_bar=False,
+            callbacks=[SharedStatistics()], logger=False, enable_checkpointing=False, enable_progress_bar=False,
             enable_model_summary=False, num_sanity_val_steps=0, use_distributed_sampler=False,
         )  # fmt: skip
         loaders = [DataLoader(batches, batch_size=None, num_workers=0) for batches in (train, validation)]
@@ -238,6 +245,40 @@ def test_two_processes_score_as_one_does_their_checkpoint(work):
         found = score_detections(truth, table_of(result["detections"])).as_dict()
         for (name, value), (same_name, same) in zip(numbers(expected), numbers(found), strict=True):
             assert name == same_name and same == (None if value is None else pytest.approx(value, abs=1e-6)), name
+
+
+def statistics_as(rank, port, folder):
+    """What a norm of each rank holds after the callback, and the state that a checkpoint of that time would have."""
+    become(rank, 2, port)
+    with process_group("cpu", 2):
+        module = toy_module(TrainingModule)
+        module.model.norm = torch.nn.BatchNorm1d(2)
+        module.model.norm.running_mean += torch.tensor([rank, 3.0])
+        module.model.norm.running_var *= 1.0 + 4.0 * rank
+        state = module.rank_state()
+        SharedStatistics().on_train_epoch_end(None, module)
+        torch.save((state["statistics"], running_statistics(module)), folder / f"{rank}.pt")
+
+
+@pytest.mark.slow
+def test_ranks_share_the_mean_of_their_statistics_and_resume_with_their_own(tmp_path):
+    spawn_two(statistics_as, tmp_path)
+    for rank in range(2):
+        own, shared = torch.load(tmp_path / f"{rank}.pt", weights_only=True)
+        assert {name: value.tolist() for name, value in shared.items()} == {
+            "model.norm.running_mean": [0.5, 3.0],
+            "model.norm.running_var": [3.0, 3.0],
+        }
+        assert own["model.norm.running_mean"].tolist() == [rank, 3.0]
+        module = toy_module(TrainingModule)
+        module._trainer = SimpleNamespace(global_rank=rank, world_size=2)
+        states = [{"means": {}, "statistics": own} if of == rank else {"means": {}} for of in range(2)]
+        checkpoint = {
+            "horizon3d": {"ranks": states},
+            "state_dict": {"model.norm.running_mean": "of rank 0", "other": 1},
+        }
+        module.on_load_checkpoint(checkpoint)
+        assert checkpoint["state_dict"] == {**own, "other": 1}
 
 
 # ---------------------------------------------------------------- resuming with another number of processes

@@ -29,8 +29,9 @@ from src.errors import (
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.reliability.checkpoints import open_checkpoint
 from src.training import handoff
-from src.training.handoff import find_source, hand_over, train_source
+from src.training.handoff import find_source, hand_over, norms_handed_over, train_source
 from src.training.identity import run_identity
+from src.training.module import TrainingModule
 from src.training.run_folder import RunFolder
 from tests.running import call, fork, run_module
 from tests.untrained import write_checkpoint
@@ -539,3 +540,26 @@ def test_make_hands_the_checkpoint_on():
         assert wrong.returncode == 2 and f"PHASE={phase}: must be 1 or 2" in wrong.stderr
     helped = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     assert "PHASE=1|2" in helped and "CHECKPOINT=PATH" in helped
+
+
+def test_norms_that_were_handed_over_may_keep_their_statistics():
+    """Those of the temporal part are new. Affine parameters learn, also in the head, which applies its norms itself."""
+    config, tree = compose_config(["scale=debug", "phase=phase2", "phase.frozen_statistics=true"])
+    model = build_model(config)
+    frozen = norms_handed_over(model)
+    names = {id(module): name for name, module in model.named_modules()}
+    held = {names[id(norm)] for norm in frozen}
+    every = {
+        name
+        for name, module in model.named_modules()
+        if isinstance(module, torch.nn.BatchNorm2d | torch.nn.BatchNorm1d)
+    }
+    assert every - held == {name for name in every if name.startswith("dptf.")} and len(held) > 10
+    module = TrainingModule(model, config.optim, 1.0, None, 0, tree, frozen_norms=frozen)
+    for mode in (True, False, True):
+        module.train(mode)
+        assert [norm.training for norm in frozen] == [False] * len(frozen)
+    assert model.dptf.bev_path.norms[0].training and model.head.heatmaps[0].training
+    branches, before = model.head.heatmaps[0], model.head.heatmaps[0].norm.running_mean.clone()
+    branches(torch.randn(9, config.model.channels) + 3.0).sum().backward()
+    assert torch.equal(branches.norm.running_mean, before) and branches.norm.weight.grad.any()

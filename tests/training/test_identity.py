@@ -39,6 +39,7 @@ def test_run_identity_of_phase_2():
         "model.dptf.gaussian_path.self_attention=null",
         "data.groups_per_scene=1",
         "data.sensor_dropout=0.5",
+        "data.past_frames=2",
         "phase.epochs=2",
     ):
         assert identity(override) != base, override

@@ -13,7 +13,6 @@ import torch
 from torch import nn
 
 from src.geometry.bev_grid import BEVGrid
-from src.models.backbones.doppler import VelocityStart
 from src.models.detector import Detector, Objective
 from src.models.horizon3d.bev_path import BEVPathConfig, WarpedCells
 from src.models.horizon3d.dptf import DPTFConfig, DPTFOutput, warped_evidence
@@ -114,8 +113,8 @@ def evidence_of(settings: DPTFConfig | None, dptf: DPTFOutput | None) -> Evidenc
 
 def config(bev: bool = True, gaussians: bool = True, compensated: bool = True) -> DPTFConfig:
     bev_path = BEVPathConfig(
-        num_frames=8, memory_threshold=0.1, max_cells_per_frame=9, velocity_start=VelocityStart.zero,
-        velocity_compensation=compensated, spatial_dilation=False,
+        num_frames=8, memory_threshold=0.1, max_cells_per_frame=9, velocity_compensation=compensated,
+        spatial_dilation=False,
     )  # fmt: skip
     gaussian_path = GaussianPathConfig(
         num_frames=4, gaussians_per_frame=9, min_contribution=0.0, sampling=Sampling.random,

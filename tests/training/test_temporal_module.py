@@ -1,6 +1,7 @@
 """Whose memory a stream gets, and when it ends."""
 
 import logging
+from dataclasses import replace
 
 import pytest
 import torch
@@ -68,6 +69,35 @@ def test_the_output_uses_the_memory(module):
     batch = toy_batch([5, 3, 8], [False, True, False], number=1)
     alone, _ = module.model(batch)
     assert torch.allclose(module.run(batch) - alone, torch.tensor([50.0, 0.0, 80.0]), atol=1e-4)
+
+
+def test_frames_with_a_past_remember_it_as_an_evaluation_would_and_nothing_else(module):
+    """Without dropout and gradient, from an empty memory, whatever the streams hold."""
+    first, second, batch = (toy_batch(None, None, number) for number in range(3))
+    module.train()
+    torch.manual_seed(0)
+    output = module.run(replace(batch, past=(first, second)))
+    assert module.model.training and len(module.memories) == 1
+    module.model.eval()
+    with torch.no_grad():
+        wanted = module.model(second, module.model(first)[1])[1]
+    module.model.train()
+    torch.manual_seed(0)
+    assert torch.equal(output, module.model(batch, wanted)[0])
+    module.forget_step(batch)
+    module.eval()
+
+
+def test_depth_and_age_of_the_memory_are_logged(module):
+    module.log = lambda *arguments, **named: None
+    module.run(toy_batch([1, 2], [True, True]))
+    found = module.objective(toy_batch([5, 3, 8], [False, True, False], number=1)).diagnostics
+    assert (float(found["memory_frames"]), float(found["memory_steps"])) == (pytest.approx(2 / 3), 2.0)  # two sets
+    past = (toy_batch(None, None, 3),)
+    found = module.objective(replace(toy_batch(None, None, 4), past=past)).diagnostics
+    assert (float(found["memory_frames"]), float(found["memory_steps"])) == (1.0, 0.0)
+    found = module.objective(toy_batch([9], [True])).diagnostics
+    assert (float(found["memory_frames"]), float(found["memory_steps"])) == (0.0, 0.0)
 
 
 def test_batches_without_streams_are_refused(module):

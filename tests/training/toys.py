@@ -30,6 +30,10 @@ class ToyMemory:
 
     values: torch.Tensor  # [B]
 
+    @property
+    def present(self):
+        return self.values[None] != 0
+
     def select(self, rows, keep):
         return ToyMemory(torch.where(keep, self.values[rows], 0.0))
 
@@ -155,7 +159,7 @@ def toy_trainer(folder, resume=None, *, epochs=EPOCHS, validate_every=1, ema=Non
     )  # fmt: skip
     phase = PhaseConfig(
         name="toy", module="TemporalModule", task="detection", monitor="val/mAP", temporal=True, init_from=None,
-        train_missing=False, epochs=epochs, validate_every=validate_every, options={},
+        train_missing=False, frozen_statistics=False, epochs=epochs, validate_every=validate_every, options={},
     )  # fmt: skip
     loggers = build_loggers(folder, resume, None) if is_main_process() else []
     trainer = build_trainer(folder, config, phase, precision="32-true", ema_decay=ema, loggers=loggers)

@@ -29,16 +29,18 @@ def real_sweep():
     return REAL.read_bytes()
 
 
-def straight_scene(kind, ahead_m, speed_mps=0.0):
-    """One object straight ahead of a truck on a straight road along x, at time 0."""
+def straight_scene(kind, ahead_m, speed_mps=0.0, aside_m=0.0, own_m=0.0, screen_m=0.0, copies=1):
+    """One object ahead of a truck on a straight road along x, at time 0, `aside_m` left of the road's middle."""
     s = np.arange(START_M, END_M + 1)
-    road = Road(xy=np.stack([s, 0 * s], 1), heading_rad=0 * s, z=0 * s, lanes=2, side_road=0, apron=None)
+    line = {"xy": np.stack([s, 0 * s], 1), "heading_rad": 0 * s, "z": 0 * s}
+    road = Road(**line, lanes=2, side_road=0, apron=None, screen_m=screen_m)
     time = np.arange(STEPS) * 0.05 - 0.7
 
-    def track(start, speed):
+    def track(start, speed, across):
         moving = np.full((1, STEPS), speed)
         still = np.zeros((1, STEPS))
-        return Tracks(road=road, s=start + speed * time[None], s_rate=moving, d=still, d_rate=still, turn=still)
+        s = start + speed * time[None]
+        return Tracks(road=road, s=s, s_rate=moving, d=still + across, d_rate=still, turn=still)
 
     actor = Actor(
         name=kind,
@@ -48,19 +50,20 @@ def straight_scene(kind, ahead_m, speed_mps=0.0):
         parked=False,
         variant=0,
     )
-    ego = EgoMotion(tracks=track(0.0, EGO_MPS), sway=np.zeros((4, 3)))
+    ego = EgoMotion(tracks=track(0.0, EGO_MPS, own_m), sway=np.zeros((4, 3)))
     return Scene(
         conditions=None,
         road=road,
-        actors=[actor],
-        tracks=track(ahead_m, speed_mps),
+        actors=[actor] * copies,
+        tracks=track(ahead_m, speed_mps, aside_m),
         ego=ego,
         utm_offset=np.zeros(3),
     )
 
 
 NOTHING = Scenery(
-    mesh=None, layer=None, s=None, clutter=np.zeros((0, 3)), clutter_rcs_db=np.zeros(0), clutter_s=np.zeros(0)
+    mesh=None, layer=None, s=None, clutter=np.zeros((0, 3)),
+    **{f"clutter_{name}": np.zeros(0) for name in ("rcs_db", "s", "d", "height")},
 )
 
 
@@ -72,7 +75,10 @@ def front_sweep(make_config):
 
 def sweep_of(make_config, scene, **changes):
     """The front left radar's returns in the ego frame: points, radial speeds over ground, sweep."""
-    quiet = {"ghost_fraction": 0.0, "false_alarms_per_sweep": 0.0, "clutter_density": 0.0}
+    quiet = dict.fromkeys(
+        ("ghost_fraction", "mirror_fraction", "false_alarms_per_sweep", "clutter_density", "aliased_fraction",
+         "gain_db", "scatter_m", "mount_error_deg"), 0.0,
+    )  # fmt: skip
     config = make_config(**(quiet | changes))
     rig = sensor_rig(config)
     mounts = [rig[name] for name in RADARS]
@@ -84,7 +90,7 @@ def sweep_of(make_config, scene, **changes):
     return sweep[:, :3] @ mount.rotation.T + mount.translation, over_ground, sweep
 
 
-@pytest.mark.parametrize(("kind", "near_m", "far_m"), [("adult", 105.0, 175.0), ("bollard", 80.0, 150.0)])
+@pytest.mark.parametrize(("kind", "near_m", "far_m"), [("adult", 140.0, 184.0), ("bollard", 80.0, 150.0)])
 def test_returns_fall_with_the_fourth_power_of_range_where_the_signal_is_weak(kind, near_m, far_m, front_sweep):
     near, far = (
         len(front_sweep(straight_scene(kind, r + 5.26), returns_density=3000.0 * (r / near_m) ** 2)[0])
@@ -96,7 +102,7 @@ def test_returns_fall_with_the_fourth_power_of_range_where_the_signal_is_weak(ki
 
 def test_larger_and_nearer_objects_give_more_returns(front_sweep):
     count = {name: np.mean([len(front_sweep(straight_scene(name, 60.0), returns_density=60.0)[0])]) for name in KINDS}
-    assert count["semi_trailer"] > count["car"] > count["adult"] > count["cone"]
+    assert count["lorry"] > count["car"] > count["adult"] > count["cone"]
 
 
 def test_returns_lie_on_the_side_that_faces_the_radar(front_sweep):
@@ -124,6 +130,73 @@ def test_velocity_is_radial_relative_and_compensates_to_that_of_the_object(front
     assert abs(np.median((sweep[:, 3:6] * sight).sum(1)) - 15.0) < 0.6
     _, standing, _ = front_sweep(straight_scene("container", 60.0), returns_density=30.0)
     assert np.median(np.abs(standing)) < 0.15
+
+
+def test_an_objects_gain_stays_for_seconds_so_that_a_dropout_outlasts_several_sweeps(make_config):
+    config = make_config()
+    mounts = [sensor_rig(config)[name] for name in RADARS]
+    scene = straight_scene("car", 60.0, copies=3000)
+    radars = Radars(config, scene, NOTHING, mounts, np.random.default_rng(5))
+    gains = []
+    for now in (0.0, 0.25, 3.25, 40.0):
+        radars._fade(now)
+        gains.append(radars.gain_db.copy())
+    assert abs(gains[0].std() - 8.0) < 0.4 and abs(gains[3].std() - 8.0) < 0.4
+    for later, expected in ((1, np.exp(-0.25 / 3)), (2, np.exp(-3.25 / 3)), (3, 0.0)):
+        assert abs(np.corrcoef(gains[0], gains[later])[0, 1] - expected) < 0.06
+
+
+def test_returns_come_from_few_fixed_places_of_an_object(make_config):
+    still = dict.fromkeys(("range_noise_m", "azimuth_noise_deg", "elevation_noise_deg"), 0.0)
+    points, _, _ = sweep_of(make_config, straight_scene("car", 60.0), returns_density=300.0, **still)
+    places = np.unique(np.round(points, 2), axis=0)
+    assert len(points) > 300 and 2 <= len(places) <= 2 * 6 + 4  # two faces, and what rounding splits
+
+
+def test_places_that_reflect_lie_about_the_label(make_config):
+    scene = straight_scene("car", 60.0, copies=500)
+    mounts = [sensor_rig(make_config())[name] for name in RADARS]
+    half = 0.5 * np.array(KINDS["car"].size_m[:2])
+    outside = []
+    for scatter in (0.0, 0.25):
+        config = make_config(scatter_m=scatter)
+        centres = Radars(config, scene, NOTHING, mounts, np.random.default_rng(1)).centres
+        outside.append((np.abs(centres[..., :2]) > half).any(-1).mean())
+    assert outside[0] == 0.0 and 0.2 < outside[1] < 0.6
+
+
+def test_the_screen_on_the_median_hides_what_is_low_and_far_on_the_other_side(make_config):
+    def seen(kind, ahead, screen):
+        scene = straight_scene(kind, ahead, aside_m=8.0, own_m=-8.0, screen_m=screen)
+        return len(sweep_of(make_config, scene, returns_density=60.0, past_occluder=0.0)[0])
+
+    assert seen("car", 125.0, 0.0) > 30 and seen("car", 125.0, 2.5) == 0
+    assert seen("car", 25.0, 2.5) > 0.5 * seen("car", 25.0, 0.0)  # across the road it is open
+    assert seen("lorry", 125.0, 2.0) > 0.2 * seen("lorry", 125.0, 0.0) > 10  # the radars see over it
+
+
+def test_the_guard_rail_mirrors_what_moves(make_config):
+    scene = straight_scene("car", 50.0, 35.0, aside_m=-6.0, own_m=-6.0)
+    assert scene.road.rail_m == pytest.approx(12.5)
+    points, over_ground, _ = sweep_of(make_config, scene, returns_density=60.0, mirror_fraction=1.0)
+    mirrored = points[:, 1] < -6.5
+    assert 0.4 < mirrored.mean() < 0.6
+    assert abs(np.median(points[mirrored, 1]) + 13.0) < 1.0  # at -19 m across the road, the truck is at -6 m
+    assert abs(np.median(points[mirrored, 0]) - 50.0) < 4.0
+    sight = np.cos(np.arctan2(13.0, 45.0))
+    assert abs(np.median(over_ground[mirrored]) - 35.0 * sight) < 1.0
+    parked = straight_scene("car", 50.0, 0.0, aside_m=-6.0, own_m=-6.0)
+    points, _, _ = sweep_of(make_config, parked, returns_density=60.0, mirror_fraction=1.0)
+    assert (points[:, 1] > -3.0).all()
+
+
+def test_aliased_doppler_is_off_by_the_span_either_way(make_config):
+    _, over_ground, _ = sweep_of(
+        make_config, straight_scene("container", 60.0), returns_density=60.0, aliased_fraction=0.5
+    )
+    off = np.abs(over_ground) > 5.0
+    assert 0.4 < off.mean() < 0.6
+    assert np.abs(np.abs(over_ground[off]) - 30.0).max() < 1.5 and len(set(np.sign(over_ground[off]))) == 2
 
 
 def test_sweeps_hold_at_most_800_points_with_whole_rcs_values_in_view(front_sweep):
@@ -163,7 +236,7 @@ def test_static_points_of_a_stored_world_stand_still(world):
     speeds = np.abs(np.concatenate(speeds))
     assert 0.5 < (speeds < 0.5).mean() < 0.95  # most of the world stands still
     assert np.median(speeds[speeds < 2.0]) < 0.12
-    assert speeds.max() < 60
+    assert speeds.max() < 60 + 30  # 4 % of the values are off by an ambiguity of 30 m/s
 
 
 def test_file_layout_is_that_of_the_real_file(world):

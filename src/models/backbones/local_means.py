@@ -6,9 +6,13 @@ import torch
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
-from src.models.backbones.doppler import window_sums
+from src.ops.kernel_maps import submanifold_map
+from src.ops.segment_reduce import segment_sum
+from src.ops.sparse_conv import neighbour_sum
 from src.structures.sparse_bev import SparseBEV
 
+PASSES = 2
+"""Sums over 3x3 cells one after the other: a window of 5x5 cells whose weight falls off with distance."""
 MIN_SPEED_SUM = 1e-3
 """Below it nothing moves, in units of the velocity scale."""
 
@@ -48,6 +52,10 @@ class LocalMeans(nn.Module):
         decides; log of 1 + the points' weight. All 0 where no point is near.
         """
         points = radar_points.float()
+        cells = self.grid.cell_of(points[:, :2])
+        rows = bev.sites.rows_of(torch.cat([radar_batch[:, None], cells], dim=1))
+        near = (rows >= 0).nonzero().squeeze(1)
+        points = points[near]
         velocities = points[:, 4:6] / self.point_scales[4:6]
         speeds = velocities.norm(dim=1, keepdim=True)
         values = [
@@ -57,8 +65,10 @@ class LocalMeans(nn.Module):
             points[:, :2] / self.grid.cell_m,
             points[:, 2:] / self.point_scales[2:],
         ]
-        cells = torch.cat([radar_batch[:, None], self.grid.cell_of(points[:, :2])], dim=1)
-        sums = window_sums(bev, cells, torch.cat(values, dim=1))
+        sums = segment_sum(torch.cat(values, dim=1), rows[near], len(bev))
+        window = submanifold_map(bev.sites, 3)
+        for _ in range(PASSES):
+            sums = neighbour_sum(sums, window)
         counts, speed_sums, velocity_sums, position_sums, other_sums = sums.split([1, 1, 2, 2, 5], dim=1)
         shares = 1.0 / counts.clamp(min=1.0)  # a point weighs at least 1, in its own cell's window
         positions = position_sums * shares - self.grid.centre_of(bev.indices[:, 1:]) / self.grid.cell_m * (counts > 0)

@@ -23,6 +23,8 @@ from src.structures.sparse_bev import SparseBEV, SparseMap
 # x, y, z (m), rcs (dB), vx, vy (m/s), dt (s) divided by these (method 1.3)
 POINT_SCALES = (150.0, 150.0, 5.0, 20.0, 20.0, 20.0, 0.5)
 BACKBONE_NORM_EPS = 1e-3
+BAND_MARGIN_M = 1e-3
+"""The upper end of the height band is open."""
 SHARED_NORM = {"eps": 1e-5, "momentum": 0.1}  # the public code leaves torch's defaults here
 
 
@@ -183,6 +185,12 @@ class RadarEncoderConfig(VoxelEncoderConfig):
     key: ClassVar[str] = "model.radar_encoder"
 
     local_means: bool  # mean of the points around a cell, added to F_R
+    height_tolerance_deg: float  # points outside the height band by no more than this error of elevation are moved in
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.height_tolerance_deg < 90:
+            raise ConfigError(f"{self.key}.height_tolerance_deg={self.height_tolerance_deg}: must lie in [0, 90)")
 
 
 class RadarEncoder(VoxelEncoder):
@@ -190,6 +198,7 @@ class RadarEncoder(VoxelEncoder):
 
     def __init__(self, config: RadarEncoderConfig, grid: BEVGrid, channels: int) -> None:
         super().__init__(config, grid, channels, POINT_SCALES)
+        self.z_range_m, self.height_tolerance = grid.z_range_m, math.tan(math.radians(config.height_tolerance_deg))
         self.local_means = LocalMeans(self.point_scales, grid, channels) if config.local_means else None
 
     def forward(
@@ -199,8 +208,16 @@ class RadarEncoder(VoxelEncoder):
         batch_size: int,
     ) -> SparseBEV:
         """F_R, with the local means of the points where they are wanted."""
-        bev = super().forward(points, batch, batch_size)
+        bev = super().forward(self._into_band(points) if self.height_tolerance else points, batch, batch_size)
         return bev if self.local_means is None else self.local_means(bev, points, batch)
+
+    def _into_band(self, points: Tensor) -> Tensor:  # [P, 7] -> [P, 7]
+        """A radar's elevation is coarse: at 150 m two degrees are 5 m, and what stands on the road floats or sinks."""
+        low, high = self.z_range_m
+        z = points[:, 2]
+        inside = z.clamp(low, high - BAND_MARGIN_M)
+        near = (z - inside).abs() <= self.height_tolerance * points[:, :2].norm(dim=1)
+        return torch.cat([points[:, :2], torch.where(near, inside, z)[:, None], points[:, 3:]], dim=1)
 
 
 def _stage(in_channels: int | None, channels: int, blocks: int, ndim: int, norm: dict[str, float]) -> nn.Sequential:

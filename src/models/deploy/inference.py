@@ -18,7 +18,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from src.losses.normalizers import full_precision
 from src.models.detector import Detector
 from src.models.heads.branches import Branches
 from src.models.heads.center_head import CenterHead
@@ -96,7 +95,7 @@ class MergedBranches(nn.Module):
     ) -> Tensor:  # [n, sum of widths] float32
         """Outputs of all branches side by side."""
         parts = [x] if x.device.type != "cpu" else x.split(CPU_CHUNK)
-        return full_precision(torch.cat([self.outputs(self.hidden(part).relu_()) for part in parts]))
+        return torch.cat([self.outputs(self.hidden(part).relu_()) for part in parts])
 
 
 def _fold_norms(model: nn.Module) -> None:

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.losses.normalizers import full_precision
+from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.sparse import RowNorm
 from src.ops.checkpointed_mlp import checkpointed_mlp, projected_statistics
 
@@ -24,7 +25,7 @@ class Branches(nn.Module):
         super().__init__()
         self.hidden = nn.Linear(channels, len(widths) * channels, bias=False)
         self.norm = RowNorm(len(widths) * channels)
-        self.outputs = nn.ModuleList(nn.Linear(channels, width) for width in widths)
+        self.outputs = nn.ModuleList(FullPrecisionLinear(channels, width) for width in widths)
 
     def forward(
         self,
@@ -34,7 +35,7 @@ class Branches(nn.Module):
         if self.checkpointed:
             return checkpointed_branches([self], x)
         hidden = F.relu(self.norm(self.hidden(x)), inplace=True).chunk(len(self.outputs), dim=1)  # [n, C] each
-        return full_precision(torch.cat([output(h) for output, h in zip(self.outputs, hidden, strict=True)], dim=1))
+        return torch.cat([output(h) for output, h in zip(self.outputs, hidden, strict=True)], dim=1)
 
 
 def checkpointed_branches(
@@ -54,7 +55,7 @@ def checkpointed_branches(
         shift = torch.cat([part.norm.bias for part in parts]) - mean * scale
         outputs = [output for part in parts for output in part.outputs]
         out_weight, out_bias = torch.block_diag(*(out.weight for out in outputs)), torch.cat([o.bias for o in outputs])
-    return full_precision(checkpointed_mlp(x, (weight * scale[:, None]).t(), shift, out_weight.t(), out_bias))
+    return checkpointed_mlp(x, (weight * scale[:, None]).t(), shift, out_weight.t(), out_bias)
 
 
 def _norm_statistics(
@@ -63,7 +64,7 @@ def _norm_statistics(
     weight: Tensor,  # [H, C]
 ) -> tuple[Tensor, Tensor]:  # [H], [H]
     """Mean and variance that the norms divide by: the batch's in training, where the running ones learn from them."""
-    if not parts[0].training or len(x) < 2:
+    if not parts[0].norm.training or len(x) < 2:
         return torch.cat([p.norm.running_mean for p in parts]), torch.cat([p.norm.running_var for p in parts])
     mean, variance = projected_statistics(full_precision(x), weight)
     with torch.no_grad():

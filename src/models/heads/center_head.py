@@ -27,6 +27,7 @@ from src.models.heads.decode import (
     top_candidates,
 )
 from src.models.layers.dense import AllCells, DenseConvNormReLU
+from src.models.layers.doppler import Doppler
 from src.models.layers.sparse import ConvNormReLU, SubmanifoldConv
 from src.ops.nms import maxpool_peaks
 from src.structures.boxes import Boxes3D
@@ -92,6 +93,7 @@ class HeadOutput:
     bev: SparseBEV  # cells with the shared features that the regression branches read
     logits: Tensor  # [M, 12] float32, columns as taxonomy.CLASSES
     codes: Tensor | None  # [M, 7, CODE_SIZE (+ 11 attributes)] in training with `all`, else evaluated where needed
+    doppler: Doppler | None = None  # velocities take their radial part from it
 
 
 class CenterHead(nn.Module):
@@ -122,6 +124,7 @@ class CenterHead(nn.Module):
     def forward(
         self,
         bev: SparseBEV | Tensor,  # a tensor [B, C, rows, cols] where the head is dense
+        doppler: Doppler | None = None,
     ) -> HeadOutput:
         """Heat maps of all cells; box codes only where training needs them everywhere."""
         bev = self.shared(bev)
@@ -133,7 +136,7 @@ class CenterHead(nn.Module):
         codes = None
         if self.training and self.config.train_regression is TrainRegression.all:
             codes = torch.stack([checkpointed_branches([part], bev.features) for part in self.regressions], dim=1)
-        return HeadOutput(bev, logits, codes)
+        return HeadOutput(bev, logits, codes, doppler)
 
     def regress(
         self,
@@ -147,10 +150,10 @@ class CenterHead(nn.Module):
         statistics come from the chosen cells and an even sample of the others.
         """
         if output.codes is not None:
-            return output.codes[rows, groups]
+            return _measured(output, output.codes[rows, groups], rows)
         order = groups.argsort(stable=True)
         counts = torch.bincount(groups, minlength=len(HEAD_GROUPS)).tolist()
-        return self._regress_by_group(output, rows[order], counts)[order.argsort()]
+        return _measured(output, self._regress_by_group(output, rows[order], counts)[order.argsort()], rows)
 
     def _regress_by_group(
         self,
@@ -232,12 +235,25 @@ class CenterHead(nn.Module):
         else:
             groups = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts)).to(best.rows.device)
             codes = output.codes[best.rows, groups]
+        codes = _measured(output, codes, best.rows)
         boxes = boxes_from_codes(cells[best.rows, 1:], codes[:, :CODE_SIZE], best.labels, best.scores, self.grid)
         if self.learned:
             boxes.attributes = learned_attributes(codes[:, CODE_SIZE:], best.labels)
         else:
             boxes.attributes = rule_attributes(boxes)
         return suppress(boxes, best.counts, self.config.nms, self.config.max_boxes)
+
+
+def _measured(
+    output: HeadOutput,
+    codes: Tensor,  # [n, CODE_SIZE (+ 11)]
+    rows: Tensor,  # [n] int64, cells
+) -> Tensor:  # [n, CODE_SIZE (+ 11)]
+    """With what the radar measures of the velocities, the last numbers of a box code."""
+    if output.doppler is None:
+        return codes
+    before, velocities, after = codes.split([CODE_SIZE - 2, 2, codes.shape[1] - CODE_SIZE], dim=1)
+    return torch.cat([before, output.doppler.impose(velocities, output.bev.sites.linear()[rows]), after], dim=1)
 
 
 def _attribute_loss(logits: Tensor, targets: HeadTargets) -> Tensor:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from src.models.layers.full_precision import FullPrecisionConv2d
+
 # Probability 0.1 for every pixel at the start, so that the focal loss is not drowned by background.
 KEYPOINT_BIAS = -2.19
 CHANNELS_PER_NORM_GROUP = 4
@@ -33,13 +35,13 @@ class CameraKeypointHead(nn.Module):
             nn.Conv2d(in_channels, channels, 3, padding=1, bias=False), nn.GroupNorm(groups, channels), nn.ReLU()
         )
         self.keypoint = nn.Sequential(
-            nn.Conv2d(channels, channels // 2, 3, padding=1), nn.ReLU(), nn.Conv2d(channels // 2, 1, 1)
+            nn.Conv2d(channels, channels // 2, 3, padding=1), nn.ReLU(), FullPrecisionConv2d(channels // 2, 1, 1)
         )
         self.depth = nn.Sequential(
             nn.Conv2d(channels, channels, 3, padding=1, bias=False),
             nn.GroupNorm(groups, channels),
             nn.ReLU(),
-            nn.Conv2d(channels, num_depth_bins, 1),
+            FullPrecisionConv2d(channels, num_depth_bins, 1),
         )
         nn.init.constant_(self.keypoint[-1].bias, KEYPOINT_BIAS)
 

@@ -11,9 +11,10 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
-from src.models.backbones.doppler import VelocityStart
 from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
+from src.models.layers.doppler import Doppler
+from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.merging import block_diagonal, joined_convs
 from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv, TemporalConv
 from src.models.memory import motions, moving
@@ -38,7 +39,6 @@ class BEVPathConfig:
     num_frames: int  # remembered key frames
     memory_threshold: float  # tau_mem, occupancy from which a cell is remembered
     max_cells_per_frame: int  # guard: the most occupied cells of a frame
-    velocity_start: VelocityStart  # what the predicted velocity of a cell is added to
     velocity_compensation: bool  # move cells by their own velocity; off: by the ego motion alone (Table 6)
     spatial_dilation: bool  # literal strided convolutions, which spread every cell to its neighbours
 
@@ -72,8 +72,6 @@ class WarpedCells:
 
 class BEVPath(nn.Module):
     """Sparse memory of occupied BEV cells (method 6.1)."""
-
-    full_precision_parts = ("occupancy.1",)
 
     def __init__(self, config: BEVPathConfig, channels: int, grid: BEVGrid) -> None:
         super().__init__()
@@ -109,19 +107,17 @@ class BEVPath(nn.Module):
         self.occupancy = nn.ModuleList([occupancy, block_diagonal([first, second])])
         self.velocity = None
 
-    def predict(self, fused: SparseBEV, doppler: SparseBEV | None = None) -> CellPrediction:
-        """Occupancy and velocity of every cell of F_fuse; the velocity may start from what the radar measures there."""
+    def predict(self, fused: SparseBEV, doppler: Doppler | None = None) -> CellPrediction:
+        """Occupancy and velocity of every cell of F_fuse; with `doppler` the radial part is the measured one."""
         values: list[Tensor] = []
         for head in (self.occupancy, self.velocity):
             if head is not None:
-                hidden = head[0](fused).features
-                with torch.autocast(hidden.device.type, enabled=False):
-                    values.append(head[1](hidden.float()))
+                values.append(head[1](head[0](fused).features))
         if self.velocity is None:
             values = list(values[0].split([1, 2], dim=1))
         velocities = VELOCITY_UNIT_MPS * values[1]
-        if self.config.velocity_start is VelocityStart.doppler:
-            velocities = velocities + doppler.lookup(fused.indices)
+        if doppler is not None:
+            velocities = doppler.impose(velocities, fused.sites.linear())
         return CellPrediction(values[0].squeeze(1), velocities)
 
     @torch.no_grad()
@@ -207,4 +203,4 @@ def _cell_head(channels: int, outputs: int) -> nn.ModuleList:
     """Submanifold 3x3, norm, ReLU, then one linear layer per cell."""
     hidden = channels // 2
     conv = SubmanifoldConv(channels, hidden, 3, 2, bias=False)
-    return nn.ModuleList([ConvNormReLU(conv, **NORM), nn.Linear(hidden, outputs)])
+    return nn.ModuleList([ConvNormReLU(conv, **NORM), FullPrecisionLinear(hidden, outputs)])

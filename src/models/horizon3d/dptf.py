@@ -13,6 +13,7 @@ from src.models.horizon3d.bev_path import BEVPath, BEVPathConfig, CellPrediction
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.gaussian_path import GaussianPath, GaussianPathConfig, VelocityFrom
 from src.models.horizon3d.ocsf import OCSFOutput
+from src.models.layers.doppler import Doppler
 from src.ops.sites import rows_of_keys
 from src.structures.batch import FrameBatch
 from src.structures.evidence import WarpedPoints
@@ -91,7 +92,7 @@ class DPTF(nn.Module):
             warped = self.bev_path.recall(memory, batch, *limits)
         return WarpedMemory(memory, history, warped)
 
-    def aggregate(self, fused: SparseBEV, warped_memory: WarpedMemory, doppler: SparseBEV | None = None) -> DPTFOutput:
+    def aggregate(self, fused: SparseBEV, warped_memory: WarpedMemory, doppler: Doppler | None = None) -> DPTFOutput:
         """F_fuse and the remembered cells into F_out."""
         cells, bev = None, fused
         if self.bev_path is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -49,6 +50,20 @@ class MemoryFrame(RememberedFrame):
             gaussians = gaussians.map(lambda value: value[rows])
             gaussians = replace(gaussians, valid=gaussians.valid & keep[:, None])
         return replace(super().select(rows, keep), cells=cells, gaussians=gaussians)
+
+    def with_velocities(self, velocities: Callable[[int, Tensor, Tensor], Tensor]) -> MemoryFrame:
+        """Of cells and of Gaussians."""
+        cells, gaussians = self.cells, self.gaussians
+        streams = range(len(self.present))
+        if cells is not None:
+            parts = [
+                velocities(row, cells.xy[cells.rows == row], cells.velocities[cells.rows == row]) for row in streams
+            ]
+            cells = replace(cells, velocities=torch.cat(parts))  # their rows ascend
+        if gaussians is not None:
+            parts = [velocities(row, gaussians.means[row], gaussians.velocities[row]) for row in streams]
+            gaussians = replace(gaussians, velocities=torch.stack(parts))
+        return replace(self, cells=cells, gaussians=gaussians)
 
 
 @dataclass(frozen=True)

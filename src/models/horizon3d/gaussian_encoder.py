@@ -20,6 +20,8 @@ from src.models.horizon3d.cross_attention import (
 )
 from src.models.horizon3d.temporal_attention import TemporalSelfAttention
 from src.models.horizon3d.views import CameraViews
+from src.models.layers.doppler import Doppler
+from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.sparse import SubmanifoldConv
 from src.ops.segment_reduce import segment_mean
 from src.ops.sites import Sites
@@ -139,14 +141,13 @@ class Refinement(nn.Module):
     With `residual_velocity` the velocity is a step from the one before, too.
     """
 
-    full_precision_parts = ("output",)
     static_parts = ("",)
 
     def __init__(self, channels: int, grid: BEVGrid, bounds: GaussianBounds, residual_velocity: bool) -> None:
         super().__init__()
         self.bounds, self.residual_velocity = bounds, residual_velocity
         self.trunk = linear_relu_norm(channels, channels)
-        self.output = nn.Linear(channels, 2 + len(RAW_ATTRIBUTES))
+        self.output = FullPrecisionLinear(channels, 2 + len(RAW_ATTRIBUTES))
         self.output_scale = nn.Parameter(torch.ones(2 + len(RAW_ATTRIBUTES)))
         # Untrained, a Gaussian keeps the position and the attributes that KGGI gives it.
         nn.init.normal_(self.output.weight, std=REFINEMENT_STD)
@@ -163,13 +164,11 @@ class Refinement(nn.Module):
         gaussians: GaussianSet,
     ) -> GaussianSet:
         """Attributes are float32 also under autocast."""
-        trunk = self.trunk(x)
-        with torch.autocast(x.device.type, enabled=False):
-            raw = self.output(trunk.float()) * self.output_scale  # [B, G, 9]
-            shift = self.bounds.max_mean_shift_m * (2.0 * raw[..., :2].sigmoid() - 1.0)
-            means = torch.minimum(torch.maximum(gaussians.means + shift, self.lower_m), self.upper_m)
-            start = gaussians.velocities if self.residual_velocity else None
-            return replace(gaussians, means=means, **self.bounds.activate(raw[..., 2:], start))
+        raw = self.output(self.trunk(x)) * self.output_scale  # [B, G, 9]
+        shift = self.bounds.max_mean_shift_m * (2.0 * raw[..., :2].sigmoid() - 1.0)
+        means = torch.minimum(torch.maximum(gaussians.means + shift, self.lower_m), self.upper_m)
+        start = gaussians.velocities if self.residual_velocity else None
+        return replace(gaussians, means=means, **self.bounds.activate(raw[..., 2:], start))
 
 
 class EncoderLayer(nn.Module):
@@ -262,14 +261,28 @@ class GaussianEncoder(nn.Module):
         self.image_value = nn.Conv2d(image_channels, channels, 1)
         self.layers = nn.ModuleList(make_layer() for _ in range(num_layers))
 
-    def forward(self, gaussians: GaussianSet, radar_bev: SparseBEV, views: CameraViews) -> GaussianSet:
-        """G_0 -> G_L."""
+    def forward(
+        self, gaussians: GaussianSet, radar_bev: SparseBEV, views: CameraViews, doppler: Doppler | None = None
+    ) -> GaussianSet:
+        """G_0 -> G_L; with `doppler` the radial part of their velocities is always the measured one."""
         values = [
             self.image_value(level.flatten(0, 1)).unflatten(0, level.shape[:2]) for level in views.levels
         ]  # L x [B, N, C, h, w]
+        gaussians = _measured(gaussians, doppler)
         for layer in self.layers:
-            gaussians = layer(gaussians, self.anchor(gaussians), radar_bev, views, values)
+            gaussians = _measured(layer(gaussians, self.anchor(gaussians), radar_bev, views, values), doppler)
         return gaussians
+
+
+def _measured(gaussians: GaussianSet, doppler: Doppler | None) -> GaussianSet:
+    """With what the radar measures of their velocities."""
+    if doppler is None:
+        return gaussians
+    row, col = doppler.grid.cell_of(gaussians.means.detach()).unbind(-1)  # [B, G]
+    sample = torch.arange(len(row), device=row.device)[:, None]
+    cells = (sample * doppler.grid.rows + row) * doppler.grid.cols + col
+    velocities = doppler.impose(gaussians.velocities.flatten(0, 1), cells.flatten())
+    return replace(gaussians, velocities=velocities.unflatten(0, row.shape))
 
 
 def _feed_forward(channels: int) -> nn.Sequential:

@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
-from src.models.backbones.doppler import VelocityStart
 from src.models.heads.keypoint_head import KEYPOINT_BIAS, CameraKeypointHead, CameraMaps, keypoint_scores
 from src.models.horizon3d.gaussian_encoder import RAW_ATTRIBUTES, GaussianBounds
 from src.models.horizon3d.views import CameraViews
+from src.models.layers.full_precision import FullPrecisionLinear
 from src.ops.segment_reduce import topk_per_sample
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV
@@ -45,11 +45,12 @@ class KGGIConfig:
     depth_target: DepthTarget  # what supervises the depth head
     keypoint_nms_cells: int | None  # odd window of local maxima in the keypoint map; null = every pixel competes
     property_head: bool  # local features correct the learnable attributes
-    initial_velocity: VelocityStart  # what the learnable velocity is added to
+    source_embedding_std: float  # of the source embedding's random start
 
     def __post_init__(self) -> None:
         least = 0 if self.initialization is Initialization.random else 1
         own = {"num_radar_keypoints": least, "num_camera_keypoints": least, "num_depth_bins": 1}
+        own["source_embedding_std"] = 0
         require_least(self, "model.kggi", own)
         if self.num_random_keypoints < 0 or sum(self.counts.values()) < 1:
             raise ConfigError(
@@ -120,18 +121,21 @@ class KGGI(nn.Module):
         counts = config.counts
         self.slots = nn.ModuleDict({source.name.lower(): GaussianSlots(n, channels) for source, n in counts.items()})
         self.source_embedding = nn.Embedding(len(Source), channels)
+        nn.init.normal_(self.source_embedding.weight, std=config.source_embedding_std)
         if Source.RANDOM in counts:
             # In units of the half extent, so that one step of Adam is of the order of a metre.
             self.random_means = nn.Parameter(torch.empty(counts[Source.RANDOM], 2).uniform_(-1.0, 1.0))
         if config.uses_keypoints:
-            self.objectness = nn.Sequential(nn.Linear(channels, channels // 2), nn.ReLU(), nn.Linear(channels // 2, 1))
+            self.objectness = nn.Sequential(
+                nn.Linear(channels, channels // 2), nn.ReLU(), FullPrecisionLinear(channels // 2, 1)
+            )
             nn.init.constant_(self.objectness[-1].bias, KEYPOINT_BIAS)
             self.camera_head = CameraKeypointHead(image_channels, channels, config.num_depth_bins)
             centres = lid_centres(config.depth_range, config.num_depth_bins)
             self.register_buffer("depth_centres_m", centres, persistent=False)
         if config.uses_keypoints and config.property_head:
             self.property_heads = nn.ModuleDict(
-                {name: nn.Linear(channels, channels + len(RAW_ATTRIBUTES)) for name in ("radar", "camera")}
+                {name: FullPrecisionLinear(channels, channels + len(RAW_ATTRIBUTES)) for name in ("radar", "camera")}
             )
             for head in self.property_heads.values():
                 nn.init.zeros_(head.weight)
@@ -139,33 +143,19 @@ class KGGI(nn.Module):
         self.register_buffer("centre_m", torch.tensor(grid.centre_m), persistent=False)
         self.register_buffer("half_extent_m", torch.tensor(grid.half_extent_m), persistent=False)
 
-    @property
-    def full_precision_parts(self) -> tuple[str, ...]:
-        """Positions and velocities come from the property heads."""
-        return ("property_heads",) if hasattr(self, "property_heads") else ()
-
-    def forward(
-        self,
-        radar_bev: SparseBEV,
-        views: CameraViews,
-        history: GaussianSet | None = None,
-        doppler: SparseBEV | None = None,  # needed where velocities start from it
-    ) -> KGGIOutput:
+    def forward(self, radar_bev: SparseBEV, views: CameraViews, history: GaussianSet | None = None) -> KGGIOutput:
         """G_0: radar, camera, random, then history Gaussians with their own attributes and features (method 4.4)."""
         parts: list[GaussianSet] = []
         logits = camera = None
         if self.config.uses_keypoints:
-            logits = self.objectness(radar_bev.features).squeeze(-1).float()  # [M]
+            logits = self.objectness(radar_bev.features).squeeze(-1)  # [M]
             camera = self.camera_head(views.levels[0])
-            parts += [
-                self._radar_gaussians(logits.detach(), radar_bev, doppler),
-                self._camera_gaussians(camera, views, doppler),
-            ]
+            parts += [self._radar_gaussians(logits.detach(), radar_bev), self._camera_gaussians(camera, views)]
         if Source.RANDOM in self.config.counts:
             means = self.centre_m + self.half_extent_m * self.random_means.clamp(-INSIDE, INSIDE)
             means = means.expand(radar_bev.batch_size, -1, -1)
             valid = torch.ones(means.shape[:2], dtype=torch.bool, device=means.device)
-            parts.append(self._gaussians(Source.RANDOM, means, valid, None, doppler))
+            parts.append(self._gaussians(Source.RANDOM, means, valid, None))
         if history is not None:
             parts.append(replace(history, features=history.features + self.source_embedding.weight[Source.HISTORY]))
         return KGGIOutput(GaussianSet.concatenate(parts), logits, camera)
@@ -174,7 +164,6 @@ class KGGI(nn.Module):
         self,
         scores: Tensor,  # [M]
         radar_bev: SparseBEV,
-        doppler: SparseBEV | None,
     ) -> GaussianSet:
         rows = topk_per_sample(scores, radar_bev.indices[:, 0], radar_bev.batch_size, self.config.num_radar_keypoints)
         valid = rows >= 0
@@ -182,9 +171,9 @@ class KGGI(nn.Module):
         features = F.pad(radar_bev.features, (0, 0, 0, 1))
         picks = torch.where(valid, rows, len(radar_bev))  # [B, K]
         means = self.grid.centre_of(cells[picks][..., 1:])  # [B, K, 2]
-        return self._gaussians(Source.RADAR, means, valid, F.embedding(picks, features), doppler)
+        return self._gaussians(Source.RADAR, means, valid, F.embedding(picks, features))
 
-    def _camera_gaussians(self, camera: CameraMaps, views: CameraViews, doppler: SparseBEV | None) -> GaussianSet:
+    def _camera_gaussians(self, camera: CameraMaps, views: CameraViews) -> GaussianSet:
         with torch.no_grad():
             depth, confidence = most_likely_depth(camera.depth_logits, self.depth_centres_m)  # [B, N, h, w] each
             xy = views.lift(depth)[..., :2]
@@ -198,7 +187,7 @@ class KGGI(nn.Module):
             means = xy.flatten(1, 3).gather(1, picks[..., None].expand(-1, -1, 2))
         local = camera.features.movedim(2, -1).flatten(1, 3)  # [B, N*h*w, C]
         local = local.gather(1, picks[..., None].expand(-1, -1, local.shape[-1]))
-        return self._gaussians(Source.CAMERA, means, best > 0, local, doppler)
+        return self._gaussians(Source.CAMERA, means, best > 0, local)
 
     def _gaussians(
         self,
@@ -206,28 +195,21 @@ class KGGI(nn.Module):
         means: Tensor,  # [B, K, 2] m
         valid: Tensor,  # [B, K] bool
         local: Tensor | None,  # [B, K, C] features at the keypoints
-        doppler: SparseBEV | None = None,
     ) -> GaussianSet:
         """Slot attributes, corrected by the property head where there is one."""
         name = source.name.lower()
         features = self.slots[name].features + self.source_embedding.weight[source]  # [K, C]
         features, raw = features.expand(*valid.shape, -1), self.slots[name].attributes.expand(*valid.shape, -1)
         if local is not None and self.config.property_head:
-            with torch.autocast(local.device.type, enabled=False):  # attributes are float32 also under autocast
-                change = self.property_heads[name](local.float())
+            change = self.property_heads[name](local)
             features, raw = features + change[..., : features.shape[-1]], raw + change[..., features.shape[-1] :]
-        means, start = torch.where(valid[..., None], means.float(), self.centre_m), None
-        if self.config.initial_velocity is VelocityStart.doppler:
-            sample = torch.arange(len(means), device=means.device)[:, None, None].expand(*valid.shape, 1)
-            cells = torch.cat([sample, self.grid.cell_of(means.detach())], dim=-1)
-            start = doppler.lookup(cells.flatten(0, 1)).unflatten(0, valid.shape)
         return GaussianSet(
-            means=means,
+            means=torch.where(valid[..., None], means.float(), self.centre_m),
             features=features,
             sources=torch.full_like(valid, int(source), dtype=torch.int64),
             elapsed_s=torch.zeros_like(valid, dtype=torch.float32),
             valid=valid,
-            **self.bounds.activate(raw, start),
+            **self.bounds.activate(raw),
         )
 
 

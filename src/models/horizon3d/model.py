@@ -8,7 +8,6 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.backbones.doppler import doppler_map
 from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.detector import Detector, Objective
@@ -21,6 +20,7 @@ from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import OCSF
 from src.models.horizon3d.output import Horizon3DOutput
 from src.models.horizon3d.views import CameraViews
+from src.models.layers.doppler import Doppler
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
@@ -89,23 +89,30 @@ class Horizon3D(Detector):
             raise ValueError(f"the memory holds {memory.batch_size} streams, but the batch {len(batch)} frames")
         warped_memory = self.dptf.recall(memory, batch) if self.dptf is not None else None
         radar_bev = fused = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
-        doppler = views = kggi = ocsf = None
-        if self.config.uses_doppler:
-            doppler = doppler_map(radar_bev, self.grid, batch.radar_points, batch.radar_batch)
+        views = kggi = ocsf = None
+        doppler = self._measure_doppler(batch)
         if self.image_encoder is not None:
             views = self._encode_views(batch)
-            kggi = self.kggi(radar_bev, views, warped_memory.history if warped_memory is not None else None, doppler)
-            ocsf = self.ocsf(kggi.gaussians, radar_bev, views)
+            kggi = self.kggi(radar_bev, views, warped_memory.history if warped_memory is not None else None)
+            ocsf = self.ocsf(kggi.gaussians, radar_bev, views, doppler["gaussians"])
             fused = ocsf.fused_bev
         if self.dptf is None:
-            return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, None, self.head(fused)), None
-        dptf = self.dptf.aggregate(fused, warped_memory, doppler)
-        output = Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, dptf, self.head(dptf.bev))
+            return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, None, self.head(fused, doppler["boxes"])), None
+        dptf = self.dptf.aggregate(fused, warped_memory, doppler["cells"])
+        output = Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, dptf, self.head(dptf.bev, doppler["boxes"]))
         return output, self.dptf.remember(warped_memory.past, batch, fused, dptf, ocsf)
 
     def restore_memory(self, state: list[dict[str, Any]]) -> Memory:
         """The memory that `Memory.state` described."""
         return Memory.from_state(state)
+
+    def _measure_doppler(self, batch: FrameBatch) -> dict[str, Doppler | None]:
+        """For whom the configuration wants it."""
+        wanted = vars(self.config.doppler)
+        measured = None
+        if any(wanted.values()):
+            measured = Doppler.measure(batch.radar_points, batch.radar_batch, self.grid)
+        return {name: measured if its else None for name, its in wanted.items()}
 
     def _encode_views(self, batch: FrameBatch) -> CameraViews:
         if batch.images is None or batch.image_valid is None or batch.pix_from_aug is None:

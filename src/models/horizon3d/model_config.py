@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 from src.errors import ConfigError
-from src.models.backbones.doppler import VelocityStart
 from src.models.backbones.sparse_voxel import RadarEncoderConfig
 from src.models.detector import ModelConfig
 from src.models.heads.center_head import HeadConfig
@@ -16,6 +15,7 @@ from src.models.horizon3d.dptf import DPTFConfig
 from src.models.horizon3d.kggi import KGGIConfig
 from src.models.horizon3d.loss import Horizon3DLossConfig
 from src.models.horizon3d.ocsf import OCSFConfig
+from src.models.layers.doppler import DopplerConfig
 
 CHANNEL_MULTIPLE = 4 * NUM_HEADS
 """C splits into attention heads of at least 4 channels and into groups of 4 for the camera head's norm."""
@@ -32,6 +32,7 @@ class Horizon3DConfig(ModelConfig):
     kggi: KGGIConfig | None  # null together with ocsf: radar only
     ocsf: OCSFConfig | None
     dptf: DPTFConfig | None  # null: single frames, phase 1
+    doppler: DopplerConfig
     head: HeadConfig
     loss: Horizon3DLossConfig
 
@@ -64,19 +65,12 @@ class Horizon3DConfig(ModelConfig):
         return ("radar",) if self.ocsf is None else ("camera", "radar")
 
     @property
-    def uses_doppler(self) -> bool:
-        """Whether a velocity starts from what the radar measures."""
-        cells = self.dptf.bev_path if self.dptf is not None else None
-        starts = [self.kggi and self.kggi.initial_velocity, cells and cells.velocity_start]
-        return VelocityStart.doppler in starts
-
-    @property
     def keys_of_temporal_phase(self) -> tuple[str, ...]:
         """All of DPTF with its loss terms; velocities of Gaussians unless they are supervised before."""
         terms = [f"cell_{term}_weight" for term in ("focal", "dice", "lovasz", "velocity")]
         if not self.loss.gaussian_velocity_in_phase1:
             terms += ["dptf_weight", "gaussian_velocity_weight"]
-        return ("model.dptf", *(f"model.loss.{term}" for term in terms))
+        return ("model.dptf", "model.doppler.cells", *(f"model.loss.{term}" for term in terms))
 
     @property
     def temporal_heads(self) -> int | None:

@@ -14,6 +14,7 @@ from src.models.horizon3d.gaussian_encoder import FIXED_POINTS, EncoderLayer, Ga
 from src.models.horizon3d.sparse_fusion import SparseFusion
 from src.models.horizon3d.splatting import GaussianSplat, splat_set
 from src.models.horizon3d.views import CameraViews
+from src.models.layers.doppler import Doppler
 from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV
 
@@ -57,6 +58,7 @@ class OCSFConfig:
     cross_attention: CrossAttention
     refine_from: RefineFrom
     gate_kernel_size: int  # of psi: 1 or 3
+    identity_start: bool  # untrained, the fusion passes the radar map through
 
     def __post_init__(self) -> None:
         own = {"num_layers": 1, "num_learnable_points": 0, "max_occupied_cells": 1, "margin_m": 0}
@@ -124,12 +126,18 @@ class OCSF(nn.Module):
             temporal_heads=temporal_heads,
         )
         self.encoder = GaussianEncoder(channels, image_channels, grid, config.bounds, config.num_layers, layer)
-        self.fusion = SparseFusion(channels, config.gate_kernel_size)
+        self.fusion = SparseFusion(channels, config.gate_kernel_size, config.identity_start)
 
-    def forward(self, gaussians: GaussianSet, radar_bev: SparseBEV, views: CameraViews) -> OCSFOutput:
+    def forward(
+        self,
+        gaussians: GaussianSet,
+        radar_bev: SparseBEV,
+        views: CameraViews,
+        doppler: Doppler | None = None,  # velocities take their radial part from it
+    ) -> OCSFOutput:
         """G_0 to F_fuse."""
         config = self.config
-        gaussians = self.encoder(gaussians, radar_bev, views)
+        gaussians = self.encoder(gaussians, radar_bev, views, doppler)
         splat = splat_set(
             gaussians, self.grid, config.occupancy_threshold, config.max_occupied_cells, config.support_sigmas
         )

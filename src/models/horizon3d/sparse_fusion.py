@@ -15,7 +15,8 @@ class SparseFusion(nn.Module):
     """F_fuse = E([w_G F_G, w_R F_R]) with gates w = sigmoid(psi([F_G, F_R])) per branch and channel (Eq. 11-12).
 
     E is a residual block. Each branch is normalised first, since F_G is a sum whose scale follows how crowded a cell
-    is; a branch without a site in a cell counts as zero there.
+    is; a branch without a site in a cell counts as zero there. With `identity_start` an untrained F_fuse is the
+    positive part of the normalised F_R, and zero on cells that only Gaussians have.
     """
 
     norm_pairs = (("conv1", "norm1"), ("conv2", "norm2"))
@@ -23,7 +24,7 @@ class SparseFusion(nn.Module):
     """Compute both equations by `gated_fusion_conv`. The literal form multiplies zeros in half of the rows: some 5 % of
     a training step and of a frame on a CPU (mini scale)."""
 
-    def __init__(self, channels: int, gate_kernel_size: int) -> None:
+    def __init__(self, channels: int, gate_kernel_size: int, identity_start: bool = False) -> None:
         super().__init__()
         both = 2 * channels
         self.norm_gaussian, self.norm_radar = RowNorm(channels), RowNorm(channels)
@@ -34,6 +35,12 @@ class SparseFusion(nn.Module):
         self.conv2 = SubmanifoldConv(channels, channels, 3, 2, bias=False)
         self.norm2 = RowNorm(channels)
         self.shortcut = SubmanifoldConv(both, channels, 1, 2, bias=False)
+        if identity_start:
+            for part in (self.gate_gaussian, self.gate_radar):  # open by half
+                nn.init.zeros_(part.weight)
+                nn.init.zeros_(part.bias)
+            nn.init.zeros_(self.norm2.weight)
+            self.shortcut.weight.data[0] = torch.cat([torch.zeros(channels, channels), 2 * torch.eye(channels)])
 
     def forward(self, gaussian_bev: SparseBEV, radar_bev: SparseBEV) -> SparseBEV:
         """F_fuse on the cells of either map."""

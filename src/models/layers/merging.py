@@ -20,15 +20,17 @@ def joined_convs(convs: Sequence[SubmanifoldConv]) -> SubmanifoldConv:
 
 
 def block_diagonal(layers: Sequence[nn.Linear]) -> nn.Linear:
-    """One layer that maps the inputs of all, side by side, to the outputs of all."""
-    return joined_linear(torch.block_diag(*(x.weight for x in layers)), torch.cat([x.bias for x in layers]))
+    """One layer of their kind that maps the inputs of all, side by side, to the outputs of all."""
+    weight, bias = torch.block_diag(*(x.weight for x in layers)), torch.cat([x.bias for x in layers])
+    return joined_linear(weight, bias, type(layers[0]))
 
 
 def joined_linear(
     weight: Tensor,  # [out, in]
     bias: Tensor,  # [out]
+    kind: type[nn.Linear] = nn.Linear,
 ) -> nn.Linear:
     """A linear layer of these values, without gradient."""
-    layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
+    layer = kind(weight.shape[1], weight.shape[0], device="meta")
     layer.weight, layer.bias = (nn.Parameter(value, requires_grad=False) for value in (weight, bias))
     return layer

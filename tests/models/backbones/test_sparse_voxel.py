@@ -23,6 +23,7 @@ PILLARS = RadarEncoderConfig(
     norm_momentum=0.01,
     point_count_channel=True,
     local_means=False,
+    height_tolerance_deg=0.0,
 )
 VOXELS = replace(PILLARS, voxel_size_m=[0.2, 0.2, 1.0], stage_channels=[4, 6, 8, 8], conv_out=ConvOut.sparse)
 FULL = RadarEncoderConfig(
@@ -34,6 +35,7 @@ FULL = RadarEncoderConfig(
     norm_momentum=0.01,
     point_count_channel=False,
     local_means=False,
+    height_tolerance_deg=0.0,
 )
 both = pytest.mark.parametrize("config", [PILLARS, VOXELS], ids=["pillars", "voxels"])
 
@@ -58,6 +60,24 @@ def published_name(key: str) -> str:
     key = re.sub(r"^(conv_out|shared_conv)\.norm\.", r"\1.1.", key)
     key = re.sub(r"^stages\.(\d)\.", lambda m: f"conv{int(m[1]) + 1}.", key)
     return re.sub(r"^(conv\d)\.0\.conv\.", r"\1.0.0.", re.sub(r"^(conv\d)\.0\.norm\.", r"\1.0.1.", key))
+
+
+def test_points_just_outside_the_height_band_may_be_moved_in() -> None:
+    """Ten metres away two degrees are 0.35 m: of points above and below the band the nearer ones count, at its edge."""
+    points = radar_points(6)
+    points[:, :2] = torch.tensor([[8.0, 6.0]])
+    points[:, 2] = torch.tensor([5.0, 5.3, 5.4, -3.3, -3.4, 1.0])
+    encoder = encoder_of(replace(VOXELS, height_tolerance_deg=2.0))
+    moved = encoder._into_band(points)
+    assert moved[:, 2].tolist() == pytest.approx([4.999, 4.999, 5.4, -3.0, -3.4, 1.0])
+    assert torch.equal(moved[:, [0, 1, 3, 4, 5, 6]], points[:, [0, 1, 3, 4, 5, 6]])
+    batch = torch.zeros(6, dtype=torch.int64)
+    assert encoder.voxelise(moved, batch, 1).indices[:, 1].tolist() == [0, 4, 7]
+    assert encoder_of(VOXELS).voxelise(points, batch, 1).indices[:, 1].tolist() == [4]
+    assert not torch.equal(encoder(points, batch, 1).features, encoder_of(VOXELS)(points, batch, 1).features)
+    for wrong in (-1.0, 90.0):
+        with pytest.raises(ConfigError, match=f"model.radar_encoder.height_tolerance_deg={wrong}"):
+            replace(VOXELS, height_tolerance_deg=wrong)
 
 
 def test_agrees_with_the_recorded_backbone(golden: Callable) -> None:

@@ -3,7 +3,6 @@
 import torch
 
 from src.geometry.bev_grid import BEVGrid
-from src.models.backbones.doppler import VelocityStart
 from src.models.horizon3d.bev_path import BEVPath, BEVPathConfig
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV
@@ -19,7 +18,6 @@ def make_path(grid=GRID, channels=C, **changes):
         "num_frames": 8,
         "memory_threshold": 0.1,
         "max_cells_per_frame": 4096,
-        "velocity_start": VelocityStart.zero,
         "velocity_compensation": True,
         "spatial_dilation": False,
     }

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from src.geometry.bev_grid import BEVGrid
-from src.models.backbones.doppler import VelocityStart
 from src.models.backbones.image import ImageEncoderConfig, NeckName
 from src.models.backbones.sparse_voxel import ConvOut, RadarEncoderConfig
 from src.models.backbones.weights import BackboneName
@@ -19,6 +18,7 @@ from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom, VelocityUpdate
 from src.models.horizon3d.views import CameraViews
+from src.models.layers.doppler import DopplerConfig
 from src.structures.batch import FrameBatch
 from src.targets.depth import DepthTarget
 from tests.models.surroundings import DIAGONALS, camera_matrices, random_boxes
@@ -93,7 +93,7 @@ def backbone():
 def make_config():
     """Smallest configuration with every part on; keyword arguments replace values of kggi, ocsf and loss by name."""
 
-    def build(radar_only=False, dptf=None, **changes):
+    def build(radar_only=False, dptf=None, doppler=(), **changes):
         kggi = {
             "initialization": Initialization.both,
             "num_radar_keypoints": 24,
@@ -104,7 +104,7 @@ def make_config():
             "depth_target": DepthTarget.box,
             "keypoint_nms_cells": None,
             "property_head": True,
-            "initial_velocity": VelocityStart.zero,
+            "source_embedding_std": 1.0,
         }
         ocsf = {
             "num_layers": 2,
@@ -121,6 +121,7 @@ def make_config():
             "cross_attention": CrossAttention.parallel,
             "refine_from": RefineFrom.self_encoding,
             "gate_kernel_size": 1,
+            "identity_start": False,
         }
         loss = {
             "kggi_weight": 1.0,
@@ -156,10 +157,12 @@ def make_config():
                 norm_momentum=0.01,
                 point_count_channel=True,
                 local_means=True,
+                height_tolerance_deg=0.0,
             ),
             kggi=None if radar_only else KGGIConfig(**kggi),
             ocsf=None if radar_only else OCSFConfig(**ocsf),
             dptf=dptf,
+            doppler=DopplerConfig(**{name: name in doppler for name in ("gaussians", "cells", "boxes")}),
             head=head_config(),
             loss=Horizon3DLossConfig(**loss),
         )
@@ -173,7 +176,6 @@ def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, min_speed_mps=
         "num_frames": 3,
         "memory_threshold": 0.1,
         "max_cells_per_frame": 200,
-        "velocity_start": VelocityStart.zero,
         "velocity_compensation": True,
         "spatial_dilation": False,
     }

@@ -12,9 +12,9 @@ import torch.nn.functional as F
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import cells_in_boxes
-from src.models.backbones.doppler import VelocityStart
 from src.models.horizon3d.bev_path import CellPrediction
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
+from src.models.layers.doppler import Doppler
 from tests.models.horizon3d.cells import FULL, GRID, TINY, C, bev_of, make_path, random_cells
 from tests.models.moving import UTM, bare_frame, bda, pose
 
@@ -369,14 +369,14 @@ def test_heads_predict_metres_per_second_in_float32_and_take_gradients():
     assert cells.occupancy_logits.requires_grad and cells.velocities.requires_grad
 
 
-def test_a_cells_velocity_may_start_from_what_the_radar_measures_there():
-    """Doppler of 20 m/s in the first cell; the radar map has no site at the second."""
-    fused, _ = bev_of(torch.tensor([[0, 2, 2], [0, 3, 4]]), TINY)
-    doppler, _ = bev_of(torch.tensor([[0, 1, 1], [0, 2, 2]]), TINY)
-    doppler = doppler.with_features(torch.tensor([[9.0, 9.0], [20.0, -1.0]]))
-    plain, started = make_path(TINY).eval(), make_path(TINY, velocity_start=VelocityStart.doppler).eval()
-    change = started.predict(fused, doppler).velocities - plain.predict(fused).velocities
-    torch.testing.assert_close(change, torch.tensor([[20.0, -1.0], [0.0, 0.0]]))
+def test_a_cells_velocity_takes_its_radial_part_from_the_radar():
+    """A point of 5 m/s along x near the first cell; what the head says across it stays."""
+    fused, _ = bev_of(torch.tensor([[0, 2, 2], [0, 90, 4]]), GRID)
+    point = torch.cat([GRID.centre_of(torch.tensor([[2, 2]])), torch.tensor([[1.0, 0.0, 5.0, 0.0, 0.1]])], dim=1)
+    doppler, path = Doppler.measure(point, torch.tensor([0]), GRID), make_path().eval()
+    plain, found = path.predict(fused).velocities, path.predict(fused, doppler).velocities
+    torch.testing.assert_close(found[0], torch.tensor([5.0, float(plain[0, 1].detach())]))
+    assert torch.equal(found[1], plain[1])
 
 
 def test_a_path_without_frames_or_with_an_impossible_threshold_is_refused():

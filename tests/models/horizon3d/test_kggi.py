@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from src.errors import ConfigError
-from src.models.backbones.doppler import VelocityStart
 from src.models.heads.keypoint_head import CameraMaps, keypoint_scores
 from src.models.horizon3d.gaussian_encoder import GaussianBounds
 from src.models.horizon3d.kggi import KGGI, Initialization, most_likely_depth
@@ -71,22 +70,6 @@ def test_a_keypoint_at_the_pixel_of_a_known_point_becomes_a_gaussian_at_its_plac
     # Best keypoint first; half a stride-8 pixel and half a depth bin of tolerance.
     torch.testing.assert_close(camera[:3], points[:, :2], atol=2.2, rtol=0)
     assert out.valid[0, out.sources[0] == Source.CAMERA].all()
-
-
-def test_velocities_start_from_what_the_radar_measures_at_their_cell(make_config, grid, make_views):
-    """Slots and property heads of a fresh model add nothing; a cell without radar, and padding, start at zero."""
-    radar = make_radar(grid)
-    doppler = radar.with_features(torch.tensor([[30.0, -3.0], [0.5, 0.0], [-22.0, 4.0]]))
-    kggi = make_kggi(make_config, grid, initial_velocity=VelocityStart.doppler)
-    kggi.camera_head = FixedHead(flat_maps())
-    with torch.no_grad():
-        kggi.random_means[0] = (grid.centre_of(torch.tensor([20, 30])) - kggi.centre_m) / kggi.half_extent_m
-    out = kggi(radar, make_views(), None, doppler).gaussians
-    for source, expected in ((Source.RADAR, [[30.0, -3.0], [0.5, 0.0], [-22.0, 4.0]]), (Source.RANDOM, [[0.5, 0.0]])):
-        rows = (out.sources[0] == source) & out.velocities[0].any(1)
-        found = torch.tensor(sorted(out.velocities[0, rows].tolist()))
-        torch.testing.assert_close(found, torch.tensor(sorted(expected)))
-    assert not out.velocities[~out.valid].any()
 
 
 def test_exact_place_when_point_lies_on_pixel_and_bin_centre(make_config, grid, make_views):

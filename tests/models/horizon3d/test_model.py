@@ -10,13 +10,13 @@ from omegaconf import OmegaConf
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models import FAMILIES, build_model
-from src.models.backbones.doppler import VelocityStart, doppler_map
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.heads.center_head import BoxOptions
 from src.models.horizon3d.kggi import Initialization
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
-from src.models.horizon3d.ocsf import CrossAttention, RefineFrom, VelocityUpdate
+from src.models.horizon3d.ocsf import CrossAttention, RefineFrom
+from src.models.layers.doppler import Doppler
 from src.structures.boxes import Boxes3D
 from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
 
@@ -162,20 +162,25 @@ def test_gaussian_velocity_is_supervised_in_phase_1_where_asked_for(make_model, 
     assert float(train_step(model, batch)[1]["gaussian_velocity"].detach()) == 0.0
 
 
-def test_an_untrained_model_knows_the_radial_velocities(make_model, make_batch):
-    """They start from the Doppler of their cell and are changed by steps, which an untrained layer hardly makes."""
-    start = {"initial_velocity": VelocityStart.doppler, "velocity_update": VelocityUpdate.residual}
-    model, batch = make_model(**start).eval(), make_batch()
+def test_velocities_are_those_that_the_radar_measures_along_the_line_of_sight(make_model, make_batch):
+    """Of Gaussians and boxes of an untrained model, which says that all stands: wherever something is seen to stand."""
+    model, batch = make_model(doppler=("gaussians", "boxes")), make_batch(boxes=(12, 12))
+    batch.radar_points[:, 4:6] *= 0.2
     with torch.no_grad():
-        output, _ = model(batch)
-    measured = doppler_map(output.radar_bev, model.grid, batch.radar_points, batch.radar_batch)
-    first, last = output.kggi.gaussians, output.ocsf.gaussians
-    sample, gaussian = first.valid.nonzero().unbind(1)
-    cells = model.grid.cell_of(first.means[sample, gaussian])
-    wanted = measured.lookup(torch.cat([sample[:, None], cells], dim=1))
-    assert wanted.abs().max() > 5
-    torch.testing.assert_close(last.velocities[sample, gaussian], wanted, atol=0.5, rtol=0)
-    assert parameters_that_stay(make_model(**start, velocity_unit_mps=10.0), make_batch(boxes=(12, 12)), lr=1e-2) == []
+        output, _ = model.eval()(batch)
+        every = torch.arange(len(output.head.bev))
+        codes = model.head.regress(output.head, every, 0 * every)
+    doppler = Doppler.measure(batch.radar_points, batch.radar_batch, model.grid)
+    gaussians = output.ocsf.gaussians
+    sample, _ = gaussians.valid.nonzero().unbind(1)
+    row, col = model.grid.cell_of(gaussians.means[gaussians.valid]).unbind(1)
+    for cells, velocities in (
+        ((sample * model.grid.rows + row) * model.grid.cols + col, gaussians.velocities[gaussians.valid]),
+        (output.head.bev.sites.linear(), codes[:, 8:]),
+    ):
+        torch.testing.assert_close(doppler.impose(velocities, cells), velocities, atol=1e-4, rtol=0)
+        assert (doppler.impose(0 * velocities, cells).norm(dim=1) > 0.3).sum() > 10
+    assert parameters_that_stay(make_model(doppler=("gaussians", "boxes")), batch, lr=1e-2) == []
 
 
 @pytest.mark.slow
@@ -225,6 +230,9 @@ def test_autocast_keeps_attributes_and_losses_in_float32(make_model, make_batch)
     for name in ("means", "scales", "directions", "opacity_logits", "velocities"):
         assert getattr(gaussians, name).dtype == torch.float32, name
     assert output.ocsf.splat.cells.log_free.dtype == torch.float32
+    camera = output.kggi.camera
+    for value in (output.kggi.objectness_logits, camera.keypoint_logits, camera.depth_logits, output.head.logits):
+        assert (value != value.bfloat16()).float().mean() > 0.8  # what is ranked, or read in metres, is not rounded
     assert all(value.dtype == torch.float32 and value.isfinite() for value in terms.values())
     assert gradients_are_finite(model)
 

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from src.errors import ConfigError
-from src.models.backbones.doppler import VelocityStart
 from src.models.horizon3d.gaussian_path import Sampling, SelfAttentionConfig
 from src.structures.gaussians import GaussianSet, Source
 from tests.models.moving import pose
@@ -23,7 +22,6 @@ TOGGLES = {  # Tables 5, 6, 7 and 13
     "Gaussian not compensated": GAUSSIAN_ONLY | {"velocity_compensation": False},
     "random": GAUSSIAN_ONLY | {"sampling": Sampling.random},
     "top opacity": GAUSSIAN_ONLY | {"sampling": Sampling.top_opacity},
-    "cells and radar": {"velocity_start": VelocityStart.doppler},
     "no self-attention": {"self_attention": None},
     "one head": {"self_attention": SelfAttentionConfig(num_heads=1)},
 }
@@ -174,7 +172,7 @@ def test_every_row_of_the_tables_trains(make_model, make_batch, make_dptf, name)
 
 
 def test_radar_only_with_the_bev_path(make_model, make_batch, make_dptf):
-    model = make_model(radar_only=True, dptf=make_dptf(gaussian_path=False, velocity_start=VelocityStart.doppler))
+    model = make_model(radar_only=True, dptf=make_dptf(gaussian_path=False), doppler=("cells", "boxes"))
     batches = [at(make_batch(seed=i, images=False), 10.0 + 0.5 * i, 5.0 * i) for i in range(2)]
     output, terms, memory = two_steps(model, *batches)
     assert set(terms) == {"heatmap", "box", "total"} | CELL_TERMS

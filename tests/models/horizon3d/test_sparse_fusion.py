@@ -47,6 +47,25 @@ def test_union_of_cells_and_samples_apart(kernel):
     assert torch.equal(fusion(gaussian, radar).features[:2], out.features[:2])
 
 
+@pytest.mark.parametrize("kernel", [1, 3])
+def test_an_identity_start_passes_the_radar_map_through(kernel):
+    """Batch norm of an untrained layer in eval mode divides by sqrt(1 + eps)."""
+    fusion = SparseFusion(8, kernel, identity_start=True).eval()
+    gaussian, radar = make_map([[0, 3, 3], [0, 3, 4]]), make_map([[0, 3, 4], [1, 5, 5]])
+    out = fusion(gaussian, radar)
+    assert not out.lookup(torch.tensor([[0, 3, 3]])).any()
+    torch.testing.assert_close(out.lookup(radar.indices), radar.features.relu() / (1 + 1e-5) ** 0.5)
+    fusion.train()
+    stay = {name for name, _ in fusion.named_parameters()}
+    optimizer = torch.optim.SGD(fusion.parameters(), lr=0.1)
+    for _ in range(2):  # what lies behind a zero takes a step longer
+        optimizer.zero_grad()
+        fusion(gaussian, radar).features.square().sum().backward()
+        stay -= {name for name, value in fusion.named_parameters() if value.grad.any()}
+        optimizer.step()
+    assert stay == set()
+
+
 @pytest.mark.parametrize("cells", [([], [[0, 1, 1]]), ([[0, 1, 1]], []), ([], [])])
 def test_empty_branches(cells):
     fusion = SparseFusion(8, 1).train()
