@@ -8,8 +8,8 @@ from torch import Tensor
 from src.ops.backend import implementation
 from src.ops.kernel_maps import KernelMap
 from src.ops.segment_reduce import gather_segment_sum
+from src.ops.sparse_conv_cpu import cpu_sparse_conv
 from src.ops.sparse_conv_grouped import GROUPED_DTYPES, grouped_sparse_conv
-from src.ops.sparse_conv_tiled import tiled_sparse_conv
 
 
 def sparse_conv(
@@ -52,7 +52,7 @@ def sparse_conv_reference(
     if kernel_map.identity:
         return features @ weight[0] if bias is None else torch.addmm(bias, features, weight[0])
     if features.device.type == "cpu":
-        return tiled_sparse_conv(features, weight, kernel_map, bias)
+        return cpu_sparse_conv(features, weight, kernel_map, bias)
     if features.dtype in GROUPED_DTYPES:
         return grouped_sparse_conv(features, weight, kernel_map, bias)
     return plain_sparse_conv(features, weight, kernel_map, bias)

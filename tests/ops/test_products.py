@@ -1,0 +1,51 @@
+"""Which type a product takes, and that float32 stays float32 whichever library multiplies."""
+
+import pytest
+import torch
+
+from src.ops import products
+from src.ops.products import bfloat16_products, multiplies_bfloat16, multiply, product_type, row_steps
+
+
+@pytest.fixture(params=[False, True], ids=["torch", "oneDNN"])
+def library(request, monkeypatch):
+    if request.param and not torch.backends.mkldnn.is_available():
+        pytest.skip("this torch has no oneDNN")
+    monkeypatch.setattr(products, "prefers_onednn", lambda: request.param)
+
+
+@pytest.mark.parametrize("shape", [(256, 64, 64), (300, 7, 5), (64, 512, 96), (1, 1, 1)])
+def test_float32_has_all_its_digits(shape, library):
+    torch.manual_seed(0)
+    n, k, m = shape
+    a, b = torch.rand(n, k), torch.rand(k, m)  # no cancellation: errors are relative to the result
+    for left, right in ((a, b), (torch.rand(k, n).t(), b), (a, torch.rand(m, k).t())):
+        expected = left.double() @ right.double()
+        torch.testing.assert_close(multiply(left, right).double(), expected, rtol=1e-5, atol=0)
+
+
+def test_other_types_are_multiplied_as_they_are(library):
+    a, b = torch.randn(256, 64), torch.randn(64, 64)
+    for dtype in (torch.float64, torch.bfloat16):
+        assert torch.equal(multiply(a.to(dtype), b.to(dtype)), a.to(dtype) @ b.to(dtype))
+
+
+def test_large_products_of_float32_take_bfloat16_in_its_context(monkeypatch):
+    monkeypatch.setattr(products, "multiplies_bfloat16", lambda: True)
+    large, short, narrow = torch.zeros(4096, 64), torch.zeros(128, 64), torch.zeros(4096, 16)
+    assert product_type(large, 64) == torch.float32
+    with bfloat16_products():
+        assert [product_type(x, 64) for x in (large, short, narrow)] == [torch.bfloat16, torch.float32, torch.float32]
+        assert product_type(large, 32) == torch.bfloat16 and product_type(large, 8) == torch.float32
+        assert product_type(large.double(), 64) == torch.float64
+        with bfloat16_products(False):
+            assert product_type(large, 64) == torch.float32
+    assert product_type(large, 64) == torch.float32
+    monkeypatch.setattr(products, "multiplies_bfloat16", lambda: False)
+    with bfloat16_products():
+        assert product_type(large, 64) == torch.float32
+
+
+def test_the_processor_is_asked():
+    assert isinstance(multiplies_bfloat16(), bool) and isinstance(products.prefers_onednn(), bool)
+    assert [row_steps(rows) for rows in (0, 1, 256, 257)] == [0, 256, 256, 512]
