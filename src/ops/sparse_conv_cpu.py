@@ -98,7 +98,7 @@ def _convolve(
                 out.index_add_(0, into, product[: len(into)].to(full))
             if grad is not None:
                 if part.rows is None:
-                    partners = others[span]
+                    partners = others[span][: len(gathered)]  # padding may be a step longer
                 else:
                     partners = _gather("partners", others, _filled(into, len(gathered), num))
                 products = multiply(partners.t(), gathered).view(c_out, -1, c_in)  # [Cb, T, Ca]
