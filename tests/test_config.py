@@ -126,7 +126,7 @@ FULL_SIZE = {
     "model.ocsf": {
         "num_layers": 2, "num_learnable_points": 6, "margin_m": 4.8, "occupancy_threshold": 0.1,
         "max_occupied_cells": 32768, "scale_range_m": [0.2, 3.2], "max_mean_shift_m": 4.0, "max_speed_mps": 60.0,
-        "velocity_unit_mps": 1.0, "velocity_update": "anew", "support_sigmas": 3.0, "cross_attention": "parallel",
+        "velocity_unit_mps": 1.0, "support_sigmas": 3.0, "cross_attention": "parallel",
         "refine_from": "self_encoding", "gate_kernel_size": 1,
         "identity_start": False,
     },

@@ -38,8 +38,6 @@ INITIAL_OPACITY = 0.25
 RAW_ATTRIBUTES = (0.0, 0.0, 1.0, 0.0, math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY)), 0.0, 0.0)
 """Raw scale 2, rotation 2, opacity 1, velocity 2 of an untrained Gaussian (method 4.4)."""
 REFINEMENT_STD = 0.01
-LARGEST_SHARE = 0.999
-"""Of the largest speed that a velocity can start from, so that its inverse hyperbolic tangent is finite."""
 
 
 @dataclass(frozen=True)
@@ -54,19 +52,15 @@ class GaussianBounds:
     def activate(
         self,
         raw: Tensor,  # [..., 7] scale 2, rotation 2, opacity 1, velocity 2
-        start_mps: Tensor | None = None,  # [..., 2] velocity that the raw one is added to; None: zero
     ) -> dict[str, Tensor]:
         """Physical attributes by their GaussianSet name, float32; opacity stays a logit."""
         scale, rotation, opacity, velocity = raw.float().split([2, 2, 1, 2], dim=-1)
         low, high = self.scale_range_m
-        velocity = velocity * (self.velocity_unit_mps / self.max_speed_mps)
-        if start_mps is not None:
-            velocity = velocity + torch.atanh((start_mps / self.max_speed_mps).clamp(-LARGEST_SHARE, LARGEST_SHARE))
         return {
             "scales": low + (high - low) * scale.sigmoid(),
             "directions": F.normalize(rotation, dim=-1, eps=1e-6),
             "opacity_logits": opacity.squeeze(-1),
-            "velocities": self.max_speed_mps * torch.tanh(velocity),
+            "velocities": self.max_speed_mps * torch.tanh(velocity * (self.velocity_unit_mps / self.max_speed_mps)),
         }
 
 
@@ -136,16 +130,13 @@ class SelfEncoding(nn.Module):
 
 
 class Refinement(nn.Module):
-    """New attributes from features (Eq. 3): the mean moves by a bounded step, everything else is regressed anew.
-
-    With `residual_velocity` the velocity is a step from the one before, too.
-    """
+    """New attributes from features (Eq. 3): the mean moves by a bounded step, everything else is regressed anew."""
 
     static_parts = ("",)
 
-    def __init__(self, channels: int, grid: BEVGrid, bounds: GaussianBounds, residual_velocity: bool) -> None:
+    def __init__(self, channels: int, grid: BEVGrid, bounds: GaussianBounds) -> None:
         super().__init__()
-        self.bounds, self.residual_velocity = bounds, residual_velocity
+        self.bounds = bounds
         self.trunk = linear_relu_norm(channels, channels)
         self.output = FullPrecisionLinear(channels, 2 + len(RAW_ATTRIBUTES))
         self.output_scale = nn.Parameter(torch.ones(2 + len(RAW_ATTRIBUTES)))
@@ -167,8 +158,7 @@ class Refinement(nn.Module):
         raw = self.output(self.trunk(x)) * self.output_scale  # [B, G, 9]
         shift = self.bounds.max_mean_shift_m * (2.0 * raw[..., :2].sigmoid() - 1.0)
         means = torch.minimum(torch.maximum(gaussians.means + shift, self.lower_m), self.upper_m)
-        start = gaussians.velocities if self.residual_velocity else None
-        return replace(gaussians, means=means, **self.bounds.activate(raw[..., 2:], start))
+        return replace(gaussians, means=means, **self.bounds.activate(raw[..., 2:]))
 
 
 class EncoderLayer(nn.Module):
@@ -186,7 +176,6 @@ class EncoderLayer(nn.Module):
         bounds: GaussianBounds,
         chained_attention: bool,
         refine_before_self_encoding: bool,
-        residual_velocity: bool,
         temporal_heads: int | None,
     ) -> None:
         super().__init__()
@@ -201,7 +190,7 @@ class EncoderLayer(nn.Module):
         self.self_encoding = SelfEncoding(channels, grid)
         self.feed_forward = nn.ModuleList(_feed_forward(channels) for _ in range(2))
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(4))
-        self.refinement = Refinement(channels, grid, bounds, residual_velocity)
+        self.refinement = Refinement(channels, grid, bounds)
 
     def sampling_points(
         self,

@@ -33,13 +33,6 @@ class RefineFrom(Enum):
     cross_attention = "cross_attention"
 
 
-class VelocityUpdate(Enum):
-    """How a layer changes a Gaussian's velocity: regressed anew as Eq. 3 has it, or a step from the one before."""
-
-    anew = "anew"
-    residual = "residual"
-
-
 @dataclass(kw_only=True)
 class OCSFConfig:
     """Settings of OCSF (`model.ocsf`). Raises ConfigError for values that cannot work."""
@@ -53,7 +46,6 @@ class OCSFConfig:
     max_mean_shift_m: float  # bound of one refinement step per axis
     max_speed_mps: float  # bound of a Gaussian's velocity per axis
     velocity_unit_mps: float  # in which the network states it
-    velocity_update: VelocityUpdate
     support_sigmas: float  # a Gaussian ends at this many standard deviations
     cross_attention: CrossAttention
     refine_from: RefineFrom
@@ -122,7 +114,6 @@ class OCSF(nn.Module):
             config.bounds,
             chained_attention=config.cross_attention is CrossAttention.chained,
             refine_before_self_encoding=config.refine_from is RefineFrom.cross_attention,
-            residual_velocity=config.velocity_update is VelocityUpdate.residual,
             temporal_heads=temporal_heads,
         )
         self.encoder = GaussianEncoder(channels, image_channels, grid, config.bounds, config.num_layers, layer)

@@ -16,7 +16,7 @@ from src.models.horizon3d.kggi import Initialization, KGGIConfig
 from src.models.horizon3d.loss import Horizon3DLossConfig, VelocityGroups
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
-from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom, VelocityUpdate
+from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom
 from src.models.horizon3d.views import CameraViews
 from src.models.layers.doppler import DopplerConfig
 from src.structures.batch import FrameBatch
@@ -116,7 +116,6 @@ def make_config():
             "max_mean_shift_m": 4.0,
             "max_speed_mps": 60.0,
             "velocity_unit_mps": 1.0,
-            "velocity_update": VelocityUpdate.anew,
             "support_sigmas": 3.0,
             "cross_attention": CrossAttention.parallel,
             "refine_from": RefineFrom.self_encoding,
