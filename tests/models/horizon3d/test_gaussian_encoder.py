@@ -50,7 +50,7 @@ def make_radar(grid, count=300, b=1, seed=1):
 
 def make_encoder(grid, layers=2, chained=False, early=False, learnable=3):
     torch.manual_seed(3)
-    layer = partial(EncoderLayer, C, learnable, 4, 3, grid, BOUNDS, chained, early, False, None)
+    layer = partial(EncoderLayer, C, learnable, 4, 3, grid, BOUNDS, chained, early, None)
     return GaussianEncoder(C, 16, grid, BOUNDS, layers, layer).eval()
 
 
@@ -61,7 +61,7 @@ def places(count, b=1, seed=5):
 
 def test_sampling_points_follow_scale_and_rotation(grid):
     torch.manual_seed(0)
-    layer = EncoderLayer(C, 0, 4, 3, grid, BOUNDS, False, False, False, None)
+    layer = EncoderLayer(C, 0, 4, 3, grid, BOUNDS, False, False, None)
     angle = math.radians(30.0)
     gaussians = replace(
         make_gaussians(torch.tensor([[[3.0, 4.0]]])),
@@ -76,7 +76,7 @@ def test_sampling_points_follow_scale_and_rotation(grid):
 
 
 def test_learnable_points_stay_within_three_sigma(grid):
-    layer = EncoderLayer(C, 6, 4, 3, grid, BOUNDS, False, False, False, None)
+    layer = EncoderLayer(C, 6, 4, 3, grid, BOUNDS, False, False, None)
     gaussians = make_gaussians(places(20))
     points = layer.sampling_points(1e3 * torch.randn(1, 20, C), gaussians)
     offset = points - gaussians.means[:, :, None]
