@@ -13,7 +13,7 @@ from src.world.world_config import WorldConfig
 
 Array = np.ndarray
 
-SMALL_RANGE_M = 110.0
+SMALL_RANGE_M = 130.0
 """People label small things only as far as they can tell what they are."""
 LIDAR_PATCH_RAD2 = np.radians(0.2) * np.radians(0.25)
 """Solid angle of a beam; gives the medians of the real boxes by class and distance."""

@@ -86,7 +86,7 @@ def bystanders(config: WorldConfig, road: Road, reach_m: float, rng: np.random.G
 def _roadworks(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
     """Cones along a shoulder, barriers, workers and a machine; on either side of the motorway."""
     rng = make.rng
-    side = -1 if rng.random() < 0.85 else 1
+    side = -1 if rng.random() < 0.92 else 1
     start = rng.uniform(15, max(20.0, reach_m - 60))
     for i in range(make.count(3)):
         yield Bystander(
@@ -108,8 +108,9 @@ def _roadworks(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
         yield Bystander(
             make.actor("excavator", parked=True), begin + 30, side * (road.edge_m + 5.5), turn=rng.normal(0, 0.3)
         )
-        if rng.random() < 0.5:  # the site's hut stands before it
-            yield Bystander(make.actor("container", parked=True), begin + 22, side * (road.edge_m + 4.2))
+        for along, chance in ((21, 0.9), (39, 0.6)):  # the site's huts hide it from either side
+            if rng.random() < chance:
+                yield Bystander(make.actor("container", parked=True), begin + along, side * (road.edge_m + 4.2))
     for _ in range(make.count(1.1)):
         yield Bystander(
             make.actor("police_officer" if rng.random() < 0.15 else "worker"),
@@ -182,6 +183,8 @@ def _apron(make: _Maker, road: Road) -> Iterator[Bystander]:
             actor = make.actor(names[k], parked=True)
             d = far + 0.5 * actor.size[0] + rng.uniform(2.0, 8.0)
             yield Bystander(actor, slot, d, turn=float(rng.choice([-1, 1])) * np.pi / 2 + rng.normal(0, 0.04))
+    if make.count(0.5):  # one that waits for its tractor beside the motorway
+        yield Bystander(make.actor("semi_trailer", parked=True), rng.uniform(first + 8, last - 8), near - 2.0)
     for name, mean in (("adult", 0.6), ("motorcycle", 0.3), ("bicycle", 0.4), ("child", 0.2)):
         for _ in range(make.count(mean)):
             walks = name in ("adult", "child") and rng.random() < 0.6
@@ -222,7 +225,7 @@ def _signs(make: _Maker, road: Road, reach_m: float) -> Iterator[Bystander]:
         turn = np.pi if direction > 0 else 0.0
         s = rng.uniform(-180, -100)
         while s < reach_m + 230:
-            name = "guide_sign" if rng.random() < 0.2 else "sign"
+            name = "guide_sign" if rng.random() < 0.15 else "sign"
             beside = name == "sign" and rng.random() < 0.2  # on the median
             across = -direction * (0.3 if beside else road.rail_m + rng.uniform(1.0, 2.5))
             yield Bystander(make.actor(name), s, across, turn=turn + rng.normal(0, 0.05))

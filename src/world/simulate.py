@@ -99,7 +99,7 @@ def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.
         if rng.random() < 0.6:
             _add(fleet, Vehicle("lorry", 1, slow, side * rng.uniform(32, 65), ego_mps, may_change=False))
     if rng.random() < 0.12:  # one that takes its time to overtake the ego truck
-        place, wanted = rng.uniform(4, 28), ego_mps + rng.uniform(0.5, 2.0)
+        place, wanted = rng.uniform(-26, 2), ego_mps + rng.uniform(0.5, 2.0)
         _add(fleet, Vehicle("tractor_unit", 1, slow - 1, place, wanted, has_trailer=True, may_change=False))
     for kind, lane, faster, place in company:
         chosen = "bendy_bus" if kind == "bus" and rng.random() < 0.3 else kind
@@ -110,7 +110,7 @@ def _draw_fleet(config: WorldConfig, road: Road, ego_mps: float, rng: np.random.
             busy = config.vehicles_per_lane_km * (0.8 if lane == 0 else 1.1)
             place = low + rng.uniform(0, 40)
             while busy > 0 and place < high:
-                rear_seen = direction > 0 and place > -200
+                rear_seen = direction > 0 and place > 0
                 kind, wanted = _draw_vehicle(road, lane, rear_seen, rng)
                 has_trailer = rear_seen and rng.random() < TRAILER_CHANCE.get(kind, 0.0)
                 _add(fleet, Vehicle(kind, direction, lane, place, wanted, has_trailer=has_trailer))

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 
 from src.errors import ConfigError
 
-GENERATOR = "highway-2"
+GENERATOR = "highway-3"
 """Changes whenever the same config would give other bytes, so that old worlds are not mistaken for new ones."""
 
 RADAR_RATE_HZ = 20
