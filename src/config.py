@@ -27,6 +27,7 @@ from src.errors import CheckpointError, ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models import FAMILIES, read_phase_options
 from src.models.backbones.image import ImageEncoderConfig
+from src.ops.precision import Precision
 from src.reliability.passwords import masked
 from src.reliability.untrusted import fault_of_tree
 from src.training.identity import key_of
@@ -99,13 +100,6 @@ class PathsConfig:
     reports: str
 
 
-class Precision(Enum):
-    """Lightning's precision names, as the command line writes them."""
-
-    full = "32-true"
-    bf16 = "bf16-mixed"
-
-
 class BenchmarkSuite(Enum):
     """What `python -m src.benchmark` measures."""
 
@@ -146,8 +140,8 @@ class Config:
     oracle: Oracle
 
     def __post_init__(self) -> None:
-        if not isinstance(self.precision, str) or self.precision not in [p.value for p in Precision]:
-            raise ConfigError(f"precision must be one of {[p.value for p in Precision]}, but got {self.precision!r}")
+        if self.precision not in list(Precision):
+            raise ConfigError(f"precision must be one of {[*map(str, Precision)]}, but got {self.precision!r}")
         if not 0 <= self.seed < 2**32:
             raise ConfigError(f"seed must be at least 0 and below 2**32, but got {self.seed}")
         if self.model.name not in FAMILIES:

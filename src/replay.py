@@ -26,8 +26,9 @@ import torch
 from torch import Tensor, nn
 
 from src.assembly import restored_model
-from src.config import Config, Precision, compose_config, restore_config
+from src.config import Config, compose_config, restore_config
 from src.errors import ConfigError, DivergedError
+from src.ops.precision import computing
 from src.reliability.command import run_command
 from src.reliability.nonfinite import describe_gradients, gradient_norm, read_dump
 from src.structures.batch import LIDAR_POINT_FIELDS, RADAR_POINT_FIELDS, FrameBatch
@@ -86,9 +87,8 @@ class Step:
     def forward(self, module: TrainingModule) -> dict[str, Tensor]:
         """The loss terms, drawn from the step's own seed."""
         torch.manual_seed(self.content["horizon3d"]["step"]["seed"])
-        bf16 = self.config.precision == Precision.bf16.value
         batch = self.batch.to(self.device)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16):
+        with computing(self.config.precision, self.device):
             return module.model.loss(module.run(batch), batch).terms
 
     def stop_at_first(self, seen: Watch) -> None:

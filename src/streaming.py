@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from src.assembly import restored_model
-from src.config import Config, Precision, restore_config
+from src.config import Config, restore_config
 from src.data.reader import ReaderSettings
 from src.data.sensors import Camera, LidarSweep, RadarSweep, frame_from_sensors
 from src.errors import ConfigError
@@ -18,6 +18,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.deploy.inference import prepare_for_inference
 from src.models.deploy.static_parts import compile_static_parts, replay_image_encoder
 from src.models.detector import Detector
+from src.ops.precision import Precision, computing
 from src.reliability.checkpoints import read_checkpoint
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
@@ -46,17 +47,17 @@ class StreamingDetector:
         grid: BEVGrid,
         settings: ReaderSettings,
         device: torch.device | str | None = None,
-        bf16: bool | None = None,
+        precision: str | None = None,
         plain: bool = False,
         compiled: bool = False,
         cuda_graph: bool = False,
     ) -> None:
         """`model` is a trained one, of which a copy is prepared for inference, or that of another detector.
 
-        `device` None is where the model is. `bf16` None is float32, or what the model is prepared for. `plain` runs the
-        model itself, in evaluation mode and as it was trained: slower, the same boxes up to rounding. `compiled`
-        compiles the parts of fixed shape, which takes a minute at the first frames and pays on a GPU; `cuda_graph` runs
-        the image encoder as one CUDA graph, on a CPU it changes nothing.
+        `device` None is where the model is. `precision` (see `Precision`) None is float32, or what the model is
+        prepared for. `plain` runs the model itself, in evaluation mode and as it was trained: slower, the same boxes up
+        to rounding. `compiled` compiles the parts of fixed shape, which takes a minute at the first frames and pays on
+        a GPU; `cuda_graph` runs the image encoder as one CUDA graph, on a CPU it changes nothing.
 
         Raises ConfigError for a device that is not there or switches that do not go together, ValueError for a model
         that is prepared for another precision.
@@ -66,17 +67,17 @@ class StreamingDetector:
             raise ConfigError(f"device={device}: torch sees no GPU on this machine; use device=cpu")
         if plain and (compiled or cuda_graph):
             raise ConfigError("plain=True runs the model as trained; compiled and cuda_graph need it prepared")
-        prepared = model.prepared_bf16
+        prepared = model.prepared_for
         if prepared is not None and (plain or compiled or cuda_graph):
             raise ConfigError(
                 "plain, compiled and cuda_graph are for a trained model; that of another detector runs as it does there"
             )
-        if bf16 is None:
-            bf16 = bool(prepared)
-        if prepared is not None and prepared != bf16:
-            raise ValueError(f"the model is prepared for bf16={prepared}, but bf16={bf16} was asked for")
+        if precision is None:
+            precision = prepared or Precision.FULL
+        if prepared is not None and prepared != precision:
+            raise ValueError(f"the model is prepared for precision={prepared}, but {precision} was asked for")
         if prepared is None and not plain:
-            model = prepare_for_inference(model, bf16)
+            model = prepare_for_inference(model, precision)
             if cuda_graph:
                 replay_image_encoder(model)
             if compiled:
@@ -84,7 +85,7 @@ class StreamingDetector:
         self.model = model.to(self.device).eval()
         self.grid = grid
         self.settings = settings
-        self.bf16 = bf16
+        self.precision = precision
         self.memory: Any = None
 
     @classmethod
@@ -109,8 +110,7 @@ class StreamingDetector:
         """The detector of a checkpoint that has been read already; `path` is for messages."""
         model = restored_model(config, checkpoint, path)
         settings = config.data.reader_settings(config.model.sensors, config.image_size_px)
-        bf16 = config.precision == Precision.bf16.value
-        return cls(model, config.grid.build(), settings, device, bf16, **switches)
+        return cls(model, config.grid.build(), settings, device, config.precision, **switches)
 
     def reset(self) -> None:
         """Forget everything: the next frame begins a new recording."""
@@ -140,7 +140,7 @@ class StreamingDetector:
         self._check(frame)
         if frame.starts is not None and bool(frame.starts[0]):
             self.reset()
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16):
+        with computing(self.precision, self.device):
             output, self.memory = self.model(frame.to(self.device), self.memory)
             (boxes,) = self.model.decode(output)
         return boxes, output

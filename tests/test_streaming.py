@@ -267,13 +267,13 @@ def test_bf16_runs_in_autocast(tmp_path):
     detector = StreamingDetector.load(path)
     frame = make_frame(detector, 0.0)
     boxes = detector.step(frame)
-    assert detector.bf16 and torch.isfinite(boxes.centers).all()
+    assert detector.precision == "bf16-mixed" and torch.isfinite(boxes.centers).all()
     assert same(alone(detector, frame), boxes)  # a second vehicle's detector takes the precision over
     plain = StreamingDetector.load(path, plain=True)
-    full = StreamingDetector(plain.model, plain.grid, plain.settings, bf16=False)
+    full = StreamingDetector(plain.model, plain.grid, plain.settings, precision="32-true")
     assert not same(full.step(frame), boxes)
-    with pytest.raises(ValueError, match="prepared for bf16=True, but bf16=False"):
-        StreamingDetector(detector.model, detector.grid, detector.settings, bf16=False)
+    with pytest.raises(ValueError, match="prepared for precision=bf16-mixed, but 32-true"):
+        StreamingDetector(detector.model, detector.grid, detector.settings, precision="32-true")
 
 
 def test_the_example_of_the_guide_runs(checkpoints, tmp_path, monkeypatch, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from src.assembly import build_model
 from src.config import Config
 from src.models.deploy.inference import prepare_for_inference
 from src.models.detector import Detector
+from src.ops.precision import computing
 from src.reliability.checkpoints import load_model_weights, read_checkpoint
 from src.structures.batch import FrameBatch
 
@@ -31,26 +33,26 @@ class Case:
     batch: FrameBatch
     memory: Any
     device: torch.device
-    autocast: bool  # bfloat16
+    precision: str
 
-    def precision(self) -> torch.autocast:
+    def computing(self) -> AbstractContextManager[None]:
         """As training and prediction compute."""
-        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.autocast)
+        return computing(self.precision, self.device)
 
     def infer(self) -> tuple[Any, Any]:
         """Forward and decode, without gradients."""
-        with torch.no_grad(), self.precision():
+        with torch.no_grad(), self.computing():
             output, _ = self.prepared(self.batch, self.memory)
             return output, self.prepared.decode(output)
 
     def run(self) -> tuple[Any, Any]:
         """Forward, for gradients."""
-        with self.precision():
+        with self.computing():
             return self.model(self.batch, self.memory)
 
     def step(self) -> Tensor:
         """Forward, losses and backward; the weights' gradients are dropped."""
-        with self.precision():
+        with self.computing():
             output, _ = self.model(self.batch, self.memory)
             total = self.model.loss(output, self.batch).terms["total"]
         total.backward()
@@ -62,8 +64,8 @@ def build_case(config: Config, batch: FrameBatch, device: torch.device) -> Case:
     """The configured model, with weights of `checkpoint=PATH` if given, before its first batch."""
     model = build_model(config)
     load_weights(config, model)
-    bf16 = config.precision == "bf16-mixed"
-    return Case(model.to(device).train(), prepare_for_inference(model, bf16), batch, None, device, bf16)
+    prepared = prepare_for_inference(model, config.precision)
+    return Case(model.to(device).train(), prepared, batch, None, device, config.precision)
 
 
 def load_weights(config: Config, model: Detector) -> None:
@@ -78,7 +80,7 @@ def expect_trained_scores(case: Case) -> tuple[Any, Any]:
     Fresh weights give every cell about the threshold of the configuration, and boxes would be made of half of them.
     Returns what forward gave for the frame that the scores are of: output and memory.
     """
-    with torch.no_grad(), case.precision():
+    with torch.no_grad(), case.computing():
         output, memory = case.prepared(case.batch, case.memory)
     scores = output.head.logits.float().sigmoid().flatten()
     if len(scores) > CANDIDATES:

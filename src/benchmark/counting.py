@@ -41,10 +41,15 @@ def _attention_backward(grad: Shape, query: Shape, key: Shape, value: Shape, *_:
     return sdpa_backward_flop_count(grad, query, key, value)
 
 
+def _linear(rows: Shape, weight: Shape, *_: Any, **__: Any) -> int:
+    return 2 * math.prod(rows) * weight[0]
+
+
 FORMULAS: dict[Any, Callable[..., int]] = {
     aten._grouped_mm: _product,
     aten.addmm_: _added_product,
     aten.baddbmm_: _added_product,
+    torch.ops.mkldnn._linear_pointwise: _linear,
     aten._scaled_dot_product_flash_attention_for_cpu: _attention,
     aten._scaled_dot_product_flash_attention_for_cpu_backward: _attention_backward,
 }
@@ -66,10 +71,11 @@ class Work:
 def counted_work() -> Iterator[Work]:
     """Count all tensor operations within the context, backward passes included.
 
-    Operations with kernels of their own run in the torch reference meanwhile, whose products can be seen.
+    Operations with kernels of their own run in the torch reference meanwhile, whose products can be seen, and sparse
+    convolutions multiply existing pairs only.
     """
     work, chosen = Work(), backend.chosen()
-    backend.use(backend.REFERENCE)
+    backend.use(backend.COUNTED)
     try:
         with _Counter(work):
             yield work

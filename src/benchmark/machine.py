@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from src.benchmark.timing import clock, interleaved
+from src.ops.precision import Precision
 from src.report.sweep_text import is_busy
 
 # Square products large enough to reach the highest rate, small enough for seconds on two cores.
@@ -118,6 +119,6 @@ class Gemm:
 
 
 def gemm_rate(roofline: dict[str, float], precision: str) -> float:
-    """GFLOP/s that work in a precision (`32-true`, `bf16-mixed`) could reach."""
-    wanted = "bf16_gflops" if precision == "bf16-mixed" else "fp32_gflops"
+    """GFLOP/s that work in a precision could reach."""
+    wanted = "fp32_gflops" if precision == Precision.FULL else "bf16_gflops"
     return roofline.get(wanted, roofline["fp32_gflops"])

@@ -147,7 +147,7 @@ def measure_mode(case: Case, calls: dict[str, list[Call]], backward: bool) -> di
         ready = [call.prepare() for call in calls[name]]
 
         def run() -> bool:
-            with torch.set_grad_enabled(backward), case.precision():
+            with torch.set_grad_enabled(backward), case.computing():
                 results = [call() for call in ready]
             return backward and any([backward_from(result) for result in results])
 

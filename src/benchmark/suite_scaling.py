@@ -204,7 +204,7 @@ def make_case(config: Config, point: Point, device: torch.device) -> tuple[Case,
     case = build_case(replace(config, model=settings, grid=replace(config.grid, cells=cells)), batch, device)
     encoder = getattr(case.prepared, "image_encoder", None)
     if encoder is not None:  # it gives the same features every time, without encoding again
-        with torch.no_grad(), case.precision():
+        with torch.no_grad(), case.computing():
             features = encoder(case.batch.images)
         encoder.forward = lambda images: features
     output, memory = expect_trained_scores(case)
@@ -228,7 +228,7 @@ def fill_memory(case: Case, memory: Any, num_frames: int) -> None:
         own = {"timestamps_s": frame.timestamps_s - KEY_FRAME_S * age}
         past.append(replace(copy.deepcopy(frame), global_from_ego=behind(frame, age + 1), **own))
     before = replace(case.batch, global_from_ego=behind(case.batch, 1))
-    with torch.no_grad(), case.precision():
+    with torch.no_grad(), case.computing():
         # Once more by the model, which keeps of each frame what it reads at that age.
         _, case.memory = case.prepared(before, type(memory)(tuple(past)))
     case.batch = replace(case.batch, timestamps_s=case.batch.timestamps_s + KEY_FRAME_S)

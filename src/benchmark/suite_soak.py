@@ -104,12 +104,12 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
 def make_detector(config: Config, datamodule: DetectionDataModule, device: torch.device) -> StreamingDetector:
     """The configured model, as prediction prepares it."""
     torch.manual_seed(config.seed)
-    model, bf16 = build_model(config), config.precision == "bf16-mixed"
+    model = build_model(config)
     load_weights(config, model)
-    detector = StreamingDetector(model, config.grid.build(), datamodule.settings, device, bf16)
+    detector = StreamingDetector(model, config.grid.build(), datamodule.settings, device, config.precision)
     if config.checkpoint is None:
         frame = next(datamodule.stream()).to(device)
-        expect_trained_scores(Case(model, detector.model, frame, None, device, bf16))
+        expect_trained_scores(Case(model, detector.model, frame, None, device, config.precision))
     return detector
 
 

@@ -16,6 +16,7 @@ from src.assembly import build_datamodule, build_module, data_root
 from src.benchmark.operation_table import OPERATIONS_NOTE, operation_table
 from src.benchmark.timing import clock, milliseconds, peak_bytes, timed_parts
 from src.config import Config
+from src.ops.precision import computing
 from src.structures.batch import FrameBatch
 from src.training.module import TrainingModule
 from src.training.optim import build_optimizer
@@ -35,7 +36,6 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """
     device = config.trainer.device()
     datamodule = build_datamodule(config, data_root(config))
-    autocast = config.precision == "bf16-mixed"
     batches: list[FrameBatch] = []
     passes = {}
     for name in ("with loader", "loaded"):
@@ -43,7 +43,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
         module = build_module(config, tree, datamodule).to(device).train()
         loading = name == "with loader"
         source = chain.from_iterable(repeat(datamodule.train_dataloader())) if loading else iter(batches)
-        passes[name], batches = run_steps(module, source, device, autocast)
+        passes[name], batches = run_steps(module, source, device, config.precision)
     rows = []
     for name, (stages, frames) in passes.items():
         step = [sum(values) for values in zip(*stages.values(), strict=True)]
@@ -51,7 +51,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
         row["frames/s (median step)"] = statistics.mean(frames) / statistics.median(step)
         row |= milliseconds(step, "step ")
         rows.append(row | {f"{stage} ms": 1e3 * statistics.median(values) for stage, values in stages.items()})
-    last, step_on = batches[-1].to(device), make_stepper(module, PROFILED_STEPS, device, autocast)
+    last, step_on = batches[-1].to(device), make_stepper(module, PROFILED_STEPS, device, config.precision)
     operations = operation_table(lambda: step_on(last), device)
     return {
         "notes": [
@@ -71,10 +71,10 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def run_steps(
-    module: TrainingModule, source: Iterator[FrameBatch], device: torch.device, autocast: bool
+    module: TrainingModule, source: Iterator[FrameBatch], device: torch.device, precision: str
 ) -> tuple[tuple[dict[str, list[float]], list[int]], list[FrameBatch]]:
     """Seconds of each stage of the measured steps with the frames of each, and all batches that came."""
-    now, step_on = clock(device), make_stepper(module, WARM_UP_STEPS + MEASURED_STEPS, device, autocast)
+    now, step_on = clock(device), make_stepper(module, WARM_UP_STEPS + MEASURED_STEPS, device, precision)
     stages: dict[str, list[float]] = {}
     frames, taken = [], []
     for number in range(WARM_UP_STEPS + MEASURED_STEPS):
@@ -92,7 +92,7 @@ def run_steps(
 
 
 def make_stepper(
-    module: TrainingModule, num_steps: int, device: torch.device, autocast: bool
+    module: TrainingModule, num_steps: int, device: torch.device, precision: str
 ) -> Callable[[FrameBatch], dict[str, float]]:
     """One optimiser step as the trainer makes it, with a fresh optimiser; seconds by stage."""
     optimizer, schedule = build_optimizer(
@@ -104,7 +104,7 @@ def make_stepper(
         with warnings.catch_warnings(), timed_parts(module, paths, now) as parts:
             warnings.filterwarnings("ignore", message=".*self.trainer.*")  # nothing is logged without a trainer
             begin = now()
-            with torch.autocast(device.type, dtype=torch.bfloat16, enabled=autocast):
+            with computing(precision, device):
                 objective = module.objective(batch)
             computed = now()
             optimizer.zero_grad(set_to_none=True)

@@ -103,8 +103,8 @@ class Detector(nn.Module, ABC):
     `package.module:function`, that each is; `part: inner` lies within `part`."""
     latency_parts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """The parts of Table 15 by the methods that each is; one within another counts for both."""
-    prepared_bf16: bool | None = None
-    """Whether `prepare_for_inference` made this copy for bfloat16 or for float32; None: as trained."""
+    prepared_for: str | None = None
+    """The precision that `prepare_for_inference` made this copy for; None: as trained."""
 
     @property
     def image_backbone(self) -> nn.Module | None:

@@ -13,6 +13,7 @@ from torch import Tensor
 from src.errors import ConfigError
 
 REFERENCE = "reference"
+COUNTED = "counted"  # the reference, with no product but those of the formula, for counting arithmetic
 TRITON = "triton"
 # The environment variable that chooses the backend of a process, and the one of Triton's interpreter.
 VARIABLE = "HORIZON3D_OPS"
@@ -33,7 +34,7 @@ def use(name: str) -> None:
     Raises ConfigError, in the words of HORIZON3D_OPS, for a name that is unknown or cannot run here.
     """
     global _chosen
-    if name not in (REFERENCE, TRITON):
+    if name not in (REFERENCE, TRITON, COUNTED):
         raise ConfigError(f"{VARIABLE}={name}: expected {REFERENCE} or {TRITON}, or leave it unset")
     if name == TRITON and (obstacle := _triton_obstacle()):
         raise ConfigError(f"{VARIABLE}={name}: {obstacle}; unset it or set {VARIABLE}={REFERENCE}")
@@ -53,7 +54,7 @@ def chosen() -> str:
 
 def implementation(reference: Callable[..., Any]) -> Callable[..., Any]:
     """The function that runs an operation in the chosen backend, of its torch reference `<operation>_reference`."""
-    if chosen() == REFERENCE:
+    if chosen() != TRITON:
         return reference
     operation = reference.__name__.removesuffix("_reference")
     return getattr(importlib.import_module(KERNELS[operation]), f"{operation}_{TRITON}")

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
+
+from src.ops.products import multiply, product_type, row_spans, whole_steps
 
 CPU_ROWS = 1024
 GPU_ROWS = 1 << 18
@@ -22,13 +26,14 @@ def checkpointed_mlp(
 
     Recomputing the hidden layer costs one product, keeping it [n, H] of memory, written and read several times.
     Under autocast x and the hidden layer are of its type, cast by hand; the outputs are not, since scores would tie and
-    metres per second be rounded. Gradients of weights are summed in float32 at least.
+    metres per second be rounded; products in bfloat16 likewise. Gradients of weights are summed in float32 at least.
     """
     hidden = (x, hidden_weight, hidden_bias)
     if torch.is_autocast_enabled(x.device.type) and x.dtype != torch.float64:
         hidden = tuple(value.to(torch.get_autocast_dtype(x.device.type)) for value in hidden)
     full = torch.promote_types(x.dtype, torch.float32)
-    return _CheckpointedMLP.apply(*hidden, weight.to(full), bias.to(full))
+    dtype = product_type(hidden[0], hidden_weight.shape[1])
+    return _CheckpointedMLP.apply(*hidden, weight.to(full), bias.to(full), dtype)
 
 
 def projected_statistics(
@@ -45,36 +50,40 @@ def projected_statistics(
 class _CheckpointedMLP(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: FunctionCtx, x: Tensor, hidden_weight: Tensor, hidden_bias: Tensor, weight: Tensor, bias: Tensor
+        ctx: FunctionCtx,
+        x: Tensor,
+        hidden_weight: Tensor,
+        hidden_bias: Tensor,
+        weight: Tensor,
+        bias: Tensor,
+        dtype: torch.dtype,  # of the operands of products
     ) -> Tensor:
         ctx.save_for_backward(x, hidden_weight, hidden_bias, weight)
+        ctx.dtype = dtype
+        first = hidden_weight.to(dtype), hidden_bias.to(dtype)
         out = weight.new_empty(len(x), weight.shape[1])
         for span in _spans(x):
-            torch.addmm(bias, _hidden(x[span], hidden_weight, hidden_bias).to(weight.dtype), weight, out=out[span])
+            hidden = multiply(whole_steps(x[span]).to(dtype), *first).relu_()
+            out[span] = multiply(hidden.to(weight.dtype), weight, bias)[: len(out[span])]
         return out
 
     @staticmethod
-    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, ...]:
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, ...]:
         x, hidden_weight, hidden_bias, weight = ctx.saved_tensors
-        full = weight.dtype
+        dtype, full = ctx.dtype, weight.dtype
+        first, second = (hidden_weight.to(dtype), hidden_bias.to(dtype)), weight.to(dtype)
         grad_x = torch.empty_like(x)
         sums = [torch.zeros_like(value, dtype=full) for value in (hidden_weight, hidden_bias, weight)]
-        pulls, out_weight = grad.to(x.dtype).contiguous(), weight.to(x.dtype)
         for span in _spans(x):
-            rows, pull = x[span], pulls[span]
-            hidden = _hidden(rows, hidden_weight, hidden_bias)
-            sums[2].add_(torch.mm(hidden.t(), pull))
-            back = torch.ops.aten.threshold_backward(torch.mm(pull, out_weight.t()), hidden, 0)
-            sums[0].add_(torch.mm(rows.t(), back))
+            rows, pull = whole_steps(x[span]).to(dtype), whole_steps(grad[span]).to(dtype).contiguous()
+            hidden = multiply(rows, *first).relu_()
+            sums[2].add_(multiply(hidden.t(), pull))
+            back = torch.ops.aten.threshold_backward(multiply(pull, second.t()), hidden, 0)
+            sums[0].add_(multiply(rows.t(), back))
             sums[1].add_(back.sum(0, dtype=full))
-            torch.mm(back, hidden_weight.t(), out=grad_x[span])
-        return grad_x, sums[0].to(x.dtype), sums[1].to(x.dtype), sums[2], grad.sum(0)
+            grad_x[span] = multiply(back, first[0].t())[: len(x[span])]
+        return grad_x, sums[0].to(x.dtype), sums[1].to(x.dtype), sums[2], grad.sum(0), None
 
 
-def _hidden(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    return torch.addmm(bias, x, weight).relu_()
-
-
-def _spans(x: Tensor) -> list[slice]:
-    rows = CPU_ROWS if x.device.type == "cpu" else GPU_ROWS
-    return [slice(first, first + rows) for first in range(0, len(x), rows)]
+def _spans(x: Tensor) -> Iterator[slice]:
+    return row_spans(len(x), CPU_ROWS if x.device.type == "cpu" else GPU_ROWS)

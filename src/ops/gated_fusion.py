@@ -6,10 +6,10 @@ import math
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from src.ops.kernel_maps import stacked_map, submanifold_map
+from src.ops.linear import linear
 from src.ops.segment_reduce import inverse_rows, permute_rows
 from src.ops.sites import Sites, union
 from src.ops.sparse_conv import sparse_conv
@@ -35,7 +35,7 @@ def gated_fusion_conv(
     kernel_map = stacked_map(joint, math.isqrt(len(weight)), rows)
     convolved = sparse_conv(torch.cat(gated), torch.cat(weight.chunk(2, dim=1)), kernel_map, bias)
     addends = tuple(
-        permute_rows(x @ matrix, place, own)
+        permute_rows(linear(x, matrix), place, own)
         for x, matrix, place, own in zip(gated, shortcut.chunk(2), places, rows, strict=True)
     )
     return joint, convolved, addends
@@ -57,7 +57,7 @@ def _gates(
             torch.cat([gaussian, permute_rows(radar, radar_there, gaussian_there)], dim=1),  # [n_G, 2C]
             torch.cat([permute_rows(gaussian, gaussian_there, radar_there), radar], dim=1),  # [n_R, 2C]
         )
-        return [F.linear(x, weight[0].t(), bias) for x, (weight, bias) in zip(pairs, gates, strict=True)]
+        return [linear(x, weight[0], bias) for x, (weight, bias) in zip(pairs, gates, strict=True)]
     both = torch.cat([permute_rows(*part) for part in zip(features, places, rows, strict=True)], dim=1)  # [M, 2C]
     kernel_map = submanifold_map(joint, kernel_size)
     return [

@@ -9,10 +9,13 @@ from functools import cache
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 ROW_STEP = 256
 """oneDNN makes a program for every shape it meets, about half a millisecond each: rows come in multiples of this."""
+MOST_ROWS = 4096
+"""Of one product: its operands and result fit the cache."""
 LEAST_ROWS, LEAST_WIDTHS = 512, (32, 64)
 """Products of fewer rows, or of matrices narrower than this on their narrow and on their wide side, stay as they are:
 the operands' rounding costs what bfloat16 saves."""
@@ -48,11 +51,28 @@ def product_type(
 def multiply(
     a: Tensor,  # [n, k]
     b: Tensor,  # [k, m]
+    bias: Tensor | None = None,  # [m]
 ) -> Tensor:  # [n, m]
-    """a @ b without gradient. In float32 by oneDNN where MKL leaves half of a processor unused."""
+    """a @ b + bias without gradient. In float32 by oneDNN where MKL leaves half of a processor unused.
+
+    Operands must not be expanded ones: oneDNN takes a thousand times as long for a value that stands for many.
+    """
     if a.dtype == torch.float32 and a.device.type == "cpu" and prefers_onednn():
-        return torch.ops.mkldnn._linear_pointwise(a, b.t(), None, "none", [], "")
-    return torch.mm(a, b)
+        return torch.ops.mkldnn._linear_pointwise(a, b.t(), bias, "none", [], "")
+    return torch.mm(a, b) if bias is None else torch.addmm(bias, a, b)
+
+
+def row_spans(rows: int, most: int) -> Iterator[slice]:
+    """Slices of at most so many rows."""
+    return (slice(first, min(first + most, rows)) for first in range(0, rows, most))
+
+
+def whole_steps(
+    rows: Tensor,  # [n, C]
+) -> Tensor:  # [n up to a step, C]
+    """On a CPU the rows with zeros behind them up to a multiple of ROW_STEP."""
+    missing = row_steps(len(rows)) - len(rows)
+    return F.pad(rows, (0, 0, 0, missing)) if missing and rows.device.type == "cpu" else rows
 
 
 def row_steps(rows: int) -> int:
@@ -75,10 +95,10 @@ def prefers_onednn() -> bool:
     return ours and bool(found.get("avx512_f")) and "AMD" in found.get("cpu_name", "")
 
 
-def describe_products() -> dict[str, Any]:
-    """What is chosen in this context, for the record of a run."""
+def describe_products(wanted: bool) -> dict[str, Any]:
+    """What a CPU multiplies by and in, where bfloat16 is wanted or not, for the record of a run."""
     large = f"from {LEAST_ROWS} rows and widths of {LEAST_WIDTHS[0]} and {LEAST_WIDTHS[1]}"
     return {
         "float32": "oneDNN" if prefers_onednn() else "torch",
-        "bfloat16": large if _bfloat16.get() else "never",
+        "bfloat16": large if wanted and multiplies_bfloat16() else "never",
     }

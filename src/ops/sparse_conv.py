@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from src.ops.backend import implementation
+from src.ops.backend import COUNTED, chosen, implementation
 from src.ops.kernel_maps import KernelMap
+from src.ops.linear import linear
 from src.ops.segment_reduce import gather_segment_sum
 from src.ops.sparse_conv_cpu import cpu_sparse_conv
 from src.ops.sparse_conv_grouped import GROUPED_DTYPES, grouped_sparse_conv
@@ -50,8 +51,8 @@ def sparse_conv_reference(
 ) -> Tensor:  # [M_out, Cout]
     """Torch's form by device and type; a kernel of one offset is a linear layer."""
     if kernel_map.identity:
-        return features @ weight[0] if bias is None else torch.addmm(bias, features, weight[0])
-    if features.device.type == "cpu":
+        return linear(features, weight[0], bias)
+    if features.device.type == "cpu" and chosen() != COUNTED:  # it multiplies by zeros
         return cpu_sparse_conv(features, weight, kernel_map, bias)
     if features.dtype in GROUPED_DTYPES:
         return grouped_sparse_conv(features, weight, kernel_map, bias)

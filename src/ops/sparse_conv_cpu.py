@@ -12,13 +12,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.ops.kernel_maps import KernelMap
-from src.ops.products import ROW_STEP, multiply, product_type, row_steps
+from src.ops.products import MOST_ROWS, ROW_STEP, multiply, product_type, row_spans, row_steps
 from src.ops.sparse_conv_function import SparseConvFunction
 
 GATHERED_BYTES = 5 << 19
 """Of the rows gathered for one product. Measured: a quarter or four times as much costs 5 to 15 %."""
-MOST_ROWS = 4096
-"""Of one product."""
 LEAST_FILL = 0.47
 """Share of a block's pairs that exist, below which blocks of fewer offsets are better, whose rows are fewer."""
 SMALL = 1 << 15
@@ -98,7 +96,7 @@ def _convolve(
                 out.index_add_(0, into, product[: len(into)].to(full))
             if grad is not None:
                 if part.rows is None:
-                    partners = others[span][: len(gathered)]  # padding may be a step longer
+                    partners = others[span]
                 else:
                     partners = _gather("partners", others, _filled(into, len(gathered), num))
                 products = multiply(partners.t(), gathered).view(c_out, -1, c_in)  # [Cb, T, Ca]
@@ -168,8 +166,7 @@ def _gather(name: str, rows: Tensor, picks: Tensor) -> Tensor:
 def _spans(rows: int, width: int, dtype: torch.dtype) -> Iterator[slice]:
     """Slices of rows [rows, width] for one product each."""
     step = GATHERED_BYTES // (width * dtype.itemsize) // ROW_STEP * ROW_STEP
-    step = min(max(step, ROW_STEP), MOST_ROWS)
-    return (slice(first, first + step) for first in range(0, rows, step))
+    return row_spans(rows, min(max(step, ROW_STEP), MOST_ROWS))
 
 
 class _Scratch(threading.local):

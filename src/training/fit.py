@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, WeightAveraging
 from lightning.pytorch.loggers.logger import Logger
+from lightning.pytorch.plugins.precision import Precision as PrecisionPlugin
 
 from src.data.datamodule import DetectionDataModule
 from src.data.frame_loader import dead_workers_named
 from src.errors import InterruptedRunError
+from src.ops.precision import Precision
+from src.ops.products import bfloat16_products
 from src.reliability.checkpoints import BEST, LAST, AtomicCheckpointIO, OpenCheckpoint
 from src.reliability.interruption import Interruption
 from src.reliability.metrics_csv import MetricsCSV
@@ -28,6 +33,21 @@ EXPECTED_WARNINGS = (
     ".*resuming from a checkpoint that ended before the epoch ended",  # the sampler knows its place by the step
     ".*recommended to use `self.log.*sync_dist=True",  # everything logged by epoch is the same on all ranks
 )
+
+
+class Bfloat16Products(PrecisionPlugin):
+    """Steps of training and validation within `bfloat16_products`."""
+
+    @contextmanager
+    def forward_context(self) -> Iterator[None]:
+        """Around forward and backward."""
+        with bfloat16_products():
+            yield
+
+
+def precision_plugins(precision: str) -> list[PrecisionPlugin]:
+    """For a precision that is none of Lightning's."""
+    return [Bfloat16Products()] if precision == Precision.PRODUCTS else []
 
 
 def build_trainer(
@@ -56,17 +76,18 @@ def build_trainer(
     if ema_decay is not None:
         callbacks.append(EMAWeightAveraging(decay=ema_decay))
     callbacks.append(SharedStatistics())  # behind the moving average
+    plugins = precision_plugins(precision)
     return L.Trainer(
         max_epochs=phase.epochs,
         check_val_every_n_epoch=phase.validate_every,
-        precision=precision,
         accelerator=config.accelerator.value,
         devices=config.devices,
         num_nodes=config.num_nodes,
         strategy=build_strategy(*config.processes),
         logger=loggers,
         callbacks=callbacks,
-        plugins=[AtomicCheckpointIO(folder.check_held, fail_fast=lambda: interruption.requested)],
+        precision=None if plugins else precision,
+        plugins=[*plugins, AtomicCheckpointIO(folder.check_held, fail_fast=lambda: interruption.requested)],
         log_every_n_steps=config.log_every_steps,
         deterministic=config.deterministic,
         num_sanity_val_steps=0,
@@ -121,10 +142,12 @@ def fit(
 
 def build_evaluation_trainer(precision: str, accelerator: str) -> L.Trainer:
     """A Trainer that only validates: one device, nothing written."""
+    plugins = precision_plugins(precision)
     return L.Trainer(
         accelerator=accelerator,
         devices=1,
-        precision=precision,
+        precision=None if plugins else precision,
+        plugins=plugins,
         logger=False,
         enable_checkpointing=False,
         enable_model_summary=False,

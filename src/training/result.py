@@ -13,6 +13,8 @@ import numpy as np
 import torch
 
 from src.errors import DataError
+from src.ops.precision import Precision
+from src.ops.products import describe_products
 from src.structures.skipped import SHOWN_NAMES
 from src.training.module import TrainingModule
 from src.training.phases import EVALUATORS
@@ -41,6 +43,7 @@ def run_record(
         "device": str(module.device),
         "processes": config.trainer.num_processes,
         "threads": torch.get_num_threads(),
+        "cpu_products": describe_products(config.precision == Precision.PRODUCTS),
         "versions": {
             "python": platform.python_version(),
             "torch": torch.__version__,

@@ -7,6 +7,7 @@ import numpy as np
 from src.world.camera_render import Studio
 from src.world.pcd_writer import LIDAR_TYPE
 from src.world.rig import Mount
+from src.world.road import SLAT_M, SLAT_STEP_M, Road
 from src.world.simulate import Scene
 from src.world.world_config import WorldConfig
 
@@ -19,6 +20,7 @@ ELEVATIONS_RAD = np.radians(
 )
 REACH_M = 180.0
 RANGE_NOISE_M = 0.02
+SLAT_THICK_M = 0.05
 
 
 def scan_lidars(
@@ -32,14 +34,15 @@ def scan_lidars(
 ) -> dict[str, Array]:
     """One cloud of LIDAR_TYPE per lidar in its sensor frame, not compensated for what moves during the scan.
 
-    Rays meet the boxes of the actors (their footprint over their height) and the road plane under the truck, each at
-    the ray's own time; `time_s` and `stamp_us` are those of the scan's middle.
+    Rays meet the boxes of the actors (their footprint over their height), the screen on the median and the road plane
+    under the truck, each at the ray's own time; `time_s` and `stamp_us` are those of the scan's middle.
     """
     ground, velocity, yaw = scene.tracks.state(time_s)
     near = np.flatnonzero(np.hypot(*(ground - scene.ego.pose(time_s)[1])[:, :2].T) < REACH_M + 10)
     middles, sizes = ground[near], scene.sizes[near]
     middles[:, 2] += studio.floors[near] + 0.5 * sizes[:, 2]
     boxes = list(zip(middles, velocity[near], sizes, yaw[near], strict=True))
+    boxes += _slats(scene.road, float(scene.ego.tracks.road_state(time_s)[0][0]))
     azimuths = np.arange(-HALF_WIDTH_RAD, HALF_WIDTH_RAD, np.radians(config.lidar_step_deg))
     after_s = azimuths / (2 * HALF_WIDTH_RAD) * SCAN_S
     rotations, translations = scene.ego.poses(time_s + after_s)  # [A, 3, 3], [A, 3]
@@ -61,6 +64,16 @@ def scan_lidars(
         cloud["timestamp"] = stamp_us + np.round(1e6 * after_s[of_ray[hit]]).astype(np.int64)
         clouds[mount.channel] = cloud
     return clouds
+
+
+def _slats(road: Road, along_m: float) -> list[tuple[Array, Array, Array, float]]:
+    """The anti-glare screen on the median around a place along the road, as boxes of `_nearest_hit`."""
+    if not road.screen_m:
+        return []
+    s = SLAT_STEP_M * np.arange((along_m - REACH_M) // SLAT_STEP_M, (along_m + REACH_M) // SLAT_STEP_M + 1)
+    middles = road.place(s, np.zeros_like(s), 0.5 * road.screen_m)
+    size = np.array([SLAT_THICK_M, SLAT_M, road.screen_m])
+    return [(middle, np.zeros(3), size, yaw) for middle, yaw in zip(middles, road.heading_at(s), strict=True)]
 
 
 def _nearest_hit(

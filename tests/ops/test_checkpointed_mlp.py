@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from src.ops import products
 from src.ops.checkpointed_mlp import checkpointed_mlp, projected_statistics
 
 
@@ -51,3 +52,19 @@ def test_statistics_of_a_projection_never_made():
     torch.testing.assert_close(
         torch.autograd.grad(found, (x, weight), pull), torch.autograd.grad(expected, (x, weight), pull)
     )
+
+
+def test_products_in_bfloat16_halve_the_hidden_layer_and_not_the_outputs(monkeypatch):
+    monkeypatch.setattr(products, "multiplies_bfloat16", lambda: True)
+    torch.manual_seed(0)
+    sizes = ((1300, 64), (64, 96), (96,), (96, 3), (3,))
+    values = x, w, b, v, c = [torch.randn(*size, requires_grad=True) for size in sizes]
+    pull = torch.randn(1300, 3)
+    exact = torch.autograd.grad(checkpointed_mlp(*values), values, pull)
+    with products.bfloat16_products():
+        out = checkpointed_mlp(*values)
+        near = torch.autograd.grad(out, values, pull)
+    hidden = torch.addmm(b.bfloat16(), x.bfloat16(), w.bfloat16()).relu()
+    torch.testing.assert_close(out, hidden.float() @ v + c, atol=1e-4, rtol=0)
+    for one, other in zip(exact, near, strict=True):
+        assert other.dtype == torch.float32 and (one - other).norm() < 0.06 * one.norm()  # the ReLU may open or not

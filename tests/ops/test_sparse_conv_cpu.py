@@ -37,6 +37,15 @@ def test_blocks_and_their_size_change_nothing(mode, fill, monkeypatch):
     torch.testing.assert_close(found, values_and_gradients(plain_sparse_conv, kernel_map))
 
 
+@pytest.mark.parametrize("rows", [256, 512])
+def test_as_many_rows_as_fill_their_steps(rows):
+    """All rows of a block that has every one of them: the features' padding is then a step longer than the block's."""
+    kernel_map = submanifold_map(Sites.from_linear(torch.arange(rows), (1, 1, rows)), (1, 3))
+    found = values_and_gradients(sparse_conv, kernel_map)
+    assert any(part.rows is None and len(part.table) == rows for part in blocks(kernel_map, backward=True))
+    torch.testing.assert_close(found, values_and_gradients(plain_sparse_conv, kernel_map))
+
+
 def test_blocks_hold_every_pair_once():
     sites = random_sites((2, 40, 50), 900)
     parts = [torch.arange(0, 900, 2), torch.arange(0, 900, 3)]

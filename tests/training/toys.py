@@ -151,7 +151,9 @@ def toy_module(module_class=TemporalModule, seed=0):
     )
 
 
-def toy_trainer(folder, resume=None, *, epochs=EPOCHS, validate_every=1, ema=None, every_steps=None, ranks=1):
+def toy_trainer(
+    folder, resume=None, *, epochs=EPOCHS, validate_every=1, ema=None, every_steps=None, ranks=1, precision="32-true"
+):
     """A Trainer on the CPU for this module, without a progress bar."""
     config = TrainerConfig(
         accelerator=Accelerator.cpu, devices=ranks, num_nodes=1, log_every_steps=1, checkpoint_every_steps=every_steps,
@@ -162,6 +164,6 @@ def toy_trainer(folder, resume=None, *, epochs=EPOCHS, validate_every=1, ema=Non
         train_missing=False, frozen_statistics=False, epochs=epochs, validate_every=validate_every, options={},
     )  # fmt: skip
     loggers = build_loggers(folder, resume, None) if is_main_process() else []
-    trainer = build_trainer(folder, config, phase, precision="32-true", ema_decay=ema, loggers=loggers)
+    trainer = build_trainer(folder, config, phase, precision=precision, ema_decay=ema, loggers=loggers)
     trainer.progress_bar_callback.disable()
     return trainer

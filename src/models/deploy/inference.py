@@ -23,6 +23,7 @@ from src.models.heads.branches import Branches
 from src.models.heads.center_head import CenterHead
 from src.models.layers.merging import block_diagonal, joined_linear
 from src.models.layers.sparse import SparseKernel
+from src.ops.precision import Precision
 
 CPU_CHUNK = 512
 """Rows at a time through a wide hidden layer, so that it stays in the cache."""
@@ -31,14 +32,14 @@ Linear = nn.Conv2d | nn.ConvTranspose2d | nn.Linear | SparseKernel
 """Layers that a norm behind them can go into."""
 
 
-def prepare_for_inference(model: Detector, bf16: bool = False) -> Detector:
+def prepare_for_inference(model: Detector, precision: str = Precision.FULL) -> Detector:
     """A copy of the model in evaluation mode that gives the same outputs up to rounding, faster.
 
-    With `bf16` the weights that autocast would round in every frame are rounded once, so the copy runs under bfloat16
-    autocast only. Parts that the copy does not know are left as they are. `loss` and `train` are of no use with it.
-    Raises ValueError for a model that is prepared already.
+    With bf16-mixed the weights that autocast would round in every frame are rounded once, so the copy runs under
+    bfloat16 autocast only. Parts that the copy does not know are left as they are. `loss` and `train` are of no use
+    with it. Raises ValueError for a model that is prepared already.
     """
-    if model.prepared_bf16 is not None:
+    if model.prepared_for is not None:
         raise ValueError("the model is prepared for inference already; prepare the trained one")
     with torch.inference_mode(False), torch.no_grad():
         model = copy.deepcopy(model).eval()
@@ -50,13 +51,13 @@ def prepare_for_inference(model: Detector, bf16: bool = False) -> Detector:
                 _merge_head(module)
             elif hasattr(module, "merge_for_inference"):
                 module.merge_for_inference()
-        if bf16:
+        if precision == Precision.MIXED:
             _round_weights(model)
         for value in model.parameters():
             if value.dim() == 4:
                 value.data = value.data.contiguous(memory_format=torch.channels_last)
             value.requires_grad_(False)
-    model.prepared_bf16 = bf16
+    model.prepared_for = precision
     return model
 
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.views import CameraViews
 from src.ops.deform_sample import deform_attend_bev, deform_attend_images
+from src.ops.linear import linear
 from src.structures.sparse_bev import SparseBEV
 
 NUM_HEADS = 4
@@ -55,7 +56,8 @@ class RadarCrossAttention(nn.Module):
     ) -> Tensor:  # [B, G, C]
         """Weighted bilinear samples; cells without a site and points beyond the grid count as zero."""
         b, g = query.shape[:2]
-        values = self.value(radar_bev.features).unflatten(-1, (NUM_HEADS, -1))  # [M, heads, C / heads]
+        values = linear(radar_bev.features, self.value.weight.t(), self.value.bias)
+        values = values.unflatten(-1, (NUM_HEADS, -1))  # [M, heads, C / heads]
         weights = self.logits(query).float().unflatten(-1, (NUM_HEADS, self.num_points)).softmax(-1)
         sample = torch.arange(b, device=query.device).repeat_interleave(g)
         gathered = deform_attend_bev(

@@ -14,6 +14,7 @@ from src.models.deploy.static_parts import GraphReplay, ImageNetwork
 from src.models.heads.branches import Branches
 from src.models.horizon3d.sparse_fusion import SparseFusion
 from src.models.layers.sparse import RowNorm, SparseConv, SubmanifoldConv
+from src.ops.precision import computing
 from src.ops.sites import Sites
 from src.streaming import StreamingDetector
 from src.structures.boxes import Boxes3D
@@ -53,11 +54,11 @@ def trained(tmp_path_factory):
     return get
 
 
-def pair(detector, bf16=False, **switches):
+def pair(detector, precision="32-true", **switches):
     """Two fresh detectors of one model: as trained and prepared."""
     parts = (detector.model, detector.grid, detector.settings)
-    plain = StreamingDetector(*parts, bf16=bf16, plain=True)
-    return plain, StreamingDetector(*parts, bf16=bf16, **switches)
+    plain = StreamingDetector(*parts, precision=precision, plain=True)
+    return plain, StreamingDetector(*parts, precision=precision, **switches)
 
 
 def distance(found: Boxes3D, wanted: Boxes3D) -> torch.Tensor:
@@ -138,7 +139,7 @@ def test_no_norm_is_left_behind_a_layer_and_the_trained_model_is_untouched(train
     assert left == {id(norm) for fusion in before_a_union for norm in (fusion.norm_gaussian, fusion.norm_radar)}
     assert not any(parameter.requires_grad for parameter in prepared.parameters()) and not prepared.training
     assert all(torch.equal(value, before[key]) for key, value in model.state_dict().items())
-    assert model.prepared_bf16 is None and all(parameter.requires_grad for parameter in model.parameters())
+    assert model.prepared_for is None and all(parameter.requires_grad for parameter in model.parameters())
     with pytest.raises(ValueError, match="prepared for inference already"):
         prepare_for_inference(prepared)
 
@@ -166,7 +167,7 @@ def test_a_stream_gives_the_same_detections(trained, name):
 @pytest.mark.parametrize("name", ["phase 1", "phase 2", "dense"])
 def test_bf16_is_no_further_from_float32_than_the_plain_path_in_bf16(trained, name):
     detector = trained(*MODELS[name])
-    (plain, fast), (exact, _) = pair(detector, bf16=True), pair(detector)
+    (plain, fast), (exact, _) = pair(detector, "bf16-mixed"), pair(detector)
     near = torch.zeros(2)
     for k in range(6 if plain.model.config.memory_frames else 2):
         frame = make_frame(detector, 0.5 * k, seed=k)
@@ -283,13 +284,13 @@ def test_on_a_cpu_a_graph_is_the_network_itself(trained):
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@pytest.mark.parametrize("bf16", [False, True])
-def test_a_cuda_graph_gives_the_networks_own_maps(trained, bf16):
-    encoder = prepare_for_inference(trained(*MODELS["phase 1"]).model.cuda(), bf16).image_encoder
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+def test_a_cuda_graph_gives_the_networks_own_maps(trained, precision):
+    encoder = prepare_for_inference(trained(*MODELS["phase 1"]).model.cuda(), precision).image_encoder
     network = ImageNetwork(encoder.backbone, encoder.neck)
     replay = GraphReplay(network)
     kept = []
-    with torch.inference_mode(), torch.autocast("cuda", torch.bfloat16, enabled=bf16):
+    with torch.inference_mode(), computing(precision, torch.device("cuda")):
         for seed in range(3):
             generator = torch.Generator("cuda").manual_seed(seed)
             x = torch.randn(4, 3, 96, 320, device="cuda", generator=generator)

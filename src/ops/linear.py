@@ -1,0 +1,52 @@
+"""A linear layer on many rows."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.autograd.function import FunctionCtx
+
+from src.ops.products import MOST_ROWS, multiply, product_type, row_spans, whole_steps
+
+LEAST_ROWS = 2048
+"""Below, torch's own layer is as fast."""
+
+
+def linear(
+    x: Tensor,  # [n, C]
+    weight: Tensor,  # [C, O]
+    bias: Tensor | None = None,  # [O]
+) -> Tensor:  # [n, O]
+    """x W + b; many rows in float32 on a CPU by `multiply`, in the type that `product_type` chooses."""
+    plain = x.device.type != "cpu" or x.dtype != torch.float32 or torch.is_autocast_enabled("cpu")
+    if plain or len(x) < LEAST_ROWS:
+        return x @ weight if bias is None else torch.addmm(bias, x, weight)
+    return _Linear.apply(x.contiguous(), weight, bias, product_type(x, weight.shape[1]))
+
+
+class _Linear(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: FunctionCtx, x: Tensor, weight: Tensor, bias: Tensor | None, dtype: torch.dtype) -> Tensor:
+        ctx.save_for_backward(x, weight)
+        ctx.dtype = dtype
+        out = _times(x, weight, dtype)
+        return out if bias is None else out.add_(bias)
+
+    @staticmethod
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, ...]:
+        (x, weight), dtype, grad = ctx.saved_tensors, ctx.dtype, grad.contiguous()
+        grad_x = grad_weight = None
+        if ctx.needs_input_grad[0]:
+            grad_x = _times(grad, weight.t(), dtype)
+        if ctx.needs_input_grad[1]:
+            grad_weight = torch.zeros_like(weight)
+            for span in row_spans(len(x), MOST_ROWS):
+                grad_weight += multiply(whole_steps(x[span]).t().to(dtype), whole_steps(grad[span]).to(dtype))
+        return grad_x, grad_weight, grad.sum(0) if ctx.needs_input_grad[2] else None, None
+
+
+def _times(x: Tensor, weight: Tensor, dtype: torch.dtype) -> Tensor:
+    out, weight = x.new_empty(len(x), weight.shape[1]), weight.to(dtype)
+    for span in row_spans(len(x), MOST_ROWS):
+        out[span] = multiply(whole_steps(x[span]).to(dtype), weight)[: len(x[span])]
+    return out
