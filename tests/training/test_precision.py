@@ -6,7 +6,7 @@ import torch
 from src.ops import products
 from src.ops.precision import Precision, computing
 from src.training.fit import build_evaluation_trainer, fit
-from src.training.run_folder import RunFolder
+from src.training.run_folder import Resume, RunFolder
 from tests.training.toys import ToyData, ToyDetector, toy_module, toy_trainer
 
 
@@ -29,7 +29,9 @@ def seen(monkeypatch):
 def test_trainings_and_evaluations_agree(precision, seen, tmp_path):
     expected = torch.bfloat16 if precision == "bf16-products" else torch.float32, precision == "bf16-mixed"
     module, data = toy_module(), ToyData()
-    fit(toy_trainer(RunFolder(tmp_path / "run"), precision=precision, epochs=1), module, data, None)
+    folder = RunFolder(tmp_path, "run")
+    folder.open(Resume.auto)
+    fit(toy_trainer(folder, precision=precision, epochs=1), module, data, None)
     assert seen == {(training, *expected) for training in (True, False)}
     seen.clear()
     trainer = build_evaluation_trainer(precision, "cpu")
@@ -38,7 +40,7 @@ def test_trainings_and_evaluations_agree(precision, seen, tmp_path):
     assert seen == {(False, *expected)}
     assert products.product_type(torch.zeros(4096, 64), 64) == torch.float32
     with computing(precision, torch.device("cpu")):  # commands that have no trainer
-        module.model(next(iter(data_of(data))))
+        module.model.eval()(next(iter(data_of(data))))
     assert seen == {(False, *expected)}
 
 
