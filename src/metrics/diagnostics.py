@@ -75,7 +75,7 @@ def sums_by_sample(
     `unoccupied_recall`: of those without an occupied cell inside. `remembered_share`: share of the objects that a
     remembered Gaussian covers. Of all three only ground truth that counts.
     `<source>_gaussians`: how many a frame has; `<source>_near`: share of them near an object; `<source>_faint`: share
-    below FAINT_OPACITY; `<source>_velocity_error`: m/s, of those near a box that moves at FAST_MPS or faster, to its
+    below FAINT_OPACITY; `<source>_velocity_error`: m/s, of those inside a box that moves at FAST_MPS or faster, to its
     velocity; the sources are those of `Source`.
     """
     truth, num_samples = evaluation_set.ground_truth, len(evaluation_set.tokens)
@@ -183,10 +183,10 @@ def _velocity_errors(
     distances: Tensor,  # [g, k] m
     boxes: Boxes3D,
 ) -> Tensor:  # [g] m/s
-    """Of Gaussians to the velocity of the nearest box; NaN unless it is near and moves fast."""
+    """Of Gaussians within a fast box to its velocity; NaN elsewhere, where what stands beside the road may be meant."""
     if not len(boxes):
         return velocities.new_full((len(velocities),), torch.nan)
     nearest, box = distances.min(dim=1)
     errors = (velocities - boxes.velocities[box]).norm(dim=1)
-    counted = (nearest <= NEAR_M) & (boxes.velocities[box].norm(dim=1) >= FAST_MPS)
+    counted = (nearest == 0) & (boxes.velocities[box].norm(dim=1) >= FAST_MPS)
     return torch.where(counted, errors, torch.nan)
