@@ -384,7 +384,7 @@ def test_a_stopped_run_resumes_under_torchrun_and_scores_as_one_process_does(pha
     alone, together = (json.loads((folder / "metrics.json").read_text()) for folder in (tmp_path, phase1))
     for name in ("mAP", "NDS", "mATE", "mASE", "mAOE", "mAVE", "mAAE"):
         assert together[name] == pytest.approx(alone[name], abs=1e-6), name
-    assert together["mAP"] > 0 or together["mATE"] < 1
+    assert together["mATE"] != 1, "nothing is matched, so nothing is compared"
 
 
 @needs_proc
