@@ -180,7 +180,7 @@ def fits_dense(layer: Layer, out_sites: Sites) -> bool:
     cells = [torch.Size(sites.shape).numel() for sites in (layer.sites, out_sites)]
     kernel = layer.kernel
     room = 4 * (cells[0] * kernel.in_channels + cells[1] * kernel.out_channels)
-    flops = 2 * cells[1] * kernel.in_channels * kernel.out_channels * kernel.kernel_size**kernel.ndim
+    flops = 2 * cells[1] * kernel.in_channels * kernel.out_channels * len(kernel.weight)
     return not layer.temporal and room <= DENSE_LIMIT_BYTES and flops <= DENSE_LIMIT_FLOPS
 
 
@@ -188,7 +188,7 @@ def dense_convolution(layer: Layer, features: Tensor, out_sites: Sites) -> Tenso
     """All cells: scatter the features, convolve the whole grid, take the cells that ours computes."""
     kernel, ndim = layer.kernel, layer.kernel.ndim
     grid = SparseMap(layer.sites, features).to_dense()
-    cube = kernel.weight.view(*(kernel.kernel_size,) * ndim, *kernel.weight.shape[1:])
+    cube = kernel.weight.view(*kernel.kernel_size, *kernel.weight.shape[1:])
     convolve = F.conv2d if ndim == 2 else F.conv3d
     dense = convolve(grid, cube.permute(-1, -2, *range(ndim)), stride=kernel.stride, padding=kernel.padding)
     return dense.movedim(1, -1).flatten(0, -2).index_select(0, out_sites.linear())

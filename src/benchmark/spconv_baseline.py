@@ -44,7 +44,7 @@ def build_layer(spconv: ModuleType, kernel: SparseKernel, key: str) -> nn.Module
         layer = getattr(spconv, f"SparseConv{ndim}d")(*sizes, stride=kernel.stride, padding=kernel.padding, **shared)
     layer = layer.to(weight.device)
     with torch.no_grad():
-        cube = weight.view(*(kernel.kernel_size,) * ndim, *weight.shape[1:])
+        cube = weight.view(*kernel.kernel_size, *weight.shape[1:])
         layer.weight.copy_(cube.permute(-1, *range(ndim), -2))
         if kernel.bias is not None:
             layer.bias.copy_(kernel.bias)

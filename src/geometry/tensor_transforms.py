@@ -1,6 +1,6 @@
-"""Transforms of torch tensors: rigid inverses, the ground plane and the way back from pixels; `transforms` is numpy's.
+"""Transforms of torch tensors: rigid inverses, points and vectors, the way back from pixels; `transforms` is numpy's.
 
-Vectors of the plane are turned component by component: autocast and TF32 would round the factors of a matrix product,
+Vectors are turned component by component: autocast and TF32 would round the factors of a matrix product,
 and with them positions of 150 m.
 """
 
@@ -81,3 +81,20 @@ def invert_projection(
     """
     matrix = torch.where(valid[..., None, None], pix_from_src, torch.eye(4, device=pix_from_src.device))
     return torch.linalg.inv_ex(matrix.double())[0].float()
+
+
+def transform_points(
+    dst_from_src: Tensor,  # [..., 4, 4]
+    points: Tensor,  # [..., 3] m
+) -> Tensor:  # [..., 3] m
+    """Points in another frame."""
+    return transform_vectors(dst_from_src, points) + dst_from_src[..., :3, 3]
+
+
+def transform_vectors(
+    dst_from_src: Tensor,  # [..., 4, 4]
+    vectors: Tensor,  # [..., 3]
+) -> Tensor:  # [..., 3]
+    """Vectors, such as velocities, in another frame."""
+    x, y, z = (dst_from_src[..., :3, axis] * vectors[..., axis : axis + 1] for axis in range(3))
+    return x + y + z

@@ -14,11 +14,14 @@ from src.models.dense_bev.model import DenseBEV, DenseBEVConfig
 from src.models.detector import Detector, ModelConfig
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
+from src.models.lrs4fusion.lrs_config import LRS4FusionConfig
+from src.models.lrs4fusion.model import LRS4Fusion
 
 FAMILIES: dict[str, tuple[type[ModelConfig], type[Detector]]] = {
     "horizon3d": (Horizon3DConfig, Horizon3D),
     "dense_bev": (DenseBEVConfig, DenseBEV),
     "centerpoint": (CenterPointConfig, CenterPoint),
+    "lrs4fusion": (LRS4FusionConfig, LRS4Fusion),
 }
 
 

@@ -17,7 +17,11 @@ from src.structures.evidence import Evidence
 
 @dataclass(kw_only=True)
 class ModelConfig:
-    """What every model's settings (`model`) have in common, and what commands ask of them."""
+    """What every model's settings (`model`) have in common, and what commands ask of them.
+
+    Each also has `sensors`, as a property or as a key: which of `taxonomy.SENSORS` are read, all that `forward` takes
+    of a batch, and what a submission states.
+    """
 
     temporal_part: ClassVar[str] = ""
     """The key of all that is temporal; a phase of single frames sets it to null. Empty for a model without."""
@@ -27,11 +31,6 @@ class ModelConfig:
 
     name: str
     channels: int  # C, width of the map that the head reads
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Which of `taxonomy.SENSORS` are read: all that `forward` takes of a batch, and what a submission states."""
-        raise NotImplementedError
 
     @property
     def keys_of_temporal_phase(self) -> tuple[str, ...]:

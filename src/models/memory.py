@@ -80,6 +80,27 @@ class RememberedFrame(TensorFields):
         raise ConfigError(f"{type(self).__name__} holds no velocities that an oracle could replace; leave oracle= out")
 
 
+class StoredRows(TensorFields):
+    """Base of what a frame remembers as rows of all its streams, one after the other."""
+
+    rows: Tensor  # [n] int64, stream of each, ascending; a field of every subclass
+
+    def of_streams(
+        self,
+        rows: Tensor,  # [B'] int64, distinct where kept
+        keep: Tensor,  # [B'] bool
+        batch_size: int,  # B, of the streams so far
+    ) -> Self:
+        """What belongs to the streams at `rows`, those without `keep` forgotten."""
+        target = rows.new_full((batch_size,), -1)  # new row of every old one
+        kept = keep.nonzero().squeeze(1)
+        target[rows[kept]] = kept
+        moved = target[self.rows]
+        order = moved.argsort(stable=True)
+        order = order[moved[order] >= 0]
+        return replace(self.map(lambda value: value[order]), rows=moved[order])
+
+
 Frame = TypeVar("Frame", bound=RememberedFrame)
 
 

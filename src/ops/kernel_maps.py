@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.ops.segment_reduce import segments
+from src.ops.segment_reduce import inverse_rows, segments
 from src.ops.sites import HALO, Sites
 
 Size = int | tuple[int, ...]
@@ -50,6 +50,21 @@ class KernelMap:
         return torch.tensor(list(itertools.accumulate(self.counts)), dtype=torch.int32, device=self.inputs.device)
 
     @cached_property
+    def transposed(self) -> KernelMap:
+        """The map from its outputs to its inputs through the same offsets, as of a transposed convolution."""
+        return KernelMap(self.outputs, self.inputs, self.counts, self.num_outputs, self.num_inputs)
+
+    def keep_outputs(
+        self,
+        rows: Tensor,  # [m] int64, ascending
+    ) -> KernelMap:
+        """The map to these of its outputs only. Synchronises with a GPU."""
+        new = inverse_rows(rows, self.num_outputs).to(torch.int32).index_select(0, self.outputs)
+        kept = (new >= 0).nonzero().squeeze(1)
+        pairs = (values.index_select(0, kept) for values in (self.inputs, new))
+        return KernelMap(*pairs, tuple(_counts_kept(kept, self).tolist()), self.num_inputs, len(rows))
+
+    @cached_property
     def by_output(self) -> tuple[Tensor, Tensor]:
         """Pairs ordered by output row [pairs] int32 and the first pair of each row [num_outputs + 1] int32."""
         return segments(self.outputs, self.num_outputs)
@@ -65,9 +80,7 @@ def submanifold_map(sites: Sites, kernel_size: Size) -> KernelMap:
 
     Raises ValueError for an even or too large kernel.
     """
-    kernel = _per_axis(kernel_size, sites.ndim, "kernel_size")
-    if any(size % 2 == 0 or size > 2 * HALO + 1 for size in kernel):
-        raise ValueError(f"kernel_size={kernel}: a submanifold kernel must be odd and at most {2 * HALO + 1} per axis")
+    kernel = _odd_kernel(sites, kernel_size)
     key = ("submanifold", kernel)
     if key not in sites.cache:
         sites.cache[key] = _build_submanifold(sites, kernel)
@@ -80,12 +93,42 @@ def strided_map(sites: Sites, kernel_size: Size, stride: Size, padding: Size) ->
     Output cell p sees input cell p * stride - padding + k, as in a dense torch convolution, and the output grid has its
     size. Raises ValueError when the kernel does not fit the padded grid.
     """
-    kernel = _per_axis(kernel_size, sites.ndim, "kernel_size")
-    strides, pads = _per_axis(stride, sites.ndim, "stride"), _per_axis(padding, sites.ndim, "padding")
+    kernel = per_axis(kernel_size, sites.ndim, "kernel_size")
+    strides, pads = per_axis(stride, sites.ndim, "stride"), per_axis(padding, sites.ndim, "padding")
     key = ("strided", kernel, strides, pads)
     if key not in sites.cache:
         sites.cache[key] = _build_strided(sites, kernel, strides, pads)
     return sites.cache[key]
+
+
+def inverse_map(fine: Sites, coarse: Sites, kernel_size: Size, stride: Size, padding: Size) -> KernelMap:
+    """The strided map from `fine` to `coarse` read backwards, as of a transposed convolution; cached on `fine`.
+
+    Raises ValueError unless `coarse` is what the strided map makes of `fine`.
+    """
+    forward, reached = strided_map(fine, kernel_size, stride, padding)
+    if reached is not coarse and (reached.shape != coarse.shape or not torch.equal(reached.keys, coarse.keys)):
+        raise ValueError(
+            f"{len(coarse)} coarse sites on {coarse.shape} are not those that kernel_size={kernel_size}, "
+            f"stride={stride}, padding={padding} makes of the {len(fine)} fine ones ({len(reached)} on "
+            f"{reached.shape}); give the sites that the strided convolution started from"
+        )
+    return forward.transposed
+
+
+def window_map(inputs: Sites, outputs: Sites, kernel_size: Size) -> KernelMap:
+    """Map from one set of sites to another of the same grid: each output sees the inputs in the window around it.
+
+    Raises ValueError for different grids, or a kernel that is even or too large.
+    """
+    if inputs.shape != outputs.shape:
+        raise ValueError(f"a window joins sites of one grid, but got shapes {inputs.shape} and {outputs.shape}")
+    kernel = _odd_kernel(outputs, kernel_size)
+    found, where = _search(
+        inputs.keys, _corners(outputs, kernel), outputs.strides[1:], kernel, torch.Size(kernel).numel()
+    )
+    hits, rows, counts = _hits(found)
+    return KernelMap(where.reshape(-1).index_select(0, hits).to(torch.int32), rows, counts, len(inputs), len(outputs))
 
 
 def stacked_map(
@@ -100,7 +143,6 @@ def stacked_map(
     computing with the zeros.
     """
     base = submanifold_map(sites, kernel_size)
-    ends = torch.tensor(list(itertools.accumulate(base.counts)), device=sites.device)
     inputs, outputs, counts, first = [], [], [], 0
     for rows in parts:
         place = torch.full((len(sites),), -1, dtype=torch.int32, device=sites.device)
@@ -109,7 +151,7 @@ def stacked_map(
         kept = (seen >= 0).nonzero().squeeze(1)
         inputs.append(seen.index_select(0, kept))
         outputs.append(base.outputs.index_select(0, kept))
-        counts.append(torch.searchsorted(kept, ends).diff(prepend=ends.new_zeros(1)))
+        counts.append(_counts_kept(kept, base))
         first += len(rows)
     return KernelMap(torch.cat(inputs), torch.cat(outputs), tuple(torch.cat(counts).tolist()), first, len(sites))
 
@@ -121,8 +163,8 @@ def temporal_map(sites: Sites, kernel_size: Size, stride: Size, padding: Size) -
     still reach the spatial neighbours. `stride` is (s, 1, 1), the spatial padding half the spatial kernel.
     Raises ValueError for another stride or padding.
     """
-    kernel = _per_axis(kernel_size, sites.ndim, "kernel_size")
-    strides, pads = _per_axis(stride, sites.ndim, "stride"), _per_axis(padding, sites.ndim, "padding")
+    kernel = per_axis(kernel_size, sites.ndim, "kernel_size")
+    strides, pads = per_axis(stride, sites.ndim, "stride"), per_axis(padding, sites.ndim, "padding")
     if any(s != 1 for s in strides[1:]) or any(2 * p + 1 != k for p, k in zip(pads[1:], kernel[1:], strict=True)):
         raise ValueError(
             f"stride={strides}, padding={pads}, kernel_size={kernel}: behind the time axis the stride must be 1 "
@@ -136,6 +178,23 @@ def temporal_map(sites: Sites, kernel_size: Size, stride: Size, padding: Size) -
     return sites.cache[key]
 
 
+def _odd_kernel(sites: Sites, kernel_size: Size) -> tuple[int, ...]:
+    kernel = per_axis(kernel_size, sites.ndim, "kernel_size")
+    if any(size % 2 == 0 or size > 2 * HALO + 1 for size in kernel):
+        raise ValueError(f"kernel_size={kernel}: a submanifold kernel must be odd and at most {2 * HALO + 1} per axis")
+    return kernel
+
+
+def _corners(sites: Sites, kernel: tuple[int, ...]) -> Tensor:  # [n] int64
+    """Key of the first cell of the odd kernel around each site."""
+    return sites.keys - sum(size // 2 * step for size, step in zip(kernel, sites.strides[1:], strict=True))
+
+
+def _counts_kept(kept: Tensor, base: KernelMap) -> Tensor:  # [n] int64 positions of pairs, ascending -> [K]
+    """How many of each offset's pairs were kept."""
+    return torch.searchsorted(kept, base.ends.long()).diff(prepend=kept.new_zeros(1))
+
+
 def _build_submanifold(sites: Sites, kernel: tuple[int, ...]) -> KernelMap:
     """Search the offsets before the centre only; those behind it are their mirror images."""
     num, device = len(sites), sites.device
@@ -143,8 +202,7 @@ def _build_submanifold(sites: Sites, kernel: tuple[int, ...]) -> KernelMap:
     half = torch.Size(kernel).numel() // 2
     if half == 0:
         return KernelMap(rows, rows, (num,), num, num, mirrored=True, identity=True)
-    starts = sites.keys - sum(size // 2 * step for size, step in zip(kernel, sites.strides[1:], strict=True))
-    found, where = _search(sites.keys, starts, sites.strides[1:], kernel, half)
+    found, where = _search(sites.keys, _corners(sites, kernel), sites.strides[1:], kernel, half)
     hits, outputs, counts = _hits(found)
     inputs = where.reshape(-1).index_select(0, hits).to(torch.int32)
     blocks_in, blocks_out = inputs.split(counts), outputs.split(counts)
@@ -244,7 +302,8 @@ def _output_shape(
     return (shape[0], *sizes)
 
 
-def _per_axis(value: Size, ndim: int, name: str) -> tuple[int, ...]:
+def per_axis(value: Size, ndim: int, name: str) -> tuple[int, ...]:
+    """One number for each spatial axis, of one for all or one for each. Raises ValueError for other numbers of them."""
     sizes = (value,) * ndim if isinstance(value, int) else tuple(value)
     if len(sizes) != ndim or min(sizes) < (0 if name == "padding" else 1):
         raise ValueError(f"{name}={value}: expected one number or {ndim}, one per spatial axis, none too small")

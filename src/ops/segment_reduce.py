@@ -56,6 +56,17 @@ def segment_mean(
     return segment_sum(values, rows, num_rows) / counts.clamp(min=1)[:, None].to(values.dtype)
 
 
+def segment_max(
+    values: Tensor,  # [n, C]
+    rows: Tensor,  # [n] int64
+    num_rows: int,
+) -> Tensor:  # [num_rows, C]
+    """Scatter maximum: of the values that share a row; absent rows are 0. Differentiable."""
+    index = rows[:, None].expand_as(values)
+    zeros = values.new_zeros(num_rows, values.shape[1])
+    return zeros.scatter_reduce(0, index, values, "amax", include_self=False)
+
+
 class _SegmentSum(torch.autograd.Function):
     @staticmethod
     def forward(ctx: FunctionCtx, values: Tensor, rows: Tensor, num_rows: int) -> Tensor:

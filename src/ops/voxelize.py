@@ -27,11 +27,36 @@ def voxelize(
     on ties those with the lowest index. Means are float32 at least, whatever autocast says, and the same for any order
     of the points up to rounding. Raises ValueError for shapes that do not fit together.
     """
+    if len(points) != len(batch):
+        raise ValueError(f"expected one row of points for each entry of batch [{len(batch)}], got {len(points)}")
+    sites, rows, inside = voxel_rows(coordinates, batch, lower_m, voxel_size_m, shape, batch_size)
+    values = points.index_select(0, inside)
+    if max_voxels is not None and len(sites) > max_voxels:
+        kept = _densest(sites, torch.bincount(rows, minlength=len(sites)), max_voxels)
+        rows = inverse_rows(kept, len(sites)).index_select(0, rows)
+        values, rows = values[rows >= 0], rows[rows >= 0]
+        sites = Sites(sites.shape, sites.keys.index_select(0, kept))
+    values = values.to(torch.promote_types(values.dtype, torch.float32))
+    return sites, segment_mean(values, rows, len(sites)), torch.bincount(rows, minlength=len(sites))
+
+
+def voxel_rows(
+    coordinates: Tensor,  # [P, d] metres in the order (x, y) or (x, y, z)
+    batch: Tensor,  # [P] int64, sample of each point
+    lower_m: tuple[float, ...],  # (x, y[, z]) lower corner of the grid
+    voxel_size_m: tuple[float, ...],  # (x, y[, z])
+    shape: tuple[int, ...],  # (y, x) or (z, y, x) voxels
+    batch_size: int,
+) -> tuple[Sites, Tensor, Tensor]:
+    """Sites [V] of the voxels that hold points; of the n points inside, the voxel and which they are, both [n] int64.
+
+    What is inside, and what raises ValueError, is as for `voxelize`.
+    """
     ndim = len(shape)
-    if coordinates.shape != (len(points), ndim) or batch.shape != (len(points),):
+    if coordinates.shape != (len(batch), ndim):
         raise ValueError(
-            f"expected coordinates [{len(points)}, {ndim}] and batch [{len(points)}] for shape {tuple(shape)}, got "
-            f"{list(coordinates.shape)} and {list(batch.shape)}"
+            f"expected coordinates [{len(batch)}, {ndim}] for batch [{len(batch)}] and shape {tuple(shape)}, got "
+            f"{list(coordinates.shape)}"
         )
     if len(lower_m) != ndim or len(voxel_size_m) != ndim:
         raise ValueError(f"lower_m={lower_m}, voxel_size_m={voxel_size_m}: expected {ndim} values each, as in {shape}")
@@ -43,14 +68,7 @@ def voxelize(
     inside = ((cells >= 0) & (cells < limit)).all(1).nonzero().squeeze(1)
     indices = torch.cat([batch[:, None].index_select(0, inside), cells.index_select(0, inside).long()], 1)
     sites, rows = Sites.unique(indices, (batch_size, *shape))
-    values = points.index_select(0, inside)
-    if max_voxels is not None and len(sites) > max_voxels:
-        kept = _densest(sites, torch.bincount(rows, minlength=len(sites)), max_voxels)
-        rows = inverse_rows(kept, len(sites)).index_select(0, rows)
-        values, rows = values[rows >= 0], rows[rows >= 0]
-        sites = Sites(sites.shape, sites.keys.index_select(0, kept))
-    values = values.to(torch.promote_types(values.dtype, torch.float32))
-    return sites, segment_mean(values, rows, len(sites)), torch.bincount(rows, minlength=len(sites))
+    return sites, rows, inside
 
 
 def _densest(sites: Sites, counts: Tensor, limit: int) -> Tensor:

@@ -8,7 +8,9 @@ from src.geometry.tensor_transforms import (
     pixel_centres,
     rotate,
     rotate_back,
+    transform_points,
     transform_points_xy,
+    transform_vectors,
     transform_vectors_xy,
 )
 from tests.models.moving import UTM, bda, pose
@@ -53,3 +55,11 @@ def test_projections_are_inverted_and_missing_cameras_may_be_singular():
     inverse = invert_projection(matrix, torch.tensor([[True, False]]))
     torch.testing.assert_close(inverse[0, 0] @ matrix[0, 0], torch.eye(4), rtol=0, atol=1e-5)
     assert torch.equal(inverse[0, 1], torch.eye(4))
+
+
+def test_points_and_vectors_of_space_equal_the_homogeneous_product():
+    matrix = torch.stack([pose(3.0, -2.0, 0.7, pitch=0.1), pose(-1.0, 5.0, -2.0)])
+    points = torch.randn(2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for last, transform in ((1.0, transform_points), (0.0, transform_vectors)):
+        full = torch.cat([points, torch.full((2, 1), last, dtype=torch.float64)], 1)
+        torch.testing.assert_close(transform(matrix, points), (matrix @ full[..., None])[:, :3, 0])

@@ -1,4 +1,4 @@
-"""Random sites and the three kinds of kernel maps over (t, y, x)."""
+"""Random sites and the kinds of kernel maps over (t, y, x), or (z, y, x)."""
 
 import torch
 
@@ -15,5 +15,7 @@ def random_sites(shape, count, seed=0):
 def map_of(mode, sites):
     if mode == "submanifold":
         return submanifold_map(sites, 3)
+    if mode == "inverse":
+        return strided_map(sites, 3, 2, 1)[0].transposed
     build = strided_map if mode == "strided" else temporal_map
     return build(sites, 3, (2, 1, 1), 1)[0]

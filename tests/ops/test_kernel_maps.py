@@ -3,7 +3,7 @@ import itertools
 import pytest
 import torch
 
-from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
+from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map, window_map
 from src.ops.sites import Sites
 from tests.ops.maps import random_sites
 
@@ -50,3 +50,35 @@ def test_wrong_kernels_are_named():
         strided_map(sites, 9, 1, 0)
     with pytest.raises(ValueError, match="the plane would change"):
         temporal_map(random_sites((1, 4, 4, 4), 5), 3, 2, 1)
+
+
+@pytest.mark.parametrize("kernel", [3, (1, 3, 5)])
+def test_a_window_joins_two_sets_of_sites(kernel):
+    inputs, outputs = random_sites((2, 3, 4, 6), 40), random_sites((2, 3, 4, 6), 50, seed=1)
+    half = torch.tensor([0, *(size // 2 for size in ((kernel,) * 3 if isinstance(kernel, int) else kernel))])
+    apart = (inputs.indices()[None] - outputs.indices()[:, None]).abs()  # [outputs, inputs, 4]
+    expected = (apart <= half).all(2).nonzero()
+    found = window_map(inputs, outputs, kernel)
+    pairs = torch.stack([found.outputs, found.inputs], 1).long()
+    assert sorted(pairs.tolist()) == expected.tolist() and sum(found.counts) == len(pairs)
+    itself, known = window_map(inputs, inputs, kernel), submanifold_map(inputs, kernel)
+    assert torch.equal(itself.inputs, known.inputs) and itself.counts == known.counts
+    with pytest.raises(ValueError, match="sites of one grid"):
+        window_map(inputs, random_sites((2, 3, 4, 5), 3), kernel)
+
+
+def test_outputs_are_left_out():
+    kernel_map, _ = strided_map(random_sites((2, 5, 6), 20), 3, 1, 1)
+    rows = torch.arange(0, kernel_map.num_outputs, 3)
+    kept = kernel_map.keep_outputs(rows)
+    offsets = torch.arange(9).repeat_interleave(torch.tensor(kernel_map.counts))
+    wanted = [
+        (offset, source, rows.tolist().index(target))
+        for offset, source, target in zip(
+            offsets.tolist(), kernel_map.inputs.tolist(), kernel_map.outputs.tolist(), strict=True
+        )
+        if target % 3 == 0
+    ]
+    offsets = torch.arange(9).repeat_interleave(torch.tensor(kept.counts)).tolist()
+    assert wanted == list(zip(offsets, kept.inputs.tolist(), kept.outputs.tolist(), strict=True))
+    assert kept.num_outputs == len(rows)

@@ -6,6 +6,7 @@ from src.ops.segment_reduce import (
     paired_dot,
     permute_rows,
     rank_per_sample,
+    segment_max,
     segment_mean,
     segment_sum,
     segments,
@@ -81,3 +82,12 @@ def test_permuted_rows_and_their_gradient():
     none = permute_rows(empty, torch.tensor([-1, -1]), torch.zeros(0, dtype=torch.int64))
     none.sum().backward()
     assert none.tolist() == [[0.0] * 3] * 2 and empty.grad.shape == (0, 3)
+
+
+def test_segment_max_by_hand():
+    values = torch.tensor([[-3.0, 1.0], [-2.0, 0.5], [7.0, -1.0]], dtype=torch.float64, requires_grad=True)
+    out = segment_max(values, torch.tensor([2, 2, 0]), 4)
+    assert out.tolist() == [[7, -1], [0, 0], [-2, 1], [0, 0]]
+    out.backward(torch.tensor([[1.0, 2], [3, 4], [5, 6], [7, 8]]).double())
+    assert values.grad.tolist() == [[0, 6], [5, 0], [1, 2]]
+    assert segment_max(values[:0], torch.zeros(0, dtype=torch.int64), 2).tolist() == [[0, 0], [0, 0]]

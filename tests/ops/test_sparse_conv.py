@@ -6,7 +6,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from src.ops.kernel_maps import stacked_map, strided_map, submanifold_map, temporal_map
+from src.ops.kernel_maps import inverse_map, stacked_map, strided_map, submanifold_map, temporal_map
 from src.ops.sites import Sites
 from src.ops.sparse_conv import neighbour_sum, plain_sparse_conv, sparse_conv
 from tests.ops.maps import map_of, random_sites
@@ -92,26 +92,68 @@ def test_strided_equals_dense_where_the_window_holds_a_site(kernel, stride, padd
     torch.testing.assert_close(sparse_conv(features, ours(weight), kernel_map), gather(dense, out_sites))
 
 
-@pytest.mark.parametrize("mode", ["subm", "full", "temporal"])
+INVERSE = [
+    (3, 2, 1, (5, 6, 7)),
+    (3, 2, 1, (6, 8, 4)),
+    ((1, 3, 3), (1, 2, 2), (0, 1, 1), (3, 7, 6)),
+    ((3, 1, 2), (2, 1, 2), (1, 0, 0), (5, 4, 6)),
+]
+
+
+@pytest.mark.parametrize(("kernel", "stride", "padding", "spatial"), INVERSE)
+def test_inverse_equals_dense_transposed_at_the_finer_sites(kernel, stride, padding, spatial):
+    """Values and gradients, of a dense transposed convolution that is told the finer grid's size."""
+    fine = random_sites((2, *spatial), 60)
+    _, coarse = strided_map(fine, kernel, stride, padding)
+    kernel_map = inverse_map(fine, coarse, kernel, stride, padding)
+    assert kernel_map is inverse_map(fine, Sites(coarse.shape, coarse.keys), kernel, stride, padding)
+    torch.manual_seed(0)
+    size = (kernel,) * 3 if isinstance(kernel, int) else kernel
+    features = torch.randn(len(coarse), 3).double().requires_grad_()
+    weight = torch.randn(3, 4, *size).double().requires_grad_()  # torch's order: [Cin, Cout, k...]
+    dense = densify(coarse, features)
+    smallest = F.conv_transpose3d(dense, weight, stride=stride, padding=padding).shape[2:]
+    missing = tuple(have - least for have, least in zip(spatial, smallest, strict=True))
+    whole = F.conv_transpose3d(dense, weight, stride=stride, padding=padding, output_padding=missing)
+    expected = gather(whole, fine)
+    out = sparse_conv(features, weight.flatten(2).permute(2, 0, 1), kernel_map)
+    torch.testing.assert_close(out, expected)
+    seed = torch.randn(out.shape, dtype=torch.float64)
+    found, wanted = (torch.autograd.grad(y, (features, weight), seed) for y in (out, expected))
+    torch.testing.assert_close(found, wanted)
+
+
+def test_inverse_refuses_sites_of_another_map():
+    fine = random_sites((1, 6, 6), 12)
+    _, coarse = strided_map(fine, 3, 2, 1)
+    with pytest.raises(ValueError, match=f"{len(coarse) - 1} coarse sites on .* are not those"):
+        inverse_map(fine, Sites(coarse.shape, coarse.keys[1:]), 3, 2, 1)
+
+
+@pytest.mark.parametrize("mode", ["subm", "full", "temporal", "inverse"])
 def test_gradcheck(mode):
     sites = random_sites((2, 3, 3, 4), 14)
     if mode == "subm":
         kernel_map = submanifold_map(sites, 3)
     elif mode == "full":
         kernel_map, _ = strided_map(sites, 3, 2, 1)
+    elif mode == "inverse":
+        kernel_map = strided_map(sites, 3, 2, 1)[0].transposed
     else:
         kernel_map, _ = temporal_map(sites, 3, (2, 1, 1), 1)
     torch.manual_seed(0)
-    inputs = [torch.randn(*size).double().requires_grad_() for size in ((14, 2), (27, 2, 3), (3,))]
+    sizes = ((kernel_map.num_inputs, 2), (27, 2, 3), (3,))
+    inputs = [torch.randn(*size).double().requires_grad_() for size in sizes]
     assert torch.autograd.gradcheck(lambda x, w, b: sparse_conv(x, w, kernel_map, b), inputs)
 
 
-@pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal"])
+@pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal", "inverse"])
 def test_formula_and_optimised_forms_agree(mode):
     """Values and all three gradients."""
     kernel_map = map_of(mode, random_sites((2, 5, 6, 7), 70))
     torch.manual_seed(0)
-    inputs = [torch.randn(*size).double().requires_grad_() for size in ((70, 3), (27, 3, 4), (4,))]
+    sizes = ((kernel_map.num_inputs, 3), (27, 3, 4), (4,))
+    inputs = [torch.randn(*size).double().requires_grad_() for size in sizes]
     results = []
     for convolve in (sparse_conv, plain_sparse_conv):
         out = convolve(inputs[0], inputs[1], kernel_map, inputs[2])

@@ -23,7 +23,7 @@ def values_and_gradients(convolve, kernel_map, width=3, dtype=torch.float64):
 
 
 @pytest.mark.parametrize("fill", [0.0, 0.3, 2.0])
-@pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal"])
+@pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal", "inverse"])
 def test_blocks_and_their_size_change_nothing(mode, fill, monkeypatch):
     """One block of all 27 offsets, one for each plane or row of the kernel, several products of a block."""
     monkeypatch.setattr("src.ops.sparse_conv_cpu.LEAST_FILL", fill)

@@ -7,7 +7,7 @@ from tests.ops.maps import map_of, random_sites
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-@pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal", "empty"])
+@pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal", "inverse", "empty"])
 def test_one_launch_for_all_offsets_gives_the_same(mode, dtype):
     """The form of a GPU without Triton, on a CPU."""
     sites = random_sites((2, 5, 6, 7), 0 if mode == "empty" else 70)
@@ -15,7 +15,7 @@ def test_one_launch_for_all_offsets_gives_the_same(mode, dtype):
     results = []
     for convolve in (cpu_sparse_conv, grouped_sparse_conv):
         torch.manual_seed(0)
-        x = torch.randn(len(sites), 3).to(dtype).requires_grad_()
+        x = torch.randn(kernel_map.num_inputs, 3).to(dtype).requires_grad_()
         w, b = torch.randn(27, 3, 5).to(dtype).requires_grad_(), torch.randn(5).to(dtype).requires_grad_()
         out = convolve(x, w, kernel_map, b)
         (out * torch.randn(out.shape).to(dtype)).sum().backward()

@@ -13,7 +13,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.sparse_voxel import POINT_SCALES
 from src.models.layers.dense import map_of_rows
 from src.models.layers.sparse import RowNorm
-from src.ops.segment_reduce import segment_mean
+from src.ops.segment_reduce import segment_max, segment_mean
 
 EXTRA_FEATURES = 6
 """From the cell's centre (x, y), from the mean of the pillar's points (x, y, z), log of their number."""
@@ -68,7 +68,7 @@ class PillarEncoder(nn.Module):
             features, cells, rows = self.describe(radar_points.float(), radar_batch)
             for layer, norm in zip(self.layers, self.norms, strict=True):
                 points = F.relu(norm(layer(features)))
-                pillars = _maximum(points, rows, len(cells))  # [V, width]
+                pillars = segment_max(points, rows, len(cells))  # [V, width]
                 features = torch.cat([points, F.embedding(rows, pillars)], dim=1)
             shape = (batch_size, self.grid.rows, self.grid.cols)
             whole = pillars.new_zeros(torch.Size(shape).numel(), pillars.shape[1])
@@ -92,13 +92,3 @@ class PillarEncoder(nn.Module):
         from_mean = (points[:, :3] - mean) / points.new_tensor([self.grid.cell_m, self.grid.cell_m, POINT_SCALES[2]])
         count = torch.bincount(rows, minlength=len(cells)).to(points.dtype).log()[rows]
         return torch.cat([points / self.point_scales, from_centre, from_mean, count[:, None]], dim=1), cells, rows
-
-
-def _maximum(
-    values: Tensor,  # [n, C], none negative
-    rows: Tensor,  # [n] int64
-    num_rows: int,
-) -> Tensor:  # [num_rows, C]
-    """Maximum of the values that share a row."""
-    index = rows[:, None].expand_as(values)
-    return values.new_zeros(num_rows, values.shape[1]).scatter_reduce(0, index, values, "amax")

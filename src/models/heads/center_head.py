@@ -103,14 +103,20 @@ class CenterHead(nn.Module):
     """
 
     def __init__(
-        self, config: HeadConfig, channels: int, grid: BEVGrid, velocity_code_weight: float, dense: bool = False
+        self,
+        config: HeadConfig,
+        channels: int,
+        grid: BEVGrid,
+        velocity_code_weight: float,
+        dense: bool = False,
+        in_channels: int | None = None,  # of a dense map that is wider than the head; None: C
     ) -> None:
         super().__init__()
         self.config, self.grid = config, grid
         self.learned = config.attributes is AttributeSource.learned
         self.code_weights = (1.0,) * (CODE_SIZE - 2) + (velocity_code_weight,) * 2
         if dense:
-            self.shared = nn.Sequential(DenseConvNormReLU(channels, channels, 3, bias=True), AllCells())
+            self.shared = nn.Sequential(DenseConvNormReLU(in_channels or channels, channels, 3, bias=True), AllCells())
         else:
             self.shared = ConvNormReLU(SubmanifoldConv(channels, channels, 3, 2, bias=True), eps=1e-5, momentum=0.1)
         self.heatmaps = nn.ModuleList(Branches(channels, (len(group),)) for group in HEAD_GROUPS)

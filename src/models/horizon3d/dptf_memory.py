@@ -9,13 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.models.memory import FrameMemory, RememberedFrame
+from src.models.memory import FrameMemory, RememberedFrame, StoredRows
 from src.structures.gaussians import GaussianSet
-from src.structures.tensor_fields import TensorFields
 
 
 @dataclass
-class StoredCells(TensorFields):
+class StoredCells(StoredRows):
     """Remembered BEV cells of one key frame of every stream: rows of all streams, one after the other."""
 
     xy: Tensor  # [n, 2] m, cell centres in the ego frame of their own time
@@ -39,13 +38,7 @@ class MemoryFrame(RememberedFrame):
         """The streams at `rows`, those without `keep` forgotten."""
         cells, gaussians = self.cells, self.gaussians
         if cells is not None:
-            target = torch.full_like(self.present, -1, dtype=torch.int64)  # new row of every old one
-            kept = keep.nonzero().squeeze(1)
-            target[rows[kept]] = kept
-            moved = target[cells.rows]
-            order = moved.argsort(stable=True)
-            order = order[moved[order] >= 0]
-            cells = replace(cells.map(lambda value: value[order]), rows=moved[order])
+            cells = cells.of_streams(rows, keep, len(self.present))
         if gaussians is not None:
             gaussians = gaussians.map(lambda value: value[rows])
             gaussians = replace(gaussians, valid=gaussians.valid & keep[:, None])

@@ -8,7 +8,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map
+from src.ops.kernel_maps import (
+    KernelMap,
+    Size,
+    inverse_map,
+    per_axis,
+    strided_map,
+    submanifold_map,
+    temporal_map,
+)
 from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv
 from src.structures.sparse_bev import SparseMap
@@ -17,26 +25,29 @@ from src.structures.sparse_bev import SparseMap
 class SparseKernel(nn.Module):
     """A sparse convolution; weight and bias are drawn like those of torch's dense one.
 
-    `weight` is [K, in, out], its K = kernel_size ** ndim offsets in C order over the kernel axes.
+    `weight` is [K, in, out], its K offsets in C order over the kernel axes (z, row, col). Sizes are one number, or one
+    for each axis.
     """
 
     def __init__(
         self,
         in_channels: int,
         out_channels: int,
-        kernel_size: int,
+        kernel_size: Size,
         ndim: int,
         bias: bool,
-        stride: int | tuple[int, ...] = 1,
-        padding: int | None = None,  # on either side; None: half the kernel
+        stride: Size = 1,
+        padding: Size | None = None,  # on either side; None: half the kernel
     ) -> None:
         super().__init__()
         self.in_channels, self.out_channels = in_channels, out_channels
-        self.kernel_size, self.ndim = kernel_size, ndim
-        self.stride, self.padding = stride, kernel_size // 2 if padding is None else padding
-        self.weight = nn.Parameter(torch.empty(kernel_size**ndim, in_channels, out_channels))
+        self.kernel_size, self.ndim = per_axis(kernel_size, ndim, "kernel_size"), ndim
+        self.stride = stride
+        self.padding = tuple(size // 2 for size in self.kernel_size) if padding is None else padding
+        num_offsets = math.prod(self.kernel_size)
+        self.weight = nn.Parameter(torch.empty(num_offsets, in_channels, out_channels))
         self.bias = nn.Parameter(torch.empty(out_channels)) if bias else None
-        bound = 1 / math.sqrt(kernel_size**ndim * in_channels)
+        bound = 1 / math.sqrt(num_offsets * in_channels)
         nn.init.uniform_(self.weight, -bound, bound)
         if self.bias is not None:
             nn.init.uniform_(self.bias, -bound, bound)
@@ -46,7 +57,10 @@ class SparseKernel(nn.Module):
         raise NotImplementedError
 
     def forward(self, x: SparseMap) -> SparseMap:
-        kernel_map, sites = self.map(x.sites)
+        return self.convolve(x, *self.map(x.sites))
+
+    def convolve(self, x: SparseMap, kernel_map: KernelMap, sites: Sites) -> SparseMap:
+        """Convolve to the given sites through a kernel map from those of `x`."""
         return type(x)(sites, sparse_conv(x.features, self.weight, kernel_map, self.bias))
 
     def extra_repr(self) -> str:
@@ -66,6 +80,20 @@ class SparseConv(SparseKernel):
 
     def map(self, sites: Sites) -> tuple[KernelMap, Sites]:
         return strided_map(sites, self.kernel_size, self.stride, self.padding)
+
+
+class SparseInverseConv(SparseKernel):
+    """Convolution back to the sites that a `SparseConv` of the same kernel, stride and padding started from.
+
+    As a transposed convolution of the dense grid, read at those sites.
+    """
+
+    def forward(
+        self,
+        x: SparseMap,
+        sites: Sites,  # the finer ones; their strided map, cached since the way down, is read backwards
+    ) -> SparseMap:
+        return self.convolve(x, inverse_map(sites, x.sites, self.kernel_size, self.stride, self.padding), sites)
 
 
 class TemporalConv(SparseKernel):
@@ -95,18 +123,28 @@ class RowNorm(nn.BatchNorm1d):
 
 
 class ConvNormReLU(nn.Module):
-    """A sparse convolution, batch norm and ReLU."""
+    """A sparse convolution, batch norm and ReLU, leaky if it has a slope below zero."""
 
     norm_pairs = (("conv", "norm"),)
 
-    def __init__(self, conv: SubmanifoldConv | SparseConv, eps: float, momentum: float) -> None:
+    def __init__(self, conv: SparseKernel, eps: float, momentum: float, negative_slope: float = 0.0) -> None:
         super().__init__()
-        self.conv = conv
+        self.conv, self.negative_slope = conv, negative_slope
         self.norm = RowNorm(conv.out_channels, eps=eps, momentum=momentum)
 
-    def forward(self, x: SparseMap) -> SparseMap:
-        y = self.conv(x)
-        return y.with_features(F.relu(self.norm(y.features), inplace=True))
+    def forward(
+        self,
+        x: SparseMap,
+        *sites: Sites,  # those of the output, where the convolution asks for them
+    ) -> SparseMap:
+        return self.activate(self.conv(x, *sites))
+
+    def activate(self, y: SparseMap) -> SparseMap:
+        """Norm and activation of what the convolution gave."""
+        features = self.norm(y.features)
+        if self.negative_slope:
+            return y.with_features(F.leaky_relu(features, self.negative_slope, inplace=True))
+        return y.with_features(F.relu(features, inplace=True))
 
 
 class ResidualBlock(nn.Module):

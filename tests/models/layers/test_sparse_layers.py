@@ -20,7 +20,7 @@ def random_map(ndim: int, channels: int, count: int = 30, seed: int = 0) -> Spar
 
 
 def dense_weight(conv: SparseKernel) -> torch.Tensor:
-    return conv.weight.permute(2, 1, 0).unflatten(2, (conv.kernel_size,) * conv.ndim)
+    return conv.weight.permute(2, 1, 0).unflatten(2, conv.kernel_size)
 
 
 @pytest.mark.parametrize("ndim", [2, 3])

@@ -56,6 +56,8 @@ def build(mode, device):
         return submanifold_map(sites, 3)
     if mode == "strided":
         return strided_map(sites, 3, 2, 1)[0]
+    if mode == "inverse":
+        return strided_map(sites, 3, 2, 1)[0].transposed
     if mode == "dilating":
         return strided_map(sites, (1, 3, 2), 1, (0, 1, 0))[0]
     if mode == "pointwise":
@@ -63,10 +65,10 @@ def build(mode, device):
     return temporal_map(sites, 3, (2, 1, 1), 1)[0]
 
 
-@pytest.mark.parametrize("mode", ["2d", "3d", "strided", "dilating", "pointwise", "temporal"])
+@pytest.mark.parametrize("mode", ["2d", "3d", "strided", "inverse", "dilating", "pointwise", "temporal"])
 def test_values_and_gradients(device, mode):
     kernel_map = build(mode, device)
-    assert kernel_map.num_outputs > (64 if mode in ("2d", "3d", "dilating", "temporal") else 8)
+    assert kernel_map.num_outputs > (8 if mode in ("strided", "pointwise") else 64)
     compare(kernel_map, 3, 5, device)
 
 

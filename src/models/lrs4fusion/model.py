@@ -1,0 +1,207 @@
+"""LRS4Fusion: a sparse multi-scale volume learnt from LiDAR, and what is read from it (lrs 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.image import ImageEncoderConfig
+from src.models.detector import Detector, Objective
+from src.models.heads.center_head import CenterHead, HeadOutput
+from src.models.lrs4fusion.bev_neck import BEVNeck
+from src.models.lrs4fusion.decoders import Decoders
+from src.models.lrs4fusion.late_encoder import FUSED_SCALE, FusionStem, LateEncoder, Volumes
+from src.models.lrs4fusion.lrs_config import LRS4FusionConfig, LRSOptions, LRSStage
+from src.models.lrs4fusion.ray_head import RayHead
+from src.models.lrs4fusion.sparse_unet import SparseUNet
+from src.models.lrs4fusion.volume_memory import VolumeMemory
+from src.models.lrs4fusion.voxel_pointnet import VoxelPointNet
+from src.models.lrs4fusion.windowed_fusion import WindowedFusion
+from src.structures.batch import FrameBatch
+from src.structures.boxes import Boxes3D
+
+NORM_EPS = 1e-3  # PartA2's
+QUERIES_AT_ONCE = 1 << 16
+"""Of samples along rays: their features are 544 numbers each."""
+
+
+@dataclass
+class LRSOutput:
+    """B frames through the model."""
+
+    volumes: Volumes
+    head: HeadOutput | None  # None where no boxes are learned
+
+
+class LRS4Fusion(Detector):
+    """LiDAR to voxels to a U-Net to a completed volume of four scales, which remembers its past (lrs 5).
+
+    It answers queries (x, y, z, t) by occupancy and radial velocity, and gives the ranges of future rays, and boxes.
+    Parts that the phase's stage does not train are frozen; those that it does not use are absent.
+    Raises ConfigError when parts, region and grid do not fit.
+    """
+
+    phase_options = LRSOptions
+    latency_parts = {
+        "lidar_encoder": ("pointnet.forward", "unet.forward"),
+        "late_encoder": ("stem.forward", "late_encoder.forward"),
+        "temporal_fusion": ("temporal.recall", "temporal.forward", "temporal.remember"),
+        "detection_head": ("neck.forward", "head.forward", "head.decode"),
+    }
+
+    def __init__(
+        self, config: LRS4FusionConfig, grid: BEVGrid, backbone: ImageEncoderConfig | None, options: LRSOptions
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.stage = LRSStage(options.stage)
+        self.voxels = config.roi.build(len(config.unet.encoder_channels))
+        norm = {"eps": NORM_EPS, "momentum": config.norm_momentum}
+        unet, late = config.unet, config.late_encoder
+        self.pointnet = VoxelPointNet(unet.point_channels, self.voxels, **norm)
+        self.unet = SparseUNet(unet.point_channels, unet.encoder_channels, unet.decoder_channels, **norm)
+        self.stem = FusionStem(self.unet.out_channels, late.fused_channels, late.stem_channels, norm)
+        self.late_encoder = LateEncoder(late.stem_channels, late.scale_channels, late.max_sites, norm)
+        self.temporal = None
+        if config.temporal is not None:
+            widths = (late.scale_channels[FUSED_SCALE - 1], late.scale_channels[FUSED_SCALE])
+            self.temporal = WindowedFusion(config.temporal, *widths, self.voxels.at(FUSED_SCALE))
+        self.decoders = Decoders(config.decoders, late.scale_channels, self.voxels)
+        self.ray_head = self.neck = self.head = None
+        if self.stage is LRSStage.forecast:
+            self.requires_grad_(False)
+            self.ray_head = RayHead(config.ray_head, self.voxels.farthest_m)
+        if self.stage is LRSStage.detection:
+            self.decoders.requires_grad_(False)  # they still say how fast what is remembered moves
+            self.neck = BEVNeck(config.neck, late.scale_channels[-1]).to(memory_format=torch.channels_last)
+            self.head = CenterHead(
+                config.head,
+                config.channels,
+                self.voxels.at(len(late.scale_channels) - 1).bev(),
+                options.velocity_code_weight,
+                dense=True,
+                in_channels=self.neck.out_channels,
+            ).to(memory_format=torch.channels_last)
+
+    def forward(self, batch: FrameBatch, memory: VolumeMemory | None = None) -> tuple[LRSOutput, VolumeMemory | None]:
+        """The volumes of B frames, given what is remembered of their streams; the new memory is detached.
+
+        Raises ValueError for a batch without LiDAR, and for a memory of other streams, voxels or widths.
+        """
+        volumes = self.encode(batch, memory)
+        head = None if self.head is None else self.head(self.neck(volumes.scales[-1]))
+        remembered = self.remember(volumes, batch)
+        return LRSOutput(volumes, head), remembered if remembered is None else remembered.detached()
+
+    def encode(self, batch: FrameBatch, memory: VolumeMemory | None = None) -> Volumes:
+        """The volumes alone; raises as `forward`."""
+        if batch.lidar_points is None or batch.lidar_batch is None:
+            raise ValueError("FrameBatch.lidar_points is None, but this model uses LiDAR; read it with the frames")
+        x = self.stem(self.unet(self.pointnet(batch.lidar_points, batch.lidar_batch, len(batch))))
+        if self.temporal is None:
+            return self.late_encoder(x)
+        warped = self.temporal.recall(memory, batch)
+        return self.late_encoder(x, lambda current: self.temporal(current, warped))
+
+    def remember(self, volumes: Volumes, batch: FrameBatch) -> VolumeMemory | None:
+        """What the next frame needs of this one, None without temporal part.
+
+        The remembered features carry their gradient, for the one transition that is trained through.
+        """
+        if self.temporal is None:
+            return None
+        volume, speeds = volumes.scales[FUSED_SCALE], None
+        if self.config.temporal.velocity_compensation:
+            indices = volume.indices
+            centres = self.temporal.grid.centre_of(indices[:, 1:])
+            now = torch.cat([centres, torch.zeros_like(centres[:, :1])], dim=1)
+            speeds = self._in_parts(self.velocity, volumes, now, indices[:, 0])
+        return self.temporal.remember(volume, speeds, batch)
+
+    def restore_memory(self, state: list[dict[str, Any]]) -> VolumeMemory:
+        """The memory that `VolumeMemory.state` described."""
+        return VolumeMemory.from_state(state)
+
+    def answers(
+        self,
+        volumes: Volumes,
+        queries: Tensor,  # [Q, 4] x, y, z m (aug frame), t s from the frame's time
+        batch: Tensor,  # [Q] int64, sample of each query
+    ) -> tuple[Tensor, Tensor | None]:  # [Q], [Q]
+        """Logits of occupancy and radial velocities from one look into the volumes; see `Decoders.forward`."""
+        return self.decoders(volumes, queries, batch)
+
+    def occupancy_logits(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> Tensor:  # [Q]
+        """Logits of occupancy, as `answers`."""
+        return self.answers(volumes, queries, batch)[0]
+
+    def velocity(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> Tensor:  # [Q] m/s
+        """Radial velocities, as `answers`. Raises ConfigError for a model that predicts none."""
+        speeds = self.answers(volumes, queries, batch)[1]
+        if speeds is None:
+            raise ConfigError("model.decoders.velocity=false: this model predicts no velocities")
+        return speeds
+
+    def ray_ranges(
+        self,
+        volumes: Volumes,
+        origins: Tensor,  # [R, 3] m, aug frame
+        directions: Tensor,  # [R, 3] of length 1
+        times_s: Tensor,  # [R] from the frame's time
+        batch: Tensor,  # [R] int64, sample of each ray
+    ) -> Tensor:  # [R] m
+        """Ranges that a LiDAR would measure; gradients go to the ray head alone.
+
+        Raises ConfigError for a model without ray head, that is of another stage than `forecast`.
+        """
+        if self.ray_head is None:
+            raise ConfigError(f"phase.options.stage={self.stage}: ranges of rays need the stage {LRSStage.forecast}")
+        return self.ray_head(self.ray_occupancy(volumes, origins, directions, times_s, batch))
+
+    @torch.no_grad()
+    def ray_occupancy(
+        self, volumes: Volumes, origins: Tensor, directions: Tensor, times_s: Tensor, batch: Tensor
+    ) -> Tensor:  # [R, N]
+        """Probability of occupancy at the ray head's samples along every ray."""
+        samples = self.ray_head.samples_m
+        points = origins[:, None] + samples[:, None] * directions[:, None]  # [R, N, 3]
+        queries = torch.cat([points, times_s[:, None, None].expand(-1, len(samples), 1)], dim=2).flatten(0, 1)
+        logits = self._in_parts(self.occupancy_logits, volumes, queries, batch.repeat_interleave(len(samples)))
+        return logits.view(len(origins), -1).sigmoid()
+
+    @staticmethod
+    @torch.no_grad()
+    def _in_parts(
+        ask: Callable[[Volumes, Tensor, Tensor], Tensor], volumes: Volumes, queries: Tensor, batch: Tensor
+    ) -> Tensor:  # [Q]
+        """The answers to many queries, a part of them at a time, without gradient."""
+        parts = zip(queries.split(QUERIES_AT_ONCE), batch.split(QUERIES_AT_ONCE), strict=True)
+        return torch.cat([ask(volumes, *part) for part in parts])
+
+    def loss_terms(self, output: LRSOutput, batch: FrameBatch) -> Objective:
+        """Weighted terms `heatmap` and `box` of the stage `detection`."""
+        if output.head is None:
+            raise NotImplementedError(f"phase.options.stage={self.stage} has no loss yet; only detection has")
+        weights = self.config.loss
+        return self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
+
+    def decode(self, output: LRSOutput) -> list[Boxes3D]:
+        """Boxes of each frame, best first. Raises ConfigError for a model that learns none."""
+        if output.head is None:
+            raise ConfigError(f"phase.options.stage={self.stage}: boxes need the stage {LRSStage.detection}")
+        return self.head.decode(output.head)
+
+    def diagnostics(self, output: LRSOutput) -> dict[str, Tensor | float]:
+        """Sites of every scale per frame, and those that the guard has left out."""
+        frames = output.volumes.scales[0].batch_size
+        values: dict[str, Tensor | float] = {}
+        for scale, (volume, dropped) in enumerate(zip(output.volumes.scales, output.volumes.dropped, strict=True)):
+            values[f"sites_{scale + 1}"] = len(volume) / frames
+            values[f"dropped_sites_{scale + 1}"] = dropped / frames
+        return values

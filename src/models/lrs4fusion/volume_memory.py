@@ -1,0 +1,68 @@
+"""What is remembered of each stream: the voxels of V2 of its last frame, with their velocities (lrs 5.5, O10)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from src.models.memory import FrameMemory, RememberedFrame, StoredRows
+
+
+@dataclass
+class StoredVoxels(StoredRows):
+    """Remembered voxels of one frame of every stream: rows of all streams, one after the other."""
+
+    xyz: Tensor  # [n, 3] m, voxel centres in the ego frame of their own time
+    velocities: Tensor  # [n, 3] m/s over ground, same axes; along the ray from the ego, which is all that is predicted
+    features: Tensor  # [n, C] rows of V2
+    rows: Tensor  # [n] int64, row of the batch each voxel belongs to, ascending
+
+
+@dataclass
+class VolumeFrame(RememberedFrame):
+    """The remembered voxels of one frame of each of B streams, in unaugmented ego coordinates of its own time."""
+
+    voxel_m: tuple[float, ...]  # (x, y, z) edges
+    voxels: StoredVoxels
+
+    def select(
+        self,
+        rows: Tensor,  # [B'] int64, distinct where kept
+        keep: Tensor,  # [B'] bool
+    ) -> VolumeFrame:
+        """The streams at `rows`, those without `keep` forgotten."""
+        return replace(super().select(rows, keep), voxels=self.voxels.of_streams(rows, keep, len(self.present)))
+
+    def with_velocities(self, velocities: Callable[[int, Tensor, Tensor], Tensor]) -> VolumeFrame:
+        """Of voxels, over the ground plane."""
+        voxels = self.voxels
+        own = [voxels.rows == row for row in range(len(self.present))]
+        parts = [velocities(row, voxels.xyz[at, :2], voxels.velocities[at, :2]) for row, at in enumerate(own)]
+        flat = torch.cat(parts)  # their rows ascend
+        return replace(self, voxels=replace(voxels, velocities=torch.cat([flat, torch.zeros_like(flat[:, :1])], 1)))
+
+
+@dataclass(frozen=True)
+class VolumeMemory(FrameMemory[VolumeFrame]):
+    """The last frame of each of B streams, which has taken in those before it."""
+
+    def detached(self) -> VolumeMemory:
+        """The memory whose features carry no gradient to the frame that they are of."""
+        return self.mapped(lambda frame: frame.map(Tensor.detach))
+
+    def state(self) -> list[dict[str, Any]]:
+        """Tensors and plain containers, for a checkpoint."""
+        return [_plain(frame) | {"voxels": _plain(frame.voxels)} for frame in self.frames]
+
+    @classmethod
+    def from_state(cls, state: list[dict[str, Any]]) -> VolumeMemory:
+        """The memory that `state` described."""
+        return cls(tuple(VolumeFrame(**(entry | {"voxels": StoredVoxels(**entry["voxels"])})) for entry in state))
+
+
+def _plain(part: VolumeFrame | StoredVoxels) -> dict[str, Any]:
+    return {field.name: getattr(part, field.name) for field in fields(part)}

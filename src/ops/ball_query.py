@@ -1,0 +1,48 @@
+"""Features at points: those of the voxel around a point and of its face neighbours, looked up by index (lrs 5.6)."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from src.geometry.voxel_grid import VoxelGrid
+from src.ops.segment_reduce import segment_sum, weighted_segment_sum
+from src.ops.sites import Sites
+
+OFFSETS = ((0, 0, 0), (-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
+SOFTENING = 0.1
+"""Of a voxel's edge along x, added to distances: at a centre the weight of that voxel stays finite."""
+
+
+def ball_query(
+    features: Tensor,  # [M, C]
+    sites: Sites,  # M voxels of (batch, z, y, x)
+    grid: VoxelGrid,  # of the sites
+    points: Tensor,  # [q, 3] x, y, z m
+    batch: Tensor,  # [q] int64, sample of each point
+    neighbours: int,  # 1 or 7
+) -> Tensor:  # [q, C]
+    """Mean of the voxel that holds each point and, with 7, of its six face neighbours, weighted by inverse distance.
+
+    f(p) = sum w_k f_k / sum w_k over the voxels that exist, w_k = 1 / (0.1 v + |p - c_k|) with centres c_k and the edge
+    v (O12); zeros where none exists or the point lies outside the grid. Differentiable in the features and, through the
+    weights, in the points. Raises ValueError for another number of neighbours or sites of another grid.
+    """
+    if neighbours not in (1, len(OFFSETS)):
+        raise ValueError(f"neighbours={neighbours}: must be 1 or {len(OFFSETS)}, the voxel alone or with its faces'")
+    if sites.shape[1:] != grid.cells:
+        raise ValueError(f"the sites lie on {sites.shape[1:]} voxels, but the grid has {grid.cells}")
+    if neighbours == 1:
+        points = points.detach()  # the weight is 1 wherever in the voxel it lies
+    cells = grid.cell_of(points.detach())  # [q, 3]
+    near = cells[:, None] + cells.new_tensor(OFFSETS[:neighbours])  # [q, K, 3]
+    rows = sites.rows_of(torch.cat([batch[:, None, None].expand(-1, neighbours, 1), near], 2).flatten(0, 1))
+    found = (rows.view(-1, neighbours) >= 0) & grid.contains(points.detach())[:, None]
+    point, place = found.nonzero().unbind(1)  # pairs, point by point
+    distance = (points[point] - grid.centre_of(near[point, place]).to(points.dtype)).norm(dim=1)
+    weights = 1 / (SOFTENING * grid.voxel_m[0] + distance)
+    total = segment_sum(weights[:, None], point, len(points))
+    weights = weights / F.embedding(point, total).squeeze(1)
+    picks = rows.view(-1, neighbours)[point, place]
+    return weighted_segment_sum(features.to(weights.dtype), weights, picks, point, len(points))
