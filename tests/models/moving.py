@@ -46,9 +46,10 @@ def tensors_of(memory):
     """All tensors of a memory, flat."""
 
     def leaves(node):
-        if isinstance(node, torch.Tensor):
-            return [node]
-        values = node.values() if isinstance(node, dict) else node or []
-        return [leaf for value in values for leaf in leaves(value)]
+        if isinstance(node, dict):
+            node = list(node.values())
+        if isinstance(node, (list, tuple)):
+            return [leaf for value in node for leaf in leaves(value)]
+        return [node] if isinstance(node, torch.Tensor) else []
 
     return leaves(memory.state())

@@ -173,7 +173,7 @@ class LRS4Fusion(Detector):
         points = origins[:, None] + samples[:, None] * directions[:, None]  # [R, N, 3]
         queries = torch.cat([points, times_s[:, None, None].expand(-1, len(samples), 1)], dim=2).flatten(0, 1)
         logits = self._in_parts(self.occupancy_logits, volumes, queries, batch.repeat_interleave(len(samples)))
-        return logits.view(len(origins), -1).sigmoid()
+        return logits.view(len(origins), len(samples)).sigmoid()
 
     @staticmethod
     @torch.no_grad()

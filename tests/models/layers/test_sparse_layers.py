@@ -3,7 +3,15 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from src.models.layers.sparse import ConvNormReLU, ResidualBlock, RowNorm, SparseConv, SparseKernel, SubmanifoldConv
+from src.models.layers.sparse import (
+    ConvNormReLU,
+    ResidualBlock,
+    RowNorm,
+    SparseConv,
+    SparseInverseConv,
+    SparseKernel,
+    SubmanifoldConv,
+)
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV, SparseMap
 
@@ -110,3 +118,48 @@ def test_map_without_sites() -> None:
     assert y.features.shape == (0, 4) and y.sites.shape == (2, 3, 3, 4)
     y.features.sum().backward()
     assert all(p.grad is not None and not p.grad.any() for p in layers.parameters())
+
+
+@pytest.mark.parametrize("kernel", [(1, 3, 3), (3, 1, 3), (3, 3, 1), (1, 5, 5), (1, 1, 3)])
+def test_kernels_of_any_shape_are_the_dense_ones(kernel: tuple[int, ...]) -> None:
+    """The default padding is half the kernel, axis by axis, so the grid keeps its size."""
+    x, padding = random_map(3, 3), tuple(size // 2 for size in kernel)
+    same, dilating = SubmanifoldConv(3, 5, kernel, 3, bias=True), SparseConv(3, 5, kernel, 3, bias=True)
+    assert same.weight.shape == (torch.Size(kernel).numel(), 3, 5)
+    for conv, sites in ((same, x.sites), (dilating, dilating(x).sites)):
+        dense = F.conv3d(x.to_dense(), dense_weight(conv), conv.bias, padding=padding)
+        torch.testing.assert_close(conv(x).features, dense.movedim(1, -1)[sites.indices().unbind(1)])
+    reached = F.conv3d(x.with_features(torch.ones(len(x), 1)).to_dense(), torch.ones(1, 1, *kernel), padding=padding)
+    assert torch.equal(dilating(x).indices, reached.squeeze(1).nonzero())
+
+
+def test_a_kernel_of_wrong_shape_is_named() -> None:
+    with pytest.raises(ValueError, match=r"kernel_size=\(3, 3\): expected one number or 3"):
+        SubmanifoldConv(3, 5, (3, 3), 3, bias=False)
+
+
+@pytest.mark.parametrize("ndim", [2, 3])
+def test_inverse_convolution_leads_back_to_the_finer_sites(ndim: int) -> None:
+    down = SparseConv(3, 4, 3, ndim, bias=False, stride=2)
+    up, x = SparseInverseConv(4, 5, 3, ndim, bias=True, stride=2), random_map(ndim, 3)
+    coarse = down(x)
+    fine = up(coarse, x.sites)
+    assert fine.sites is x.sites and type(fine) is type(x)
+    extra = [size - (2 * low - 1) for size, low in zip(x.sites.shape[1:], coarse.sites.shape[1:], strict=True)]
+    transposed = {2: F.conv_transpose2d, 3: F.conv_transpose3d}[ndim]
+    weight = up.weight.permute(1, 2, 0).unflatten(2, up.kernel_size)  # [in, out, k...]
+    dense = transposed(coarse.to_dense(), weight, up.bias, stride=2, padding=1, output_padding=extra)
+    torch.testing.assert_close(fine.features, dense.movedim(1, -1)[x.indices.unbind(1)])
+    layer = ConvNormReLU(up, eps=1e-3, momentum=0.1)
+    layer(coarse, x.sites).features.sum().backward()
+    assert all(p.grad is not None for p in (*layer.parameters(), down.weight))
+
+
+def test_leaky_relu() -> None:
+    conv = SubmanifoldConv(3, 4, 3, 2, bias=False)
+    leaky, plain = (ConvNormReLU(conv, 1e-3, 0.1, negative_slope=slope).eval() for slope in (0.01, 0.0))
+    x = random_map(2, 3)
+    before = leaky.norm(conv(x).features)
+    assert (before < 0).any() and (before > 0).any()
+    torch.testing.assert_close(leaky(x).features, torch.where(before > 0, before, 0.01 * before))
+    torch.testing.assert_close(plain(x).features, before.clamp(min=0))

@@ -1,0 +1,182 @@
+"""LRS4Fusion as a whole: what it reads, remembers, answers and learns."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from src.errors import ConfigError
+from src.models.deploy.inference import prepare_for_inference
+from src.structures.boxes import Boxes3D
+from tests.models.learning import gradients_are_finite, train_step
+from tests.models.lrs4fusion.lrs_frames import cloud, lidar_frame, lrs_config, lrs_model
+from tests.models.moving import pose, tensors_of
+
+pytestmark = pytest.mark.slow
+
+OCCUPANCY, FORECAST = "phase.options.stage=occupancy", "phase.options.stage=forecast"
+
+
+def box(x, y):
+    return Boxes3D(
+        centers=torch.tensor([[x, y, 0.5]]), sizes=torch.tensor([[1.9, 4.5, 1.7]]), yaws=torch.tensor([0.3]),
+        velocities=torch.tensor([[8.0, 0.0]]), labels=torch.tensor([0]), attributes=torch.tensor([-1]),
+        num_points=torch.tensor([9]),
+    )  # fmt: skip
+
+
+def frame(counts=(400, 300), time_s=0.0, seed=0):
+    clouds = [cloud(count, seed + number) for number, count in enumerate(counts)]
+    boxes = [box(4.0, -3.0), box(-5.0, 6.0)][: len(counts)]
+    return lidar_frame(clouds, time_s, [pose(20 * time_s)] * len(counts), boxes=boxes)
+
+
+def some_queries(count, batch_size=2):
+    unit = torch.rand(count, 4, generator=torch.Generator().manual_seed(0))
+    return (unit - 0.5) * torch.tensor([60.0, 60.0, 8.0, 6.0]), torch.arange(count) % batch_size
+
+
+def test_sensors_and_stages_that_there_are():
+    assert lrs_config().model.sensors == ["lidar"] and lrs_config().model.memory_frames == 1
+    with pytest.raises(ConfigError, match=r"model.sensors=\['lidar', 'camera'\]: must be \['lidar'\]"):
+        lrs_config("model.sensors=[lidar,camera]")
+    with pytest.raises(ConfigError, match="stage=dreams: must be one of occupancy, forecast, detection"):
+        lrs_config("phase.options.stage=dreams")
+    with pytest.raises(ConfigError, match="velocity_compensation=true needs model.decoders.velocity=true"):
+        lrs_config("model.decoders.velocity=false")
+    with pytest.raises(ConfigError, match="reads LiDAR, which this world lacks"):
+        lrs_config("data.world.lidar=false")
+    with pytest.raises(ValueError, match="FrameBatch.lidar_points is None, but this model uses LiDAR"):
+        lrs_model()(replace(frame(), lidar_points=None, lidar_batch=None))
+
+
+@pytest.mark.parametrize("counts", [(400, 300), (60, 0), (0, 0)])
+def test_detection_trains_all_but_the_decoders(counts):
+    model, batch = lrs_model().train(), frame(counts)
+    _, terms = train_step(model, batch)
+    assert set(terms) == {"heatmap", "box", "total"} and terms["total"].isfinite()
+    frozen = {name for name, p in model.named_parameters() if not p.requires_grad}
+    assert frozen == {name for name, _ in model.named_parameters() if name.startswith("decoders.")}
+    model.decoders.requires_grad_(True).zero_grad()
+    del model.decoders
+    assert gradients_are_finite(model)
+
+
+def test_occupancy_trains_everything_and_has_no_boxes():
+    model, batch = lrs_model(OCCUPANCY).train(), frame()
+    q, owner = some_queries(200)
+    output, memory = model(batch)
+    later, _ = model(frame(time_s=0.5), memory)
+    logits, speeds = model.answers(later.volumes, q, owner)
+    assert torch.equal(model.occupancy_logits(later.volumes, q, owner), logits)
+    assert torch.equal(model.velocity(later.volumes, q, owner), speeds)
+    (logits.square().sum() + (speeds - 1).square().sum()).backward()
+    zero = {name for name, p in model.named_parameters() if p.grad is None}
+    assert zero == set() and model.head is None and model.ray_head is None
+    with pytest.raises(ConfigError, match="boxes need the stage detection"):
+        model.decode(output)
+    with pytest.raises(ConfigError, match="ranges of rays need the stage forecast"):
+        model.ray_ranges(output.volumes, q[:, :3], q[:, :3], q[:, 3], owner)
+
+
+def test_forecasts_train_the_ray_head_alone(monkeypatch):
+    model = lrs_model(FORECAST)
+    volumes = model(frame())[0].volumes
+    origins, owner = torch.tensor([[1.0, 0.0, 2.0]]).repeat(6, 1), torch.tensor([0, 0, 0, 1, 1, 1])
+    directions = F.normalize(torch.randn(6, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    times = torch.linspace(0, 3, 6)
+    asked = (volumes, origins, directions, times, owner)
+    ranges = model.ray_ranges(*asked)
+    assert ranges.shape == (6,)
+    ranges.sum().backward()
+    assert {name.partition(".")[0] for name, p in model.named_parameters() if p.grad is not None} == {"ray_head"}
+    occupancy = model.ray_occupancy(*asked)
+    n = len(model.ray_head.samples_m)
+    samples = torch.cat([origins[4] + model.ray_head.samples_m[:, None] * directions[4], times[4].expand(n, 1)], 1)
+    expected = model.occupancy_logits(volumes, samples, owner[4].expand(n)).sigmoid()
+    torch.testing.assert_close(occupancy[4], expected)
+    monkeypatch.setattr("src.models.lrs4fusion.model.QUERIES_AT_ONCE", 100)
+    torch.testing.assert_close(model.ray_occupancy(*asked), occupancy)
+    assert model.ray_ranges(volumes, *(value[:0] for value in asked[1:])).shape == (0,)
+
+
+def test_the_memory_changes_features_and_no_site():
+    model = lrs_model(OCCUPANCY).eval()
+    _, memory = model(frame())
+    assert not any(value.requires_grad for value in tensors_of(memory))
+    now = frame(time_s=0.5, seed=4)
+    alone, remembering = model(now)[0].volumes, model(now, memory)[0].volumes
+    for scale, (a, b) in enumerate(zip(alone.scales, remembering.scales, strict=True)):
+        assert torch.equal(a.sites.keys, b.sites.keys)
+        assert torch.equal(a.features, b.features) is (scale == 0)
+    restored = model.restore_memory(memory.state())
+    assert torch.equal(model(now, restored)[0].volumes.scales[3].features, remembering.scales[3].features)
+
+
+def test_the_last_transition_carries_a_gradient_where_it_is_asked_for():
+    model = lrs_model(OCCUPANCY).train()
+    batch = frame()
+    volumes = model.encode(batch)
+    later = model.encode(frame(time_s=0.5), model.remember(volumes, batch))
+    grad = torch.autograd.grad(later.scales[1].features.square().sum(), volumes.scales[1].features, allow_unused=True)
+    assert grad[0] is not None and grad[0].any()
+
+
+def test_single_frames_have_no_memory():
+    model = lrs_model("model.temporal=null").eval()
+    output, memory = model(frame())
+    assert memory is None and model.temporal is None and len(model.decode(output)) == 2
+
+
+def test_points_outside_the_region_and_other_samples_change_nothing():
+    model = lrs_model().eval()
+    first = cloud(300)
+    outside = torch.tensor([[200.0, 0, 0, 1, 0], [0, 0, 9.0, 1, 0], [float("nan"), 0, 0, 1, 0]])
+    one = model(lidar_frame([first]))[0].volumes
+    both = model(lidar_frame([torch.cat([first, outside]), cloud(200, seed=7)]))[0].volumes
+    for a, b in zip(one.scales, both.scales, strict=True):
+        own = b.indices[:, 0] == 0
+        assert torch.equal(a.indices, b.indices[own])
+        torch.testing.assert_close(a.features, b.features[own], rtol=1e-4, atol=1e-5)
+    assert model(lidar_frame([outside]))[0].volumes.scales[0].features.shape[0] == 0
+
+
+def test_sites_are_counted():
+    model = lrs_model("model.late_encoder.max_sites=[300,300,300,300]").eval()
+    values = model.diagnostics(model(frame())[0])
+    assert values["sites_1"] == 300 and values["dropped_sites_1"] > 0
+    assert set(values) == {f"{name}_{scale}" for name in ("sites", "dropped_sites") for scale in range(1, 5)}
+
+
+def test_prepared_for_inference_it_gives_the_same():
+    model = lrs_model()
+    model.train()(frame())  # statistics that are not 0 and 1
+    model.eval()
+    prepared = prepare_for_inference(model)
+    memories = [part(frame())[1] for part in (model, prepared)]
+    now = frame(time_s=0.5)
+    a, b = (part(now, memory)[0] for part, memory in zip((model, prepared), memories, strict=True))
+    torch.testing.assert_close(a.volumes.scales[3].features, b.volumes.scales[3].features, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(a.head.logits, b.head.logits, rtol=1e-3, atol=1e-3)
+
+
+def test_occupancy_of_one_scene_is_learnt():
+    """A wall ahead, free before it and matter behind its face: from points on the face alone."""
+    model = lrs_model(OCCUPANCY, "model.temporal=null").train()
+    generator = torch.Generator().manual_seed(0)
+    face = torch.rand(600, 5, generator=generator) * torch.tensor([0.0, 40.0, 4.0, 20.0, 0.0])
+    face[:, :3] += torch.tensor([20.0, -20.0, -2.0])
+    batch = lidar_frame([face])
+    unit = torch.rand(3000, 4, generator=generator)
+    q = unit * torch.tensor([4.8, 36.0, 3.0, 0.0]) + torch.tensor([17.6, -18.0, -1.5, 0.0])
+    target, owner = (q[:, 0] > 20.0).float(), torch.zeros(3000, dtype=torch.int64)
+    optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
+    for _ in range(25):
+        logits = model.occupancy_logits(model.encode(batch), q, owner)
+        loss = F.binary_cross_entropy_with_logits(logits, target)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    found, truth = logits > 0, target > 0.5
+    assert (found & truth).sum() / (found | truth).sum() > 0.9
