@@ -41,7 +41,9 @@ class DecoderConfig:
 class Decoders(nn.Module):
     """One sampler, and a head each for occupancy and velocity.
 
-    Runs in float32 also under autocast: positions, times and velocities are what it reads and writes.
+    Queries [Q, 4] are x, y, z in m (aug frame of the volumes) and t in s from their time, `batch` [Q] int64 their
+    samples. A place outside the region sees no volume and gets what a head says to its position and time alone.
+    Everything runs in float32 also under autocast: positions, times and velocities are what is read and written.
     """
 
     full_precision_parts = ("",)
@@ -62,21 +64,23 @@ class Decoders(nn.Module):
             nn.init.zeros_(self.velocity.output.weight)  # untrained, everything rests
             nn.init.zeros_(self.velocity.output.bias)
 
-    def forward(
-        self,
-        volumes: Volumes,
-        queries: Tensor,  # [Q, 4] x, y, z m (aug frame of the volumes), t s from their time
-        batch: Tensor,  # [Q] int64, sample of each query
-    ) -> tuple[Tensor, Tensor | None]:  # [Q], [Q]
-        """Logits of occupancy and, where there is a decoder of it, radial velocity in m/s, away from the ego positive.
+    def forward(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> tuple[Tensor, Tensor | None]:  # [Q], [Q]
+        """What both heads say, the second None where there is none, from one look into the volumes."""
+        place, seen = self.sampler(volumes, queries, batch)
+        return self.occupancy(place, seen), None if self.velocity is None else self.velocity(place, seen)
 
-        Velocities are over ground, so that what stands has 0 however the ego moves (O14). A place outside the region
-        sees no volume and gets what a head says to its position and time alone.
+    def occupancy_logits(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> Tensor:  # [Q]
+        """Logits of the probability that a place is occupied."""
+        return self.occupancy(*self.sampler(volumes, queries, batch))
+
+    def velocities(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> Tensor:  # [Q] m/s
+        """Radial velocities, away from the ego positive, over ground: what stands has 0 however the ego moves (O14).
+
+        Raises ConfigError where there is no decoder of them.
         """
-        with torch.autocast(queries.device.type, enabled=False):
-            place, seen = self.sampler(volumes, queries, batch)
-            velocity = None if self.velocity is None else self.velocity(place, seen)
-            return self.occupancy(place, seen), velocity
+        if self.velocity is None:
+            raise ConfigError("model.decoders.velocity=false: this model predicts no velocities")
+        return self.velocity(*self.sampler(volumes, queries, batch))
 
 
 class QuerySampler(nn.Module):
@@ -103,16 +107,16 @@ class QuerySampler(nn.Module):
         batch: Tensor,  # [Q] int64
     ) -> tuple[Tensor, Tensor]:  # [Q, 4], [Q, out_channels]
         """Normalised place and time, and the features z."""
-        queries = full_precision(queries)
-        points, times = queries.split([3, 1], dim=1)
-        place = torch.cat([self.grid.normalised(points), times / HORIZON_S], dim=1)
-        here = self._seen(volumes, FUSED_SCALE, points, batch)
-        a = self.place(place) + self.context(here)
-        for layer in self.hidden:
-            a = F.relu(layer(a))
-        moved = points + self.offset(a)
-        there = [self._seen(volumes, scale, moved, batch) for scale in range(NUM_SCALES)]
-        return place, torch.cat([here, *there], dim=1)
+        with torch.autocast(queries.device.type, enabled=False):
+            points, times = full_precision(queries).split([3, 1], dim=1)
+            place = torch.cat([self.grid.normalised(points), times / HORIZON_S], dim=1)
+            here = self._seen(volumes, FUSED_SCALE, points, batch)
+            a = self.place(place) + self.context(here)
+            for layer in self.hidden:
+                a = F.relu(layer(a))
+            moved = points + self.offset(a)
+            there = [self._seen(volumes, scale, moved, batch) for scale in range(NUM_SCALES)]
+            return place, torch.cat([here, *there], dim=1)
 
     def _seen(self, volumes: Volumes, scale: int, points: Tensor, batch: Tensor) -> Tensor:  # [Q, C]
         volume = volumes.scales[scale]
@@ -138,8 +142,9 @@ class QueryHead(nn.Module):
         place: Tensor,  # [Q, 4]
         seen: Tensor,  # [Q, C]
     ) -> Tensor:  # [Q]
-        h = self.place(place)
-        for layer, block in zip(self.seen, self.blocks, strict=True):
-            h = h + layer(seen)
-            h = h + block(h)
-        return self.output(h).squeeze(1)
+        with torch.autocast(place.device.type, enabled=False):
+            h = self.place(place)
+            for layer, block in zip(self.seen, self.blocks, strict=True):
+                h = h + layer(seen)
+                h = h + block(h)
+            return self.output(h).squeeze(1)

@@ -128,25 +128,17 @@ class LRS4Fusion(Detector):
         """The memory that `VolumeMemory.state` described."""
         return VolumeMemory.from_state(state)
 
-    def answers(
-        self,
-        volumes: Volumes,
-        queries: Tensor,  # [Q, 4] x, y, z m (aug frame), t s from the frame's time
-        batch: Tensor,  # [Q] int64, sample of each query
-    ) -> tuple[Tensor, Tensor | None]:  # [Q], [Q]
-        """Logits of occupancy and radial velocities from one look into the volumes; see `Decoders.forward`."""
+    def answers(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> tuple[Tensor, Tensor | None]:  # [Q], [Q]
+        """Logits of occupancy and radial velocities (m/s) of queries [Q, 4] and their samples [Q]; see `Decoders`."""
         return self.decoders(volumes, queries, batch)
 
     def occupancy_logits(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> Tensor:  # [Q]
-        """Logits of occupancy, as `answers`."""
-        return self.answers(volumes, queries, batch)[0]
+        """The first of `answers` alone."""
+        return self.decoders.occupancy_logits(volumes, queries, batch)
 
     def velocity(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> Tensor:  # [Q] m/s
-        """Radial velocities, as `answers`. Raises ConfigError for a model that predicts none."""
-        speeds = self.answers(volumes, queries, batch)[1]
-        if speeds is None:
-            raise ConfigError("model.decoders.velocity=false: this model predicts no velocities")
-        return speeds
+        """The second of `answers` alone. Raises ConfigError for a model that predicts none."""
+        return self.decoders.velocities(volumes, queries, batch)
 
     def ray_ranges(
         self,
