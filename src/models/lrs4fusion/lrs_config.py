@@ -129,3 +129,8 @@ class LRS4FusionConfig(ModelConfig):
                 "model.temporal.velocity_compensation=true needs model.decoders.velocity=true, which predicts it"
             )
         self.roi.build(len(self.unet.encoder_channels))
+
+    @property
+    def keys_of_temporal_phase(self) -> tuple[str, ...]:
+        """None: the phase before remembers as well."""
+        return ()

@@ -12,7 +12,6 @@ from src.geometry.tensor_transforms import transform_points, transform_vectors
 from src.geometry.voxel_grid import VoxelGrid
 from src.losses.normalizers import full_precision
 from src.models.lrs4fusion.volume_memory import StoredVoxels, VolumeFrame, VolumeMemory
-from src.models.memory import moving
 from src.ops.kernel_maps import window_map
 from src.ops.segment_reduce import segment_mean
 from src.ops.sites import Sites
@@ -102,7 +101,7 @@ class WindowedFusion(nn.Module):
         indices = sites.indices()
         return torch.cat([self.grid.centre_of(indices[:, 1:]) / POSITION_SCALE_M, elapsed_s[indices[:, 0]][:, None]], 1)
 
-    def recall(self, memory: VolumeMemory | None, batch: FrameBatch, min_speed_mps: float = 0.0) -> WarpedVolume:
+    def recall(self, memory: VolumeMemory | None, batch: FrameBatch) -> WarpedVolume:
         """The remembered voxels in the batch's augmented frame: p' = A_t T (p + v dt); outside the grid they are lost.
 
         Without a usable memory, after a jump of the pose for instance, the volume has no sites. Differentiable in the
@@ -120,7 +119,7 @@ class WindowedFusion(nn.Module):
         voxels, motion = frames[0].voxels, frames[0].motion(batch, self.config.max_age_s)
         xyz = voxels.xyz
         if self.config.velocity_compensation:
-            xyz = xyz + moving(voxels.velocities, min_speed_mps) * motion.elapsed_s[voxels.rows][:, None]
+            xyz = xyz + voxels.velocities * motion.elapsed_s[voxels.rows][:, None]
         xyz = transform_points(motion.aug_from_past[voxels.rows], xyz)
         kept = (motion.usable[voxels.rows] & self.grid.contains(xyz)).nonzero().squeeze(1)
         indices = torch.cat([voxels.rows[:, None], self.grid.cell_of(xyz)], dim=1)[kept]
@@ -139,7 +138,7 @@ class WindowedFusion(nn.Module):
             )
 
     @torch.no_grad()
-    def place_in_ego(
+    def _in_ego(
         self,
         volume: SparseMap,  # V2
         speeds_mps: Tensor | None,  # [M] radial, of every voxel; None: all at rest
@@ -160,7 +159,7 @@ class WindowedFusion(nn.Module):
         batch: FrameBatch,
     ) -> VolumeMemory:
         """The memory of the next frame, whose features carry their gradient on."""
-        xyz, velocities = self.place_in_ego(volume, speeds_mps, batch)
+        xyz, velocities = self._in_ego(volume, speeds_mps, batch)
         voxels = StoredVoxels(xyz, velocities, volume.features, volume.indices[:, 0])
         present = torch.ones_like(batch.timestamps_s, dtype=torch.bool)
         frame = VolumeFrame(batch.timestamps_s, batch.global_from_ego, present, self.grid.voxel_m, voxels)
