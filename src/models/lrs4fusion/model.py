@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -44,7 +44,8 @@ class LRS4Fusion(Detector):
 
     It answers queries (x, y, z, t) by occupancy and radial velocity, and gives the ranges of future rays, and boxes.
     Parts that the phase's stage does not train are frozen; those that it does not use are absent.
-    Raises ConfigError when parts, region and grid do not fit.
+    Region and voxels are the model's own (`model.roi`); it has no use for the `grid` that others share.
+    Raises ConfigError when parts and region do not fit.
     """
 
     phase_options = LRSOptions
@@ -88,6 +89,14 @@ class LRS4Fusion(Detector):
                 dense=True,
                 in_channels=self.neck.out_channels,
             ).to(memory_format=torch.channels_last)
+
+    def train(self, mode: bool = True) -> Self:
+        """As the base; while only the ray head learns, all norms before it keep their running statistics."""
+        super().train(mode)
+        if self.stage is LRSStage.forecast:
+            for name, part in self.named_children():
+                part.train(mode and name == "ray_head")
+        return self
 
     def forward(self, batch: FrameBatch, memory: VolumeMemory | None = None) -> tuple[LRSOutput, VolumeMemory | None]:
         """The volumes of B frames, given what is remembered of their streams; the new memory is detached.

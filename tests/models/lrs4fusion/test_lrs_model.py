@@ -1,5 +1,6 @@
 """LRS4Fusion as a whole: what it reads, remembers, answers and learns."""
 
+import io
 from dataclasses import replace
 
 import pytest
@@ -81,8 +82,10 @@ def test_occupancy_trains_everything_and_has_no_boxes():
 
 
 def test_forecasts_train_the_ray_head_alone(monkeypatch):
-    model = lrs_model(FORECAST)
+    model = lrs_model(FORECAST).train()
+    before = {name: value.clone() for name, value in model.named_buffers()}
     volumes = model(frame())[0].volumes
+    assert all(torch.equal(value, before[name]) for name, value in model.named_buffers())
     origins, owner = torch.tensor([[1.0, 0.0, 2.0]]).repeat(6, 1), torch.tensor([0, 0, 0, 1, 1, 1])
     directions = F.normalize(torch.randn(6, 3, generator=torch.Generator().manual_seed(0)), dim=1)
     times = torch.linspace(0, 3, 6)
@@ -110,7 +113,10 @@ def test_the_memory_changes_features_and_no_site():
     for scale, (a, b) in enumerate(zip(alone.scales, remembering.scales, strict=True)):
         assert torch.equal(a.sites.keys, b.sites.keys)
         assert torch.equal(a.features, b.features) is (scale == 0)
-    restored = model.restore_memory(memory.state())
+    file = io.BytesIO()
+    torch.save(memory.state(), file)
+    file.seek(0)
+    restored = model.restore_memory(torch.load(file, weights_only=True))
     assert torch.equal(model(now, restored)[0].volumes.scales[3].features, remembering.scales[3].features)
 
 
