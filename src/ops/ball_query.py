@@ -6,9 +6,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from src.geometry.constants import constant
 from src.geometry.voxel_grid import VoxelGrid
 from src.ops.segment_reduce import segment_sum, weighted_segment_sum
-from src.ops.sites import Sites
+from src.ops.sites import Sites, rows_of_keys
 
 OFFSETS = ((0, 0, 0), (-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
 SOFTENING = 0.1
@@ -35,14 +36,16 @@ def ball_query(
         raise ValueError(f"the sites lie on {sites.shape[1:]} voxels, but the grid has {grid.cells}")
     if neighbours == 1:
         points = points.detach()  # the weight is 1 wherever in the voxel it lies
-    cells = grid.cell_of(points.detach())  # [q, 3]
-    near = cells[:, None] + cells.new_tensor(OFFSETS[:neighbours])  # [q, K, 3]
-    rows = sites.rows_of(torch.cat([batch[:, None, None].expand(-1, neighbours, 1), near], 2).flatten(0, 1))
-    found = (rows.view(-1, neighbours) >= 0) & grid.contains(points.detach())[:, None]
-    point, place = found.nonzero().unbind(1)  # pairs, point by point
-    distance = (points[point] - grid.centre_of(near[point, place]).to(points.dtype)).norm(dim=1)
+    cells, inside = grid.cell_of(points.detach()), grid.contains(points.detach())
+    cells = torch.where(inside[:, None], cells, 0)
+    offsets = constant(OFFSETS[:neighbours], torch.int64, points.device)  # [K, 3]
+    steps = (offsets * constant(sites.strides[1:], torch.int64, points.device)).sum(1)
+    keys = sites.keys_of(torch.cat([batch[:, None], cells], dim=1))[:, None] + steps  # a face lies in the halo at most
+    rows = rows_of_keys(sites.keys, keys.flatten()).view(-1, neighbours)
+    point, place = ((rows >= 0) & inside[:, None]).nonzero().unbind(1)  # pairs, point by point
+    picks, centres = rows[point, place], grid.centre_of(sites.indices()[:, 1:]).to(points.dtype)
+    distance = (F.embedding(point, points) - F.embedding(picks, centres)).norm(dim=1)
     weights = 1 / (SOFTENING * grid.voxel_m[0] + distance)
     total = segment_sum(weights[:, None], point, len(points))
     weights = weights / F.embedding(point, total).squeeze(1)
-    picks = rows.view(-1, neighbours)[point, place]
     return weighted_segment_sum(features.to(weights.dtype), weights, picks, point, len(points))

@@ -40,7 +40,7 @@ class Sites:
         Raises ValueError for a cell outside `shape` or listed twice.
         """
         empty = _checked_empty(indices, shape)
-        keys, order = torch.sort(empty._keys_of(indices))
+        keys, order = torch.sort(empty.keys_of(indices))
         sites = cls(empty.shape, keys)
         if len(keys) > 1 and bool((keys[1:] == keys[:-1]).any()):
             raise ValueError(
@@ -60,7 +60,7 @@ class Sites:
         Raises ValueError for a cell outside `shape`.
         """
         empty = _checked_empty(indices, shape)
-        keys, rows = torch.unique(empty._keys_of(indices), return_inverse=True)
+        keys, rows = torch.unique(empty.keys_of(indices), return_inverse=True)
         return cls(empty.shape, keys), rows
 
     @classmethod
@@ -123,9 +123,13 @@ class Sites:
         """Row of each cell among the sites, -1 where it is absent or outside the grid."""
         upper = constant(self.shape, torch.int64, indices.device)
         inside = ((indices >= 0) & (indices < upper)).all(1)
-        return torch.where(inside, rows_of_keys(self.keys, self._keys_of(indices)), -1)
+        return torch.where(inside, rows_of_keys(self.keys, self.keys_of(indices)), -1)
 
-    def _keys_of(self, indices: Tensor) -> Tensor:
+    def keys_of(
+        self,
+        indices: Tensor,  # [q, 1 + d] int64, at most HALO cells outside the grid
+    ) -> Tensor:  # [q] int64
+        """Key of each cell, a site or not."""
         return (indices.long() * constant(self.strides, torch.int64, indices.device)).sum(1)
 
 
