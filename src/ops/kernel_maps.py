@@ -190,7 +190,10 @@ def _corners(sites: Sites, kernel: tuple[int, ...]) -> Tensor:  # [n] int64
     return sites.keys - sum(size // 2 * step for size, step in zip(kernel, sites.strides[1:], strict=True))
 
 
-def _counts_kept(kept: Tensor, base: KernelMap) -> Tensor:  # [n] int64 positions of pairs, ascending -> [K]
+def _counts_kept(
+    kept: Tensor,  # [n] int64, positions of pairs, ascending
+    base: KernelMap,
+) -> Tensor:  # [K] int64
     """How many of each offset's pairs were kept."""
     return torch.searchsorted(kept, base.ends.long()).diff(prepend=kept.new_zeros(1))
 
