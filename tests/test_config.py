@@ -336,6 +336,15 @@ def test_another_data_choice_is_taken_at_the_checkpoints_scale():
     assert config.data.num_sweeps == 10 and not config.data.propagate_points
 
 
+def test_the_lidar_timeline_composes_and_a_checkpoint_older_than_it_has_none():
+    config, tree = compose_config(["scale=debug", "data.root=x", "+data/timeline=lidar", "data.num_future_frames=2"])
+    assert config.data.timeline.interval_s == 0.2 and config.data.timeline.last_step == 15
+    assert restore_config(tree, []).data.timeline == config.data.timeline
+    _, tree = compose_config(["scale=debug", "data.root=x"])
+    del tree["data"]["timeline"]
+    assert restore_config(tree, []).data.timeline is None
+
+
 @pytest.mark.parametrize("scale", SCALES)
 def test_every_scale_reads_recorded_data(scale):
     config, _ = compose_config([f"scale={scale}", "data=truckscenes", "data.root=x"])

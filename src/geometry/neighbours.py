@@ -28,25 +28,24 @@ def neighbours_within(
 def nearest_squared(
     queries: Array,  # [Q, D] float64
     points: Array,  # [P, D] float64, at least one
-    first_radius: float = 0.5,
+    radii: tuple[float, ...] = (0.5, 2.0),
 ) -> Array:  # [Q] float64
-    """Squared distance of every query to its nearest point, exact: the radius grows where nothing is found.
+    """Squared distance of every query to its nearest point, exact: first those with one within the radii, by cells,
+    then the rest against all.
 
     Raises ValueError without a point and for coordinates that are not finite.
     """
     if not (len(points) and np.isfinite(queries).all() and np.isfinite(points).all()):
         raise ValueError(f"points must be at least one, but got {len(points)}, and all coordinates finite")
-    best, radius = np.full(len(queries), np.inf), first_radius
-    low, high = points.min(0), points.max(0)
-    # Beyond the box around the points a smaller radius can find nothing.
-    outside = np.linalg.norm(np.maximum(0.0, np.maximum(low - queries, queries - high)), axis=1)
-    open_rows = np.arange(len(queries))
-    while len(open_rows):
-        tried = open_rows[outside[open_rows] <= radius]
-        for query, _, squared in _pairs(queries[tried], points, radius):
-            np.minimum.at(best, tried[query], squared)
-        open_rows = open_rows[~np.isfinite(best[open_rows])]
-        radius *= 4.0
+    best, rest = np.full(len(queries), np.inf), np.arange(len(queries))
+    for radius in radii:
+        for query, _, squared in _pairs(queries[rest], points, radius):
+            np.minimum.at(best, rest[query], squared)
+        rest = rest[np.isinf(best[rest])]
+    lengths = 0.5 * (points**2).sum(1)
+    for part in np.array_split(rest, len(rest) * len(points) // MAX_PAIRS + 1):
+        nearest = np.argmin(lengths - queries[part] @ points.T, axis=1)
+        best[part] = ((queries[part] - points[nearest]) ** 2).sum(1)
     return best
 
 
@@ -60,6 +59,8 @@ def _pairs(queries: Array, points: Array, radius: float) -> Iterator[tuple[Array
     keys = cells @ strides
     order = np.argsort(keys, kind="stable")
     keys, own_keys = keys[order], own @ strides
+    along = np.argsort(own_keys)  # look-ups in order find the keys in the cache
+    own_keys = own_keys[along]
     for shift in itertools.product((-1, 0, 1), repeat=queries.shape[1] - 1):
         row = own_keys + np.array([*shift, 0]) @ strides  # with its two neighbours along the last axis
         starts, ends = np.searchsorted(keys, row - 1), np.searchsorted(keys, row + 1, "right")
@@ -68,7 +69,7 @@ def _pairs(queries: Array, points: Array, radius: float) -> Iterator[tuple[Array
         for part in np.split(some, np.flatnonzero(np.diff(np.cumsum(counts[some]) // MAX_PAIRS)) + 1):
             query = np.repeat(part, counts[part])
             within = np.arange(len(query)) - np.repeat(np.cumsum(counts[part]) - counts[part], counts[part])
-            point = order[starts[query] + within]
+            point, query = order[starts[query] + within], along[query]
             squared = ((queries[query] - points[point]) ** 2).sum(1)
             kept = squared <= radius * radius
             yield query[kept], point[kept], squared[kept]
