@@ -123,8 +123,13 @@ def test_what_a_timeline_cannot_be():
         config(timeline=FIVE_HERTZ).reader_settings(("radar",), None)
 
 
-def test_data_without_lidar_or_without_sweeps_between_are_refused(data_set, tmp_path):
+def test_data_without_lidar_or_without_sweeps_between_are_refused(data_set, broken_tables):
     settings = config(timeline=FIVE_HERTZ)
+    for row, sensor in enumerate(broken_tables.records("sensor")):
+        if sensor["channel"].startswith("LIDAR"):
+            broken_tables.edit("sensor", row, channel="SONAR")
+    with pytest.raises(DataError, match="holds no LiDAR files, but the model reads lidar"):
+        DetectionDataModule(config(), broken_tables.root, ("lidar",), None, 0, broken_tables.root / "c", temporal=True)
     with pytest.raises(DataError, match="none between.*data.world.lidar=true"):
         FrameReader(load_index(data_set.root, VERSION, None), settings.reader_settings(("lidar",), None))
 
