@@ -18,7 +18,7 @@ from src.data.augment import AugmentationConfig, draw_bev_transform, draw_crop, 
 from src.data.compensation import Sweeps, compensate_clouds, ego_motion, motion_known, place_sweep, reached
 from src.data.images import read_image, width_fit
 from src.data.pcd import LidarCloud, read_lidar_points, read_radar_points
-from src.data.rays import RADAR_WINDOW_S, TRUE_MARGIN_M, lidar_rays, radar_speeds
+from src.data.rays import RADAR_WINDOW_S, TRUE_MARGIN_M, lidar_rays, radar_speeds, without_ego_body
 from src.data.schema import CHANNELS, DatasetIndex
 from src.data.timeline import LidarTimeline, RadialSpeeds, SweepTimeline, TimelineConfig
 from src.data.true_geometry import TrueGeometry
@@ -312,6 +312,8 @@ class FrameReader:
         for step in steps:
             files = self._with_sweeps_before(self.timeline.sweeps(sample, step), 1)
             rows, clouds = self._lidar_clouds(sample, files, skipped)
+            mounts = self.index.ego_from_sensor[self.index.data_calibrations[rows]]
+            clouds = list(map(without_ego_body, clouds, mounts))
             parts.append(lidar_rays(self._placed(rows, clouds, aug_from_global, frame_time_us, origins=True), step))
         rays, source = RayBundle.join(parts), self.settings.timeline.radial_speeds
         if source is RadialSpeeds.none or not len(rays):
@@ -336,18 +338,15 @@ class FrameReader:
         if self._radars is None:
             self._radars = SweepTimeline(index, RADARS)
         times_us = frame_time_us + np.round(1e6 * rays.times_s.double().numpy()).astype(np.int64)
-        window_us = round(1e6 * RADAR_WINDOW_S)
-        spans = [times_us[rays.steps.numpy() == step] for step in rays.steps.unique().tolist()]
-        files = np.unique(
-            np.concatenate([self._radars.between(sample, of.min() - window_us, of.max() + window_us) for of in spans])
-        )
-        rows, clouds = self._clouds(sample, files.tolist(), lambda path, row: read_radar_points(path), skipped)
-        sweeps, ages_s = (
-            self._sweeps(rows, clouds, index.data_times_us[rows]),
-            1e-6 * (frame_time_us - index.data_times_us[rows]),
-        )
-        unmoved = replace(self.settings, propagate_points=False)
-        tensors = radar_tensors(sweeps, ages_s, np.eye(4), aug_from_global, unmoved)
+        window_us, files = round(1e6 * RADAR_WINDOW_S), set()
+        for step in rays.steps.unique().tolist():
+            own_us = times_us[rays.steps.numpy() == step]
+            files |= set(self._radars.between(sample, own_us.min() - window_us, own_us.max() + window_us).tolist())
+        rows, clouds = self._clouds(sample, sorted(files), lambda path, row: read_radar_points(path), skipped)
+        sweeps = self._sweeps(rows, clouds, index.data_times_us[rows])
+        ages_s = 1e-6 * (frame_time_us - index.data_times_us[rows])
+        unmoved, pose = replace(self.settings, propagate_points=False), self._global_from_ego(sample)
+        tensors = radar_tensors(sweeps, ages_s, pose, aug_from_global @ pose, unmoved)
         return radar_speeds(rays, tensors["radar_points"].double().numpy())
 
     # ---------------------------------------------------------------- cameras

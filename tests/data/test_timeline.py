@@ -81,11 +81,25 @@ def test_moments_without_sweeps_give_no_rays_and_ends_at_the_sensor_no_ray(broke
     index = reader.index
     row = int(index.key_data[1, 10])
     cloud = np.zeros((3, 4))
-    cloud[1] = [5, 0, 0, 1]
+    cloud[1] = [0, 9, 0, 1]
     (broken_lidar.root / index.filename(row)).write_bytes(lidar_bytes(cloud, np.full(3, index.data_times_us[row])))
     assert len(reader.read(1, None, targets=[0]).rays) == 1 + len(STATIC)
     (broken_lidar.root / index.filename(row)).write_bytes(lidar_bytes(cloud[:0], np.zeros(0)))
     assert len(reader.read(1, None, targets=[0]).rays) == len(STATIC)
+
+
+def test_returns_of_the_truck_itself_are_input_but_no_targets(broken_lidar):
+    reader = broken_lidar.reader(**ONLY_LIDAR, num_future_frames=1, min_distance_m=0.0)
+    row = int(reader.index.key_data[1, 10])
+    in_ego = np.array([[0.0, 0.0, 2.0], [-11.0, 1.0, 3.0], [0.0, 0.0, 0.1], [0.0, 2.0, 2.0], [7.0, 0.0, 2.0]])
+    points = np.zeros((5, 4))
+    points[:, :3] = apply(invert_rigid(mount("LIDAR_LEFT")), in_ego)
+    (broken_lidar.root / reader.index.filename(row)).write_bytes(
+        lidar_bytes(points, np.full(5, reader.index.data_times_us[row]))
+    )
+    frame = reader.read(1, None, targets=[0])
+    assert len(frame.lidar_points) == 5 + len(STATIC) and len(frame.rays) == 3 + len(STATIC)
+    np.testing.assert_allclose(frame.rays.points[:3], in_ego[2:], atol=1e-3)
 
 
 def test_the_nearest_sweep_counts_within_the_tolerance_and_the_scene(lidar_set):
