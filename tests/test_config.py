@@ -152,7 +152,7 @@ FULL_SIZE = {
         "train_split": "train", "split": "val", "batch_size": 8, "num_sweeps": 10, "min_distance_m": 1.0,
         "propagate_points": False, "on_bad_file": "error", "test_resize_offset": 0.0, "groups_per_scene": 2,
         "stream_sets": 1, "past_frames": 0, "sensor_dropout": 0.0, "num_lidar_sweeps": 5, "lidar_origins": False,
-        "deskew_lidar": True, "num_future_frames": 0,
+        "deskew_lidar": True, "timeline": None, "num_future_frames": 0,
     },
     "data.augmentation.image": {"resize": [-0.06, 0.11], "rotation_deg": 5.4, "flip_probability": 0.5},
     "data.augmentation.bev": {"scale": [0.95, 1.05], "rotation_rad": 0.3925, "flip_probability": 0.5},
@@ -334,6 +334,15 @@ def test_another_data_choice_is_taken_at_the_checkpoints_scale():
     _, tree = compose_config(["scale=paper", "data.root=/real"])
     config = restore_config(tree, ["data=truckscenes", "data.root=/elsewhere"])
     assert config.data.num_sweeps == 10 and not config.data.propagate_points
+
+
+def test_the_lidar_timeline_composes_and_a_checkpoint_older_than_it_has_none():
+    config, tree = compose_config(["scale=debug", "data.root=x", "+data/timeline=lidar", "data.num_future_frames=2"])
+    assert config.data.timeline.interval_s == 0.2 and config.data.timeline.last_step == 15
+    assert restore_config(tree, []).data.timeline == config.data.timeline
+    _, tree = compose_config(["scale=debug", "data.root=x"])
+    del tree["data"]["timeline"]
+    assert restore_config(tree, []).data.timeline is None
 
 
 @pytest.mark.parametrize("scale", SCALES)

@@ -23,7 +23,7 @@ from src.data.tables import LARGEST, LAST_TIME_US
 from src.files.atomic_write import replacing
 from src.structures.taxonomy import ATTRIBUTES, CLASSES
 
-FORMAT = 4  # raise it when DatasetIndex or a check changes: older caches are then built again
+FORMAT = 5  # raise it when DatasetIndex or a check changes: older caches are then built again
 
 _log = logging.getLogger(__name__)
 _PLAIN = ("root", "version", "annotated")
@@ -41,8 +41,10 @@ _WIDE = {"key_data": (len(CHANNELS),), "data_sizes": (2,)}
 """The other columns hold whole numbers, one of each record but for these."""
 
 
-def load_index(root: str | Path, version: str, cache_folder: str | Path | None) -> DatasetIndex:
+def load_index(root: str | Path, version: str, cache_folder: str | Path | None, labels: bool = True) -> DatasetIndex:
     """The checked tables of `root/version`, from the cache where the table files have not changed.
+
+    Without `labels` annotations are not touched.
 
     A cache that cannot be read is built again, without one that cannot be written it works too; both are logged.
     Raises DataError as `build_index`.
@@ -50,14 +52,15 @@ def load_index(root: str | Path, version: str, cache_folder: str | Path | None) 
     root = Path(root).absolute()
     folder = version_folder(root, version)
     if cache_folder is None:
-        return build_index(root, version)
-    path = Path(cache_folder) / f"tables-{version}-{_digest(folder)}.npz"
+        return build_index(root, version, labels)
+    kind = "tables" if labels else "unlabelled"
+    path = Path(cache_folder) / f"{kind}-{version}-{_digest(folder)}.npz"
     if path.is_file():
         try:
             return _read(path, root, version)
         except Exception as error:  # whatever is wrong with it, the tables hold everything
             _log.warning("%s: the table cache is broken (%s); building it again", path, error)
-    index = build_index(root, version)
+    index = build_index(root, version, labels)
     try:
         _write(path, index)
     except OSError as error:
@@ -110,7 +113,8 @@ def _check(index: DatasetIndex) -> None:
             "".join(column.tolist()).encode()  # ValueError for code points that are none
     files, poses = len(index.data_times_us), len(index.pose_times_us)
     bounds = {
-        "sample_scenes": (0, len(index.scene_names)), "frame_poses": (0, poses), "key_data": (-1, files),
+        "sample_scenes": (0, len(index.scene_names)), "data_scenes": (0, len(index.scene_names)),
+        "frame_poses": (0, poses), "key_data": (-1, files),
         "data_channels": (-1, len(CHANNELS)), "data_poses": (0, poses), "data_previous": (-1, files),
         "data_calibrations": (0, len(index.ego_from_sensor)), "box_labels": (LABEL_RACK, len(CLASSES)),
         "box_attributes": (-1, len(ATTRIBUTES)), "box_points": (-2, 2 * MAX_POINTS_OF_BOX + 1),

@@ -22,7 +22,7 @@ class DataConfig(ReaderOptions):
     batch_size: int  # total over all devices; the streams when clips are streamed
     groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; method 6.4
     stream_sets: int  # at most so many sets of streams take turns when clips are streamed; 1: all streams at every step
-    past_frames: int  # 0: clips are streamed; else frames are shuffled, each with a memory of so many before it
+    past_frames: int  # 0: clips are streamed; else frames are shuffled, each with so many before it (of the timeline)
     sensor_dropout: float  # share of frames with a past that come without any sensor data
     num_workers: int  # loader processes per device
     augmentation: AugmentationConfig | None
@@ -42,6 +42,10 @@ class DataConfig(ReaderOptions):
         require_least(self, "data", least_values)
         if not 0 <= self.sensor_dropout < 1:
             raise ConfigError(f"data.sensor_dropout={self.sensor_dropout}: must be at least 0 and below 1")
+        if self.num_future_frames and self.timeline is None:
+            raise ConfigError(
+                f"data.num_future_frames={self.num_future_frames}: the future is that of data.timeline, which is null"
+            )
         if not -0.5 < self.test_resize_offset < 1:
             raise ConfigError(f"data.test_resize_offset={self.test_resize_offset}: must lie between -0.5 and 1")
 
@@ -54,6 +58,10 @@ class DataConfig(ReaderOptions):
         if not sensors or not set(sensors) <= set(SENSORS) or ("camera" in sensors and image_size_px is None):
             raise ValueError(f"sensors must be some of {SENSORS}, a camera with its image size, but got {sensors}")
         options = {field.name: getattr(self, field.name) for field in fields(ReaderOptions)}
+        if self.timeline is not None and "lidar" not in sensors:
+            raise ConfigError(
+                f"data.timeline: its frames hold LiDAR alone, and this model reads {list(sensors)}; set it to null"
+            )
         for sensor, sweeps in (("radar", "num_sweeps"), ("lidar", "num_lidar_sweeps")):
             options[sweeps] *= sensor in sensors
         return ReaderSettings(**options, image_size_px=image_size_px if "camera" in sensors else None)

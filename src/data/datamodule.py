@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from src.data.augment import AugmentationConfig
+from src.data.augment import AugmentationConfig, frame_generator
 from src.data.cache import load_index
 from src.data.clips import (
     FrameKey,
@@ -30,11 +30,12 @@ from src.data.data_config import DataConfig
 from src.data.evaluation_set import evaluation_set
 from src.data.frame_loader import FrameLoader, collate, collate_in_worker, init_worker
 from src.data.reader import FrameReader, OnBadFile
-from src.data.schema import DatasetIndex
+from src.data.schema import CHANNELS, DatasetIndex
 from src.data.splits import split_samples
 from src.errors import ConfigError, DataError, HorizonError
 from src.structures.batch import FrameBatch
 from src.structures.detections import EvaluationSet
+from src.structures.taxonomy import LIDARS
 
 
 class FrameDataset(Dataset[FrameBatch]):
@@ -51,15 +52,17 @@ class FrameDataset(Dataset[FrameBatch]):
         seed: int,
         sensor_dropout: float = 0.0,
         past_frames: int = 0,  # of a frame that is in no stream
+        training: bool = False,  # times whose rays supervise are drawn
     ) -> None:
         self.reader, self.augmentation, self.seed, self.sensor_dropout = reader, augmentation, seed, sensor_dropout
-        self.past_frames = past_frames
+        self.past_frames, self.training = past_frames, training
 
     def __getitem__(self, key: FrameKey) -> FrameBatch | HorizonError:
         clip = None if key.clip is None else str(self.reader.index.sample_tokens[key.clip])
         try:
-            frame = self.reader.read(key.sample, self.augmentation, self.seed, key.epoch, clip)
-            if self.past_frames:
+            steps = self._steps(key)
+            frame = self.reader.read(key.sample, self.augmentation, self.seed, key.epoch, clip, *steps)
+            if self.past_frames and self.reader.timeline is None:
                 frame = self._with_past(frame, key)
         except HorizonError as error:
             return error
@@ -68,6 +71,16 @@ class FrameDataset(Dataset[FrameBatch]):
         if key.stream is None:
             return drop_sensors(frame, self.sensor_dropout, draw) if self.past_frames else frame
         return drop_sensors(in_stream(frame, key.stream, key.starts), self.sensor_dropout, draw)
+
+    def _steps(self, key: FrameKey) -> tuple[list[int], list[int]]:
+        """Of the timeline: the frames of the past, and those whose rays supervise."""
+        timeline, num_future = self.reader.timeline, self.reader.settings.num_future_frames
+        if timeline is None:
+            return [], []
+        token = str(self.reader.index.sample_tokens[key.sample])
+        rng = frame_generator(self.seed, key.epoch, f"{token}/targets") if self.training else None
+        targets = timeline.targets(key.sample, self.past_frames, num_future, rng) if num_future else []
+        return timeline.config.history(self.past_frames), targets
 
     def _with_past(self, frame: FrameBatch, key: FrameKey) -> FrameBatch:
         """The frame with the key frames before it, augmented as it is; they supervise nothing."""
@@ -122,12 +135,20 @@ class DetectionDataModule(L.LightningDataModule):
         *,
         temporal: bool,
         name: str | None = None,  # of the data set in results; None: its folder's
+        labels: bool = True,  # False: annotations are not touched, and batches have no boxes
     ) -> None:
         super().__init__()
         self.config, self.root, self.seed, self.temporal = config, root, seed, temporal
         self.name = name or root.name
         self.settings = config.reader_settings(sensors, image_size_px)
-        self.index: DatasetIndex = load_index(root, config.version, cache)
+        self.index: DatasetIndex = load_index(root, config.version, cache, labels)
+        self.labels = labels
+        lidars = [CHANNELS.index(name) for name in LIDARS]
+        if "lidar" in sensors and not np.isin(self.index.data_channels, lidars).any():
+            raise DataError(
+                f"{root / config.version}: holds no LiDAR files, but the model reads {' and '.join(sensors)}; choose a "
+                "data set with LiDAR or another model"
+            )
         self.reader = FrameReader(self.index, self.settings)
 
     def evaluation_set(self) -> EvaluationSet:
@@ -188,9 +209,13 @@ class DetectionDataModule(L.LightningDataModule):
 
     def _in_order(self, samples: np.ndarray) -> Iterator[FrameBatch]:
         """One clip in stream 0, without augmentation."""
-        for at, sample in enumerate(samples):
-            frame = in_stream(self.reader.read(int(sample), None), 0, at == 0)
-            yield drop_sensors(frame, self.config.sensor_dropout, (int(sample),))
+        frames = self._frames(None)
+        for sample in samples:
+            order = (0, int(samples[0])) if self._in_streams or not self.temporal else ()
+            frame = frames[FrameKey(0, int(sample), *order)]
+            if isinstance(frame, HorizonError):
+                raise frame
+            yield frame
 
     def train_dataloader(self) -> DataLoader:
         """Augmented batches of the training split, shuffled frames or clips.
@@ -205,7 +230,7 @@ class DetectionDataModule(L.LightningDataModule):
                 f"data.batch_size={config.batch_size}: the split {config.train_split!r} has only {len(samples)} "
                 "frames; lower it"
             )
-        if not index.annotated:
+        if self.labels and not index.annotated:
             raise DataError(f"{index.root / index.version}: has no annotations to train on")
         schedule: Callable[[int], Schedule]
         if self.temporal and not config.past_frames:
@@ -215,17 +240,22 @@ class DetectionDataModule(L.LightningDataModule):
         else:
             schedule = partial(shuffled_frames, samples, config.batch_size, seed)
         sampler = ScheduleSampler(schedule, *self._rank(), self._position)
-        return self._loader(sampler, config.augmentation, config.past_frames if self.temporal else 0)
+        return self._loader(sampler, config.augmentation, training=True)
 
     def val_dataloader(self) -> DataLoader:
         """Batches of the validation split, each frame once over all ranks: in table order, or scene by scene."""
         samples = split_samples(self.index, self.config.split)
         rank, world_size = self._rank()
-        if self.temporal:
+        if self._in_streams:
             schedule = whole_scenes(self._scenes_of(samples), self.config.batch_size, world_size)
         else:
             schedule = frames_in_order(samples, self.config.batch_size)
         return self._loader(ScheduleSampler(lambda epoch: schedule, rank, world_size), None)
+
+    @property
+    def _in_streams(self) -> bool:
+        """Whether frames that are looked at in order have their past in the stream, not with them."""
+        return self.temporal and not (self.config.timeline is not None and self.config.past_frames)
 
     def _rank(self) -> tuple[int, int]:
         """This process's rank and the number of processes, which must divide the batch."""
@@ -243,12 +273,18 @@ class DetectionDataModule(L.LightningDataModule):
             return 0, 0
         return divmod(self.trainer.global_step, min(steps, self.trainer.num_training_batches))
 
+    def _frames(self, augmentation: AugmentationConfig | None, training: bool = False) -> FrameDataset:
+        """Frames by key. Those of the timeline's past always come along, the key frames before it in training."""
+        config = self.config
+        past = config.past_frames if self.temporal and (training or config.timeline is not None) else 0
+        return FrameDataset(self.reader, augmentation, self.seed, config.sensor_dropout, past, training)
+
     def _loader(
-        self, sampler: ScheduleSampler, augmentation: AugmentationConfig | None, past_frames: int = 0
+        self, sampler: ScheduleSampler, augmentation: AugmentationConfig | None, training: bool = False
     ) -> DataLoader:
         workers = self.config.num_workers
         return FrameLoader(
-            FrameDataset(self.reader, augmentation, self.seed, self.config.sensor_dropout, past_frames),
+            self._frames(augmentation, training),
             batch_sampler=sampler,
             num_workers=workers,
             collate_fn=collate_in_worker if workers else collate,

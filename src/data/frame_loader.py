@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import torch
@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader, default_collate
 from src.data.packed_batch import PackedBatch
 from src.errors import DataError, HorizonError
 from src.structures.batch import FrameBatch
+from src.structures.ray_bundle import RayBundle
 
 TERMINATION_GRACE_S = 10
 
@@ -73,9 +74,11 @@ def collate(frames: list[FrameBatch | HorizonError]) -> FrameBatch | HorizonErro
         if clouds[0] is not None:
             counts = torch.tensor([len(cloud) for cloud in clouds])
             values[f"{sensor}_batch"] = torch.repeat_interleave(torch.arange(len(frames)), counts)
-    for name in ("future", "past"):
-        parts = zip(*(getattr(frame, name) for frame in frames), strict=True)
-        values[name] = tuple(collate(list(part)) for part in parts)
+    values["past"] = tuple(collate(list(part)) for part in zip(*(frame.past for frame in frames), strict=True))
+    if frames[0].rays is not None:
+        values["rays"] = RayBundle.join(
+            [replace(frame.rays, batch=torch.full_like(frame.rays.batch, at)) for at, frame in enumerate(frames)]
+        )
     values["skipped"] = {
         name: sum(frame.skipped.get(name, 0) for frame in frames) for frame in frames for name in frame.skipped
     }

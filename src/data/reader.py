@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import os
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
 from typing import Any, TypeVar
@@ -18,13 +18,17 @@ from src.data.augment import AugmentationConfig, draw_bev_transform, draw_crop, 
 from src.data.compensation import Sweeps, compensate_clouds, ego_motion, motion_known, place_sweep, reached
 from src.data.images import read_image, width_fit
 from src.data.pcd import LidarCloud, read_lidar_points, read_radar_points
+from src.data.rays import RADAR_WINDOW_S, TRUE_MARGIN_M, lidar_rays, radar_speeds, without_ego_body
 from src.data.schema import CHANNELS, DatasetIndex
+from src.data.timeline import LidarTimeline, RadialSpeeds, SweepTimeline, TimelineConfig
+from src.data.true_geometry import TrueGeometry
 from src.errors import DataError
 from src.geometry.camera import pixels_from_points
 from src.geometry.transforms import invert_rigid, pose_matrix, quaternion_to_matrix, yaw_of
 from src.structures.batch import LIDAR_POINT_FIELDS, RADAR_POINT_FIELDS, FrameBatch
 from src.structures.boxes import Boxes3D
-from src.structures.taxonomy import CAMERAS, LIDARS, RADARS
+from src.structures.ray_bundle import RayBundle
+from src.structures.taxonomy import CAMERAS, LIDARS, RADARS, REFERENCE_CHANNEL
 
 Array = np.ndarray
 T = TypeVar("T")
@@ -44,8 +48,9 @@ class OnBadFile(Enum):
 
 @dataclass
 class _Skipped:
-    """What a frame does without."""
+    """What a frame does without, and the sweeps that it has read."""
 
+    sweeps: dict[int, LidarCloud | None] = field(default_factory=dict)  # by row; frames of a timeline share them
     channels: Counter[str] = field(default_factory=Counter)
     files: list[str] = field(default_factory=list)
     lost: bool = False  # the key frame's own pose is wrong, so that no annotation is where it says
@@ -59,7 +64,8 @@ class ReaderOptions:
     num_lidar_sweeps: int  # past sweeps of each LiDAR, the key frame's included
     lidar_origins: bool  # also where the ray of each LiDAR point began
     deskew_lidar: bool  # LiDAR points are moved by what was driven between their own times and the sweep's
-    num_future_frames: int  # next key frames of the scene whose LiDAR comes along as supervision
+    timeline: TimelineConfig | None  # LiDAR frames between key frames; None: key frames alone
+    num_future_frames: int  # frames of the timeline's future, drawn in training, whose rays supervise; 0: no rays
     min_distance_m: float  # points nearer than this in both x and y (sensor frame) are dropped: the truck itself
     propagate_points: bool  # move radar points by their own radial velocity to the key frame's time
     on_bad_file: OnBadFile
@@ -82,9 +88,10 @@ class FrameReader:
         self._root = os.path.realpath(index.root)
         self._folders: dict[str, str] = {}  # where the folders of files lead to
         self._reported: set[str] = set()
-        self._following = _following(index)  # [N] row of the scene's next sample, -1 for none
-        self._preceding = inverse = np.full_like(self._following, -1)
-        inverse[self._following[self._following >= 0]] = np.flatnonzero(self._following >= 0)
+        self._preceding = _preceding(index)  # [N] row of the scene's sample before, -1 for none
+        self.timeline = settings.timeline and LidarTimeline(index, settings.timeline)
+        self._radars: SweepTimeline | None = None  # made on first need
+        self._truth: tuple[int, TrueGeometry] | None = None  # of the scene read last, by its row
 
     def read(
         self,
@@ -93,11 +100,14 @@ class FrameReader:
         seed: int = 0,
         epoch: int = 0,
         clip: str | None = None,
+        history: Sequence[int] = (),
+        targets: Sequence[int] = (),
     ) -> FrameBatch:
         """The frame at row `sample` of the sample table; random draws depend on (seed, epoch, token) alone.
 
         `clip` is the token of the first frame of the clip that this frame is part of: A_t is then that frame's, so
-        that it stays the same throughout the clip (method 6.4).
+        that it stays the same throughout the clip (method 6.4). `history` and `targets` are steps of the timeline: its
+        LiDAR frames at the first are `past`, those at the second `rays`.
         Raises DataError for an unreadable file (unless skipped) and for poses that jump.
         """
         index = self.index
@@ -113,12 +123,13 @@ class FrameReader:
         if self.settings.num_sweeps:
             batch |= self._radar_points(sample, global_from_ego, aug_from_ego, skipped)
         if self.settings.num_lidar_sweeps:
-            sweeps, origins = self.settings.num_lidar_sweeps, self.settings.lidar_origins
-            batch |= self._lidar_points(sample, global_from_ego, aug_from_ego, sweeps, origins, skipped)
+            batch |= self._lidar_points(sample, global_from_ego, aug_from_ego, skipped)
         if self.settings.image_size_px is not None:
             batch |= self._images(sample, global_from_ego, aug_from_ego, augmentation, rng, skipped)
-        if self.settings.num_future_frames:
-            batch["future"] = self._future(sample, aug_from_ego, skipped)
+        if history:
+            batch["past"] = tuple(self._past_frame(sample, step, aug_from_ego, skipped) for step in history)
+        if targets:
+            batch["rays"] = self._rays(sample, targets, aug_from_ego @ invert_rigid(global_from_ego), skipped)
         if index.annotated:
             boxes = self._boxes(sample, global_from_ego).transform(torch.from_numpy(aug_from_ego))
             batch["boxes"] = [Boxes3D.empty() if skipped.lost else boxes]
@@ -141,8 +152,10 @@ class FrameReader:
         }
 
     def _global_from_ego(self, sample: int) -> Array:  # [4, 4]
-        pose = self.index.frame_poses[sample]
-        return pose_matrix(self.index.pose_rotations[pose], self.index.pose_translations[pose])
+        return self._pose(self.index.frame_poses[sample])
+
+    def _pose(self, row: int) -> Array:  # [4, 4]
+        return pose_matrix(self.index.pose_rotations[row], self.index.pose_translations[row])
 
     # ---------------------------------------------------------------- radar and LiDAR
 
@@ -153,37 +166,44 @@ class FrameReader:
         aug_from_ego: Array,  # [4, 4]
         skipped: _Skipped,
     ) -> dict[str, torch.Tensor]:
-        rows, clouds = self._clouds(
-            sample, RADARS, self.settings.num_sweeps, lambda path, row: read_radar_points(path), skipped
-        )
+        files = self._files(sample, RADARS, self.settings.num_sweeps, skipped)
+        rows, clouds = self._clouds(sample, files, lambda path, row: read_radar_points(path), skipped)
         times_us = self.index.data_times_us[rows]
         ages_s = 1e-6 * (self.index.frame_times_us[sample] - times_us)
         sweeps = self._sweeps(rows, clouds, times_us)
         return radar_tensors(sweeps, ages_s, global_from_ego, aug_from_ego, self.settings)
 
-    def _clouds(
-        self,
-        sample: int,
-        channels: tuple[str, ...],
-        count: int,
-        read: Callable[[str, int], T],  # of the path and the row of the file
-        skipped: _Skipped,
-    ) -> tuple[Array, list[T]]:  # [S] int64 rows of the files
-        """The key frame's and the sweeps before it of each channel, fewer at a scene's start."""
-        rows, owners = [], []
-        for channel in channels:
-            row = int(self.index.key_data[sample, CHANNELS.index(channel)])
+    def _files(self, sample: int, channels: tuple[str, ...], count: int, skipped: _Skipped) -> list[int]:
+        """Rows of the key frame's files and the sweeps before it of each channel, fewer at a scene's start."""
+        rows = self.index.key_data[sample, [CHANNELS.index(channel) for channel in channels]]
+        for channel, row in zip(channels, rows, strict=True):
             if row < 0 and count:
                 skipped.channels[f"{channel} (not recorded)"] += 1
+        return self._with_sweeps_before(rows, count)
+
+    def _with_sweeps_before(self, rows: Array, count: int) -> list[int]:
+        """Of each sensor `count` files that end with the given one; -1 stands for none."""
+        files = []
+        for row in rows.tolist():
             for _ in range(count):
                 if row < 0:
                     break
-                rows.append(row)
-                owners.append(channel)
+                files.append(row)
                 row = int(self.index.data_previous[row])
+        return files
+
+    def _clouds(
+        self,
+        sample: int,
+        files: list[int],  # rows
+        read: Callable[[str, int], T],  # of the path and the row of the file
+        skipped: _Skipped,
+    ) -> tuple[Array, list[T]]:  # [S] int64 rows of the files
+        """What could be read of these files of sensors of one kind."""
+        owners = [CHANNELS[channel] for channel in self.index.data_channels[files]]
         kept, clouds = [], []
         for row, channel in zip(
-            *self._with_known_poses(sample, np.array(rows, np.int64), owners, skipped), strict=True
+            *self._with_known_poses(sample, np.array(files, np.int64), owners, skipped), strict=True
         ):
             cloud = self._guarded(sample, channel, row, partial(read, row=row), skipped)
             if cloud is not None:
@@ -216,21 +236,40 @@ class FrameReader:
         sample: int,
         global_from_ego: Array,  # [4, 4]
         aug_from_ego: Array,  # [4, 4]
-        num_sweeps: int,
-        origins: bool,
         skipped: _Skipped,
     ) -> dict[str, torch.Tensor]:
-        index, frame_time_us = self.index, int(self.index.frame_times_us[sample])
-        rows, clouds = self._clouds(sample, LIDARS, num_sweeps, self._lidar_cloud, skipped)
-        pose_times_us = index.pose_times_us[index.data_poses[rows]]
+        files = self._files(sample, LIDARS, self.settings.num_lidar_sweeps, skipped)
+        rows, clouds = self._lidar_clouds(sample, files, skipped)
+        aug_from_global = aug_from_ego @ invert_rigid(global_from_ego)
+        return self._placed(rows, clouds, aug_from_global, int(self.index.frame_times_us[sample]))
+
+    def _lidar_clouds(self, sample: int, files: list[int], skipped: _Skipped) -> tuple[Array, list[LidarCloud]]:
+        """As `_clouds`; a file is read once in a frame, and if it is bad counts once."""
+        fresh = [row for row in files if row not in skipped.sweeps]
+        skipped.sweeps |= dict.fromkeys(fresh)
+        rows, clouds = self._clouds(sample, fresh, self._lidar_cloud, skipped)
+        skipped.sweeps |= zip(rows.tolist(), clouds, strict=True)
+        kept = [row for row in files if skipped.sweeps[row] is not None]
+        return np.array(kept, np.int64), [skipped.sweeps[row] for row in kept]
+
+    def _placed(
+        self,
+        rows: Array,  # [S]
+        clouds: list[LidarCloud],
+        aug_from_global: Array,  # [4, 4]
+        frame_time_us: int,
+        origins: bool | None = None,  # None: as the settings say
+    ) -> dict[str, torch.Tensor]:
+        """`lidar_tensors` of these files."""
+        pose_times_us = self.index.pose_times_us[self.index.data_poses[rows]]
         points = [cloud.points for cloud in clouds]
         return lidar_tensors(
             self._sweeps(rows, points, pose_times_us if self.settings.deskew_lidar else None),
             [1e-6 * (frame_time_us - cloud.times_us) for cloud in clouds],
             [1e-6 * (cloud.times_us - time_us) for cloud, time_us in zip(clouds, pose_times_us, strict=True)],
-            aug_from_ego @ invert_rigid(global_from_ego),
+            aug_from_global,
             self.settings.min_distance_m,
-            origins,
+            self.settings.lidar_origins if origins is None else origins,
         )
 
     def _lidar_cloud(self, path: str, row: int) -> LidarCloud:
@@ -248,15 +287,67 @@ class FrameReader:
             )
         return cloud
 
-    def _future(self, sample: int, aug_from_ego: Array, skipped: _Skipped) -> tuple[FrameBatch, ...]:
-        """LiDAR of the next key frames, see `FrameBatch.future`."""
-        frames, row = [], sample
-        for _ in range(self.settings.num_future_frames):
-            row = int(self._following[row]) if row >= 0 else -1
-            at, sweeps = (row, 1) if row >= 0 else (sample, 0)
-            points = self._lidar_points(at, self._global_from_ego(at), aug_from_ego, sweeps, True, skipped)
-            frames.append(FrameBatch(**self._key_frame(at, aug_from_ego), **points))
-        return tuple(frames)
+    # ---------------------------------------------------------------- LiDAR of the timeline
+
+    def _past_frame(self, sample: int, step: int, aug_from_ego: Array, skipped: _Skipped) -> FrameBatch:
+        """The LiDAR frame at a moment, in the ego frame of its LIDAR_LEFT sweep or else of the first there is."""
+        files = self._with_sweeps_before(self.timeline.sweeps(sample, step), self.settings.num_lidar_sweeps)
+        rows, clouds = self._lidar_clouds(sample, files, skipped)
+        frame, aug_from_global = self._key_frame(sample, aug_from_ego), np.eye(4)
+        if len(rows):
+            own = rows[np.argmax(self.index.data_channels[rows] == CHANNELS.index(REFERENCE_CHANNEL))]
+            global_from_ego = self._pose(self.index.data_poses[own])
+            time_us = int(self.index.data_times_us[own])
+            aug_from_global = aug_from_ego @ invert_rigid(global_from_ego)
+            frame |= {
+                "tokens": [f"{frame['tokens'][0]}{step * self.settings.timeline.interval_s:+.1f}s"],
+                "timestamps_s": torch.tensor([1e-6 * time_us], dtype=torch.float64),
+                "global_from_ego": torch.from_numpy(global_from_ego[None]),
+            }
+        return FrameBatch(**frame, **self._placed(rows, clouds, aug_from_global, time_us if len(rows) else 0))
+
+    def _rays(self, sample: int, steps: Sequence[int], aug_from_global: Array, skipped: _Skipped) -> RayBundle:
+        """Returns of one sweep of each LiDAR at each moment; a moment without sweeps gives no rays."""
+        frame_time_us, parts = int(self.index.frame_times_us[sample]), []
+        for step in steps:
+            files = self._with_sweeps_before(self.timeline.sweeps(sample, step), 1)
+            rows, clouds = self._lidar_clouds(sample, files, skipped)
+            mounts = self.index.ego_from_sensor[self.index.data_calibrations[rows]]
+            clouds = list(map(without_ego_body, clouds, mounts))
+            parts.append(lidar_rays(self._placed(rows, clouds, aug_from_global, frame_time_us, origins=True), step))
+        rays, source = RayBundle.join(parts), self.settings.timeline.radial_speeds
+        if source is RadialSpeeds.none or not len(rays):
+            return rays
+        find = self._true_speeds if source is RadialSpeeds.exact else self._radar_speeds
+        return replace(rays, speeds=torch.from_numpy(find(sample, rays, aug_from_global, skipped).astype(np.float32)))
+
+    def _true_speeds(self, sample: int, rays: RayBundle, aug_from_global: Array, skipped: _Skipped) -> Array:  # [R]
+        """By the true motion that a synthetic world knows, in metres of the augmented frame."""
+        scene = int(self.index.sample_scenes[sample])
+        if self._truth is None or self._truth[0] != scene:
+            self._truth = scene, TrueGeometry.read(self.index.root, str(self.index.scene_names[scene]))
+        global_from_aug = np.linalg.inv(aug_from_global)
+        points = rays.points.double().numpy() @ global_from_aug[:3, :3].T + global_from_aug[:3, 3]
+        times_us = self.index.frame_times_us[sample] + np.round(1e6 * rays.times_s.double().numpy()).astype(np.int64)
+        velocities = self._truth[1].velocities(points, times_us, TRUE_MARGIN_M) @ aug_from_global[:3, :3].T
+        return (velocities * rays.directions.double().numpy()).sum(1)
+
+    def _radar_speeds(self, sample: int, rays: RayBundle, aug_from_global: Array, skipped: _Skipped) -> Array:  # [R]
+        """By the radar returns beside the rays' ends."""
+        index, frame_time_us = self.index, int(self.index.frame_times_us[sample])
+        if self._radars is None:
+            self._radars = SweepTimeline(index, RADARS)
+        times_us = frame_time_us + np.round(1e6 * rays.times_s.double().numpy()).astype(np.int64)
+        window_us, files = round(1e6 * RADAR_WINDOW_S), set()
+        for step in rays.steps.unique().tolist():
+            own_us = times_us[rays.steps.numpy() == step]
+            files |= set(self._radars.between(sample, own_us.min() - window_us, own_us.max() + window_us).tolist())
+        rows, clouds = self._clouds(sample, sorted(files), lambda path, row: read_radar_points(path), skipped)
+        sweeps = self._sweeps(rows, clouds, index.data_times_us[rows])
+        ages_s = 1e-6 * (frame_time_us - index.data_times_us[rows])
+        unmoved, pose = replace(self.settings, propagate_points=False), self._global_from_ego(sample)
+        tensors = radar_tensors(sweeps, ages_s, pose, aug_from_global @ pose, unmoved)
+        return radar_speeds(rays, tensors["radar_points"].double().numpy())
 
     # ---------------------------------------------------------------- cameras
 
@@ -405,12 +496,12 @@ class FrameReader:
         return path
 
 
-def _following(index: DatasetIndex) -> Array:  # [N] int64
+def _preceding(index: DatasetIndex) -> Array:  # [N] int64
     order = np.lexsort((index.frame_times_us, index.sample_scenes))
-    following = np.full(len(order), -1)
+    preceding = np.full(len(order), -1)
     linked = np.diff(index.sample_scenes[order]) == 0
-    following[order[:-1][linked]] = order[1:][linked]
-    return following
+    preceding[order[1:][linked]] = order[:-1][linked]
+    return preceding
 
 
 def radar_tensors(

@@ -63,7 +63,7 @@ class DatasetIndex:
 
     root: Path
     version: str
-    annotated: bool  # False for test releases
+    annotated: bool  # False for test releases, and where labels were left unread
     # Scenes
     scene_names: Array  # [S] str
     scene_descriptions: Array  # [S] str, tags joined by ';'
@@ -74,6 +74,7 @@ class DatasetIndex:
     frame_poses: Array  # [N] int32, its ego pose
     key_data: Array  # [N, 16] int32, sensor file of each of CHANNELS
     # Sensor files
+    data_scenes: Array  # [D] int32
     data_channels: Array  # [D] int8, index into CHANNELS, -1 for others
     data_times_us: Array  # [D] int64
     data_poses: Array  # [D] int32
@@ -113,13 +114,13 @@ class DatasetIndex:
         return np.flatnonzero(wanted[self.sample_scenes])
 
 
-def build_index(root: Path, version: str) -> DatasetIndex:
-    """Read, check and link the 14 tables of `root/version`.
+def build_index(root: Path, version: str, labels: bool = True) -> DatasetIndex:
+    """Read, check and link the 14 tables of `root/version`; without `labels` annotations need not even be there.
 
     Raises DataError (table, record, value, remedy) for anything missing, contradictory or out of range.
     """
     folder = version_folder(root, version)
-    without_boxes = version.endswith("-test")
+    without_boxes = version.endswith("-test") or not labels
     optional = OPTIONAL_TABLES + (("sample_annotation", "instance") if without_boxes else ())
     missing = [name for name in TABLES if name not in optional and not (folder / f"{name}.json").is_file()]
     if missing:
@@ -135,9 +136,11 @@ def build_index(root: Path, version: str) -> DatasetIndex:
     calibrations = _calibration_columns(folder, parts)
     data_samples, data_key = _data_columns(folder, samples, calibrations, parts)
     _frame_columns(samples, data_samples, data_key, parts)
-    annotations = Table(folder / "sample_annotation.json", without_boxes)
+    annotations, instances = (
+        Table(folder / f"{name}.json", without_boxes, labels) for name in ("sample_annotation", "instance")
+    )
     annotated = bool(len(annotations)) or not without_boxes
-    _box_columns(folder, samples, annotations, without_boxes, parts)
+    _box_columns(folder, samples, annotations, instances, parts)
     del parts["sample_times_us"]
     return DatasetIndex(root=root, version=version, annotated=annotated, **parts)
 
@@ -209,7 +212,7 @@ def _data_columns(
 
     table = Table(folder / "sample_data.json")
     data_samples = table.links("sample_token", samples)
-    scenes = parts["sample_scenes"][data_samples]
+    scenes = parts["data_scenes"] = parts["sample_scenes"][data_samples]
     parts["data_poses"] = sorted_row[table.links("ego_pose_token", poses)]
     rows = table.links("calibrated_sensor_token", calibrations[0])
     parts["data_calibrations"] = rows.astype(np.int32)
@@ -278,10 +281,9 @@ def _frame_columns(samples: Table, data_samples: Array, data_key: Array, parts: 
     samples.check(advances, "timestamp", frame_times, expected)
 
 
-def _box_columns(folder: Path, samples: Table, table: Table, without_boxes: bool, parts: dict[str, Array]) -> None:
+def _box_columns(folder: Path, samples: Table, table: Table, instances: Table, parts: dict[str, Array]) -> None:
     """Annotations of the 12 classes and bicycle racks, with the devkit's finite-difference velocity."""
-    instances, categories = Table(folder / "instance.json", without_boxes), Table(folder / "category.json")
-    attributes = Table(folder / "attribute.json")
+    categories, attributes = Table(folder / "category.json"), Table(folder / "attribute.json")
     sample_rows = table.links("sample_token", samples)
     instance_rows = table.links("instance_token", instances)
     table.links("visibility_token", Table(folder / "visibility.json"), optional=True)

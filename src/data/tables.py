@@ -28,16 +28,18 @@ _REMEDY = "restore the file from the data set's archive, or write the synthetic 
 
 
 class Table:
-    """The records of one table, addressed by column.
+    """The records of one table, addressed by column; none of one that is not `wanted`, which is not opened.
 
     Raises DataError when the file is missing (an `optional` one then has no records), is not JSON (with line and
     column), is not a list of records, or when a token is missing, empty or used twice.
     """
 
-    def __init__(self, path: Path, optional: bool = False) -> None:
+    def __init__(self, path: Path, optional: bool = False, wanted: bool = True) -> None:
         self.path = path
         self.name = path.stem
-        self.records: list[dict[str, Any]] = [] if optional and not path.exists() else _read_list(path)
+        self.records: list[dict[str, Any]] = []
+        if wanted and (not optional or path.exists()):
+            self.records = _read_list(path)
         self.tokens: list[str] = self.values("token")
         self.rows = {token: row for row, token in enumerate(self.tokens)}
         if len(self.rows) != len(self.tokens):

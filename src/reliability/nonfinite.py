@@ -19,6 +19,7 @@ from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
 from src.reliability.processes import gather_by_rank
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
+from src.structures.ray_bundle import RayBundle
 
 logger = logging.getLogger(__name__)
 
@@ -209,17 +210,18 @@ def read_dump(path: Path) -> tuple[dict[str, Any], FrameBatch]:
         values = dict(step["batch"])
         if values["boxes"] is not None:
             values["boxes"] = [Boxes3D(**boxes) for boxes in values["boxes"]]
-        for name in ("future", "past"):
-            values[name] = tuple(FrameBatch(**(frame | {"future": (), "past": ()})) for frame in values[name])
+        if values["rays"] is not None:
+            values["rays"] = RayBundle(**values["rays"])
+        values["past"] = tuple(FrameBatch(**(frame | {"past": ()})) for frame in values["past"])
         return content, FrameBatch(**values)
     except (TypeError, ValueError, KeyError, AttributeError) as error:
         raise CheckpointError(f"{path}: its batch is not as written ({error})") from error
 
 
 def _plain(value: Any) -> Any:
-    """Tensors on the CPU, and batches and boxes as dictionaries."""
+    """Tensors on the CPU, and batches, boxes and rays as dictionaries."""
     if isinstance(value, Tensor):
         return value.detach().cpu()
-    if isinstance(value, (FrameBatch, Boxes3D)):
+    if isinstance(value, (FrameBatch, Boxes3D, RayBundle)):
         return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
     return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value

@@ -1,4 +1,4 @@
-"""What travels from the data layer to a model: one key frame of each of B samples."""
+"""What travels from the data layer to a model: one frame of each of B samples."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from src.structures.boxes import Boxes3D
+from src.structures.ray_bundle import RayBundle
 from src.structures.tensor_fields import TensorFields
 
 MAX_EGO_SPEED_MPS = 100.0
@@ -45,14 +46,10 @@ class FrameBatch(TensorFields):
     starts: Tensor | None = None  # [B] bool, the row begins a clip: memory of its stream ends; given with `streams`
     skipped: dict[str, int] = field(default_factory=dict)  # unreadable files skipped, by channel
     bad_files: list[str] = field(default_factory=list)  # which these were, relative to the data set's root
-    future: tuple[FrameBatch, ...] = ()
-    """The next key frames of the same scenes, one sweep of each lidar with ray origins: supervision, never an input.
-
-    Each is in its own ego frame, with the A_t of this batch: aug_from_future = A_t inv(G) G_future inv(A_t), G being
-    `global_from_ego`. Where a scene has ended, the row repeats this frame's token, time and pose and has no points.
-    """
+    rays: RayBundle | None = None
+    """LiDAR at several times of the same scenes: supervision, never an input. None where it was not asked for."""
     past: tuple[FrameBatch, ...] = ()
-    """The key frames before these, the oldest first, with the A_t of this batch, for a memory made in this step alone.
+    """Frames before these, the oldest first, with the A_t of this batch, for a memory made in this step alone.
 
     Where a scene had not begun, the row repeats this frame's token, time and pose and sees nothing.
     """
@@ -82,10 +79,11 @@ class FrameBatch(TensorFields):
                 raise ValueError(f"FrameBatch.streams must be unique, but got {self.streams.tolist()}")
         if self.boxes is not None and len(self.boxes) != b:
             raise ValueError(f"FrameBatch.boxes must hold {b} entries, one per sample, but got {len(self.boxes)}")
-        for name in ("future", "past"):
-            sizes = [len(frame) for frame in getattr(self, name)]
-            if sizes != [b] * len(sizes):
-                raise ValueError(f"FrameBatch.{name} must hold batches of {b}, but got {sizes}")
+        sizes = [len(frame) for frame in self.past]
+        if sizes != [b] * len(sizes):
+            raise ValueError(f"FrameBatch.past must hold batches of {b}, but got {sizes}")
+        if self.rays is not None:
+            self._check_owners("rays.batch", self.rays.batch)
 
     def _check_points(self, sensor: str, width: int) -> None:
         points, owners = getattr(self, f"{sensor}_points"), getattr(self, f"{sensor}_batch")
@@ -94,10 +92,13 @@ class FrameBatch(TensorFields):
         count = 0 if points is None else len(points)
         self._expect(f"{sensor}_points", (count, width), torch.float32)
         self._expect(f"{sensor}_batch", (count,), torch.int64)
+        self._check_owners(f"{sensor}_batch", owners)
+
+    def _check_owners(self, name: str, owners: Tensor) -> None:
         # Values are looked at where the batch is built; on a GPU the look would stall every step.
-        looked_at = owners.device.type == "cpu" and count > 0
+        looked_at = owners.device.type == "cpu" and len(owners) > 0
         if looked_at and not (owners[0] >= 0 and owners[-1] < len(self) and bool((owners.diff() >= 0).all())):
-            raise ValueError(f"FrameBatch.{sensor}_batch must ascend within 0..{len(self) - 1}")
+            raise ValueError(f"FrameBatch.{name} must ascend within 0..{len(self) - 1}")
 
     def _expect(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> None:
         value = getattr(self, name)

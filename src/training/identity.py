@@ -86,5 +86,7 @@ def run_identity(tree: dict[str, Any], source: str | None = None) -> str:
     if not tree["phase"]["temporal"]:
         for key in TEMPORAL_DATA_KEYS:
             tree["data"].pop(key)
+    if tree["data"].get("timeline") is None:
+        tree["data"].pop("timeline", None)  # a run of key frames is what it was before there were others
     digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:8]
     return f"{tree['model']['name']}-{tree['phase']['name']}-{tree['scale']}-{digest}"

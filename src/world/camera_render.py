@@ -44,7 +44,7 @@ class Studio:
     def __init__(self, scene: Scene, scenery: Scenery, width: int, height: int, rng: np.random.Generator) -> None:
         self.scene, self.scenery, self.width, self.height = scene, scenery, width, height
         self.meshes = [actor_mesh(actor) for actor in scene.actors]
-        self.floors = np.array([actor.kind.floor_m for actor in scene.actors])
+        self.floors = scene.floors
         bearing = np.linspace(-np.pi, np.pi, 1441)
         waves = sum(rng.uniform(0.2, 1.0) * np.sin(k * bearing + rng.uniform(0, 6.28)) / k for k in range(2, 9))
         trees = np.repeat(rng.uniform(-1, 1, 721), 2)[:1441]

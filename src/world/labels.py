@@ -35,16 +35,14 @@ class FrameTruth:
 
 def frame_truth(scene: Scene, time_s: float, own_pixels: Array, seen_pixels: Array) -> FrameTruth:
     """Boxes of all actors at a key frame; point counts are zero until they are filled in."""
-    ground, velocity, yaw = scene.tracks.state(time_s)
+    centres, velocity, yaw = scene.boxes(time_s)
     _, ego = scene.ego.pose(time_s)
-    floors = np.array([actor.kind.floor_m for actor in scene.actors])
-    centres = ground + np.stack([np.zeros_like(floors), np.zeros_like(floors), floors + 0.5 * scene.sizes[:, 2]], 1)
     nothing = np.zeros(len(centres), dtype=np.int64)
     return FrameTruth(
         centres=centres,
         yaws=yaw,
         speeds=np.linalg.norm(velocity, axis=1),
-        distance_m=np.hypot(*(ground - ego)[:, :2].T),
+        distance_m=np.hypot(*(centres - ego)[:, :2].T),
         own_pixels=own_pixels,
         seen_pixels=seen_pixels,
         radar_points=nothing,

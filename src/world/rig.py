@@ -17,6 +17,29 @@ RADAR_ELEVATION_RAD = np.radians(11.0)
 
 
 @dataclass(frozen=True, kw_only=True)
+class Beams:
+    """How one kind of lidar looks around, about its own x axis."""
+
+    half_width_rad: float
+    elevations_rad: Array  # [E]
+    reach_m: float  # nothing comes back from farther away; there a reflectivity of 0.1 has a chance of 0.9
+
+
+LONG_BEAMS = Beams(
+    half_width_rad=np.radians(135.0),
+    elevations_rad=np.radians(
+        np.concatenate([np.linspace(-22, -4, 16), np.linspace(-3.5, 3.5, 22), np.linspace(4.5, 10, 6)])
+    ),
+    reach_m=200.0,
+)
+SHORT_BEAMS = Beams(half_width_rad=np.radians(90.0), elevations_rad=np.radians(np.linspace(-45, 45, 32)), reach_m=35.0)
+LONG_LIDARS = ("LIDAR_LEFT", "LIDAR_RIGHT")
+"""The others are of the short kind: Pandar64 and Ouster OS0 on the real trucks."""
+CAB_M = np.array([[3.5, -1.25, 0.6], [5.3, 1.25, 3.3]])
+"""Lowest and highest corner of what the truck's own lidars do not see through, ego frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Mount:
     """One sensor: point_ego = rotation @ point_sensor + translation."""
 

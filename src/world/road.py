@@ -17,6 +17,7 @@ START_M = -800.0
 END_M = 1500.0
 SLAT_M, SLAT_STEP_M = 0.36, 2.0
 """Width across the road and distance of the slats of an anti-glare screen: opaque along the road, open across it."""
+SLAT_THICK_M = 0.05
 SIDE_ROAD_GAP_M = 13.0
 SIDE_ROAD_HALF_M = 3.2
 APRON_GAP_M = 10.0
@@ -85,6 +86,26 @@ class Road:
     def curvature_at(self, s: Array) -> Array:
         """1/m, left turns positive."""
         return (self.heading_at(np.asarray(s) + 1.0) - self.heading_at(np.asarray(s) - 1.0)) / 2.0
+
+    def along(
+        self,
+        xy: Array,  # [..., 2] m
+        guess_s: Array,  # [...] m, where to look first
+        rounds: int = 20,
+    ) -> Array:  # [...] m
+        """The place along the road that points lie beside: `place(along, d)` leads back to them for some d."""
+        s = np.asarray(guess_s, dtype=np.float64)
+        for _ in range(rounds):
+            heading = self.heading_at(s)
+            away = xy - self._lookup(self.xy, s)
+            s = s + away[..., 0] * np.cos(heading) + away[..., 1] * np.sin(heading)
+        return s
+
+    def slats(self, first_m: float, last_m: float) -> tuple[Array, Array, Array]:
+        """Middles [N, 3], sizes [N, 3] and headings [N] of the anti-glare screen's slats between two places."""
+        s = SLAT_STEP_M * np.arange(first_m // SLAT_STEP_M, last_m // SLAT_STEP_M + 1) if self.screen_m else np.zeros(0)
+        size = np.tile([SLAT_THICK_M, SLAT_M, self.screen_m], (len(s), 1))
+        return self.place(s, np.zeros_like(s), 0.5 * self.screen_m), size, self.heading_at(s)
 
     def place(self, s: Array, d: Array, height: Array | float = 0.0) -> Array:
         """Local xyz [..., 3] of road positions, `height` metres above the ground."""

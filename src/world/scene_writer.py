@@ -30,6 +30,7 @@ from src.world.rig import Mount, sensor_rig
 from src.world.scenery import make_scenery
 from src.world.sensor_faults import SensorFaults
 from src.world.simulate import Scene, make_scene, scene_rng
+from src.world.solid import true_geometry
 from src.world.table_rows import Row, Tables, link_by, link_chain, rounded, token
 from src.world.world_config import (
     CAMERA_RATE_HZ,
@@ -77,6 +78,8 @@ class SceneWriter:
         pixels = self._write_cameras()
         lidar_points = self._write_lidars()
         frames = self._truths(pixels, key_points, lidar_points)
+        if self.config.lidar:
+            true_geometry(self.scene, self.config.duration_s, self.start_us).write(self.folder, self.name)
         return self._annotation_tables(frames) | self._sample_tables() | self._motion_tables()
 
     def _token(self, *parts: object) -> str:
@@ -171,7 +174,7 @@ class SceneWriter:
             time = self._quantised(base + self.rig[REFERENCE_CHANNEL].delay_s)
             clouds = {REFERENCE_CHANNEL: np.zeros(0, dtype=LIDAR_TYPE)}
             if self.config.lidar:
-                clouds = scan_lidars(self.config, self.scene, self.studio, mounts, time, self._stamp(time), rng)
+                clouds = scan_lidars(self.config, self.scene, mounts, time, self._stamp(time), rng)
             for name, cloud in clouds.items():
                 self._store(name, frame, is_key, time, lidar_pcd(cloud), len(cloud))
             if is_key:

@@ -46,6 +46,17 @@ class Scene:
         """[N, 3] length, width, height."""
         return np.array([actor.size for actor in self.actors])
 
+    @property
+    def floors(self) -> Array:
+        """[N] height of each actor's lower edge above the ground."""
+        return np.array([actor.kind.floor_m for actor in self.actors])
+
+    def boxes(self, time_s: float) -> tuple[Array, Array, Array]:
+        """Middles [N, 3], velocities [N, 3] and headings [N] of all actors at a time, local coordinates."""
+        middles, velocities, headings = self.tracks.state(time_s)
+        middles[:, 2] += self.floors + 0.5 * self.sizes[:, 2]
+        return middles, velocities, headings
+
 
 def scene_rng(config: WorldConfig, index: int, purpose: int) -> np.random.Generator:
     """A random stream of its own for each scene and purpose, so that one part's draws never move another's."""

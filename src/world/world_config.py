@@ -12,6 +12,9 @@ from src.errors import ConfigError
 GENERATOR = "highway-3"
 """Changes whenever the same config would give other bytes, so that old worlds are not mistaken for new ones."""
 
+LIDAR_GENERATOR = "lidar-2"
+"""The same of what is written only with `lidar`; worlds without stay what they are."""
+
 RADAR_RATE_HZ = 20
 CAMERA_RATE_HZ = 10
 LIDAR_RATE_HZ = 10
@@ -106,7 +109,7 @@ class WorldConfig:
     screened_fraction: float  # of scenes with an opaque median
     rare_objects: float  # scales how many of the rare classes a scene gets
     annotation_range_m: float  # objects farther away are not labelled
-    lidar: bool  # ray-cast six lidars; otherwise only the empty LIDAR_LEFT key frames
+    lidar: bool  # ray-cast six lidars and write the true geometry; otherwise only the empty LIDAR_LEFT key frames
     lidar_sweeps_per_key_frame: int  # sweeps written up to and including a key frame, 5 = all of the 10 Hz
     lidar_step_deg: float  # azimuth step of the ray-cast lidars
     ego_rate_hz: int  # ego_pose and ego_motion rows per second besides those of the sensors
@@ -134,7 +137,7 @@ def stored_config(config: WorldConfig) -> dict[str, object]:
     """What decides the bytes of a world: the config without `num_workers`, with the generator's name."""
     values = asdict(config)
     del values["num_workers"]
-    return {"generator": GENERATOR, **values}
+    return {"generator": f"{GENERATOR}, {LIDAR_GENERATOR}" if config.lidar else GENERATOR, **values}
 
 
 def world_digest(config: WorldConfig) -> str:

@@ -14,6 +14,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from src.data.schema import TABLES
+from src.data.true_geometry import TRUTH_FOLDER
 from src.errors import ConfigError, DataError
 from src.structures.taxonomy import CAMERAS, LIDARS, RADARS, REFERENCE_CHANNEL
 from src.world.rig import sensor_rig
@@ -91,6 +92,8 @@ def _fill(config: WorldConfig, folder: Path, progress: bool) -> None:
         (folder / "samples" / channel).mkdir(parents=True)
         if channel not in LIDARS or (config.lidar and config.lidar_sweeps_per_key_frame > 1):
             (folder / "sweeps" / channel).mkdir(parents=True)
+    if config.lidar:
+        (folder / TRUTH_FOLDER).mkdir()
     tables: Tables = {name: [] for name in TABLES} | shared_tables(config.seed, sensor_rig(config))
     names = []
     bar = tqdm(total=config.num_scenes, desc="writing the synthetic world", unit="scene", disable=not progress)

@@ -65,7 +65,7 @@ def test_a_cache_that_a_stranger_wrote_is_built_again(broken_tables, tmp_path, c
     np.savez(file, **(columns | {name: change(columns[name])}))
     again = load_index(broken_tables.root, VERSION, tmp_path / "cache")
     # Times are what sensor files are counted by: a cut there shows at the first column beside it.
-    told = "data_channels is [402] int8, expected [401]" if name == "data_times_us" else name
+    told = "data_scenes is [402] int32, expected [401]" if name == "data_times_us" else name
     assert "broken" in caplog.text and told in caplog.text
     np.testing.assert_array_equal(getattr(again, name), getattr(whole, name))
 

@@ -21,7 +21,7 @@ from src.data.frame_loader import collate, dead_workers_named
 from src.data.reader import OnBadFile
 from src.errors import ConfigError, DataError, HorizonError
 from src.structures.taxonomy import RADARS
-from tests.data.tiny_set import START_S, VERSION, DataSet, Writer, token
+from tests.data.tiny_set import FIVE_HERTZ, START_S, VERSION, DataSet, Writer, token
 
 BEV = BevAugmentationConfig(scale=[0.95, 1.05], rotation_rad=0.4, flip_probability=0.5)
 
@@ -31,7 +31,7 @@ def config(**changes):
         root=None, version=VERSION, train_split="train", split="val", batch_size=2, groups_per_scene=2, stream_sets=1,
         past_frames=0, sensor_dropout=0.0, num_workers=0, num_sweeps=2, min_distance_m=1.0, propagate_points=False,
         on_bad_file=OnBadFile.error, test_resize_offset=0.0, num_lidar_sweeps=1, lidar_origins=False,
-        deskew_lidar=True, num_future_frames=0,
+        deskew_lidar=True, timeline=None, num_future_frames=0,
         augmentation=AugmentationConfig(image=None, bev=BEV),
     )  # fmt: skip
     return DataConfig(**(values | changes))
@@ -117,21 +117,21 @@ def test_empty_and_full_frames_share_a_batch(data_set):
 @pytest.mark.slow
 @pytest.mark.parametrize("num_workers", [0, 1])
 def test_what_is_read_follows_from_the_sensors(lidar_set, num_workers, quick_end):
-    chosen = {"num_lidar_sweeps": 2, "num_future_frames": 1, "lidar_origins": True, "num_workers": num_workers}
+    chosen = {"num_lidar_sweeps": 2, "timeline": FIVE_HERTZ, "num_future_frames": 1, "lidar_origins": True,
+              "num_workers": num_workers}  # fmt: skip
     data = module(lidar_set, sensors=("lidar",), **chosen)
     first, second = data.val_dataloader()
     assert first.radar_points is None and first.radar_batch is None and first.images is None
     assert first.lidar_batch.bincount().tolist() == [80, 80] and second.lidar_batch.bincount().tolist() == [80]
     assert len(first.lidar_origins) == 160
-    (future,) = first.future
-    assert future.tokens == [first.tokens[1], second.tokens[0]] and future.lidar_batch.bincount().tolist() == [40, 40]
-    assert len(second.future[0].lidar_points) == 0  # the scene has ended
+    assert first.rays.batch.bincount().tolist() == [240, 120] and second.rays.batch.bincount().tolist() == [40]
+    assert first.rays.steps[first.rays.batch == 1].unique_consecutive().tolist() == [0, 1, 2]
     alone = data.reader.read(4, None)
     rows = first.lidar_batch == 1
     assert torch.equal(first.lidar_points[rows], alone.lidar_points)
     assert torch.equal(first.lidar_origins[rows], alone.lidar_origins)
     every = next(iter(module(lidar_set, sensors=("lidar", "camera", "radar")).val_dataloader()))
-    assert every.images is not None and len(every.radar_points) and len(every.lidar_points) and every.future == ()
+    assert every.images is not None and len(every.radar_points) and len(every.lidar_points) and every.rays is None
 
 
 @pytest.mark.parametrize("sensors", [(), ("sonar",), ("radar", "sonar")])
@@ -141,13 +141,13 @@ def test_sensors_that_are_none(data_set, sensors):
 
 
 def test_lidar_is_dropped_with_the_other_sensors(lidar_set):
-    chosen = {"sensor_dropout": 0.99, "num_future_frames": 1, "lidar_origins": True}
+    chosen = {"sensor_dropout": 0.99, "timeline": FIVE_HERTZ, "num_future_frames": 1, "lidar_origins": True}
     data = module(lidar_set, ("lidar", "radar"), temporal=True, **chosen)
     first, second, _ = data.stream()
     assert len(first.lidar_points) and len(first.radar_points)
     assert second.lidar_points.shape == (0, 5) and second.radar_points.shape == (0, 7)
     assert second.lidar_origins.shape == (0, 3) and len(second.lidar_batch) == 0
-    assert len(second.future[0].lidar_points)  # what is to be predicted stays
+    assert len(second.rays)  # what is to be predicted stays
 
 
 @pytest.mark.slow

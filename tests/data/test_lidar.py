@@ -1,4 +1,4 @@
-"""LiDAR of one frame and of future ones: every point by its own time, on a truck that drives a curve."""
+"""LiDAR of one frame: every point by its own time, on a truck that drives a curve."""
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from src.geometry.transforms import invert_rigid, rigid
 from src.structures.taxonomy import LIDARS
 from src.world.write import ensure_world
 from tests.data.tiny_set import (
+    FIVE_HERTZ,
     LIDAR_CHANNELS,
     LIDAR_STEP_US,
     START_S,
@@ -98,47 +99,23 @@ def test_fewer_sweeps_at_a_scenes_start_and_near_points_are_dropped(lidar_set, b
 
 
 def test_augmentation_moves_points_and_origins(lidar_set):
-    reader = lidar_set.reader(**ONLY_LIDAR, lidar_origins=True, num_future_frames=1)
-    plain, turned = reader.read(1, None), reader.read(1, TURNED, 0, 3)
-    matrix = turned.aug_from_ego[0].double().numpy()
+    reader = lidar_set.reader(**ONLY_LIDAR, lidar_origins=True)
+    before, after = reader.read(1, None), reader.read(1, TURNED, 0, 3)
+    matrix = after.aug_from_ego[0].double().numpy()
     assert not np.allclose(matrix, np.eye(4), atol=0.05)
-    for before, after in ((plain, turned), (plain.future[0], turned.future[0])):
-        points, moved = before.lidar_points.double().numpy(), after.lidar_points.double().numpy()
-        np.testing.assert_allclose(moved[:, :3], apply(matrix, points[:, :3]), atol=1e-3)
-        np.testing.assert_array_equal(moved[:, 3:], points[:, 3:])
-        origins = before.lidar_origins.double().numpy()
-        np.testing.assert_allclose(after.lidar_origins, apply(matrix, origins), atol=1e-3)
-        assert torch.equal(after.aug_from_ego, turned.aug_from_ego)
+    points, moved = before.lidar_points.double().numpy(), after.lidar_points.double().numpy()
+    np.testing.assert_allclose(moved[:, :3], apply(matrix, points[:, :3]), atol=1e-3)
+    np.testing.assert_array_equal(moved[:, 3:], points[:, 3:])
+    origins = before.lidar_origins.double().numpy()
+    np.testing.assert_allclose(after.lidar_origins, apply(matrix, origins), atol=1e-3)
 
 
 def test_reading_lidar_changes_no_draw(lidar_set):
     alone = lidar_set.reader(num_lidar_sweeps=0).read(1, TURNED, 4, 2)
-    both = lidar_set.reader(num_lidar_sweeps=1, num_future_frames=2).read(1, TURNED, 4, 2)
+    timed = lidar_set.reader(num_lidar_sweeps=1, timeline=FIVE_HERTZ, num_future_frames=2)
+    both = timed.read(1, TURNED, 4, 2, None, [-1], [0, 1])
     assert torch.equal(alone.radar_points, both.radar_points) and torch.equal(alone.images, both.images)
-    assert torch.equal(alone.pix_from_aug, both.pix_from_aug) and alone.lidar_points is None and alone.future == ()
-
-
-def test_future_frames_meet_the_present_by_their_poses_and_end_with_the_scene(lidar_set):
-    reader = lidar_set.reader(**ONLY_LIDAR, num_future_frames=2)
-    frame = reader.read(0, TURNED, 1, 1)
-    tokens = lidar_set.records("sample")
-    assert [future.tokens for future in frame.future] == [[tokens[1]["token"]], [tokens[2]["token"]]]
-    to_aug = frame.aug_from_ego[0].double().numpy()
-    for number, future in enumerate(frame.future, start=1):
-        assert float(future.timestamps_s - frame.timestamps_s) == pytest.approx(0.5 * number, abs=1e-5)
-        assert len(future.lidar_points) == 2 * len(STATIC) and future.boxes is None and future.radar_points is None
-        pose, then = (f.global_from_ego[0].numpy() for f in (frame, future))
-        aug_from_future = to_aug @ invert_rigid(pose) @ then @ np.linalg.inv(to_aug)
-        now = apply(aug_from_future, future.lidar_points[:, :3].double().numpy())
-        truth = apply(to_aug @ invert_rigid(pose), STATIC)
-        np.testing.assert_allclose(now, np.tile(truth, (2, 1)), atol=5e-3)
-    last = reader.read(2, None)
-    for future in last.future:
-        assert future.tokens == last.tokens and torch.equal(future.timestamps_s, last.timestamps_s)
-        assert torch.equal(future.global_from_ego, last.global_from_ego)
-        assert future.lidar_points.shape == (0, 5) and future.lidar_origins.shape == (0, 3)
-    middle = reader.read(4, None)  # second of the other scene
-    assert [len(future.lidar_points) for future in middle.future] == [2 * len(STATIC), 0]
+    assert torch.equal(alone.pix_from_aug, both.pix_from_aug) and alone.lidar_points is None and alone.rays is None
 
 
 def damage(path, fault):
@@ -171,16 +148,6 @@ def test_bad_files_stop_or_are_counted(broken_lidar, fault, words):
     if fault == "clock":
         frame = broken_lidar.reader(**ONLY_LIDAR, deskew_lidar=False).read(1, None)
         assert len(frame.lidar_points) == 6 * len(STATIC)
-
-
-def test_a_bad_file_of_a_future_frame_counts_for_the_frame(broken_lidar):
-    path = lidar_path(broken_lidar, "LIDAR_LEFT", 2)
-    damage(path, "gone")
-    reader = broken_lidar.reader(**ONLY_LIDAR, num_future_frames=1, on_bad_file=OnBadFile.skip)
-    frame = reader.read(1, None)
-    assert frame.skipped == {name: 2 for name in NOT_RECORDED} | {"LIDAR_LEFT": 1}
-    assert frame.bad_files == [str(path.relative_to(broken_lidar.root))]
-    assert len(frame.future[0].lidar_points) == len(STATIC)
 
 
 def test_deskewing_is_the_motion_of_a_constant_twist():

@@ -12,6 +12,8 @@ from src.data.frame_loader import collate
 from src.data.packed_batch import LARGE_BYTES, PackedBatch
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
+from src.structures.ray_bundle import RayBundle
+from tests.data.tiny_set import FIVE_HERTZ
 
 
 @pytest.fixture
@@ -24,7 +26,7 @@ def pieces(value):
     for field in fields(value):
         item = getattr(value, field.name)
         for entry in item if isinstance(item, (list, tuple)) else [item]:
-            yield from pieces(entry) if isinstance(entry, (Boxes3D, FrameBatch)) else [entry]
+            yield from pieces(entry) if isinstance(entry, (Boxes3D, FrameBatch, RayBundle)) else [entry]
 
 
 def assert_same(found, expected):
@@ -44,12 +46,14 @@ def test_what_is_packed_is_unpacked(batch):
             assert_same(PackedBatch.pack(one).unpack(), one)
 
 
-def test_lidar_and_future_frames_are_packed_too(lidar_set):
+def test_lidar_past_frames_and_rays_are_packed_too(lidar_set):
     reader = lidar_set.reader(
-        image_size_px=None, num_sweeps=0, num_lidar_sweeps=2, lidar_origins=True, num_future_frames=2
-    )
-    one = collate([reader.read(row, None) for row in (0, 1)])
-    assert [len(frame.lidar_points) for frame in one.future] == [80, 40] and one.radar_points is None
+        image_size_px=None, num_sweeps=0, num_lidar_sweeps=2, lidar_origins=True, timeline=FIVE_HERTZ,
+        num_future_frames=2,
+    )  # fmt: skip
+    one = collate([reader.read(row, None, history=[-2, -1], targets=[0, 3]) for row in (0, 1)])
+    assert [len(frame.lidar_points) for frame in one.past] == [160, 160] and one.radar_points is None
+    assert one.rays.batch.bincount().tolist() == [80, 40]
     assert_same(PackedBatch.pack(one).unpack(), one)
     points, owners = one.lidar_points.repeat(1000, 1), one.lidar_batch.repeat(1000).sort()[0]
     large = replace(one, lidar_points=points, lidar_batch=owners, lidar_origins=None)

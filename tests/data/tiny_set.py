@@ -15,6 +15,7 @@ from PIL import Image
 
 from src.data.cache import load_index
 from src.data.reader import FrameReader, OnBadFile, ReaderSettings
+from src.data.timeline import RadialSpeeds, TimelineConfig
 from src.geometry.camera import pixels_from_points, project
 from src.geometry.transforms import invert_rigid, matrix_to_quaternion, rigid
 from src.structures.taxonomy import ATTRIBUTES, BICYCLE_RACK, CAMERAS, CATEGORY_TO_CLASS, IGNORED_CATEGORIES, RADARS
@@ -281,8 +282,14 @@ class DataSet:
         return FrameReader(load_index(self.root, VERSION, None), reader_settings(**settings))
 
 
+FIVE_HERTZ = TimelineConfig(
+    interval_s=0.2, tolerance_s=0.06, history_stride=1, horizon_s=3.0, num_past_targets=1,
+    radial_speeds=RadialSpeeds.none,
+)  # fmt: skip
+
+
 def reader_settings(**changes: Any) -> ReaderSettings:
     values = dict(num_sweeps=10, min_distance_m=1.0, propagate_points=False, on_bad_file=OnBadFile.error,
                   image_size_px=(64, 160), test_resize_offset=0.0, num_lidar_sweeps=0, lidar_origins=False,
-                  deskew_lidar=True, num_future_frames=0)  # fmt: skip
+                  deskew_lidar=True, timeline=None, num_future_frames=0)  # fmt: skip
     return ReaderSettings(**(values | changes))

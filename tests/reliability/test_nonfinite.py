@@ -18,6 +18,7 @@ from src.reliability import nonfinite
 from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
 from src.reliability.nonfinite import describe_gradients, finite_everywhere, gradient_norm, read_dump, write_dump
 from src.reliability.processes import is_main_process, process_group
+from src.structures.ray_bundle import RayBundle
 from src.training.fit import fit
 from src.training.module import TrainingModule
 from src.training.run_folder import Resume, RunFolder
@@ -234,20 +235,22 @@ def test_a_disk_that_refuses_the_dump_does_not_hide_the_fault(tmp_path, monkeypa
     assert "no space left" in caplog.text and not dumps(folder)
 
 
-def test_a_dump_keeps_lidar_and_future_frames(tmp_path):
+def test_a_dump_keeps_lidar_past_frames_and_rays(tmp_path):
     def cloud(count):
         points, owners = torch.randn(count, 5), torch.arange(count) % 2
         return {"lidar_points": points, "lidar_batch": owners.sort()[0], "lidar_origins": torch.randn(count, 3)}
 
     bare = replace(toy_batch([3, 7], [True, False]), radar_points=None, radar_batch=None)
-    future = replace(bare, streams=None, starts=None, **cloud(3))
-    batch = replace(bare, **cloud(4), future=(future, replace(future, **cloud(0))))
+    past, numbers, two = replace(bare, streams=None, starts=None, **cloud(3)), torch.randn(2), torch.arange(2)
+    rays = RayBundle(torch.randn(2, 3), torch.randn(2, 3), numbers, numbers, numbers, two, two)
+    batch = replace(bare, **cloud(4), past=(past, replace(past, **cloud(0))), rays=rays)
     named = {"global_step": 1, "rank": 0, "epoch": 0, "world_size": 1, "seed": 1, "memories": [], "found": ""}
     _, found = read_dump(write_dump(tmp_path, toy_module().model, {}, batch, **named))
-    assert found.radar_points is None and [len(frame.lidar_points) for frame in found.future] == [3, 0]
-    for one, other in ((found, batch), (found.future[0], future)):
+    assert found.radar_points is None and [len(frame.lidar_points) for frame in found.past] == [3, 0]
+    for one, other in ((found, batch), (found.past[0], past)):
         for name in ("lidar_points", "lidar_batch", "lidar_origins", "global_from_ego"):
             assert torch.equal(getattr(one, name), getattr(other, name))
+    assert torch.equal(found.rays.points, rays.points) and torch.equal(found.rays.steps, rays.steps)
 
 
 def test_other_files_are_no_dumps(tmp_path):

@@ -5,6 +5,7 @@ import torch
 
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
+from src.structures.ray_bundle import RayBundle
 
 STREAM = ("streams", "starts")
 
@@ -42,19 +43,33 @@ def test_every_sensor_may_be_missing():
     assert batch(**(LIDAR | {"lidar_origins": None})).lidar_origins is None
 
 
-def test_future_frames_move_with_the_batch_and_have_its_length():
-    future = batch(**NO_RADAR, **NO_CAMERA, **LIDAR, boxes=None)
-    present = batch(future=(future, future))
+def rays(owners):
+    count = len(owners)
+    return RayBundle(
+        origins=torch.zeros(count, 3), directions=torch.eye(3)[:1].repeat(count, 1), ranges=torch.ones(count),
+        times_s=torch.zeros(count), speeds=torch.zeros(count), steps=torch.zeros(count, dtype=torch.int64),
+        batch=torch.tensor(owners),
+    )  # fmt: skip
+
+
+def test_rays_and_past_frames_move_with_the_batch_and_fit_it():
+    past = batch(**NO_RADAR, **NO_CAMERA, **LIDAR, boxes=None)
+    present = batch(past=(past, past), rays=rays([0, 0, 2]))
     moved = present.to("meta")
-    assert [frame.device.type for frame in moved.future] == ["meta", "meta"]
-    assert moved.future[1].lidar_points.is_meta and moved.future[1].lidar_origins.shape == (5, 3)
-    assert present.future[0] is future
-    with pytest.raises(ValueError, match="FrameBatch.future must hold batches of 3, but got .3, 1."):
+    assert [frame.device.type for frame in moved.past] == ["meta", "meta"] and moved.rays.points.is_meta
+    assert moved.past[1].lidar_points.is_meta and moved.past[1].lidar_origins.shape == (5, 3)
+    assert present.past[0] is past and present.rays.points.tolist() == [[1, 0, 0]] * 3
+    with pytest.raises(ValueError, match="FrameBatch.past must hold batches of 3, but got .3, 1."):
         one = batch(
             tokens=["a"], timestamps_s=torch.zeros(1, dtype=torch.float64), aug_from_ego=torch.eye(4)[None],
             global_from_ego=torch.eye(4, dtype=torch.float64)[None], boxes=None, **NO_RADAR, **NO_CAMERA,
         )  # fmt: skip
-        batch(future=(future, one))
+        batch(past=(past, one))
+    for owners in ([0, 3], [2, 0]):
+        with pytest.raises(ValueError, match="FrameBatch.rays.batch must ascend within 0..2"):
+            batch(rays=rays(owners))
+    with pytest.raises(ValueError, match=r"RayBundle.ranges must be \[3\] torch.float32, but got .*float64"):
+        dataclasses.replace(rays([0, 1, 2]), ranges=torch.ones(3).double())
 
 
 def test_a_sample_may_lack_points_boxes_and_images():
@@ -131,7 +146,7 @@ def test_moving_keeps_every_value():
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_page_locked():
-    pinned = batch(**LIDAR, future=(batch(**LIDAR),)).pin_memory()
+    pinned = batch(**LIDAR, rays=rays([0, 1])).pin_memory()
     assert pinned.radar_points.is_pinned() and pinned.boxes[0].centers.is_pinned()
-    assert pinned.lidar_origins.is_pinned() and pinned.future[0].lidar_points.is_pinned()
+    assert pinned.lidar_origins.is_pinned() and pinned.rays.ranges.is_pinned()
     assert torch.equal(pinned.to("cuda", non_blocking=True).radar_points.cpu(), batch().radar_points)

@@ -1,0 +1,157 @@
+"""The forecast that needs no training: everything stays where the last scan saw it (lrs 7.2)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from src.geometry.bounds import Bounds
+from src.geometry.neighbours import neighbours_within
+from src.geometry.tensor_transforms import invert_rigid
+from src.structures.batch import FrameBatch
+
+Array = np.ndarray
+
+RADII_RAD = tuple(np.radians([0.5, 2.0, 8.0]))
+"""A ray meets the point nearest to its direction, looked for within these one after the other."""
+COARSE_POINTS = 8192
+"""Of the points at most so many are looked at for the last: where nothing is nearer, which it is says little."""
+ORIGIN_CELL_M = 0.25
+"""Rays that begin in one cell see the scan from its middle ray's origin: 0.7 degrees at 10 m are the most it errs."""
+NEAR_M = 0.5
+"""Points so near to where a ray begins have no direction to speak of."""
+
+
+def static_world(
+    batch: FrameBatch,
+    max_range_m: float,
+    past: bool = True,
+) -> Tensor:  # [R] m
+    """Range of every ray of `batch.rays` in a world that stands still since the last scans: those of all LiDARs at the
+    sample's own frame, and with `past` those of `batch.past`, moved by the ego's motion.
+
+    Raises ValueError for a batch without rays or LiDAR.
+    """
+    if batch.rays is None or batch.lidar_points is None:
+        raise ValueError("batch: the static world is looked up for FrameBatch.rays in FrameBatch.lidar_points")
+    points, owners = aggregated_scan(batch, past)
+    rays, found = batch.rays, torch.empty_like(batch.rays.ranges)
+    for sample in range(len(batch)):
+        own = rays.batch == sample
+        arrays = (points[owners == sample], rays.origins[own], rays.directions[own])
+        ranges = look_up_ranges(*(array.double().cpu().numpy() for array in arrays), max_range_m)
+        found[own] = torch.from_numpy(ranges).to(found)
+    return found
+
+
+def aggregated_scan(
+    batch: FrameBatch,
+    past: bool = True,
+) -> tuple[Tensor, Tensor]:  # [L, 3] m in the batch's (augmented) ego frames, [L] int64 sample
+    """The points of the frame's own sweeps, with `past` also of the frames before it."""
+    clouds, owners = [batch.lidar_points[:, :3]], [batch.lidar_batch]
+    for frame in batch.past if past else ():
+        aug_from_past = aug_from_frame(batch, frame)[frame.lidar_batch]
+        clouds.append(_moved(aug_from_past, frame.lidar_points[:, :3]))
+        owners.append(frame.lidar_batch)
+    return torch.cat(clouds), torch.cat(owners)
+
+
+def aug_from_frame(batch: FrameBatch, other: FrameBatch) -> Tensor:  # [B, 4, 4] float32
+    """From the (augmented) ego frame of another time to the batch's: A_t inv(G) G_other inv(A_t)."""
+    aug = batch.aug_from_ego.double()
+    ego_from_other = invert_rigid(batch.global_from_ego) @ other.global_from_ego
+    return (aug @ ego_from_other @ torch.linalg.inv(other.aug_from_ego.double())).float()
+
+
+def look_up_ranges(
+    points: Array,  # [P, 3] m
+    origins: Array,  # [R, 3] m
+    directions: Array,  # [R, 3] unit length
+    max_range_m: float,
+) -> Array:  # [R] m
+    """How far along each ray the point lies whose direction, seen from where the ray begins, is nearest to the ray's.
+
+    `max_range_m` where no point lies within the largest of RADII_RAD: nothing is known to stand there.
+    """
+    found = np.full(len(origins), max_range_m)
+    _, cell = np.unique(np.floor(origins / ORIGIN_CELL_M).astype(np.int64), axis=0, return_inverse=True)
+    order = np.argsort(cell.ravel(), kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(cell.ravel()[order])) + 1) if len(order) else ():
+        middle = origins[rows].mean(0)
+        offsets = points - middle
+        away = np.linalg.norm(offsets, axis=1)
+        kept = np.flatnonzero(away > NEAR_M)
+        met = _nearest_bearings(directions[rows], offsets[kept] / away[kept, None])
+        rows, met = rows[met >= 0], kept[met[met >= 0]]
+        ends = offsets[met] + middle - origins[rows]
+        found[rows] = np.clip((ends * directions[rows]).sum(1), 0.0, max_range_m)
+    return found
+
+
+def _nearest_bearings(
+    directions: Array,  # [r, 3] unit length
+    bearings: Array,  # [p, 3] unit length
+) -> Array:  # [r] int64, row of the bearing, -1 for none
+    """By the chord, which is near enough to the angle."""
+    found = np.full(len(directions), -1)
+    axis = directions.mean(0) / max(np.linalg.norm(directions.mean(0)), 1e-9)
+    widest = np.arccos(np.clip((directions @ axis).min(), -1, 1))
+    aside = bearings @ axis
+    for radius in RADII_RAD:
+        rest = np.flatnonzero(found < 0)
+        ahead = np.flatnonzero(aside >= np.cos(min(widest + radius, np.pi)) - 1e-12)
+        if radius == RADII_RAD[-1]:
+            ahead = ahead[:: len(ahead) // COARSE_POINTS + 1]
+        ray, point, squared = neighbours_within(directions[rest], bearings[ahead], radius)
+        nearest = np.lexsort((squared, ray))
+        ray, first = np.unique(ray[nearest], return_index=True)
+        found[rest[ray]] = ahead[point[nearest][first]]
+    return found
+
+
+def unseen(
+    batch: FrameBatch,
+    bounds: Bounds,
+    cell_m: float = 2.0,
+) -> Tensor:  # [R] bool
+    """Rays of `batch.rays` that end in the bounds where no ray of the input, past frames included, ended or passed.
+
+    Space is divided into cubes; one of 2 m is as wide as the gaps between the beams at 100 m. Raises ValueError for a
+    batch without the origins of its LiDAR points (`data.lidar_origins`).
+    """
+    if batch.rays is None or batch.lidar_origins is None:
+        raise ValueError("batch: what was seen follows from FrameBatch.lidar_origins; give data.lidar_origins=true")
+    low, high = torch.tensor(bounds, dtype=torch.float32).unbind(1)
+    shape = ((high - low) / cell_m).ceil().long().tolist()
+    seen = torch.zeros(len(batch), *shape, dtype=torch.bool)
+    for frame in (batch, *batch.past):
+        matrix = aug_from_frame(batch, frame)[frame.lidar_batch]
+        ends, starts = _moved(matrix, frame.lidar_points[:, :3]), _moved(matrix, frame.lidar_origins)
+        owners, ranges = frame.lidar_batch.cpu(), (ends - starts).norm(dim=1)
+        for distance in torch.arange(0, float(ranges.max()) if len(ranges) else 0.0, 0.5 * cell_m).tolist():
+            rows = ranges > distance
+            passed = starts[rows] + distance / ranges[rows, None] * (ends - starts)[rows]
+            _mark(seen, passed, owners[rows.cpu()], low, cell_m)
+        _mark(seen, ends, owners, low, cell_m)
+    cells, inside = _cells(batch.rays.points, low, cell_m, shape)
+    found = torch.zeros(len(batch.rays), dtype=torch.bool)
+    found[inside] = ~seen[batch.rays.batch.cpu()[inside], *cells[inside].unbind(1)]
+    return found
+
+
+def _mark(seen: Tensor, points: Tensor, owners: Tensor, low: Tensor, cell_m: float) -> None:
+    cells, inside = _cells(points, low, cell_m, list(seen.shape[1:]))
+    seen[owners[inside], *cells[inside].unbind(1)] = True
+
+
+def _cells(points: Tensor, low: Tensor, cell_m: float, shape: list[int]) -> tuple[Tensor, Tensor]:
+    """Cell [n, 3] of each point and whether it is one of the grid [n], on the CPU."""
+    cells = ((points.cpu() - low) / cell_m).floor().long()
+    return cells, ((cells >= 0) & (cells < torch.tensor(shape))).all(1)
+
+
+def _moved(matrices: Tensor, points: Tensor) -> Tensor:  # [n, 3]
+    """Points [n, 3], each by a matrix [n, 4, 4] of its own."""
+    return torch.einsum("nij,nj->ni", matrices[:, :3, :3], points) + matrices[:, :3, 3]

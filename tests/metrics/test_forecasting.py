@@ -1,0 +1,95 @@
+"""Scores of forecasts, worked out by hand and against all distances."""
+
+import numpy as np
+import pytest
+import torch
+
+from src.metrics.diagnostics import ratios
+from src.metrics.forecasting import ForecastScores, chamfer_distance, median_errors, score_forecast, sums_by_sample
+from src.structures.ray_bundle import RayBundle
+
+BOUNDS = ((-100.0, 250.0), (-100.0, 100.0), (-12.0, 12.0))
+
+
+def test_chamfer_distance_is_halved_and_squared():
+    assert chamfer_distance(np.zeros((1, 3)), np.array([[3.0, 4.0, 0.0]])) == 25.0
+    one_sided = chamfer_distance(np.zeros((1, 3)), np.array([[0.0, 0, 0], [2.0, 0, 0]]))
+    assert one_sided == 0.5 * (0 + (0 + 4) / 2)
+    assert np.isnan(chamfer_distance(np.zeros((0, 3)), np.zeros((1, 3))))
+
+
+@pytest.mark.parametrize("spread", [1.0, 40.0])
+def test_chamfer_distance_is_that_of_all_distances(spread):
+    rng = np.random.default_rng(0)
+    found, truth = rng.normal(0, spread, (300, 3)), rng.normal(3, spread, (500, 3))
+    squared = ((found[:, None] - truth[None]) ** 2).sum(-1)
+    expected = 0.5 * (squared.min(1).mean() + squared.min(0).mean())
+    assert chamfer_distance(found, truth) == pytest.approx(expected, rel=1e-12)
+    assert chamfer_distance(truth, found) == pytest.approx(expected, rel=1e-12)
+    assert chamfer_distance(found, found[::-1]) == 0.0
+
+
+def bundle(ends, steps, batch=None):
+    ends = torch.tensor(ends, dtype=torch.float32)
+    ranges, zeros = ends.norm(dim=1), torch.zeros(len(ends))
+    return RayBundle(
+        origins=torch.zeros_like(ends), directions=ends / ranges[:, None], ranges=ranges, times_s=zeros, speeds=zeros,
+        steps=torch.tensor(steps), batch=torch.tensor([0] * len(ends) if batch is None else batch),
+    )  # fmt: skip
+
+
+def test_near_and_long_field_are_those_of_each_clouds_own_points():
+    rays = bundle([[40.0, 0, 0], [60.0, 0.0, 0.0], [0.0, 80.0, 0.0]], [1, 1, 1])
+    found = torch.tensor([44.0, 45.0, 83.0])  # the second comes into the near field
+    scores = score_forecast(rays, found, np.array([7]), BOUNDS)
+    assert scores.samples.tolist() == [7] and scores.steps.tolist() == [1]
+    near = 0.5 * ((16 + 25) / 2 + 16)
+    far = 0.5 * (9 + ((60**2 + 83**2) + 9) / 2)
+    assert scores.chamfer["nfcd"][0] == pytest.approx(near, rel=1e-5)
+    assert scores.chamfer["lfcd"][0] == pytest.approx(far, rel=1e-5)
+    np.testing.assert_allclose(scores.errors, [4, 15, 3], rtol=1e-5)
+
+
+def test_clouds_are_cut_to_the_bounds_each_by_its_own_points():
+    rays = bundle([[100.0, 0, 0], [240.0, 0, 0], [0.0, 150.0, 0]], [1] * 3)
+    scores = score_forecast(rays, torch.tensor([101.0, 260.0, 150.0]), np.array([0]), BOUNDS)
+    assert scores.chamfer["cd"][0] == pytest.approx(0.5 * (1 + (1 + 139**2) / 2), rel=1e-5)
+    np.testing.assert_allclose(scores.errors, [1, 20])  # the third return lies outside
+    nothing = score_forecast(rays[rays.ranges < 0], torch.zeros(0), np.array([0]), BOUNDS)
+    assert len(nothing.samples) == len(nothing.errors) == 0
+
+
+def scored():
+    """Two samples: the first at steps 0, 2, 5 and 15, one metre, 2 m, 3 m and 4 m wrong; the second at 5, 6 m wrong."""
+    rays = bundle([[30.0, 0, 0], [0, 90.0, 0]] * 5, [0, 0, 2, 2, 5, 5, 15, 15, 5, 5], [0] * 8 + [1] * 2)
+    moving = torch.tensor([True, False] * 4 + [False] * 2)
+    off = torch.tensor([1.0, 1, 2, 2, 3, 3, 4, 4, 6, 6])
+    return score_forecast(rays, rays.ranges + off, np.array([4, 1]), BOUNDS, {"moving": moving})
+
+
+def test_means_over_the_horizon_frames_and_bins():
+    sums = sums_by_sample(scored(), 5, 0.2)
+    means = {name: float(value[0]) for name, value in ratios(sums, np.ones((1, 5))).items()}
+    assert means["cd_1s"] == pytest.approx((4 + 9 + 36 - 0) / 3, rel=1e-5)
+    assert means["cd_3s"] == pytest.approx((4 + 9 + 16 + 36) / 4, rel=1e-5)
+    assert means["cd@0.4s"] == pytest.approx(4, rel=1e-5) and means["cd@0.0s"] == pytest.approx(1, rel=1e-5)
+    assert means["cd_moving_3s"] == pytest.approx((4 + 9 + 16) / 3, rel=1e-5)  # the second sample has none
+    assert means["l1_3s"] == pytest.approx((2 + 3 + 4 + 6) / 4, rel=1e-5)
+    assert means["l1_50-150m_1s"] == pytest.approx((2 + 3 + 6) / 3, rel=1e-5)
+    assert np.isnan(means["l1_150-250m_1s"])
+    assert sums["cd_1s"].tolist()[1] == pytest.approx([36, 1], rel=1e-5) and sums["cd_1s"][4, 1] == 2
+    medians = median_errors(scored(), 0.2)
+    assert medians["l1_median_1s"] == pytest.approx(3) and medians["l1_median_0-50m_3s"] == pytest.approx(3.5)
+    assert np.isnan(medians["l1_median_150-250m_3s"])
+
+
+def test_batches_join():
+    one = scored()
+    both = ForecastScores.join([one, one])
+    alone, twice = (sums_by_sample(scores, 5, 0.2) for scores in (one, both))
+    assert alone.keys() == twice.keys() and all(np.array_equal(2 * alone[name], twice[name]) for name in alone)
+
+
+def test_a_negative_range_is_a_point_at_the_sensor():
+    scores = score_forecast(bundle([[3.0, 4, 0]], [1]), torch.tensor([-2.0]), np.array([0]), BOUNDS)
+    assert scores.chamfer["cd"][0] == pytest.approx(25) and scores.errors[0] == pytest.approx(7)

@@ -1,0 +1,110 @@
+"""The world that stands still: what a scan says of rays of other times, by hand and on the synthetic highway."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from src.data.cache import load_index
+from src.data.reader import FrameReader
+from src.data.timeline import RadialSpeeds
+from src.metrics.static_world import aggregated_scan, look_up_ranges, static_world, unseen
+from src.structures.batch import FrameBatch
+from src.structures.ray_bundle import RayBundle
+from src.world.write import VERSION, ensure_world
+from tests.data.tiny_set import FIVE_HERTZ, reader_settings
+from tests.world.conftest import small_config
+
+BOUNDS = ((-100.0, 250.0), (-100.0, 100.0), (-12.0, 12.0))
+
+
+def wall(x, half_width=20.0, step=0.1):
+    y, z = np.meshgrid(np.arange(-half_width, half_width, step), np.arange(0, 4, step))
+    return np.stack([np.full(y.size, x), y.ravel(), z.ravel()], 1)
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def test_rays_of_a_truck_that_drove_on_meet_the_wall_where_it_stands():
+    rng = np.random.default_rng(0)
+    ends = np.stack([np.full(200, 50.0), rng.uniform(-15, 15, 200), rng.uniform(0.5, 3.5, 200)], 1)
+    origins = np.stack([rng.uniform(8, 12, 200), rng.uniform(-1, 1, 200), np.full(200, 2.0)], 1)
+    found = look_up_ranges(wall(50.0), origins, unit(ends - origins), 300.0)
+    away = np.linalg.norm(ends - origins, axis=1)
+    assert np.abs(found - away).max() < 0.2 and np.median(np.abs(found - away)) < 0.03
+    assert (look_up_ranges(np.zeros((0, 3)), origins, unit(ends - origins), 300.0) == 300.0).all()
+
+
+def test_the_nearest_direction_is_taken_and_looked_for_ever_wider():
+    points = np.array([[100.0, 0.0, 0.0], [20.0, 1.0, 0.0]])
+    directions = unit(np.array([[1.0, 0.005, 0.0], [20.0, 0.8, 0.0], [20.0, 3.0, 0.0], [1.0, -4.0, 0.0]]))
+    found = look_up_ranges(points, np.zeros((4, 3)), directions, 300.0)
+    np.testing.assert_allclose(found, [100, 20.02, 19.9, 300], atol=0.05)
+
+
+def frame(points, origins=None, at=0.0, **rest):
+    """A truck at x = `at`, in whose frame the points lie."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[0, 3] = at
+    points = torch.tensor(points, dtype=torch.float32).reshape(-1, 3)
+    return FrameBatch(
+        tokens=[f"at {at}"], timestamps_s=torch.tensor([at], dtype=torch.float64), global_from_ego=pose[None],
+        aug_from_ego=torch.eye(4)[None], lidar_points=torch.nn.functional.pad(points, (0, 2)),
+        lidar_batch=torch.zeros(len(points), dtype=torch.int64),
+        lidar_origins=torch.zeros_like(points) if origins is None else origins, **rest,
+    )  # fmt: skip
+
+
+def rays_to(ends):
+    ends = torch.tensor(ends, dtype=torch.float32)
+    ranges, zeros = ends.norm(dim=1), torch.zeros(len(ends))
+    integers = torch.zeros(len(ends), dtype=torch.int64)
+    directions = ends / ranges[:, None]
+    return RayBundle(torch.zeros_like(ends), directions, ranges, zeros, zeros, integers, integers)
+
+
+def test_past_scans_are_moved_by_the_ego_and_used_on_demand():
+    past = frame([[30.0, 5.0, 0.0]], at=10.0)
+    batch = frame([[50.0, 0.0, 0.0]], at=12.0, past=(past,), rays=rays_to([[28.0, 5.0, 0], [60.0, 0, 0]]))
+    points, owners = aggregated_scan(batch, past=True)
+    torch.testing.assert_close(points, torch.tensor([[50.0, 0, 0], [28.0, 5, 0]])) and owners.tolist() == [0, 0]
+    assert static_world(batch, 300.0, past=True).tolist() == pytest.approx([np.hypot(28, 5), 50])
+    assert static_world(batch, 300.0, past=False).tolist() == [300.0, 50.0]  # 10 degrees away is another direction
+    with pytest.raises(ValueError, match="FrameBatch.rays"):
+        static_world(past, 300.0)
+    assert static_world(replace(frame(np.zeros((0, 3))), rays=batch.rays), 300.0).tolist() == [300.0, 300.0]
+
+
+def test_unseen_is_what_no_ray_of_the_input_reached():
+    past = frame([[60.0, 30.0, 0.0]], at=-2.0)
+    ends = [[15.0, 0, 0], [19.0, 0, 0], [30.0, 0, 0], [29.0, 15.0, 0.0], [300.0, 0, 0]]
+    batch = frame([[20.5, 0.0, 0.0]], past=(past,), rays=rays_to(ends))
+    assert unseen(batch, BOUNDS).tolist() == [False, False, True, False, False]
+    assert unseen(replace(batch, past=()), BOUNDS).tolist() == [False, False, True, True, False]
+    with pytest.raises(ValueError, match="data.lidar_origins=true"):
+        unseen(replace(batch, lidar_origins=None), BOUNDS)
+
+
+@pytest.mark.slow
+def test_on_the_highway_it_is_right_about_what_stands_and_wrong_about_what_drives(tmp_path):
+    world = small_config(
+        num_train_scenes=1, num_val_scenes=0, key_frames_per_scene=3, lidar=True, lidar_sweeps_per_key_frame=5,
+        lidar_step_deg=0.8, radar_sweeps_per_key_frame=1,
+    )  # fmt: skip
+    root = ensure_world(world, tmp_path / "world", progress=False)
+    timeline = replace(FIVE_HERTZ, radial_speeds=RadialSpeeds.exact)
+    settings = reader_settings(
+        image_size_px=None, num_sweeps=0, num_lidar_sweeps=1, timeline=timeline, num_future_frames=1, lidar_origins=True
+    )
+    batch = FrameReader(load_index(root, VERSION, None), settings).read(0, None, history=[-2], targets=[0, 5])
+    rays, found = batch.rays, static_world(batch, 300.0)
+    errors = (found - rays.ranges).abs()
+    still, moving = rays.speeds == 0, rays.speeds.abs() > 5
+    assert errors[rays.steps == 0].median() < 0.02  # its own scan
+    assert errors[(rays.steps == 5) & still].median() < 0.5
+    assert errors[(rays.steps == 5) & moving].median() > 1.0
+    share = unseen(batch, BOUNDS)[rays.steps == 5].float().mean()
+    assert 0.005 < share < 0.5
