@@ -211,9 +211,11 @@ def _compose(overrides: list[str]) -> DictConfig:
             tree = compose("config", overrides=overrides)
         if not tree.phase.temporal:
             # In code: a later at_scale file would revive a part that a phase file sets to null.
-            part = OmegaConf.get_type(tree.model).temporal_part
-            if part:
-                tree.model[part] = None
+            family = OmegaConf.get_type(tree.model)
+            if family.temporal_part:
+                tree.model[family.temporal_part] = None
+            for switch in family.temporal_switches:
+                OmegaConf.update(tree.model, switch, False)
         return tree
     except (HydraException, OmegaConfBaseException, OverflowError) as error:  # the last: beyond every float
         raise ConfigError(hydra_message(error)) from error

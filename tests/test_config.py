@@ -37,7 +37,7 @@ def test_phase_2_composes_at_every_scale(scale):
     assert dptf.bev_path.velocity_compensation and dptf.gaussian_path.velocity_compensation
     assert dptf.gaussian_path.sampling.value == "farthest_point" and dptf.max_age_s == 6.0
     assert config.model.channels % dptf.gaussian_path.self_attention.num_heads == 0
-    assert config.data.groups_per_scene == 2
+    assert config.data.groups_per_scene == (1 if scale == "mini" else 2)
     _, single = compose_config([f"scale={scale}", "data.root=x", "phase=phase1"])
     assert single["model"]["dptf"] is None and tree["model"]["dptf"] is not None
 
@@ -126,16 +126,16 @@ FULL_SIZE = {
     "model.ocsf": {
         "num_layers": 2, "num_learnable_points": 6, "margin_m": 4.8, "occupancy_threshold": 0.1,
         "max_occupied_cells": 32768, "scale_range_m": [0.2, 3.2], "max_mean_shift_m": 4.0, "max_speed_mps": 60.0,
-        "velocity_unit_mps": 1.0, "support_sigmas": 3.0, "cross_attention": "parallel",
+        "velocity_unit_mps": 10.0, "support_sigmas": 3.0, "cross_attention": "parallel",
         "refine_from": "self_encoding", "gate_kernel_size": 1,
         "identity_start": False,
     },
-    "model.doppler": {"gaussians": False, "cells": False, "boxes": False},
+    "model.doppler": {"gaussians": True, "cells": False, "boxes": True},
     "model.head": {"nms": "per_group", "score_threshold": 0.1, "max_boxes": 500, "attributes": "rule"},
     "model.loss": {
         "kggi_weight": 1.0, "ocsf_weight": 5.0, "heatmap_weight": 1.0, "box_weight": 0.25, "keypoint_weight": 1.0,
         "depth_weight": 1.0, "radar_objectness_weight": 1.0, "occupancy_focal_weight": 1.0,
-        "occupancy_dice_weight": 1.0, "gaussian_velocity_weight": 0.25, "gaussian_velocity_in_phase1": False,
+        "occupancy_dice_weight": 1.0, "gaussian_velocity_weight": 0.25, "gaussian_velocity_in_phase1": True,
         "dptf_weight": 1.0, "cell_focal_weight": 1.0, "cell_dice_weight": 1.0, "cell_lovasz_weight": 1.0,
         "cell_velocity_weight": 0.25, "velocity_groups": "boxes",
     },
@@ -171,13 +171,14 @@ FULL_SIZE_PHASE_2 = {
         "train_missing": True, "temporal": True,
     },
     "phase.options": {"velocity_code_weight": 1.0},
-    "model.dptf": {"max_age_s": 6.0, "min_speed_mps": 0.0},
+    "model.doppler": {"gaussians": True, "cells": True, "boxes": True},
+    "model.dptf": {"max_age_s": 6.0, "min_speed_mps": 1.0},
     "model.dptf.bev_path": {
         "num_frames": 8, "memory_threshold": 0.1, "max_cells_per_frame": 4096, "velocity_compensation": True,
         "spatial_dilation": False,
     },
     "model.dptf.gaussian_path": {
-        "num_frames": 4, "gaussians_per_frame": 256, "min_contribution": 0.0, "sampling": "farthest_point",
+        "num_frames": 4, "gaussians_per_frame": 256, "min_contribution": 0.2, "sampling": "farthest_point",
         "velocity_from": "gaussian", "velocity_compensation": True, "self_attention": {"num_heads": 8},
     },
 }  # fmt: skip

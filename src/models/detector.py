@@ -25,6 +25,8 @@ class ModelConfig:
 
     temporal_part: ClassVar[str] = ""
     """The key of all that is temporal; a phase of single frames sets it to null. Empty for a model without."""
+    temporal_switches: ClassVar[tuple[str, ...]] = ()
+    """Keys of switches that only this part reads, though they stand elsewhere; such a phase sets them to false."""
     new_in_temporal_phase: ClassVar[str] = ""
     """Regular expression: names of the parameters that the temporal phase adds, and no checkpoint of the phase before
     holds. Empty for a model without."""

@@ -9,7 +9,7 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -150,7 +150,7 @@ def hand_over(model: Detector, weights: OpenCheckpoint, tree: dict[str, Any]) ->
     parts = sorted({key.partition(".")[0] for key in new})
     logger.info("weights from %s; new: %d tensors in %s", weights.path, len(new), ", ".join(parts) or "nothing")
     stored = checkpoint["horizon3d"]["config"]
-    for key, (old, now) in differing_settings(stored, tree, model.config.temporal_part).items():
+    for key, (old, now) in differing_settings(stored, tree, model.config.keys_of_temporal_phase).items():
         logger.warning("%s was %s in the run these weights come from and is %s now", key, old, now)
 
 
@@ -167,11 +167,11 @@ def norms_handed_over(model: Detector) -> list[nn.Module]:
 def differing_settings(
     old: dict[str, Any],
     new: dict[str, Any],
-    temporal_part: str,  # of the model
+    temporal: Iterable[str],  # dotted keys of the temporal phase alone
 ) -> dict[str, tuple[Any, Any]]:
     """Dotted keys of the model, the backbone, the grid and of what is read that both have and whose values differ.
 
-    Loss weights and the temporal part are the new phase's own.
+    Loss weights and what is temporal are the new phase's own.
     """
 
     def flat(node: Any, prefix: str) -> dict[str, Any]:
@@ -185,7 +185,7 @@ def differing_settings(
         return {key: value for name, part in parts.items() for key, value in flat(part, name).items()}
 
     before, after = settings(old), settings(new)
-    own = ("model.loss.", f"model.{temporal_part}.") if temporal_part else ("model.loss.",)
+    own = ("model.loss.", *(f"{key}." for key in temporal))
     return {
         key: (before[key], after[key])
         for key in before.keys() & after.keys()

@@ -126,6 +126,7 @@ def draw_table(path: Path, table: FigureTable, title: str) -> None:
         step = max(1, len(columns) // 8)
         axes.set_xticks(range(0, len(columns), step), columns[::step])
         axes.set_xlim(-0.5, len(columns) - 0.5)
+        axes.set_xlabel("distance, m", fontsize=9, labelpad=1)
         axes.set_ylim(0, 100 if table.allowed is not None or table.name == "support_grown" else None)
     canvas.save(path, photographs=False)
 

@@ -21,6 +21,8 @@ from src.data.frame_loader import collate
 from src.errors import CheckpointError, ConfigError, DivergedError
 from src.models.detector import Objective
 from src.models.horizon3d.model import Horizon3D
+from src.ops import products
+from src.ops.precision import computing
 from src.reliability.checkpoints import read_checkpoint
 from src.reliability.nonfinite import step_seed, write_dump
 from src.training.module import TrainingModule
@@ -230,12 +232,12 @@ def test_another_policy_is_refused():
 # ---------------------------------------------------------------- half precision
 
 
-def steps(module, batches, bf16):
+def steps(module, batches, precision="32-true"):
     """(loss terms, all gradients) of consecutive steps from the same weights and seeds."""
     for number, batch in enumerate(batches):
         module.zero_grad()
         torch.manual_seed(7 + number)
-        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+        with computing(precision, torch.device("cpu")):
             terms = module.model.loss(module.run(batch), batch).terms
         terms["total"].backward()
         gradients = [p.new_zeros(p.shape) if p.grad is None else p.grad for p in module.model.parameters()]
@@ -247,8 +249,9 @@ MODELS = PHASES | {"dense": ("model=dense_bev", *PHASES["phase2"])}
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("precision", ["bf16-mixed", "bf16-products"])
 @pytest.mark.parametrize("name", MODELS)
-def test_half_precision_is_as_near_as_its_digits_allow(load, name):
+def test_half_precision_is_as_near_as_its_digits_allow(load, name, precision, monkeypatch):
     """The loss within 3 %, its terms within 8 % or thrice what half a digit of the weights moves them, as the gradient.
 
     bfloat16 has 8 bits: a rounding moves a number by up to 2^-9 = 0.2 %, and some forty layers one after the other, by
@@ -257,15 +260,18 @@ def test_half_precision_is_as_near_as_its_digits_allow(load, name):
     float32 with weights moved by up to 2^-9, and so is a term; half precision rounds activations and their gradients
     too: three times.
     """
+    monkeypatch.setattr(products, "multiplies_bfloat16", lambda: True)
+    monkeypatch.setattr(products, "LEAST_ROWS", 0)
+    monkeypatch.setattr(products, "LEAST_WIDTHS", (8, 8))  # those of this small model
     module, _, batches = load(*MODELS[name])
-    plain = list(steps(module, batches, bf16=False))
-    half = list(steps(load(*MODELS[name])[0], batches, bf16=True))
+    plain = list(steps(module, batches))
+    half = list(steps(load(*MODELS[name])[0], batches, precision))
     moved, _, _ = load(*MODELS[name])
     generator = torch.Generator().manual_seed(3)
     with torch.no_grad():
         for parameter in moved.model.parameters():
             parameter.mul_(1 + 2.0**-9 * (2 * torch.rand(parameter.shape, generator=generator) - 1))
-    moved = list(steps(moved, batches, bf16=False))
+    moved = list(steps(moved, batches))
     for (terms, gradient), (rounded, its_gradient), (shaken, moved_gradient) in zip(plain, half, moved, strict=True):
         assert rounded["total"] != terms["total"]
         assert rounded["total"] == pytest.approx(terms["total"], rel=0.03)

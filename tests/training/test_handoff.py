@@ -86,9 +86,9 @@ def test_phase_1_starts_from_fresh_weights():
 )
 def test_the_run_of_the_same_command_in_phase_1(tmp_path, own):
     """Less what only the later phase has: Tables 5 to 7 and 13 start from one and the same run of phase 1."""
-    shared = ["model.ocsf.margin_m=1.6", "seed=3", f"paths.outputs={tmp_path}"]
-    source, _ = source_of("phase=phase2", *shared, *own)
-    assert source.identity == identity("phase=phase1", *shared[:2])
+    shared = ["model.ocsf.margin_m=1.6", "model.loss.gaussian_velocity_in_phase1=false", "seed=3"]
+    source, _ = source_of("phase=phase2", *shared, f"paths.outputs={tmp_path}", *own)
+    assert source.identity == identity("phase=phase1", *shared)
     assert source.checkpoint == tmp_path / source.identity / "checkpoints" / "last.ckpt"
     assert source.overrides[0] == "phase=phase1" and not source.ready
     assert not [override for override in source.overrides if override.startswith(("phase.", "model.dptf", "resume"))]

@@ -26,6 +26,7 @@ class Horizon3DConfig(ModelConfig):
     """Settings of the model (`model`). Raises ConfigError for parts that do not go together."""
 
     temporal_part: ClassVar[str] = "dptf"
+    temporal_switches: ClassVar[tuple[str, ...]] = ("doppler.cells",)
     new_in_temporal_phase: ClassVar[str] = r"dptf\.|ocsf\.encoder\.layers\.\d+\.temporal_attention\."
 
     radar_encoder: RadarEncoderConfig
@@ -70,7 +71,8 @@ class Horizon3DConfig(ModelConfig):
         terms = [f"cell_{term}_weight" for term in ("focal", "dice", "lovasz", "velocity")]
         if not self.loss.gaussian_velocity_in_phase1:
             terms += ["dptf_weight", "gaussian_velocity_weight"]
-        return ("model.dptf", "model.doppler.cells", *(f"model.loss.{term}" for term in terms))
+        switches = (f"model.{switch}" for switch in self.temporal_switches)
+        return ("model.dptf", *switches, *(f"model.loss.{term}" for term in terms))
 
     @property
     def temporal_heads(self) -> int | None:
