@@ -62,6 +62,8 @@ def build_datamodule(config: Config, root: Path) -> DetectionDataModule:
         cache=Path(config.paths.outputs) / "cache",
         temporal=config.phase.temporal,
         name="synthetic highway" if config.data.world is not None else None,
+        labels=EVALUATORS[config.phase.task].labels,
+        read_by=f"model={config.model.name}",
     )
 
 

@@ -175,10 +175,12 @@ def run(
 
 
 def draw_pictures(config: Config, module: TrainingModule, datamodule: DetectionDataModule, folder: RunFolder) -> None:
-    """Learning curves, the evaluator's pictures, and some validation frames spread over the split."""
+    """Learning curves, the evaluator's pictures, and where there are boxes some validation frames over the split."""
     folder.pictures.mkdir(exist_ok=True)
     draw_curves(folder.pictures / "curves.png", curves_of(folder.metrics_csv), folder.run_id)
     module.evaluator.draw(folder.pictures, folder.run_id)
+    if not datamodule.labels:
+        return
     length = config.model.memory_frames + 1 if config.phase.temporal else 1
     clips = datamodule.validation_clips(config.trainer.num_pictures, length)
     draw_frames(module.model, clips, config.grid.build(), folder.pictures)

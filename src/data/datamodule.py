@@ -136,6 +136,7 @@ class DetectionDataModule(L.LightningDataModule):
         temporal: bool,
         name: str | None = None,  # of the data set in results; None: its folder's
         labels: bool = True,  # False: annotations are not touched, and batches have no boxes
+        read_by: str = "the model",  # in messages
     ) -> None:
         super().__init__()
         self.config, self.root, self.seed, self.temporal = config, root, seed, temporal
@@ -146,7 +147,7 @@ class DetectionDataModule(L.LightningDataModule):
         lidars = [CHANNELS.index(name) for name in LIDARS]
         if "lidar" in sensors and not np.isin(self.index.data_channels, lidars).any():
             raise DataError(
-                f"{root / config.version}: holds no LiDAR files, but the model reads {' and '.join(sensors)}; choose a "
+                f"{root / config.version}: holds no LiDAR files, but {read_by} reads {' and '.join(sensors)}; choose a "
                 "data set with LiDAR or another model"
             )
         self.reader = FrameReader(self.index, self.settings)
@@ -245,12 +246,26 @@ class DetectionDataModule(L.LightningDataModule):
     def val_dataloader(self) -> DataLoader:
         """Batches of the validation split, each frame once over all ranks: in table order, or scene by scene."""
         samples = split_samples(self.index, self.config.split)
+        if self.reader.timeline is not None and self.config.num_future_frames:
+            samples = self._scored(samples)
         rank, world_size = self._rank()
         if self._in_streams:
             schedule = whole_scenes(self._scenes_of(samples), self.config.batch_size, world_size)
         else:
             schedule = frames_in_order(samples, self.config.batch_size)
         return self._loader(ScheduleSampler(lambda epoch: schedule, rank, world_size), None)
+
+    def _scored(self, samples: np.ndarray) -> np.ndarray:
+        """Of each scene some key frames that have the timeline's whole horizon ahead; raises DataError for none."""
+        timeline, scenes = self.reader.timeline, self.index.sample_scenes[samples]
+        whole = np.array([timeline.is_whole(sample) for sample in samples])
+        if not whole.any():
+            raise DataError(
+                f"{self.index.root / self.config.version}: no scene of the split {self.config.split!r} goes on for "
+                f"data.timeline.horizon_s={timeline.config.horizon_s} s after a key frame; lower it"
+            )
+        own = [samples[whole & (scenes == scene)] for scene in np.unique(scenes[whole])]
+        return np.concatenate([_evenly_spread(frames, timeline.config.scored_frames) for frames in own])
 
     @property
     def _in_streams(self) -> bool:

@@ -31,11 +31,15 @@ class TimelineConfig:
     history_stride: int  # moments from one frame of the past to the next
     horizon_s: float  # rays supervise, and are scored, up to so far into the future
     num_past_targets: int  # frames of the past, drawn in training, whose rays supervise too
+    scored_frames: int  # key frames of each scene that a validation with rays reads
+    score_stride: int  # moments of the future from one whose rays are scored to the next
+    scored_rays: int  # of each such moment at most, drawn
     radial_speeds: RadialSpeeds
 
     def __post_init__(self) -> None:
         least_values = {"interval_s": 0.01, "tolerance_s": 0, "history_stride": 1, "num_past_targets": 0}
-        require_least(self, "data.timeline", least_values | {"horizon_s": self.interval_s})
+        least_values |= {"scored_frames": 1, "score_stride": 1, "scored_rays": 1, "horizon_s": self.interval_s}
+        require_least(self, "data.timeline", least_values)
 
     @property
     def last_step(self) -> int:
@@ -125,15 +129,20 @@ class LidarTimeline:
     ) -> list[int]:
         """Steps whose rays supervise (O18): 0, some of the past and `num_future` of those up to the horizon, drawn.
 
-        Only such as the scene has, so there may be fewer. Without `rng` 0 and all of the future.
+        Only such as the scene has, so there may be fewer. Without `rng` 0 and those of the future that are scored.
         """
-        future = self._existing(sample, range(1, self.config.last_step + 1))
         if rng is None:
-            return [0, *future]
+            stride = self.config.score_stride
+            return [0, *self._existing(sample, range(stride, self.config.last_step + 1, stride))]
+        future = self._existing(sample, range(1, self.config.last_step + 1))
         past = self._existing(sample, self.config.history(num_history))
         draws = ((past, self.config.num_past_targets), (future, num_future))
         picked = [rng.choice(steps, min(count, len(steps)), replace=False) for steps, count in draws]
         return sorted(int(step) for step in np.concatenate([[0], *picked]))
+
+    def is_whole(self, sample: int) -> bool:
+        """Whether the scene goes on to the horizon of a key frame."""
+        return bool(self._existing(sample, [self.config.last_step]))
 
     def _existing(self, sample: int, steps: range | list[int]) -> list[int]:
         return [step for step in steps if (self.sweeps(sample, step) >= 0).any()]

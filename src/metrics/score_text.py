@@ -43,7 +43,7 @@ def format_scores(metrics: Mapping[str, Any]) -> str:
         tables.append(_measures(measures))
     if measures.get("radar_gaussians") is not None:
         tables.append(_gaussians(measures))
-    return "\n\n".join([*map(_align, tables), *_intervals(metrics.get("intervals", {"bounds": {}}))])
+    return "\n\n".join([*map(align, tables), *_intervals(metrics.get("intervals", {"bounds": {}}))])
 
 
 def _intervals(intervals: Mapping[str, Any]) -> list[str]:
@@ -93,7 +93,8 @@ def _plain(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
-def _align(rows: list[list[str]]) -> str:
+def align(rows: list[list[str]]) -> str:
+    """Columns as wide as their widest cell, the first to the left; a line below the heads."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for row in rows:

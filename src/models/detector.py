@@ -104,6 +104,8 @@ class Detector(nn.Module, ABC):
     `package.module:function`, that each is; `part: inner` lies within `part`."""
     latency_parts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """The parts of Table 15 by the methods that each is; one within another counts for both."""
+    trains_last_transition: bool = False
+    """Whether a step learns also through the encoding of the frame before, where frames bring their past along."""
     prepared_for: str | None = None
     """The precision that `prepare_for_inference` made this copy for; None: as trained."""
 
@@ -121,6 +123,10 @@ class Detector(nn.Module, ABC):
         `memory` is what the call for the previous frames of the same streams returned, row by row (see
         `TemporalMemory.select`); None where there is none. A detector of single frames takes and returns None.
         """
+
+    def transition(self, batch: FrameBatch, memory: Any) -> Any:
+        """The memory that `forward` gives, not detached; asked for where `trains_last_transition`."""
+        raise NotImplementedError(f"{type(self).__name__} does not learn what to remember")
 
     def restore_memory(self, state: list[dict[str, Any]]) -> Any:
         """The memory that `TemporalMemory.state` described. Raises NotImplementedError for single-frame detectors."""

@@ -18,7 +18,7 @@ BALANCE_M = (50.0, 150.0)
 
 @dataclass(kw_only=True)
 class RaySampling:
-    """How places are drawn along rays."""
+    """How places are drawn along rays (`model.loss.sampling`). Raises ConfigError for values that cannot work."""
 
     min_free_m: float  # eps: free from here on, as seen from the sensor
     depth_m: float  # delta: occupied so far behind the return
@@ -26,11 +26,13 @@ class RaySampling:
     ray_balance: bool  # equal mass to returns nearer than 50 m, 50 to 150 m and beyond; else rays uniform over returns
 
     def __post_init__(self) -> None:
-        require_least(self, "sampling", {"min_free_m": 0, "num_queries": 2})
+        require_least(self, "model.loss.sampling", {"min_free_m": 0, "num_queries": 2})
         if not self.depth_m > 0:
-            raise ConfigError(f"sampling.depth_m={self.depth_m}: must be above 0, or nothing is occupied")
+            raise ConfigError(f"model.loss.sampling.depth_m={self.depth_m}: must be above 0, or nothing is occupied")
         if self.num_queries % 2:
-            raise ConfigError(f"sampling.num_queries={self.num_queries}: must be even, half of them are occupied")
+            raise ConfigError(
+                f"model.loss.sampling.num_queries={self.num_queries}: must be even, half of them are occupied"
+            )
 
 
 @dataclass
@@ -63,8 +65,7 @@ def sample_queries(
         (enter.clamp(min=sampling.min_free_m), torch.minimum(rays.ranges, leave)),
     )
     usable = [high > low for low, high in stretches]
-    span = (rays.steps.max() - rays.steps.min() + 1) if len(rays) else 1
-    groups, group = torch.unique(rays.batch * span + rays.steps, return_inverse=True)
+    groups, group = torch.unique(_group(rays), return_inverse=True)
     bins = torch.zeros_like(group)
     if sampling.ray_balance:
         bins = torch.bucketize(rays.ranges, torch.tensor(BALANCE_M, device=bins.device), right=True)
@@ -124,3 +125,27 @@ def _draw_rows(
     chosen = torch.searchsorted(filled.cumsum(1), nth + 1)
     within = (draws[1] * counts.gather(1, chosen)).long()
     return order[(starts.gather(1, chosen) + within).flatten()]
+
+
+def draw_rays(
+    rays: RayBundle,
+    bounds: Bounds,
+    count: int,
+    generator: torch.Generator | None = None,  # on the rays' device
+) -> RayBundle:
+    """Up to `count` rays of every sample and target time that end in the bounds, without replacement, in order."""
+    low, high = torch.tensor(bounds, dtype=rays.origins.dtype, device=rays.origins.device).unbind(1)
+    ends = rays.points
+    rows = ((ends >= low) & (ends < high)).all(1).nonzero().squeeze(1)
+    rows = rows[torch.rand(len(rows), generator=generator, device=rows.device).argsort()]
+    rows = rows[_group(rays)[rows].argsort(stable=True)]
+    _, sizes = torch.unique_consecutive(_group(rays)[rows], return_counts=True)
+    starts = sizes.cumsum(0) - sizes
+    place = torch.arange(len(rows), device=rows.device) - starts.repeat_interleave(sizes)
+    return rays[rows[place < count].sort().values]
+
+
+def _group(rays: RayBundle) -> Tensor:  # [R] int64
+    """A number for each pair of sample and target time, ascending with both."""
+    span = (rays.steps.max() - rays.steps.min() + 1) if len(rays) else 1
+    return rays.batch * span + rays.steps

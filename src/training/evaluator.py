@@ -32,6 +32,8 @@ class Evaluator(nn.Module, ABC):
     """The number at the top of `as_dict` that sweeps and messages go by; larger is better."""
     monitored: ClassVar[tuple[str, ...]]
     """Numbers of `compute` that the best checkpoint may be chosen by (`phase.monitor`); larger is better."""
+    labels: ClassVar[bool] = True
+    """Whether annotations are read, in training as well; without, those of a data set are not touched."""
 
     @classmethod
     @abstractmethod

@@ -31,7 +31,7 @@ logger = logging.getLogger(__name__)
 OF_THIS_RUN = ("phase", "resume")
 """Overrides that never concern the run whose weights are taken."""
 OF_STREAMED_DATA = tuple(f"data.{key}" for key in TEMPORAL_DATA_KEYS)
-"""Nor do these and the model's `keys_of_temporal_phase`, where that run is of the phase before."""
+"""Nor do these and the model's `keys_of_temporal_phase`, where that run is of single frames."""
 INPUT_SETTINGS = (
     *("num_sweeps", "num_lidar_sweeps", "deskew_lidar"),
     *("min_distance_m", "propagate_points", "test_resize_offset"),
@@ -83,12 +83,13 @@ def find_source(
                 f"phase.init_from={name}: there is no such checkpoint, and no phase of that name ({', '.join(phases)})"
             )
         return WeightSource(hashlib.sha256(path.read_bytes()).hexdigest()[:16], path, None, None)
-    others = OF_THIS_RUN
-    if name != config.phase.name:
-        others += (*OF_STREAMED_DATA, *config.model.keys_of_temporal_phase)
-    kept = [override for override in overrides if not is_of(override, others)]
+    kept = [override for override in overrides if not is_of(override, OF_THIS_RUN)]
     wanted = [f"phase={name}", *kept]
     its_config, tree = compose(wanted)
+    if not its_config.phase.temporal:
+        others = (*OF_STREAMED_DATA, *config.model.keys_of_temporal_phase)
+        wanted = [override for override in wanted if not is_of(override, others)]
+        its_config, tree = compose(wanted)
     its_source = find_source(its_config, wanted, compose, phases)  # what that run starts from is part of its identity
     identity = run_identity(tree, its_source.identity if its_source is not None else None)
     folder = RunFolder(Path(config.paths.outputs), identity)

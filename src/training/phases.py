@@ -9,9 +9,14 @@ from src.errors import ConfigError, require_least
 from src.training.evaluator import DetectionEvaluator, Evaluator
 from src.training.module import TrainingModule
 from src.training.temporal_module import TemporalModule
+from src.training.world_evaluators import ForecastEvaluator, OccupancyEvaluator
 
 MODULES: dict[str, type[TrainingModule]] = {kind.__name__: kind for kind in (TrainingModule, TemporalModule)}
-EVALUATORS: dict[str, type[Evaluator]] = {"detection": DetectionEvaluator}
+EVALUATORS: dict[str, type[Evaluator]] = {
+    "detection": DetectionEvaluator,
+    "occupancy": OccupancyEvaluator,
+    "forecasting": ForecastEvaluator,
+}
 
 
 @dataclass(kw_only=True)

@@ -53,15 +53,19 @@ class TemporalModule(TrainingModule):
             self.memories.append((batch.streams, memory))
         return output
 
-    @torch.no_grad()
     def remember(self, frames: tuple[FrameBatch, ...]) -> TemporalMemory | None:
-        """What the model, as it is used later, remembers of the key frames before a batch."""
+        """What the model, as it is used later, remembers of the frames before a batch, without gradient.
+
+        In training a model may learn through the last of them (`Detector.trains_last_transition`).
+        """
         training, memory = self.model.training, None
+        learns = training and self.model.trains_last_transition
         self.model.eval()
-        for frame in frames:
-            _, memory = self.model(frame, memory)
+        with torch.no_grad():
+            for frame in frames[: len(frames) - learns]:
+                _, memory = self.model(frame, memory)
         self.model.train(training)
-        return memory
+        return self.model.transition(frames[-1], memory) if learns else memory
 
     def recall(self, batch: FrameBatch) -> TemporalMemory | None:
         """Memory of the batch's streams, row by row, or None where none of them has any."""

@@ -8,13 +8,13 @@ from typing import ClassVar
 
 from src.errors import ConfigError, require_least
 from src.geometry.voxel_grid import VoxelGrid
-from src.losses.loss_weights import LossWeights
 from src.models.detector import ModelConfig
 from src.models.heads.center_head import BoxOptions, HeadConfig
 from src.models.lrs4fusion.bev_neck import BEVNeckConfig
 from src.models.lrs4fusion.decoders import DecoderConfig
 from src.models.lrs4fusion.late_encoder import NUM_SCALES
 from src.models.lrs4fusion.ray_head import RayHeadConfig
+from src.models.lrs4fusion.ray_loss import LRSLossConfig
 from src.models.lrs4fusion.windowed_fusion import VolumeMemoryConfig
 
 SENSORS = ("lidar",)
@@ -36,6 +36,7 @@ class LRSOptions(BoxOptions):
 
     velocity_code_weight: float | None  # null where no boxes are learned
     stage: str  # one of LRSStage
+    train_last_transition: bool  # learn also through the encoding of the frame before, where frames bring their past
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,14 +90,6 @@ class LateEncoderConfig:
             value = getattr(self, name)
             if len(value) != NUM_SCALES or min(value) < 1:
                 raise ConfigError(f"model.late_encoder.{name}={value}: must list {NUM_SCALES} positive numbers")
-
-
-@dataclass(kw_only=True)
-class LRSLossConfig(LossWeights):
-    """Weights of the terms (`model.loss`); null switches a term off, uncomputed."""
-
-    heatmap_weight: float | None
-    box_weight: float | None
 
 
 @dataclass(kw_only=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Self
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.bounds import Bounds
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.detector import Detector, Objective
 from src.models.heads.center_head import CenterHead, HeadOutput
@@ -19,12 +21,15 @@ from src.models.lrs4fusion.decoders import Decoders
 from src.models.lrs4fusion.late_encoder import FUSED_SCALE, FusionStem, LateEncoder, Volumes
 from src.models.lrs4fusion.lrs_config import LRS4FusionConfig, LRSOptions, LRSStage
 from src.models.lrs4fusion.ray_head import RayHead
+from src.models.lrs4fusion.ray_loss import occupancy_objective, range_objective
 from src.models.lrs4fusion.sparse_unet import SparseUNet
 from src.models.lrs4fusion.volume_memory import VolumeMemory
 from src.models.lrs4fusion.voxel_pointnet import VoxelPointNet
 from src.models.lrs4fusion.windowed_fusion import WindowedFusion
+from src.models.world_model import WorldModel
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
+from src.structures.ray_bundle import RayBundle
 
 NORM_EPS = 1e-3  # PartA2's
 QUERIES_AT_ONCE = 1 << 16
@@ -39,7 +44,7 @@ class LRSOutput:
     head: HeadOutput | None  # None where no boxes are learned
 
 
-class LRS4Fusion(Detector):
+class LRS4Fusion(Detector, WorldModel):
     """LiDAR to voxels to a U-Net to a completed volume of four scales, which remembers its past (lrs 5).
 
     It answers queries (x, y, z, t) by occupancy and radial velocity, and gives the ranges of future rays, and boxes.
@@ -62,6 +67,7 @@ class LRS4Fusion(Detector):
         super().__init__()
         self.config = config
         self.stage = LRSStage(options.stage)
+        self.trains_last_transition = options.train_last_transition and config.temporal is not None
         self.voxels = config.roi.build(len(config.unet.encoder_channels))
         norm = {"eps": NORM_EPS, "momentum": config.norm_momentum}
         unet, late = config.unet, config.late_encoder
@@ -133,6 +139,10 @@ class LRS4Fusion(Detector):
             speeds = self._in_parts(self.velocity, volumes, now, indices[:, 0])
         return self.temporal.remember(volume, speeds, batch)
 
+    def transition(self, batch: FrameBatch, memory: VolumeMemory | None) -> VolumeMemory | None:
+        """As in `Detector`."""
+        return self.remember(self.encode(batch, memory), batch)
+
     def restore_memory(self, state: list[dict[str, Any]]) -> VolumeMemory:
         """The memory that `VolumeMemory.state` described."""
         return VolumeMemory.from_state(state)
@@ -185,12 +195,39 @@ class LRS4Fusion(Detector):
         parts = zip(queries.split(QUERIES_AT_ONCE), batch.split(QUERIES_AT_ONCE), strict=True)
         return torch.cat([ask(volumes, *part) for part in parts])
 
+    @property
+    def bounds(self) -> Bounds:
+        """The region."""
+        return tuple(zip(self.voxels.lower_m, self.voxels.upper_m, strict=True))
+
+    @torch.no_grad()
+    def look_up(self, output: LRSOutput, queries: Tensor, batch: Tensor) -> tuple[Tensor, Tensor | None]:
+        """As in `WorldModel`."""
+        parts = zip(queries.split(QUERIES_AT_ONCE), batch.split(QUERIES_AT_ONCE), strict=True)
+        logits, speeds = zip(*(self.answers(output.volumes, *part) for part in parts), strict=True)
+        return torch.cat(logits).sigmoid(), None if speeds[0] is None else torch.cat(speeds)
+
+    def forecast(self, output: LRSOutput, rays: RayBundle) -> Tensor:  # [R] m
+        """As in `WorldModel`, by `ray_ranges`."""
+        return self.ray_ranges(output.volumes, rays.origins, rays.directions, rays.times_s, rays.batch)
+
     def loss_terms(self, output: LRSOutput, batch: FrameBatch) -> Objective:
-        """Weighted terms `heatmap` and `box` of the stage `detection`."""
-        if output.head is None:
-            raise NotImplementedError(f"phase.options.stage={self.stage} has no loss yet; only detection has")
+        """Weighted terms of the stage: `heatmap` and `box`; `occupancy` and `velocity`; or `range`.
+
+        Raises ValueError for a batch without the boxes or the rays that the stage learns from.
+        """
         weights = self.config.loss
-        return self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
+        if self.stage is LRSStage.detection:
+            return self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
+        if batch.rays is None:
+            raise ValueError(
+                f"FrameBatch.rays is None, but phase.options.stage={self.stage} learns from them; give "
+                "data.num_future_frames=2"
+            )
+        if self.stage is LRSStage.occupancy:
+            answer = partial(self.answers, output.volumes)
+            return occupancy_objective(answer, batch.rays, self.bounds, weights)
+        return range_objective(partial(self.forecast, output), batch.rays, self.bounds, weights)
 
     def decode(self, output: LRSOutput) -> list[Boxes3D]:
         """Boxes of each frame, best first. Raises ConfigError for a model that learns none."""

@@ -1,0 +1,328 @@
+"""Scores of a world model: occupancy and radial velocity, and forecasts of LiDAR beside those of a static world.
+
+No annotation is read. What only a synthetic world knows, its true geometry, is compared with where there is any.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from src.data.datamodule import DetectionDataModule
+from src.data.schema import DatasetIndex
+from src.data.true_geometry import TRUTH_FOLDER, TrueGeometry
+from src.errors import ConfigError
+from src.geometry.bounds import Bounds
+from src.metrics.bootstrap import LEVEL, NUM_DRAWS, SEED, interval
+from src.metrics.diagnostics import ratios
+from src.metrics.forecast_text import format_forecast, format_occupancy
+from src.metrics.forecasting import HORIZONS_S, ForecastScores, median_errors, score_forecast, sums_by_sample
+from src.metrics.static_world import static_world, unseen
+from src.models.world_model import WorldModel
+from src.reliability.processes import gather_by_rank
+from src.structures.batch import FrameBatch
+from src.structures.ray_bundle import RayBundle
+from src.targets.occupancy_rays import RaySampling, draw_rays, sample_queries
+from src.training.evaluator import Evaluator
+
+Array = np.ndarray
+
+SAMPLING = RaySampling(min_free_m=1.5, depth_m=0.1, num_queries=4096, ray_balance=False)
+"""Places along rays that are asked for: as the paper's training draws them, fewer."""
+MOVING_MPS = 1.0
+"""What is faster over ground moves."""
+TRUE_MARGIN_M = 0.3
+"""Boxes are grown by it where it is asked what a measured point belongs to."""
+SLICE_REACH_M, SLICE_STEP_M, SLICE_HEIGHT_M = 50.0, 1.0, 1.0
+"""The true geometry is compared with on a lattice so far about the ego, so high above the ground."""
+SUBSETS = ("", "_moving", "_unseen")
+STATIC = "static_"
+
+
+@dataclass
+class WorldScores:
+    """Of one sample."""
+
+    sums: dict[str, Array] = field(default_factory=dict)  # [2] total and count by number
+    speed_errors: Array | None = None  # [n] m/s, of rays that end on what moves
+    forecasts: dict[str, ForecastScores] = field(default_factory=dict)  # by the prefix of their numbers
+
+    def add(self, name: str, values: Tensor | Array, among: Tensor | Array) -> None:
+        """The mean of `values` over those `among`."""
+        self.sums[name] = np.array([float(values[among].sum()), float(among.sum())])
+
+    def add_iou(self, name: str, found: Tensor, truth: Tensor) -> None:
+        """Intersection over union."""
+        self.sums[name] = np.array([float((found & truth).sum()), float((found | truth).sum())])
+
+
+class OccupancyEvaluator(Evaluator):
+    """Occupancy along the rays that came, and on a slice of the true geometry, by time; radial velocities.
+
+    `iou@<t>s` is of places along rays, half of them occupied, `iou` of all times; `slice_iou@<t>s` of the lattice one
+    metre above the ground. `velocity_error_moving`: mean of |predicted - true| m/s where rays end on what moves.
+    A sample that several processes saw counts once.
+    """
+
+    headline = "iou"
+    monitored = ("iou",)
+    labels: ClassVar[bool] = False
+    logged: ClassVar[tuple[str, ...]] = ("iou", "velocity_error_moving", "velocity_median_moving")
+
+    def __init__(self, index: DatasetIndex, interval_s: float, num_rays: int) -> None:
+        super().__init__()
+        self.index, self.interval_s, self.num_rays = index, interval_s, num_rays
+        self.rows = {token: row for row, token in enumerate(index.sample_tokens.tolist())}
+        self.found: dict[int, WorldScores] = {}  # by row of the sample
+        self.content: dict[str, Any] | None = None
+        self._truth: tuple[int, TrueGeometry | None] | None = None  # of the scene asked for last, by its row
+
+    @classmethod
+    def of(cls, datamodule: DetectionDataModule) -> Self:
+        """Of the validation split's frames that are read with rays. Raises ConfigError without a timeline."""
+        timeline = datamodule.config.timeline
+        if timeline is None or not datamodule.config.num_future_frames:
+            raise ConfigError(
+                "data.num_future_frames=0 or data.timeline=null: this phase learns from the rays of future LiDAR"
+            )
+        return cls(datamodule.index, timeline.interval_s, timeline.scored_rays)
+
+    def reset(self) -> None:
+        """Forget what an earlier pass collected."""
+        self.found.clear()
+
+    def update(self, model: WorldModel, output: Any, batch: FrameBatch) -> None:
+        """Score every sample of a batch."""
+        rows = [self.rows[token] for token in batch.tokens]
+        parts = []
+        for sample, row in enumerate(rows):
+            generator = torch.Generator(batch.device).manual_seed(row)
+            own = batch.rays[batch.rays.batch == sample]
+            parts.append(draw_rays(own, model.bounds, self.num_rays, generator))
+        batch = replace(batch, rays=RayBundle.join(parts))
+        scores = [WorldScores() for _ in rows]
+        self._score(model, output, batch, rows, scores)
+        for row, own in zip(rows, scores, strict=True):
+            self.found.setdefault(row, own)
+
+    def _score(
+        self, model: WorldModel, output: Any, batch: FrameBatch, rows: list[int], scores: list[WorldScores]
+    ) -> Tensor | None:  # [R] bool, rays that end on what moves; None where nobody knows
+        """Write what is found of each sample of `batch`, whose rays are thinned, into `scores`."""
+        moving = torch.zeros(len(batch.rays), dtype=torch.bool)
+        known = True
+        for sample, (row, own) in enumerate(zip(rows, scores, strict=True)):
+            among = batch.rays.batch == sample
+            rays, truth = batch.rays[among], self._truth_of(row)
+            self._score_occupancy(model, output, rays, own, row)
+            if truth is not None:
+                self._score_slice(model, output, batch, sample, truth, own, rays.steps.unique().tolist())
+            speeds, moves = true_speeds(rays, batch, sample, truth)
+            known &= moves is not None
+            if moves is not None:
+                moving[among.cpu()] = moves
+                self._score_velocity(model, output, rays, speeds, moves, own)
+        return moving if known else None
+
+    def _score_occupancy(self, model: WorldModel, output: Any, rays: RayBundle, scores: WorldScores, row: int) -> None:
+        generator = torch.Generator(rays.ranges.device).manual_seed(row)
+        queries = sample_queries(rays, model.bounds, SAMPLING, generator)
+        at = torch.cat([queries.points, queries.times_s[:, None]], 1)
+        if not len(at):
+            return
+        found = model.look_up(output, at, queries.batch)[0] > 0.5
+        scores.add_iou("iou", found, queries.occupied)
+        for step in queries.steps[queries.steps >= 0].unique().tolist():
+            own = queries.steps == step
+            scores.add_iou(f"iou@{step * self.interval_s:.1f}s", found[own], queries.occupied[own])
+
+    def _score_slice(
+        self,
+        model: WorldModel,
+        output: Any,
+        batch: FrameBatch,
+        sample: int,
+        truth: TrueGeometry,
+        scores: WorldScores,
+        steps: list[int],
+    ) -> None:
+        global_from_aug = _global_from_aug(batch, sample)
+        places = _lattice(model.bounds)
+        points = places @ global_from_aug[:3, :3].T + global_from_aug[:3, 3]
+        points[:, 2] = truth.origin[2] + truth.ground_height(points) + SLICE_HEIGHT_M
+        in_aug = torch.from_numpy((points - global_from_aug[:3, 3]) @ global_from_aug[:3, :3]).float()
+        low, high = torch.tensor(model.bounds).unbind(1)
+        inside = ((in_aug >= low) & (in_aug < high)).all(1)
+        points, in_aug = points[inside.numpy()], in_aug[inside]
+        owner = torch.full((len(points),), sample, device=batch.device)
+        for step in steps:
+            time_s = step * self.interval_s
+            at = torch.cat([in_aug, in_aug.new_full((len(in_aug), 1), time_s)], 1).to(batch.device)
+            found = model.look_up(output, at, owner)[0].cpu() > 0.5
+            times_us = np.full(len(points), round(1e6 * (float(batch.timestamps_s[sample]) + time_s)))
+            scores.add_iou(f"slice_iou@{time_s:.1f}s", found, torch.from_numpy(truth.solid(points, times_us)))
+
+    def _score_velocity(
+        self, model: WorldModel, output: Any, rays: RayBundle, speeds: Tensor, moves: Tensor, scores: WorldScores
+    ) -> None:
+        inside = rays.points + 0.5 * SAMPLING.depth_m * rays.directions
+        found = model.look_up(output, torch.cat([inside, rays.times_s[:, None]], 1), rays.batch)[1]
+        if found is None:
+            return
+        errors, known = (found.cpu() - speeds).abs().nan_to_num(), ~speeds.isnan()
+        scores.add("velocity_error_moving", errors, moves & known)
+        scores.add("velocity_error_standing", errors, ~moves & known)
+        scores.speed_errors = errors[moves & known].numpy()
+
+    def _truth_of(self, row: int) -> TrueGeometry | None:
+        scene = int(self.index.sample_scenes[row])
+        if self._truth is None or self._truth[0] != scene:
+            known = (self.index.root / TRUTH_FOLDER).is_dir()
+            name = str(self.index.scene_names[scene])
+            self._truth = scene, TrueGeometry.read(self.index.root, name) if known else None
+        return self._truth[1]
+
+    def compute(self) -> dict[str, float]:
+        """The headline and some more."""
+        found: dict[int, WorldScores] = {}
+        for of_rank in gather_by_rank(self.found):
+            found = of_rank | found
+        rows = sorted(found)
+        names = sorted({name for row in rows for name in found[row].sums})
+        sums = {name: np.stack([found[row].sums.get(name, np.zeros(2)) for row in rows]) for name in names}
+        numbers = {name: float(values[0]) for name, values in self._ratios(sums, np.ones((1, len(rows)))).items()}
+        errors = [found[row].speed_errors for row in rows if found[row].speed_errors is not None]
+        if sum(map(len, errors)):
+            numbers["velocity_median_moving"] = float(np.median(np.concatenate(errors)))
+        for prefix in {prefix for row in rows for prefix in found[row].forecasts}:
+            joined = ForecastScores.join([found[row].forecasts[prefix] for row in rows])
+            medians = median_errors(joined, self.interval_s)
+            numbers |= {f"{prefix}{name}": value for name, value in medians.items()}
+        self.content = _plain(numbers) | {"intervals": self._intervals(sums, self.index.sample_scenes[rows])}
+        shown = (name for name in (self.headline, *self.logged) if numbers.get(name) is not None)
+        return {self.headline: float("nan")} | {name: numbers[name] for name in shown}
+
+    def _ratios(
+        self,
+        sums: Mapping[str, Array],  # [S, 2] each
+        weights: Array,  # [R, S]
+    ) -> dict[str, Array]:  # [R] each
+        return ratios(sums, weights)
+
+    def _intervals(self, sums: Mapping[str, Array], scenes: Array) -> dict[str, Any]:
+        """As those of a detection's metrics.json: scenes are drawn again with replacement."""
+        names, scenes = np.unique(scenes, return_inverse=True)
+        bounds = {}
+        if len(names) > 1:
+            draws = np.random.default_rng(SEED).multinomial(len(names), np.full(len(names), 1 / len(names)), NUM_DRAWS)
+            drawn = self._ratios(sums, draws[:, scenes])
+            bounds = {name: found for name, values in drawn.items() if (found := interval(values)) is not None}
+        return {"scenes": len(names), "draws": NUM_DRAWS, "level": LEVEL, "bounds": bounds}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Every number by its name, null where undefined, and `intervals`."""
+        return self.content
+
+    @staticmethod
+    def describe(metrics: Mapping[str, Any]) -> str:
+        """By time."""
+        return format_occupancy(metrics)
+
+
+class ForecastEvaluator(OccupancyEvaluator):
+    """The same, with forecast LiDAR and beside it, `static_`, that of a world that stands still.
+
+    Names are those of `sums_by_sample` and `median_errors`; `moving` and `unseen` are rays that end on what moves, and
+    where the input had not seen. A `gain` is the share by which a Chamfer distance lies below the static world's.
+    Rays are thinned to `data.timeline.scored_rays`, so distances are larger than between whole clouds.
+    """
+
+    headline = "cd_gain_3s"
+    monitored = ("cd_gain_3s", "cd_gain_1s", "iou")
+    logged = (*("iou", "cd_1s", "cd_3s", "nfcd_3s", "lfcd_3s", "l1_3s"), *("cd_moving_gain_3s", "cd_unseen_gain_3s"))
+
+    def _score(
+        self, model: WorldModel, output: Any, batch: FrameBatch, rows: list[int], scores: list[WorldScores]
+    ) -> Tensor | None:
+        moving = super()._score(model, output, batch, rows, scores)
+        future = batch.rays.steps > 0
+        rays = batch.rays[future]
+        subsets = {} if moving is None else {"moving": moving[future.cpu()]}
+        if batch.lidar_origins is not None:
+            subsets["unseen"] = unseen(replace(batch, rays=rays), model.bounds)
+        found = {
+            "": model.forecast(output, rays),
+            STATIC: static_world(replace(batch, rays=rays), _farthest_m(model.bounds)),
+        }
+        for sample, own in enumerate(scores):
+            among = rays.batch == sample
+            masks = {name: mask[among.cpu()] for name, mask in subsets.items()}
+            zeros = np.zeros(len(batch), np.int64)
+            for prefix, ranges in found.items():
+                forecast = score_forecast(rays[among], ranges[among], zeros, model.bounds, masks)
+                own.forecasts[prefix] = forecast
+                sums = sums_by_sample(forecast, 1, self.interval_s)
+                own.sums |= {f"{prefix}{name}": values[0] for name, values in sums.items()}
+        return moving
+
+    def _ratios(self, sums: Mapping[str, Array], weights: Array) -> dict[str, Array]:
+        found = ratios(sums, weights)
+        for kind in (*(f"cd{subset}" for subset in SUBSETS), "nfcd", "lfcd"):
+            for horizon in HORIZONS_S:
+                own, static = (found.get(f"{prefix}{kind}_{horizon:g}s") for prefix in ("", STATIC))
+                if own is not None and static is not None:
+                    found[f"{kind}_gain_{horizon:g}s"] = 1 - own / static
+        return found
+
+    @staticmethod
+    def describe(metrics: Mapping[str, Any]) -> str:
+        """Beside the static world."""
+        return f"{format_forecast(metrics)}\n\n{format_occupancy(metrics)}"
+
+
+def true_speeds(
+    rays: RayBundle,
+    batch: FrameBatch,
+    sample: int,
+    truth: TrueGeometry | None,
+) -> tuple[Tensor, Tensor | None]:  # [R] m/s, [R] bool
+    """Speeds over ground along rays of one sample, and which end on what moves: true ones, else those measured.
+
+    The second is None where nothing is known of any.
+    """
+    if truth is None:
+        speeds = rays.speeds.cpu()
+        return speeds, None if speeds.isnan().all() else speeds.abs() > MOVING_MPS
+    global_from_aug = _global_from_aug(batch, sample)
+    points = rays.points.double().cpu().numpy() @ global_from_aug[:3, :3].T + global_from_aug[:3, 3]
+    times_s = float(batch.timestamps_s[sample]) + rays.times_s.double().cpu().numpy()
+    velocities = truth.velocities(points, np.round(1e6 * times_s).astype(np.int64), TRUE_MARGIN_M)
+    along = ((velocities @ global_from_aug[:3, :3]) * rays.directions.double().cpu().numpy()).sum(1)
+    return torch.from_numpy(along).float(), torch.from_numpy(np.linalg.norm(velocities, axis=1) > MOVING_MPS)
+
+
+def _global_from_aug(batch: FrameBatch, sample: int) -> Array:  # [4, 4]
+    matrix = batch.global_from_ego[sample] @ torch.linalg.inv(batch.aug_from_ego[sample].double())
+    return matrix.cpu().numpy()
+
+
+def _lattice(bounds: Bounds) -> Array:  # [n, 3] m, z 0
+    axes = [
+        np.arange(max(low, -SLICE_REACH_M) + 0.5 * SLICE_STEP_M, min(high, SLICE_REACH_M), SLICE_STEP_M)
+        for low, high in bounds[:2]
+    ]
+    x, y = (values.ravel() for values in np.meshgrid(*axes, indexing="ij"))
+    return np.stack([x, y, np.zeros_like(x)], 1)
+
+
+def _farthest_m(bounds: Bounds) -> float:
+    return float(np.linalg.norm(np.abs(bounds).max(axis=1)))
+
+
+def _plain(numbers: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: None if np.isnan(value) else value for name, value in numbers.items()}
