@@ -43,7 +43,7 @@ def format_occupancy(metrics: Mapping[str, Any]) -> str:
     times = sorted({name.partition("@")[2] for name in metrics if name.startswith("iou@")}, key=lambda t: float(t[:-1]))
     rows = [["time", "IoU along rays", "IoU above the ground"]]
     rows += [[time, *(_plain(metrics.get(f"{kind}@{time}")) for kind in ("iou", "slice_iou"))] for time in times]
-    rows.append(["all", _plain(metrics["iou"]), ""])
+    rows.append(["all", _plain(metrics.get("iou")), ""])
     names = {"velocity_error_moving": "mean", "velocity_median_moving": "median"}
     speeds = [f"{words} {_plain(metrics[name])}" for name, words in names.items() if metrics.get(name) is not None]
     text = f"radial velocity error of what moves, m/s: {', '.join(speeds)}"

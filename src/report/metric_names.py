@@ -79,16 +79,37 @@ for _part in PARTS + FURTHER_PARTS:
 METRICS["latency.fps"] = Metric("latency.fps", "frames per second", "1/s", 1.0, 2, True)
 METRICS["latency.memory_gb"] = Metric("latency.memory_gb", "memory", "GB", 1.0, 2, False)
 
+FORECASTS = {"iou": Metric("iou", "occupancy IoU along rays", "%", 100.0, 1)}
+"""Of a world model's tasks, `occupancy` and `forecasting`, whose other numbers have no names here."""
+for _horizon in ("1s", "3s"):
+    for _key, _words in (
+        ("cd", "Chamfer"), ("nfcd", "Chamfer 0-50 m"), ("lfcd", "Chamfer 50-250 m"),
+        ("cd_moving", "Chamfer of what moves"), ("cd_unseen", "Chamfer of unseen space"),
+    ):  # fmt: skip
+        for _prefix, _of in (("", ""), ("static_", "static world's ")):
+            _name = f"{_prefix}{_key}_{_horizon}"
+            FORECASTS[_name] = Metric(_name, f"{_of}{_words} {_horizon}", "m^2", 1.0, 2, False)
+        _name = f"{_key}_gain_{_horizon}"
+        FORECASTS[_name] = Metric(_name, f"{_words} {_horizon} below the static world's", "%", 100.0, 1)
+    for _key, _words in (("l1", "L1 along rays"), ("l1_median", "median along rays")):
+        FORECASTS[f"{_key}_{_horizon}"] = Metric(f"{_key}_{_horizon}", f"{_words} {_horizon}", "m", 1.0, 2, False)
+for _step in range(4):
+    for _key, _words in (("iou", "IoU along rays"), ("slice_iou", "IoU above the ground")):
+        _name = f"{_key}@{_step}.0s"
+        FORECASTS[_name] = Metric(_name, f"{_words} at {_step} s", "%", 100.0, 1)
+for _key, _words in (("velocity_error_moving", "mean"), ("velocity_median_moving", "median")):
+    FORECASTS[_key] = Metric(_key, f"{_words} radial velocity error of what moves", "m/s", 1.0, 2, False)
+
 
 def find_metric(name: str, where: str, task: str = DETECTION) -> Metric:
-    """The metric of this name; of another task than detection, any other name is a plain number, larger being better.
+    """The metric of this name; of another task than detection, an unknown name is a plain number, larger being better.
 
     Raises ConfigError naming `where` it stands and the nearest names there are.
     """
     if name in METRICS:
         return METRICS[name]
     if task != DETECTION:
-        return Metric(name, name)
+        return FORECASTS.get(name, Metric(name, name))
     near = difflib.get_close_matches(name, METRICS, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(list(METRICS)[:7])}, ..."
     raise ConfigError(f"{where}: {name} is not a metric; {hint}")

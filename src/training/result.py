@@ -22,6 +22,9 @@ from src.training.run_folder import RunFolder, current_commit
 
 logger = logging.getLogger(__name__)
 
+FILES = ("metrics.json", "metrics.csv", "config.yaml", "log.txt", "pictures", "submission.json")
+"""What a user may look at of a finished run."""
+
 
 def run_record(
     config: Any,  # of the run
@@ -91,4 +94,5 @@ def print_result(folder: RunFolder, record: dict[str, Any], scores: dict[str, An
         names = record["skipped_names"]
         shown = f": {', '.join(names[:SHOWN_NAMES])}{' ...' if len(names) > SHOWN_NAMES else ''}" if names else ""
         print(f"skipped sensor files: {record['skipped_files']}{shown} (names in run.json)")
-    print(f"run folder: {folder.path}  (metrics.json, metrics.csv, config.yaml, log.txt, pictures/, submission.json)")
+    written = [name for name in FILES if (folder.path / name).exists()]
+    print(f"run folder: {folder.path}  ({', '.join(written)})")

@@ -123,6 +123,10 @@ def test_targets_are_drawn_among_those_that_exist(lidar_set):
     assert {draw[0] for draw in draws} == {-2, -1} and {draw[1] for draw in draws} == {0}
     assert {draw[2:] for draw in draws} == {(a, b) for a in range(1, 6) for b in range(a + 1, 6)}
     assert timeline.targets(2, 0, 2, np.random.default_rng(0)) == [0]
+    some = LidarTimeline(timeline.index, replace(FIVE_HERTZ, score_stride=2))
+    assert some.targets(0, 4, 2, None) == [0, 2, 4] and not some.is_whole(0)
+    horizons = [LidarTimeline(timeline.index, replace(FIVE_HERTZ, horizon_s=seconds)) for seconds in (1.0, 1.2)]
+    assert [one.is_whole(0) for one in horizons] == [True, False]
     slow = replace(FIVE_HERTZ, history_stride=3)
     assert slow.history(4) == [-12, -9, -6, -3] and slow.last_step == 15
 
@@ -183,7 +187,8 @@ def test_nothing_needs_labels(broken_lidar):
         broken_lidar.table(name).unlink()
     with pytest.raises(DataError, match="sample_annotation"):
         load_index(broken_lidar.root, VERSION, None)
-    settings = config(timeline=FIVE_HERTZ, num_future_frames=2, past_frames=2, batch_size=1)
+    timeline = replace(FIVE_HERTZ, horizon_s=0.4)
+    settings = config(timeline=timeline, num_future_frames=2, past_frames=2, batch_size=1)
     data = DetectionDataModule(
         settings, broken_lidar.root, ("lidar",), None, 0, broken_lidar.root / "cache", temporal=True, labels=False
     )

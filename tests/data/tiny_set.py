@@ -284,7 +284,7 @@ class DataSet:
 
 FIVE_HERTZ = TimelineConfig(
     interval_s=0.2, tolerance_s=0.06, history_stride=1, horizon_s=3.0, num_past_targets=1,
-    radial_speeds=RadialSpeeds.none,
+    scored_frames=1, score_stride=1, scored_rays=100, radial_speeds=RadialSpeeds.none,
 )  # fmt: skip
 
 

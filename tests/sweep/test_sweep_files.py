@@ -18,6 +18,8 @@ SCALES = sorted(path.stem for path in (CONF / "scale").glob("*.yaml"))
 FILES = list(sweep_files())
 QUESTIONS = [name for name in FILES if not load_sweep(name).is_search]
 REPORTED = CONF.parent.parent / "shared" / "spec" / "reported_numbers.json"
+LRS, LRS_REPORTED = "LRS4Fusion, ", REPORTED.with_name("lrs4fusion_reported.json")
+"""Sources of the second paper begin so."""
 
 METRIC_OF = {"latency_ms": "latency.gaussian_encoder", "FPS": "latency.fps", "mem_gb": "latency.memory_gb"}
 """Names of the reported numbers that are not the metric's own."""
@@ -65,10 +67,14 @@ def overrides_of(sweep, row):
     return [*sweep.overrides, *row.overrides]
 
 
+def reported(path):
+    if not path.is_file():
+        pytest.skip(f"{path} is absent: nothing to compare the paper's numbers with")
+    return json.loads(path.read_text())
+
+
 def reported_tables(source):
-    if not REPORTED.is_file():
-        pytest.skip(f"{REPORTED} is absent: nothing to compare the paper's numbers with")
-    tables = json.loads(REPORTED.read_text())["tables"]
+    tables = reported(REPORTED)["tables"]
     return {f"table{number}": tables[f"table{number}"] for number in re.findall(r"\d+", source or "")}
 
 
@@ -93,11 +99,12 @@ def numbers_of(entry):
 
 
 def test_every_table_of_results_has_its_sweep_and_only_one():
-    sources = [int(number) for name in FILES for number in re.findall(r"\d+", load_sweep(name).source or "")]
+    names = [source for source in (load_sweep(name).source or "" for name in FILES) if not source.startswith(LRS)]
+    sources = [int(number) for name in names for number in re.findall(r"\d+", name)]
     assert sorted(sources) == sorted(ALL_TABLES)
 
 
-@pytest.mark.parametrize("name", [name for name in QUESTIONS if name != OTHER_METHODS])
+@pytest.mark.parametrize("name", [name for name in QUESTIONS if name != OTHER_METHODS and not name.startswith("lrs_")])
 def test_paper_numbers_are_those_reported_for_the_rows_configuration(name):
     """The reported row is found by what the row configures, not by its label."""
     sweep = load_sweep(name)
@@ -115,6 +122,23 @@ def test_paper_numbers_are_those_reported_for_the_rows_configuration(name):
             assert config.backbone.name.value == "resnet50"
             found.append(table["rows"].index(entry))
         assert sorted(found) == list(range(len(table["rows"])))
+
+
+def test_numbers_of_the_second_paper_are_those_reported():
+    tables = reported(LRS_REPORTED)
+    history, pretraining = (load_sweep(f"lrs_{name}") for name in ("history", "pretraining"))
+    assert (history.source, pretraining.source) == (f"{LRS}Table 3", f"{LRS}Table 5")
+    areas = {"Short": "51.2 m around", "Full": "-100 to 250 m"}
+    wanted = {
+        f"ViDAR, {row['history_s']} s, {areas[row['range']]}": {key: row[key] for key in ("cd_1s", "cd_3s")}
+        for row in tables["table3_vidar_roi"]["rows"]
+    }
+    assert {row.label: row.paper for row in history.paper_rows} == wanted and not any(r.paper for r in history.rows)
+    ours = [row for row in tables["table5_longrange_detection"]["rows"] if row["method"].startswith("LRS4Fusion")]
+    assert ["w/o pre-train" in row["method"] for row in ours] == [True, False]
+    assert [row.paper for row in pretraining.rows] == [{"mAP": row["mAP_full"]} for row in ours]
+    configs = [build_config(tree_of("paper", overrides_of(pretraining, row))) for row in pretraining.rows]
+    assert [config.phase.init_from for config in configs] == [None, "lrs_occupancy"]
 
 
 def test_numbers_of_all_methods_are_those_reported():

@@ -120,6 +120,16 @@ def test_further_epochs_of_the_same_phase():
 
 
 @pytest.mark.slow
+def test_a_source_that_remembers_has_the_same_past():
+    """What is temporal is dropped for a source of single frames alone."""
+    past = ("data.past_frames=1", "data.timeline.history_stride=3", "model.temporal.max_age_s=2")
+    for phase in ("lrs_forecast", "lrs_detection"):
+        source, _ = source_of("model=lrs4fusion", f"phase={phase}", *past, "phase.epochs=3")
+        assert source.identity == identity("model=lrs4fusion", "phase=lrs_occupancy", *past)
+        assert source.overrides == ["phase=lrs_occupancy", "scale=debug", "model=lrs4fusion", *past]
+
+
+@pytest.mark.slow
 def test_a_file_counts_by_its_content(tmp_path):
     first, same, other = (tmp_path / name for name in ("a.ckpt", "b.ckpt", "c.ckpt"))
     first.write_bytes(b"weights"), same.write_bytes(b"weights"), other.write_bytes(b"others")

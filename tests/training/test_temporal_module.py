@@ -8,7 +8,7 @@ import torch
 
 from src.models.detector import Detector
 from src.training.module import TrainingModule
-from tests.training.toys import toy_batch, toy_module
+from tests.training.toys import ToyMemory, toy_batch, toy_module
 
 
 def past(module, batch):
@@ -86,6 +86,27 @@ def test_frames_with_a_past_remember_it_as_an_evaluation_would_and_nothing_else(
     assert torch.equal(output, module.model(batch, wanted)[0])
     module.forget_step(batch)
     module.eval()
+
+
+def test_the_last_frame_of_the_past_is_learnt_through_where_the_model_asks_for_it(module):
+    """In training alone; the frames before it are remembered as ever."""
+    seen = []
+
+    class Learner(type(module.model)):
+        trains_last_transition = True
+
+        def transition(self, batch, memory):
+            seen.append((self.training, torch.is_grad_enabled(), memory.values))
+            return ToyMemory(self.forward(batch, memory)[0])
+
+    module.model.__class__ = Learner
+    first, second, third = (toy_batch(None, None, number) for number in range(3))
+    wanted = module.remember((first, second))
+    assert not seen and not wanted.values.requires_grad
+    module.train()
+    memory = module.remember((first, second, third))
+    assert memory.values.requires_grad and module.model.training
+    assert seen[0][:2] == (True, True) and torch.equal(seen[0][2], wanted.values)
 
 
 def test_depth_and_age_of_the_memory_are_logged(module):
