@@ -38,7 +38,6 @@ from src.training.identity import run_identity
 from src.training.module import TrainingModule
 from src.training.result import print_result, run_record, show_finished
 from src.training.run_folder import Resume, RunFolder, write_json
-from src.training.snapshots import draw_frames
 from src.training.true_motion import Oracle
 from src.training.wandb import WandbRun
 
@@ -175,15 +174,13 @@ def run(
 
 
 def draw_pictures(config: Config, module: TrainingModule, datamodule: DetectionDataModule, folder: RunFolder) -> None:
-    """Learning curves, the evaluator's pictures, and where there are boxes some validation frames over the split."""
+    """Learning curves, and the evaluator's pictures of the scores and of some validation frames."""
     folder.pictures.mkdir(exist_ok=True)
     draw_curves(folder.pictures / "curves.png", curves_of(folder.metrics_csv), folder.run_id)
     module.evaluator.draw(folder.pictures, folder.run_id)
-    if not datamodule.labels:
-        return
     length = config.model.memory_frames + 1 if config.phase.temporal else 1
     clips = datamodule.validation_clips(config.trainer.num_pictures, length)
-    draw_frames(module.model, clips, config.grid.build(), folder.pictures)
+    module.evaluator.draw_frames(module.model, clips, config.grid.build(), folder.pictures)
 
 
 if __name__ == "__main__":

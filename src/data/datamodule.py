@@ -167,11 +167,14 @@ class DetectionDataModule(L.LightningDataModule):
         }
 
     def validation_clips(self, count: int, length: int) -> list[list[FrameBatch]]:
-        """Up to `count` clips that end at different frames spread evenly over the validation split, in stream 0.
+        """Up to `count` clips that end at different frames spread evenly over what validation reads, in stream 0.
 
-        A clip has `length` consecutive frames in batches of one, fewer where its scene begins later than that.
+        A clip has `length` consecutive frames in batches of one, fewer where its scene begins later than that; where
+        frames of the timeline bring their past along, that past and the frame.
         """
-        samples = split_samples(self.index, self.config.split)
+        samples = self._validated()
+        if self.config.timeline is not None and self.temporal and not self._in_streams:
+            return [[*frame.past, frame] for frame in self._in_order(_evenly_spread(samples, count))]
         scenes = self._scenes_of(samples)
         clips = []
         for sample in _evenly_spread(samples, count):
@@ -245,9 +248,7 @@ class DetectionDataModule(L.LightningDataModule):
 
     def val_dataloader(self) -> DataLoader:
         """Batches of the validation split, each frame once over all ranks: in table order, or scene by scene."""
-        samples = split_samples(self.index, self.config.split)
-        if self.reader.timeline is not None and self.config.num_future_frames:
-            samples = self._scored(samples)
+        samples = self._validated()
         rank, world_size = self._rank()
         if self._in_streams:
             schedule = whole_scenes(self._scenes_of(samples), self.config.batch_size, world_size)
@@ -255,8 +256,14 @@ class DetectionDataModule(L.LightningDataModule):
             schedule = frames_in_order(samples, self.config.batch_size)
         return self._loader(ScheduleSampler(lambda epoch: schedule, rank, world_size), None)
 
-    def _scored(self, samples: np.ndarray) -> np.ndarray:
-        """Of each scene some key frames that have the timeline's whole horizon ahead; raises DataError for none."""
+    def _validated(self) -> np.ndarray:
+        """The validation split; with rays, of each scene some key frames that have the timeline's whole horizon ahead.
+
+        Raises DataError where none has.
+        """
+        samples = split_samples(self.index, self.config.split)
+        if self.reader.timeline is None or not self.config.num_future_frames:
+            return samples
         timeline, scenes = self.reader.timeline, self.index.sample_scenes[samples]
         whole = np.array([timeline.is_whole(sample) for sample in samples])
         if not whole.any():

@@ -129,12 +129,11 @@ class LidarTimeline:
     ) -> list[int]:
         """Steps whose rays supervise (O18): 0, some of the past and `num_future` of those up to the horizon, drawn.
 
-        Only such as the scene has, so there may be fewer. Without `rng` 0 and those of the future that are scored.
+        Only such as the scene has, so there may be fewer. Without `rng` 0 and all of the future.
         """
-        if rng is None:
-            stride = self.config.score_stride
-            return [0, *self._existing(sample, range(stride, self.config.last_step + 1, stride))]
         future = self._existing(sample, range(1, self.config.last_step + 1))
+        if rng is None:
+            return [0, *future]
         past = self._existing(sample, self.config.history(num_history))
         draws = ((past, self.config.num_past_targets), (future, num_future))
         picked = [rng.choice(steps, min(count, len(steps)), replace=False) for steps, count in draws]

@@ -19,6 +19,11 @@ class WorldModel(ABC):
     def bounds(self) -> Bounds:
         """What it knows of."""
 
+    @property
+    @abstractmethod
+    def forecasts(self) -> bool:
+        """Whether it has learnt to say `forecast`."""
+
     @abstractmethod
     def look_up(
         self,

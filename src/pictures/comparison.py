@@ -30,13 +30,12 @@ class BarPanel:
     digits: int = 1
 
 
-def paint_groups(axes: Axes, panel: BarPanel) -> None:
+def paint_groups(axes: Axes, panel: BarPanel, colours: Mapping[str, str]) -> None:
     """Bars of all experiments side by side in each group, the interval as a whisker, the mean above it."""
     count = max(len(panel.bars), 1)
     width = 0.86 / count
     top = 0.0
-    for index, values in enumerate(panel.bars.values()):
-        colour = LINE_COLOURS[index % len(LINE_COLOURS)]
+    for index, (name, values) in enumerate(panel.bars.items()):
         for group, value in enumerate(values):
             place = group + (index - (count - 1) / 2) * width
             if value is None:
@@ -45,7 +44,7 @@ def paint_groups(axes: Axes, panel: BarPanel) -> None:
             mean, low, high = value
             end = max(mean, high)
             top = max(top, end)
-            axes.bar(place, mean, width * 0.88, color=colour)
+            axes.bar(place, mean, width * 0.88, color=colours[name])
             if high > low:
                 axes.vlines(place, low, high, color=INK, linewidth=1)
             axes.annotate(
@@ -60,6 +59,7 @@ def paint_groups(axes: Axes, panel: BarPanel) -> None:
 def draw_comparison(path: Path | str, panels: Sequence[BarPanel], title: str = "") -> None:
     """Write a PNG of panels of grouped bars, one below the other, under the keys of the experiments if several."""
     names = list(dict.fromkeys(name for panel in panels for name in panel.bars))
+    colours = {name: LINE_COLOURS[index % len(LINE_COLOURS)] for index, name in enumerate(names)}
     names = names if len(names) > 1 else []
     rows = int(np.ceil(len(names) / KEYS_PER_ROW))
     head = 50 + 24 * rows
@@ -67,10 +67,10 @@ def draw_comparison(path: Path | str, panels: Sequence[BarPanel], title: str = "
     canvas.text(12, 10, title, 20, bold=True)
     for row in range(rows):
         part = range(row * KEYS_PER_ROW, min((row + 1) * KEYS_PER_ROW, len(names)))
-        keys = [Patch(color=LINE_COLOURS[i % len(LINE_COLOURS)], label=names[i].replace("$", r"\$")) for i in part]
+        keys = [Patch(color=colours[names[i]], label=names[i].replace("$", r"\$")) for i in part]
         canvas.legend(12, 46 + 24 * row, keys)
     for index, panel in enumerate(panels):
         axes = canvas.axes(50, head + HEIGHT_PX * index + 40, SHEET_PX - 80, HEIGHT_PX - 80)
         style_axes(axes, panel.title)
-        paint_groups(axes, panel)
+        paint_groups(axes, panel, colours)
     canvas.save(path)

@@ -47,12 +47,12 @@ class Film:
         self._times_s.append(time_s)
 
     def write_animation(self, path: Path) -> None:
-        """Write a looping GIF at the frames' own rate; atomically."""
+        """Write a looping GIF, or by its name an animated PNG, at the frames' own rate; atomically."""
         steps = np.diff(self._times_s) * 1000
         steps = np.append(steps, steps[-1] if len(steps) else MAX_STEP_MS).clip(MIN_STEP_MS, MAX_STEP_MS)
         first, *others = self._pictures
         durations = [int(step) for step in steps.round()]
-        _write(path, first, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
+        _write(path, first, path.suffix[1:].upper(), save_all=True, append_images=others, duration=durations, loop=0)
 
     def write_strip(self, path: Path, count: int) -> None:
         """Write a PNG of up to `count` frames side by side, spread over the film; atomically."""

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self
 from torch import nn
 
 from src.data.datamodule import DetectionDataModule
+from src.geometry.bev_grid import BEVGrid
 from src.metrics.bootstrap import with_intervals
 from src.metrics.detection import DetectionScores, score_detections
 from src.metrics.diagnostics import FrameDiagnosis, diagnose
@@ -20,6 +21,7 @@ from src.pictures.comparison import BarPanel, draw_comparison
 from src.reliability.processes import gather_by_rank
 from src.structures.batch import FrameBatch
 from src.structures.detections import DetectionTable, EvaluationSet
+from src.training.snapshots import draw_frames
 
 SaveTable = Callable[[Path, list[str], DetectionTable], bool]
 """Writes the boxes of these samples as a submission; whether there were any."""
@@ -63,6 +65,10 @@ class Evaluator(nn.Module, ABC):
 
     def draw(self, folder: Path, title: str) -> None:
         """Pictures of the last scores."""
+
+    def draw_frames(self, model: Detector, clips: list[list[FrameBatch]], grid: BEVGrid, folder: Path) -> None:
+        """Pictures of what the model says at the end of each of some clips of consecutive validation frames."""
+        draw_frames(model, clips, grid, folder)
 
     def write(self, folder: Path, save: SaveTable) -> list[str]:
         """Files besides metrics.json that hold the last results; their names."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,16 +35,9 @@ def draw_frames(model: Detector, clips: Iterable[list[FrameBatch]], grid: BEVGri
     `frame_*` shows cameras, BEV, Gaussians and boxes; for a model with memory, which streams the clip, `memory_*`
     what it remembered. A model of single frames needs clips of one frame. Returns the paths.
     """
-    was_training, device = model.training, next(model.parameters()).device
-    model.eval()
     paths = []
-    for number, clip in enumerate(clips):
-        memory = None
-        for frame in clip:
-            batch = frame.to(device)
-            output, memory = model(batch, memory)
+    for name, batch, output in last_outputs(model, clips):
         (predictions,) = model.decode(output)
-        name = f"{number}_{re.sub('[^0-9A-Za-z_-]', '_', batch.tokens[0])[:12]}.png"
         evidence = model.evidence(output)
         scene = scene_of(batch, predictions, evidence, grid)
         title = f"Sample {batch.tokens[0][:12]}"
@@ -53,8 +47,21 @@ def draw_frames(model: Detector, clips: Iterable[list[FrameBatch]], grid: BEVGri
         if remembered is not None:
             paths.append(folder / f"memory_{name}")
             draw_memory(paths[-1], remembered, f"{title}: what was remembered")
-    model.train(was_training)
     return paths
+
+
+@torch.no_grad()
+def last_outputs(model: Detector, clips: Iterable[list[FrameBatch]]) -> Iterator[tuple[str, FrameBatch, Any]]:
+    """Of every clip the end of its pictures' names, its last frame on the model's device, and the model's output."""
+    was_training, device = model.training, next(model.parameters()).device
+    model.eval()
+    for number, clip in enumerate(clips):
+        memory = None
+        for frame in clip:
+            batch = frame.to(device)
+            output, memory = model(batch, memory)
+        yield f"{number}_{re.sub('[^0-9A-Za-z_-]', '_', batch.tokens[0])[:12]}.png", batch, output
+    model.train(was_training)
 
 
 def scene_of(

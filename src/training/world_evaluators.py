@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -15,20 +16,25 @@ from torch import Tensor
 
 from src.data.datamodule import DetectionDataModule
 from src.data.schema import DatasetIndex
+from src.data.timeline import TimelineConfig
 from src.data.true_geometry import TRUTH_FOLDER, TrueGeometry
 from src.errors import ConfigError
-from src.geometry.bounds import Bounds
+from src.geometry.bev_grid import BEVGrid
 from src.metrics.bootstrap import LEVEL, NUM_DRAWS, SEED, interval
 from src.metrics.diagnostics import ratios
 from src.metrics.forecast_text import format_forecast, format_occupancy
 from src.metrics.forecasting import HORIZONS_S, ForecastScores, median_errors, score_forecast, sums_by_sample
 from src.metrics.static_world import static_world, unseen
+from src.models.detector import Detector
 from src.models.world_model import WorldModel
+from src.pictures.world_picture import draw_horizons
 from src.reliability.processes import gather_by_rank
 from src.structures.batch import FrameBatch
 from src.structures.ray_bundle import RayBundle
 from src.targets.occupancy_rays import RaySampling, draw_rays, sample_queries
 from src.training.evaluator import Evaluator
+from src.training.ground_slice import GroundSlice, global_from_aug
+from src.training.world_snapshots import draw_world, farthest_m
 
 Array = np.ndarray
 
@@ -38,8 +44,8 @@ MOVING_MPS = 1.0
 """What is faster over ground moves."""
 TRUE_MARGIN_M = 0.3
 """Boxes are grown by it where it is asked what a measured point belongs to."""
-SLICE_REACH_M, SLICE_STEP_M, SLICE_HEIGHT_M = 50.0, 1.0, 1.0
-"""The true geometry is compared with on a lattice so far about the ego, so high above the ground."""
+SLICE_WINDOW, SLICE_CELL_M = ((-40.0, 40.0), (-40.0, 40.0)), 1.0
+"""Where the true geometry is compared with, above the ground."""
 SUBSETS = ("", "_moving", "_unseen")
 STATIC = "static_"
 
@@ -64,8 +70,10 @@ class WorldScores:
 class OccupancyEvaluator(Evaluator):
     """Occupancy along the rays that came, and on a slice of the true geometry, by time; radial velocities.
 
-    `iou@<t>s` is of places along rays, half of them occupied, `iou` of all times; `slice_iou@<t>s` of the lattice one
-    metre above the ground. `velocity_error_moving`: mean of |predicted - true| m/s where rays end on what moves.
+    `iou@<t>s` is of places along rays, half of them occupied, `iou` of all times; `slice_iou@<t>s` of a lattice one
+    metre above the ground, as far as it can be seen at the time. `velocity_error_moving`: mean of |predicted - true|
+    m/s where rays end on what moves.
+
     A sample that several processes saw counts once.
     """
 
@@ -74,9 +82,9 @@ class OccupancyEvaluator(Evaluator):
     labels: ClassVar[bool] = False
     logged: ClassVar[tuple[str, ...]] = ("iou", "velocity_error_moving", "velocity_median_moving")
 
-    def __init__(self, index: DatasetIndex, interval_s: float, num_rays: int) -> None:
+    def __init__(self, index: DatasetIndex, timeline: TimelineConfig) -> None:
         super().__init__()
-        self.index, self.interval_s, self.num_rays = index, interval_s, num_rays
+        self.index, self.timeline = index, timeline
         self.rows = {token: row for row, token in enumerate(index.sample_tokens.tolist())}
         self.found: dict[int, WorldScores] = {}  # by row of the sample
         self.content: dict[str, Any] | None = None
@@ -90,7 +98,7 @@ class OccupancyEvaluator(Evaluator):
             raise ConfigError(
                 "data.num_future_frames=0 or data.timeline=null: this phase learns from the rays of future LiDAR"
             )
-        return cls(datamodule.index, timeline.interval_s, timeline.scored_rays)
+        return cls(datamodule.index, timeline)
 
     def reset(self) -> None:
         """Forget what an earlier pass collected."""
@@ -102,8 +110,8 @@ class OccupancyEvaluator(Evaluator):
         parts = []
         for sample, row in enumerate(rows):
             generator = torch.Generator(batch.device).manual_seed(row)
-            own = batch.rays[batch.rays.batch == sample]
-            parts.append(draw_rays(own, model.bounds, self.num_rays, generator))
+            scored = (batch.rays.batch == sample) & (batch.rays.steps % self.timeline.score_stride == 0)
+            parts.append(draw_rays(batch.rays[scored], model.bounds, self.timeline.scored_rays, generator))
         batch = replace(batch, rays=RayBundle.join(parts))
         scores = [WorldScores() for _ in rows]
         self._score(model, output, batch, rows, scores)
@@ -121,7 +129,7 @@ class OccupancyEvaluator(Evaluator):
             rays, truth = batch.rays[among], self._truth_of(row)
             self._score_occupancy(model, output, rays, own, row)
             if truth is not None:
-                self._score_slice(model, output, batch, sample, truth, own, rays.steps.unique().tolist())
+                self._score_slice(model, output, batch, sample, rays, truth, own)
             speeds, moves = true_speeds(rays, batch, sample, truth)
             known &= moves is not None
             if moves is not None:
@@ -139,7 +147,7 @@ class OccupancyEvaluator(Evaluator):
         scores.add_iou("iou", found, queries.occupied)
         for step in queries.steps[queries.steps >= 0].unique().tolist():
             own = queries.steps == step
-            scores.add_iou(f"iou@{step * self.interval_s:.1f}s", found[own], queries.occupied[own])
+            scores.add_iou(f"iou@{step * self.timeline.interval_s:.1f}s", found[own], queries.occupied[own])
 
     def _score_slice(
         self,
@@ -147,25 +155,20 @@ class OccupancyEvaluator(Evaluator):
         output: Any,
         batch: FrameBatch,
         sample: int,
+        rays: RayBundle,  # of the sample
         truth: TrueGeometry,
         scores: WorldScores,
-        steps: list[int],
     ) -> None:
-        global_from_aug = _global_from_aug(batch, sample)
-        places = _lattice(model.bounds)
-        points = places @ global_from_aug[:3, :3].T + global_from_aug[:3, 3]
-        points[:, 2] = truth.origin[2] + truth.ground_height(points) + SLICE_HEIGHT_M
-        in_aug = torch.from_numpy((points - global_from_aug[:3, 3]) @ global_from_aug[:3, :3]).float()
-        low, high = torch.tensor(model.bounds).unbind(1)
-        inside = ((in_aug >= low) & (in_aug < high)).all(1)
-        points, in_aug = points[inside.numpy()], in_aug[inside]
-        owner = torch.full((len(points),), sample, device=batch.device)
-        for step in steps:
-            time_s = step * self.interval_s
-            at = torch.cat([in_aug, in_aug.new_full((len(in_aug), 1), time_s)], 1).to(batch.device)
-            found = model.look_up(output, at, owner)[0].cpu() > 0.5
-            times_us = np.full(len(points), round(1e6 * (float(batch.timestamps_s[sample]) + time_s)))
-            scores.add_iou(f"slice_iou@{time_s:.1f}s", found, torch.from_numpy(truth.solid(points, times_us)))
+        """Of what can be seen at the time, from where the rays begin: nobody learns what is hidden."""
+        places = GroundSlice.of(batch, sample, truth, model.bounds, SLICE_WINDOW, SLICE_CELL_M)
+        matrix = global_from_aug(batch, sample)
+        for step in rays.steps.unique().tolist():
+            time_s = step * self.timeline.interval_s
+            eye = matrix[:3, :3] @ rays.origins[rays.steps == step].double().mean(0).cpu().numpy() + matrix[:3, 3]
+            seen = torch.from_numpy(places.visible(truth, time_s, eye))
+            solid = torch.from_numpy(places.solid(truth, time_s))
+            found = model.look_up(output, *places.queries(time_s, batch.device))[0].cpu() > 0.5
+            scores.add_iou(f"slice_iou@{time_s:.1f}s", found & seen, solid & seen)
 
     def _score_velocity(
         self, model: WorldModel, output: Any, rays: RayBundle, speeds: Tensor, moves: Tensor, scores: WorldScores
@@ -201,7 +204,7 @@ class OccupancyEvaluator(Evaluator):
             numbers["velocity_median_moving"] = float(np.median(np.concatenate(errors)))
         for prefix in {prefix for row in rows for prefix in found[row].forecasts}:
             joined = ForecastScores.join([found[row].forecasts[prefix] for row in rows])
-            medians = median_errors(joined, self.interval_s)
+            medians = median_errors(joined, self.timeline.interval_s)
             numbers |= {f"{prefix}{name}": value for name, value in medians.items()}
         self.content = _plain(numbers) | {"intervals": self._intervals(sums, self.index.sample_scenes[rows])}
         shown = (name for name in (self.headline, *self.logged) if numbers.get(name) is not None)
@@ -227,6 +230,17 @@ class OccupancyEvaluator(Evaluator):
     def as_dict(self) -> dict[str, Any]:
         """Every number by its name, null where undefined, and `intervals`."""
         return self.content
+
+    def draw(self, folder: Path, title: str) -> None:
+        """Scores by time and distance."""
+        draw_horizons(folder / "horizons.png", self.content, title)
+
+    def draw_frames(self, model: Detector, clips: list[list[FrameBatch]], grid: BEVGrid, folder: Path) -> None:
+        """As `draw_world`, beside the true geometry where it is known."""
+        draw_world(model, clips, self._truth_by_token, self.timeline, folder)
+
+    def _truth_by_token(self, token: str) -> TrueGeometry | None:
+        return self._truth_of(self.rows[token])
 
     @staticmethod
     def describe(metrics: Mapping[str, Any]) -> str:
@@ -257,7 +271,7 @@ class ForecastEvaluator(OccupancyEvaluator):
             subsets["unseen"] = unseen(replace(batch, rays=rays), model.bounds)
         found = {
             "": model.forecast(output, rays),
-            STATIC: static_world(replace(batch, rays=rays), _farthest_m(model.bounds)),
+            STATIC: static_world(replace(batch, rays=rays), farthest_m(model.bounds)),
         }
         for sample, own in enumerate(scores):
             among = rays.batch == sample
@@ -266,7 +280,7 @@ class ForecastEvaluator(OccupancyEvaluator):
             for prefix, ranges in found.items():
                 forecast = score_forecast(rays[among], ranges[among], zeros, model.bounds, masks)
                 own.forecasts[prefix] = forecast
-                sums = sums_by_sample(forecast, 1, self.interval_s)
+                sums = sums_by_sample(forecast, 1, self.timeline.interval_s)
                 own.sums |= {f"{prefix}{name}": values[0] for name, values in sums.items()}
         return moving
 
@@ -298,30 +312,12 @@ def true_speeds(
     if truth is None:
         speeds = rays.speeds.cpu()
         return speeds, None if speeds.isnan().all() else speeds.abs() > MOVING_MPS
-    global_from_aug = _global_from_aug(batch, sample)
-    points = rays.points.double().cpu().numpy() @ global_from_aug[:3, :3].T + global_from_aug[:3, 3]
+    matrix = global_from_aug(batch, sample)
+    points = rays.points.double().cpu().numpy() @ matrix[:3, :3].T + matrix[:3, 3]
     times_s = float(batch.timestamps_s[sample]) + rays.times_s.double().cpu().numpy()
     velocities = truth.velocities(points, np.round(1e6 * times_s).astype(np.int64), TRUE_MARGIN_M)
-    along = ((velocities @ global_from_aug[:3, :3]) * rays.directions.double().cpu().numpy()).sum(1)
+    along = ((velocities @ matrix[:3, :3]) * rays.directions.double().cpu().numpy()).sum(1)
     return torch.from_numpy(along).float(), torch.from_numpy(np.linalg.norm(velocities, axis=1) > MOVING_MPS)
-
-
-def _global_from_aug(batch: FrameBatch, sample: int) -> Array:  # [4, 4]
-    matrix = batch.global_from_ego[sample] @ torch.linalg.inv(batch.aug_from_ego[sample].double())
-    return matrix.cpu().numpy()
-
-
-def _lattice(bounds: Bounds) -> Array:  # [n, 3] m, z 0
-    axes = [
-        np.arange(max(low, -SLICE_REACH_M) + 0.5 * SLICE_STEP_M, min(high, SLICE_REACH_M), SLICE_STEP_M)
-        for low, high in bounds[:2]
-    ]
-    x, y = (values.ravel() for values in np.meshgrid(*axes, indexing="ij"))
-    return np.stack([x, y, np.zeros_like(x)], 1)
-
-
-def _farthest_m(bounds: Bounds) -> float:
-    return float(np.linalg.norm(np.abs(bounds).max(axis=1)))
 
 
 def _plain(numbers: Mapping[str, float]) -> dict[str, float | None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from matplotlib.colors import to_hex
 from PIL import Image
 
 from src.pictures.canvas import Canvas
@@ -17,9 +18,12 @@ def test_bars_stand_side_by_side_with_their_intervals() -> None:
         BarPanel(
             "t", ["near", "far"], {"a": [(40.0, 32.0, 45.0), (20.0, 20.0, 20.0)], "b": [(50.0, 49.0, 51.0), None]}
         ),
+        {"a": "#112233", "b": "#445566"},
     )
     bars = sorted((patch.get_x(), patch.get_height()) for patch in axes.patches)
     assert [height for _, height in bars] == [40.0, 50.0, 20.0]
+    colours = [to_hex(patch.get_facecolor()) for patch in sorted(axes.patches, key=lambda p: p.get_x())]
+    assert colours == ["#112233", "#445566", "#112233"]
     ends = [patch.get_x() + patch.get_width() for patch in sorted(axes.patches, key=lambda p: p.get_x())]
     assert ends[0] < bars[1][0] and ends[1] < 0.5 < bars[2][0], "bars of a group do not overlap, nor groups"
     assert [text.get_text() for text in axes.texts] == ["40.0", "20.0", "50.0", "-"]

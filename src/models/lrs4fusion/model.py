@@ -200,6 +200,11 @@ class LRS4Fusion(Detector, WorldModel):
         """The region."""
         return tuple(zip(self.voxels.lower_m, self.voxels.upper_m, strict=True))
 
+    @property
+    def forecasts(self) -> bool:
+        """Of the stage `forecast` alone."""
+        return self.ray_head is not None
+
     @torch.no_grad()
     def look_up(self, output: LRSOutput, queries: Tensor, batch: Tensor) -> tuple[Tensor, Tensor | None]:
         """As in `WorldModel`."""

@@ -1,0 +1,82 @@
+"""Places at one height above the ground about the ego, in the frames that models and truths speak of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from src.data.true_geometry import TrueGeometry
+from src.geometry.bounds import Bounds
+from src.structures.batch import FrameBatch
+
+Array = np.ndarray
+
+Window = tuple[tuple[float, float], tuple[float, float]]
+"""From and to along x and along y, m."""
+HEIGHT_M = 1.0
+DEPTH_M = 2.0
+"""Matter is seen so far behind its face, and no further."""
+LOOK_STEPS = 50
+"""Places that are looked at between the eye and each place."""
+
+
+@dataclass
+class GroundSlice:
+    """n places HEIGHT_M above the ground about one sample of a batch, a square lattice cut to a model's bounds."""
+
+    in_aug: Tensor  # [n, 3] float32 m, frame of the sample
+    in_global: Array  # [n, 3] float64 m
+    sample: int
+    timestamp_s: float  # of the sample
+
+    @classmethod
+    def of(
+        cls,
+        batch: FrameBatch,
+        sample: int,
+        truth: TrueGeometry | None,  # that knows the ground; None: level ground under the ego
+        bounds: Bounds,
+        window: Window,
+        cell_m: float,
+    ) -> GroundSlice:
+        low, high = np.maximum([x[0] for x in window], [x[0] for x in bounds[:2]]), [x[1] for x in window]
+        high = np.minimum(high, [x[1] for x in bounds[:2]])
+        axes = [np.arange(start + 0.5 * cell_m, end, cell_m) for start, end in zip(low, high, strict=True)]
+        x, y = (values.ravel() for values in np.meshgrid(*axes, indexing="ij"))
+        matrix = global_from_aug(batch, sample)
+        in_global = np.stack([x, y, np.full_like(x, HEIGHT_M)], 1) @ matrix[:3, :3].T + matrix[:3, 3]
+        if truth is not None:
+            in_global[:, 2] = truth.origin[2] + truth.ground_height(in_global) + HEIGHT_M
+        in_aug = (in_global - matrix[:3, 3]) @ matrix[:3, :3]
+        inside = (in_aug[:, 2] >= bounds[2][0]) & (in_aug[:, 2] < bounds[2][1])
+        return cls(
+            torch.from_numpy(in_aug[inside]).float(), in_global[inside], sample, float(batch.timestamps_s[sample])
+        )
+
+    def queries(self, time_s: float, device: torch.device) -> tuple[Tensor, Tensor]:  # [n, 4], [n]
+        """As a world model is asked for them at a time after the sample's frame."""
+        times = self.in_aug.new_full((len(self.in_aug), 1), time_s)
+        owner = torch.full((len(self.in_aug),), self.sample, device=device)
+        return torch.cat([self.in_aug, times], 1).to(device), owner
+
+    def solid(self, truth: TrueGeometry, time_s: float) -> Array:  # [n] bool
+        """What is really there."""
+        times_us = np.full(len(self.in_global), round(1e6 * (self.timestamp_s + time_s)))
+        return truth.solid(self.in_global, times_us)
+
+    def visible(self, truth: TrueGeometry, time_s: float, eye: Array) -> Array:  # [n] bool
+        """Whether no more than DEPTH_M of matter lies before each place, seen from the eye [3] m (global axes)."""
+        away = self.in_global - eye
+        between = eye + np.linspace(0, 1, LOOK_STEPS, endpoint=False)[:, None, None] * away  # [steps, n, 3]
+        times_us = np.full(between[..., 0].size, round(1e6 * (self.timestamp_s + time_s)))
+        solid = truth.solid(between.reshape(-1, 3), times_us).reshape(LOOK_STEPS, -1)
+        return solid.mean(0) * np.linalg.norm(away, axis=1) <= DEPTH_M
+
+
+def global_from_aug(batch: FrameBatch, sample: int) -> Array:  # [4, 4]
+    """Of one sample."""
+    matrix = batch.global_from_ego[sample] @ torch.linalg.inv(batch.aug_from_ego[sample].double())
+    return matrix.cpu().numpy()

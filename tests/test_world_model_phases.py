@@ -1,0 +1,138 @@
+"""LRS4Fusion's three phases as commands at debug scale: no labels in the first two, strict handoff, kill and resume."""
+
+import json
+import os
+import shutil
+import signal
+import time
+
+import pytest
+import torch
+from PIL import Image
+
+from tests.running import call, fork, run_module
+
+pytestmark = pytest.mark.slow
+MODEL = ("model=lrs4fusion", "scale=debug", "trainer.num_pictures=0")
+
+
+@pytest.fixture(scope="module")
+def outputs(tmp_path_factory):
+    return tmp_path_factory.mktemp("outputs")
+
+
+@pytest.fixture(scope="module")
+def occupancy(outputs):
+    """The run of the first phase, which also wrote its world."""
+    call("train", *MODEL, "phase=lrs_occupancy", f"paths.outputs={outputs}")
+    return only(outputs, "lrs_occupancy")
+
+
+@pytest.fixture(scope="module")
+def world(occupancy, outputs):
+    (root,) = (outputs / "worlds").iterdir()
+    return root
+
+
+def only(outputs, phase):
+    (folder,) = outputs.glob(f"lrs4fusion-{phase}-debug-*")
+    return folder
+
+
+def weights(folder):
+    return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+
+
+def record(folder):
+    return json.loads((folder / "run.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def unlabelled(world, tmp_path_factory):
+    """The same world as recorded data that nobody has labelled."""
+    root = tmp_path_factory.mktemp("unlabelled") / "world"
+    labels = ("sample_annotation", "instance")
+    shutil.copytree(
+        world, root, ignore=shutil.ignore_patterns(*(f"{name}.json" for name in labels)), copy_function=os.link
+    )
+    return root
+
+
+def test_the_first_phase_writes_its_world_and_scores_occupancy(occupancy, world):
+    assert list(world.glob("s*s/LIDAR_LEFT")) and (world / "truth").is_dir()
+    found, run = json.loads((occupancy / "metrics.json").read_text()), record(occupancy)
+    assert (run["task"], run["headline"], run["initialized_from"]) == ("occupancy", "iou", None)
+    assert 0 < found["iou"] <= 1 and {"iou@0.0s", "iou@0.4s", "slice_iou@0.4s", "velocity_error_moving"} <= set(found)
+    assert not (occupancy / "submission.json").exists()
+
+
+def test_without_labels_a_forecast_learns_the_ray_head_alone(unlabelled, tmp_path):
+    places = ("trainer.num_pictures=1", "data.world=null", f"data.root={unlabelled}", f"paths.outputs={tmp_path}")
+    said = call("train", *MODEL, "phase=lrs_forecast", *places)  # the first phase before it
+    first, folder = only(tmp_path, "lrs_occupancy"), only(tmp_path, "lrs_forecast")
+    assert record(folder)["initialized_from"] == first.name and "static 1s" in said.stdout
+    before, after = weights(first), weights(folder)
+    assert before.keys() <= after.keys() and all(torch.equal(before[name], after[name]) for name in before)
+    assert {name.split(".")[1] for name in after.keys() - before.keys()} == {"ray_head"}
+    found = json.loads((folder / "metrics.json").read_text())
+    assert found["cd_1s"] > 0 and found["static_cd_1s"] > 0 and found["static_l1_median_1s"] > 0
+    assert found["cd_gain_1s"] == pytest.approx(1 - found["cd_1s"] / found["static_cd_1s"])
+    pictures = {path.name.partition("_")[0]: path for path in (folder / "pictures").glob("*.png")}
+    assert set(pictures) == {"curves.png", "horizons.png", "occupancy", "forecast", "film"}
+    assert Image.open(pictures["film"]).n_frames == 2  # the moments of 0.4 s
+    checkpoint = folder / "checkpoints" / "last.ckpt"
+    call("evaluate", f"checkpoint={checkpoint}", f"out={tmp_path / 'again'}", f"paths.outputs={tmp_path}")
+    assert json.loads((tmp_path / "again" / "metrics.json").read_text()) == found
+    failed = call("train", *MODEL, "phase=lrs_detection", *places, expect=4)
+    assert "sample_annotation" in failed.stderr
+
+
+def test_detection_begins_from_the_volume_with_a_new_head(occupancy, outputs):
+    said = call("train", *MODEL, "phase=lrs_detection", f"paths.outputs={outputs}")
+    folder = only(outputs, "lrs_detection")
+    assert record(folder)["initialized_from"] == occupancy.name
+    assert "mAP" in json.loads((folder / "metrics.json").read_text()) and "new:" in said.stderr
+    before, after = weights(occupancy), weights(folder)
+    assert {name.split(".")[1] for name in after.keys() - before.keys()} == {"neck", "head"}
+    frozen = [name for name in before if ".decoders." in name]
+    assert frozen and all(torch.equal(before[name], after[name]) for name in frozen)
+    assert not torch.equal(before["model.pointnet.linear.weight"], after["model.pointnet.linear.weight"])
+
+
+def test_a_source_of_another_region_is_refused(occupancy, outputs):
+    checkpoint = occupancy / "checkpoints" / "last.ckpt"
+    arguments = ("phase=lrs_forecast", f'phase.init_from="{checkpoint}"', f"paths.outputs={outputs}")
+    said = call("train", *MODEL, *arguments, "model.unet.point_channels=16", expect=3)
+    assert "unet" in said.stderr
+
+
+def test_a_killed_run_of_unlabelled_frames_ends_with_the_same_weights(unlabelled, tmp_path):
+    arguments = (*MODEL, "phase=lrs_occupancy", "phase.epochs=3", "data.batch_size=1")
+    arguments += ("data.world=null", f"data.root={unlabelled}")
+    whole, killed, said = tmp_path / "whole", tmp_path / "killed", tmp_path / "said"
+    call("train", *arguments, f"paths.outputs={whole}")
+    process = fork(run_module, "train", *arguments, f"paths.outputs={killed}", out=said, err=said)
+    deadline = time.monotonic() + 400
+    while not list(killed.glob("*/checkpoints/last.ckpt")):
+        assert time.monotonic() < deadline and process.is_alive(), said.read_text()[-2000:]
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.join()
+    assert not list(killed.glob("*/metrics.json"))
+    call("train", *arguments, f"paths.outputs={killed}")
+    first, second = (only(outputs, "lrs_occupancy") for outputs in (whole, killed))
+    wanted, found = weights(first), weights(second)
+    assert wanted.keys() == found.keys() and all(torch.equal(wanted[name], found[name]) for name in wanted)
+    assert (first / "metrics.json").read_text() == (second / "metrics.json").read_text()
+    assert record(second)["resumed"] and not record(first)["resumed"]
+
+
+def test_a_world_without_lidar_names_the_model_that_needs_it(world, tmp_path):
+    bare = tmp_path / "bare"
+    shutil.copytree(world, bare, ignore=shutil.ignore_patterns("LIDAR*", "CAMERA*", "RADAR*"))
+    (tables,) = {path.parent for path in bare.glob("*/sample_data.json")}
+    files = json.loads((tables / "sample_data.json").read_text())
+    (tables / "sample_data.json").write_text(json.dumps([row for row in files if "LIDAR" not in row["filename"]]))
+    arguments = (f"data.root={bare}", f"paths.outputs={tmp_path}")
+    said = call("train", *MODEL, "phase=lrs_occupancy", *arguments, expect=4)
+    assert "model=lrs4fusion reads lidar" in said.stderr
