@@ -1,5 +1,5 @@
 # `make help` lists the targets. Without an active environment, one is made in .venv and used.
-PHASE ?= 1
+MODEL ?=
 SCALE ?=
 CHECKPOINT ?=
 SWEEP ?=
@@ -12,7 +12,15 @@ STAMP := $(if $(ACTIVE),$(ACTIVE),.venv)/.horizon3d-installed
 TEST_STAMP := $(STAMP)-tests
 SCALE_ARG := $(if $(SCALE),scale=$(SCALE))
 INIT_ARG := $(if $(CHECKPOINT),'phase.init_from="$(CHECKPOINT)"')
-$(if $(filter 1 2,$(PHASE)),,$(error PHASE=$(PHASE): must be 1 or 2))
+ifeq ($(MODEL),lrs4fusion)  # all its phases, one after the other, or the one that PHASE names
+PHASES := $(if $(PHASE),lrs_$(PHASE),lrs_occupancy lrs_forecast lrs_detection)
+$(if $(and $(CHECKPOINT),$(word 2,$(PHASES))),$(error CHECKPOINT=$(CHECKPOINT): say which PHASE begins from it))
+else
+PHASE ?= 1
+PHASES := phase$(PHASE)
+endif
+$(if $(filter phase1 phase2 lrs_occupancy lrs_forecast lrs_detection,$(PHASES)),,$(error PHASE=$(PHASE): must be 1 or 2, or with MODEL=lrs4fusion occupancy, forecast or detection))
+MODEL_ARG := $(if $(MODEL),model=$(MODEL))
 
 .PHONY: help install world train sweep report dashboard benchmark performance test test-all test-faults audit check
 .DEFAULT_GOAL := help
@@ -36,14 +44,18 @@ install: $(STAMP) ## create .venv (unless an environment is active) and install 
 world: $(STAMP) ## write the synthetic highway (preview: ARGS="preview=true")
 	$(PYTHON) -m src.world $(SCALE_ARG) $(ARGS)
 
-train: $(STAMP) ## train PHASE=1|2 [CHECKPOINT=PATH] [SCALE=debug|mini|paper] [ARGS="optim.lr=2e-4 ..."]
-	$(PYTHON) -m src.train phase=phase$(PHASE) $(INIT_ARG) $(SCALE_ARG) $(ARGS)
+define TRAIN
+$(PYTHON) -m src.train $(MODEL_ARG) phase=$(1) $(INIT_ARG) $(SCALE_ARG) $(ARGS)
+
+endef
+train: $(STAMP) ## train PHASE=1|2 [MODEL=lrs4fusion: all its phases] [CHECKPOINT=PATH] [SCALE=debug|mini|paper] [ARGS="optim.lr=2e-4 ..."]
+	$(foreach phase,$(PHASES),$(call TRAIN,$(phase)))
 
 sweep: $(STAMP) ## train every row of SWEEP=epsilon and write its tables [ARGS="seeds=3 workers=2 dry_run=true"]
 	$(PYTHON) -m src.sweep +sweep=$(SWEEP) $(SCALE_ARG) $(ARGS)
 
 report: $(STAMP) ## everything finished into reports/: results, tables, pages, dashboard.html; shows the page of PHASE
-	$(PYTHON) -m src.report phase=phase$(PHASE) $(SCALE_ARG) $(ARGS)
+	$(PYTHON) -m src.report $(MODEL_ARG) phase=$(lastword $(PHASES)) $(SCALE_ARG) $(ARGS)
 
 dashboard: $(STAMP) ## sweeps and runs in the browser, on this machine [ARGS="port=8000" or ARGS="export=FILE"]
 	$(PYTHON) -m src.dashboard $(ARGS)

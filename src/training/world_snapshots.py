@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,6 @@ from src.pictures.world_picture import (
     draw_slices,
 )
 from src.structures.batch import FrameBatch
-from src.structures.ray_bundle import RayBundle
 from src.targets.occupancy_rays import draw_rays
 from src.training.ground_slice import HEIGHT_M, GroundSlice
 from src.training.snapshots import last_outputs
@@ -60,12 +59,13 @@ def draw_world(
         draw_slices(paths[-1], slices, title, HEIGHT_M)
         if not model.forecasts:
             continue
-        steps = {min(round(1.0 / timeline.interval_s), timeline.last_step), timeline.last_step}
-        moments = _moments(model, output, batch, steps, SHOWN_RAYS, timeline.interval_s)
+        last = timeline.last_step
+        steps = sorted({min(round(1.0 / timeline.interval_s), last), last})
+        moments = list(_moments(model, output, batch, steps, SHOWN_RAYS, timeline.interval_s))
         paths.append(folder / f"forecast_{name}")
         draw_forecast(paths[-1], moments, title)
         if name.startswith("0_"):
-            every = set(range(1, timeline.last_step + 1))
+            every = range(1, last + 1)
             paths.append(folder / f"film_{name}")
             _write_film(paths[-1], _moments(model, output, batch, every, FILM_RAYS, timeline.interval_s), title)
     return paths
@@ -88,25 +88,19 @@ def _slice(
 
 
 def _moments(
-    model: WorldModel, output: Any, batch: FrameBatch, steps: set[int], count: int, interval_s: float
-) -> list[ForecastMoment]:
-    """Of those steps that the scene has, in order; `count` rays each, the same at every call."""
-    wanted = torch.isin(batch.rays.steps, torch.tensor(sorted(steps), device=batch.device))
-    rays = draw_rays(batch.rays[wanted], model.bounds, count, torch.Generator(batch.device).manual_seed(0))
-    forecast = model.forecast(output, rays)
-    static = static_world(replace(batch, rays=rays), farthest_m(model.bounds))
-    return [_moment(rays, forecast, static, step, interval_s) for step in rays.steps.unique().tolist()]
+    model: WorldModel, output: Any, batch: FrameBatch, steps: Sequence[int], count: int, interval_s: float
+) -> Iterator[ForecastMoment]:
+    """Of those steps that the scene has; `count` rays each, the same at every call."""
+    for step in steps:
+        generator = torch.Generator(batch.device).manual_seed(step)
+        rays = draw_rays(batch.rays[batch.rays.steps == step], model.bounds, count, generator)
+        if len(rays):
+            static = static_world(replace(batch, rays=rays), farthest_m(model.bounds))
+            values = (rays.origins, rays.directions, rays.ranges, model.forecast(output, rays), static)
+            yield ForecastMoment(step * interval_s, *(value.cpu().numpy() for value in values))
 
 
-def _moment(
-    rays: RayBundle, forecast: torch.Tensor, static: torch.Tensor, step: int, interval_s: float
-) -> ForecastMoment:
-    own = rays.steps == step
-    values = (rays.origins, rays.directions, rays.ranges, forecast, static)
-    return ForecastMoment(step * interval_s, *(value[own].cpu().numpy() for value in values))
-
-
-def _write_film(path: Path, moments: Sequence[ForecastMoment], title: str) -> None:
+def _write_film(path: Path, moments: Iterable[ForecastMoment], title: str) -> None:
     film = Film()
     with tempfile.TemporaryDirectory() as folder:
         for moment in moments:

@@ -534,17 +534,37 @@ def test_without_phase_1_and_without_training_it(tmp_path):
     assert "Traceback" not in result.stderr and not (tmp_path / wanted).exists()
 
 
+def made_trainings(*arguments):
+    made = subprocess.run(["make", "-n", "train", *arguments], cwd=ROOT, capture_output=True, text=True, check=True)
+    return [shlex.split(line.split("src.train")[1]) for line in made.stdout.splitlines() if "src.train" in line]
+
+
+def test_make_trains_a_model_with_phases_of_its_own_in_all_of_them():
+    lines = made_trainings("MODEL=lrs4fusion", "SCALE=debug")
+    assert lines == [
+        ["model=lrs4fusion", f"phase=lrs_{n}", "scale=debug"] for n in ("occupancy", "forecast", "detection")
+    ]
+    sources = [compose_config(line)[0].phase.init_from for line in lines]
+    assert sources == [None, "lrs_occupancy", "lrs_occupancy"]
+    assert made_trainings("MODEL=lrs4fusion", "PHASE=forecast") == [["model=lrs4fusion", "phase=lrs_forecast"]]
+    assert made_trainings("MODEL=dense_bev") == [["model=dense_bev", "phase=phase1"]]
+    for wrong in ("PHASE=1", "CHECKPOINT=a.ckpt"):
+        made = subprocess.run(
+            ["make", "-n", "train", "MODEL=lrs4fusion", wrong], cwd=ROOT, capture_output=True, text=True
+        )
+        assert made.returncode == 2 and wrong in made.stderr
+
+
 def test_make_hands_the_checkpoint_on():
     def shown(*arguments):
-        made = subprocess.run(["make", "-n", *arguments], cwd=ROOT, capture_output=True, text=True, check=True)
-        (line,) = (line for line in made.stdout.splitlines() if "src.train" in line)
-        return shlex.split(line.split("src.train")[1])
+        (line,) = made_trainings(*arguments)
+        return line
 
     path = "/a folder/x=1, y/last.ckpt"
-    options = shown("train", "PHASE=2", f"CHECKPOINT={path}")
+    options = shown("PHASE=2", f"CHECKPOINT={path}")
     assert options[0] == "phase=phase2" and compose_config(options)[0].phase.init_from == path
-    assert shown("train", "PHASE=2", "SCALE=debug") == ["phase=phase2", "scale=debug"]
-    assert shown("train") == ["phase=phase1"]
+    assert shown("PHASE=2", "SCALE=debug") == ["phase=phase2", "scale=debug"]
+    assert shown() == ["phase=phase1"]
     for phase in ("", "3", "phase2"):
         wrong = subprocess.run(["make", "-n", "train", f"PHASE={phase}"], cwd=ROOT, capture_output=True, text=True)
         assert wrong.returncode == 2 and f"PHASE={phase}: must be 1 or 2" in wrong.stderr
