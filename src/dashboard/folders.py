@@ -25,6 +25,15 @@ CONFIG_BYTES = 1_000_000
 ALIVE_S = 300.0
 """A run folder without a result counts as running as long as something was written in it this recently."""
 
+FRAME_KINDS = {
+    "frame": "Cameras and bird's-eye view",
+    "memory": "Memory",
+    "film": "Forecast beside what came, moment by moment",
+    "forecast": "Forecast beside what came",
+    "occupancy": "Occupancy above the ground",
+}
+"""Pictures of a sample, in the order of pages; their names carry its number and the beginning of its token."""
+
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
@@ -42,14 +51,15 @@ class Picture:
     def title(self) -> str:
         """What it shows, by its name: frames carry the beginning of their sample's token."""
         kind, _, rest = self.path.stem.partition("_")
-        known = {"frame": "Cameras and bird's-eye view", "memory": "Memory", "curves": "Learning curves"}
+        known = FRAME_KINDS | {"curves": "Learning curves", "horizons": "Scores over time and distance"}
         words = known.get(kind, self.path.stem.replace("_", " ").capitalize())
-        return f"{words}, sample {rest.partition('_')[2]}" if kind in ("frame", "memory") and rest else words
+        return f"{words}, sample {rest.partition('_')[2]}" if kind in FRAME_KINDS and rest else words
 
     @property
     def order(self) -> tuple[int, str]:
         """Frames first, charts (which pages draw themselves) last."""
-        return ("frame", "memory").index(self.kind) if self.kind in ("frame", "memory") else 2, self.name
+        kinds = list(FRAME_KINDS)
+        return kinds.index(self.kind) if self.kind in kinds else len(kinds), self.name
 
     @property
     def kind(self) -> str:

@@ -122,7 +122,9 @@ class Scores(Errors):
 
 @with_config(OPEN)
 class OtherScores(TypedDict, extra_items=Measure | dict[str, Any] | None):
-    """metrics.json of another task: numbers by name are read, what is nested is not."""
+    """metrics.json of another task: numbers by name and their intervals are read, what else is nested is not."""
+
+    intervals: NotRequired[Intervals]
 
 
 @with_config(ANY_KEYS)
@@ -264,7 +266,8 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
     if is_detection:
         scores = _slim(from_json(metrics_path.read_bytes()))
     else:
-        scores = _numbers(scores, record.headline, metrics_path, remedy)
+        intervals = {"intervals": scores["intervals"]} if "intervals" in scores else {}
+        scores = _numbers(scores, record.headline, metrics_path, remedy) | intervals
     config = _read_config(run_folder / "config.yaml")
     latency_path = run_folder / "latency.json"
     latency = read_as(Latency, latency_path, "delete it and measure again") if latency_path.is_file() else None
@@ -302,10 +305,11 @@ def read_result(path: Path) -> RunResult:
         raise DataError(f"{path}: run_id must be {path.stem}, the file's name, but is {fields['run_id']}; {remedy}")
     if is_detection:
         numbers = _flat_scores(fields["metrics"])
-        if (found := fields["metrics"].get("intervals")) is not None:
-            fields |= {"intervals": _named(found["bounds"]), "scenes": found["scenes"]}
     else:
         numbers = _numbers(fields["metrics"], fields["headline"], path, remedy)
+    if (found := fields["metrics"].get("intervals")) is not None:
+        bounds = _named(found["bounds"]) if is_detection else found["bounds"]
+        fields |= {"intervals": bounds, "scenes": found["scenes"]}
     if (latency := fields["latency"]) is not None:
         numbers |= {f"latency.{part}": value for part, value in latency["ms"].items()}
         numbers |= {f"latency.{name}": latency[name] for name in ("fps", "memory_gb")}

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from src.report.comparisons import compare
 from src.report.escaping import as_code
-from src.report.metric_names import DETECTION, METRICS, RANGES, SPEEDS, Metric
+from src.report.metric_names import DETECTION, FORECASTS, METRICS, RANGES, SPEEDS, Metric
 from src.report.results import RunResult
 from src.report.sweep_file import MAX_COLUMNS
 from src.report.sweep_table import format_score
@@ -44,8 +44,11 @@ class Experiment:
 
 
 def metrics_of(run: RunResult) -> list[Metric]:
-    """What may be shown of a run: detection's metrics, or its own task's."""
-    return [METRICS.get(name, Metric(name, name)) for name in (METRICS if run.task == DETECTION else run.metrics)]
+    """What may be shown of a run: detection's metrics, or its own task's; of a world model's those that have a name."""
+    if run.task == DETECTION:
+        return list(METRICS.values())
+    named = [metric for name, metric in FORECASTS.items() if name in run.metrics]
+    return named or [METRICS.get(name, Metric(name, name)) for name in run.metrics]
 
 
 def group_runs(runs: list[RunResult], name_of: Callable[[RunResult], str | None]) -> list[Experiment]:

@@ -11,16 +11,17 @@ from torch import Tensor
 from src.data.true_geometry import TrueGeometry
 from src.geometry.bounds import Bounds
 from src.structures.batch import FrameBatch
+from src.structures.ray_bundle import RayBundle
 
 Array = np.ndarray
 
 Window = tuple[tuple[float, float], tuple[float, float]]
 """From and to along x and along y, m."""
 HEIGHT_M = 1.0
-DEPTH_M = 2.0
-"""Matter is seen so far behind its face, and no further."""
-LOOK_STEPS = 50
-"""Places that are looked at between the eye and each place."""
+SLACK_M = 0.5
+"""A ray tells of a place that it passes so far above or below."""
+DEPTH_M = 1.0
+"""It tells of matter so far behind the face that it met."""
 
 
 @dataclass
@@ -29,6 +30,7 @@ class GroundSlice:
 
     in_aug: Tensor  # [n, 3] float32 m, frame of the sample
     in_global: Array  # [n, 3] float64 m
+    cell_m: float
     sample: int
     timestamp_s: float  # of the sample
 
@@ -52,9 +54,8 @@ class GroundSlice:
             in_global[:, 2] = truth.origin[2] + truth.ground_height(in_global) + HEIGHT_M
         in_aug = (in_global - matrix[:3, 3]) @ matrix[:3, :3]
         inside = (in_aug[:, 2] >= bounds[2][0]) & (in_aug[:, 2] < bounds[2][1])
-        return cls(
-            torch.from_numpy(in_aug[inside]).float(), in_global[inside], sample, float(batch.timestamps_s[sample])
-        )
+        found, time_s = torch.from_numpy(in_aug[inside]).float(), float(batch.timestamps_s[sample])
+        return cls(found, in_global[inside], cell_m, sample, time_s)
 
     def queries(self, time_s: float, device: torch.device) -> tuple[Tensor, Tensor]:  # [n, 4], [n]
         """As a world model is asked for them at a time after the sample's frame."""
@@ -67,13 +68,24 @@ class GroundSlice:
         times_us = np.full(len(self.in_global), round(1e6 * (self.timestamp_s + time_s)))
         return truth.solid(self.in_global, times_us)
 
-    def visible(self, truth: TrueGeometry, time_s: float, eye: Array) -> Array:  # [n] bool
-        """Whether no more than DEPTH_M of matter lies before each place, seen from the eye [3] m (global axes)."""
-        away = self.in_global - eye
-        between = eye + np.linspace(0, 1, LOOK_STEPS, endpoint=False)[:, None, None] * away  # [steps, n, 3]
-        times_us = np.full(between[..., 0].size, round(1e6 * (self.timestamp_s + time_s)))
-        solid = truth.solid(between.reshape(-1, 3), times_us).reshape(LOOK_STEPS, -1)
-        return solid.mean(0) * np.linalg.norm(away, axis=1) <= DEPTH_M
+    def reached(self, rays: RayBundle) -> Array:  # [n] bool
+        """Places that rays of the sample passed or met: of others nobody learns what is there."""
+        low = self.in_aug[:, :2].min(0).values - 0.5 * self.cell_m
+        cells = ((self.in_aug[:, :2] - low) / self.cell_m).long()
+        rows = torch.full((cells.max(0).values + 1).tolist(), -1)
+        rows[cells[:, 0], cells[:, 1]] = torch.arange(len(cells))
+        found = torch.zeros(len(cells), dtype=torch.bool)
+        origins, directions = rays.origins.cpu(), rays.directions.cpu()
+        lengths = rays.ranges.cpu() + DEPTH_M
+        for away in torch.arange(0, float(lengths.max()) if len(rays) else 0.0, 0.5 * self.cell_m).tolist():
+            own = lengths > away
+            points = origins[own] + away * directions[own]
+            at = ((points[:, :2] - low) / self.cell_m).floor().long()
+            inside = ((at >= 0) & (at < torch.tensor(rows.shape))).all(1)
+            row = rows[at[inside, 0], at[inside, 1]]
+            near = (points[inside, 2] - self.in_aug[row, 2]).abs() <= SLACK_M
+            found[row[near & (row >= 0)]] = True
+        return found.numpy()
 
 
 def global_from_aug(batch: FrameBatch, sample: int) -> Array:  # [4, 4]

@@ -71,8 +71,8 @@ class OccupancyEvaluator(Evaluator):
     """Occupancy along the rays that came, and on a slice of the true geometry, by time; radial velocities.
 
     `iou@<t>s` is of places along rays, half of them occupied, `iou` of all times; `slice_iou@<t>s` of a lattice one
-    metre above the ground, as far as it can be seen at the time. `velocity_error_moving`: mean of |predicted - true|
-    m/s where rays end on what moves.
+    metre above the ground, as far as the rays of the time tell of it. `velocity_error_moving`: mean of
+    |predicted - true| m/s where rays end on what moves.
 
     A sample that several processes saw counts once.
     """
@@ -107,14 +107,15 @@ class OccupancyEvaluator(Evaluator):
     def update(self, model: WorldModel, output: Any, batch: FrameBatch) -> None:
         """Score every sample of a batch."""
         rows = [self.rows[token] for token in batch.tokens]
-        parts = []
-        for sample, row in enumerate(rows):
+        scores, parts = [WorldScores() for _ in rows], []
+        for sample, (row, own) in enumerate(zip(rows, scores, strict=True)):
             generator = torch.Generator(batch.device).manual_seed(row)
-            scored = (batch.rays.batch == sample) & (batch.rays.steps % self.timeline.score_stride == 0)
-            parts.append(draw_rays(batch.rays[scored], model.bounds, self.timeline.scored_rays, generator))
-        batch = replace(batch, rays=RayBundle.join(parts))
-        scores = [WorldScores() for _ in rows]
-        self._score(model, output, batch, rows, scores)
+            rays = (batch.rays.batch == sample) & (batch.rays.steps % self.timeline.score_stride == 0)
+            rays, truth = batch.rays[rays], self._truth_of(row)
+            parts.append(draw_rays(rays, model.bounds, self.timeline.scored_rays, generator))
+            if truth is not None:
+                self._score_slice(model, output, batch, sample, rays, truth, own)
+        self._score(model, output, replace(batch, rays=RayBundle.join(parts)), rows, scores)
         for row, own in zip(rows, scores, strict=True):
             self.found.setdefault(row, own)
 
@@ -128,8 +129,6 @@ class OccupancyEvaluator(Evaluator):
             among = batch.rays.batch == sample
             rays, truth = batch.rays[among], self._truth_of(row)
             self._score_occupancy(model, output, rays, own, row)
-            if truth is not None:
-                self._score_slice(model, output, batch, sample, rays, truth, own)
             speeds, moves = true_speeds(rays, batch, sample, truth)
             known &= moves is not None
             if moves is not None:
@@ -155,20 +154,17 @@ class OccupancyEvaluator(Evaluator):
         output: Any,
         batch: FrameBatch,
         sample: int,
-        rays: RayBundle,  # of the sample
+        rays: RayBundle,  # of the sample, all that came
         truth: TrueGeometry,
         scores: WorldScores,
     ) -> None:
-        """Of what can be seen at the time, from where the rays begin: nobody learns what is hidden."""
         places = GroundSlice.of(batch, sample, truth, model.bounds, SLICE_WINDOW, SLICE_CELL_M)
-        matrix = global_from_aug(batch, sample)
         for step in rays.steps.unique().tolist():
             time_s = step * self.timeline.interval_s
-            eye = matrix[:3, :3] @ rays.origins[rays.steps == step].double().mean(0).cpu().numpy() + matrix[:3, 3]
-            seen = torch.from_numpy(places.visible(truth, time_s, eye))
+            told = torch.from_numpy(places.reached(rays[rays.steps == step]))
             solid = torch.from_numpy(places.solid(truth, time_s))
             found = model.look_up(output, *places.queries(time_s, batch.device))[0].cpu() > 0.5
-            scores.add_iou(f"slice_iou@{time_s:.1f}s", found & seen, solid & seen)
+            scores.add_iou(f"slice_iou@{time_s:.1f}s", found & told, solid & told)
 
     def _score_velocity(
         self, model: WorldModel, output: Any, rays: RayBundle, speeds: Tensor, moves: Tensor, scores: WorldScores

@@ -33,6 +33,12 @@ def test_pictures_have_their_size_and_torn_ones_are_left_out(world, folders):
     pictures = folders.pictures(world.run_id(0, 0))
     assert [(p.name, p.width, p.height) for p in pictures] == [("frame_0_abc.png", 320, 240), ("curves.png", 320, 240)]
     assert pictures[0].title == "Cameras and bird's-eye view, sample abc"
+    for name in ("occupancy_0_abc", "film_0_abc", "horizons"):
+        (folder / f"{name}.png").write_bytes(whole)
+    pictures = folders.pictures(world.run_id(0, 0))
+    assert [p.kind for p in pictures] == ["frame", "film", "occupancy", "curves", "horizons"]
+    assert pictures[1].title == "Forecast beside what came, moment by moment, sample abc"
+    assert pictures[4].title == "Scores over time and distance"
 
 
 def test_nothing_outside_the_folders_is_found(world, folders):

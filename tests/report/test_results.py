@@ -275,11 +275,14 @@ def other_task(folder, **metrics):
 
 
 def test_a_run_of_another_task_has_the_numbers_it_has(write_run, reports):
-    folder = other_task(write_run("a", [], 0, 0.3), IoU=1, recall=0.25, lanes=None, classes={"car": float("nan")})
+    bounds = {"scenes": 3, "bounds": {"IoU": [0.5, 1.5], "of_another_name": [0.0, 1.0]}, "level": 0.95}
+    numbers = {"IoU": 1, "recall": 0.25, "lanes": None, "classes": {"car": float("nan")}, "intervals": bounds}
+    folder = other_task(write_run("a", [], 0, 0.3), **numbers)
     path = publish_result(folder, reports)
     result = read_result(path)
     assert (result.task, result.headline) == ("segmentation", "IoU")
     assert result.metrics == {"IoU": 1.0, "recall": 0.25, "lanes": None}
+    assert result.intervals["IoU"] == [0.5, 1.5] and result.scenes == 3
     damage(path, lambda content: content.update(task="detection"))
     with pytest.raises(DataError, match="metrics.mAP is missing"):
         read_result(path)

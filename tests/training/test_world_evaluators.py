@@ -148,10 +148,10 @@ def test_the_true_geometry_tells_what_moves_and_what_is_solid(tmp_path):
     bearings = torch.linspace(-0.5, 0.5, 41)
     assert found["velocity_error_moving"] == pytest.approx(float((5 * bearings.cos() - 4).abs().mean()), abs=0.05)
     assert found["velocity_error_standing"] is None
-    # 20 to 40 m are said to be matter and 20 to 30 m are, but nobody sees deeper than 2 m.
+    # 20 to 40 m are said to be matter and 20 to 30 m are, but no ray tells of what lies deeper than a metre.
     assert found["slice_iou@0.0s"] == found["slice_iou@1.0s"] == 1
     early, _, _ = scores_of(OccupancyEvaluator, Wall(scale=0.8), batch, tmp_path)
-    assert 0.2 < early["slice_iou@0.0s"] < 0.4  # 4 m of free space and 2 m of the wall
+    assert 0.05 < early["slice_iou@0.0s"] < 0.3  # 4 m of free space and 1 m of the wall
     assert found["cd_moving_3s"] == pytest.approx(0, abs=1e-8) and found["static_cd_moving_3s"] > 1
 
 
