@@ -28,9 +28,12 @@ class DecoderConfig:
     num_blocks: int
     neighbours: list[int]  # voxels that a point sees in V1 .. V4: 1, its own, or 7, with those at its faces
     velocity: bool  # a decoder of radial velocity, where there is something to supervise it
+    velocity_unit_mps: float  # in which the network states it
 
     def __post_init__(self) -> None:
         require_least(self, "model.decoders", {"hidden_channels": 1, "num_blocks": 1})
+        if not self.velocity_unit_mps > 0:
+            raise ConfigError(f"model.decoders.velocity_unit_mps={self.velocity_unit_mps}: must be above 0")
         if len(self.neighbours) != NUM_SCALES or not set(self.neighbours) <= {1, len(OFFSETS)}:
             raise ConfigError(
                 f"model.decoders.neighbours={self.neighbours}: must list 1 or {len(OFFSETS)} for each of the "
@@ -60,6 +63,7 @@ class Decoders(nn.Module):
         width = self.sampler.out_channels
         self.occupancy = QueryHead(width, hidden, config.num_blocks)
         self.velocity = QueryHead(width, hidden, config.num_blocks) if config.velocity else None
+        self.velocity_unit_mps = config.velocity_unit_mps
         if self.velocity is not None:
             nn.init.zeros_(self.velocity.output.weight)  # untrained, everything rests
             nn.init.zeros_(self.velocity.output.bias)
@@ -67,7 +71,8 @@ class Decoders(nn.Module):
     def forward(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> tuple[Tensor, Tensor | None]:  # [Q], [Q]
         """What both heads say, the second None where there is none, from one look into the volumes."""
         place, seen = self.sampler(volumes, queries, batch)
-        return self.occupancy(place, seen), None if self.velocity is None else self.velocity(place, seen)
+        speeds = None if self.velocity is None else self.velocity_unit_mps * self.velocity(place, seen)
+        return self.occupancy(place, seen), speeds
 
     def occupancy_logits(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> Tensor:  # [Q]
         """Logits of the probability that a place is occupied."""
@@ -80,7 +85,7 @@ class Decoders(nn.Module):
         """
         if self.velocity is None:
             raise ConfigError("model.decoders.velocity=false: this model predicts no velocities")
-        return self.velocity(*self.sampler(volumes, queries, batch))
+        return self.velocity_unit_mps * self.velocity(*self.sampler(volumes, queries, batch))
 
 
 class QuerySampler(nn.Module):

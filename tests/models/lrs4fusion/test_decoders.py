@@ -15,6 +15,7 @@ WIDTHS = (3, 4, 5, 6)
 
 def settings(**changes):
     values = {"hidden_channels": 8, "num_blocks": 2, "neighbours": [7, 7, 1, 1], "velocity": True}
+    values["velocity_unit_mps"] = 10.0
     return DecoderConfig(**(values | changes))
 
 
@@ -103,6 +104,17 @@ def test_autocast_changes_nothing():
 def test_without_velocity_there_is_one_head():
     model, (q, batch) = decoders(velocity=False), queries(5)
     assert model.velocity is None and model(volumes(), q, batch)[1] is None
+
+
+def test_velocities_are_stated_in_a_unit():
+    """Together with the occupancy and alone; of the same weights."""
+    tens, ones, (q, batch) = decoders(), decoders(velocity_unit_mps=1.0), queries(20)
+    for model in (tens, ones):
+        torch.nn.init.constant_(model.velocity.output.bias, 0.5)
+    torch.testing.assert_close(tens(volumes(), q, batch)[1], 10 * ones(volumes(), q, batch)[1])
+    torch.testing.assert_close(tens.velocities(volumes(), q, batch), tens(volumes(), q, batch)[1])
+    with pytest.raises(ConfigError, match="velocity_unit_mps=0.0: must be above 0"):
+        settings(velocity_unit_mps=0.0)
 
 
 @pytest.mark.parametrize("neighbours", [[7, 7, 1], [7, 7, 1, 3]])
