@@ -99,6 +99,18 @@ def test_detection_begins_from_the_volume_with_a_new_head(occupancy, outputs):
     assert not torch.equal(before["model.pointnet.linear.weight"], after["model.pointnet.linear.weight"])
 
 
+def test_pages_show_every_phase_with_its_command(occupancy, outputs, tmp_path):
+    """The default model does not have these phases."""
+    call("report.__main__", *MODEL[:2], "phase=lrs_detection", f"paths.outputs={outputs}", f"paths.reports={tmp_path}")
+    for phase, page, words in (
+        ("lrs_detection", "lrs_detection", "mAP, %"),
+        ("lrs_occupancy", "lrs_occupancy_occupancy", "IoU above the ground at 0 s, %"),
+    ):
+        text = (tmp_path / f"{page}_debug.md").read_text()
+        assert f"python -m src.train phase={phase} scale=debug model=lrs4fusion" in text and words in text
+    assert "Scores over time and distance" in (tmp_path / "dashboard.html").read_text()
+
+
 def test_a_source_of_another_region_is_refused(occupancy, outputs):
     checkpoint = occupancy / "checkpoints" / "last.ckpt"
     arguments = ("phase=lrs_forecast", f'phase.init_from="{checkpoint}"', f"paths.outputs={outputs}")

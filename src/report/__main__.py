@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from src.config import PHASES, Config, compose_config
-from src.errors import DataError
+from src.errors import ConfigError, DataError
 from src.files.atomic_write import write_whole
 from src.pictures.comparison import BarPanel, draw_comparison
 from src.reliability.command import run_command
@@ -84,8 +85,10 @@ def write_pages(
     Of another task than detection: `<phase>_<task>_<scale>.md`.
     """
     pages, faults = {}, []
-    with_settings = {result.phase for result in results.values() if result.settings} & set(PHASES)
-    defaults = {phase: compose_config([f"scale={config.scale}", f"phase={phase}"])[1] for phase in with_settings}
+    with_settings = {result.phase: result.model for result in results.values() if result.settings}
+    defaults = {
+        phase: defaults_of(config.scale, phase, model) for phase, model in with_settings.items() if phase in PHASES
+    }
     detection = [run for run in results.values() if run.task == DETECTION]
     groups = {phase: runs_on_page(detection, phase, in_sweeps, defaults) for phase in PHASES}
     for run in results.values():
@@ -99,6 +102,15 @@ def write_pages(
                 kept = f"{config.paths.reports}/results"
                 faults.append(f"{kept}: {error}; keep results on different data in different paths.reports")
     return pages, faults
+
+
+def defaults_of(scale: str, phase: str, model: str) -> dict[str, Any]:
+    """Of a run without settings; where the default model lacks the phase, of `model`, whose name stays a setting."""
+    choices = [f"scale={scale}", f"phase={phase}"]
+    try:
+        return compose_config(choices)[1]
+    except ConfigError:
+        return compose_config([*choices, f"model={model}"])[1] | {"model": {}}
 
 
 def write_page(reports: Path, name: str, scale: str, runs: list[RunResult]) -> Path:

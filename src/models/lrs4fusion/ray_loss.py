@@ -18,6 +18,8 @@ from src.models.detector import Objective
 from src.structures.ray_bundle import RayBundle
 from src.targets.occupancy_rays import RaySampling, draw_rays, sample_queries
 
+MOVING_MPS = 1.0
+
 Answer = Callable[[Tensor, Tensor], tuple[Tensor, Tensor | None]]
 """Queries [Q, 4] and their samples [Q] to logits [Q] and radial velocities [Q] m/s."""
 
@@ -30,17 +32,19 @@ class LRSLossConfig(LossWeights):
     box_weight: float | None
     occupancy_weight: float  # w_o
     velocity_weight: float | None  # w_v
+    moving_weight: float  # of the error of what is measured to move faster than MOVING_MPS, within the mean
     range_weight: float
     rays_per_frame: int  # rays of each sample and target time that the ray head learns from
     sampling: RaySampling
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_least(self, "model.loss", {"rays_per_frame": 1})
+        require_least(self, "model.loss", {"rays_per_frame": 1, "moving_weight": 1})
 
 
 def occupancy_objective(answer: Answer, rays: RayBundle, bounds: Bounds, config: LRSLossConfig) -> Objective:
-    """Weighted terms `occupancy` and `velocity`, each a mean over its queries (eq. 14 and 15, O20).
+    """Weighted terms `occupancy` and `velocity`, each a mean over its queries (eq. 14 and 15, O20), in the second what
+    moves with a weight of its own.
 
     A free query has speed 0. Where no return of the batch has a known speed these alone would teach that everything
     stands, so the term is 0.
@@ -56,8 +60,9 @@ def occupancy_objective(answer: Answer, rays: RayBundle, bounds: Bounds, config:
         "known_speeds": known.sum() / queries.occupied.sum().clamp(min=1),
     }
     if config.velocity_weight is not None and speeds is not None:
-        errors = masked_l1(speeds, queries.speeds)
-        valid = mean_over_ranks((~queries.speeds.isnan()).sum())
+        weights = 1 + (config.moving_weight - 1) * (queries.speeds.abs() > MOVING_MPS)
+        errors = weights * masked_l1(speeds, queries.speeds)
+        valid = mean_over_ranks(weights[~queries.speeds.isnan()].sum())
         terms["velocity"] = config.velocity_weight * known.any() * errors.sum() / valid
     return Objective(terms, counts)
 

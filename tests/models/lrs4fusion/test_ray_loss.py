@@ -48,6 +48,18 @@ def test_unknown_speeds_count_neither_as_error_nor_in_the_mean():
     assert terms["velocity"] == pytest.approx(float((2 * known + free) / (known + free)))
 
 
+def test_what_moves_has_its_own_weight_within_the_mean():
+    rays = rays_along_x([20.0] * 8, torch.tensor([3.0, 0.5] * 4))
+    torch.manual_seed(0)
+    counted = occupancy_objective(perfect(1.0), rays, BOUNDS, settings(moving_weight=1.0))[0]["velocity"]
+    torch.manual_seed(0)
+    found = occupancy_objective(perfect(1.0), rays, BOUNDS, settings(moving_weight=9.0))[0]["velocity"]
+    # Errors: 2 of n that move, 0.5 of 256 - n that crawl, 1 of 256 free ones.
+    n = (512 * float(counted) - 256 * 1.5) / 1.5
+    assert n == pytest.approx(round(n), abs=1e-2) and 90 < n < 166
+    assert found == pytest.approx((9 * 2 * n + 0.5 * (256 - n) + 256) / (512 + 8 * n), rel=1e-4)
+
+
 def test_free_space_alone_teaches_no_speed():
     speed = torch.tensor(2.0, requires_grad=True)
     answer = lambda queries, batch: (queries[:, 0], speed.expand(len(queries)))  # noqa: E731
@@ -92,6 +104,7 @@ def test_rays_are_drawn_without_replacement_from_each_sample_and_time():
     ("change", "message"),
     [
         ("rays_per_frame=0", r"model.loss.rays_per_frame"),
+        ("moving_weight=0.5", r"model.loss.moving_weight"),
         ("sampling.num_queries=3", r"model.loss.sampling.num_queries=3: must be even"),
         ("sampling.depth_m=0", r"model.loss.sampling.depth_m=0.0: must be above 0"),
     ],
