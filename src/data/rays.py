@@ -14,6 +14,9 @@ Array = np.ndarray
 RADAR_RADIUS_M = 2.0
 RADAR_WINDOW_S = 0.06
 """A radar return tells the speed of a LiDAR return that is no further in xy and in time (lrs 2.5)."""
+RADAR_LEAST_HEIGHT_M = 0.3
+"""And that is not lower than this above the ego's ground: the height of a radar return is noise, and the road beside a
+car would drive along, a third of all that seems to move [ours]."""
 MAX_RADIAL_MPS = 60.0
 """Faster returns are ambiguous Doppler (lrs 2.5)."""
 EGO_BODY_M = np.array([[-12.0, -1.5, 0.3], [6.0, 1.5, 4.3]])
@@ -58,11 +61,16 @@ def radar_speeds(
     rays: RayBundle,
     radar_points: Array,  # [P, 7] in the order of RADAR_POINT_FIELDS, same frame, moved by nothing of their own
 ) -> Array:  # [R] m/s, NaN where no return is near
-    """Along each ray the velocity of the radar return nearest to its end in xy, within RADAR_RADIUS_M and _WINDOW_S."""
+    """Along each ray the velocity of the radar return nearest to its end in xy, within RADAR_RADIUS_M and _WINDOW_S.
+
+    NaN too for what lies below RADAR_LEAST_HEIGHT_M.
+    """
     speeds, ends = np.full(len(rays), np.nan), rays.points.double().numpy()
     sound = np.hypot(radar_points[:, 4], radar_points[:, 5]) <= MAX_RADIAL_MPS
     radar_points = radar_points[sound]
-    ray, point, squared = neighbours_within(ends[:, :2], radar_points[:, :2], RADAR_RADIUS_M)
+    high = np.flatnonzero(ends[:, 2] >= RADAR_LEAST_HEIGHT_M)
+    ray, point, squared = neighbours_within(ends[high, :2], radar_points[:, :2], RADAR_RADIUS_M)
+    ray = high[ray]
     # `dt` is the key frame's time less the point's, a ray's time that of its return less the key frame's.
     timely = np.abs(rays.times_s.double().numpy()[ray] + radar_points[point, 6]) <= RADAR_WINDOW_S
     ray, point, squared = ray[timely], point[timely], squared[timely]

@@ -222,14 +222,15 @@ def bundle(points, times_s):
 
 
 def test_a_radar_return_beside_a_ray_tells_its_speed():
-    rays = bundle([[30, 0, 1], [30, 0, 1], [30, 3.1, 1], [0, 50, 1], [0, 80, 0]], [0.0, 0.2, 0.0, 0.0, 0.0])
+    ends = [[30, 0, 1], [30, 0, 1], [30, 3.1, 1], [0, 50, 1], [0, 80, 1], [30, 0, 0.2]]  # the last on the road
+    rays = bundle(ends, [0.0, 0.2, 0.0, 0.0, 0.0, 0.0])
     radar = np.zeros((5, 7))  # x, y, z, rcs, vx, vy, dt
     radar[0, [0, 1, 4]] = [31.5, 0, 12.0]
     radar[1, [0, 1, 4]] = [30, 1.2, -7.0]  # nearer
     radar[2, [0, 1, 5]] = [0, 51, 61.0]  # ambiguous
-    radar[3, [0, 1, 2, 5]] = [0, 81, 9, 5.0]  # heights do not count
+    radar[3, [0, 1, 2, 5]] = [0, 81, 9, 5.0]  # the radar's height does not count
     radar[4, [0, 1, 4, 6]] = [30, 0.1, 99, 0.061]  # too fast and of another time
-    expected = [-7 * 30 / np.hypot(30, 1), np.nan, -7 * 30 / rays.ranges[2], np.nan, 5]
+    expected = [-7 * 30 / np.hypot(30, 1), np.nan, -7 * 30 / rays.ranges[2], np.nan, 5 * 80 / np.hypot(80, 1), np.nan]
     np.testing.assert_allclose(radar_speeds(rays, radar), expected, rtol=1e-5)
 
 
