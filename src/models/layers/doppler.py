@@ -18,6 +18,8 @@ WINDOW_CELLS = 2
 BIN_MPS = 6.0
 NUM_BINS = 31
 """Bins of radial speed, which keep a mover, what stands beside it and an aliased value apart."""
+NEAR_BINS = 2
+"""How far a prediction may be from the measured value it takes: 12 to 18 m/s, less than an aliased value is off."""
 MIN_SPEED_MPS = 0.5
 """Below it a velocity is noise whose direction says nothing; the line of sight is then that from the ego's origin."""
 
@@ -78,14 +80,15 @@ class Doppler:
     ) -> Tensor:  # [n, 2]
         """The velocities with the measured radial part that is nearest to theirs; as they are where none is near.
 
-        Near is the own bin of radial speed or the next. The gradient passes as if nothing had been replaced, so that
-        the radial part is learnt as far as it leads to a wrong measurement or to none.
+        Near is within NEAR_BINS of the own bin of radial speed. The gradient passes as if nothing had been replaced,
+        so that the radial part is learnt as far as it leads to a wrong measurement or to none.
         """
         with torch.no_grad():
             row, col = torch.div(cells, self.grid.cols, rounding_mode="floor") % self.grid.rows, cells % self.grid.cols
             sight = F.normalize(self.grid.centre_of(torch.stack([row, col], dim=1)), dim=1)
-            bins = _bin_of((velocities * sight).sum(dim=1))[:, None] + torch.arange(-1, 2, device=cells.device)
-            rows = rows_of_keys(self.keys, cells[:, None] * NUM_BINS + bins.clamp(0, NUM_BINS - 1))  # [n, 3]
+            near = torch.arange(-NEAR_BINS, NEAR_BINS + 1, device=cells.device)
+            bins = _bin_of((velocities * sight).sum(dim=1))[:, None] + near
+            rows = rows_of_keys(self.keys, cells[:, None] * NUM_BINS + bins.clamp(0, NUM_BINS - 1))  # [n, 5]
             measured = F.embedding(rows.where(rows >= 0, len(self.keys)), F.pad(self.velocities, (0, 0, 0, 1)))
             miss = ((measured - velocities[:, None]) * sight[:, None]).sum(dim=2).abs()
             best = miss.where(rows >= 0, torch.inf).argmin(dim=1, keepdim=True)  # [n, 1]
