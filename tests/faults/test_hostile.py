@@ -391,7 +391,7 @@ def test_a_cached_table_is_numbers_and_nothing_else(tmp_path, monkeypatch, caplo
     folder = tmp_path / "root" / "v1"
     folder.mkdir(parents=True)
     built = object()
-    monkeypatch.setattr(cache, "build_index", lambda root, version: built)
+    monkeypatch.setattr(cache, "build_index", lambda root, version, labels: built)
     monkeypatch.setattr(cache, "_write", lambda path, index: None)
     path = tmp_path / "cache" / f"tables-v1-{cache._digest(folder)}.npz"
     path.parent.mkdir()
