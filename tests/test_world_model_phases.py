@@ -91,7 +91,9 @@ def test_detection_begins_from_the_volume_with_a_new_head(occupancy, outputs):
     said = call("train", *MODEL, "phase=lrs_detection", f"paths.outputs={outputs}")
     folder = only(outputs, "lrs_detection")
     assert record(folder)["initialized_from"] == occupancy.name
-    assert "mAP" in json.loads((folder / "metrics.json").read_text()) and "new:" in said.stderr
+    found = json.loads((folder / "metrics.json").read_text())
+    assert "mAP" in found and "new:" in said.stderr and "long range (m)" in said.stdout
+    assert list(found["long_range"]["ranges"]) == ["0-50", "50-150", "150-250"]
     before, after = weights(occupancy), weights(folder)
     assert {name.split(".")[1] for name in after.keys() - before.keys()} == {"neck", "head"}
     frozen = [name for name in before if ".decoders." in name]
