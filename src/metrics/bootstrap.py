@@ -8,7 +8,7 @@ to end. (Where predictions have equal scores, those of a scene's copies stand to
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,19 +60,29 @@ def with_intervals(scores: DetectionScores) -> dict[str, object]:
     These hold `scenes`, `draws`, `level` and `bounds`, [low, high] of a number by its path, as in `ranges.0-25.mAP`.
     A number without any is undefined; a single scene says nothing of others, so there are no bounds at all.
     """
-    num_scenes = len(np.unique(scores.parts.ranking.evaluation_set.scenes))
-    bounds: dict[str, list[float]] = {}
-    if num_scenes > 1:
-        draws = np.random.default_rng(SEED).multinomial(num_scenes, np.full(num_scenes, 1 / num_scenes), NUM_DRAWS)
+
+    def bounds(draws: Array) -> dict[str, list[float]]:
         drawn = score_draws(scores.parts, draws)
         tree = drawn.overall.as_dict(interval) | {
             "ranges": {name: part.as_dict(interval) for name, part in drawn.ranges.items()},
             "speeds": {name: part.as_dict(interval, True) for name, part in drawn.speeds.items()},
             "measures": {name: interval(values) for name, values in drawn.measures.items()},
         }
-        bounds = dict(_paths(tree))
-    intervals = {"scenes": num_scenes, "draws": NUM_DRAWS, "level": LEVEL, "bounds": bounds}
-    return scores.as_dict() | {"intervals": intervals}
+        return dict(_paths(tree))
+
+    return scores.as_dict() | {"intervals": intervals_of(scores.parts.ranking.evaluation_set.scenes, bounds)}
+
+
+def intervals_of(
+    scenes: Array,  # [S] of each sample, in any numbering
+    bounds: Callable[[Array], dict[str, list[float]]],  # of [R, C] draws: how often each scene counts, ascending
+) -> dict[str, object]:
+    """`intervals` of metrics.json; without bounds where there is a single scene."""
+    count = len(np.unique(scenes))
+    drawn = {}
+    if count > 1:
+        drawn = bounds(np.random.default_rng(SEED).multinomial(count, np.full(count, 1 / count), NUM_DRAWS))
+    return {"scenes": count, "draws": NUM_DRAWS, "level": LEVEL, "bounds": drawn}
 
 
 def interval(

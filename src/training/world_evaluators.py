@@ -20,7 +20,7 @@ from src.data.timeline import TimelineConfig
 from src.data.true_geometry import TRUTH_FOLDER, TrueGeometry
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.metrics.bootstrap import LEVEL, NUM_DRAWS, SEED, interval
+from src.metrics.bootstrap import interval, intervals_of
 from src.metrics.diagnostics import ratios
 from src.metrics.forecast_text import format_forecast, format_occupancy
 from src.metrics.forecasting import HORIZONS_S, ForecastScores, median_errors, score_forecast, sums_by_sample
@@ -215,13 +215,13 @@ class OccupancyEvaluator(Evaluator):
 
     def _intervals(self, sums: Mapping[str, Array], scenes: Array) -> dict[str, Any]:
         """As those of a detection's metrics.json: scenes are drawn again with replacement."""
-        names, scenes = np.unique(scenes, return_inverse=True)
-        bounds = {}
-        if len(names) > 1:
-            draws = np.random.default_rng(SEED).multinomial(len(names), np.full(len(names), 1 / len(names)), NUM_DRAWS)
-            drawn = self._ratios(sums, draws[:, scenes])
-            bounds = {name: found for name, values in drawn.items() if (found := interval(values)) is not None}
-        return {"scenes": len(names), "draws": NUM_DRAWS, "level": LEVEL, "bounds": bounds}
+        _, places = np.unique(scenes, return_inverse=True)
+
+        def bounds(draws: Array) -> dict[str, list[float]]:
+            drawn = self._ratios(sums, draws[:, places])
+            return {name: found for name, values in drawn.items() if (found := interval(values)) is not None}
+
+        return intervals_of(scenes, bounds)
 
     def as_dict(self) -> dict[str, Any]:
         """Every number by its name, null where undefined, and `intervals`."""
