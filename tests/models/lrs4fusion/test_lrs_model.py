@@ -7,10 +7,13 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from src.benchmark.scenes import ROADS
+from src.benchmark.scenes import lidar_frame as made_frame
 from src.errors import ConfigError
 from src.models.deploy.inference import prepare_for_inference
 from src.structures.boxes import Boxes3D
 from src.structures.ray_bundle import RayBundle
+from src.targets.occupancy_rays import sample_queries
 from tests.models.learning import gradients_are_finite, train_step
 from tests.models.lrs4fusion.lrs_frames import cloud, lidar_frame, lrs_config, lrs_model
 from tests.models.moving import pose, tensors_of
@@ -195,22 +198,19 @@ def test_prepared_for_inference_it_gives_the_same():
     torch.testing.assert_close(a.head.logits, b.head.logits, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_occupancy_of_one_scene_is_learnt():
-    """A wall ahead, free before it and matter behind its face: from points on the face alone."""
-    model = lrs_model(OCCUPANCY, "model.temporal=null").train()
-    generator = torch.Generator().manual_seed(0)
-    face = torch.rand(600, 5, generator=generator) * torch.tensor([0.0, 40.0, 4.0, 20.0, 0.0])
-    face[:, :3] += torch.tensor([20.0, -20.0, -2.0])
-    batch = lidar_frame([face])
-    unit = torch.rand(3000, 4, generator=generator)
-    q = unit * torch.tensor([4.8, 36.0, 3.0, 0.0]) + torch.tensor([17.6, -18.0, -1.5, 0.0])
-    target, owner = (q[:, 0] > 20.0).float(), torch.zeros(3000, dtype=torch.int64)
-    optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
-    for _ in range(25):
-        logits = model.decoders.occupancy_logits(model.encode(batch), q, owner)
-        loss = F.binary_cross_entropy_with_logits(logits, target)
-        optimizer.zero_grad()
-        loss.backward()
+    """By the phase's own loss from rays alone, asked at other places along them: IoU at a threshold of a half."""
+    model = lrs_model(OCCUPANCY, "model.temporal=null", "model.loss.sampling.num_queries=1024").train()
+    batch = made_frame(replace(ROADS["debug"], reach_m=40.0))
+    optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 70)
+    for _ in range(70):
+        model.loss(model(batch)[0], batch).terms["total"].backward()
         optimizer.step()
-    found, truth = logits > 0, target > 0.5
-    assert (found & truth).sum() / (found | truth).sum() > 0.9
+        optimizer.zero_grad()
+        schedule.step()
+    asked = sample_queries(batch.rays, model.bounds, model.config.loss.sampling, torch.Generator().manual_seed(1))
+    queries = torch.cat([asked.points, asked.times_s[:, None]], dim=1)
+    found = model.look_up(model(batch)[0], queries, asked.batch)[0] > 0.5
+    assert (found & asked.occupied).sum() / (found | asked.occupied).sum() > 0.9
