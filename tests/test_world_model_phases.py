@@ -113,6 +113,22 @@ def test_pages_show_every_phase_with_its_command(occupancy, outputs, tmp_path):
     assert "Scores over time and distance" in (tmp_path / "dashboard.html").read_text()
 
 
+def test_two_processes_learn_from_rays_and_score_every_frame_once(occupancy, outputs, tmp_path):
+    """A sample a rank; the learning rate is so small that both runs score the same weights."""
+    still = ("phase=lrs_occupancy", "optim.lr=1e-12", f"data.root={next((outputs / 'worlds').iterdir())}")
+    found = []
+    for processes in (1, 2):
+        folder = tmp_path / str(processes)
+        call("train", *MODEL, *still, "trainer=cpu", f"trainer.devices={processes}", f"paths.outputs={folder}")
+        run = only(folder, "lrs_occupancy")
+        found.append(json.loads((run / "metrics.json").read_text()))
+        assert record(run)["processes"] == processes and record(run)["steps"] > 0
+    one, two = found
+    assert one.keys() == two.keys() and one["intervals"]["scenes"] == two["intervals"]["scenes"]
+    assert two["slice_iou@0.0s"] == pytest.approx(one["slice_iou@0.0s"], abs=0.02)
+    assert two["velocity_error_moving"] == pytest.approx(one["velocity_error_moving"], rel=1e-3)
+
+
 def test_a_source_of_another_region_is_refused(occupancy, outputs):
     checkpoint = occupancy / "checkpoints" / "last.ckpt"
     arguments = ("phase=lrs_forecast", f'phase.init_from="{checkpoint}"', f"paths.outputs={outputs}")
