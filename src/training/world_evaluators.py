@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from src.data.datamodule import DetectionDataModule
+from src.data.rays import TRUE_MARGIN_M
 from src.data.schema import DatasetIndex
 from src.data.timeline import TimelineConfig
 from src.data.true_geometry import TRUTH_FOLDER, TrueGeometry
@@ -42,8 +43,6 @@ SAMPLING = RaySampling(min_free_m=1.5, depth_m=0.1, num_queries=4096, ray_balanc
 """Places along rays that are asked for: as the paper's training draws them, fewer."""
 MOVING_MPS = 1.0
 """What is faster over ground moves."""
-TRUE_MARGIN_M = 0.3
-"""Boxes are grown by it where it is asked what a measured point belongs to."""
 SLICE_WINDOW, SLICE_CELL_M = ((-40.0, 40.0), (-40.0, 40.0)), 1.0
 """Where the true geometry is compared with, above the ground."""
 SUBSETS = ("", "_moving", "_unseen")
