@@ -29,6 +29,7 @@ def page_name(config: Config) -> str:
     if config.suite is BenchmarkSuite.metric:
         return config.suite.value
     of_one_model = config.suite in (BenchmarkSuite.model, BenchmarkSuite.training, BenchmarkSuite.soak)
+    of_one_model |= config.suite is BenchmarkSuite.scaling and "lidar" in config.model.sensors
     which = [config.model.name, config.phase.name] if of_one_model else []
     device = ["gpu"] if config.suite is not BenchmarkSuite.reader and config.trainer.device().type == "cuda" else []
     return "_".join([config.suite.value, *which, config.scale, *device])

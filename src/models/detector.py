@@ -61,6 +61,10 @@ class ModelConfig:
         does not have stays as it is."""
         return self
 
+    def at_range(self, range_m: float) -> Self:
+        """The settings with a region of their own, not the `grid`, that reaches at least so far to each side."""
+        return self
+
 
 class TemporalMemory(Protocol):
     """What a temporal detector carries from frame to frame, detached, one row per stream."""
