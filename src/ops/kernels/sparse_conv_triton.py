@@ -11,6 +11,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from src.geometry.constants import on_device
 from src.ops.backend import interpreted, runs_kernels
 from src.ops.kernel_maps import KernelMap
 from src.ops.segment_reduce import gather_segment_sum
@@ -234,7 +235,7 @@ def _table(
     num: int,
 ) -> Tensor:  # [K, num] int32
     """The row that each row sees through each tap, -1 where there is none."""
-    ends = _on_device(list(itertools.accumulate(counts)), seeing.device)
+    ends = on_device(list(itertools.accumulate(counts)), torch.int32, seeing.device)
     pair = torch.arange(len(seeing), dtype=torch.int32, device=seeing.device)
     tap = torch.searchsorted(ends, pair, right=True)  # [pairs] int64
     table = seen.new_full((len(counts), num), -1)
@@ -266,15 +267,9 @@ def _spans(kernel_map: KernelMap) -> tuple[Tensor, Tensor, Tensor]:  # [spans, 2
             begin = end
         numbers = [*itertools.chain(*bounds), *range(len(bounds)), *first_span]
         sizes = (2 * len(bounds), len(bounds), len(first_span))
-        flat, spans, starts = _on_device(numbers, kernel_map.inputs.device).split(sizes)
+        flat, spans, starts = on_device(numbers, torch.int32, kernel_map.inputs.device).split(sizes)
         kernel_map.cache["spans"] = flat.view(-1, 2), spans, starts
     return kernel_map.cache["spans"]
-
-
-def _on_device(numbers: list[int], device: torch.device) -> Tensor:
-    """The numbers as int32; from pinned memory, because a copy from other memory waits for the device."""
-    pinned = device.type == "cuda"
-    return torch.tensor(numbers, dtype=torch.int32, pin_memory=pinned).to(device, non_blocking=pinned)
 
 
 def _tile(channels: int, most: int) -> int:
