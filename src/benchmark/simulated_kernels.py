@@ -21,6 +21,7 @@ from torch import Tensor
 from src.benchmark.simulated_device import SimTensor, count_launch, host_values
 from src.ops import backend
 from src.ops.farthest_point import farthest_points_reference
+from src.ops.neighbour_table import neighbour_table_reference
 from src.ops.splat import log1mexp
 
 
@@ -45,7 +46,7 @@ def simulated_kernels() -> Iterator[None]:
 def _stub() -> dict[str, ModuleType]:
     """What the kernels' modules need of Triton to be imported."""
     triton, language = ModuleType("triton"), ModuleType("triton.language")
-    triton.jit = lambda function: function
+    triton.jit = lambda function=None, **options: function or (lambda own: own)
     triton.cdiv = lambda a, b: -(-a // b)
     triton.next_power_of_2 = lambda n: 1 << max(n - 1, 0).bit_length()
     triton.language, language.constexpr = language, lambda value=None: value
@@ -72,13 +73,18 @@ def _sample(points: Tensor, valid: Tensor, start: Tensor, picks: Tensor, num: in
     picks.copy_(farthest_points_reference(points, valid.bool(), start, count))
 
 
+def _search(keys: Tensor, corners: Tensor, taps: Tensor, table: Tensor, bits: Tensor, *sizes: int) -> None:
+    for out, found in zip((table, bits), neighbour_table_reference(keys, corners, taps), strict=True):
+        out.copy_(found)
+
+
 def _gather_product(
-    rows: Tensor, weight: Tensor, bias: Tensor, out: Tensor, order: Tensor, table: Tensor, *_: Any
+    rows: Tensor, weight: Tensor, bias: Tensor, out: Tensor, order: Tensor, table: Tensor, *sizes: int
 ) -> None:
     total = torch.zeros(out.shape)
-    for tap, seen in enumerate(table[:, : len(order)].long()):
+    for matrix, seen in zip(weight.float(), table.long(), strict=True):
         hit = (seen >= 0).nonzero().squeeze(1)
-        total.index_add_(0, order[hit], rows[seen[hit]].float() @ weight[tap].float())
+        total.index_add_(0, hit, rows[seen[hit]].float() @ matrix)
     out.copy_(total if bias.data_ptr() == out.data_ptr() else total + bias.float())
 
 
@@ -117,6 +123,7 @@ def _segment_sum(values: Tensor, starts: Tensor) -> Tensor:
 
 KERNELS: dict[str, Callable[..., None] | None] = {
     "_sample": _sample,
+    "_search": _search,
     "_gather_product": _gather_product,
     "_span_product": None,
     "_log_free": _log_free,
