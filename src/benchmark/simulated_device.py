@@ -195,7 +195,8 @@ def _count(
             return
         blocking = not (kwargs.get("non_blocking") or True in args[2:]) or not getattr(hosts[0], "pinned", False)
         tally.uploads["upload", place] += 1
-        tally.waits["blocking upload", place] += blocking
+        if blocking:
+            tally.waits["blocking upload", place] += 1
         return
     if sims and hosts:
         if name in INDEXING and isinstance(args[0], SimTensor):  # torch uploads indices by itself
@@ -210,7 +211,8 @@ def _count(
         tally.waits[name, place] += WAITS[name]
     elif name in INDEXING:
         masks = sum(isinstance(x, Tensor) and x.dtype == torch.bool for x in args[1] or ())
-        tally.waits["index by mask", place] += masks
+        if masks:
+            tally.waits["index by mask", place] += masks
     if name not in FREE:
         tally.launches[name, place] += 1
 

@@ -127,7 +127,7 @@ class CenterHead(nn.Module):
         widths = (*CODE_WIDTHS, len(ATTRIBUTES)) if self.learned else CODE_WIDTHS
         self.regressions = nn.ModuleList(Branches(channels, widths) for _ in HEAD_GROUPS)
         in_group_order = [CLASSES.index(name) for group in HEAD_GROUPS for name in group]
-        self.class_columns = [in_group_order.index(label) for label in range(len(CLASSES))]
+        self.class_columns = tuple(in_group_order.index(label) for label in range(len(CLASSES)))
 
     def forward(
         self,
@@ -140,7 +140,7 @@ class CenterHead(nn.Module):
             logits = checkpointed_branches(list(self.heatmaps), bev.features)
         else:  # prepared for inference
             logits = self.heatmaps[0](bev.features)
-        logits = logits[:, self.class_columns]
+        logits = logits.index_select(1, constant(self.class_columns, torch.int64, logits.device))
         codes = None
         if self.training and self.config.train_regression is TrainRegression.all:
             codes = torch.stack([checkpointed_branches([part], bev.features) for part in self.regressions], dim=1)
