@@ -111,6 +111,7 @@ class BenchmarkSuite(Enum):
     soak = "soak"
     metric = "metric"
     reader = "reader"
+    launches = "launches"
 
 
 @dataclass(kw_only=True)
