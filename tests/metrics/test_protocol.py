@@ -55,9 +55,7 @@ def test_a_report_holds_both_scores_and_the_intervals_of_both():
     truth = boxes([(10, 0), (200, 0)] * 2, samples=[0, 0, 1, 1])
     evaluation_set = set_of(truth, "ab", scenes=np.array([0, 1]))
     predictions = boxes([(13, 0), (200, 0)], scores=[0.9, 0.8], samples=[0, 0])
-    content = score_report(
-        evaluation_set, predictions, score_detections(evaluation_set, predictions), Protocol(**LONG)
-    )
+    content = score_report(evaluation_set, predictions, score_detections(evaluation_set, predictions), Protocol(**LONG))
     assert content["classes"]["car"]["AP@4.0"] > 0 and content["ranges"].keys() == {*OFFICIAL.range_names}
     own = content["long_range"]
     assert own["classes"]["car"]["num_gt"] == 4 and own["classes"]["car"].keys() >= {"AP", "AP@6.0", "ATE"}
