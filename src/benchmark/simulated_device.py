@@ -89,7 +89,10 @@ _active: list[Tally] = []
 
 
 class SimulatedDevice:
-    """Context in which tensors can be moved to `sim:0`; yields what is counted. Contexts do not nest."""
+    """Context in which tensors can be moved to `sim:0`; yields what is counted. Contexts do not nest.
+
+    Gradients need that the first was entered before the process's first backward pass, which counts the devices.
+    """
 
     def __enter__(self) -> Tally:
         _register()

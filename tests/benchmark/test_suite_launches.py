@@ -1,12 +1,13 @@
 """What a frame and a step would launch and wait for on a GPU: the simulated device counts right, and budgets hold."""
 
+import json
+
 import pytest
 import torch
 
 from src.benchmark.simulated_device import DEVICE, SimulatedDevice
-from src.benchmark.suite_launches import measure
-from src.config import compose_config
 from src.ops.segment_reduce import segment_sum
+from tests.running import command
 
 # Of the debug scale, phase 2: an architecture of the same parts. A change that needs more says why here.
 BUDGETS = {
@@ -56,10 +57,10 @@ def test_values_are_those_of_the_cpu():
     assert torch.equal(found, segment_sum(values, rows, 4))
 
 
-def test_a_frame_and_a_training_step_keep_their_budgets():
-    config, _ = compose_config(["scale=debug", "phase=phase2", "model.dptf.bev_path.memory_threshold=0"])
-    config.data.batch_size = 1
-    page = measure(config, {})
+def test_a_frame_and_a_training_step_keep_their_budgets(tmp_path):
+    full_memory = "model.dptf.bev_path.memory_threshold=0"
+    command("benchmark", "suite=launches", "scale=debug", "phase=phase2", full_memory, f"out={tmp_path}")
+    page = json.loads((tmp_path / "launches_horizon3d_phase2_debug.json").read_text())["result"]
     for name, budget in BUDGETS.items():
         parts = {row["part"]: row for row in page[name]}
         spent = {key: parts["whole"][key] for key in budget}
