@@ -21,13 +21,19 @@ _T = (
 """Of Student's t the two-sided 95 % point for 1 to 30 degrees of freedom."""
 _Z = 1.960
 
+LOOKS = {3: 7.6488, 6: 3.5341, 12: 2.8200}
+"""Paired seeds at which a claim is looked at, and Student's two-sided point of 1 - 0.05/3 for them.
+
+Bonferroni over the three looks: whichever of them decides first, the error is at most 5 %.
+"""
+
 
 @dataclass(frozen=True)
 class Comparison:
     """What one row has more than another, in the table's unit."""
 
     mean: float
-    low: float | None  # 95 % interval; None of one pair, which says nothing of the next
+    low: float | None  # 95 % interval, or that of a look; None of too few pairs, which say nothing of the next
     high: float | None
     pairs: int
     digits: int  # that are shown
@@ -41,12 +47,21 @@ class Comparison:
         """Whether it is decided for the first row."""
         return self.decided and (self.mean > 0) == metric.higher_is_better
 
+    def settled(self, half_width: float) -> bool:
+        """Whether it is decided, or its interval is no wider than twice `half_width`."""
+        return self.decided or (self.low is not None and self.high - self.low <= 2 * half_width)
+
+    @property
+    def numbers(self) -> str:
+        """Difference and interval."""
+        text = _signed(self.mean, self.digits)
+        bounds = "" if self.low is None else f" [{_signed(self.low, self.digits)}, {_signed(self.high, self.digits)}]"
+        return text + bounds
+
     @property
     def text(self) -> str:
-        """Difference and interval, and that it is undecided."""
-        text = _signed(self.mean, self.digits)
-        text += "" if self.low is None else f" [{_signed(self.low, self.digits)}, {_signed(self.high, self.digits)}]"
-        return text if self.decided else f"{text} {UNDECIDED}"
+        """The numbers, and that it is undecided."""
+        return self.numbers if self.decided else f"{self.numbers} {UNDECIDED}"
 
 
 def compare(
@@ -55,13 +70,43 @@ def compare(
     digits: int,
 ) -> Comparison | None:
     """`first` minus `second` over the seeds that both have; None without any."""
-    gains = [first[seed] - second[seed] for seed in first if seed in second]
+    gains = _gains(first, second)
     if not gains:
         return None
+    return _with_interval(gains, t_quantile(len(gains) - 1) if len(gains) > 1 else None, digits)
+
+
+def compare_at_looks(
+    first: Mapping[int, float],  # by seed
+    second: Mapping[int, float],
+    half_width: float,  # that is precise enough, in the table's unit
+    digits: int,
+) -> Comparison | None:
+    """`first` minus `second` at the first of `LOOKS` that is decided or precise enough, else at the last one reached.
+
+    A look is at the pairs of the smallest seeds. Before the first look there is a mean and no interval; None without
+    any pair.
+    """
+    gains = _gains(first, second)
+    found = _with_interval(gains, None, digits) if gains else None
+    for pairs, quantile in LOOKS.items():
+        if pairs > len(gains):
+            break
+        found = _with_interval(gains[:pairs], quantile, digits)
+        if found.settled(half_width):
+            break
+    return found
+
+
+def _gains(first: Mapping[int, float], second: Mapping[int, float]) -> list[float]:
+    return [first[seed] - second[seed] for seed in sorted(first) if seed in second]
+
+
+def _with_interval(gains: list[float], quantile: float | None, digits: int) -> Comparison:
     mean = statistics.mean(gains)
-    if len(gains) == 1:
-        return Comparison(mean, None, None, 1, digits)
-    half = t_quantile(len(gains) - 1) * statistics.stdev(gains) / math.sqrt(len(gains))
+    if quantile is None:
+        return Comparison(mean, None, None, len(gains), digits)
+    half = quantile * statistics.stdev(gains) / math.sqrt(len(gains))
     return Comparison(mean, mean - half, mean + half, len(gains), digits)
 
 

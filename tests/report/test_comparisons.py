@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from src.report.comparisons import Comparison, compare, t_quantile
+from src.report.comparisons import LOOKS, Comparison, compare, compare_at_looks, t_quantile
 from src.report.metric_names import METRICS
 
 MAP, ERROR = METRICS["mAP"], METRICS["mAVE"]
@@ -37,11 +37,57 @@ def test_an_interval_that_ends_at_zero_as_shown_is_undecided():
     assert Comparison(0.5, 0.04, 0.96, 3, 1).text == "+0.5 [+0.0, +1.0] undecided"
 
 
+ZERO = dict.fromkeys(range(12), 0.0)
+
+
+def by_seed(*values):
+    return dict(enumerate(values))
+
+
+def test_a_claim_is_looked_at_after_three_six_and_twelve_pairs():
+    # 2, 1, 0: mean 1, deviation 1, so 7.6488 / sqrt(3) to each side
+    three = compare_at_looks(by_seed(2.0, 1.0, 0.0), ZERO, 0.5, 1)
+    assert (three.mean, three.pairs) == (1.0, 3) and not three.settled(0.5)
+    assert (three.low, three.high) == (pytest.approx(-3.4160, abs=1e-4), pytest.approx(5.4160, abs=1e-4))
+    for between in ([9.0], [9.0, 9.0]):  # four and five pairs are no look: the first three by number
+        assert compare_at_looks(by_seed(2.0, 1.0, 0.0, *between), ZERO, 0.5, 1) == three
+    # 2, 1, 0 twice: deviation sqrt(4 / 5), so 3.5341 sqrt(0.8 / 6) to each side
+    six = compare_at_looks(by_seed(2.0, 1.0, 0.0, 2.0, 1.0, 0.0, 50.0), ZERO, 0.5, 1)
+    assert six.pairs == 6 and six.high == pytest.approx(1 + 1.2905, abs=1e-4) and not six.decided
+    # four times: deviation sqrt(8 / 11), so 2.82 sqrt(8 / 11 / 12) to each side
+    twelve = compare_at_looks(by_seed(*[2.0, 1.0, 0.0] * 4, 50.0), ZERO | {12: 0.0}, 0.5, 1)
+    assert twelve.pairs == 12 and twelve.low == pytest.approx(1 - 0.6942, abs=1e-4) and twelve.decided
+
+
+def test_the_first_look_that_decides_or_is_precise_stays():
+    decided = [5.0, 5.1, 4.9]
+    found = compare_at_looks(by_seed(*decided, -90.0, 90.0, -90.0), ZERO, 0.5, 1)
+    assert (found.pairs, found.decided) == (3, True)
+    # deviation 0.1: 0.44 to each side, and zero is inside
+    precise = compare_at_looks(by_seed(0.1, 0.2, 0.0, 5.0, 5.0, 5.0), ZERO, 0.5, 1)
+    assert precise.pairs == 3 and precise.settled(0.5) and not precise.decided and not precise.settled(0.4)
+    assert compare_at_looks(by_seed(0.1, 0.2, 0.0, 5.0, 5.0, 5.0), ZERO, 0.4, 1).pairs == 6
+
+
+def test_fewer_pairs_than_a_look_have_no_interval():
+    found = compare_at_looks({0: 90.0, 3: 91.0, 7: 9.0}, {0: 1.0, 3: 1.0}, 0.5, 1)
+    assert found == Comparison(89.5, None, None, 2, 1) and not found.settled(1e9) and found.numbers == "+89.5"
+    assert compare_at_looks({0: 1.0}, {1: 1.0}, 0.5, 1) is None
+
+
 @pytest.mark.parametrize("freedom", [1, 2, 5, 13, 30, 31, 60, 400])
 def test_quantiles_are_those_of_students_t(freedom):
-    """The density by Simpson's rule from 0 to the quantile is 0.475."""
-    q, n = t_quantile(freedom), 2000
+    assert area_to(t_quantile(freedom), freedom) == pytest.approx(0.475, abs=2e-4)
+
+
+def test_quantiles_of_looks_are_those_of_a_third_of_the_error():
+    for pairs, quantile in LOOKS.items():
+        assert area_to(quantile, pairs - 1) == pytest.approx(0.5 - 0.05 / 3 / 2, abs=1e-6)
+
+
+def area_to(q, freedom):
+    """Student's density by Simpson's rule from 0 to q."""
+    n = 2000
     norm = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(freedom * math.pi)
     density = [norm * (1 + (q * k / n) ** 2 / freedom) ** (-(freedom + 1) / 2) for k in range(n + 1)]
-    area = q / n / 3 * (density[0] + density[-1] + 4 * sum(density[1:-1:2]) + 2 * sum(density[2:-1:2]))
-    assert area == pytest.approx(0.475, abs=2e-4)
+    return q / n / 3 * (density[0] + density[-1] + 4 * sum(density[1:-1:2]) + 2 * sum(density[2:-1:2]))

@@ -115,6 +115,9 @@ def test_paper_numbers_are_those_reported_for_the_rows_configuration(name):
         found = []
         for row in sweep.rows:
             config = build_config(tree_of("paper", overrides_of(sweep, row)))
+            if not row.paper:  # ours, beside the paper's
+                assert config.phase.init_from == "phase1" and config.phase.name == "phase1", row.label
+                continue
             wanted = ROW_OF[key](config)
             (entry,) = [e for e in table["rows"] if wanted.items() <= e.items()]
             assert row.paper == numbers_of(entry), row.label
