@@ -1,6 +1,7 @@
 """`python -m src.report [scale=...] [phase=...]`: everything finished at one scale, into paths.reports.
 
-Results of the runs under paths.outputs, a page per phase, the tables of every sweep, and the dashboard.
+Results of the runs under paths.outputs, a page per phase, the tables of every sweep, the page of the claims, and the
+dashboard.
 """
 
 from __future__ import annotations
@@ -14,7 +15,10 @@ from src.config import PHASES, Config, compose_config
 from src.errors import ConfigError, DataError
 from src.files.atomic_write import write_whole
 from src.pictures.comparison import BarPanel, draw_comparison
+from src.pictures.forest import ForestGroup, ForestRow, draw_forest
 from src.reliability.command import run_command
+from src.report.claims import Claim, Finding, judge, load_claims, verdict_of
+from src.report.claims_page import claims_page
 from src.report.metric_names import DETECTION, RANGES, SPEEDS
 from src.report.pages import (
     PHASES_OF,
@@ -26,8 +30,10 @@ from src.report.pages import (
 )
 from src.report.results import RunResult, finished_runs, publish_result, read_results
 from src.report.score_tables import BY_RANGE, BY_SPEED, ERROR_BY_SPEED, Experiment, estimate
-from src.report.sweep_record import read_records
+from src.report.sweep_record import SweepRecord, read_records
+from src.report.sweep_table import MISSING
 from src.report.table_builder import write_sweep_tables
+from src.sweep.compose import load_sweep
 from src.training.run_folder import make_writable
 
 
@@ -49,9 +55,12 @@ def main(overrides: list[str]) -> None:
     pages, of_pages = write_pages(config, results, {run for record in records for run in record.runs})
     faults += of_pages
     tables: list[Path] = []
+    sound: list[SweepRecord] = []
     for record in records:
         with noted_in(faults):
             tables += write_sweep_tables(reports, record, results)
+            sound.append(record)
+    claims = write_claims(reports, config.scale, sound, results)
     if not pages and not records:
         what = f"{outputs}: no finished run of {config.phase.name} at scale={config.scale}"
         raise DataError("\n".join([what, *faults]))
@@ -62,7 +71,7 @@ def main(overrides: list[str]) -> None:
     if config.phase.name in pages:
         text = pages[config.phase.name].read_text()
         print(text[text.index("\n| ") + 1 :])
-    for path in [*pages.values(), *tables, dashboard]:
+    for path in [*pages.values(), *tables, *claims, dashboard]:
         print(f"written: {path}")
     if faults:
         raise DataError("\n".join(["all else is written, but", *faults]))
@@ -125,6 +134,42 @@ def write_page(reports: Path, name: str, scale: str, runs: list[RunResult]) -> P
     path = reports / f"{name}_{scale}.md"
     write_whole(path, text)
     return path
+
+
+def write_claims(reports: Path, scale: str, records: list[SweepRecord], results: dict[str, RunResult]) -> list[Path]:
+    """`README.md` of the claims and its picture, once any has a result; sweeps that a command line changed are others.
+
+    Raises ConfigError for a file of claims that is wrong.
+    """
+    by_sweep = {record.name: record for record in records if not record.changes}
+    findings = [(claim, judge(claim, by_sweep, results)) for claim in load_claims(load_sweep)]
+    if not any(finding.found for _, found in findings for finding in found):
+        return []
+    path, picture = reports / "README.md", f"pictures/claims_{scale}.png"
+    draw_claims(reports / picture, findings, scale)
+    write_whole(path, claims_page(findings, scale, picture))
+    return [path]
+
+
+def draw_claims(path: Path, findings: list[tuple[Claim, list[Finding]]], scale: str) -> None:
+    """All measures in points of percent, claim by claim."""
+    groups = []
+    for number, (claim, found) in enumerate(findings, start=1):
+        rows, before = [], ""
+        for finding in found:
+            measure, effect = finding.measure, finding.found
+            if measure.metric.unit != "%":
+                continue
+            text = measure.comparison.text
+            label, before = "" if text == before else text, text
+            numbers = MISSING
+            if effect is not None:
+                numbers = f"{effect.numbers}   {effect.pairs} seed{'s' if effect.pairs > 1 else ''}"
+            ends = (effect.mean, effect.low, effect.high) if effect is not None else (None, None, None)
+            verdict, more = str(finding.verdict), (measure.paper, measure.decides)
+            rows.append(ForestRow(label, measure.metric.title, verdict, numbers, *ends, *more))
+        groups.append(ForestGroup(f"{number}. {claim.config.sentence}", str(verdict_of(found)), rows))
+    draw_forest(path, groups, f"The paper's claims, scale {scale}", "difference of the two rows, points of percent")
 
 
 def bar_panels(experiments: list[Experiment]) -> list[BarPanel]:

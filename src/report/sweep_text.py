@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from src.report.comparisons import Comparison
@@ -26,20 +27,9 @@ def describe_table(table: SweepTable, record: SweepRecord, results: dict[str, Ru
         data = f"Data: {any_result.dataset}, split {any_result.data.get('split', 'unknown')}"
     parts = [data, f"scale {record.scale}"]
     parts += [f"with {' '.join(record.changes)}"] if record.changes else []
-    if results:
-        by_phase: dict[str, set[int]] = {}
-        for result in results.values():
-            by_phase.setdefault(result.phase, set()).add(result.epochs)
-        for phase, epochs in sorted(by_phase.items()):
-            parts.append(f"{phase}: {_listed(sorted(epochs))} epoch{'' if epochs == {1} else 's'}")
+    parts += describe_epochs(results.values())
     parts.append(f"seed{'s' if len(seeds) > 1 else ''} {_listed(seeds)}{', of which means' if len(seeds) > 1 else ''}")
-    code, devices = set(), set()
-    for result in results.values():
-        code.add(result.commit[:10] + ("+" if result.commit.endswith("+") else ""))
-        threads = f"{_counted(result.processes, 'process')} of {_counted(result.threads, 'thread')}"
-        devices.add(f"{result.device}, {threads}")
-    for words, found in (("code ", code), ("", devices)):
-        parts += [words + _listed(sorted(found))] if found else []
+    parts += describe_machines(results.values())
     text = "; ".join(parts) + "."
     text += _scene_intervals(results)
     if table.shows_differences:
@@ -47,6 +37,27 @@ def describe_table(table: SweepTable, record: SweepRecord, results: dict[str, Ru
     if not table.is_search:
         text += " Bold is decided against every other row" + ("." if complete else " whose seeds have all finished.")
     return text + _latency(table, [result.latency for result in results.values() if result.latency is not None])
+
+
+def describe_epochs(results: Iterable[RunResult]) -> list[str]:
+    """How long each phase was trained."""
+    by_phase: dict[str, set[int]] = {}
+    for result in results:
+        by_phase.setdefault(result.phase, set()).add(result.epochs)
+    return [
+        f"{phase}: {_listed(sorted(epochs))} epoch{'' if epochs == {1} else 's'}"
+        for phase, epochs in sorted(by_phase.items())
+    ]
+
+
+def describe_machines(results: Iterable[RunResult]) -> list[str]:
+    """The code that trained, and where."""
+    code, devices = set(), set()
+    for result in results:
+        code.add(result.commit[:10] + ("+" if result.commit.endswith("+") else ""))
+        threads = f"{_counted(result.processes, 'process')} of {_counted(result.threads, 'thread')}"
+        devices.add(f"{result.device}, {threads}")
+    return [words + _listed(sorted(found)) for words, found in (("code ", code), ("", devices)) if found]
 
 
 def _scene_intervals(results: dict[str, RunResult]) -> str:

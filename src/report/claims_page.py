@@ -1,0 +1,93 @@
+"""`reports/README.md`: what was run, and which of the paper's claims hold here, each with the command that says so."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from src.report.claims import Claim, Finding, Verdict, verdict_of
+from src.report.comparisons import LOOKS
+from src.report.escaping import as_code, escape_markdown
+from src.report.results import RunResult
+from src.report.sweep_table import MISSING, format_paper
+from src.report.sweep_text import SYNTHETIC, describe_epochs, describe_machines
+
+HEADS = ("claim", "measure", "paper", "here", "seeds", "verdict", "command")
+
+_FEW, _MOST = ", ".join(map(str, sorted(LOOKS)[:-1])), max(LOOKS)
+RULE = f"""Rows are compared by runs of the same seed: the mean difference, looked at with {_FEW} and {_MOST}
+pairs and no other number, each time with an interval of 1 - 0.05/{len(LOOKS)}, so that stopping at the first
+look that decides keeps the error at 5 %. *Shows*: the interval is beyond zero on the claimed side; *does not show*: it
+is beyond zero on the other side, or holds zero and is as narrow as [claims.yaml](../src/report/claims.yaml) asks; else
+*undecided*. A claim shows where all its measures do. What stands in italics is shown beside them and decides nothing.
+More of it: [docs/scores.md](../docs/scores.md#when-a-claim-holds)."""
+
+
+def claims_page(findings: list[tuple[Claim, list[Finding]]], scale: str, picture: str) -> str:
+    """The page; `picture` is the address of the figure, seen from it."""
+    verdicts = [verdict_of(found) for _, found in findings]
+    counts = ", ".join(f"{v} {verdicts.count(v)}" for v in Verdict if v in verdicts)
+    parts = [
+        f"# The paper's claims, scale {scale}",
+        f"Of {len(findings)} claims: {counts}. Written by `python -m src.report scale={scale}` from the results of the "
+        f"sweeps; `python -m src.study scale={scale}` trains what is missing.",
+        f"![Each claim's effect with its interval, and the paper's effect]({picture})",
+        f"## What was run\n\n{_what_was_run(findings, scale)}",
+        f"## The claims\n\n{RULE}\n\n{_table(findings, scale)}",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def command_of(sweep: str, findings: Iterable[Finding], scale: str) -> str:
+    """What trains the rows of a sweep with all seeds that findings on it stand on, at least those of the first look."""
+    used = (run for one in findings if one.measure.comparison.sweep == sweep for run in one.results)
+    seeds = max([min(LOOKS), *(run.seed + 1 for run in used)])
+    return f"python -m src.sweep +sweep={sweep} scale={scale} seeds={seeds}"
+
+
+def _what_was_run(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
+    worlds: dict[str, set[str]] = {}
+    runs: dict[str, RunResult] = {}
+    for _, found in findings:
+        for finding in found:
+            for result in finding.results:
+                data = f"{result.dataset}, split {result.data.get('split', 'unknown')}"
+                worlds.setdefault(data, set()).add(finding.measure.comparison.sweep)
+                runs[result.run_id] = result
+    if len(worlds) > 1:
+        data = "; ".join(f"{world} ({', '.join(sorted(sweeps))})" for world, sweeps in worlds.items())
+    else:
+        data = next(iter(worlds), "none yet")
+    seeds = len({run.seed for run in runs.values()})
+    parts = [f"Data: {data}", f"scale {scale}", f"{len(runs)} runs of up to {seeds} seeds"]
+    parts += [*describe_epochs(runs.values()), *describe_machines(runs.values())]
+    text = f"{'; '.join(parts)}."
+    if any(run.data["name"] == SYNTHETIC for run in runs.values()):
+        text += (
+            f" The {SYNTHETIC} is no TruckScenes, and this scale not the paper's: signs and order compare with the "
+            "paper's, sizes do not."
+        )
+    return escape_markdown(text)
+
+
+def _table(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
+    lines = [HEADS, ["---"] * len(HEADS)]
+    for number, (claim, found) in enumerate(findings, start=1):
+        title = f"**{number}. {escape_markdown(claim.config.sentence)}** ({escape_markdown(claim.config.source)})"
+        lines.append([title, "", "", "", "", f"**{verdict_of(found)}**", ""])
+        before = ""
+        for finding in found:
+            measure, metric = finding.measure, finding.measure.metric
+            text, command = measure.comparison.text, command_of(measure.comparison.sweep, found, scale)
+            first, before = text != before, text
+            lines.append(
+                [
+                    escape_markdown(text) if first else "",
+                    metric.heading if measure.decides else f"*{metric.heading}*",
+                    format_paper(measure.paper, metric, signed=True),
+                    MISSING if finding.found is None else finding.found.numbers,
+                    MISSING if finding.found is None else str(finding.found.pairs),
+                    str(finding.verdict) if measure.decides else "",
+                    as_code([command]) if first else "",
+                ]
+            )
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -1,0 +1,66 @@
+"""The page of the claims and its picture, through the command's own entry."""
+
+import pytest
+from PIL import Image
+
+from src.dashboard import single_file as export
+from src.report.__main__ import main
+from src.report.sweep_record import record_path, write_record
+
+
+@pytest.fixture
+def report(tmp_path, monkeypatch, capsys):
+    """Writes all pages of the runs under `tmp_path`; returns the folder and what was printed."""
+    monkeypatch.setattr(export, "export_dashboard", lambda *arguments: None)
+
+    def run():
+        main(["phase=phase1", "scale=mini", f"paths.outputs={tmp_path}", f"paths.reports={tmp_path / 'reports'}"])
+        return tmp_path / "reports", capsys.readouterr().out
+
+    return run
+
+
+@pytest.fixture
+def write_sweep(write_run, make_record, tmp_path):
+    """Writes the record of a sweep and a run for each row and seed; every score is the row's value for that seed."""
+
+    def write(name, rows, changes=()):
+        record = make_record(dict.fromkeys(rows, {}), seeds=max(map(len, rows.values())), name=name)
+        record.changes = list(changes)
+        for label, values in rows.items():
+            for seed, value in enumerate(values):
+                write_run(record.rows[label][seed].rpartition("-")[2], [f"x={label}"], seed, value, speeds=True)
+        write_record(record_path(tmp_path / "reports", name, "mini", changes), record)
+
+    return write
+
+
+def test_claims_with_results_stand_beside_those_that_are_not_run(report, write_sweep):
+    write_sweep("enlargement", {"off": [0.10, 0.10, 0.10], "on, 4.8 m": [0.12, 0.121, 0.119]})
+    reports, said = report()
+    text = (reports / "README.md").read_text()
+    assert f"written: {reports / 'README.md'}" in said and len(text.splitlines()) < 70
+    assert "Of 10 claims: undecided 1, not run 9." in text  # claim 3 wants the optimum as well
+    command = "`python -m src.sweep +sweep=enlargement scale=mini seeds=3`"
+    # deviation 0.1, so 7.6488 * 0.1 / sqrt(3) = 0.44 to each side
+    assert f"| on, 4.8 m over off | mAP, % | +3.1 | +2.0 [+1.6, +2.4] | 3 | shows | {command} |" in text
+    missing = "`python -m src.sweep +sweep=layers scale=mini seeds=3`"
+    assert f"| 2 layers over 1 layer | mAP, % | +1.1 | – | – | not run | {missing} |" in text
+    assert "|  | *mAP, %* | +1.4 | – | – |  |  |" in text
+    assert "Data: synthetic highway world, split val; scale mini; 6 runs of up to 3 seeds; phase1: 6 epochs" in text
+    assert "code 0123456789" in text and "(pictures/claims_mini.png)" in text
+    assert Image.open(reports / "pictures" / "claims_mini.png").width == 1600
+
+
+def test_the_command_trains_all_seeds_that_the_page_reads(report, write_sweep):
+    write_sweep("layers", {"1 layer": [0.10] * 7, "2 layers": [0.10, 0.12, 0.14, 0.10, 0.12, 0.14, 0.9]})
+    text = (report()[0] / "README.md").read_text()
+    # 0, 2, 4 twice: deviation sqrt(16 / 5), so 3.5341 * sqrt(3.2 / 6) = 2.58 to each side; the seventh is no look
+    row = "| 2 layers over 1 layer | mAP, % | +1.1 | +2.0 [-0.6, +4.6] | 6 | undecided |"
+    assert f"{row} `python -m src.sweep +sweep=layers scale=mini seeds=6` |" in text
+
+
+def test_without_a_result_of_any_claim_there_is_no_page(report, write_sweep):
+    write_sweep("layers", {"1 layer": [0.10], "2 layers": [0.2]}, changes=["phase.epochs=1"])
+    reports, said = report()
+    assert "README" not in said and not (reports / "README.md").exists()
