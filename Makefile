@@ -22,7 +22,7 @@ endif
 $(if $(filter phase1 phase2 lrs_occupancy lrs_forecast lrs_detection,$(PHASES)),,$(error PHASE=$(PHASE): must be 1 or 2, or with MODEL=lrs4fusion occupancy, forecast or detection))
 MODEL_ARG := $(if $(MODEL),model=$(MODEL))
 
-.PHONY: help install world train sweep report dashboard benchmark performance test test-all test-faults audit check
+.PHONY: help install world train sweep study report dashboard benchmark performance test test-all test-faults audit check
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -53,6 +53,9 @@ train: $(STAMP) ## train PHASE=1|2 [MODEL=lrs4fusion: all its phases] [CHECKPOIN
 
 sweep: $(STAMP) ## train every row of SWEEP=epsilon and write its tables [ARGS="seeds=3 workers=2 dry_run=true"]
 	$(PYTHON) -m src.sweep +sweep=$(SWEEP) $(SCALE_ARG) $(ARGS)
+
+study: $(STAMP) ## train the sweeps of the paper's claims, with as many seeds as each needs [ARGS="workers=2 dry_run=true"]
+	$(PYTHON) -m src.study $(SCALE_ARG) $(ARGS)
 
 report: $(STAMP) ## everything finished into reports/: results, tables, pages, dashboard.html; shows the page of PHASE
 	$(PYTHON) -m src.report $(MODEL_ARG) phase=$(lastword $(PHASES)) $(SCALE_ARG) $(ARGS)

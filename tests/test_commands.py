@@ -144,5 +144,5 @@ def test_world_preview_and_comparison(outputs, tmp_path):
 
 def test_make_names_its_targets_and_a_wrong_phase():
     helped = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    for target in ("install", "world", "train", "benchmark", "test", "check"):
+    for target in ("install", "world", "train", "sweep", "study", "report", "benchmark", "test", "check"):
         assert f"make {target}" in helped

@@ -27,7 +27,7 @@ from src.report.sweep_file import DimensionConfig
 from src.report.sweep_record import SweepRecord
 from src.report.table_builder import write_sweep_tables
 from src.report.time_left import progress_line
-from src.sweep.compose import compose_sweep
+from src.sweep.compose import SweepCommand, compose_sweep
 from src.sweep.latency_runs import measure_latencies
 from src.sweep.launcher import Launcher
 from src.sweep.plan import (
@@ -71,10 +71,30 @@ def main(overrides: list[str]) -> None:
     if command.dry_run:
         print(describe(plan, outputs))
         return
+    run_plan(plan, command, common, identify, outputs, reports, resume_command("src.sweep", overrides))
+
+
+def resume_command(module: str, overrides: list[str]) -> str:
+    """The command line that goes on with this one, without passwords."""
+    return shlex.join(["python", "-m", module, *[masked(override) for override in overrides]])
+
+
+def run_plan(
+    plan: Plan,
+    command: SweepCommand,
+    common: list[str],
+    identify: Identifier,
+    outputs: Path,
+    reports: Path,
+    again: str,
+) -> None:
+    """Train what is missing, measure latencies, write and show the tables; `again` is the command that resumes it.
+
+    Raises InterruptedRunError when it was stopped, HorizonError when a run has failed.
+    """
     make_writable(outputs / "sweeps", "paths.outputs")
     make_writable(reports / "sweeps", "paths.reports")
     study = SweepStudy(outputs, plan.study, command.storage or default_storage(outputs), definition(plan, common))
-    again = shlex.join(["python", "-m", "src.sweep", *[masked(override) for override in overrides]])
     launcher = Launcher(
         [sys.executable, "-m", "src.train"],
         study.folder,
@@ -91,7 +111,7 @@ def main(overrides: list[str]) -> None:
     if runner.stop.requested:
         print(progress_line(record, command.workers, time.time()))
         raise InterruptedRunError(f"the sweep was stopped; nothing finished is lost, resume it with\n    {again}")
-    if sweep.latency:
+    if plan.sweep.latency:
         measured = measure_latencies(record, outputs, partial(latency_command, outputs), runner)
         logger.info("latency measured of %d runs", measured)
     finish(record, runner, outputs, reports, again)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any
 
 from src.errors import ConfigError, HorizonError
@@ -108,21 +109,25 @@ def _value_of(override: str) -> str:
     return override.partition("=")[2].strip("'\"")
 
 
-def make_plan(sweep: SweepConfig, common: list[str], seeds: list[int], identify: Identify) -> Plan:
+def make_plan(
+    sweep: SweepConfig, common: list[str], seeds: Sequence[int] | Mapping[str, Sequence[int]], identify: Identify
+) -> Plan:
     """Plan every row with every seed; seed by seed, and of each seed first what several rows start from.
 
-    `common` is the command line's part for every run. Raises ConfigError naming file and row for one that does not
-    compose or is of another scale than the others.
+    `seeds` may be those of each row, by its label; `common` is the command line's part for every run. Raises
+    ConfigError naming file and row for one that does not compose or is of another scale than the others.
     """
     scale = compose_file(sweep, common, identify).scale
     sweep = sweep.at_scale(scale)
-    plan = Plan(sweep, scale, list(seeds), changes_of(sweep, common))
+    by_row = seeds if isinstance(seeds, Mapping) else dict.fromkeys((row.label for row in sweep.rows), seeds)
+    every = list(dict.fromkeys(chain(*by_row.values()) if by_row else seeds))
+    plan = Plan(sweep, scale, every, changes_of(sweep, common))
     if sweep.is_search:
         return plan
-    for seed in seeds:
+    for seed in every:
         needed: list[RunSpec] = []
         own: list[RunSpec] = []
-        for row in sweep.rows:
+        for row in (row for row in sweep.rows if seed in by_row[row.label]):
             joined = join_overrides(sweep.overrides, row.overrides, common)
             overrides = join_overrides(joined, [f"seed={seed}"])
             found = _compose(sweep, row, overrides, common, identify)

@@ -42,6 +42,15 @@ def test_order_is_seed_by_seed_and_first_what_others_start_from():
     assert plan.changes == ["model.x=2"] and plan.study == f"fake-debug{suffix_of(plan.changes)}"
 
 
+def test_rows_may_have_seeds_of_their_own():
+    sweep = make_sweep({"a": ["phase=phase1"], "b": ["phase=phase2"], "c": ["model.x=1"]})
+    plan = make_plan(sweep, [], {"a": [0], "b": range(2), "c": range(3)}, identify)
+    assert {label: list(runs) for label, runs in plan.rows.items()} == {"a": [0], "b": [0, 1], "c": [0, 1, 2]}
+    labels = [(spec.label, spec.seed) for spec in plan.specs.values()]
+    assert labels == [("a", 0), ("b", 0), ("c", 0), ("weights for b", 1), ("b", 1), ("c", 1), ("c", 2)]
+    assert plan.seeds == [0, 1, 2]
+
+
 def test_a_run_that_no_row_shows_says_what_it_is_for():
     plan = make_plan(make_sweep({"b": ["phase=phase2"]}), ["paths.outputs=o"], [0], identify)
     first, second = plan.specs.values()

@@ -1,0 +1,159 @@
+"""`python -m src.study`: the sweeps that the paper's claims name, each comparison with as many seeds as it needs.
+
+At the first of `LOOKS` every row of every sweep is trained, sweep by sweep in the order of the claims; at each later
+one the rows of the comparisons that are still open. How they are decided: docs/scores.md.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from src.errors import ConfigError, DataError, HorizonError, InterruptedRunError
+from src.reliability.command import run_command
+from src.reliability.passwords import hide_in_process_list
+from src.report.claims import Claim, Finding, judge, load_claims, verdict_of
+from src.report.comparisons import LOOKS
+from src.report.results import RunResult, read_results
+from src.report.sweep_record import RunState, SweepRecord, read_record, record_path
+from src.report.time_left import progress_line
+from src.sweep.__main__ import Identifier, resume_command, run_plan
+from src.sweep.compose import SweepCommand, compose_sweep, load_sweep
+from src.sweep.plan import Plan, changes_of, compose_file, join_overrides, make_plan, without_published
+from src.sweep.run_status import is_done
+from src.training.identity import key_of
+
+logger = logging.getLogger(__name__)
+
+SET_BY_THE_RULE = ("sweep", "seed", "seeds", "trials")
+
+
+def main(overrides: list[str]) -> None:
+    """Train what the claims still need, show what they come to. Raises HorizonError listing what failed."""
+    for override in overrides:
+        hide_in_process_list(override)
+        if key_of(override) in SET_BY_THE_RULE:
+            raise ConfigError(
+                f"{override}: the claims say which sweeps and seeds are run; leave {key_of(override)}= out"
+            )
+    study = read_study(overrides)
+    if study.options.dry_run:
+        print(study.describe())
+        return
+    again = resume_command("src.study", overrides)
+    problems = []
+    for look in LOOKS:
+        plans = study.plans(look, study.results())
+        for plan in plans:
+            logger.info("%s", study.progress(plans, look, study.results()))
+            command = study.commands[plan.sweep.name]
+            try:
+                run_plan(plan, command, study.common, study.identify, study.outputs, study.reports, again)
+            except InterruptedRunError:
+                raise
+            except HorizonError as error:  # costs no other sweep
+                problems.append(f"{plan.study}: {error}")
+    print(study.verdicts())
+    if problems:
+        raise HorizonError("\n".join(problems))
+
+
+@dataclass
+class Study:
+    """The claims, and the sweeps that they name as the command line makes them."""
+
+    claims: list[Claim]
+    commands: dict[str, SweepCommand]  # by the sweep's name, in the order of the claims
+    common: list[str]  # overrides of every run
+    scale: str
+    outputs: Path
+    reports: Path
+    identify: Identifier
+
+    @property
+    def options(self) -> SweepCommand:
+        """The runner's; the same for every sweep."""
+        return next(iter(self.commands.values()))
+
+    def results(self) -> dict[str, RunResult]:
+        """What has finished so far, by run id."""
+        return read_results(self.reports, self.scale)[0]
+
+    def findings(self, results: dict[str, RunResult]) -> list[tuple[Claim, list[Finding]]]:
+        """What they say of each claim."""
+        records: dict[str, SweepRecord] = {}
+        for name, command in self.commands.items():
+            path = record_path(self.reports, name, self.scale, changes_of(command.sweep, self.common))
+            try:
+                records[name] = read_record(path)
+            except DataError:  # none yet, or one that the runner will replace
+                continue
+        return [(claim, judge(claim, records, results)) for claim in self.claims]
+
+    def plans(self, look: int, results: dict[str, RunResult]) -> list[Plan]:
+        """What each sweep trains for a look, without those of which nothing is open any more."""
+        still = [one.measure.comparison for _, found in self.findings(results) for one in found if one.is_open]
+        first, plans = min(LOOKS), []
+        for name, command in self.commands.items():
+            rows = {row for one in still if one.sweep == name for row in (one.row, one.over)}
+            if look > first and not rows:
+                continue
+            seeds = {row.label: range(look if row.label in rows else first) for row in command.sweep.rows}
+            plan = make_plan(command.sweep, self.common, seeds, self.identify)
+            plans.append(without_published(plan, results) if command.published else plan)
+        return plans
+
+    def progress(self, plans: list[Plan], look: int, results: dict[str, RunResult]) -> str:
+        """How far a look is, over all its sweeps, and the time left as far as runs finished here tell it."""
+        runs = {}
+        for spec in (spec for plan in plans for spec in plan.specs.values()):
+            done = is_done(self.outputs / spec.run_id)
+            took = results[spec.run_id].seconds["all"] if done and spec.run_id in results else None
+            counts = done or any(spec.run_id in plan.published for plan in plans)
+            state = "done" if counts else "waiting"
+            runs[spec.run_id] = RunState(**spec.stored, state=state, started=None if took is None else 0.0, ended=took)
+        record = SweepRecord(
+            sweep=plans[0].sweep, scale=self.scale, command="", seeds=[], rows={}, runs=runs,
+            study=f"study at scale {self.scale}, {look} seeds", storage="",
+        )  # fmt: skip
+        return progress_line(record, self.options.workers, time.time())
+
+    def describe(self) -> str:
+        """The plan as text: what each look trains, later ones if what is open now stays so; then the verdicts."""
+        results, lines = self.results(), []
+        for look in LOOKS:
+            plans = self.plans(look, results)
+            if not plans:
+                continue
+            lines.append(f"# {self.progress(plans, look, results)}{', if all stays open' if look > min(LOOKS) else ''}")
+            for plan in plans:
+                rows = [label for label, runs in plan.rows.items() if len(runs) == look]
+                lines.append(f"#   {plan.sweep.name}: {'; '.join(rows)}")
+        return "\n".join([*lines, self.verdicts()])
+
+    def verdicts(self) -> str:
+        """A line per claim."""
+        return "\n".join(
+            f"{claim.config.name}: {verdict_of(found)} ({claim.config.sentence})"
+            for claim, found in self.findings(self.results())
+        )
+
+
+def read_study(overrides: list[str]) -> Study:
+    """The study of a command line. Raises ConfigError for claims, sweeps and options that are wrong."""
+    claims = load_claims(load_sweep)
+    names = dict.fromkeys(measure.comparison.sweep for claim in claims for measure in claim.measures)
+    composed = {name: compose_sweep([f"+sweep={name}", *overrides]) for name in names}
+    commands = {name: command for name, (command, _) in composed.items()}
+    (_, common), identify = next(iter(composed.values())), Identifier()
+    sweep = next(iter(commands.values())).sweep
+    compose_file(sweep, common, identify)
+    config, _ = identify.compose(join_overrides(sweep.overrides, common))
+    outputs, reports = Path(config.paths.outputs), Path(config.paths.reports)
+    return Study(claims, commands, common, config.scale, outputs, reports, identify)
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,188 @@
+"""`python -m src.study`: what each look trains, with a runner that makes results up instead of training."""
+
+import json
+
+import pytest
+
+from src.errors import ConfigError, HorizonError, InterruptedRunError
+from src.report.claims import load_claims
+from src.report.results import RunResult
+from src.study import __main__ as study
+from src.sweep import compose as sweep_config
+from src.sweep.__main__ import Identifier, definition
+from src.sweep.record_writer import RecordWriter
+from src.sweep.sweep_study import SweepStudy, default_storage
+from tests.sweep.fake_train import identify
+
+SWEEPS = {
+    "margin": ["none", "small", "large"],
+    "layers": ["one", "two"],
+}
+CLAIMS = {
+    "half_width": 0.1,
+    "claims": [
+        {
+            "name": "margin", "sentence": "Larger is better", "source": "Table 1",
+            "comparisons": [{"sweep": "margin", "row": "large", "over": "small", "metrics": ["mAP"]}],
+        },
+        {
+            "name": "layers", "sentence": "Two are better", "source": "Table 2",
+            "comparisons": [{"sweep": "layers", "row": "two", "over": "one", "metrics": ["mAP"]}],
+        },
+    ],
+}  # fmt: skip
+GAIN = {"large": [2.0, 2.1, 1.9] * 4, "two": [2.0, 1.0, 0.9, 1.0, 1.2, 1.1, *[1.0] * 6]}
+"""Over the other rows, by seed, in percent: the first is decided at three pairs, the second at six."""
+
+
+class FakeIdentifier(Identifier):
+    def __call__(self, overrides):
+        return identify(overrides)
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    """Two sweeps and two claims on them, and the overrides that keep everything in the test's folder."""
+    folder = tmp_path / "sweeps"
+    folder.mkdir()
+    for name, labels in SWEEPS.items():
+        rows = [{"label": label, "overrides": [f"model.{name}={label}"]} for label in labels]
+        (folder / f"{name}.yaml").write_text(json.dumps({"title": "t", "question": "q?", "rows": rows}))
+    (tmp_path / "claims.yaml").write_text(json.dumps(CLAIMS))
+    monkeypatch.setattr(sweep_config, "SWEEPS", folder)
+    monkeypatch.setattr(study, "load_claims", lambda load: load_claims(load, tmp_path / "claims.yaml"))
+    monkeypatch.setattr(study, "Identifier", FakeIdentifier)
+    return ["scale=debug", f"paths.outputs={tmp_path / 'outputs'}", f"paths.reports={tmp_path / 'reports'}"]
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Stands for the runner: finishes every run of a plan. Returns (sweep, runs that were not there, by row) a call."""
+    results, calls = {}, []
+
+    def run_plan(plan, command, common, identify, outputs, reports, again):
+        new = {}
+        for spec in plan.specs.values():
+            if spec.run_id in results or spec.run_id in plan.published:
+                continue
+            new.setdefault(spec.label, []).append(spec.seed)
+            value = 0.1 + GAIN.get(spec.label, [0.0] * 12)[spec.seed] / 100
+            folder = outputs / spec.run_id
+            folder.mkdir(parents=True)
+            (folder / "run.json").write_text("{}")
+            (folder / "metrics.json").write_text(json.dumps({"mAP": value}))
+            results[spec.run_id] = RunResult(
+                run_id=spec.run_id, model="m", phase="phase1", scale="debug", seed=spec.seed, overrides=[],
+                data={"name": "n", "root": "r"}, commit="c", versions={}, device="cpu", processes=1, threads=1,
+                initialized_from=None, epochs=1, steps=1, parameters=1, resumed=False, seconds={"all": 60.0},
+                peak_memory_mib={"process": 1}, skipped_files={}, config={}, metrics={"mAP": value}, curves={},
+                latency=None,
+            )  # fmt: skip
+        shared = SweepStudy(outputs, plan.study, default_storage(outputs), definition(plan, common))
+        RecordWriter(plan, shared, again, outputs, reports).write()
+        calls.append((plan.sweep.name, new))
+
+    monkeypatch.setattr(study, "run_plan", run_plan)
+    monkeypatch.setattr(study.Study, "results", lambda self: dict(results))
+    return calls, results
+
+
+def test_seeds_are_added_to_what_is_open_and_to_nothing_else(places, trained, capsys):
+    calls, _ = trained
+    study.main(places)
+    three = [0, 1, 2]
+    assert calls == [
+        ("margin", {"none": three, "small": three, "large": three}),
+        ("layers", {"one": three, "two": three}),
+        ("layers", {"one": [3, 4, 5], "two": [3, 4, 5]}),
+    ]
+    assert capsys.readouterr().out == "margin: shows (Larger is better)\nlayers: shows (Two are better)\n"
+    calls.clear()
+    study.main(places)  # nothing is open: the first look is shown again
+    assert calls == [("margin", {}), ("layers", {})]
+
+
+def test_rows_outside_the_open_comparisons_stay_at_the_first_look(places, trained, monkeypatch):
+    calls, _ = trained
+    monkeypatch.setitem(GAIN, "large", [9.0, -9.0] * 6)
+    study.main(places)
+    assert [new for name, new in calls if name == "margin"][1:] == [
+        {"small": [3, 4, 5], "large": [3, 4, 5]},
+        {"small": [*range(6, 12)], "large": [*range(6, 12)]},
+    ]
+
+
+def test_a_plan_is_printed_with_the_time_that_it_takes(places, trained, capsys, tmp_path):
+    calls, _ = trained
+    study.main([*places, "dry_run=true"])
+    out = capsys.readouterr().out.splitlines()
+    assert not calls and not (tmp_path / "outputs").exists() and not (tmp_path / "reports").exists()
+    assert out == [
+        "# study at scale debug, 3 seeds: 0 of 15 done, 0 running, 15 left, time left unknown yet",
+        "#   margin: none; small; large",
+        "#   layers: one; two",
+        "# study at scale debug, 6 seeds: 0 of 27 done, 0 running, 27 left, time left unknown yet, if all stays open",
+        "#   margin: small; large",
+        "#   layers: one; two",
+        "# study at scale debug, 12 seeds: 0 of 51 done, 0 running, 51 left, time left unknown yet, if all stays open",
+        "#   margin: small; large",
+        "#   layers: one; two",
+        "margin: not run (Larger is better)",
+        "layers: not run (Two are better)",
+    ]
+
+
+def test_time_left_is_that_of_runs_finished_here(places, trained):
+    _, results = trained
+    study.main(places)
+    here = study.read_study([*places, "workers=2"])
+    plans = here.plans(12, {})  # as if no claim had a result: all is open
+    assert here.progress(plans, 12, results) == (
+        "study at scale debug, 12 seeds: 21 of 51 done, 0 running, 30 left, about 15 min left"
+    )
+    assert here.progress(plans, 12, {}).endswith("30 left, time left unknown yet")
+
+
+def test_a_sweep_that_fails_costs_no_other(places, trained, monkeypatch, capsys):
+    calls, _ = trained
+    run_plan = study.run_plan
+
+    def failing(plan, *rest):
+        if plan.sweep.name == "margin":
+            raise HorizonError("1 of 9 runs failed")
+        run_plan(plan, *rest)
+
+    monkeypatch.setattr(study, "run_plan", failing)
+    with pytest.raises(HorizonError, match="margin-debug: 1 of 9 runs failed"):
+        study.main(places)
+    assert {name for name, _ in calls} == {"layers"}
+    assert "margin: not run" in capsys.readouterr().out
+
+    def stopped(plan, *rest):
+        raise InterruptedRunError("stopped")
+
+    monkeypatch.setattr(study, "run_plan", stopped)
+    with pytest.raises(InterruptedRunError):
+        study.main(places)
+
+
+def test_what_has_a_result_elsewhere_is_not_trained(places, trained, tmp_path):
+    calls, results = trained
+    study.main(places)
+    calls.clear()
+    gone = next(run_id for run_id, result in results.items() if result.seed == 1)
+    del results[gone]
+    study.main([*places, "published=true", f"paths.outputs={tmp_path / 'another'}"])
+    assert [new for _, new in calls if new] == [{"none": [1]}]
+
+
+def test_another_experiment_has_records_of_its_own(places, trained, tmp_path):
+    study.main([*places, "optim.lr=1"])
+    assert [path.name for path in (tmp_path / "reports" / "sweeps").glob("margin_debug-*.json")]
+    assert not (tmp_path / "reports" / "sweeps" / "margin_debug.json").exists()
+
+
+@pytest.mark.parametrize("override", ["+sweep=margin", "seed=3", "seeds=12", "trials=3"])
+def test_what_the_rule_sets_is_refused(places, override):
+    with pytest.raises(ConfigError, match=r"the claims say which sweeps and seeds are run; leave \w+= out"):
+        study.main([*places, override])
