@@ -112,6 +112,7 @@ class BenchmarkSuite(Enum):
     metric = "metric"
     reader = "reader"
     launches = "launches"
+    gpu = "gpu"
 
 
 @dataclass(kw_only=True)

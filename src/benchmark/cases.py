@@ -72,11 +72,11 @@ class Case:
 
 def build_case(config: Config, batch: FrameBatch, device: torch.device) -> Case:
     """The configured model, with weights of `checkpoint=PATH` if given, before its first batch."""
-    model = build_model(config)
+    model = build_model(config).to(device)
     load_weights(config, model)
     prepared = prepare_for_inference(model, config.precision)
     learns_boxes = EVALUATORS[config.phase.task].labels
-    return Case(model.to(device).train(), prepared, batch, None, device, config.precision, learns_boxes)
+    return Case(model.train(), prepared, batch, None, device, config.precision, learns_boxes)
 
 
 def load_weights(config: Config, model: Detector) -> None:
