@@ -9,6 +9,7 @@ from torch import Tensor
 
 from src.geometry.constants import constant
 from src.ops.kernel_map import KernelMap, TableMap, counts_kept
+from src.ops.moved_keys import NONE, moved_keys
 from src.ops.neighbour_table import neighbour_table
 from src.ops.sites import HALO, Sites
 
@@ -234,26 +235,35 @@ def _reached(
     sites: Sites, shape: tuple[int, ...], kernel: tuple[int, ...], stride: tuple[int, ...], padding: tuple[int, ...]
 ) -> Sites:
     """Every cell of the coarse grid whose window holds a site. Waits for a GPU once, for their number."""
-    device, none = sites.device, torch.iinfo(torch.int64).max
-    coarse = Sites(shape, sites.keys)
     taps = itertools.product(*(range(size) for size in kernel))
     shifts = tuple(tuple(pad - k for pad, k in zip(padding, tap, strict=True)) for tap in taps)
-    cells = sites.indices()  # [n, 1 + d]
-    moved = cells[:, 1:] + constant(shifts, torch.int64, device)[:, None]  # [K, n, d]
-    steps, sizes = constant((stride, shape[1:]), torch.int64, device)
-    target = torch.div(moved, steps, rounding_mode="floor")
-    fits = ((target * steps == moved) & (target >= 0) & (target < sizes)).all(-1)
-    inner = (target * constant(coarse.strides[1:], torch.int64, device)).sum(-1) + cells[:, 0] * coarse.strides[0]
-    # What fits nowhere becomes the largest key, which is there at least once and cut off.
-    candidates = torch.cat([torch.where(fits, inner, none).flatten(), constant((none,), torch.int64, device)])
-    return Sites(shape, torch.unique(candidates)[:-1])
+    coarse = Sites(shape, sites.keys)
+    ones, zeros = (1,) * sites.ndim, (0,) * sites.ndim
+    candidates = _moved(sites, coarse, ones, stride, (zeros, shape[1:]), shifts).flatten()
+    # What fits nowhere is the largest key, which is there at least once and cut off.
+    return Sites(shape, torch.unique(torch.cat([candidates, constant((NONE,), torch.int64, sites.device)]))[:-1])
 
 
 def _strided_corners(sites: Sites, out: Sites, stride: tuple[int, ...], padding: tuple[int, ...]) -> Tensor:  # [m]
     """Key among `sites` of the first cell of each output's window."""
-    steps = (sites.strides[0], *(s * step for s, step in zip(stride, sites.strides[1:], strict=True)))
-    before = sum(pad * step for pad, step in zip(padding, sites.strides[1:], strict=True))
-    return (out.indices() * constant(steps, torch.int64, sites.device)).sum(1) - before
+    low, high = (-HALO,) * sites.ndim, tuple(size + HALO for size in sites.shape[1:])
+    shifts = (tuple(-pad for pad in padding),)
+    return _moved(out, sites, stride, (1,) * sites.ndim, (low, high), shifts)[0]
+
+
+def _moved(
+    sites: Sites,
+    target: Sites,  # whose grid
+    factors: tuple[int, ...],
+    divisors: tuple[int, ...],
+    limits: tuple[tuple[int, ...], tuple[int, ...]],  # low and high of the cells there
+    shifts: tuple[tuple[int, ...], ...],
+) -> Tensor:  # [K, n] int64
+    """Keys of the sites on another grid, tap by tap."""
+    sizes = tuple(size + HALO for size in sites.shape[1:])
+    columns = (sites.strides[1:], sizes, factors, divisors, *limits, target.strides[1:])
+    axes = tuple(zip(*columns, strict=True))
+    return moved_keys(sites.keys, (sites.strides[0], target.strides[0]), axes, shifts)
 
 
 def _map_between(
