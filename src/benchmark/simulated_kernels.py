@@ -96,13 +96,17 @@ def _nearest_radial(
 
 
 def _gather_product(
-    rows: Tensor, weight: Tensor, bias: Tensor, out: Tensor, order: Tensor, table: Tensor, *sizes: int
-) -> None:
+    rows: Tensor, weight: Tensor, bias: Tensor, residual: Tensor, out: Tensor, order: Tensor, table: Tensor,
+    relu: bool, reverse: bool, *sizes: int,
+) -> None:  # fmt: skip
     total = torch.zeros(out.shape)
-    for matrix, seen in zip(weight.float(), table.long(), strict=True):
+    for matrix, seen in zip(weight.flip(0) if reverse else weight, table.long(), strict=True):
         hit = (seen >= 0).nonzero().squeeze(1)
-        total.index_add_(0, hit, rows[seen[hit]].float() @ matrix)
-    out.copy_(total if bias.data_ptr() == out.data_ptr() else total + bias.float())
+        total.index_add_(0, hit, rows[seen[hit]].float() @ matrix.float())
+    for added in (bias, residual):
+        if added.data_ptr() != out.data_ptr():
+            total += added.float()
+    out.copy_(total.relu_() if relu else total)
 
 
 def _log_free(

@@ -25,6 +25,7 @@ KERNELS = {
     "neighbour_table": "src.ops.kernels.neighbour_table_triton",
     "radial_change": "src.ops.kernels.radial_change_triton",
     "sparse_conv": "src.ops.kernels.sparse_conv_triton",
+    "sparse_conv_relu": "src.ops.kernels.sparse_conv_triton",
     "splat": "src.ops.kernels.splat_triton",
 }
 

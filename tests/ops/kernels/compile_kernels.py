@@ -65,6 +65,8 @@ def main():
         inputs = [features.requires_grad_(), weight.requires_grad_()]
         out = sparse_conv_triton.sparse_conv_triton(*inputs, kernel_map, torch.zeros(c_out, dtype=dtype))
         torch.autograd.grad(out, inputs, torch.zeros_like(out))
+        operands = (features.detach(), weight.detach(), kernel_map, None, out.detach())
+        sparse_conv_triton.sparse_conv_relu_triton(*operands)
 
     moved_keys_triton.moved_keys_triton(torch.arange(80), (120, 35), ((12, 10, 1, 2, 0, 5, 7),) * 2, ((1, 0),))
 
