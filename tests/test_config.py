@@ -117,7 +117,7 @@ FULL_SIZE = {
     "model": {"channels": 128},
     "model.radar_encoder": {
         "voxel_size_m": [0.1, 0.1, 0.2], "stage_channels": [16, 32, 64, 128, 128, 128], "max_voxels": 60000,
-        "conv_out": "sparse", "height_tolerance_deg": 0.0,
+        "conv_out": "sparse", "height_tolerance_deg": 0.0, "pruning_ratio": 0.0,
     },
     "model.kggi": {
         "initialization": "both", "num_radar_keypoints": 1024, "num_camera_keypoints": 256,

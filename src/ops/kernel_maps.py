@@ -129,6 +129,32 @@ def temporal_map(sites: Sites, kernel_size: Size, stride: Size, padding: Size) -
     return sites.cache[key]
 
 
+def pruned_map(
+    sites: Sites,
+    wide: Tensor,  # [n] bool
+    kernel_size: Size,
+    stride: Size,
+    padding: Size,
+) -> tuple[KernelMap, Sites]:
+    """The strided map without the outputs that only sites which are not `wide` reach, but for each site's own.
+
+    Its own output is the cell that it lies in, cell // stride. Every output that stays sees all inputs in its window.
+    Waits for a GPU once. Raises ValueError where a site's own output might lie outside its window.
+    """
+    kernel = per_axis(kernel_size, sites.ndim, "kernel_size")
+    strides, pads = per_axis(stride, sites.ndim, "stride"), per_axis(padding, sites.ndim, "padding")
+    if any(pad + step > size for pad, step, size in zip(pads, strides, kernel, strict=True)) or max(pads) > HALO:
+        raise ValueError(f"kernel_size={kernel}, stride={strides}, padding={pads}: no window reaches its whole cell")
+    tap_steps = [torch.Size(kernel[axis + 1 :]).numel() for axis in range(sites.ndim)]
+    steps, first, per_tap = constant((strides, pads, tuple(tap_steps)), torch.int64, sites.device)
+    own = ((first + sites.indices()[:, 1:] % steps) * per_tap).sum(1)  # [n] the tap between a site and its own output
+    taps = torch.arange(torch.Size(kernel).numel(), device=sites.device)[:, None]
+    out = _reached(
+        sites, _output_shape(sites.shape, kernel, strides, pads), kernel, strides, pads, wide | (taps == own)
+    )
+    return _map_between(sites, out, kernel, strides, pads), out
+
+
 def _odd_kernel(sites: Sites, kernel_size: Size) -> tuple[int, ...]:
     kernel = per_axis(kernel_size, sites.ndim, "kernel_size")
     if any(size % 2 == 0 or size > 2 * HALO + 1 for size in kernel):
@@ -222,24 +248,24 @@ def _build_temporal(
     else:
         _, reached = _build_strided(sites, *first)
     out = Sites(shape, reached.keys)
-    if makes_tables(sites):
-        return _map_between(sites, out, kernel, stride, padding), out
-    corner = _strided_corners(sites, out, stride, padding)
-    found, where = _search(sites.keys, corner, sites.strides[1:], kernel, torch.Size(kernel).numel())
-    hits, outputs, counts = _hits(found)
-    inputs = where.reshape(-1).index_select(0, hits).to(torch.int32)
-    return KernelMap(inputs, outputs, counts, len(sites), len(out)), out
+    return _map_between(sites, out, kernel, stride, padding), out
 
 
 def _reached(
-    sites: Sites, shape: tuple[int, ...], kernel: tuple[int, ...], stride: tuple[int, ...], padding: tuple[int, ...]
+    sites: Sites,
+    shape: tuple[int, ...],
+    kernel: tuple[int, ...],
+    stride: tuple[int, ...],
+    padding: tuple[int, ...],
+    kept: Tensor | None = None,  # [K, n] bool, the taps through which a site counts
 ) -> Sites:
     """Every cell of the coarse grid whose window holds a site. Waits for a GPU once, for their number."""
     taps = itertools.product(*(range(size) for size in kernel))
     shifts = tuple(tuple(pad - k for pad, k in zip(padding, tap, strict=True)) for tap in taps)
     coarse = Sites(shape, sites.keys)
     ones, zeros = (1,) * sites.ndim, (0,) * sites.ndim
-    candidates = _moved(sites, coarse, ones, stride, (zeros, shape[1:]), shifts).flatten()
+    candidates = _moved(sites, coarse, ones, stride, (zeros, shape[1:]), shifts)
+    candidates = (candidates if kept is None else torch.where(kept, candidates, NONE)).flatten()
     # What fits nowhere is the largest key, which is there at least once and cut off.
     return Sites(shape, torch.unique(torch.cat([candidates, constant((NONE,), torch.int64, sites.device)]))[:-1])
 
@@ -269,10 +295,15 @@ def _moved(
 def _map_between(
     sites: Sites, out: Sites, kernel: tuple[int, ...], stride: tuple[int, ...], padding: tuple[int, ...]
 ) -> KernelMap:
-    """The map between two sets that are known, as a table."""
+    """The map between two sets that are known."""
     corners = _strided_corners(sites, out, stride, padding)
-    table, bits = neighbour_table(sites.keys, corners, _taps(sites, kernel))
-    return TableMap(table, len(sites), bits=bits)
+    if makes_tables(sites):
+        table, bits = neighbour_table(sites.keys, corners, _taps(sites, kernel))
+        return TableMap(table, len(sites), bits=bits)
+    found, where = _search(sites.keys, corners, sites.strides[1:], kernel, torch.Size(kernel).numel())
+    hits, outputs, counts = _hits(found)
+    inputs = where.reshape(-1).index_select(0, hits).to(torch.int32)
+    return KernelMap(inputs, outputs, counts, len(sites), len(out))
 
 
 def _search(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -13,10 +14,12 @@ from src.ops.kernel_maps import (
     Size,
     inverse_map,
     per_axis,
+    pruned_map,
     strided_map,
     submanifold_map,
     temporal_map,
 )
+from src.ops.segment_reduce import rank_per_sample, segment_count
 from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv, sparse_conv_relu
 from src.structures.sparse_bev import SparseMap
@@ -82,6 +85,26 @@ class SparseConv(SparseKernel):
 
     def map(self, sites: Sites) -> tuple[KernelMap, Sites]:
         return strided_map(sites, self.kernel_size, self.stride, self.padding)
+
+
+class PrunedSparseConv(SparseConv):
+    """A `SparseConv` that only part of its input dilates (VoxelNeXt 3.1: spatially voxel pruning).
+
+    Of every sample the `pruning_ratio` of the sites with the smallest mean magnitude over the channels, rounded down,
+    reach no cell but their own; ties by row.
+    """
+
+    def __init__(self, *arguments: Any, pruning_ratio: float, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self.pruning_ratio = pruning_ratio
+
+    def forward(self, x: SparseMap) -> SparseMap:
+        sample = x.sites.indices()[:, 0]
+        order, rank = rank_per_sample(x.features.detach().abs().mean(1), sample)
+        counts = segment_count(sample, x.batch_size)
+        most = counts - (self.pruning_ratio * counts.double()).long()  # [B]
+        wide = torch.empty_like(sample, dtype=torch.bool).index_copy_(0, order, rank < most[sample[order]])
+        return self.convolve(x, *pruned_map(x.sites, wide, self.kernel_size, self.stride, self.padding))
 
 
 class SparseInverseConv(SparseKernel):
