@@ -23,7 +23,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.ops import backend
 from src.ops.farthest_point import farthest_points_reference
 from src.ops.moved_keys import moved_keys_reference
-from src.ops.neighbour_table import neighbour_table_reference
+from src.ops.neighbour_table import neighbour_table_reference, turned_table_reference
 from src.ops.radial_change import radial_change_reference
 from src.ops.splat import log1mexp
 
@@ -78,6 +78,11 @@ def _sample(points: Tensor, valid: Tensor, start: Tensor, picks: Tensor, num: in
 
 def _search(keys: Tensor, corners: Tensor, taps: Tensor, table: Tensor, bits: Tensor, *sizes: int) -> None:
     for out, found in zip((table, bits), neighbour_table_reference(keys, corners, taps), strict=True):
+        out.copy_(found)
+
+
+def _turn(table: Tensor, back: Tensor, bits: Tensor, num: int, cells: int) -> None:
+    for out, found in zip((back, bits), turned_table_reference(table, num), strict=True):
         out.copy_(found)
 
 
@@ -153,5 +158,6 @@ KERNELS: dict[str, Callable[..., None] | None] = {
     "_cell_features": _cell_features,
     "_nearest_cell": _nearest_cell,
     "_gaussian_gradient": None,
+    "_turn": _turn,
 }
 """The plain form of every kernel, None where its values are a gradient."""

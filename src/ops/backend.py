@@ -27,6 +27,7 @@ KERNELS = {
     "sparse_conv": "src.ops.kernels.sparse_conv_triton",
     "sparse_conv_relu": "src.ops.kernels.sparse_conv_triton",
     "splat": "src.ops.kernels.splat_triton",
+    "turned_table": "src.ops.kernels.neighbour_table_triton",
 }
 
 _chosen: str | None = None  # until the first operation asks
