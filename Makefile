@@ -22,7 +22,7 @@ endif
 $(if $(filter phase1 phase2 lrs_occupancy lrs_forecast lrs_detection,$(PHASES)),,$(error PHASE=$(PHASE): must be 1 or 2, or with MODEL=lrs4fusion occupancy, forecast or detection))
 MODEL_ARG := $(if $(MODEL),model=$(MODEL))
 
-.PHONY: help install world train sweep study report dashboard benchmark performance test test-all test-faults audit check
+.PHONY: help install world train sweep study report dashboard benchmark performance test test-all test-faults audit gpu check
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -80,6 +80,16 @@ performance: $(STAMP) ## all pages of reports/performance, an hour and a half of
 	    "suite=training" "suite=training model=dense_bev" "suite=reader $(FULL_SIZE)" "suite=reader" "suite=metric" \
 	    "suite=soak phase=phase2"; do \
 	    $(PYTHON) -m src.benchmark $$suite $(PRECISION) out=reports/performance $(ARGS) || exit 1; \
+	done
+
+# The kernels, the sanitizer on the smallest case, then the pages; what is late is ended, so that no more than 45 minutes pass.
+gpu: $(TEST_STAMP) ## on a GPU, without data, in 45 minutes: tests of the kernels, sanitizer, pages of reports/performance
+	timeout 10m $(PYTHON) -m pytest -q -m gpu tests $(ARGS)
+	if command -v compute-sanitizer; then timeout 5m compute-sanitizer --target-processes all --error-exitcode 1 \
+	    $(PYTHON) -m pytest -q -m gpu tests/ops/kernels -k one_site || exit 1; fi
+	for suite in "suite=gpu phase=phase2" "suite=scaling phase=phase2" "suite=ops"; do \
+	    timeout 10m $(PYTHON) -m src.benchmark $$suite $(FULL_SIZE) model.dptf.bev_path.memory_threshold=0 \
+	        precision=bf16-mixed trainer.accelerator=gpu out=reports/performance || exit 1; \
 	done
 
 # One thread per process: small operators gain nothing from a second one, and side by side they slow each other down.

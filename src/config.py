@@ -30,7 +30,7 @@ from src.models.backbones.image import ImageEncoderConfig
 from src.ops.precision import Precision
 from src.reliability.passwords import masked
 from src.reliability.untrusted import fault_of_tree
-from src.training.identity import key_of
+from src.training.identity import YOUNGER_KEYS, key_of
 from src.training.optim import OptimConfig
 from src.training.phases import PhaseConfig
 from src.training.run_folder import Resume
@@ -112,6 +112,7 @@ class BenchmarkSuite(Enum):
     metric = "metric"
     reader = "reader"
     launches = "launches"
+    gpu = "gpu"
 
 
 @dataclass(kw_only=True)
@@ -259,10 +260,9 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     """A configuration as a checkpoint stores it, with the keys named in `overrides` replaced.
 
     A group choice (`data=truckscenes`) replaces that whole group, at the checkpoint's scale and phase; `model=` only
-    says whose keys may follow. A key of `trainer` that is younger than the checkpoint has today's value; a checkpoint
-    without `data.timeline` read key frames alone, one without `phase.long_range` has the official score alone. `paths`
-    are the command's own: where it reads and writes is not for a file to say, least of all a stranger's; so is
-    `oracle`.
+    says whose keys may follow. A key of `trainer` that is younger than the checkpoint has today's value, one of
+    YOUNGER_KEYS the value stated there. `paths` are the command's own: where it reads and writes is not for a file to
+    say, least of all a stranger's; so is `oracle`.
     Raises CheckpointError when the stored tree does not fit this version of the code, ConfigError for another model,
     scale or phase and for a key below a part that the checkpoint does not have.
     """
@@ -284,6 +284,11 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     own = [f"{key}={fixed[key]}" for key in ("scale", "model", "phase")]
     tree, fresh = OmegaConf.create(stored), _compose([*own, *overrides])
     tree.paths, tree.oracle = fresh.paths, fresh.oracle
+    for key, before in YOUNGER_KEYS.items():
+        part, leaf = key.rpartition(".")[::2]
+        if all(isinstance(OmegaConf.select(whole, part), DictConfig) for whole in (tree, fresh)):
+            if leaf in OmegaConf.select(fresh, part) and leaf not in OmegaConf.select(tree, part):
+                OmegaConf.update(tree, key, before)
     changes.pop("model", None)  # only says whose keys may follow: the checkpoint's own values stay
     for key in sorted(changes, key=lambda key: key.count(".")):  # a part before what lies in it
         part = key.rpartition(".")[0]
@@ -293,8 +298,7 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     schema = OmegaConf.structured(Config)
     try:
         schema.model = OmegaConf.structured(FAMILIES[model][0])
-        younger = {"trainer": fresh.trainer, "data": {"timeline": None}, "phase": {"long_range": None}}
-        return build_config(OmegaConf.merge(schema, younger, tree))
+        return build_config(OmegaConf.merge(schema, {"trainer": fresh.trainer}, tree))
     except (OmegaConfBaseException, ConfigError, OverflowError) as error:  # the last: a whole number beyond every float
         raise CheckpointError(f"the checkpoint's configuration does not fit this code: {error}") from None
 

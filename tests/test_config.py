@@ -10,7 +10,7 @@ import pytest
 from src.config import CONF, compose_config, restore_config
 from src.errors import CheckpointError, ConfigError
 from src.reliability.command import run_command
-from src.training.identity import run_identity
+from src.training.identity import YOUNGER_KEYS, run_identity, without_keys
 from tests.running import command
 
 SCALES = sorted(p.stem for p in (CONF / "scale").glob("*.yaml"))
@@ -117,7 +117,7 @@ FULL_SIZE = {
     "model": {"channels": 128},
     "model.radar_encoder": {
         "voxel_size_m": [0.1, 0.1, 0.2], "stage_channels": [16, 32, 64, 128, 128, 128], "max_voxels": 60000,
-        "conv_out": "sparse", "height_tolerance_deg": 0.0,
+        "conv_out": "sparse", "height_tolerance_deg": 0.0, "pruning_ratio": 0.0,
     },
     "model.kggi": {
         "initialization": "both", "num_radar_keypoints": 1024, "num_camera_keypoints": 256,
@@ -354,10 +354,14 @@ def test_a_second_score_of_detections_composes_and_an_older_checkpoint_has_none(
     with pytest.raises(ConfigError, match="long_range scores detections, but phase.task=occupancy"):
         compose_config(["scale=debug", "model=lrs4fusion", "phase=lrs_detection", "phase.task=occupancy",
                         "phase.monitor=val/iou"])  # fmt: skip
-    _, tree = compose_config(["scale=debug"])
-    identity = run_identity(tree)
-    del tree["phase"]["long_range"]
-    assert restore_config(tree, []).phase.long_range is None and run_identity(tree) == identity
+
+
+@pytest.mark.parametrize("key", YOUNGER_KEYS)
+def test_what_was_made_before_there_was_a_key_is_what_it_was(key):
+    config, tree = compose_config(["scale=debug"])
+    older = without_keys(tree, [key])
+    assert older != tree and run_identity(older) == run_identity(tree)
+    assert restore_config(older, []) == config
 
 
 @pytest.mark.parametrize("scale", SCALES)

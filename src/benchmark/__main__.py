@@ -14,6 +14,7 @@ suite=latency   a frame of the trained model checkpoint=PATH, part by part, with
 suite=soak      memory, time and handles over thousands of streamed frames, in inference and in training (phase=phase2)
 suite=metric    our metric against the official evaluator on one val-sized problem
 suite=launches  launches, waits and uploads of a frame and of a training step on a GPU, counted on a simulated one
+suite=gpu       frames and steps on a GPU: wall and busy time, waits, beside what suite=launches counts
 suite=reader    frames per second of the reader on one core
 """
 
@@ -35,7 +36,7 @@ from src.training.run_folder import make_writable, write_json
 def main(overrides: list[str]) -> None:
     """Measure one suite, print its page, and keep it as JSON and Markdown in `out` when given."""
     config, tree = compose_config(overrides)
-    of_one_frame = config.suite in (BenchmarkSuite.model, BenchmarkSuite.launches)
+    of_one_frame = config.suite in (BenchmarkSuite.model, BenchmarkSuite.launches, BenchmarkSuite.gpu)
     if of_one_frame and not any(word.startswith("data.batch_size=") for word in overrides):
         config.data.batch_size = 1
     tune_cpu_allocator()

@@ -17,12 +17,18 @@ from src.models.detector import Detector
 from src.ops.precision import computing
 from src.reliability.checkpoints import load_model_weights, read_checkpoint
 from src.structures.batch import FrameBatch
+from src.structures.gaussians import GaussianSet
 from src.training.phases import EVALUATORS
 
 KEY_FRAME_S = 0.5
 CANDIDATES = 300  # cells above the score threshold: what traffic lights up in a trained model, within its 500 boxes
 CELLS_PER_VEHICLE = {"paper": 17, "mini": 6, "debug": 2}
 """Remembered in each frame, where fresh weights would call no cell occupied; paper: 8000 cells in eight frames."""
+
+OCCUPIED_CELLS = {"paper": 6104, "mini": 8600, "debug": 600}
+"""What trained Gaussians occupy in a frame, of 147,456. paper: the 450 that the authors show of one (project page,
+ocsf_demo.json; opacities from 0.996 on), above the threshold of 0.1. mini: `occupied_share` of a trained phase 2."""
+OPAQUE = 6.0  # logit
 
 
 @dataclass
@@ -72,11 +78,11 @@ class Case:
 
 def build_case(config: Config, batch: FrameBatch, device: torch.device) -> Case:
     """The configured model, with weights of `checkpoint=PATH` if given, before its first batch."""
-    model = build_model(config)
+    model = build_model(config).to(device)
     load_weights(config, model)
     prepared = prepare_for_inference(model, config.precision)
     learns_boxes = EVALUATORS[config.phase.task].labels
-    return Case(model.to(device).train(), prepared, batch, None, device, config.precision, learns_boxes)
+    return Case(model.train(), prepared, batch, None, device, config.precision, learns_boxes)
 
 
 def load_weights(config: Config, model: Detector) -> None:
@@ -99,3 +105,35 @@ def expect_trained_scores(case: Case) -> tuple[Any, Any]:
         head = case.prepared.head
         head.config = replace(head.config, score_threshold=float(scores.topk(CANDIDATES).values[-1]))
     return output, memory
+
+
+def expect_trained_occupancy(case: Case, num_cells: int) -> None:
+    """Make as many Gaussians of the prepared model opaque as occupy about `num_cells` cells, evenly among all, and the
+    rest transparent; nothing of a model without Gaussians.
+
+    Of fresh weights every Gaussian is faintly opaque, and together they fill the map to its limit.
+    """
+    ocsf = getattr(case.prepared, "ocsf", None)
+    if ocsf is None:
+        return
+    encode, opaque = ocsf.encoder.forward, None
+
+    def forward(*inputs: Any) -> GaussianSet:
+        gaussians = encode(*inputs)
+        if opaque is None:
+            return gaussians
+        logits = torch.where(opaque, OPAQUE, -OPAQUE).expand_as(gaussians.opacity_logits)
+        return replace(gaussians, opacity_logits=logits)
+
+    def output() -> Any:
+        with torch.no_grad(), case.computing():
+            return case.prepared(case.batch, case.memory)[0].ocsf
+
+    ocsf.encoder.forward = forward
+    number = torch.arange(output().gaussians.valid.shape[1], device=case.device)
+    low, high = 0, len(number) + 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        opaque = (number + 1) * middle // len(number) > number * middle // len(number)
+        low, high = (middle, high) if len(output().splat.cells.occupied) <= num_cells else (low, middle)
+    opaque = (number + 1) * low // len(number) > number * low // len(number)

@@ -11,7 +11,13 @@ from src.benchmark.machine import busy_warning
 from src.config import BenchmarkSuite, Config
 from src.training.run_folder import current_commit, write_json
 
-ONE_MODEL = (BenchmarkSuite.model, BenchmarkSuite.training, BenchmarkSuite.soak, BenchmarkSuite.launches)
+ONE_MODEL = (
+    BenchmarkSuite.model,
+    BenchmarkSuite.training,
+    BenchmarkSuite.soak,
+    BenchmarkSuite.launches,
+    BenchmarkSuite.gpu,
+)
 GPU_NOTE = "Measured without a GPU. On one: the command above with `trainer.accelerator=gpu precision=bf16-mixed`."
 
 

@@ -19,9 +19,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.benchmark.simulated_device import SimTensor, count_launch, host_values
+from src.geometry.bev_grid import BEVGrid
 from src.ops import backend
 from src.ops.farthest_point import farthest_points_reference
-from src.ops.neighbour_table import neighbour_table_reference
+from src.ops.moved_keys import moved_keys_reference
+from src.ops.neighbour_table import neighbour_table_reference, turned_table_reference
+from src.ops.radial_change import radial_change_reference
 from src.ops.splat import log1mexp
 
 
@@ -78,14 +81,37 @@ def _search(keys: Tensor, corners: Tensor, taps: Tensor, table: Tensor, bits: Te
         out.copy_(found)
 
 
-def _gather_product(
-    rows: Tensor, weight: Tensor, bias: Tensor, out: Tensor, order: Tensor, table: Tensor, *sizes: int
+def _turn(table: Tensor, back: Tensor, bits: Tensor, num: int, cells: int) -> None:
+    for out, found in zip((back, bits), turned_table_reference(table, num), strict=True):
+        out.copy_(found)
+
+
+def _move(keys: Tensor, plan: Tensor, taps: Tensor, out: Tensor, num: int, old_step: int, new_step: int) -> None:
+    axes, shifts = (tuple(map(tuple, rows.tolist())) for rows in (plan, taps))
+    out.copy_(moved_keys_reference(keys, (old_step, new_step), axes, shifts))
+
+
+def _nearest_radial(
+    velocities: Tensor, cells: Tensor, keys: Tensor, measured: Tensor, out: Tensor, *rest: float
 ) -> None:
+    rows, cols, x_min, y_min, cell_m = rest[3:8]
+    centre = (x_min + 0.5 * cols * cell_m, y_min + 0.5 * rows * cell_m)
+    grid = BEVGrid(cells=(rows, cols), cell_m=cell_m, centre_m=centre, z_range_m=(0.0, 1.0))
+    out.copy_(radial_change_reference(velocities, cells, keys, measured, grid))
+
+
+def _gather_product(
+    rows: Tensor, weight: Tensor, bias: Tensor, residual: Tensor, out: Tensor, order: Tensor, table: Tensor,
+    relu: bool, reverse: bool, *sizes: int,
+) -> None:  # fmt: skip
     total = torch.zeros(out.shape)
-    for matrix, seen in zip(weight.float(), table.long(), strict=True):
+    for matrix, seen in zip(weight.flip(0) if reverse else weight, table.long(), strict=True):
         hit = (seen >= 0).nonzero().squeeze(1)
-        total.index_add_(0, hit, rows[seen[hit]].float() @ matrix)
-    out.copy_(total if bias.data_ptr() == out.data_ptr() else total + bias.float())
+        total.index_add_(0, hit, rows[seen[hit]].float() @ matrix.float())
+    for added in (bias, residual):
+        if added.data_ptr() != out.data_ptr():
+            total += added.float()
+    out.copy_(total.relu_() if relu else total)
 
 
 def _log_free(
@@ -123,6 +149,8 @@ def _segment_sum(values: Tensor, starts: Tensor) -> Tensor:
 
 KERNELS: dict[str, Callable[..., None] | None] = {
     "_sample": _sample,
+    "_move": _move,
+    "_nearest_radial": _nearest_radial,
     "_search": _search,
     "_gather_product": _gather_product,
     "_span_product": None,
@@ -130,5 +158,6 @@ KERNELS: dict[str, Callable[..., None] | None] = {
     "_cell_features": _cell_features,
     "_nearest_cell": _nearest_cell,
     "_gaussian_gradient": None,
+    "_turn": _turn,
 }
 """The plain form of every kernel, None where its values are a gradient."""

@@ -21,10 +21,11 @@ from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CLASSES
 
 ROAD = Highway(background=600, num_vehicles=12, points_per_vehicle=10, reach_m=150.0)
-"""Few points: what is counted follows the code and hardly the values."""
 IMAGE_SIZE_PX = (64, 128)
+"""Few points and pixels: what is counted follows the code and hardly the values."""
 NUM_BOXES = 24
 SHOWN_PLACES = 12
+CPU = torch.device("cpu")
 
 
 def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
@@ -50,13 +51,18 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def make_case(config: Config) -> Case:
-    """The configured model on a made frame, its memory full, on the simulated device once that is entered."""
+def make_case(
+    config: Config,
+    device: torch.device = CPU,
+    road: Highway = ROAD,
+    image_size_px: tuple[int, int] | None = IMAGE_SIZE_PX,
+) -> Case:
+    """The configured model on a made frame, its memory full."""
     torch.manual_seed(config.seed)
-    device = torch.device("cpu")
-    if config.backbone is not None:  # the counts do not follow the size of an image
-        config = replace(config, backbone=replace(config.backbone, image_size_px=list(IMAGE_SIZE_PX)))
-    case = build_case(config, made_batch(config.data.batch_size), device)
+    if config.backbone is not None:
+        config = replace(config, backbone=replace(config.backbone, image_size_px=list(image_size_px)))
+    batch = made_batch(config.data.batch_size, road, image_size_px or IMAGE_SIZE_PX).to(device)
+    case = build_case(config, batch, device)
     with torch.no_grad():
         for _ in range(config.model.memory_frames):
             _, case.memory = case.prepared(case.batch, case.memory)
@@ -70,9 +76,9 @@ def later(batch: FrameBatch) -> FrameBatch:
     return replace(batch, timestamps_s=batch.timestamps_s + KEY_FRAME_S)
 
 
-def made_batch(batch_size: int) -> FrameBatch:
+def made_batch(batch_size: int, road: Highway, image_size_px: tuple[int, int], seed: int = 0) -> FrameBatch:
     """Frames of a made highway with boxes, each sample another draw."""
-    frames = [highway_frame(highway_points(ROAD, seed), IMAGE_SIZE_PX) for seed in range(batch_size)]
+    frames = [highway_frame(highway_points(road, seed + row), image_size_px) for row in range(batch_size)]
     owners = [torch.full((len(frame.radar_points),), row) for row, frame in enumerate(frames)]
     joined = {
         name: torch.cat([getattr(frame, name) for frame in frames])
@@ -80,7 +86,7 @@ def made_batch(batch_size: int) -> FrameBatch:
             "timestamps_s", "global_from_ego", "aug_from_ego", "radar_points", "images", "image_valid", "pix_from_aug",
         )
     }  # fmt: skip
-    joined |= {"radar_batch": torch.cat(owners), "boxes": [made_boxes(seed) for seed in range(batch_size)]}
+    joined |= {"radar_batch": torch.cat(owners), "boxes": [made_boxes(seed + row) for row in range(batch_size)]}
     return FrameBatch([f"synthetic {row}" for row in range(batch_size)], **joined)
 
 

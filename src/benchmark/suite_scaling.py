@@ -18,8 +18,10 @@ from src.benchmark.cases import (
     CANDIDATES,
     CELLS_PER_VEHICLE,
     KEY_FRAME_S,
+    OCCUPIED_CELLS,
     Case,
     build_case,
+    expect_trained_occupancy,
     expect_trained_scores,
 )
 from src.benchmark.counting import counted_work
@@ -56,7 +58,8 @@ RANGES_M = {
 
 LIDAR_RANGES_M = (100.0, 200.0, 300.0)
 """Of a model that reads LiDAR, whose one scene ends at the first."""
-FIXED_SCENE = "range, fixed scene"
+FIXED_SCENE, CALIBRATED_SCENE = "range, fixed scene", "range, calibrated scene"
+PRUNED = (0, 50)  # % of voxels, in the calibrated scene
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,8 @@ class Point:
     road: Highway
     gaussians: float = 1.0  # factor on the keypoints of all kinds
     memory_frames: int | None = None  # None: as configured
+    occupied_cells: int | None = None  # by Gaussians; None: what fresh weights occupy
+    pruning_ratio: float | None = None  # of a radar encoder that can prune; None: as configured
 
 
 def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
@@ -78,7 +83,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     if reads_lidar(config):
         sweeps = {FIXED_SCENE: [Point(r, r, replace(road, reach_m=LIDAR_RANGES_M[0])) for r in LIDAR_RANGES_M]}
     else:
-        sweeps = sweeps_of(road, RANGES_M[config.scale], config.phase.temporal)
+        sweeps = sweeps_of(road, RANGES_M[config.scale], config.phase.temporal, OCCUPIED_CELLS[config.scale])
     measured = {name: measure_sweep(name, points, configs, device) for name, points in sweeps.items()}
     result = {
         "notes": [*notes_of(config, device), *gpu_notes(device)],
@@ -111,7 +116,9 @@ def notes_of(config: Config, device: torch.device) -> list[str]:
     return [
         measured.format(", from features that the image encoder has made already", cells) + asked,
         "range, equal density: the road goes on to the end of the range. range, fixed scene: the road ends at "
-        f"{FIXED_REACH_M:g} m. Only these two have anything beyond {NOMINAL_M:g} m. A remembered frame holds "
+        f"{FIXED_REACH_M:g} m. Only these two have anything beyond {NOMINAL_M:g} m. range, calibrated scene: the same, "
+        f"and Gaussians occupy {OCCUPIED_CELLS[config.scale]} cells as trained ones do; of fresh weights they fill the "
+        "map. pruned voxels: there, `model.radar_encoder.pruning_ratio`. A remembered frame holds "
         f"{CELLS_PER_VEHICLE[config.scale]} cells a vehicle and the Gaussians that are configured for it, or, in a "
         "dense model, its whole map.",
     ]
@@ -146,6 +153,7 @@ def sweeps_of(
     road: Highway,  # at the nominal range
     ranges_m: tuple[float, ...],
     temporal: bool,
+    occupied_cells: int,  # of the calibrated scene
 ) -> dict[str, list[Point]]:
     """The points of every sweep; what is nominal in several of them is measured in each."""
     fixed = replace(road, reach_m=FIXED_REACH_M)
@@ -164,6 +172,11 @@ def sweeps_of(
     sweeps = {
         "range, equal density": [Point(r, r, replace(road, reach_m=r)) for r in ranges_m],
         FIXED_SCENE: [Point(r, r, fixed) for r in ranges_m],
+        CALIBRATED_SCENE: [Point(r, r, fixed, occupied_cells=occupied_cells) for r in ranges_m],
+        "pruned voxels, %": [
+            Point(percent, NOMINAL_M, fixed, occupied_cells=occupied_cells, pruning_ratio=0.01 * percent)
+            for percent in PRUNED
+        ],
         "objects": [Point(vehicles(f).num_vehicles, NOMINAL_M, vehicles(f)) for f in FACTORS["objects"]],
         "radar points": [Point(len(highway_points(scene)), NOMINAL_M, scene) for scene in returned],
         "gaussians": [Point(f, NOMINAL_M, road, gaussians=f) for f in FACTORS["gaussians"]],
@@ -242,6 +255,9 @@ def make_case(config: Config, point: Point, device: torch.device) -> tuple[Case,
     output, memory = expect_trained_scores(case)
     if settings.memory_frames:
         fill_memory(case, memory, settings.memory_frames)
+    if point.occupied_cells is not None:
+        expect_trained_occupancy(case, point.occupied_cells)
+        expect_trained_scores(case)
     gaussians = case.prepared.evidence(output).gaussians
     return case, 0 if gaussians is None else int(gaussians.valid.sum())
 
@@ -250,7 +266,11 @@ def settings_at(config: Config, point: Point) -> ModelConfig:
     """The model's settings at a point, with as many remembered cells as its traffic fills."""
     vehicles = max(1, round(point.road.num_vehicles * point.road.reach_m / NOMINAL_M))
     cells = vehicles * CELLS_PER_VEHICLE[config.scale]
-    return config.model.scaled(point.gaussians, point.memory_frames, cells).at_range(point.range_m)
+    settings = config.model.scaled(point.gaussians, point.memory_frames, cells).at_range(point.range_m)
+    encoder = getattr(settings, "radar_encoder", None)
+    if point.pruning_ratio is None or not hasattr(encoder, "pruning_ratio"):
+        return settings
+    return replace(settings, radar_encoder=replace(encoder, pruning_ratio=point.pruning_ratio))
 
 
 def fill_memory(case: Case, memory: Any, num_frames: int) -> None:

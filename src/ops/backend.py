@@ -21,9 +21,13 @@ INTERPRETER = "TRITON_INTERPRET"
 # Modules with an operation's kernel, imported when it first runs in that backend: Triton is a large import.
 KERNELS = {
     "farthest_points": "src.ops.kernels.farthest_point_triton",
+    "moved_keys": "src.ops.kernels.moved_keys_triton",
     "neighbour_table": "src.ops.kernels.neighbour_table_triton",
+    "radial_change": "src.ops.kernels.radial_change_triton",
     "sparse_conv": "src.ops.kernels.sparse_conv_triton",
+    "sparse_conv_relu": "src.ops.kernels.sparse_conv_triton",
     "splat": "src.ops.kernels.splat_triton",
+    "turned_table": "src.ops.kernels.neighbour_table_triton",
 }
 
 _chosen: str | None = None  # until the first operation asks

@@ -11,8 +11,8 @@ from torch.autograd.function import FunctionCtx
 from src.ops.products import multiply, product_type, row_spans, whole_steps
 
 CPU_ROWS = 1024
-GPU_ROWS = 1 << 18
-"""Rows of a chunk: on a CPU its hidden layer stays in the cache, on a GPU it bounds the memory."""
+GPU_VALUES = 1 << 28
+"""Rows of a chunk on a CPU, where its hidden layer stays in the cache; its values on a GPU, which bound the memory."""
 
 
 def checkpointed_mlp(
@@ -62,7 +62,7 @@ class _CheckpointedMLP(torch.autograd.Function):
         ctx.dtype = dtype
         first = hidden_weight.to(dtype), hidden_bias.to(dtype)
         out = weight.new_empty(len(x), weight.shape[1])
-        for span in _spans(x):
+        for span in _spans(x, hidden_weight.shape[1]):
             hidden = multiply(whole_steps(x[span]).to(dtype), *first).relu_()
             out[span] = multiply(hidden.to(weight.dtype), weight, bias)[: len(out[span])]
         return out
@@ -74,7 +74,7 @@ class _CheckpointedMLP(torch.autograd.Function):
         first, second = (hidden_weight.to(dtype), hidden_bias.to(dtype)), weight.to(dtype)
         grad_x = torch.empty_like(x)
         sums = [torch.zeros_like(value, dtype=full) for value in (hidden_weight, hidden_bias, weight)]
-        for span in _spans(x):
+        for span in _spans(x, hidden_weight.shape[1]):
             rows, pull = whole_steps(x[span]).to(dtype), whole_steps(grad[span]).to(dtype).contiguous()
             hidden = multiply(rows, *first).relu_()
             sums[2].add_(multiply(hidden.t(), pull))
@@ -85,5 +85,5 @@ class _CheckpointedMLP(torch.autograd.Function):
         return grad_x, sums[0].to(x.dtype), sums[1].to(x.dtype), sums[2], grad.sum(0), None
 
 
-def _spans(x: Tensor) -> Iterator[slice]:
-    return row_spans(len(x), CPU_ROWS if x.device.type == "cpu" else GPU_ROWS)
+def _spans(x: Tensor, width: int) -> Iterator[slice]:
+    return row_spans(len(x), CPU_ROWS if x.device.type == "cpu" else max(1, GPU_VALUES // width))

@@ -74,8 +74,8 @@ def deform_attend_images(
 
     Pixel (i, j) of the input covers [j, j + 1) x [i, i + 1), cell (i, j) of a level the block of `stride` pixels from
     (stride * j, stride * i); values are bilinear between cell centres and zero outside. Points that are not `visible`
-    contribute nothing; a query without a point in a view costs nothing there. Gradients reach the values, the pixels
-    and the weights. Raises ValueError for shapes that do not fit or a level that does not divide the image.
+    contribute nothing; on a CPU a query without a point in a view costs nothing there. Gradients reach the values, the
+    pixels and the weights. Raises ValueError for shapes that do not fit or a level that does not divide the image.
     """
     _check_images(values, pixels, image_size_px, weights)
     with torch.autocast(pixels.device.type, enabled=False):
@@ -85,9 +85,7 @@ def deform_attend_images(
 def _attend_images(
     values: list[Tensor], pixels: Tensor, image_size_px: tuple[int, int], weights: Tensor, visible: Tensor | None
 ) -> Tensor:
-    """`grid_sample` per image and level, for the queries that have a point in that image."""
-    batch_size, queries, views, _, _ = pixels.shape
-    heads = weights.shape[2]
+    """Samples of what is seen, by the form of the device."""
     dtype = torch.promote_types(pixels.dtype, torch.float32)
     size = constant(tuple(image_size_px[::-1]), dtype, pixels.device)
     unit = pixels.to(dtype) / size  # [B, Q, N, P, 2], the image is [0, 1) x [0, 1)
@@ -99,16 +97,47 @@ def _attend_images(
         seen = seen & visible
     # Elsewhere samples are zero already, except that a point behind a camera may lie anywhere, NaN included.
     unit = torch.where(seen.unsqueeze(4), unit, -1.0)
+    places = (2 * unit - 1).transpose(1, 2).flatten(0, 1)  # [B * N, Q, P, 2]
+    images = [level.to(dtype).flatten(0, 1) for level in values]
+    if pixels.device.type == "cpu":
+        out = _sum_by_image(images, places, weights, seen)
+    else:
+        out = _sum_of_all_images(images, places, weights)
+    return out.to(values[0].dtype)
+
+
+def _sum_of_all_images(
+    images: list[Tensor],  # per level [B * N, heads * c, H_l, W_l]
+    places: Tensor,  # [B * N, Q, P, 2] in -1..1 of the image
+    weights: Tensor,  # [B, Q, heads, N, L, P]
+) -> Tensor:  # [B, Q, heads * c]
+    """`grid_sample` per level, for all queries in all images: on a GPU the zeros cost less than launches and a wait."""
+    batch_size, _, heads, views = weights.shape[:4]
+    total = 0
+    shares = weights.permute(4, 0, 3, 2, 1, 5).flatten(1, 2)  # [L, B * N, heads, Q, P]
+    for level, share in zip(images, shares, strict=True):
+        sampled = F.grid_sample(level, places, align_corners=False)  # [B * N, C, Q, P]
+        total = total + (sampled.unflatten(1, (heads, -1)) * share.unsqueeze(2)).sum(4)  # [B * N, heads, c, Q]
+    return total.unflatten(0, (batch_size, views)).sum(1).flatten(1, 2).transpose(1, 2)
+
+
+def _sum_by_image(
+    images: list[Tensor],  # per level [B * N, heads * c, H_l, W_l]
+    places: Tensor,  # [B * N, Q, P, 2] in -1..1 of the image
+    weights: Tensor,  # [B, Q, heads, N, L, P]
+    seen: Tensor,  # [B, Q, N, P] bool
+) -> Tensor:  # [B, Q, heads * c]
+    """`grid_sample` per image and level, for the queries that have a point in that image."""
+    batch_size, queries, heads, views, _, _ = weights.shape
     used = seen.any(3).permute(0, 2, 1)  # [B, N, Q]
     counts = used.sum(2).flatten().tolist()
     chosen = (torch.nonzero_static(used.flatten(), size=sum(counts)).squeeze(1) % queries).split(counts)
 
     # One image at a time; unbind, because the gradient of an index would fill the whole tensor for every image.
-    images = zip(*(level.to(dtype).flatten(0, 1).unbind(0) for level in values), strict=True)
-    places = (2 * unit - 1).transpose(1, 2).flatten(0, 1).unbind(0)  # B * N of [Q, P, 2]
+    by_image = zip(*(level.unbind(0) for level in images), strict=True)
     shares = weights.permute(0, 3, 4, 2, 1, 5).flatten(0, 1).unbind(0)  # B * N of [L, heads, Q, P]
-    out = weights.new_zeros(batch_size * queries, values[0].shape[2])
-    for image, (maps, place, share, rows) in enumerate(zip(images, places, shares, chosen, strict=True)):
+    out = weights.new_zeros(batch_size * queries, images[0].shape[1])
+    for image, (maps, place, share, rows) in enumerate(zip(by_image, places.unbind(0), shares, chosen, strict=True)):
         if len(rows) == 0:
             continue
         place = place.index_select(0, rows).unsqueeze(0)  # [1, q, P, 2]
@@ -119,7 +148,7 @@ def _attend_images(
             total = total + (sampled.view(heads, -1, *sampled.shape[2:]) * level_share).sum(3)  # [heads, c, q]
         # The queries of one image are distinct, so the sum does not depend on the order of the additions.
         out.index_add_(0, rows + image // views * queries, total.flatten(0, 1).t())
-    return out.view(batch_size, queries, values[0].shape[2]).to(values[0].dtype)
+    return out.view(batch_size, queries, images[0].shape[1])
 
 
 def _corners(

@@ -119,7 +119,8 @@ class TableMap(KernelMap):
 
     @cached_property
     def transposed(self) -> KernelMap:
-        return TableMap(turned_table(self.table, self.num_inputs), self.num_outputs)
+        table, bits = turned_table(self.table, self.num_inputs)
+        return TableMap(table, self.num_outputs, bits=bits)
 
     def keep_outputs(self, rows: Tensor) -> KernelMap:
         return TableMap(self.table.index_select(1, rows), self.num_inputs)

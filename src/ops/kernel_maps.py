@@ -9,6 +9,7 @@ from torch import Tensor
 
 from src.geometry.constants import constant
 from src.ops.kernel_map import KernelMap, TableMap, counts_kept
+from src.ops.moved_keys import NONE, moved_keys
 from src.ops.neighbour_table import neighbour_table
 from src.ops.sites import HALO, Sites
 
@@ -128,6 +129,32 @@ def temporal_map(sites: Sites, kernel_size: Size, stride: Size, padding: Size) -
     return sites.cache[key]
 
 
+def pruned_map(
+    sites: Sites,
+    wide: Tensor,  # [n] bool
+    kernel_size: Size,
+    stride: Size,
+    padding: Size,
+) -> tuple[KernelMap, Sites]:
+    """The strided map without the outputs that only sites which are not `wide` reach, but for each site's own.
+
+    Its own output is the cell that it lies in, cell // stride. Every output that stays sees all inputs in its window.
+    Waits for a GPU once. Raises ValueError where a site's own output might lie outside its window.
+    """
+    kernel = per_axis(kernel_size, sites.ndim, "kernel_size")
+    strides, pads = per_axis(stride, sites.ndim, "stride"), per_axis(padding, sites.ndim, "padding")
+    if any(pad + step > size for pad, step, size in zip(pads, strides, kernel, strict=True)) or max(pads) > HALO:
+        raise ValueError(f"kernel_size={kernel}, stride={strides}, padding={pads}: no window reaches its whole cell")
+    tap_steps = [torch.Size(kernel[axis + 1 :]).numel() for axis in range(sites.ndim)]
+    steps, first, per_tap = constant((strides, pads, tuple(tap_steps)), torch.int64, sites.device)
+    own = ((first + sites.indices()[:, 1:] % steps) * per_tap).sum(1)  # [n] the tap between a site and its own output
+    taps = torch.arange(torch.Size(kernel).numel(), device=sites.device)[:, None]
+    out = _reached(
+        sites, _output_shape(sites.shape, kernel, strides, pads), kernel, strides, pads, wide | (taps == own)
+    )
+    return _map_between(sites, out, kernel, strides, pads), out
+
+
 def _odd_kernel(sites: Sites, kernel_size: Size) -> tuple[int, ...]:
     kernel = per_axis(kernel_size, sites.ndim, "kernel_size")
     if any(size % 2 == 0 or size > 2 * HALO + 1 for size in kernel):
@@ -221,48 +248,62 @@ def _build_temporal(
     else:
         _, reached = _build_strided(sites, *first)
     out = Sites(shape, reached.keys)
-    if makes_tables(sites):
-        return _map_between(sites, out, kernel, stride, padding), out
-    corner = _strided_corners(sites, out, stride, padding)
-    found, where = _search(sites.keys, corner, sites.strides[1:], kernel, torch.Size(kernel).numel())
-    hits, outputs, counts = _hits(found)
-    inputs = where.reshape(-1).index_select(0, hits).to(torch.int32)
-    return KernelMap(inputs, outputs, counts, len(sites), len(out)), out
+    return _map_between(sites, out, kernel, stride, padding), out
 
 
 def _reached(
-    sites: Sites, shape: tuple[int, ...], kernel: tuple[int, ...], stride: tuple[int, ...], padding: tuple[int, ...]
+    sites: Sites,
+    shape: tuple[int, ...],
+    kernel: tuple[int, ...],
+    stride: tuple[int, ...],
+    padding: tuple[int, ...],
+    kept: Tensor | None = None,  # [K, n] bool, the taps through which a site counts
 ) -> Sites:
     """Every cell of the coarse grid whose window holds a site. Waits for a GPU once, for their number."""
-    device, none = sites.device, torch.iinfo(torch.int64).max
-    coarse = Sites(shape, sites.keys)
     taps = itertools.product(*(range(size) for size in kernel))
     shifts = tuple(tuple(pad - k for pad, k in zip(padding, tap, strict=True)) for tap in taps)
-    cells = sites.indices()  # [n, 1 + d]
-    moved = cells[:, 1:] + constant(shifts, torch.int64, device)[:, None]  # [K, n, d]
-    steps, sizes = constant((stride, shape[1:]), torch.int64, device)
-    target = torch.div(moved, steps, rounding_mode="floor")
-    fits = ((target * steps == moved) & (target >= 0) & (target < sizes)).all(-1)
-    inner = (target * constant(coarse.strides[1:], torch.int64, device)).sum(-1) + cells[:, 0] * coarse.strides[0]
-    # What fits nowhere becomes the largest key, which is there at least once and cut off.
-    candidates = torch.cat([torch.where(fits, inner, none).flatten(), constant((none,), torch.int64, device)])
-    return Sites(shape, torch.unique(candidates)[:-1])
+    coarse = Sites(shape, sites.keys)
+    ones, zeros = (1,) * sites.ndim, (0,) * sites.ndim
+    candidates = _moved(sites, coarse, ones, stride, (zeros, shape[1:]), shifts)
+    candidates = (candidates if kept is None else torch.where(kept, candidates, NONE)).flatten()
+    # What fits nowhere is the largest key, which is there at least once and cut off.
+    return Sites(shape, torch.unique(torch.cat([candidates, constant((NONE,), torch.int64, sites.device)]))[:-1])
 
 
 def _strided_corners(sites: Sites, out: Sites, stride: tuple[int, ...], padding: tuple[int, ...]) -> Tensor:  # [m]
     """Key among `sites` of the first cell of each output's window."""
-    steps = (sites.strides[0], *(s * step for s, step in zip(stride, sites.strides[1:], strict=True)))
-    before = sum(pad * step for pad, step in zip(padding, sites.strides[1:], strict=True))
-    return (out.indices() * constant(steps, torch.int64, sites.device)).sum(1) - before
+    low, high = (-HALO,) * sites.ndim, tuple(size + HALO for size in sites.shape[1:])
+    shifts = (tuple(-pad for pad in padding),)
+    return _moved(out, sites, stride, (1,) * sites.ndim, (low, high), shifts)[0]
+
+
+def _moved(
+    sites: Sites,
+    target: Sites,  # whose grid
+    factors: tuple[int, ...],
+    divisors: tuple[int, ...],
+    limits: tuple[tuple[int, ...], tuple[int, ...]],  # low and high of the cells there
+    shifts: tuple[tuple[int, ...], ...],
+) -> Tensor:  # [K, n] int64
+    """Keys of the sites on another grid, tap by tap."""
+    sizes = tuple(size + HALO for size in sites.shape[1:])
+    columns = (sites.strides[1:], sizes, factors, divisors, *limits, target.strides[1:])
+    axes = tuple(zip(*columns, strict=True))
+    return moved_keys(sites.keys, (sites.strides[0], target.strides[0]), axes, shifts)
 
 
 def _map_between(
     sites: Sites, out: Sites, kernel: tuple[int, ...], stride: tuple[int, ...], padding: tuple[int, ...]
 ) -> KernelMap:
-    """The map between two sets that are known, as a table."""
+    """The map between two sets that are known."""
     corners = _strided_corners(sites, out, stride, padding)
-    table, bits = neighbour_table(sites.keys, corners, _taps(sites, kernel))
-    return TableMap(table, len(sites), bits=bits)
+    if makes_tables(sites):
+        table, bits = neighbour_table(sites.keys, corners, _taps(sites, kernel))
+        return TableMap(table, len(sites), bits=bits)
+    found, where = _search(sites.keys, corners, sites.strides[1:], kernel, torch.Size(kernel).numel())
+    hits, outputs, counts = _hits(found)
+    inputs = where.reshape(-1).index_select(0, hits).to(torch.int32)
+    return KernelMap(inputs, outputs, counts, len(sites), len(out))
 
 
 def _search(

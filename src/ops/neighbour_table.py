@@ -42,12 +42,18 @@ def tap_bits(
 def turned_table(
     table: Tensor,  # [K, m] int32 of rows below `num`, none twice in a row of the table, -1 for none
     num: int,
-) -> Tensor:  # [K, num] int32
-    """The table read backwards: the cell that sees each site through each tap, -1 where there is none."""
+) -> tuple[Tensor, Tensor]:  # [K, num] int32, [num] int64
+    """The table read backwards: the cell that sees each site through each tap, -1 where there is none; its tap bits."""
+    return implementation(turned_table_reference)(table, num)
+
+
+def turned_table_reference(table: Tensor, num: int) -> tuple[Tensor, Tensor]:
+    """Plain torch form."""
     back = table.new_full((len(table), num + 1), -1)  # one more column, which takes what there is not
     cells = torch.arange(table.shape[1], dtype=table.dtype, device=table.device).expand_as(table)
     back.scatter_(1, torch.where(table < 0, num, table).long(), cells)
-    return back[:, :num].contiguous()
+    back = back[:, :num].contiguous()
+    return back, tap_bits(back)
 
 
 def pairs_of_table(

@@ -26,12 +26,41 @@ def sparse_conv(
     are cast to its type by hand, since the grouped product is not on autocast's list. The backward pass keeps the
     features and the weight only, never one row per pair. Raises ValueError for shapes or types that do not fit.
     """
+    features, weight, bias = _operands(features, weight, kernel_map, bias)
+    return implementation(sparse_conv_reference)(features, weight, kernel_map, bias)
+
+
+@torch.no_grad()
+def sparse_conv_relu(
+    features: Tensor,  # [M_in, Cin]
+    weight: Tensor,  # [K, Cin, Cout]
+    kernel_map: KernelMap,
+    bias: Tensor | None = None,  # [Cout]
+    residual: Tensor | None = None,  # [M_out, Cout]
+) -> Tensor:  # [M_out, Cout]
+    """relu(`sparse_conv` + residual), without gradient, for inference: on a GPU in one launch."""
+    features, weight, bias = _operands(features, weight, kernel_map, bias)
+    return implementation(sparse_conv_relu_reference)(features, weight, kernel_map, bias, residual)
+
+
+def sparse_conv_relu_reference(
+    features: Tensor, weight: Tensor, kernel_map: KernelMap, bias: Tensor | None, residual: Tensor | None
+) -> Tensor:
+    """The operations one after the other."""
+    out = sparse_conv_reference(features, weight, kernel_map, bias)
+    return (out if residual is None else out.add_(residual)).relu_()
+
+
+def _operands(
+    features: Tensor, weight: Tensor, kernel_map: KernelMap, bias: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Features, weight and bias in the type of the products."""
     if torch.is_autocast_enabled(features.device.type) and features.dtype != torch.float64:
         dtype = torch.get_autocast_dtype(features.device.type)
         features, weight = features.to(dtype), weight.to(dtype)
         bias = None if bias is None else bias.to(dtype)
     _check(features, weight, kernel_map, bias)
-    return implementation(sparse_conv_reference)(features, weight, kernel_map, bias)
+    return features, weight, bias
 
 
 @torch.no_grad()

@@ -35,6 +35,12 @@ They are left out of its identity, of its result, and of what a sweep records of
 TEMPORAL_DATA_KEYS = ("groups_per_scene", "stream_sets", "past_frames", "sensor_dropout")
 """Of `data`: what changes nothing of a phase without memory."""
 
+YOUNGER_KEYS = {"data.timeline": None, "phase.long_range": None, "model.radar_encoder.pruning_ratio": 0.0}
+"""Keys that runs were made without, with the value that does what was done then.
+
+At this value a key is no part of an identity, and a checkpoint without the key has it.
+"""
+
 
 def key_of(override: str) -> str:
     """The dotted key that an override sets."""
@@ -65,6 +71,14 @@ def without_keys(tree: dict[str, Any], keys: Iterable[str]) -> dict[str, Any]:
     return tree
 
 
+def _value_at(tree: dict[str, Any], key: str) -> Any:
+    """What stands at a dotted key; None where there is nothing."""
+    node: Any = tree
+    for name in key.split("."):
+        node = node.get(name) if isinstance(node, dict) else None
+    return node
+
+
 def digest_of_changes(overrides: list[str]) -> str:
     """`-` and 8 hex digits of what the command line changes of a checkpoint's configuration; empty for no change.
 
@@ -86,9 +100,7 @@ def run_identity(tree: dict[str, Any], source: str | None = None) -> str:
     if not tree["phase"]["temporal"]:
         for key in TEMPORAL_DATA_KEYS:
             tree["data"].pop(key)
-    if tree["data"].get("timeline") is None:
-        tree["data"].pop("timeline", None)  # a run of key frames is what it was before there were others
-    if tree["phase"].get("long_range") is None:
-        tree["phase"].pop("long_range", None)  # and one of the official score alone
+    unchanged = [key for key, before in YOUNGER_KEYS.items() if _value_at(tree, key) == before]
+    tree = without_keys(tree, unchanged)
     digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:8]
     return f"{tree['model']['name']}-{tree['phase']['name']}-{tree['scale']}-{digest}"

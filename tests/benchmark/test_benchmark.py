@@ -199,7 +199,8 @@ def test_scaling(outputs, tmp_path, monkeypatch):
     assert result["picture"] == "scaling_debug.png"
     sweeps = [row["sweep"] for row in result["growth"]]
     assert sweeps == [
-        "range, equal density", "range, fixed scene", "objects", "radar points", "gaussians", "memory frames"
+        "range, equal density", "range, fixed scene", "range, calibrated scene", "pruned voxels, %", "objects",
+        "radar points", "gaussians", "memory frames",
     ]  # fmt: skip
     for name in sweeps:
         assert {row["model"] for row in result[name]} == {"horizon3d", "dense_bev"}

@@ -2,11 +2,21 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from src.benchmark.cases import CELLS_PER_VEHICLE
 from src.benchmark.scenes import ROADS, Highway, highway_frame, highway_points, lidar_frame
-from src.benchmark.suite_scaling import NOMINAL_M, RANGES_M, Point, configs_of, growth_rows, settings_at, sweeps_of
+from src.benchmark.suite_scaling import (
+    NOMINAL_M,
+    RANGES_M,
+    Point,
+    configs_of,
+    growth_rows,
+    make_case,
+    settings_at,
+    sweeps_of,
+)
 from src.config import compose_config
 
 ROAD = Highway(background=400, num_vehicles=20, points_per_vehicle=10, reach_m=150.0)
@@ -89,10 +99,10 @@ def test_a_point_ahead_of_a_camera_is_seen_where_it_should_be():
 
 
 def test_only_the_ranges_reach_beyond_the_nominal_one():
-    for name, points in sweeps_of(ROADS["paper"], RANGES_M["paper"], temporal=True).items():
+    for name, points in sweeps_of(ROADS["paper"], RANGES_M["paper"], temporal=True, occupied_cells=9).items():
         beyond = [point for point in points if max(point.range_m, point.road.reach_m) > NOMINAL_M]
         assert bool(beyond) == name.startswith("range"), name
-    assert "memory frames" not in sweeps_of(ROADS["paper"], RANGES_M["paper"], temporal=False)
+    assert "memory frames" not in sweeps_of(ROADS["paper"], RANGES_M["paper"], temporal=False, occupied_cells=9)
 
 
 def test_a_point_changes_what_it_names():
@@ -107,7 +117,25 @@ def test_a_point_changes_what_it_names():
     assert settings_at(config, replace(point, memory_frames=0)).dptf is None
     assert config.model.kggi.num_radar_keypoints == 32 and config.model.dptf.bev_path.num_frames == 2
 
+    assert settings_at(config, replace(point, pruning_ratio=0.5)).radar_encoder.pruning_ratio == 0.5
+    assert settings.radar_encoder == config.model.radar_encoder
+
     same, dense = configs_of(config).values()
     assert same.model == config.model and dense.model.name == "dense_bev"
     assert settings_at(dense, point).temporal.num_frames == 5 and dense.grid == config.grid
     assert settings_at(dense, replace(point, memory_frames=0)).temporal is None
+    assert settings_at(dense, replace(point, pruning_ratio=0.5)) == settings_at(dense, point)
+
+
+@pytest.mark.parametrize("cells", [0, 600, 10**6])
+def test_gaussians_occupy_as_many_cells_as_trained_ones(cells):
+    config, _ = compose_config(["scale=debug", "phase=phase2"])
+    point = Point(1.0, NOMINAL_M, ROAD)
+    fresh, _ = make_case(config, point, torch.device("cpu"))
+    case, _ = make_case(config, replace(point, occupied_cells=cells), torch.device("cpu"))
+    every, found = (len(one.infer()[0].ocsf.splat.bev) for one in (fresh, case))
+    assert every > 700
+    if cells < every:
+        assert abs(found - cells) <= 70  # a Gaussian more or less
+    else:
+        assert found > 700  # all are opaque

@@ -5,7 +5,8 @@ import torch
 import torch.nn.functional as F
 
 from src.geometry.bev_grid import BEVGrid
-from src.ops.deform_sample import deform_attend_bev, deform_attend_images, sample_sparse_bev
+from src.ops import deform_sample
+from src.ops.deform_sample import _sum_of_all_images, deform_attend_bev, deform_attend_images, sample_sparse_bev
 from src.ops.sites import Sites
 
 GRID = BEVGrid(cells=(6, 8), cell_m=0.8, centre_m=(0.4, -0.2), z_range_m=(-3.0, 5.0))
@@ -87,6 +88,13 @@ def test_bev_attention_against_dense_and_gradcheck():
     assert torch.autograd.gradcheck(lambda v, p, w: deform_attend_bev(v, sites, p, batch, w, GRID), inputs)
 
 
+@pytest.fixture(params=["by image", "all images"])
+def form(request, monkeypatch):
+    """What a CPU does, and what a GPU does."""
+    if request.param == "all images":
+        monkeypatch.setattr(deform_sample, "_sum_by_image", lambda *inputs: _sum_of_all_images(*inputs[:3]))
+
+
 def pyramid(batch=2, queries=5, views=3, heads=2, points=4, seed=0):
     generator = torch.Generator().manual_seed(seed)
 
@@ -115,12 +123,14 @@ def plain_images(values, pixels, weights):
     return out.flatten(2)
 
 
+@pytest.mark.usefixtures("form")
 def test_image_attention_equals_every_view_sampled():
     values, pixels, weights = pyramid()
     out = deform_attend_images(values, pixels, (16, 24), weights)
     torch.testing.assert_close(out, plain_images(values, pixels, weights))
 
 
+@pytest.mark.usefixtures("form")
 def test_image_attention_reads_cell_centres():
     """Cell (1, 2) at stride 8 has its centre at pixel u = 20, v = 12."""
     level = torch.zeros(1, 1, 1, 2, 3)
@@ -130,12 +140,14 @@ def test_image_attention_reads_cell_centres():
     torch.testing.assert_close(out.flatten(), torch.tensor([1.0, 0.5, 0.5, 0.0]))
 
 
+@pytest.mark.usefixtures("form")
 def test_image_attention_gradients():
     values, pixels, weights = pyramid(batch=1, queries=3, views=2)
     inputs = [x.requires_grad_() for x in (*values, pixels, weights)]
     assert torch.autograd.gradcheck(lambda a, b, p, w: deform_attend_images([a, b], p, (16, 24), w), inputs)
 
 
+@pytest.mark.usefixtures("form")
 def test_invisible_points_count_for_nothing():
     values, pixels, weights = pyramid()
     visible = torch.rand(pixels.shape[:4], generator=torch.Generator().manual_seed(5)) < 0.5
@@ -150,6 +162,7 @@ def test_invisible_points_count_for_nothing():
     assert not deform_attend_images(values, pixels, (16, 24), weights, visible & False).any()
 
 
+@pytest.mark.usefixtures("form")
 @pytest.mark.parametrize(("batch", "queries"), [(1, 0), (0, 5)])
 def test_image_attention_of_nothing(batch, queries):
     values, pixels, weights = pyramid(batch, queries)

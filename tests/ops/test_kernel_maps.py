@@ -3,7 +3,7 @@ import itertools
 import pytest
 import torch
 
-from src.ops.kernel_maps import KernelMap, strided_map, submanifold_map, temporal_map, window_map
+from src.ops.kernel_maps import KernelMap, pruned_map, strided_map, submanifold_map, temporal_map, window_map
 from src.ops.sites import Sites
 from tests.ops.maps import random_sites
 
@@ -82,3 +82,28 @@ def test_outputs_are_left_out():
     offsets = torch.arange(9).repeat_interleave(torch.tensor(kept.counts)).tolist()
     assert wanted == list(zip(offsets, kept.inputs.tolist(), kept.outputs.tolist(), strict=True))
     assert kept.num_outputs == len(rows)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_only_wide_sites_dilate(share):
+    sites = random_sites((2, 5, 6, 7), 40)
+    wide = torch.rand(40, generator=torch.Generator().manual_seed(0)) < share
+    full, reached = strided_map(sites, 3, 2, 1)
+    found, out = pruned_map(sites, wide, 3, 2, 1)
+    kept = {tuple(cell) for cell in (sites.indices() // torch.tensor([1, 2, 2, 2])).tolist()}
+    by_wide = wide.index_select(0, full.inputs)
+    kept |= {tuple(cell) for cell in reached.indices()[full.outputs[by_wide].long()].tolist()}
+    assert out.shape == reached.shape and {tuple(cell) for cell in out.indices().tolist()} == kept
+    assert len(kept) == len(out) and (share < 1.0 or torch.equal(out.keys, reached.keys))
+
+    def pairs(kernel_map, outputs):
+        taps = torch.arange(27).repeat_interleave(torch.tensor(kernel_map.counts)).tolist()
+        cells = outputs.indices()[kernel_map.outputs.long()].tolist()
+        return {(t, i, *c) for t, i, c in zip(taps, kernel_map.inputs.tolist(), cells, strict=True)}
+
+    assert pairs(found, out) == {pair for pair in pairs(full, reached) if pair[2:] in kept}
+
+
+def test_a_window_that_misses_its_own_cell_is_refused():
+    with pytest.raises(ValueError, match="no window reaches its whole cell"):
+        pruned_map(random_sites((1, 6, 6), 3), torch.ones(3).bool(), 2, 2, 1)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from src.ops import kernel_maps
-from src.ops.kernel_maps import stacked_map, strided_map, submanifold_map, temporal_map, window_map
+from src.ops.kernel_maps import pruned_map, stacked_map, strided_map, submanifold_map, temporal_map, window_map
 from src.ops.neighbour_table import neighbour_table, tap_bits
 from tests.ops.maps import random_sites
 
@@ -13,6 +13,7 @@ BUILDERS = {
     "strided": lambda sites: strided_map(sites, 3, 2, 1)[0],
     "dilating": lambda sites: strided_map(sites, (1, 3, 2), 1, (0, 1, 0))[0],
     "inverse": lambda sites: strided_map(sites, 3, 2, 1)[0].transposed,
+    "pruned": lambda sites: pruned_map(sites, torch.arange(len(sites)) % 2 == 0, 3, 2, 1)[0],
     "temporal": lambda sites: temporal_map(sites, 3, (2, 1, 1), 1)[0],
     "window": lambda sites: window_map(random_sites((2, 4, 5, 6), 50, seed=1), sites, 3),
     "stacked": lambda sites: stacked_map(sites, 3, [torch.arange(0, len(sites), 2), torch.arange(len(sites) // 2)]),

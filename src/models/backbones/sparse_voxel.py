@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.local_means import LocalMeans
-from src.models.layers.sparse import ConvNormReLU, ResidualBlock, SparseConv, SubmanifoldConv
+from src.models.layers.sparse import ConvNormReLU, PrunedSparseConv, ResidualBlock, SparseConv, SubmanifoldConv
 from src.ops.segment_reduce import segment_sum
 from src.ops.sites import Sites
 from src.ops.voxelize import voxelize
@@ -81,6 +82,7 @@ class VoxelEncoder(nn.Module):
         grid: BEVGrid,
         channels: int,
         point_scales: Sequence[float],  # of the F columns of a point, of which x, y, z (m) come first
+        pruning_ratio: float = 0.0,  # of sites that do not dilate on the way down to the BEV cell
     ) -> None:
         super().__init__()
         self.voxel_size_m = tuple(config.voxel_size_m)
@@ -101,7 +103,14 @@ class VoxelEncoder(nn.Module):
         inputs = len(point_scales) + config.point_count_channel
         self.conv_input = ConvNormReLU(SubmanifoldConv(inputs, widths[0], 3, self.ndim, bias=False), **norm)
         self.stages = nn.ModuleList(
-            _stage(widths[index - 1] if index else None, width, config.blocks_per_stage, self.ndim, norm)
+            _stage(
+                widths[index - 1] if index else None,
+                width,
+                config.blocks_per_stage,
+                self.ndim,
+                norm,
+                pruning_ratio if index <= self.bev_stage else 0.0,
+            )
             for index, width in enumerate(widths)
         )
         if config.conv_out is ConvOut.sparse:
@@ -185,18 +194,21 @@ class RadarEncoderConfig(VoxelEncoderConfig):
 
     local_means: bool  # mean of the points around a cell, added to F_R
     height_tolerance_deg: float  # points outside the height band by no more than this error of elevation are moved in
+    pruning_ratio: float  # of voxels, the faintest, that do not dilate on the way down to the BEV cell; 0: all dilate
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 <= self.height_tolerance_deg < 90:
             raise ConfigError(f"{self.key}.height_tolerance_deg={self.height_tolerance_deg}: must lie in [0, 90)")
+        if not 0 <= self.pruning_ratio <= 1:
+            raise ConfigError(f"{self.key}.pruning_ratio={self.pruning_ratio}: must lie in [0, 1]")
 
 
 class RadarEncoder(VoxelEncoder):
     """Radar points to F_R."""
 
     def __init__(self, config: RadarEncoderConfig, grid: BEVGrid, channels: int) -> None:
-        super().__init__(config, grid, channels, POINT_SCALES)
+        super().__init__(config, grid, channels, POINT_SCALES, config.pruning_ratio)
         self.z_range_m, self.height_tolerance = grid.z_range_m, math.tan(math.radians(config.height_tolerance_deg))
         self.local_means = LocalMeans(self.point_scales, grid, channels) if config.local_means else None
 
@@ -219,11 +231,14 @@ class RadarEncoder(VoxelEncoder):
         return torch.cat([points[:, :2], torch.where(near, inside, z)[:, None], points[:, 3:]], dim=1)
 
 
-def _stage(in_channels: int | None, channels: int, blocks: int, ndim: int, norm: dict[str, float]) -> nn.Sequential:
+def _stage(
+    in_channels: int | None, channels: int, blocks: int, ndim: int, norm: dict[str, float], pruning_ratio: float
+) -> nn.Sequential:
     """Residual blocks, after a convolution of stride 2 unless the stage is the first (`in_channels` None)."""
     layers: list[nn.Module] = []
     if in_channels is not None:
-        conv = SparseConv(in_channels, channels, 3, ndim, bias=False, stride=2, padding=1)
+        kind = partial(PrunedSparseConv, pruning_ratio=pruning_ratio) if pruning_ratio else SparseConv
+        conv = kind(in_channels, channels, 3, ndim, bias=False, stride=2, padding=1)
         layers.append(ConvNormReLU(conv, **norm))
     layers += [ResidualBlock(channels, ndim, **norm) for _ in range(blocks)]
     return nn.Sequential(*layers)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -22,6 +22,7 @@ from src.models.horizon3d.temporal_attention import TemporalSelfAttention
 from src.models.horizon3d.views import CameraViews
 from src.models.layers.doppler import Doppler
 from src.models.layers.full_precision import FullPrecisionLinear
+from src.models.layers.merging import block_diagonal, joined_linear
 from src.models.layers.sparse import SubmanifoldConv
 from src.ops.segment_reduce import segment_mean
 from src.ops.sites import Sites
@@ -80,6 +81,12 @@ class AnchorEncoder(nn.Module):
         self.output = linear_relu_norm(channels, channels)
         self.register_buffer("centre_m", torch.tensor(grid.centre_m), persistent=False)
         self.register_buffer("half_extent_m", torch.tensor(grid.half_extent_m), persistent=False)
+        self.merged: MergedEmbeddings | None = None
+
+    def merge_for_inference(self) -> None:
+        """All attributes are embedded by the same products."""
+        self.merged = MergedEmbeddings(list(self.embed.values()), self.output[0])
+        self.embed, self.output = None, self.output[1:]
 
     def forward(
         self,
@@ -94,7 +101,35 @@ class AnchorEncoder(nn.Module):
                 "opacity": gaussians.opacity_logits.sigmoid()[..., None],
                 "velocity": gaussians.velocities / self.bounds.max_speed_mps,
             }
-            return self.output(sum(self.embed[name](value) for name, value in inputs.items()))
+            if self.merged is None:
+                return self.output(sum(self.embed[name](value) for name, value in inputs.items()))
+            return self.output(self.merged(torch.cat(list(inputs.values()), dim=-1)))
+
+
+class MergedEmbeddings(nn.Module):
+    """The sum of several `linear_relu_norm` of inputs side by side, through the linear layer behind it."""
+
+    def __init__(self, parts: Sequence[nn.Sequential], behind: nn.Linear) -> None:
+        super().__init__()
+        self.eps = parts[0][2].eps
+        self.first = block_diagonal([part[0] for part in parts])
+        # A norm's scale and shift go into the layer behind it.
+        weights = torch.stack([(part[3].weight * part[2].weight).t() for part in parts])  # [K, C, C]
+        biases = torch.stack([part[3].bias + part[3].weight @ part[2].bias for part in parts])
+        self.weights, self.biases = (nn.Parameter(x, requires_grad=False) for x in (weights, biases[:, None]))
+        bias = behind.bias + sum(behind.weight @ part[5].bias for part in parts)
+        self.behind = joined_linear(torch.cat([behind.weight * part[5].weight for part in parts], 1), bias)
+
+    def forward(
+        self,
+        x: Tensor,  # [B, G, widths]
+    ) -> Tensor:  # [B, G, C]
+        """Products over all parts at once."""
+        parts, channels = self.weights.shape[:2]
+        hidden = F.layer_norm(self.first(x).relu_().view(-1, parts, channels), (channels,), eps=self.eps)
+        hidden = torch.baddbmm(self.biases, hidden.transpose(0, 1), self.weights).relu_()  # [K, B * G, C]
+        hidden = F.layer_norm(hidden, (channels,), eps=self.eps)
+        return self.behind(hidden.transpose(0, 1).reshape(*x.shape[:2], parts * channels))
 
 
 class SelfEncoding(nn.Module):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -13,12 +14,14 @@ from src.ops.kernel_maps import (
     Size,
     inverse_map,
     per_axis,
+    pruned_map,
     strided_map,
     submanifold_map,
     temporal_map,
 )
+from src.ops.segment_reduce import rank_per_sample, segment_count
 from src.ops.sites import Sites
-from src.ops.sparse_conv import sparse_conv
+from src.ops.sparse_conv import sparse_conv, sparse_conv_relu
 from src.structures.sparse_bev import SparseMap
 
 
@@ -44,6 +47,7 @@ class SparseKernel(nn.Module):
         self.kernel_size, self.ndim = per_axis(kernel_size, ndim, "kernel_size"), ndim
         self.stride = stride
         self.padding = tuple(size // 2 for size in self.kernel_size) if padding is None else padding
+        self.relu = False  # of the layer behind, once that is merged into this one
         num_offsets = math.prod(self.kernel_size)
         self.weight = nn.Parameter(torch.empty(num_offsets, in_channels, out_channels))
         self.bias = nn.Parameter(torch.empty(out_channels)) if bias else None
@@ -60,8 +64,9 @@ class SparseKernel(nn.Module):
         return self.convolve(x, *self.map(x.sites))
 
     def convolve(self, x: SparseMap, kernel_map: KernelMap, sites: Sites) -> SparseMap:
-        """Convolve to the given sites through a kernel map from those of `x`."""
-        return type(x)(sites, sparse_conv(x.features, self.weight, kernel_map, self.bias))
+        """Convolve to the given sites through a kernel map from those of `x`; prepared for inference with its ReLU."""
+        convolve = sparse_conv_relu if self.relu else sparse_conv
+        return type(x)(sites, convolve(x.features, self.weight, kernel_map, self.bias))
 
     def extra_repr(self) -> str:
         """Sizes for the printed module."""
@@ -80,6 +85,26 @@ class SparseConv(SparseKernel):
 
     def map(self, sites: Sites) -> tuple[KernelMap, Sites]:
         return strided_map(sites, self.kernel_size, self.stride, self.padding)
+
+
+class PrunedSparseConv(SparseConv):
+    """A `SparseConv` that only part of its input dilates (VoxelNeXt 3.1: spatially voxel pruning).
+
+    Of every sample the `pruning_ratio` of the sites with the smallest mean magnitude over the channels, rounded down,
+    reach no cell but their own; ties by row.
+    """
+
+    def __init__(self, *arguments: Any, pruning_ratio: float, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self.pruning_ratio = pruning_ratio
+
+    def forward(self, x: SparseMap) -> SparseMap:
+        sample = x.sites.indices()[:, 0]
+        order, rank = rank_per_sample(x.features.detach().abs().mean(1), sample)
+        counts = segment_count(sample, x.batch_size)
+        most = counts - (self.pruning_ratio * counts.double()).long()  # [B]
+        wide = torch.empty_like(sample, dtype=torch.bool).index_copy_(0, order, rank < most[sample[order]])
+        return self.convolve(x, *pruned_map(x.sites, wide, self.kernel_size, self.stride, self.padding))
 
 
 class SparseInverseConv(SparseKernel):
@@ -137,7 +162,12 @@ class ConvNormReLU(nn.Module):
         x: SparseMap,
         *sites: Sites,  # those of the output, where the convolution asks for them
     ) -> SparseMap:
-        return self.activate(self.conv(x, *sites))
+        y = self.conv(x, *sites)
+        return y if self.conv.relu else self.activate(y)
+
+    def merge_for_inference(self) -> None:
+        """The convolution applies the ReLU."""
+        self.conv.relu = not self.negative_slope
 
     def activate(self, y: SparseMap) -> SparseMap:
         """Norm and activation of what the convolution gave."""
@@ -159,7 +189,14 @@ class ResidualBlock(nn.Module):
         self.conv2 = SubmanifoldConv(channels, channels, 3, ndim, bias=True)
         self.bn2 = RowNorm(channels, eps=eps, momentum=momentum)
 
+    def merge_for_inference(self) -> None:
+        """The convolutions apply the ReLUs and add the identity."""
+        self.conv1.relu = True
+
     def forward(self, x: SparseMap) -> SparseMap:
         y = self.conv1(x)
+        if self.conv1.relu:
+            conv, kernel_map = self.conv2, self.conv2.map(x.sites)[0]
+            return x.with_features(sparse_conv_relu(y.features, conv.weight, kernel_map, conv.bias, x.features))
         y = self.conv2(y.with_features(F.relu(self.bn1(y.features), inplace=True)))
         return x.with_features(F.relu(self.bn2(y.features).add_(x.features), inplace=True))

@@ -1,4 +1,4 @@
-"""A neighbour table by one Triton launch: a binary search for every tap and cell."""
+"""A neighbour table by one Triton launch: a binary search for every tap and cell. Reading it backwards is another."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import triton.language as tl
 from torch import Tensor
 
 from src.ops.backend import runs_kernels
-from src.ops.neighbour_table import ORDERING_TAPS, neighbour_table_reference
+from src.ops.neighbour_table import ORDERING_TAPS, neighbour_table_reference, turned_table_reference
 
 CELLS = 256
 """Cells a program looks around, one lane each."""
@@ -34,6 +34,26 @@ def neighbour_table_triton(
                 num_warps=4,
             )
     return table, bits
+
+
+def turned_table_triton(
+    table: Tensor,  # [K, m] int32
+    num: int,
+) -> tuple[Tensor, Tensor]:  # [K, num] int32, [num] int64
+    """The reference's table and bits."""
+    if not runs_kernels(table):
+        return turned_table_reference(table, num)
+    back, bits = table.new_full((len(table), num), -1), table.new_zeros(num, dtype=torch.int64)
+    cells = table.shape[1]
+    if cells > 0 and num > 0:
+        with torch.cuda.device_of(table):
+            _turn[(triton.cdiv(cells, CELLS), len(table))](
+                *(table.contiguous(), back, bits, num, cells),
+                BITS=ORDERING_TAPS,
+                BLOCK=CELLS,
+                num_warps=4,
+            )
+    return back, bits
 
 
 @triton.jit(do_not_specialize=["num", "cells", "all_taps", "steps"])
@@ -62,3 +82,15 @@ def _search(  # noqa: ANN202
         if tap < BITS:
             seen += found.to(tl.int64) << tap
     tl.store(bits + place, seen, mask=live)
+
+
+@triton.jit(do_not_specialize=["num", "cells"])
+def _turn(table, back, bits, num, cells, BITS: tl.constexpr, BLOCK: tl.constexpr):  # noqa: ANN001, ANN202
+    """One tap of a block of cells. No two write to the same place, and bits are set whatever the order."""
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    tap = tl.program_id(1)
+    row = tl.load(table + tap.to(tl.int64) * cells + place, mask=place < cells, other=-1)
+    seen = row >= 0
+    tl.store(back + tap.to(tl.int64) * num + row, place, mask=seen)
+    if tap < BITS:
+        tl.atomic_or(bits + row, tl.full((BLOCK,), 1, tl.int64) << tap, mask=seen)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from src.ops.backend import interpreted, runs_kernels
 from src.ops.kernel_maps import KernelMap
-from src.ops.sparse_conv import sparse_conv_reference
+from src.ops.sparse_conv import sparse_conv_reference, sparse_conv_relu_reference
 from src.ops.sparse_conv_function import SparseConvFunction
 
 DTYPES = (torch.float32, torch.float16, torch.bfloat16)
@@ -39,6 +39,19 @@ def sparse_conv_triton(
     return SparseConvFunction.apply(features.contiguous(), weight, bias, kernel_map, _forward, _gradients)
 
 
+def sparse_conv_relu_triton(
+    features: Tensor,  # [M_in, Cin]
+    weight: Tensor,  # [K, Cin, Cout]
+    kernel_map: KernelMap,
+    bias: Tensor | None,  # [Cout]
+    residual: Tensor | None,  # [M_out, Cout]
+) -> Tensor:  # [M_out, Cout]
+    """The reference's sums in float32, in one launch."""
+    if kernel_map.identity or features.dtype not in DTYPES or not runs_kernels(features):
+        return sparse_conv_relu_reference(features, weight, kernel_map, bias, residual)
+    return _product(features.contiguous(), weight, kernel_map, bias, residual, relu=True)
+
+
 def _forward(features: Tensor, weight: Tensor, bias: Tensor | None, kernel_map: KernelMap) -> Tensor:
     return _product(features, weight, kernel_map, bias)
 
@@ -49,8 +62,8 @@ def _gradients(
     grad_features = None
     if needed[0]:
         # A mirrored map is its own transpose once the taps are reversed.
-        turned = (weight.flip(0) if maps.mirrored else weight).transpose(1, 2)
-        grad_features = _product(grad, turned, maps if maps.mirrored else maps.transposed, None)
+        own = maps if maps.mirrored else maps.transposed
+        grad_features = _product(grad, weight.transpose(1, 2), own, None, reverse=maps.mirrored)
     return grad_features, _weight_gradient(features, grad, maps) if needed[1] else None
 
 
@@ -59,6 +72,9 @@ def _product(
     weight: Tensor,  # [K, Ca, Cb], any strides
     kernel_map: KernelMap,  # of n rows among m
     bias: Tensor | None,  # [Cb]
+    residual: Tensor | None = None,  # [n, Cb]
+    relu: bool = False,
+    reverse: bool = False,  # the last tap has the first matrix
 ) -> Tensor:  # [n, Cb]
     num, (_, c_in, c_out) = kernel_map.num_outputs, weight.shape
     out = rows.new_empty(num, c_out)
@@ -70,10 +86,12 @@ def _product(
             rows,
             weight,
             out if bias is None else bias.contiguous(),
+            out if residual is None else residual.contiguous(),
             out,
-            *(kernel_map.order, kernel_map.table),
+            *(kernel_map.order, kernel_map.table, relu, reverse),
             *(num, len(weight), c_in, c_out, *weight.stride()),
             HAS_BIAS=bias is not None,
+            HAS_RESIDUAL=residual is not None,
             PRECISION=_precision(),
             UPCAST=_upcast(rows),
             DEPTHS=triton.cdiv(c_in, depth),
@@ -96,10 +114,11 @@ def _add_product(left, right, total, PRECISION: tl.constexpr, UPCAST: tl.constex
 
 @triton.jit(do_not_specialize=["num", "all_taps"])
 def _gather_product(  # noqa: ANN202
-    rows, weight, bias, out, order, table,  # noqa: ANN001
+    rows, weight, bias, residual, out, order, table,  # noqa: ANN001
+    RELU: tl.constexpr, REVERSE: tl.constexpr,
     num, all_taps, c_in, c_out, stride_tap, stride_in, stride_out,  # noqa: ANN001
-    HAS_BIAS: tl.constexpr, PRECISION: tl.constexpr, UPCAST: tl.constexpr, DEPTHS: tl.constexpr,
-    BLOCK_ROWS: tl.constexpr, BLOCK_IN: tl.constexpr, BLOCK_OUT: tl.constexpr,
+    HAS_BIAS: tl.constexpr, HAS_RESIDUAL: tl.constexpr, PRECISION: tl.constexpr, UPCAST: tl.constexpr,
+    DEPTHS: tl.constexpr, BLOCK_ROWS: tl.constexpr, BLOCK_IN: tl.constexpr, BLOCK_OUT: tl.constexpr,
 ):  # fmt: skip
     """One block of output rows and channels: walks the taps through which a row of the block sees anything."""
     place = tl.program_id(0) * BLOCK_ROWS + tl.arange(0, BLOCK_ROWS)
@@ -110,6 +129,7 @@ def _gather_product(  # noqa: ANN202
     for tap in range(0, all_taps):
         row = tl.load(table + tap * num + target, mask=place < num, other=-1).to(tl.int64)
         if tl.max(row, 0) >= 0:
+            matrix_tap = all_taps - 1 - tap if REVERSE else tap
             for depth in range(0, DEPTHS):
                 channel = depth * BLOCK_IN + lane
                 values = tl.load(
@@ -118,13 +138,21 @@ def _gather_product(  # noqa: ANN202
                     other=0.0,
                 )
                 matrix = tl.load(
-                    weight + tap * stride_tap + channel[:, None] * stride_in + column[None, :] * stride_out,
+                    weight + matrix_tap * stride_tap + channel[:, None] * stride_in + column[None, :] * stride_out,
                     mask=(channel[:, None] < c_in) & (column[None, :] < c_out),
                     other=0.0,
                 )
                 total = _add_product(values, matrix, total, PRECISION, UPCAST)
     if HAS_BIAS:
         total += tl.load(bias + column, mask=column < c_out, other=0.0).to(tl.float32)[None, :]
+    if HAS_RESIDUAL:
+        total += tl.load(
+            residual + target[:, None] * c_out + column[None, :],
+            mask=(place[:, None] < num) & (column[None, :] < c_out),
+            other=0.0,
+        ).to(tl.float32)
+    if RELU:
+        total = tl.where(total < 0.0, 0.0, total)  # NaN stays what it is
     tl.store(
         out + target[:, None] * c_out + column[None, :],
         total.to(out.dtype.element_ty),

@@ -24,6 +24,7 @@ PILLARS = RadarEncoderConfig(
     point_count_channel=True,
     local_means=False,
     height_tolerance_deg=0.0,
+    pruning_ratio=0.0,
 )
 VOXELS = replace(PILLARS, voxel_size_m=[0.2, 0.2, 1.0], stage_channels=[4, 6, 8, 8], conv_out=ConvOut.sparse)
 FULL = RadarEncoderConfig(
@@ -36,8 +37,10 @@ FULL = RadarEncoderConfig(
     point_count_channel=False,
     local_means=False,
     height_tolerance_deg=0.0,
+    pruning_ratio=0.0,
 )
-both = pytest.mark.parametrize("config", [PILLARS, VOXELS], ids=["pillars", "voxels"])
+PRUNED = replace(VOXELS, pruning_ratio=0.5)
+both = pytest.mark.parametrize("config", [PILLARS, VOXELS, PRUNED], ids=["pillars", "voxels", "pruned"])
 
 
 def radar_points(count: int = 120, seed: int = 0) -> torch.Tensor:
@@ -231,6 +234,21 @@ def test_conv_out_dilates_only_when_asked() -> None:
     assert len(wide) == reached.sum() > len(narrow)
 
 
+def test_pruning_keeps_every_voxels_own_cell_and_the_parameters() -> None:
+    """Down to the BEV cell; the coarser stages dilate as ever."""
+    whole, pruned = encoder_of(VOXELS), encoder_of(PRUNED)
+    pruned.load_state_dict(whole.state_dict())
+    voxels = whole.voxelise(radar_points(), torch.arange(120) % 2, 2)
+    counts = []
+    for encoder in (whole, pruned):
+        stages = encoder.run_stages(voxels)
+        counts.append(torch.tensor([len(stage.sites) for stage in stages]))
+        for depth in range(1, 4):
+            cells = voxels.indices // torch.tensor([1, 2**depth, 2**depth, 2**depth])
+            assert (stages[depth].sites.rows_of(cells) >= 0).all()
+    assert counts[1][0] == counts[0][0] and (counts[1][1:3] < counts[0][1:3]).all()
+
+
 @pytest.mark.parametrize(
     ("change", "grid_change", "message"),
     [
@@ -249,6 +267,7 @@ def test_conv_out_dilates_only_when_asked() -> None:
         ({"voxel_size_m": [0.4, 0.2, 8.0]}, {}, "x equal to y"),
         ({"stage_channels": []}, {}, "at least one positive width"),
         ({"max_voxels": 0}, {}, "max_voxels=0: must be at least 1"),
+        ({"pruning_ratio": 1.5}, {}, r"model.radar_encoder.pruning_ratio=1.5: must lie in \[0, 1\]"),
     ],
 )
 def test_impossible_settings_are_refused(change: dict, grid_change: dict, message: str) -> None:

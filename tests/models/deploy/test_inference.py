@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.deploy.inference import MergedBranches, fold_norm, prepare_for_inference
 from src.models.deploy.static_parts import GraphReplay, ImageNetwork
 from src.models.heads.branches import Branches
+from src.models.horizon3d.gaussian_encoder import AnchorEncoder, GaussianBounds
 from src.models.horizon3d.sparse_fusion import SparseFusion
 from src.models.layers.sparse import RowNorm, SparseConv, SubmanifoldConv
 from src.ops.precision import computing
@@ -116,6 +118,19 @@ def test_merged_branches_equal_each_alone(rows):
     for one in branches:
         fold_norm(one.hidden, one.norm)
     torch.testing.assert_close(MergedBranches(branches)(x), wanted, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [0, 6])
+def test_a_merged_anchor_encoder_equals_its_parts(count):
+    grid = BEVGrid(cells=(8, 8), cell_m=0.8, centre_m=(1.0, 0.0), z_range_m=(-3.0, 5.0))
+    anchor = AnchorEncoder(4, grid, GaussianBounds((0.5, 4.0), 2.0, 40.0, 10.0)).double()
+    for parameter in anchor.parameters():
+        nn.init.normal_(parameter)
+    names = {"means": (2,), "scales": (2,), "directions": (2,), "opacity_logits": (), "velocities": (2,)}
+    gaussians = SimpleNamespace(**{name: torch.randn(2, count, *size).double() for name, size in names.items()})
+    expected = anchor(gaussians)
+    anchor.merge_for_inference()
+    torch.testing.assert_close(anchor(gaussians), expected)
 
 
 MODELS = {

@@ -7,6 +7,7 @@ import torch
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.models.heads.branches import checkpointed_branches
 from src.models.heads.center_head import CenterHead, HeadConfig, HeadOutput, TrainRegression
 from src.models.heads.decode import AttributeSource, Suppression
 from src.ops.sites import Sites
@@ -87,6 +88,14 @@ def test_regressing_top_cells_equals_regressing_all() -> None:
     every = torch.stack([branches(output.bev.features) for branches in head.regressions], dim=1)
     rows, groups = torch.randint(0, len(bev), (30,)), torch.randint(0, 7, (30,))
     torch.testing.assert_close(head.regress(output, rows, groups), every[rows, groups])
+
+
+def test_all_groups_at_once_equal_one_after_the_other() -> None:
+    """As on a GPU and as on a CPU, with the statistics of a training step."""
+    head, features = head_of().train(), make_bev().features
+    one_by_one = torch.stack([checkpointed_branches([part], features) for part in head.regressions], dim=1)
+    at_once = checkpointed_branches(list(head.regressions), features).unflatten(1, (7, -1))
+    torch.testing.assert_close(at_once, one_by_one)
 
 
 def test_sampled_training_equals_all_where_the_sample_is_everything() -> None:

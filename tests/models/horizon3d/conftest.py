@@ -157,6 +157,7 @@ def make_config():
                 point_count_channel=True,
                 local_means=True,
                 height_tolerance_deg=0.0,
+                pruning_ratio=0.0,
             ),
             kggi=None if radar_only else KGGIConfig(**kggi),
             ocsf=None if radar_only else OCSFConfig(**ocsf),

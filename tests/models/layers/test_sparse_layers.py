@@ -5,6 +5,7 @@ from torch import nn
 
 from src.models.layers.sparse import (
     ConvNormReLU,
+    PrunedSparseConv,
     ResidualBlock,
     RowNorm,
     SparseConv,
@@ -163,3 +164,14 @@ def test_leaky_relu() -> None:
     assert (before < 0).any() and (before > 0).any()
     torch.testing.assert_close(leaky(x).features, torch.where(before > 0, before, 0.01 * before))
     torch.testing.assert_close(plain(x).features, before.clamp(min=0))
+
+
+def test_the_faintest_sites_of_every_sample_do_not_dilate() -> None:
+    """Of five sites the two faintest reach only their own cell; those of the other sample rank among themselves."""
+    cells = torch.tensor([[0, 0], [0, 6], [0, 10], [0, 15], [0, 20], [1, 3], [1, 15]])
+    sites = Sites.from_indices(cells, (2, 24))[0]
+    magnitudes = torch.tensor([5.0, -4.0, 1.0, 2.0, 3.0, 0.1, 0.2])
+    layer = PrunedSparseConv(2, 3, 3, 1, bias=False, stride=2, padding=1, pruning_ratio=0.5)
+    found = layer(SparseMap(sites, magnitudes[:, None] * torch.tensor([[1.0, -1.0]])))
+    # An even cell has one output, an odd one two, of which the lower is its own.
+    assert found.indices.tolist() == [[0, 0], [0, 3], [0, 5], [0, 7], [0, 10], [1, 1], [1, 7], [1, 8]]

@@ -15,7 +15,9 @@ from src.ops.gaussian_cells import gaussian_cells
 from src.ops.kernel_maps import submanifold_map
 from src.ops.kernels import (
     farthest_point_triton,
+    moved_keys_triton,
     neighbour_table_triton,
+    radial_change_triton,
     sparse_conv_triton,
     splat_triton,
 )
@@ -47,22 +49,32 @@ def compile_only(launch):
 def main():
     driver.set_active(Target())
     JITFunction.run = compile_only(JITFunction.run)
-    for module in (farthest_point_triton, neighbour_table_triton, sparse_conv_triton, splat_triton):
+    kernels = (
+        *(farthest_point_triton, moved_keys_triton, neighbour_table_triton),
+        *(radial_change_triton, sparse_conv_triton, splat_triton),
+    )
+    for module in kernels:
         module.runs_kernels = lambda tensor: True
     valid = torch.ones(2, 700, dtype=torch.bool)
     farthest_point_triton.farthest_points_triton(torch.zeros(2, 700, 2), valid, torch.zeros(2).long(), 20)
 
     neighbour_table_triton.neighbour_table_triton(*(torch.arange(size) for size in (80, 80, 9)))
+    neighbour_table_triton.turned_table_triton(torch.zeros(9, 80, dtype=torch.int32), 80)
     kernel_map = submanifold_map(Sites.from_linear(torch.arange(80), (1, 8, 10)), 3)
     for dtype, c_in, c_out in ((torch.float32, 5, 16), (torch.bfloat16, 96, 128)):
         features, weight = torch.zeros(80, c_in, dtype=dtype), torch.zeros(9, c_in, c_out, dtype=dtype)
         inputs = [features.requires_grad_(), weight.requires_grad_()]
         out = sparse_conv_triton.sparse_conv_triton(*inputs, kernel_map, torch.zeros(c_out, dtype=dtype))
         torch.autograd.grad(out, inputs, torch.zeros_like(out))
+        operands = (features.detach(), weight.detach(), kernel_map, None, out.detach())
+        sparse_conv_triton.sparse_conv_relu_triton(*operands)
+
+    moved_keys_triton.moved_keys_triton(torch.arange(80), (120, 35), ((12, 10, 1, 2, 0, 5, 7),) * 2, ((1, 0),))
 
     # Nothing fills log_free, so the occupied cells are given.
     splat_triton.occupied_cells = lambda log_free, support, *choice: (torch.arange(len(support)), 0)
     grid = BEVGrid(cells=(8, 10), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
+    radial_change_triton.radial_change_triton(torch.zeros(9, 2), *[torch.arange(9)] * 2, torch.zeros(9, 2), grid)
     direction = torch.tensor([[1.0, 0.0]])
     gaussian = (torch.zeros(1, 2), torch.ones(1, 2), direction, torch.zeros(1), torch.zeros(1, 128))
     inputs = [x.requires_grad_() for x in gaussian]

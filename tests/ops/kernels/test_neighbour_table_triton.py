@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from src.ops.neighbour_table import neighbour_table, tap_bits
+from src.ops.neighbour_table import neighbour_table, tap_bits, turned_table
 
 
 @pytest.mark.parametrize(("count", "cells", "taps"), [(0, 5, 9), (1, 3, 1), (300, 700, 27), (64, 64, 125)])
@@ -15,3 +15,15 @@ def test_table_and_bits(device, count, cells, taps):
     wanted = (corners + steps[:, None]).tolist()
     assert table.tolist() == [[rows.get(key, -1) for key in line] for line in wanted]
     assert torch.equal(bits, tap_bits(table))
+
+
+@pytest.mark.parametrize(("num", "cells", "taps"), [(0, 5, 9), (5, 0, 9), (1, 3, 1), (300, 700, 27), (64, 64, 125)])
+def test_a_table_read_backwards(device, num, cells, taps):
+    draw = torch.Generator().manual_seed(num)
+    lines = [torch.randperm(max(num, cells), generator=draw)[:cells] for _ in range(taps)]
+    table = torch.stack([torch.where(line < num, line, -1) for line in lines]).to(torch.int32)
+    back, bits = turned_table(table.to(device), num)
+    expected = torch.full((taps, num), -1, dtype=torch.int32)
+    for tap, cell in (table >= 0).nonzero().tolist():
+        expected[tap, table[tap, cell]] = cell
+    assert torch.equal(back.cpu(), expected) and torch.equal(bits.cpu(), tap_bits(expected))

@@ -3,7 +3,7 @@ import torch
 
 from src.ops.kernel_maps import strided_map, submanifold_map, temporal_map
 from src.ops.sites import Sites
-from src.ops.sparse_conv import sparse_conv
+from src.ops.sparse_conv import sparse_conv, sparse_conv_relu
 
 # Largest error over the largest value against float64 on the same operands: float32 sums, and one rounding to the
 # type of the output (which the interpreter cuts off for bfloat16: a whole unit in the last place instead of half).
@@ -151,3 +151,19 @@ def test_autocast_reaches_the_kernel(device):
     assert out.dtype == torch.bfloat16
     expected = sparse_conv(features.double(), weight.double(), kernel_map)
     assert (out.double() - expected).abs().max() < 0.02 * expected.abs().max()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("identity", [True, False])
+def test_relu_and_residual_in_the_same_launch(device, identity, dtype):
+    kernel_map = build("2d", device)
+    draw = torch.Generator().manual_seed(0)
+    features, weight, bias, residual = (
+        torch.randn(*size, generator=draw).to(device, dtype) for size in ((100, 4), (9, 4, 20), (20,), (100, 20))
+    )
+    added = residual if identity else None
+    found = sparse_conv_relu(features, weight, kernel_map, bias, added)
+    assert found.dtype == dtype
+    expected = sparse_conv(features.double(), weight.double(), kernel_map, bias.double())
+    expected = (expected + (residual.double() if identity else 0)).relu()
+    assert (found.double() - expected).abs().max() / expected.abs().max() < TOLERANCE[dtype]

@@ -1,0 +1,87 @@
+"""The nearest measured radial velocity by one Triton launch: a binary search for every velocity and bin."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from src.geometry.bev_grid import BEVGrid
+from src.ops.backend import runs_kernels
+from src.ops.radial_change import BIN_MPS, MIN_SPEED_MPS, NEAR_BINS, NUM_BINS, radial_change_reference
+
+VELOCITIES = 128
+"""Velocities of a program, one lane each."""
+
+
+def radial_change_triton(velocities: Tensor, cells: Tensor, keys: Tensor, measured: Tensor, grid: BEVGrid) -> Tensor:
+    """The reference's change up to rounding."""
+    if velocities.dtype != torch.float32 or not runs_kernels(velocities):
+        return radial_change_reference(velocities, cells, keys, measured, grid)
+    velocities, out = velocities.contiguous(), velocities.new_empty(velocities.shape)
+    if len(out) > 0:
+        with torch.cuda.device_of(out):
+            _nearest_radial[(triton.cdiv(len(out), VELOCITIES),)](
+                *(velocities, cells.contiguous(), keys.contiguous(), measured.contiguous(), out),
+                *(len(out), len(keys), len(keys).bit_length(), grid.rows, grid.cols),
+                *(grid.x_min_m, grid.y_min_m, grid.cell_m, BIN_MPS, MIN_SPEED_MPS),
+                BINS=NUM_BINS,
+                NEAR=NEAR_BINS,
+                BLOCK=VELOCITIES,
+                num_warps=4,
+            )
+    return out
+
+
+@triton.jit(do_not_specialize=["num", "keys_num", "steps", "rows", "cols"])
+def _nearest_radial(  # noqa: ANN202
+    velocities, cells, keys, measured, out, num, keys_num, steps, rows, cols,  # noqa: ANN001
+    x_min, y_min, cell_m, bin_mps, min_speed,  # noqa: ANN001
+    BINS: tl.constexpr, NEAR: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """All near bins of a block of velocities; the first of equally near ones counts."""
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = place < num
+    cell = tl.load(cells + place, mask=live, other=0)
+    x = x_min + ((cell % cols).to(tl.float32) + 0.5) * cell_m
+    y = y_min + ((cell // cols % rows).to(tl.float32) + 0.5) * cell_m
+    length = tl.maximum(tl.sqrt(x * x + y * y), 1e-12)
+    x, y = x / length, y / length
+    own_x = tl.load(velocities + 2 * place, mask=live, other=0.0)
+    own_y = tl.load(velocities + 2 * place + 1, mask=live, other=0.0)
+    radial = (own_x * x + own_y * y) / bin_mps
+    bin_ = tl.floor(radial + 0.5)
+    odd = bin_ - 2.0 * tl.floor(0.5 * bin_)
+    bin_ = tl.where((bin_ - radial == 0.5) & (odd == 1.0), bin_ - 1.0, bin_)  # halves go to the even one, as torch's do
+    half = BINS // 2
+    bin_ = tl.minimum(tl.maximum(bin_, -half), half).to(tl.int64) + half
+    least = tl.full((BLOCK,), float("inf"), tl.float32)
+    found_x = tl.zeros((BLOCK,), tl.float32)
+    found_y = tl.zeros((BLOCK,), tl.float32)
+    for away in range(-NEAR, NEAR + 1):
+        wanted = cell * BINS + tl.minimum(tl.maximum(bin_ + away, 0), BINS - 1)
+        low = tl.zeros((BLOCK,), tl.int32)
+        high = low + keys_num
+        for _ in range(0, steps):
+            open_ = low < high
+            middle = (low + high) // 2
+            below = open_ & (tl.load(keys + middle, mask=open_, other=0) < wanted)
+            low = tl.where(below, middle + 1, low)
+            high = tl.where(open_ & (below == 0), middle, high)
+        inside = live & (low < keys_num)
+        hit = inside & (tl.load(keys + low, mask=inside, other=0) == wanted)
+        new_x = tl.load(measured + 2 * low, mask=hit, other=0.0)
+        new_y = tl.load(measured + 2 * low + 1, mask=hit, other=0.0)
+        miss = tl.abs((new_x - own_x) * x + (new_y - own_y) * y)
+        nearer = hit & (miss < least)
+        least = tl.where(nearer, miss, least)
+        found_x = tl.where(nearer, new_x, found_x)
+        found_y = tl.where(nearer, new_y, found_y)
+    speed = tl.sqrt(found_x * found_x + found_y * found_y)
+    moving = speed > min_speed
+    safe = tl.maximum(speed, 1e-12)
+    x, y = tl.where(moving, found_x / safe, x), tl.where(moving, found_y / safe, y)
+    change = tl.where(least < float("inf"), (found_x - own_x) * x + (found_y - own_y) * y, 0.0)
+    tl.store(out + 2 * place, change * x, mask=live)
+    tl.store(out + 2 * place + 1, change * y, mask=live)

@@ -1,0 +1,34 @@
+import pytest
+import torch
+
+from src.geometry.bev_grid import BEVGrid
+from src.models.layers.doppler import Doppler
+from src.ops.radial_change import BIN_MPS, radial_change, radial_change_reference
+
+GRID = BEVGrid(cells=(12, 16), cell_m=0.8, centre_m=(8.0, 0.0), z_range_m=(-3.0, 5.0))
+
+
+@pytest.mark.parametrize(("points", "count"), [(0, 5), (60, 0), (60, 1), (60, 700)])
+def test_changes(device, points, count):
+    draw = torch.Generator().manual_seed(points + count)
+    rows = torch.rand(points, 7, generator=draw) * torch.tensor([12.8, 9.6, 1, 1, 80, 80, 1])
+    rows -= torch.tensor([-1.6, 4.8, 0, 0, 40, 40, 0])
+    rows[::2, 4:6] *= 1e-2  # standing
+    doppler = Doppler.measure(rows, torch.arange(points) % 2, GRID)
+    velocities = 15 * torch.randn(count, 2, generator=draw)
+    cells = torch.randint(0, 2 * 12 * 16, (count,), generator=draw)
+    inputs = (velocities, cells, doppler.keys, doppler.velocities)
+    found = radial_change(*(x.to(device) for x in inputs), GRID).cpu()
+    torch.testing.assert_close(found, radial_change_reference(*inputs, GRID), rtol=1e-4, atol=1e-4)
+    assert count < 700 or (found != 0).any(1).float().mean() > 0.2
+
+
+def test_halves_go_to_the_even_bin(device):
+    """Of radial speeds between two bins, whose nearest measurements differ."""
+    grid = BEVGrid(cells=(13, 16), cell_m=0.8, centre_m=(8.0, 0.0), z_range_m=(-3.0, 5.0))
+    cell, sight = torch.tensor([6 * 16 + 15]), torch.tensor([[1.0, 0.0]])  # straight ahead
+    bins = torch.arange(0, 31, 3)
+    velocities = (torch.arange(-6, 6)[:, None] + 0.5) * BIN_MPS * sight
+    inputs = (velocities, cell.expand(12), cell * 31 + bins, (bins[:, None] - 15) * BIN_MPS * sight)
+    found = radial_change(*(x.to(device) for x in inputs), grid).cpu()
+    torch.testing.assert_close(found, radial_change_reference(*inputs, grid))
