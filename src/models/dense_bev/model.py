@@ -13,18 +13,15 @@ from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import depth_cross_entropy
 from src.losses.loss_weights import LossWeights
 from src.losses.normalizers import mean_over_ranks
+from src.models.backbones.bev_decoder import MIN_CHANNELS, BEVDecoder, BEVDecoderConfig, ConvFuser
 from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
-from src.models.dense_bev.bev_decoder import MIN_CHANNELS, BEVDecoder, BEVDecoderConfig, ConvFuser
-from src.models.dense_bev.lift_splat import LiftedViews, LiftSplat, LiftSplatConfig
-from src.models.dense_bev.pillars import PillarConfig, PillarEncoder
+from src.models.backbones.pillars import PillarConfig, PillarEncoder
 from src.models.dense_bev.temporal_fusion import MapMemory, TemporalConfig, TemporalFusion, WarpedMaps
 from src.models.detector import Detector, ModelConfig, Objective
 from src.models.heads.center_head import BoxOptions, CenterHead, HeadConfig, HeadOutput
+from src.models.layers.lift_splat import LiftedViews, LiftSplat, LiftSplatConfig
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
-from src.targets.depth import paint_depth
-from src.targets.projection import view_boxes
-from src.targets.supervision import supervised_boxes
 
 
 @dataclass(kw_only=True)
@@ -151,22 +148,10 @@ class DenseBEV(Detector):
         weights = self.config.loss
         terms, counts = self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
         if weights.depth_weight is not None:
-            terms["depth"] = weights.depth_weight * self._depth_loss(output.views.depth_logits, batch)
+            target = self.view_transform.depth_target(batch, self.image_encoder.image_size_px)
+            total = depth_cross_entropy(output.views.depth_logits.flatten(0, 1), target)
+            terms["depth"] = weights.depth_weight * total / mean_over_ranks((target >= 0).sum())
         return Objective(terms, counts)
-
-    def _depth_loss(
-        self,
-        logits: Tensor,  # [B, N, D, h, w]
-        batch: FrameBatch,
-    ) -> Tensor:  # []
-        """Cross-entropy at the pixels of annotated boxes, as Horizon3D's camera branch (method 4.3)."""
-        settings, size = self.config.view_transform, self.image_encoder.image_size_px
-        joined, sample = supervised_boxes(batch.boxes, self.grid)
-        seen = view_boxes(joined, sample, batch.pix_from_aug, batch.image_valid, size)
-        logits = logits.flatten(0, 1)
-        bins = (settings.depth_range, settings.num_depth_bins)
-        target = paint_depth(seen, len(logits), size, *bins, settings.image_stride_px)
-        return depth_cross_entropy(logits, target) / mean_over_ranks((target >= 0).sum())
 
     def decode(self, output: DenseBEVOutput) -> list[Boxes3D]:
         """Boxes of each frame, best first."""

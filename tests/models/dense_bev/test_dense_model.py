@@ -10,8 +10,8 @@ from src.config import compose_config
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models import FAMILIES
+from src.models.backbones.bev_decoder import BEVDecoder, BEVDecoderConfig
 from src.models.backbones.image import NeckName
-from src.models.dense_bev.bev_decoder import BEVDecoder, BEVDecoderConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig, DenseBEVLossConfig
 from src.structures.boxes import Boxes3D
 from tests.models.dense_bev.dense_frames import GRID, backbone, dense_config, dense_model, make_batch, memory_config
