@@ -3,135 +3,93 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from src.errors import ConfigError, require_least
-from src.geometry.bev_grid import BEVGrid
-from src.losses.classification import depth_cross_entropy, sigmoid_focal
-from src.losses.loss_weights import LossWeights
+from src.losses.classification import sigmoid_focal
 from src.losses.normalizers import mean_over_ranks
-from src.models.backbones.bev_decoder import MIN_CHANNELS, BEVDecoder, BEVDecoderConfig, GatedFuser
-from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
-from src.models.backbones.pillars import PillarConfig, PillarEncoder
+from src.models.backbones.bev_decoder import GatedFuser
+from src.models.camera_radar import CameraRadarConfig, CameraRadarDetector, CameraRadarLossConfig, CameraRadarOutput
 from src.models.crt_fusion.motion_estimator import CellMotion, MotionEstimator, occupancy_loss, velocity_loss
-from src.models.crt_fusion.radar_lift import RadarLift, RadarLiftConfig, RadarLiftedViews
-from src.models.detector import Detector, ModelConfig, Objective
-from src.models.heads.center_head import BoxOptions, CenterHead, HeadConfig, HeadOutput
+from src.models.crt_fusion.motion_fusion import MotionFusionConfig, MotionGuidedFusion, MovedMaps, StackMemory
+from src.models.crt_fusion.radar_lift import RadarLift, RadarLiftConfig
+from src.models.detector import Objective
 from src.structures.batch import FrameBatch
-from src.structures.boxes import Boxes3D
 from src.targets.box_raster import BoxRaster
 
 
 @dataclass(kw_only=True)
-class CRTFusionLossConfig(LossWeights):
+class CRTFusionLossConfig(CameraRadarLossConfig):
     """Weights of the terms (`model.loss`); null switches a term off, uncomputed."""
 
-    heatmap_weight: float | None
-    box_weight: float | None
-    depth_weight: float | None
     foreground_weight: float | None  # of pixels
     occupancy_weight: float | None  # of cells
     velocity_weight: float | None  # of cells
 
 
 @dataclass(kw_only=True)
-class CRTFusionConfig(ModelConfig):
+class CRTFusionConfig(CameraRadarConfig):
     """Settings of the model (`model`). Raises ConfigError for parts that do not go together."""
 
-    fused_channels: int  # width of the fused map
-    radar_encoder: PillarConfig
     view_transform: RadarLiftConfig
-    decoder: BEVDecoderConfig
-    head: HeadConfig
+    temporal: MotionFusionConfig | None  # null: single frames, phase 1
     loss: CRTFusionLossConfig
-
-    def __post_init__(self) -> None:
-        require_least(self, "model", {"channels": 1, "fused_channels": MIN_CHANNELS})
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Both always: without cameras there is nothing to fuse."""
-        return ("camera", "radar")
 
 
 @dataclass
-class CRTFusionOutput:
+class CRTFusionOutput(CameraRadarOutput):
     """One frame through the model."""
 
-    views: RadarLiftedViews
-    radar_bev: Tensor  # [B, C_radar, rows, cols]
-    fused_bev: Tensor  # [B, C_fused, rows, cols]
     motion: CellMotion
-    head: HeadOutput
+    moved: MovedMaps | None  # None in phase 1
 
 
-class CRTFusion(Detector):
-    """Multi-view fusion, motion estimator, decoder and dense head.
+class CRTFusion(CameraRadarDetector):
+    """Multi-view fusion, motion estimator, motion-guided temporal fusion, decoder and dense head."""
 
-    Raises ConfigError when parts, grid and backbone do not fit.
-    """
-
-    phase_options = BoxOptions
-    latency_parts = {
-        "image_encoder": ("image_encoder.forward",),
-        "radar_encoder": ("radar_encoder.forward",),
-        "view_transform": ("view_transform.forward", "fuser.forward"),
-        # The way from the fused map to the head, as of the dense baseline.
-        "temporal_fusion": ("estimator.forward", "decoder.forward"),
-        "detection_head": ("head.forward", "head.decode"),
+    latency_parts = CameraRadarDetector.latency_parts | {
+        "temporal_fusion": ("estimator.forward", *CameraRadarDetector.latency_parts["temporal_fusion"])
     }
 
-    def __init__(
-        self,
-        config: CRTFusionConfig,
-        grid: BEVGrid,
-        backbone: ImageEncoderConfig | None,
-        options: BoxOptions,
-    ) -> None:
-        super().__init__()
-        if backbone is None:
-            raise ConfigError("backbone=null: model=crt_fusion fuses radar with images; choose a backbone")
-        self.config, self.grid = config, grid
-        radar, lift, fused = config.radar_encoder, config.view_transform, config.fused_channels
-        self.image_encoder = ImageEncoder(backbone, strides=(lift.image_stride_px,))
-        self.radar_encoder = PillarEncoder(radar, grid)
-        self.view_transform = RadarLift(lift, self.image_encoder.channels, radar.channels, grid)
-        self.fuser = GatedFuser(lift.context_channels, radar.channels, fused)
+    def build_fusion(self) -> None:
+        """Radar-guided lifting, gated fusion of both maps, motion estimator, and the memory."""
+        config, fused, radar = self.config, self.config.fused_channels, self.config.radar_encoder.channels
+        self.view_transform = RadarLift(config.view_transform, self.image_encoder.channels, radar, self.grid)
+        self.fuser = GatedFuser(config.view_transform.context_channels, radar, fused)
         self.estimator = MotionEstimator(fused)
-        self.decoder = BEVDecoder(config.decoder, fused, config.channels, grid)
-        self.head = CenterHead(config.head, config.channels, grid, options.velocity_code_weight, dense=True)
-        self.to(memory_format=torch.channels_last)
+        self.temporal = MotionGuidedFusion(config.temporal, fused, self.grid) if config.temporal is not None else None
 
-    @property
-    def image_backbone(self) -> nn.Module:
-        """Backbone without its neck."""
-        return self.image_encoder.backbone
+    def forward(
+        self, batch: FrameBatch, memory: StackMemory | None = None
+    ) -> tuple[CRTFusionOutput, StackMemory | None]:
+        """Detect in the frames of B streams, given what is remembered of them; the new memory is detached.
 
-    def forward(self, batch: FrameBatch, memory: None = None) -> tuple[CRTFusionOutput, None]:
-        """Detect in B frames. Raises ValueError when images are absent."""
-        if batch.images is None or batch.image_valid is None or batch.pix_from_aug is None:
-            raise ValueError("FrameBatch.images is None, but this model uses images; read them with the frames")
-        (level,) = self.image_encoder(batch.images)
-        radar_bev = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
+        Raises ValueError when images are absent, or when the memory is of another number of streams.
+        """
+        level, radar_bev = self.encode(batch, memory)
         cameras = (batch.pix_from_aug, batch.image_valid, self.image_encoder.image_size_px)
         views = self.view_transform(level, radar_bev, *cameras)
-        fused = self.fuser(views.bev, radar_bev)
-        motion = self.estimator(fused)
-        return CRTFusionOutput(views, radar_bev, fused, motion, self.head(self.decoder(fused))), None
+        current = fused = self.fuser(views.bev, radar_bev)
+        motion, moved, memory_now = self.estimator(fused), None, None
+        if self.temporal is not None:
+            moved = self.temporal.recall(memory, batch)
+            current = self.temporal.aggregate(fused, moved)
+            memory_now = self.temporal.remember(batch, fused, motion, moved)
+        head = self.head(self.decoder(current))
+        return CRTFusionOutput(views, radar_bev, fused, head, motion, moved), memory_now
+
+    def restore_memory(self, state: list[dict[str, Any]]) -> StackMemory:
+        """The memory that `StackMemory.state` described."""
+        return StackMemory.from_state(state)
 
     def loss_terms(self, output: CRTFusionOutput, batch: FrameBatch) -> Objective:
         """Weighted terms `heatmap`, `box`, `depth`, `foreground`, `occupancy` and `velocity`."""
-        weights, views = self.config.loss, output.views
-        terms, counts = self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
-        depth = self.view_transform.depth_target(batch, self.image_encoder.image_size_px)  # [B*N, h, w]
-        if weights.depth_weight is not None:
-            total = depth_cross_entropy(views.depth_logits.flatten(0, 1), depth)
-            terms["depth"] = weights.depth_weight * total / mean_over_ranks((depth >= 0).sum())
+        weights, (terms, counts) = self.config.loss, super().loss_terms(output, batch)
         if weights.foreground_weight is not None:
-            present = batch.image_valid.flatten()[:, None, None].expand_as(depth)
-            total = (sigmoid_focal(views.foreground_logits, depth >= 0) * present).sum()
+            target = self.view_transform.depth_target(batch, self.image_encoder.image_size_px) >= 0  # [B*N, h, w]
+            present = batch.image_valid.flatten()[:, None, None].expand_as(target)
+            total = (sigmoid_focal(output.views.foreground_logits, target) * present).sum()
             terms["foreground"] = weights.foreground_weight * total / mean_over_ranks(present.sum())
         raster = BoxRaster(batch.boxes, self.grid, margin_m=0.0)
         if weights.occupancy_weight is not None:
@@ -140,16 +98,10 @@ class CRTFusion(Detector):
             terms["velocity"] = weights.velocity_weight * velocity_loss(output.motion, raster)
         return Objective(terms, counts)
 
-    def decode(self, output: CRTFusionOutput) -> list[Boxes3D]:
-        """Boxes of each frame, best first."""
-        return self.head.decode(output.head)
-
     def diagnostics(self, output: CRTFusionOutput) -> dict[str, Tensor | float]:
-        """Pillars, lifted pairs and occupied cells per frame, and how sure depth is."""
+        """Also cells called occupied and past maps in use."""
         frames = len(output.radar_bev)
-        return {
-            "pillars": output.radar_bev.any(dim=1).sum() / frames,
-            "lifted_pairs": output.views.num_lifted / frames,
-            "depth_confidence": output.views.depth_logits.float().softmax(2).amax(2).mean(),
-            "occupied_cells": (output.motion.occupancy_logits > 0).sum() / frames,
-        }
+        values = super().diagnostics(output) | {"occupied_cells": (output.motion.occupancy_logits > 0).sum() / frames}
+        if output.moved is not None:
+            values["remembered_frames"] = output.moved.usable.sum() / frames
+        return values

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from src.models.backbones.bev_decoder import GatedFuser
-from src.models.crt_fusion.radar_lift import AzimuthAttention
+from src.models.layers.azimuth_attention import AzimuthAttention
 from tests.models.crt_fusion.crt_frames import crt_model
 from tests.models.dense_bev.dense_frames import GRID, SIZE, make_batch
 from tests.models.surroundings import AXES, camera_matrices
@@ -14,8 +14,7 @@ from tests.models.surroundings import AXES, camera_matrices
 
 def make_attention(count=3):
     torch.manual_seed(0)
-    config = crt_model(f"model.view_transform.pillars_per_column={count}").config.view_transform
-    return AzimuthAttention(config, 6, 4, GRID).eval()
+    return AzimuthAttention(6, 4, 8, count, GRID).eval()
 
 
 def radar_map(cells):
