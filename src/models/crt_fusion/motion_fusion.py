@@ -116,7 +116,7 @@ class MotionGuidedFusion(nn.Module):
         frames = memory.before(batch).frames if memory is not None else ()
         if not frames:
             return MovedMaps(ages.new_zeros(shape[0], width, *shape[1:]), ages)
-        (frame,) = frames
+        frame = frames[0]  # has taken in what was before it
         with torch.autocast(batch.device.type, enabled=False):
             motion, cells = frame.motion(batch, self.config.max_age_s), frame.cells
             ages = torch.where(motion.usable[:, None], frame.ages_s + motion.elapsed_s[:, None], ages)
