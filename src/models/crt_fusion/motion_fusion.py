@@ -115,7 +115,7 @@ class MotionGuidedFusion(nn.Module):
         ages = torch.full((len(batch), slots), torch.inf, device=batch.device)
         frames = memory.before(batch).frames if memory is not None else ()
         if not frames:
-            return MovedMaps(ages.new_zeros(shape[0], width, *shape[1:]), ages)
+            return MovedMaps(map_of_rows(ages.new_zeros(torch.Size(shape).numel(), width), shape), ages)
         frame = frames[0]  # has taken in what was before it
         with torch.autocast(batch.device.type, enabled=False):
             motion, cells = frame.motion(batch, self.config.max_age_s), frame.cells
