@@ -1,4 +1,4 @@
-"""The dense baseline by the commands that people type, at debug scale: phase 1, phase 2, evaluation, streaming."""
+"""Detectors on a dense map by the commands people type, at debug scale: phase 1, phase 2, evaluation, streaming."""
 
 import json
 
@@ -14,22 +14,27 @@ from tests.running import call
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def outputs(tmp_path_factory):
-    return tmp_path_factory.mktemp("outputs")
+@pytest.fixture(scope="module", params=["dense_bev", "crt_fusion"])
+def family(request):
+    return request.param
 
 
 @pytest.fixture(scope="module")
-def trained(outputs):
+def outputs(tmp_path_factory, family):
+    return tmp_path_factory.mktemp(family)
+
+
+@pytest.fixture(scope="module")
+def trained(outputs, family):
     """A run of phase 2, which trains its phase 1 first."""
     few = "model.head.score_threshold=0.005"  # one step leaves every score near where it began
-    call("train", "phase=phase2", "model=dense_bev", "scale=debug", few, f"paths.outputs={outputs}")
-    (folder,) = outputs.glob("dense_bev-phase2-debug-*")
+    call("train", "phase=phase2", f"model={family}", "scale=debug", few, f"paths.outputs={outputs}")
+    (folder,) = outputs.glob(f"{family}-phase2-debug-*")
     return folder
 
 
-def test_both_phases_leave_what_is_promised(trained, outputs):
-    (first,) = outputs.glob("dense_bev-phase1-debug-*")
+def test_both_phases_leave_what_is_promised(trained, outputs, family):
+    (first,) = outputs.glob(f"{family}-phase1-debug-*")
     for folder in (first, trained):
         names = ("config.yaml", "metrics.json", "metrics.csv", "run.json", "submission.json", "checkpoints/last.ckpt")
         assert all((folder / name).is_file() for name in names), folder

@@ -10,6 +10,7 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.centerpoint.model import CenterPoint, CenterPointConfig
+from src.models.crt_fusion.model import CRTFusion, CRTFusionConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig
 from src.models.detector import Detector, ModelConfig
 from src.models.horizon3d.model import Horizon3D
@@ -20,6 +21,7 @@ from src.models.lrs4fusion.model import LRS4Fusion
 FAMILIES: dict[str, tuple[type[ModelConfig], type[Detector]]] = {
     "horizon3d": (Horizon3DConfig, Horizon3D),
     "dense_bev": (DenseBEVConfig, DenseBEV),
+    "crt_fusion": (CRTFusionConfig, CRTFusion),
     "centerpoint": (CenterPointConfig, CenterPoint),
     "lrs4fusion": (LRS4FusionConfig, LRS4Fusion),
 }

@@ -11,9 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy
+from src.models.camera_radar import TemporalConfig
 from src.models.layers.dense import DenseConvNormReLU
 from src.models.memory import FrameMemory, Motion, RememberedFrame
 from src.ops.concat_conv import concat_conv2d
@@ -21,19 +21,6 @@ from src.structures.batch import FrameBatch
 
 STORED = torch.bfloat16
 """Type of remembered maps: half the memory, and 0.4 % is far below what normalised features resolve."""
-
-
-@dataclass(kw_only=True)
-class TemporalConfig:
-    """Settings of the temporal part (`model.temporal`). Raises ConfigError when there is nothing to remember."""
-
-    num_frames: int  # remembered key frames
-    max_age_s: float  # older ones are not used
-
-    def __post_init__(self) -> None:
-        require_least(self, "model.temporal", {"num_frames": 1}, "; model.temporal=null means no memory")
-        if not self.max_age_s > 0:
-            raise ConfigError(f"model.temporal.max_age_s={self.max_age_s}: must be positive")
 
 
 @dataclass

@@ -19,6 +19,7 @@ from src.ops.kernel_maps import (
     submanifold_map,
     temporal_map,
 )
+from src.ops.linear import linear
 from src.ops.segment_reduce import rank_per_sample, segment_count
 from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv, sparse_conv_relu
@@ -145,6 +146,23 @@ class RowNorm(nn.BatchNorm1d):
         if self.training and len(x) < 2:
             return F.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, False, 0.0, self.eps)
         return super().forward(x)
+
+
+class LinearNormReLU(nn.Module):
+    """Linear, batch norm and ReLU on rows."""
+
+    norm_pairs = (("linear", "norm"),)
+
+    def __init__(self, in_channels: int, out_channels: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(in_channels, out_channels, bias=False)
+        self.norm = RowNorm(out_channels)
+
+    def forward(
+        self,
+        x: Tensor,  # [n, C]
+    ) -> Tensor:  # [n, C']
+        return F.relu(self.norm(linear(x, self.linear.weight.t(), self.linear.bias)))
 
 
 class ConvNormReLU(nn.Module):

@@ -5,15 +5,15 @@ from dataclasses import replace
 import torch
 
 from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.bev_decoder import BEVDecoderConfig
 from src.models.backbones.image import ImageEncoderConfig, NeckName
+from src.models.backbones.pillars import PillarConfig
 from src.models.backbones.weights import BackboneName
-from src.models.dense_bev.bev_decoder import BEVDecoderConfig
-from src.models.dense_bev.lift_splat import LiftSplatConfig
-from src.models.dense_bev.model import DenseBEV, DenseBEVConfig, DenseBEVLossConfig
-from src.models.dense_bev.pillars import PillarConfig
-from src.models.dense_bev.temporal_fusion import TemporalConfig
+from src.models.camera_radar import CameraRadarLossConfig, TemporalConfig
+from src.models.dense_bev.model import DenseBEV, DenseBEVConfig
 from src.models.heads.center_head import BoxOptions, HeadConfig, TrainRegression
 from src.models.heads.decode import AttributeSource, Suppression
+from src.models.layers.lift_splat import LiftSplatConfig
 from src.structures.batch import FrameBatch
 from tests.models import moving
 from tests.models.surroundings import AXES, camera_matrices, random_boxes
@@ -109,7 +109,7 @@ def dense_config(temporal=None, **changes):
             attributes=AttributeSource.rule,
             train_regression=TrainRegression.sampled,
         ),
-        loss=DenseBEVLossConfig(**weights),
+        loss=CameraRadarLossConfig(**weights),
     )
 
 

@@ -10,9 +10,10 @@ from src.config import compose_config
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models import FAMILIES
+from src.models.backbones.bev_decoder import BEVDecoder, BEVDecoderConfig
 from src.models.backbones.image import NeckName
-from src.models.dense_bev.bev_decoder import BEVDecoder, BEVDecoderConfig
-from src.models.dense_bev.model import DenseBEV, DenseBEVConfig, DenseBEVLossConfig
+from src.models.camera_radar import CameraRadarLossConfig
+from src.models.dense_bev.model import DenseBEV, DenseBEVConfig
 from src.structures.boxes import Boxes3D
 from tests.models.dense_bev.dense_frames import GRID, backbone, dense_config, dense_model, make_batch, memory_config
 from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
@@ -95,7 +96,7 @@ def test_two_samples_do_not_mix():
             torch.testing.assert_close(model(single)[0].head.logits, both[sample], atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", [field.name for field in fields(DenseBEVLossConfig)])
+@pytest.mark.parametrize("name", [field.name for field in fields(CameraRadarLossConfig)])
 def test_weights_multiply_and_null_switches_a_term_off(name):
     batch, term = make_batch(), name.removesuffix("_weight")
     model = dense_model().eval()

@@ -140,7 +140,11 @@ MODELS = {
     "wide gates, attributes": ("phase=phase1", "model.ocsf.gate_kernel_size=3", "model.head.attributes=learned"),
     "other neck": ("phase=phase1", "backbone.neck=secondfpn16"),
     "dense": ("phase=phase2", "model=dense_bev"),
-}
+    "crt_fusion": (
+        "phase=phase2", "model=crt_fusion", "model.head.score_threshold=0.02",
+        "model.temporal.occupancy_threshold=0.01",
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.slow

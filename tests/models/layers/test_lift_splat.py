@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from src.errors import ConfigError
-from src.models.dense_bev.lift_splat import LiftSplat
+from src.models.layers.lift_splat import LiftSplat
 from src.targets.depth import lid_centres
 from tests.models.dense_bev.dense_frames import GRID, SIZE, lift_config
 from tests.models.surroundings import AXES, camera_matrices

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from src.errors import ConfigError
+from src.models.backbones.pillars import PillarConfig, PillarEncoder
 from src.models.backbones.sparse_voxel import POINT_SCALES
-from src.models.dense_bev.pillars import PillarConfig, PillarEncoder
 from tests.models.dense_bev.dense_frames import GRID, make_batch
 
 

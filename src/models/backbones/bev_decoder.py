@@ -57,6 +57,29 @@ class ConvFuser(nn.Module):
         return self.conv(torch.cat([camera, radar], dim=1))
 
 
+class GatedFuser(nn.Module):
+    """Radar-camera gating (CRT-Fusion): both maps by a convolution, added with weights that each cell takes from both.
+
+    The camera map says in one more channel where anything was lifted to.
+    """
+
+    def __init__(self, camera_channels: int, radar_channels: int, channels: int) -> None:
+        super().__init__()
+        self.camera = DenseConvNormReLU(camera_channels + 1, channels, 3)
+        self.radar = DenseConvNormReLU(radar_channels, channels, 3)
+        self.gates = nn.Conv2d(channels, 2 * channels, 1)
+
+    def forward(
+        self,
+        camera: Tensor,  # [B, C_camera, rows, cols], zero where nothing was lifted to
+        radar: Tensor,  # [B, C_radar, rows, cols]
+    ) -> Tensor:  # [B, C, rows, cols]
+        camera = self.camera(torch.cat([camera, (camera != 0).any(1, keepdim=True).to(camera.dtype)], dim=1))
+        radar = self.radar(radar)
+        for_camera, for_radar = self.gates(camera + radar).sigmoid().chunk(2, dim=1)
+        return camera * for_camera + radar * for_radar
+
+
 class BEVDecoder(nn.Module):
     """Residual stages at ever coarser strides; the first and the last are joined and brought back to every cell.
 

@@ -13,7 +13,10 @@ from src.geometry.tensor_transforms import invert_projection, pixel_centres
 from src.models.backbones.resnet import BasicBlock
 from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
 from src.ops.segment_reduce import inverse_rows, weighted_segment_sum
-from src.targets.depth import lid_centres
+from src.structures.batch import FrameBatch
+from src.targets.depth import lid_centres, paint_depth
+from src.targets.projection import view_boxes
+from src.targets.supervision import supervised_boxes
 
 
 @dataclass(kw_only=True)
@@ -80,12 +83,27 @@ class LiftSplat(nn.Module):
         image_size_px: tuple[int, int],  # (H, W) of the network input
     ) -> LiftedViews:
         """Pool all views of every sample; a missing view contributes nothing."""
-        b, n, _, h, w = level.shape
         hidden = self.trunk(level.flatten(0, 1))
-        depth, context = self.depth(hidden), self.context(hidden)
-        with torch.autocast(level.device.type, enabled=False):  # sums of many terms, weighted by probabilities
+        return self.splat(self.depth(hidden), self.context(hidden), pix_from_aug, valid, image_size_px)
+
+    def splat(
+        self,
+        depth: Tensor,  # [B*N, D, h, w] logits
+        context: Tensor,  # [B*N, C, h, w]
+        pix_from_aug: Tensor,  # [B, N, 4, 4]
+        valid: Tensor,  # [B, N] bool
+        image_size_px: tuple[int, int],  # (H, W)
+        lifted: Tensor | None = None,  # [B*N, h, w] bool, the pixels whose likely bins alone are lifted
+    ) -> LiftedViews:
+        """Pool depth times context into cells; with `lifted` only of its pixels, and bins of no less than 1 / D."""
+        (b, n), (h, w) = valid.shape, depth.shape[-2:]
+        with torch.autocast(depth.device.type, enabled=False):  # sums of many terms, weighted by probabilities
             probabilities = rows_of_map(depth.float()).softmax(1)  # [B*N*h*w, D]
-            pairs, cells, by_pixel = self.pair(self.lift(pix_from_aug, valid, image_size_px, (h, w)), valid)
+            kept = valid[:, :, None, None, None]
+            if lifted is not None:
+                likely = (probabilities >= 1 / depth.shape[1]) & lifted.flatten()[:, None]
+                kept = kept & likely.view(b, n, h, w, -1)
+            pairs, cells, by_pixel = self.pair(self.lift(pix_from_aug, valid, image_size_px, (h, w)), kept)
             weights = probabilities.flatten().index_select(0, pairs)
             pixels = torch.div(pairs, self.config.num_depth_bins, rounding_mode="floor")
             shape = (b, self.grid.rows, self.grid.cols)
@@ -112,17 +130,29 @@ class LiftSplat(nn.Module):
     def pair(
         self,
         points: Tensor,  # [B, N, h, w, D, 3] aug metres
-        valid: Tensor,  # [B, N] bool
+        kept: Tensor,  # bool, broadcasts to [B, N, h, w, D]
     ) -> tuple[Tensor, Tensor, Tensor]:  # [pairs] int64 each
-        """(pixel, bin) pairs that fall into a cell as pixel * D + bin, in the order of cells; the linear key of each
-        pair's cell, ascending; and where in this order the pairs lie when they are taken pixel by pixel.
+        """Kept (pixel, bin) pairs that fall into a cell as pixel * D + bin, in the order of cells; the linear key of
+        each pair's cell, ascending; and where in this order the pairs lie when they are taken pixel by pixel.
         """
         low, high = self.config.z_range_m
         inside = self.grid.contains(points[..., :2]) & (points[..., 2] >= low) & (points[..., 2] < high)
-        inside &= valid[:, :, None, None, None]
+        inside &= kept
         hits = inside.flatten().nonzero().squeeze(1)  # synchronises a GPU
         cell = self.grid.cell_of(points.view(-1, 3).index_select(0, hits)[:, :2])
         sample = torch.div(hits, points[0].numel() // 3, rounding_mode="floor")
         keys = (sample * self.grid.rows + cell[:, 0]) * self.grid.cols + cell[:, 1]
         keys, order = torch.sort(keys, stable=True)
         return hits[order], keys, inverse_rows(order, len(order))
+
+    @torch.no_grad()
+    def depth_target(
+        self,
+        batch: FrameBatch,  # with images and annotations
+        image_size_px: tuple[int, int],  # (H, W)
+    ) -> Tensor:  # [B*N, h, w] int64
+        """Depth bin at the pixels of annotated boxes, -1 elsewhere, as Horizon3D's camera branch (method 4.3)."""
+        joined, sample = supervised_boxes(batch.boxes, self.grid)
+        seen = view_boxes(joined, sample, batch.pix_from_aug, batch.image_valid, image_size_px)
+        bins = (self.config.depth_range, self.config.num_depth_bins)
+        return paint_depth(seen, batch.image_valid.numel(), image_size_px, *bins, self.config.image_stride_px)
