@@ -2,6 +2,7 @@
 
 import json
 import logging
+import shutil
 
 import pytest
 
@@ -65,7 +66,7 @@ def root_logger():
 @pytest.mark.usefixtures("root_logger")
 def test_a_run_without_map_is_finished_tabled_and_shown(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(EVALUATORS, "counting", FrameCount)
-    (tmp_path / "sweeps").mkdir()
+    shutil.copytree(sweep_config.SWEEPS, tmp_path / "sweeps")  # claims name them
     (tmp_path / "sweeps" / "frames.yaml").write_text(SWEEP)
     monkeypatch.setattr(sweep_config, "SWEEPS", tmp_path / "sweeps")
     outputs, reports = tmp_path / "outputs", tmp_path / "reports"

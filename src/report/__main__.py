@@ -40,7 +40,7 @@ from src.training.run_folder import make_writable
 def main(overrides: list[str]) -> None:
     """Write all that can be written, show the page of `phase`, and end with what could not be.
 
-    Raises DataError for run folders, results and records that are broken, once the rest is done.
+    Raises DataError for run folders, results, records and claims that are broken, once the rest is done.
     """
     config, _ = compose_config(overrides)
     outputs, reports = Path(config.paths.outputs), Path(config.paths.reports)
@@ -60,7 +60,9 @@ def main(overrides: list[str]) -> None:
         with noted_in(faults):
             tables += write_sweep_tables(reports, record, results)
             sound.append(record)
-    claims = write_claims(reports, config.scale, sound, results)
+    claims: list[Path] = []
+    with noted_in(faults):
+        claims += write_claims(reports, config.scale, sound, results)
     if not pages and not records:
         what = f"{outputs}: no finished run of {config.phase.name} at scale={config.scale}"
         raise DataError("\n".join([what, *faults]))
@@ -79,10 +81,10 @@ def main(overrides: list[str]) -> None:
 
 @contextmanager
 def noted_in(faults: list[str]) -> Iterator[None]:
-    """What is broken costs no other run or sweep."""
+    """What is broken costs no other page."""
     try:
         yield
-    except DataError as error:
+    except (ConfigError, DataError) as error:
         faults.append(str(error))
 
 

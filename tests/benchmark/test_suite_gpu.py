@@ -10,6 +10,7 @@ from src.benchmark.scenes import ROADS
 from src.benchmark.suite_gpu import frame_seconds, full_case, measure
 from src.config import compose_config
 from src.errors import ConfigError
+from src.training.trainer_config import Accelerator
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,8 @@ def test_frames_differ_and_the_first_ones_do_not_count(config, monkeypatch):
 
 
 @pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_frame_and_a_step_on_a_gpu(config, monkeypatch):
     monkeypatch.setattr(suite_gpu, "FRAMES", 100)
-    page = measure(replace(config, trainer=replace(config.trainer, accelerator="gpu")), {})
+    page = measure(replace(config, trainer=replace(config.trainer, accelerator=Accelerator.gpu)), {})
     assert page["a frame"][0]["waits"] <= page["a frame"][0]["waits counted"]

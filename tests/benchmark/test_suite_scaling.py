@@ -120,8 +120,9 @@ def test_a_point_changes_what_it_names():
     assert settings_at(config, replace(point, pruning_ratio=0.5)).radar_encoder.pruning_ratio == 0.5
     assert settings.radar_encoder == config.model.radar_encoder
 
-    same, dense = configs_of(config).values()
-    assert same.model == config.model and dense.model.name == "dense_bev"
+    configs = configs_of(config)
+    assert [*configs] == ["horizon3d", "dense_bev", "crt_fusion"] and configs["horizon3d"].model == config.model
+    dense = configs["dense_bev"]
     assert settings_at(dense, point).temporal.num_frames == 5 and dense.grid == config.grid
     assert settings_at(dense, replace(point, memory_frames=0)).temporal is None
     assert settings_at(dense, replace(point, pruning_ratio=0.5)) == settings_at(dense, point)
