@@ -1,4 +1,4 @@
-"""One training step of a detector, and what it must do to the parameters of any of them."""
+"""What any detector must do: learn with every parameter, keep samples apart, weigh its losses."""
 
 import torch
 
@@ -29,3 +29,28 @@ def parameters_that_stay(model, batch, lr):
         optimizer.step()
     still = {name for name, _ in model.named_parameters()} - moved
     return [name for name in sorted(still) if not (name.startswith("head.regressions") and name.endswith("bias"))]
+
+
+def samples_do_not_mix(model, pair, make_batch):
+    """Logits of two samples of radar and images are those of each alone."""
+    with torch.no_grad():
+        both = model(pair)[0].head.logits.view(2, -1, 12)
+        for sample in range(2):
+            rows = pair.radar_batch == sample
+            single = make_batch(points=(0,), boxes=(0,))
+            single.radar_points, single.radar_batch = pair.radar_points[rows], pair.radar_batch[rows] * 0
+            single.images = pair.images[sample][None]
+            torch.testing.assert_close(model(single)[0].head.logits, both[sample], atol=1e-4, rtol=1e-4)
+
+
+def weight_multiplies_or_switches_off(model, batch, name, terms):
+    """Twice `model.loss.<name>` is twice its term and no other; null leaves it out of `terms`."""
+    term, loss = name.removesuffix("_weight"), model.config.loss
+    output = model(batch)[0]
+    plain = model.loss(output, batch).terms
+    setattr(loss, name, 2.0 * getattr(loss, name))
+    double = model.loss(output, batch).terms
+    assert {key for key in plain if not torch.equal(plain[key], double[key])} == {term, "total"}
+    torch.testing.assert_close(double[term], 2.0 * plain[term])
+    setattr(loss, name, None)
+    assert set(model.loss(output, batch).terms) == terms - {term}

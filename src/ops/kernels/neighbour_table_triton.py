@@ -8,6 +8,7 @@ import triton.language as tl
 from torch import Tensor
 
 from src.ops.backend import runs_kernels
+from src.ops.kernels.sorted_search_triton import lower_bound
 from src.ops.neighbour_table import ORDERING_TAPS, neighbour_table_reference, turned_table_reference
 
 CELLS = 256
@@ -61,21 +62,14 @@ def _search(  # noqa: ANN202
     keys, corners, taps, table, bits, num, cells, all_taps, steps,  # noqa: ANN001
     BITS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """All taps of a block of cells; after `steps` halvings `low` is the first row whose key is not below the wanted."""
+    """All taps of a block of cells."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = place < cells
     corner = tl.load(corners + place, mask=live, other=0)
     seen = tl.zeros((BLOCK,), tl.int64)
     for tap in range(0, all_taps):
         wanted = corner + tl.load(taps + tap)
-        low = tl.zeros((BLOCK,), tl.int32)
-        high = low + num
-        for _ in range(0, steps):
-            open_ = low < high
-            middle = (low + high) // 2
-            below = open_ & (tl.load(keys + middle, mask=open_, other=0) < wanted)
-            low = tl.where(below, middle + 1, low)
-            high = tl.where(open_ & (below == 0), middle, high)
+        low = lower_bound(keys, wanted, num, steps, BLOCK)
         inside = low < num
         found = inside & (tl.load(keys + low, mask=inside, other=0) == wanted)
         tl.store(table + tap * cells + place, tl.where(found, low, -1), mask=live)

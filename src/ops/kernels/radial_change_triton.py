@@ -9,6 +9,7 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.ops.backend import runs_kernels
+from src.ops.kernels.sorted_search_triton import lower_bound
 from src.ops.radial_change import BIN_MPS, MIN_SPEED_MPS, NEAR_BINS, NUM_BINS, radial_change_reference
 
 VELOCITIES = 128
@@ -61,14 +62,7 @@ def _nearest_radial(  # noqa: ANN202
     found_y = tl.zeros((BLOCK,), tl.float32)
     for away in range(-NEAR, NEAR + 1):
         wanted = cell * BINS + tl.minimum(tl.maximum(bin_ + away, 0), BINS - 1)
-        low = tl.zeros((BLOCK,), tl.int32)
-        high = low + keys_num
-        for _ in range(0, steps):
-            open_ = low < high
-            middle = (low + high) // 2
-            below = open_ & (tl.load(keys + middle, mask=open_, other=0) < wanted)
-            low = tl.where(below, middle + 1, low)
-            high = tl.where(open_ & (below == 0), middle, high)
+        low = lower_bound(keys, wanted, keys_num, steps, BLOCK)
         inside = live & (low < keys_num)
         hit = inside & (tl.load(keys + low, mask=inside, other=0) == wanted)
         new_x = tl.load(measured + 2 * low, mask=hit, other=0.0)

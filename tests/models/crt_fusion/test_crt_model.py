@@ -12,7 +12,13 @@ from src.models import build_model
 from src.models.crt_fusion.model import CRTFusionLossConfig
 from tests.models.crt_fusion.crt_frames import SMALL, crt_model
 from tests.models.dense_bev.dense_frames import GRID, backbone, make_batch
-from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
+from tests.models.learning import (
+    gradients_are_finite,
+    parameters_that_stay,
+    samples_do_not_mix,
+    train_step,
+    weight_multiplies_or_switches_off,
+)
 
 TERMS = {"heatmap", "box", "depth", "foreground", "occupancy", "velocity", "total"}
 EVERY = [(b, n) for b in range(2) for n in range(4)]
@@ -63,28 +69,12 @@ def test_missing_cameras(missing):
 
 
 def test_two_samples_do_not_mix():
-    model, pair = crt_model().eval(), make_batch(points=(150, 40), seed=3)
-    with torch.no_grad():
-        both = model(pair)[0].head.logits.view(2, -1, 12)
-        for sample in range(2):
-            rows = pair.radar_batch == sample
-            single = make_batch(points=(0,), boxes=(0,))
-            single.radar_points, single.radar_batch = pair.radar_points[rows], pair.radar_batch[rows] * 0
-            single.images = pair.images[sample][None]
-            torch.testing.assert_close(model(single)[0].head.logits, both[sample], atol=1e-4, rtol=1e-4)
+    samples_do_not_mix(crt_model().eval(), make_batch(points=(150, 40), seed=3), make_batch)
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(CRTFusionLossConfig)])
 def test_weights_multiply_and_null_switches_a_term_off(name):
-    model, batch, term = crt_model().eval(), make_batch(), name.removesuffix("_weight")
-    output = model(batch)[0]
-    plain = model.loss(output, batch).terms
-    setattr(model.config.loss, name, 2.0 * getattr(model.config.loss, name))
-    double = model.loss(output, batch).terms
-    assert {key for key in plain if not torch.equal(plain[key], double[key])} == {term, "total"}
-    torch.testing.assert_close(double[term], 2.0 * plain[term])
-    setattr(model.config.loss, name, None)
-    assert set(model.loss(output, batch).terms) == TERMS - {term}
+    weight_multiplies_or_switches_off(crt_model().eval(), make_batch(), name, TERMS)
 
 
 def test_autocast_keeps_positions_and_losses_in_float32():

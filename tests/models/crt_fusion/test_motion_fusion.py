@@ -14,7 +14,7 @@ from src.models.crt_fusion.model import CRTFusionConfig
 from src.models.crt_fusion.motion_estimator import CellMotion
 from src.models.crt_fusion.motion_fusion import MotionFusionConfig, MotionGuidedFusion, StackMemory
 from tests.models.crt_fusion.crt_frames import crt_model
-from tests.models.dense_bev.dense_frames import drive, pose
+from tests.models.dense_bev.dense_frames import drive, fill, pose
 from tests.models.learning import gradients_are_finite
 from tests.models.moving import bare_frame, bda
 
@@ -205,14 +205,6 @@ def pair():
     new = second.load_state_dict(first.state_dict(), strict=False)
     assert new.missing_keys and all(ADDED.match(key) for key in new.missing_keys) and not new.unexpected_keys
     return first, second
-
-
-def fill(model, steps):
-    memory = None
-    with torch.no_grad():
-        for step in range(steps):
-            _, memory = model(drive(step), memory)
-    return memory
 
 
 @pytest.mark.parametrize("training", [False, True])

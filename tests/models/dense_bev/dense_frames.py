@@ -64,6 +64,15 @@ def drive(step, **changes):
     )
 
 
+def fill(model, steps):
+    """Memory after some frames of the drive."""
+    memory = None
+    with torch.no_grad():
+        for step in range(steps):
+            _, memory = model(drive(step), memory)
+    return memory
+
+
 def backbone(neck=NeckName.fpn):
     return ImageEncoderConfig(
         name=BackboneName.small,

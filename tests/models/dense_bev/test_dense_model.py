@@ -16,7 +16,13 @@ from src.models.camera_radar import CameraRadarLossConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig
 from src.structures.boxes import Boxes3D
 from tests.models.dense_bev.dense_frames import GRID, backbone, dense_config, dense_model, make_batch, memory_config
-from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
+from tests.models.learning import (
+    gradients_are_finite,
+    parameters_that_stay,
+    samples_do_not_mix,
+    train_step,
+    weight_multiplies_or_switches_off,
+)
 
 STEPS = 140
 TERMS = {"heatmap", "box", "depth", "total"}
@@ -85,29 +91,12 @@ def test_what_a_missing_camera_shows_does_not_matter():
 
 
 def test_two_samples_do_not_mix():
-    model, pair = dense_model().eval(), make_batch(points=(150, 0), seed=3)
-    with torch.no_grad():
-        both = model(pair)[0].head.logits.view(2, -1, 12)
-        for sample in range(2):
-            rows = pair.radar_batch == sample
-            single = make_batch(points=(0,), boxes=(0,))
-            single.radar_points, single.radar_batch = pair.radar_points[rows], pair.radar_batch[rows] * 0
-            single.images = pair.images[sample][None]
-            torch.testing.assert_close(model(single)[0].head.logits, both[sample], atol=1e-4, rtol=1e-4)
+    samples_do_not_mix(dense_model().eval(), make_batch(points=(150, 0), seed=3), make_batch)
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(CameraRadarLossConfig)])
 def test_weights_multiply_and_null_switches_a_term_off(name):
-    batch, term = make_batch(), name.removesuffix("_weight")
-    model = dense_model().eval()
-    output = model(batch)[0]
-    plain = model.loss(output, batch).terms
-    setattr(model.config.loss, name, 2.0 * getattr(model.config.loss, name))
-    double = model.loss(output, batch).terms
-    assert {key for key in plain if not torch.equal(plain[key], double[key])} == {term, "total"}
-    torch.testing.assert_close(double[term], 2.0 * plain[term])
-    setattr(model.config.loss, name, None)
-    assert set(model.loss(output, batch).terms) == TERMS - {term}
+    weight_multiplies_or_switches_off(dense_model().eval(), make_batch(), name, TERMS)
 
 
 @pytest.mark.parametrize("temporal", [None, memory_config()])

@@ -14,7 +14,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.dense_bev.model import DenseBEVConfig
 from src.models.dense_bev.temporal_fusion import MapMemory, TemporalFusion
 from src.reliability.checkpoints import load_model_weights
-from tests.models.dense_bev.dense_frames import GRID, dense_model, drive, memory_config, pose
+from tests.models.dense_bev.dense_frames import GRID, dense_model, drive, fill, memory_config, pose
 from tests.models.moving import bare_frame, bda
 
 ADDED = re.compile(DenseBEVConfig.new_in_temporal_phase)
@@ -168,15 +168,6 @@ def pair():
     assert set(new) == second.state_dict().keys() - first.state_dict().keys() and new
     assert not [key for key in first.state_dict() if ADDED.match(key)]  # none of phase 1 may be missing
     return first, second
-
-
-def fill(model, steps):
-    """Memory after some frames."""
-    memory = None
-    with torch.no_grad():
-        for step in range(steps):
-            _, memory = model(drive(step), memory)
-    return memory
 
 
 @pytest.mark.slow
