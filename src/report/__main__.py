@@ -96,10 +96,8 @@ def write_pages(
     Of another task than detection: `<phase>_<task>_<scale>.md`.
     """
     pages, faults = {}, []
-    with_settings = {result.phase: result.model for result in results.values() if result.settings}
-    defaults = {
-        phase: defaults_of(config.scale, phase, model) for phase, model in with_settings.items() if phase in PHASES
-    }
+    models = {result.phase: result.model for result in results.values() if result.phase in PHASES}
+    defaults = {phase: defaults_of(config.scale, phase, model) for phase, model in models.items()}
     detection = [run for run in results.values() if run.task == DETECTION]
     groups = {phase: runs_on_page(detection, phase, in_sweeps, defaults) for phase in PHASES}
     for run in results.values():
