@@ -71,6 +71,9 @@ performance: $(STAMP) ## all pages of reports/performance, an hour and a half of
 	    "suite=model phase=phase1 $(FULL_SIZE)" "suite=model phase=phase1 model=dense_bev $(FULL_SIZE)" \
 	    "suite=model phase=phase2 model.dptf.bev_path.memory_threshold=0 $(FULL_SIZE)" \
 	    "suite=model phase=phase2 model=dense_bev $(FULL_SIZE)" \
+	    "suite=model model=lrs4fusion phase=lrs_occupancy model/roi=roi_official $(FULL_SIZE)" \
+	    "suite=scaling model=lrs4fusion phase=lrs_occupancy $(FULL_SIZE)" \
+	    "suite=launches phase=phase2 model.dptf.bev_path.memory_threshold=0 $(FULL_SIZE)" \
 	    "suite=training" "suite=training model=dense_bev" "suite=reader $(FULL_SIZE)" "suite=reader" "suite=metric" \
 	    "suite=soak phase=phase2"; do \
 	    $(PYTHON) -m src.benchmark $$suite $(PRECISION) out=reports/performance $(ARGS) || exit 1; \

@@ -106,7 +106,7 @@ def build_module(config: Config, tree: dict[str, Any], datamodule: DetectionData
         model,
         optim=config.optim,
         backbone_lr_multiplier=config.backbone.lr_multiplier,
-        evaluator=EVALUATORS[config.phase.task].of(datamodule),
+        evaluator=config.phase.evaluator(datamodule),
         seed=config.seed,
         config=tree,
         skip_nonfinite=config.trainer.on_nonfinite is OnNonfinite.skip,

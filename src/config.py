@@ -111,6 +111,7 @@ class BenchmarkSuite(Enum):
     soak = "soak"
     metric = "metric"
     reader = "reader"
+    launches = "launches"
 
 
 @dataclass(kw_only=True)
@@ -259,8 +260,9 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
 
     A group choice (`data=truckscenes`) replaces that whole group, at the checkpoint's scale and phase; `model=` only
     says whose keys may follow. A key of `trainer` that is younger than the checkpoint has today's value; a checkpoint
-    without `data.timeline` read key frames alone. `paths` are the command's own: where it reads and writes is not for a
-    file to say, least of all a stranger's; so is `oracle`.
+    without `data.timeline` read key frames alone, one without `phase.long_range` has the official score alone. `paths`
+    are the command's own: where it reads and writes is not for a file to say, least of all a stranger's; so is
+    `oracle`.
     Raises CheckpointError when the stored tree does not fit this version of the code, ConfigError for another model,
     scale or phase and for a key below a part that the checkpoint does not have.
     """
@@ -291,7 +293,8 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     schema = OmegaConf.structured(Config)
     try:
         schema.model = OmegaConf.structured(FAMILIES[model][0])
-        return build_config(OmegaConf.merge(schema, {"trainer": fresh.trainer, "data": {"timeline": None}}, tree))
+        younger = {"trainer": fresh.trainer, "data": {"timeline": None}, "phase": {"long_range": None}}
+        return build_config(OmegaConf.merge(schema, younger, tree))
     except (OmegaConfBaseException, ConfigError, OverflowError) as error:  # the last: a whole number beyond every float
         raise CheckpointError(f"the checkpoint's configuration does not fit this code: {error}") from None
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from src.assembly import build_datamodule, build_module, data_root, save_submission
 from src.config import compose_config, restore_config
 from src.errors import ConfigError, DataError
-from src.metrics.bootstrap import with_intervals
+from src.metrics.bootstrap import score_report
 from src.metrics.detection import score_detections
 from src.metrics.score_text import format_scores
 from src.metrics.submission import load_submission
@@ -49,7 +49,9 @@ def main(overrides: list[str]) -> None:
         metrics, text = evaluator.as_dict(), evaluator.describe(evaluator.as_dict())
     else:
         evaluation_set = build_datamodule(config, data_root(config, write=False)).evaluation_set()
-        metrics = with_intervals(score_detections(evaluation_set, load_submission(source, evaluation_set.tokens)))
+        boxes = load_submission(source, evaluation_set.tokens)
+        scores = score_detections(evaluation_set, boxes)
+        metrics = score_report(evaluation_set, boxes, scores, config.phase.long_range)
         text = format_scores(metrics)
     write_json(out / "metrics.json", metrics)
     print(text)

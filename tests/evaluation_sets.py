@@ -10,6 +10,7 @@ def set_of(truth: DetectionTable, tokens=("a",), tags=(), **columns) -> Evaluati
     n = len(tokens)
     plain = {
         "ego_centers": np.zeros((n, 3)),
+        "ego_rotations": np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
         "scene_tags": [tags] * n,
         "racks": DetectionTable.empty(),
         "scenes": np.zeros(n, np.int64),

@@ -10,6 +10,7 @@ import pytest
 from src.config import CONF, compose_config, restore_config
 from src.errors import CheckpointError, ConfigError
 from src.reliability.command import run_command
+from src.training.identity import run_identity
 from tests.running import command
 
 SCALES = sorted(p.stem for p in (CONF / "scale").glob("*.yaml"))
@@ -141,7 +142,7 @@ FULL_SIZE = {
     },
     "phase": {
         "epochs": 24, "module": "TrainingModule", "task": "detection", "monitor": "val/mAP", "init_from": None,
-        "train_missing": True, "frozen_statistics": False,
+        "train_missing": True, "frozen_statistics": False, "long_range": None,
     },
     "phase.options": {"velocity_code_weight": 0.2},
     "optim": {
@@ -344,6 +345,19 @@ def test_the_lidar_timeline_composes_and_a_checkpoint_older_than_it_has_none():
     _, tree = compose_config(["scale=debug", "data.root=x"])
     del tree["data"]["timeline"]
     assert restore_config(tree, []).data.timeline is None
+
+
+def test_a_second_score_of_detections_composes_and_an_older_checkpoint_has_none():
+    config, tree = compose_config(["scale=debug", "model=lrs4fusion", "phase=lrs_detection"])
+    assert config.phase.long_range.thresholds_m == [6.0] and config.phase.long_range.range_names[-1] == "150-250"
+    assert restore_config(tree, []).phase.long_range == config.phase.long_range
+    with pytest.raises(ConfigError, match="long_range scores detections, but phase.task=occupancy"):
+        compose_config(["scale=debug", "model=lrs4fusion", "phase=lrs_detection", "phase.task=occupancy",
+                        "phase.monitor=val/iou"])  # fmt: skip
+    _, tree = compose_config(["scale=debug"])
+    identity = run_identity(tree)
+    del tree["phase"]["long_range"]
+    assert restore_config(tree, []).phase.long_range is None and run_identity(tree) == identity
 
 
 @pytest.mark.parametrize("scale", SCALES)

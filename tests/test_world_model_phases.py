@@ -91,7 +91,9 @@ def test_detection_begins_from_the_volume_with_a_new_head(occupancy, outputs):
     said = call("train", *MODEL, "phase=lrs_detection", f"paths.outputs={outputs}")
     folder = only(outputs, "lrs_detection")
     assert record(folder)["initialized_from"] == occupancy.name
-    assert "mAP" in json.loads((folder / "metrics.json").read_text()) and "new:" in said.stderr
+    found = json.loads((folder / "metrics.json").read_text())
+    assert "mAP" in found and "new:" in said.stderr and "long range (m)" in said.stdout
+    assert list(found["long_range"]["ranges"]) == ["0-50", "50-150", "150-250"]
     before, after = weights(occupancy), weights(folder)
     assert {name.split(".")[1] for name in after.keys() - before.keys()} == {"neck", "head"}
     frozen = [name for name in before if ".decoders." in name]
@@ -109,6 +111,22 @@ def test_pages_show_every_phase_with_its_command(occupancy, outputs, tmp_path):
         text = (tmp_path / f"{page}_debug.md").read_text()
         assert f"python -m src.train phase={phase} scale=debug model=lrs4fusion" in text and words in text
     assert "Scores over time and distance" in (tmp_path / "dashboard.html").read_text()
+
+
+def test_two_processes_learn_from_rays_and_score_every_frame_once(occupancy, outputs, tmp_path):
+    """A sample a rank; the learning rate is so small that both runs score the same weights."""
+    still = ("phase=lrs_occupancy", "optim.lr=1e-12", f"data.root={next((outputs / 'worlds').iterdir())}")
+    found = []
+    for processes in (1, 2):
+        folder = tmp_path / str(processes)
+        call("train", *MODEL, *still, "trainer=cpu", f"trainer.devices={processes}", f"paths.outputs={folder}")
+        run = only(folder, "lrs_occupancy")
+        found.append(json.loads((run / "metrics.json").read_text()))
+        assert record(run)["processes"] == processes and record(run)["steps"] > 0
+    one, two = found
+    assert one.keys() == two.keys() and one["intervals"]["scenes"] == two["intervals"]["scenes"]
+    assert two["slice_iou@0.0s"] == pytest.approx(one["slice_iou@0.0s"], abs=0.02)
+    assert two["velocity_error_moving"] == pytest.approx(one["velocity_error_moving"], rel=1e-3)
 
 
 def test_a_source_of_another_region_is_refused(occupancy, outputs):

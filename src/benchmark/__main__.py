@@ -5,13 +5,15 @@ suite=model     the configured model part by part: time forward and with backwar
                 model holds no cell worth remembering: model.dptf.bev_path.memory_threshold=0 keeps all. The weights
                 are random unless checkpoint=PATH (of the same configuration) is given
 suite=ops       each heavy operation beside GEMM, other libraries and naive implementations, in turns
+                a phase that learns from LiDAR rays alone takes a made frame: no world is written for it
 suite=scaling   cost against range, objects, radar points, Gaussians and memory, the configured model beside others that
-                read radar and cameras (the dense baseline)
+                read radar and cameras (the dense baseline); of a model that reads LiDAR, alone, against range
 suite=training  frames per second of the phase's training step, with its loader and without
 suite=latency   a frame of the trained model checkpoint=PATH, part by part, with full memory in phase 2, over the frames
                 that it was validated on; into DIR/latency.json, where DIR is the run's folder if tables are to show it
 suite=soak      memory, time and handles over thousands of streamed frames, in inference and in training (phase=phase2)
 suite=metric    our metric against the official evaluator on one val-sized problem
+suite=launches  launches, waits and uploads of a frame and of a training step on a GPU, counted on a simulated one
 suite=reader    frames per second of the reader on one core
 """
 
@@ -33,7 +35,8 @@ from src.training.run_folder import make_writable, write_json
 def main(overrides: list[str]) -> None:
     """Measure one suite, print its page, and keep it as JSON and Markdown in `out` when given."""
     config, tree = compose_config(overrides)
-    if config.suite is BenchmarkSuite.model and not any(word.startswith("data.batch_size=") for word in overrides):
+    of_one_frame = config.suite in (BenchmarkSuite.model, BenchmarkSuite.launches)
+    if of_one_frame and not any(word.startswith("data.batch_size=") for word in overrides):
         config.data.batch_size = 1
     tune_cpu_allocator()
     if config.out:

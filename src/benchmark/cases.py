@@ -17,6 +17,7 @@ from src.models.detector import Detector
 from src.ops.precision import computing
 from src.reliability.checkpoints import load_model_weights, read_checkpoint
 from src.structures.batch import FrameBatch
+from src.training.phases import EVALUATORS
 
 KEY_FRAME_S = 0.5
 CANDIDATES = 300  # cells above the score threshold: what traffic lights up in a trained model, within its 500 boxes
@@ -34,27 +35,36 @@ class Case:
     memory: Any
     device: torch.device
     precision: str
+    learns_boxes: bool  # of a phase without, a world model is asked what is where rays end
 
     def computing(self) -> AbstractContextManager[None]:
         """As training and prediction compute."""
         return computing(self.precision, self.device)
 
     def infer(self) -> tuple[Any, Any]:
-        """Forward and decode, without gradients."""
+        """Forward and boxes, or answers where the batch's rays end, without gradients."""
         with torch.no_grad(), self.computing():
             output, _ = self.prepared(self.batch, self.memory)
-            return output, self.prepared.decode(output)
+            if self.learns_boxes:
+                return output, self.prepared.decode(output)
+            rays = self.batch.rays
+            queries = torch.cat([rays.points, rays.times_s[:, None]], dim=1)
+            return output, self.prepared.look_up(output, queries, rays.batch)
 
     def run(self) -> tuple[Any, Any]:
         """Forward, for gradients."""
         with self.computing():
             return self.model(self.batch, self.memory)
 
-    def step(self) -> Tensor:
-        """Forward, losses and backward; the weights' gradients are dropped."""
+    def losses(self) -> Tensor:
+        """Their sum, for gradients."""
         with self.computing():
             output, _ = self.model(self.batch, self.memory)
-            total = self.model.loss(output, self.batch).terms["total"]
+            return self.model.loss(output, self.batch).terms["total"]
+
+    def step(self) -> Tensor:
+        """Forward, losses and backward; the weights' gradients are dropped."""
+        total = self.losses()
         total.backward()
         self.model.zero_grad(set_to_none=True)
         return total.detach()
@@ -65,7 +75,8 @@ def build_case(config: Config, batch: FrameBatch, device: torch.device) -> Case:
     model = build_model(config)
     load_weights(config, model)
     prepared = prepare_for_inference(model, config.precision)
-    return Case(model.to(device).train(), prepared, batch, None, device, config.precision)
+    learns_boxes = EVALUATORS[config.phase.task].labels
+    return Case(model.to(device).train(), prepared, batch, None, device, config.precision, learns_boxes)
 
 
 def load_weights(config: Config, model: Detector) -> None:
@@ -75,14 +86,15 @@ def load_weights(config: Config, model: Detector) -> None:
 
 
 def expect_trained_scores(case: Case) -> tuple[Any, Any]:
-    """Set the score threshold of the prepared model so that decoding has the work that it has in a trained one.
+    """Set the score threshold of the prepared model so that decoding has the work that it has in a trained one; of a
+    model without boxes nothing.
 
     Fresh weights give every cell about the threshold of the configuration, and boxes would be made of half of them.
     Returns what forward gave for the frame that the scores are of: output and memory.
     """
     with torch.no_grad(), case.computing():
         output, memory = case.prepared(case.batch, case.memory)
-    scores = output.head.logits.float().sigmoid().flatten()
+    scores = output.head.logits.float().sigmoid().flatten() if case.learns_boxes else ()
     if len(scores) > CANDIDATES:
         head = case.prepared.head
         head.config = replace(head.config, score_threshold=float(scores.topk(CANDIDATES).values[-1]))

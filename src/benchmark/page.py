@@ -11,6 +11,7 @@ from src.benchmark.machine import busy_warning
 from src.config import BenchmarkSuite, Config
 from src.training.run_folder import current_commit, write_json
 
+ONE_MODEL = (BenchmarkSuite.model, BenchmarkSuite.training, BenchmarkSuite.soak, BenchmarkSuite.launches)
 GPU_NOTE = "Measured without a GPU. On one: the command above with `trainer.accelerator=gpu precision=bf16-mixed`."
 
 
@@ -28,7 +29,8 @@ def page_name(config: Config) -> str:
     """Name of a suite's files: with model and phase where one is measured, with the scale, and with `gpu` on one."""
     if config.suite is BenchmarkSuite.metric:
         return config.suite.value
-    of_one_model = config.suite in (BenchmarkSuite.model, BenchmarkSuite.training, BenchmarkSuite.soak)
+    of_one_model = config.suite in ONE_MODEL
+    of_one_model |= config.suite is BenchmarkSuite.scaling and "lidar" in config.model.sensors
     which = [config.model.name, config.phase.name] if of_one_model else []
     device = ["gpu"] if config.suite is not BenchmarkSuite.reader and config.trainer.device().type == "cuda" else []
     return "_".join([config.suite.value, *which, config.scale, *device])

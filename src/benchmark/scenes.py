@@ -1,4 +1,4 @@
-"""Synthetic frames to measure on: a straight highway in radar points and cameras, of any length, always the same.
+"""Synthetic frames to measure on: a straight highway in radar points and cameras, or in LiDAR, always the same.
 
 Nothing here resembles a recording in detail; what matters is how many cells are occupied and how they cluster.
 """
@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from src.structures.batch import FrameBatch
+from src.structures.ray_bundle import RayBundle
 from src.structures.taxonomy import CAMERAS
 
 RINGS_M = ((0.0, 75.0), (75.0, 150.0), (150.0, 300.0), (300.0, 600.0))
@@ -19,13 +20,18 @@ RINGS_M = ((0.0, 75.0), (75.0, 150.0), (150.0, 300.0), (300.0, 600.0))
 LANES_M = (-9.25, -5.5, -1.75, 1.75, 5.5, 9.25)
 RAILS_M = (-13.0, 0.0, 13.0)
 VEGETATION_M = (16.0, 60.0)  # |y|
+WALLS_M = (-30.0, 30.0)  # where the vegetation lets no ray through
 TRUCK_M, CAR_M = (14.0, 2.6), (4.5, 1.9)  # length, width
 CLUMP_M = 6.0  # size of a bush or wall in the returns of half a second
 NOISE_M, AZIMUTH_NOISE_RAD = 0.2, math.radians(0.5)
 HALF_DENSITY_M = 90.0  # where a metre of road gives half the returns that it gives at the truck
 SHARES = {"rails": 0.45, "vegetation": 0.4, "clutter": 0.15}  # of the background
 CAMERA_YAWS_RAD = tuple(math.radians(yaw) for yaw in (45.0, -45.0, 135.0, -135.0))
-FRAME_SENSORS = ("radar", "camera")  # of `taxonomy.SENSORS`, what a made frame has
+LIDAR_HEIGHT_M = 3.0
+ELEVATION_RAD = (math.radians(-25.0), math.radians(3.0))
+RAIL_HEIGHT_M, WALL_HEIGHT_M, CAR_HEIGHT_M, TRUCK_HEIGHT_M = 1.0, 8.0, 1.6, 3.5
+LIDAR_NOISE_M = 0.02
+TARGETS_S = (-0.2, 0.0, 1.0, 2.0)  # what a training frame has: past, present and two future moments
 CAMERA_FOV_RAD, CAMERA_HEIGHT_M = math.radians(110.0), 2.2
 
 
@@ -37,12 +43,13 @@ class Highway:
     num_vehicles: int
     points_per_vehicle: int  # in the mean
     reach_m: float  # the road ends here, ahead and behind
+    lidar_returns: int = 0
 
 
 ROADS = {
-    "paper": Highway(12_700, 60, 113, 150.0),
-    "mini": Highway(2600, 60, 23, 150.0),
-    "debug": Highway(200, 20, 5, 150.0),
+    "paper": Highway(12_700, 60, 113, 150.0, 150_000),  # the LiDARs' of MAN TruckScenes in a key frame
+    "mini": Highway(2600, 60, 23, 150.0, 20_000),
+    "debug": Highway(200, 20, 5, 150.0, 1500),
 }
 """The road of 150 m at a scale."""
 
@@ -72,10 +79,7 @@ def _vehicle_points(road: Highway, ring: tuple[float, float], share: float, draw
     vehicles = round(road.num_vehicles * (ring[1] - ring[0]) / 150.0)
     if not vehicles:
         return torch.zeros(0, 3)
-    ahead = ring[0] + (ring[1] - ring[0]) * torch.rand(vehicles, generator=draw)
-    x = ahead * (2.0 * _pick(vehicles, 2, draw) - 1.0)
-    y = torch.tensor(LANES_M)[_pick(vehicles, len(LANES_M), draw)]
-    long = torch.rand(vehicles, 1, generator=draw) < 0.3
+    x, y, long = _vehicles(vehicles, ring, draw)
     sizes = torch.where(long, torch.tensor(TRUCK_M), torch.tensor(CAR_M))
     number = round(road.points_per_vehicle * road.num_vehicles * share)
     owner = torch.multinomial(1 / (1 + (x / HALF_DENSITY_M).square()), number, replacement=True, generator=draw)
@@ -85,6 +89,14 @@ def _vehicle_points(road: Highway, ring: tuple[float, float], share: float, draw
     hull[:, 0] = torch.where(side, hull[:, 0], 0.5 * hull[:, 0].sign())
     xy = torch.stack([x, y], 1)[owner] + hull * sizes[owner]
     return _placed(xy[:, 0], xy[:, 1], -20.0 * y[owner].sign())
+
+
+def _vehicles(count: int, ring: tuple[float, float], draw: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """Places [n] along and across the road, m, and which are trucks [n, 1]."""
+    ahead = ring[0] + (ring[1] - ring[0]) * torch.rand(count, generator=draw)
+    x = ahead * (2.0 * _pick(count, 2, draw) - 1.0)
+    y = torch.tensor(LANES_M)[_pick(count, len(LANES_M), draw)]
+    return x, y, torch.rand(count, 1, generator=draw) < 0.3
 
 
 def _vegetation_points(number: int, ring: tuple[float, float], draw: torch.Generator) -> Tensor:
@@ -158,3 +170,61 @@ def _camera(yaw: float, height: int, width: int) -> Tensor:  # [4, 4]
     )  # right, down, ahead
     pix_from_cam = torch.tensor([[focal, 0, width / 2, 0], [0, focal, height / 2, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     return pix_from_cam @ cam_from_ego
+
+
+def lidar_frame(road: Highway, seed: int = 0) -> FrameBatch:
+    """One frame of a LiDAR on the truck's roof: what its rays met as points, and as rays to learn from at TARGETS_S,
+    at all of which the world is the same. The truck stands at the origin.
+    """
+    rays = _lidar_rays(road, torch.Generator().manual_seed(seed))
+    rest = torch.tensor([[20.0, 0.0]]).expand(len(rays), -1)  # intensity, age
+    return FrameBatch(
+        tokens=["synthetic"],
+        timestamps_s=torch.zeros(1, dtype=torch.float64),
+        global_from_ego=torch.eye(4, dtype=torch.float64)[None],
+        aug_from_ego=torch.eye(4)[None],
+        lidar_points=torch.cat([rays.points, rest], 1),
+        lidar_batch=torch.zeros(len(rays), dtype=torch.int64),
+        lidar_origins=rays.origins,
+        rays=rays,
+    )
+
+
+def _lidar_rays(road: Highway, draw: torch.Generator) -> RayBundle:
+    """As many as return, of evenly spread directions, from the ground, rails, walls behind them and vehicles."""
+    x, y, long = _vehicles(road.num_vehicles, (0.0, road.reach_m), draw)
+    sizes = torch.where(long, torch.tensor((*TRUCK_M, TRUCK_HEIGHT_M)), torch.tensor((*CAR_M, CAR_HEIGHT_M)))
+    centres = torch.stack([x, y, 0.5 * sizes[:, 2]], 1)
+    apart = (centres[:, :2].abs() > 0.5 * sizes[:, :2] + 1.0).any(1)  # none stands where the sensor is
+    centres, sizes = centres[apart], sizes[apart]
+    origin = torch.tensor([0.0, 0.0, LIDAR_HEIGHT_M])
+    kept: list[Tensor] = []
+    while sum(map(len, kept)) < road.lidar_returns:
+        turn = 2 * math.pi * torch.rand(road.lidar_returns, generator=draw)
+        low, high = ELEVATION_RAD
+        rise = low + (high - low) * torch.rand(road.lidar_returns, generator=draw)
+        direction = torch.stack([rise.cos() * turn.cos(), rise.cos() * turn.sin(), rise.sin()], 1)
+        reach = torch.where(direction[:, 2] < 0, -LIDAR_HEIGHT_M / direction[:, 2], torch.inf)  # the ground
+        sides = [(rail, RAIL_HEIGHT_M) for rail in RAILS_M if rail] + [(wall, WALL_HEIGHT_M) for wall in WALLS_M]
+        for away, height in sides:
+            met = away / direction[:, 1]
+            met[(met <= 0) | (origin[2] + met * direction[:, 2] > height)] = torch.inf
+            reach = torch.minimum(reach, met)
+        for centre, size in zip(centres, sizes, strict=True):
+            ends = torch.stack([(centre + side * 0.5 * size - origin) / direction for side in (-1, 1)])
+            enter, leave = ends.amin(0).amax(1), ends.amax(0).amin(1)
+            reach = torch.where((enter > 0) & (enter < leave), torch.minimum(reach, enter), reach)
+        inside = (reach[:, None] * direction[:, :2]).abs().amax(1) < road.reach_m
+        kept.append(torch.cat([direction, reach[:, None]], 1)[inside])
+    direction, reach = torch.cat(kept)[: road.lidar_returns].split([3, 1], 1)
+    count = len(reach)
+    at = torch.arange(count) % len(TARGETS_S)
+    return RayBundle(
+        origins=origin.expand(count, -1).clone(),
+        directions=direction.contiguous(),
+        ranges=reach[:, 0] + LIDAR_NOISE_M * torch.randn(count, generator=draw),
+        times_s=torch.tensor(TARGETS_S)[at],
+        speeds=torch.full((count,), torch.nan),
+        steps=at,
+        batch=torch.zeros(count, dtype=torch.int64),
+    )

@@ -11,7 +11,7 @@ import numpy as np
 from src.config import Config
 from src.errors import ConfigError
 from src.metrics.detection import score_detections
-from src.metrics.filtering import RANGE_BINS_M
+from src.metrics.protocol import OFFICIAL
 from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERRORS, SubsetScores
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import ATTRIBUTES, BICYCLE_RACK, CLASSES, REFERENCE_CHANNEL, SCENE_TAGS
@@ -54,7 +54,7 @@ def compare_with_devkit(num_samples: int, gts: int, preds: int, seed: int) -> di
     result: dict[str, float | int | bool] = {"samples": num_samples, "ground_truth": gts, "predictions": preds}
     result |= timed | {"speedup": timed["devkit_s"] / timed["ours_s"]}
     start = time.process_time()
-    for low, high in RANGE_BINS_M:
+    for low, high in OFFICIAL.ranges_m:
         differences.append(_difference(ours.ranges[f"{low:.0f}-{high:.0f}"], official.evaluate(low, high)))
     result["devkit_ranges_s"] = timed["devkit_s"] + time.process_time() - start
     result["speedup_ranges"] = result["devkit_ranges_s"] / timed["ours_ranges_s"]
@@ -90,7 +90,9 @@ def random_problem(num_samples: int, gts: int, preds: int, seed: int) -> tuple[E
     scenes = np.arange(num_samples) * len(tags) // num_samples
     of_samples = [tags[scene] for scene in scenes]
     times_s = 0.5 * np.arange(num_samples)
-    return EvaluationSet(tokens, ego, of_samples, truth, racks, scenes, times_s, np.arange(len(truth))), predictions
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (num_samples, 1))
+    instances = np.arange(len(truth))
+    return EvaluationSet(tokens, ego, level, of_samples, truth, racks, scenes, times_s, instances), predictions
 
 
 def _random_boxes(

@@ -17,6 +17,7 @@ from src.benchmark.machine import gemm_rate, measure_roofline
 from src.benchmark.operation_table import OPERATIONS_NOTE, operation_table
 from src.benchmark.page import gpu_notes
 from src.benchmark.parts import Call, backward_from, parts_of, record_calls, tensors_in
+from src.benchmark.scenes import ROADS, lidar_frame
 from src.benchmark.timing import (
     added_mib,
     clock,
@@ -26,6 +27,7 @@ from src.benchmark.timing import (
     seconds_of,
 )
 from src.config import Config
+from src.training.phases import EVALUATORS
 
 logger = logging.getLogger(__name__)
 
@@ -33,6 +35,7 @@ ROUNDS = 5  # of all parts; a round of the full size takes ten seconds on two co
 BACKWARD_PASSES = 3  # of inputs, outputs and weights: forward, and once more each for gradients to be read and written
 POINTS = ("radar_points", "lidar_points")  # of a batch, None without the sensor
 WHOLE = "whole: frame to boxes, step to gradients"
+WHOLE_WITHOUT_BOXES = "whole: frame to answers, step to gradients"
 
 
 def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
@@ -51,8 +54,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
             f"{config.model.name}, scale {config.scale}, {config.phase.name}, batch {len(case.batch)}, "
             f"{config.precision} on {device}. Medians of {ROUNDS} rounds in which every part is called in turn, alone, "
             "on the inputs that it has within the model; ± is the interquartile range. Forward is the model as "
-            "prediction prepares it, f+b forward and backward of the model as it is trained. "
-            + ("" if config.checkpoint else f"Fresh weights; {CANDIDATES} cells pass the score threshold."),
+            "prediction prepares it, f+b forward and backward of the model as it is trained. " + asked_of(config, case),
             "GFLOP are those of matrix products, convolutions and attention. The roofline bound is the longer of GFLOP "
             "over the measured GEMM rate and bytes over the measured copy rate, bytes being inputs, outputs and "
             f"weights once ({BACKWARD_PASSES} times with backward). Traffic is what all operations read and write "
@@ -74,12 +76,24 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def asked_of(config: Config, case: Case) -> str:
+    """What fresh weights are, and what the model is asked."""
+    if case.learns_boxes:
+        return "" if config.checkpoint else f"Fresh weights; {CANDIDATES} cells pass the score threshold."
+    fresh = "" if config.checkpoint else "Fresh weights. "
+    return f"{fresh}A made frame; forward also answers where its {len(case.batch.rays)} rays end."
+
+
 def make_case(config: Config, device: torch.device) -> Case:
-    """The configured model on its first training batch; in phase 2 the truck stands until the memory is full."""
-    config.data.num_workers = 0
-    datamodule = build_datamodule(config, data_root(config))
-    batch = next(iter(datamodule.train_dataloader())).to(device)
-    case = build_case(config, batch, device)
+    """The configured model on its first training batch, or, where it learns from rays alone, on a made frame that needs
+    no world; one with a memory sees the truck stand until it is full."""
+    if EVALUATORS[config.phase.task].labels:
+        config.data.num_workers = 0
+        datamodule = build_datamodule(config, data_root(config))
+        batch = next(iter(datamodule.train_dataloader()))
+    else:
+        batch = lidar_frame(ROADS[config.scale])
+    case = build_case(config, batch.to(device), device)
     with torch.no_grad():
         for _ in range(config.model.memory_frames):
             _, case.memory = case.run()
@@ -98,7 +112,9 @@ def measure_parts(
     parts = parts_of(case.model)
     inferred = record_calls(case.prepared, parts, case.infer)
     forward = measure_mode(case, inferred, backward=False)
-    trained = record_calls(case.model, {name: parts[name] for name in inferred}, case.run)
+    # What only the loss asks for, as answers at places, is part of a step without boxes.
+    learn = case.run if case.learns_boxes else case.losses
+    trained = record_calls(case.model, {name: parts[name] for name in inferred}, learn)
     both = measure_mode(case, trained, backward=True)
     modes = {"forward": forward, "f+b": both}
     times, works = [], []
@@ -110,7 +126,8 @@ def measure_parts(
                 work_row |= work_columns(mode, found[name])
         times.append(time_row)
         works.append(work_row)
-    time_row, work_row = {"part": WHOLE}, {"part": WHOLE}
+    whole = WHOLE if case.learns_boxes else WHOLE_WITHOUT_BOXES
+    time_row, work_row = {"part": whole}, {"part": whole}
     for mode, function in (("forward", case.infer), ("f+b", case.step)):
         work_row |= work_columns(mode, measure_work(function, case.device)[0])
         time_row |= milliseconds(interleaved({mode: function}, clock(case.device), ROUNDS)[mode], f"{mode} ")

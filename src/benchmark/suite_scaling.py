@@ -26,12 +26,14 @@ from src.benchmark.counting import counted_work
 from src.benchmark.page import gpu_notes, page_name
 from src.benchmark.parts import is_within, parts_of, tensors_in
 from src.benchmark.plots import draw_scaling, held_mib
-from src.benchmark.scenes import FRAME_SENSORS, ROADS, Highway, highway_frame, highway_points
+from src.benchmark.scenes import ROADS, Highway, highway_frame, highway_points, lidar_frame
 from src.benchmark.timing import added_mib, clock, interleaved, milliseconds, timed_parts
 from src.config import Config, compose_config
 from src.errors import ConfigError
 from src.models import FAMILIES
 from src.models.detector import ModelConfig
+from src.structures.batch import FrameBatch
+from src.training.phases import EVALUATORS
 
 logger = logging.getLogger(__name__)
 
@@ -52,6 +54,11 @@ RANGES_M = {
 }
 
 
+LIDAR_RANGES_M = (100.0, 200.0, 300.0)
+"""Of a model that reads LiDAR, whose one scene ends at the first."""
+FIXED_SCENE = "range, fixed scene"
+
+
 @dataclass(frozen=True)
 class Point:
     """One setting of one sweep; what is not varied is nominal."""
@@ -64,32 +71,17 @@ class Point:
 
 
 def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
-    """Time and memory of a frame without its image encoder, at every point of every sweep; growth first.
-
-    Raises ConfigError for a model that reads what a made frame does not have.
-    """
-    if not set(config.model.sensors) <= set(FRAME_SENSORS):
-        raise ConfigError(
-            f"suite=scaling measures on made frames of {' and '.join(FRAME_SENSORS)}, but model={config.model.name} "
-            f"reads {', '.join(config.model.sensors)}"
-        )
+    """Time and memory of a frame without its image encoder, at every point of every sweep; growth first."""
     device = config.trainer.device()
     configs = configs_of(config)
-    sweeps = sweeps_of(ROADS[config.scale], RANGES_M[config.scale], config.phase.temporal)
+    road = ROADS[config.scale]
+    if reads_lidar(config):
+        sweeps = {FIXED_SCENE: [Point(r, r, replace(road, reach_m=LIDAR_RANGES_M[0])) for r in LIDAR_RANGES_M]}
+    else:
+        sweeps = sweeps_of(road, RANGES_M[config.scale], config.phase.temporal)
     measured = {name: measure_sweep(name, points, configs, device) for name, points in sweeps.items()}
     result = {
-        "notes": [
-            f"Scale {config.scale}, {config.phase.name}, {config.precision} on {device}, batch 1, the models as "
-            "prediction prepares them, with fresh weights, from features that the image encoder has made already. The "
-            "cell stays 0.8 m, so a longer range has more cells. Medians; ± is the interquartile range. `added` "
-            "is the most memory that a frame takes beyond inputs and weights, `remembered` waits for the next one. "
-            f"{CANDIDATES} cells pass the score threshold, as of trained models; fresh weights alone would pass half.",
-            "range, equal density: the road goes on to the end of the range. range, fixed scene: the road ends at "
-            f"{FIXED_REACH_M:g} m. Only these two have anything beyond {NOMINAL_M:g} m. A remembered frame holds "
-            f"{CELLS_PER_VEHICLE[config.scale]} cells a vehicle and the Gaussians that are configured for it, or, in a "
-            "dense model, its whole map.",
-            *gpu_notes(device),
-        ],
+        "notes": [*notes_of(config, device), *gpu_notes(device)],
         "picture": None,
         "growth": growth_rows(measured),
     }
@@ -102,10 +94,46 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     return result | measured
 
 
+def notes_of(config: Config, device: torch.device) -> list[str]:
+    """What was measured, and on what scenes."""
+    measured = (
+        f"Scale {config.scale}, {config.phase.name}, {config.precision} on {device}, batch 1, the models as "
+        "prediction prepares them, with fresh weights{}. {}. Medians; ± is the interquartile range. `added` "
+        "is the most memory that a frame takes beyond inputs and weights, `remembered` waits for the next one."
+    )
+    asked = f" {CANDIDATES} cells pass the score threshold, as of trained models; fresh weights alone would pass half."
+    if reads_lidar(config):
+        scene = f"Voxels stay as they are, so a longer range has more; the scene ends at {LIDAR_RANGES_M[0]:g} m"
+        if not EVALUATORS[config.phase.task].labels:
+            asked = " A frame also answers where its rays end."
+        return [measured.format("", scene) + asked]
+    cells = "The cell stays 0.8 m, so a longer range has more cells"
+    return [
+        measured.format(", from features that the image encoder has made already", cells) + asked,
+        "range, equal density: the road goes on to the end of the range. range, fixed scene: the road ends at "
+        f"{FIXED_REACH_M:g} m. Only these two have anything beyond {NOMINAL_M:g} m. A remembered frame holds "
+        f"{CELLS_PER_VEHICLE[config.scale]} cells a vehicle and the Gaussians that are configured for it, or, in a "
+        "dense model, its whole map.",
+    ]
+
+
+def reads_lidar(config: Config) -> bool:
+    """Such a model is measured alone: others read other sensors, and traffic, radar and Gaussians are not its own."""
+    return "lidar" in config.model.sensors
+
+
+def points_of(batch: FrameBatch) -> dict[str, Tensor]:
+    """By sensor, of those that a made frame has."""
+    found = {"radar": batch.radar_points, "lidar": batch.lidar_points}
+    return {name: points for name, points in found.items() if points is not None}
+
+
 def configs_of(config: Config) -> dict[str, Config]:
     """By name the configured model with fresh weights, then all others that read radar and cameras in this phase, at
     the same scale, grid and backbone."""
     configs = {config.model.name: replace(config, checkpoint=None)}
+    if reads_lidar(config):
+        return configs
     same = {name: getattr(config, name) for name in ("grid", "backbone", "precision", "seed")}
     for name in [name for name in FAMILIES if name not in configs]:
         overrides = [f"model={name}", f"scale={config.scale}", f"phase={config.phase.name}", "data=synthetic"]
@@ -135,7 +163,7 @@ def sweeps_of(
     returned = [returns(factor) for factor in FACTORS["radar points"]]
     sweeps = {
         "range, equal density": [Point(r, r, replace(road, reach_m=r)) for r in ranges_m],
-        "range, fixed scene": [Point(r, r, fixed) for r in ranges_m],
+        FIXED_SCENE: [Point(r, r, fixed) for r in ranges_m],
         "objects": [Point(vehicles(f).num_vehicles, NOMINAL_M, vehicles(f)) for f in FACTORS["objects"]],
         "radar points": [Point(len(highway_points(scene)), NOMINAL_M, scene) for scene in returned],
         "gaussians": [Point(f, NOMINAL_M, road, gaussians=f) for f in FACTORS["gaussians"]],
@@ -162,7 +190,8 @@ def measure_sweep(
             row["remembered MiB"] = sum(x.nbytes for x in tensors_in(case.memory)) / 2**20
             with counted_work() as work:
                 case.infer()
-            row |= {"GFLOP": work.flops / 1e9, "radar points": len(case.batch.radar_points)}
+            row["GFLOP"] = work.flops / 1e9
+            row |= {f"{name} points": len(points) for name, points in points_of(case.batch).items()}
             rows.append(row | {f"{part} ms": 1e3 * statistics.median(values) for part, values in parts[model].items()})
         del made, cases
     return rows
@@ -200,8 +229,11 @@ def make_case(config: Config, point: Point, device: torch.device) -> tuple[Case,
     torch.manual_seed(config.seed)
     settings = settings_at(config, point)
     cells = [round(number * point.range_m / NOMINAL_M) for number in config.grid.cells]
-    batch = highway_frame(highway_points(point.road), tuple(config.backbone.image_size_px)).to(device)
-    case = build_case(replace(config, model=settings, grid=replace(config.grid, cells=cells)), batch, device)
+    if reads_lidar(config):
+        batch = lidar_frame(point.road)
+    else:
+        batch = highway_frame(highway_points(point.road), tuple(config.backbone.image_size_px))
+    case = build_case(replace(config, model=settings, grid=replace(config.grid, cells=cells)), batch.to(device), device)
     encoder = getattr(case.prepared, "image_encoder", None)
     if encoder is not None:  # it gives the same features every time, without encoding again
         with torch.no_grad(), case.computing():
@@ -217,7 +249,8 @@ def make_case(config: Config, point: Point, device: torch.device) -> tuple[Case,
 def settings_at(config: Config, point: Point) -> ModelConfig:
     """The model's settings at a point, with as many remembered cells as its traffic fills."""
     vehicles = max(1, round(point.road.num_vehicles * point.road.reach_m / NOMINAL_M))
-    return config.model.scaled(point.gaussians, point.memory_frames, vehicles * CELLS_PER_VEHICLE[config.scale])
+    cells = vehicles * CELLS_PER_VEHICLE[config.scale]
+    return config.model.scaled(point.gaussians, point.memory_frames, cells).at_range(point.range_m)
 
 
 def fill_memory(case: Case, memory: Any, num_frames: int) -> None:

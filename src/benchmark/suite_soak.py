@@ -109,7 +109,7 @@ def make_detector(config: Config, datamodule: DetectionDataModule, device: torch
     detector = StreamingDetector(model, config.grid.build(), datamodule.settings, device, config.precision)
     if config.checkpoint is None:
         frame = next(datamodule.stream()).to(device)
-        expect_trained_scores(Case(model, detector.model, frame, None, device, config.precision))
+        expect_trained_scores(Case(model, detector.model, frame, None, device, config.precision, learns_boxes=True))
     return detector
 
 

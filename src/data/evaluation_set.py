@@ -22,6 +22,7 @@ def evaluation_set(index: DatasetIndex, split: str) -> EvaluationSet:
     return EvaluationSet(
         tokens=[str(token) for token in index.sample_tokens[samples]],
         ego_centers=index.pose_translations[index.frame_poses[samples]],
+        ego_rotations=index.pose_rotations[index.frame_poses[samples]],
         scene_tags=[tuple(str(index.scene_descriptions[scene]).split(";")) for scene in index.sample_scenes[samples]],
         ground_truth=_table(index, *boxes),
         racks=_table(index, *_rows(index, samples, index.box_labels == LABEL_RACK)),

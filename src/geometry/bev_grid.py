@@ -82,7 +82,7 @@ class BEVGrid:
     ) -> Tensor:  # [...] bool
         """Whether each point lies in a cell of the grid; NaN does not."""
         g = self.to_cells(xy)
-        return (g[..., 0] >= 0) & (g[..., 0] < self.cols) & (g[..., 1] >= 0) & (g[..., 1] < self.rows)
+        return ((g >= 0) & (g < constant((self.cols, self.rows), g.dtype, g.device))).all(-1)
 
     def centre_of(
         self,

@@ -55,13 +55,12 @@ def cells_in_boxes(
     cosine, sine, half = cosine.index_select(0, box), sine.index_select(0, box), half.index_select(0, box)
     along, across = rotate_back(cosine, sine, *offset.unbind(1))
     inside = (along.abs() <= half[:, 0]) & (across.abs() <= half[:, 1])
-    box, cell = box[inside], (row * grid.cols + col)[inside]
-
-    bare = torch.bincount(box, minlength=len(boxes)) == 0
+    bare = box.new_zeros(len(boxes)).index_add(0, box, inside.long()) == 0
     fallback = bare & grid.contains(boxes[:, :2])
-    if bool(fallback.any()):
-        extra = fallback.nonzero().squeeze(1)
-        home = grid.cell_of(boxes[extra, :2])
-        box, order = torch.sort(torch.cat([box, extra]), stable=True)
-        cell = torch.cat([cell, home[:, 0] * grid.cols + home[:, 1]])[order]
-    return box, cell, fallback
+    # The cells of the last rule are candidates of every box, so that one look at all decides.
+    home = grid.cell_of(boxes[:, :2])
+    cell = torch.cat([row * grid.cols + col, home[:, 0] * grid.cols + home[:, 1]])
+    box = torch.cat([box, torch.arange(len(boxes), device=box.device)])
+    kept = torch.cat([inside, fallback]).nonzero().squeeze(1)
+    box, order = torch.sort(box[kept], stable=True)
+    return box, cell[kept[order]], fallback

@@ -45,7 +45,9 @@ def depth_cross_entropy(
     target: Tensor,  # [V, h, w] int64 bin, -1 for background
 ) -> Tensor:  # []
     """Binary cross-entropy between softmax and one-hot, summed over bins and foreground cells (method 4.3)."""
-    foreground = target >= 0
-    score = full_precision(logits.movedim(1, -1)[foreground]).softmax(-1).clamp(DEPTH_CLAMP, 1 - DEPTH_CLAMP)
-    wanted = F.one_hot(target[foreground], logits.shape[1]).bool()
+    foreground = (target >= 0).flatten().nonzero().squeeze(1)
+    logits = logits.movedim(1, -1).flatten(0, -2).index_select(0, foreground)  # [n, D]
+    score = full_precision(logits).softmax(-1).clamp(DEPTH_CLAMP, 1 - DEPTH_CLAMP)
+    bins = torch.arange(logits.shape[1], device=logits.device)
+    wanted = target.flatten().index_select(0, foreground)[:, None] == bins
     return -torch.where(wanted, score, 1 - score).log().sum()

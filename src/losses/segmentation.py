@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from src.losses.classification import FOCAL_ALPHA
 from src.losses.normalizers import full_precision
+from src.ops.segment_reduce import segment_count
 from src.ops.splat import log1mexp
 
 MIN_OCCUPANCY = 1e-4
@@ -37,7 +39,7 @@ def occupancy_losses(
     focal = torch.where(target, positive, negative).sum() + missed * cost_of_miss
 
     sample = torch.div(support, cells_per_sample, rounding_mode="floor")
-    positives = torch.bincount(torch.div(occupied, cells_per_sample, rounding_mode="floor"), minlength=batch_size)
+    positives = segment_count(torch.div(occupied, cells_per_sample, rounding_mode="floor"), batch_size)
     return focal, dice(occupancy, target, sample, batch_size, positives)
 
 
@@ -64,19 +66,17 @@ def lovasz_foreground(
     batch_size: int,
 ) -> Tensor:  # []
     """Lovasz-Softmax of the foreground class per sample, averaged over samples; 0 for a sample without foreground."""
-    counts = torch.bincount(sample, minlength=batch_size).tolist()
-    parts = zip(full_precision(score).split(counts), target.split(counts), strict=True)
-    return torch.stack([_lovasz(*part) for part in parts]).mean()
-
-
-def _lovasz(score: Tensor, target: Tensor) -> Tensor:
-    """Inner product of the sorted errors with the gradient of the Jaccard loss at their order."""
-    if not bool(target.any()):
-        return 0.0 * score.sum()
-    foreground = target.to(score.dtype)
-    errors, order = (foreground - score).abs().sort(descending=True, stable=True)
-    foreground = foreground[order]
-    total = foreground.sum()
-    jaccard = 1 - (total - foreground.cumsum(0)) / (total + (1 - foreground).cumsum(0))
-    steps = torch.cat([jaccard[:1], jaccard.diff()])
-    return (errors * steps).sum()
+    foreground = target.to(full_precision(score).dtype)
+    # Per sample, the inner product of the sorted errors with the gradient of the Jaccard loss at their order.
+    errors, order = (foreground - full_precision(score)).abs().sort(descending=True, stable=True)
+    owner, by_sample = sample[order].sort(stable=True)
+    errors, target = errors[by_sample], target[order[by_sample]]
+    starts = torch.searchsorted(owner, torch.arange(batch_size + 1, device=owner.device))
+    place = torch.arange(len(owner), device=owner.device) - starts[owner]
+    before = F.pad(target.to(errors.dtype).cumsum(0), (1, 0))  # counts, exact up to 2^24
+    found = before[1:] - before[starts[owner]]  # foreground up to here
+    total = (before[starts[1:]] - before[starts[:-1]])[owner]
+    jaccard = 1 - (total - found) / (total + place + 1 - found)
+    steps = torch.where(place == 0, jaccard, jaccard - jaccard.roll(1))
+    terms = torch.where(total > 0, errors * steps, 0.0)
+    return errors.new_zeros(batch_size).index_add(0, owner, terms).mean()

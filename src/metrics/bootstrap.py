@@ -8,16 +8,18 @@ to end. (Where predictions have equal scores, those of a scene's copies stand to
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from src.metrics.curves import FIRST_POINT, RECALLS, average_precision
-from src.metrics.detection import UNDEFINED_ERRORS, DetectionScores, MatchedParts
+from src.metrics.detection import UNDEFINED_ERRORS, DetectionScores, MatchedParts, score_detections
 from src.metrics.diagnostics import ratios
+from src.metrics.protocol import Protocol
 from src.metrics.ranking import Part, RankedList
-from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERRORS, PartScores
+from src.metrics.scores import ERRORS, PartScores
+from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import CLASSES
 
 Array = np.ndarray
@@ -25,29 +27,62 @@ Array = np.ndarray
 NUM_DRAWS = 500
 LEVEL = 0.95
 SEED = 0
+LONG_RANGE = "long_range"
+"""Key of the scores by a second protocol."""
 CHUNK = 4_000_000
 """Numbers that one intermediate array may hold: long lists are drawn in parts."""
 
 
+def score_report(
+    evaluation_set: EvaluationSet,
+    predictions: DetectionTable,
+    scores: DetectionScores,  # of them, by the official protocol
+    long_range: Protocol | None,
+) -> dict[str, object]:
+    """The content of metrics.json: `with_intervals`, and under LONG_RANGE the scores by a protocol of one's own.
+
+    The intervals of these stand among the others. Raises as `score_detections`.
+    """
+    content = with_intervals(scores)
+    if long_range is not None:
+        further = with_intervals(
+            score_detections(evaluation_set, predictions, by_tag=False, by_speed=False, protocol=long_range)
+        )
+        bounds = further.pop("intervals")["bounds"]
+        content["intervals"]["bounds"] |= {f"{LONG_RANGE}.{name}": ends for name, ends in bounds.items()}
+        content[LONG_RANGE] = {name: value for name, value in further.items() if value != {}}
+    return content
+
+
 def with_intervals(scores: DetectionScores) -> dict[str, object]:
-    """The content of metrics.json: the scores and `intervals`.
+    """The scores as plain values, and `intervals`.
 
     These hold `scenes`, `draws`, `level` and `bounds`, [low, high] of a number by its path, as in `ranges.0-25.mAP`.
     A number without any is undefined; a single scene says nothing of others, so there are no bounds at all.
     """
-    num_scenes = len(np.unique(scores.parts.ranking.evaluation_set.scenes))
-    bounds: dict[str, list[float]] = {}
-    if num_scenes > 1:
-        draws = np.random.default_rng(SEED).multinomial(num_scenes, np.full(num_scenes, 1 / num_scenes), NUM_DRAWS)
+
+    def bounds(draws: Array) -> dict[str, list[float]]:
         drawn = score_draws(scores.parts, draws)
         tree = drawn.overall.as_dict(interval) | {
             "ranges": {name: part.as_dict(interval) for name, part in drawn.ranges.items()},
             "speeds": {name: part.as_dict(interval, True) for name, part in drawn.speeds.items()},
             "measures": {name: interval(values) for name, values in drawn.measures.items()},
         }
-        bounds = dict(_paths(tree))
-    intervals = {"scenes": num_scenes, "draws": NUM_DRAWS, "level": LEVEL, "bounds": bounds}
-    return scores.as_dict() | {"intervals": intervals}
+        return dict(_paths(tree))
+
+    return scores.as_dict() | {"intervals": intervals_of(scores.parts.ranking.evaluation_set.scenes, bounds)}
+
+
+def intervals_of(
+    scenes: Array,  # [S] of each sample, in any numbering
+    bounds: Callable[[Array], dict[str, list[float]]],  # of [R, C] draws: how often each scene counts, ascending
+) -> dict[str, object]:
+    """`intervals` of metrics.json; without bounds where there is a single scene."""
+    count = len(np.unique(scenes))
+    drawn = {}
+    if count > 1:
+        drawn = bounds(np.random.default_rng(SEED).multinomial(count, np.full(count, 1 / count), NUM_DRAWS))
+    return {"scenes": count, "draws": NUM_DRAWS, "level": LEVEL, "bounds": drawn}
 
 
 def interval(
@@ -89,7 +124,7 @@ def score_draws(
     measures = {}
     if parts.moving is not None:
         boxes = draws @ _count_by_scene(parts.moving, scenes, draws.shape[1]).sum(axis=1)
-        precision = np.zeros((len(draws), len(DISTANCE_THRESHOLDS_M), len(RECALLS)))
+        precision = np.zeros((len(draws), len(parts.ranking.protocol.thresholds_m), len(RECALLS)))
         for listed in parts.moving.pooled_lists():
             precision[:, listed.threshold], _ = _curves(parts.moving, listed, scenes, draws, boxes)
         measures["moving_AP"] = np.where(boxes > 0, average_precision(precision).mean(axis=1), np.nan)
@@ -106,8 +141,9 @@ def _score_part(
     scenes: Array,  # [S] of each sample
     draws: Array,  # [R, C]
 ) -> PartScores:
+    thresholds_m = part.ranking.protocol.thresholds_m
     num_gt = draws @ _count_by_scene(part, scenes, draws.shape[1])  # [R, 12]
-    ap = np.zeros((len(draws), len(CLASSES), len(DISTANCE_THRESHOLDS_M)))
+    ap = np.zeros((len(draws), len(CLASSES), len(thresholds_m)))
     errors = np.ones((len(draws), len(CLASSES), len(ERRORS)))
     for listed in part.lists():
         c = listed.label
@@ -118,7 +154,7 @@ def _score_part(
             ap[some, c, listed.threshold] = average_precision(precision)
             if listed.errors is not None:
                 errors[some, c] = _errors(part, listed, scenes, draws[some], confidence)
-    return PartScores(num_gt, ap, np.where(UNDEFINED_ERRORS, np.nan, errors))
+    return PartScores(thresholds_m, num_gt, ap, np.where(UNDEFINED_ERRORS, np.nan, errors))
 
 
 def _count_by_scene(part: Part, scenes: Array, num_scenes: int) -> Array:  # [C, 12]

@@ -22,21 +22,10 @@ from src.metrics.curves import (
     precision_and_confidence,
 )
 from src.metrics.diagnostics import FAST_MPS, FrameDiagnosis, ratios, sums_by_sample
-from src.metrics.filtering import (
-    RANGE_BINS_M,
-    SPEED_CLASSES_MPS,
-    ego_distances,
-    official_filter,
-    speed_classes,
-)
+from src.metrics.filtering import SPEED_CLASSES_MPS, speed_classes
+from src.metrics.protocol import OFFICIAL, Protocol
 from src.metrics.ranking import Matching, Part, Ranking, find_candidates, match_predictions, rank_predictions
-from src.metrics.scores import (
-    DISTANCE_THRESHOLDS_M,
-    ERROR_THRESHOLD_M,
-    ERRORS,
-    SubsetScores,
-    plain_number,
-)
+from src.metrics.scores import ERRORS, SubsetScores, plain_number
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import CLASS_WITHOUT_ERRORS, CLASSES, SCENE_TAGS, TAGS_WITHOUT_SCORE
 
@@ -94,17 +83,20 @@ def score_detections(
     by_range: bool = True,
     by_tag: bool = True,
     by_speed: bool = True,
+    protocol: Protocol = OFFICIAL,
 ) -> DetectionScores:
     """Score predictions as the official evaluator does, and by distance bin, scene tag and speed class.
 
+    Another `protocol` counts other boxes and matches and is no official score.
+
     A sample of the set without predictions is scored as empty. Tags follow the official rule: samples whose scene
-    carries the tag, NaN for the tags in TAGS_WITHOUT_SCORE. Distance bins are our own: see RANGE_BINS_M; so are speed
+    carries the tag, NaN for the tags in TAGS_WITHOUT_SCORE. Distance bins are our own: see OFFICIAL; so are speed
     classes: see `_speed_parts`, and measures: see `measure_parts`.
 
     Raises DataError for predictions that cannot be scored (see `check_predictions`) and for matched ground truth
     whose size is not positive, as the official evaluator does.
     """
-    parts = match_parts(evaluation_set, predictions, diagnoses or {}, by_range, by_speed)
+    parts = match_parts(evaluation_set, predictions, diagnoses or {}, by_range, by_speed, protocol)
     return DetectionScores(
         overall=_score(parts.overall),
         ranges={name: _score(part) for name, part in parts.ranges.items()},
@@ -121,12 +113,13 @@ def match_parts(
     diagnoses: Mapping[int, FrameDiagnosis],  # by sample
     by_range: bool = True,
     by_speed: bool = True,
+    protocol: Protocol = OFFICIAL,
 ) -> MatchedParts:
     """Rank and match, and say which boxes are scored together. Raises as `score_detections`."""
     check_predictions(predictions, evaluation_set.tokens)
     truth = evaluation_set.ground_truth
-    kept, truth_kept = official_filter(evaluation_set, predictions), official_filter(evaluation_set, truth)
-    ranking = rank_predictions(evaluation_set, predictions, kept, truth[truth_kept])
+    kept, truth_kept = protocol.counted(evaluation_set, predictions), protocol.counted(evaluation_set, truth)
+    ranking = rank_predictions(evaluation_set, protocol, predictions, kept, truth[truth_kept])
     pairs = find_candidates(ranking)
     matching = match_predictions(ranking, pairs)
     everyone, every_truth = np.ones(len(ranking.rows), bool), np.ones(len(ranking.truth), bool)
@@ -134,19 +127,18 @@ def match_parts(
     speeds: dict[str, Part] = {}
     moving = None
     if by_range:
-        edges = [low for low, _ in RANGE_BINS_M[1:]]
-        bins = np.digitize(ego_distances(evaluation_set, predictions), edges)[ranking.rows]
-        truth_bins = np.digitize(ego_distances(evaluation_set, ranking.truth), edges)
-        # Boxes of different bins never meet, so the four bins are matched at once.
+        bins = protocol.bins(evaluation_set, predictions)[ranking.rows]
+        truth_bins = protocol.bins(evaluation_set, ranking.truth)
+        # Boxes of different bins never meet, so all bins are matched at once.
         in_bins = match_predictions(ranking, pairs[bins[pairs.predictions] == truth_bins[pairs.ground_truth]])
         ranges = {
-            f"{low:.0f}-{high:.0f}": Part(ranking, in_bins, bins == i, truth_bins == i)
-            for i, (low, high) in enumerate(RANGE_BINS_M)
+            name: Part(ranking, in_bins, bins == i, truth_bins == i) for i, name in enumerate(protocol.range_names)
         }
     if by_speed:
         speeds, moving = _speed_parts(ranking, matching)
     found = np.zeros(len(truth), bool)
-    found[np.flatnonzero(truth_kept)[matching.ground_truth[DISTANCE_THRESHOLDS_M.index(ERROR_THRESHOLD_M)]]] = True
+    with_errors = matching.ground_truth[protocol.thresholds_m.index(protocol.error_threshold_m)]
+    found[np.flatnonzero(truth_kept)[with_errors]] = True
     return MatchedParts(
         ranking=ranking,
         matching=matching,
@@ -169,7 +161,7 @@ def measure_parts(parts: MatchedParts) -> dict[str, float | None]:
     measures: dict[str, float | None] = {}
     if parts.moving is not None:
         boxes = int(parts.moving.truth_members.sum())
-        precision = np.zeros((len(DISTANCE_THRESHOLDS_M), len(RECALLS)))
+        precision = np.zeros((len(parts.ranking.protocol.thresholds_m), len(RECALLS)))
         for listed in parts.moving.pooled_lists():
             scores = parts.ranking.scores[listed.places]
             precision[listed.threshold], _ = precision_and_confidence(listed.matched, scores, boxes)
@@ -183,9 +175,9 @@ def measure_parts(parts: MatchedParts) -> dict[str, float | None]:
 
 def _score(part: Part) -> SubsetScores:
     """Curves and scores."""
-    num_classes, num_points = len(CLASSES), len(RECALLS)
+    num_classes, num_points, thresholds_m = len(CLASSES), len(RECALLS), part.ranking.protocol.thresholds_m
     num_gt = np.bincount(part.ranking.truth.labels[part.truth_members], minlength=num_classes)
-    precision = np.zeros((num_classes, len(DISTANCE_THRESHOLDS_M), num_points))
+    precision = np.zeros((num_classes, len(thresholds_m), num_points))
     confidence = np.zeros_like(precision)
     error_curves = np.ones((num_classes, len(ERRORS), num_points))
     errors = np.ones((num_classes, len(ERRORS)))
@@ -199,6 +191,7 @@ def _score(part: Part) -> SubsetScores:
             error_curves[c, e] = error_curve(values, match_scores, confidence[c, t])
             errors[c, e] = mean_error(error_curves[c, e], confidence[c, t])
     return SubsetScores(
+        thresholds_m=thresholds_m,
         num_gt=num_gt,
         ap=average_precision(precision),
         errors=np.where(UNDEFINED_ERRORS, np.nan, errors),
@@ -229,7 +222,7 @@ def _speed_parts(ranking: Ranking, matching: Matching) -> tuple[dict[str, Part],
     """
     truth = speed_classes(ranking.truth.velocities)
     stated = speed_classes(ranking.predictions.velocities)[ranking.rows]
-    followed = np.tile(stated, (len(DISTANCE_THRESHOLDS_M), 1))
+    followed = np.tile(stated, (len(ranking.protocol.thresholds_m), 1))
     for t, places in enumerate(matching.places):
         followed[t, places] = truth[matching.ground_truth[t]]
     speeds = {

@@ -1,4 +1,4 @@
-"""Which boxes the official evaluation counts: class range, points, bicycle racks."""
+"""What decides which boxes a detection score counts: distance, class range, points, bicycle racks."""
 
 from __future__ import annotations
 
@@ -9,9 +9,6 @@ from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import CLASS_RANGE_M, CLASSES
 
 Array = np.ndarray
-
-RANGE_BINS_M = ((0.0, 25.0), (25.0, 50.0), (50.0, 100.0), (100.0, 150.0))
-"""Our distance bins [low, high): after the official filters, each box by its own distance. Not part of the devkit."""
 
 SPEED_CLASSES_MPS = {"0-0.5": 0.0, "0.5-10": 0.5, "10-25": 10.0, "25+": 25.0}
 """Our speed classes, by name the speed at which each begins (it belongs to the class). Not part of the devkit."""
@@ -29,13 +26,17 @@ def ego_distances(evaluation_set: EvaluationSet, table: DetectionTable) -> Array
     return np.sqrt(x * x + y * y)
 
 
-def official_filter(evaluation_set: EvaluationSet, table: DetectionTable) -> Array:
-    """Boxes that count, [n] bool: nearer than the class range, not without points, no cycle inside a bicycle rack.
+def class_ranges_m() -> Array:
+    """Of each label, [12] metres."""
+    return np.array([CLASS_RANGE_M[name] for name in CLASSES])
 
-    The same filters apply to ground truth and predictions; a prediction that states 0 points is dropped too.
-    """
-    class_range_m = np.array([CLASS_RANGE_M[name] for name in CLASSES])
-    near = ego_distances(evaluation_set, table) < class_range_m[table.labels]
+
+def has_points_and_no_rack(
+    evaluation_set: EvaluationSet,
+    table: DetectionTable,
+    near: Array,  # [n] bool
+) -> Array:
+    """Those of the near boxes that are not without points and no cycle inside a bicycle rack, [n] bool."""
     kept = near & (table.num_points != 0)
     if len(evaluation_set.racks):
         cycles = np.flatnonzero(kept & np.isin(table.labels, _CYCLES))

@@ -23,19 +23,18 @@ HORIZONS = ("1s", "3s")
 
 
 def format_forecast(metrics: Mapping[str, Any]) -> str:
-    """Each error over the frames up to a horizon, beside the static world's; "-" where there is none."""
-    rows = [["", *(f"{name} {horizon}" for horizon in HORIZONS for name in ("forecast", "static"))]]
+    """Each error over the frames up to a horizon, beside the static world's and how far below it; "-" where there is
+    none. In brackets 95 % intervals over scenes.
+    """
+    rows = [["", *(f"{name} {horizon}" for horizon in HORIZONS for name in ("forecast", "static", "below, %"))]]
     for name, words in ROWS.items():
-        names = [f"{prefix}{name}_{horizon}" for horizon in HORIZONS for prefix in ("", "static_")]
-        if any(metrics.get(name) is not None for name in names):
-            rows.append([words, *(_plain(metrics.get(name)) for name in names)])
-    bounds, low_high = metrics["intervals"]["bounds"], []
-    for horizon in HORIZONS:
-        found = bounds.get(f"cd_gain_{horizon}")
-        if found:
-            low_high.append(f"{horizon} {100 * found[0]:.1f} to {100 * found[1]:.1f} %")
-    sure = f"Chamfer below the static world's, 95 % over {metrics['intervals']['scenes']} scenes: {', '.join(low_high)}"
-    return "\n\n".join([align(rows), *([sure] if low_high else [])])
+        cells = []
+        for horizon in HORIZONS:
+            cells += [_plain(metrics.get(f"{prefix}{name}_{horizon}")) for prefix in ("", "static_")]
+            cells.append(_gain(metrics, f"{name}_gain_{horizon}"))
+        if any(cell not in ("-", "") for cell in cells):
+            rows.append([words, *cells])
+    return align(rows)
 
 
 def format_occupancy(metrics: Mapping[str, Any]) -> str:
@@ -48,6 +47,15 @@ def format_occupancy(metrics: Mapping[str, Any]) -> str:
     speeds = [f"{words} {_plain(metrics[name])}" for name, words in names.items() if metrics.get(name) is not None]
     text = f"radial velocity error of what moves, m/s: {', '.join(speeds)}"
     return "\n\n".join([align(rows), *([text] if speeds else [])])
+
+
+def _gain(metrics: Mapping[str, Any], name: str) -> str:
+    """In percent; empty for an error that has none."""
+    value, bounds = metrics.get(name), metrics["intervals"]["bounds"].get(name)
+    if value is None:
+        return ""
+    sure = f" [{100 * bounds[0]:.1f}, {100 * bounds[1]:.1f}]" if bounds else ""
+    return f"{100 * value:.1f}{sure}"
 
 
 def _plain(value: float | None) -> str:

@@ -10,7 +10,8 @@ import numpy as np
 
 from src.errors import DataError
 from src.metrics.matching import CandidatePairs, find_pairs, match_greedily
-from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERROR_THRESHOLD_M, ERRORS
+from src.metrics.protocol import Protocol
+from src.metrics.scores import ERRORS
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import CLASSES
 
@@ -28,6 +29,7 @@ class Ranking:
     """
 
     evaluation_set: EvaluationSet
+    protocol: Protocol
     predictions: DetectionTable  # as in the file, those that do not count among them
     rows: Array  # [n] row of `predictions` at each place of the order
     truth: DetectionTable  # k
@@ -47,11 +49,12 @@ class Ranking:
 
 @dataclass
 class Matching:
-    """Matches at every threshold, by place of the prediction, and the errors of those at 2 m."""
+    """Matches at each of the protocol's T thresholds, by place of the prediction, and the errors of those at its
+    error threshold."""
 
-    places: list[Array]  # 4 x [m] ascending
-    ground_truth: list[Array]  # 4 x [m] row of `Ranking.truth` that the prediction took
-    errors: Array  # [m at 2 m, 5]
+    places: list[Array]  # T x [m] ascending
+    ground_truth: list[Array]  # T x [m] row of `Ranking.truth` that the prediction took
+    errors: Array  # [m at the error threshold, 5]
 
 
 @dataclass
@@ -59,10 +62,10 @@ class RankedList:
     """What one AP is read from: the predictions of a class, or of several, at one threshold by descending score."""
 
     label: int  # the class, -1 for several
-    threshold: int  # index into DISTANCE_THRESHOLDS_M
+    threshold: int  # index into the thresholds of the protocol
     places: Array  # [n] in the ranking
     matched: Array  # [m] ascending, which of the n matched
-    errors: Array | None  # [m, 5], at 2 m only
+    errors: Array | None  # [m, 5], at the error threshold only
 
 
 @dataclass
@@ -71,11 +74,12 @@ class Part:
 
     ranking: Ranking
     matching: Matching
-    members: Array  # [n] or, by threshold, [4, n] bool over the ranked predictions
+    members: Array  # [n] or, by threshold, [T, n] bool over the ranked predictions
     truth_members: Array  # [k] bool over the ground truth that counts
 
     def lists(self) -> Iterator[RankedList]:
         """One for every threshold and class with a match."""
+        protocol = self.ranking.protocol
         for t, matched_places in enumerate(self.matching.places):
             if t == 0 or self.members.ndim == 2:
                 members = self.members if self.members.ndim == 1 else self.members[t]
@@ -84,7 +88,8 @@ class Part:
             chosen = members[matched_places]
             matched = np.searchsorted(places, matched_places[chosen])
             match_starts = np.searchsorted(matched, class_starts)
-            errors = self.matching.errors[chosen] if DISTANCE_THRESHOLDS_M[t] == ERROR_THRESHOLD_M else None
+            at_errors = protocol.thresholds_m[t] == protocol.error_threshold_m
+            errors = self.matching.errors[chosen] if at_errors else None
             for c in np.flatnonzero(np.diff(match_starts)):
                 begin, of_class = class_starts[c], slice(match_starts[c], match_starts[c + 1])
                 yield RankedList(
@@ -105,6 +110,7 @@ class Part:
 
 def rank_predictions(
     evaluation_set: EvaluationSet,
+    protocol: Protocol,
     predictions: DetectionTable,
     kept: Array,  # [all predictions] bool, those that count
     truth: DetectionTable,  # those that count
@@ -115,7 +121,7 @@ def rank_predictions(
     order = np.argsort(predictions.scores[rows], kind="stable")[::-1]
     order = order[np.argsort(predictions.labels[rows[order]].astype(np.uint8), kind="stable")]
     class_starts = np.searchsorted(predictions.labels[rows[order]], np.arange(len(CLASSES) + 1))
-    return Ranking(evaluation_set, predictions, rows[order], truth, class_starts, np.argsort(order))
+    return Ranking(evaluation_set, protocol, predictions, rows[order], truth, class_starts, np.argsort(order))
 
 
 def find_candidates(ranking: Ranking) -> CandidatePairs:
@@ -133,23 +139,23 @@ def find_candidates(ranking: Ranking) -> CandidatePairs:
         truth_xy=truth.centers[:, :2],
         truth_offsets=truth.centers[:, 0] - ego_x[truth.samples],
         num_groups=len(ranking.evaluation_set.tokens) * len(CLASSES),
-        radius_m=max(DISTANCE_THRESHOLDS_M),
+        radius_m=ranking.protocol.thresholds_m[-1],
     )
 
 
 def match_predictions(ranking: Ranking, pairs: CandidatePairs) -> Matching:
-    """Match at each threshold among `pairs`, and measure the matches at 2 m.
+    """Match at each threshold among `pairs`, and measure the matches at the error threshold.
 
     Raises DataError when matched ground truth has a size that is not positive, as the official evaluator does.
     """
     places, ground_truth, errors = [], [], np.zeros((0, len(ERRORS)))
-    for threshold in DISTANCE_THRESHOLDS_M:
+    for threshold in ranking.protocol.thresholds_m:
         near = pairs[pairs.distances < threshold]
         matches = near[match_greedily(near, len(ranking.truth))]
         _check_sizes(ranking, matches)
         places.append(matches.predictions)
         ground_truth.append(matches.ground_truth)
-        if threshold == ERROR_THRESHOLD_M:
+        if threshold == ranking.protocol.error_threshold_m:
             errors = _match_errors(ranking, matches)
     return Matching(places, ground_truth, errors)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from src.metrics.bootstrap import LONG_RANGE
 from src.metrics.scores import ERRORS
 
 MEASURES = {
@@ -14,28 +15,32 @@ MEASURES = {
     "remembered_share": "objects that history covers",
 }
 
-IN_WORDS = {"mAP": "mAP", "NDS": "NDS", "classes.car.AP": "car AP", "measures.moving_AP": "AP of moving vehicles"}
+IN_WORDS = {
+    "mAP": "mAP",
+    "NDS": "NDS",
+    "classes.car.AP": "car AP",
+    "measures.moving_AP": "AP of moving vehicles",
+    f"{LONG_RANGE}.mAP": "mAP at long range",
+}
 """Numbers whose intervals are shown, by their paths."""
 
 
 def format_scores(metrics: Mapping[str, Any]) -> str:
-    """Tables of the content of metrics.json: a summary by distance bin, every class by distance bin, speed classes,
-    measures.
+    """Tables of the content of metrics.json: a summary by distance bin, every class by distance bin, the summary by a
+    second protocol, speed classes, measures.
 
     `metrics` is `DetectionScores.as_dict()`, fresh or read back; a file written before there were speed classes or
     measures has no table of them. mAP, NDS and AP in percent, errors in their own units (m, 1 - IoU, rad, m/s,
     1 - accuracy); "-" where a number is undefined. By speed, means are over the classes that have ground truth there.
     """
     parts = {"all": metrics} | metrics["ranges"]
-    summary = [["range (m)", "mAP", "NDS", *(f"m{name}" for name in ERRORS), "boxes"]]
-    for name, part in parts.items():
-        errors = [_plain(part[f"m{error}"]) for error in ERRORS]
-        summary.append([name, _percent(part["mAP"]), _percent(part["NDS"]), *errors, _boxes(part)])
     classes = [["class", "AP", *(f"AP {name}" for name in metrics["ranges"]), *ERRORS, "boxes"]]
     for name, overall in metrics["classes"].items():
         aps = [_percent(part["classes"][name]["AP"]) for part in parts.values()]
         classes.append([name, *aps, *(_plain(overall[error]) for error in ERRORS), str(overall["num_gt"])])
-    tables = [summary, classes]
+    tables = [_summary("range (m)", metrics), classes]
+    if LONG_RANGE in metrics:
+        tables.append(_summary("long range (m)", metrics[LONG_RANGE]))
     if metrics.get("speeds"):
         tables.append(_speeds(metrics["speeds"]))
     measures = metrics.get("measures", {})
@@ -44,6 +49,15 @@ def format_scores(metrics: Mapping[str, Any]) -> str:
     if measures.get("radar_gaussians") is not None:
         tables.append(_gaussians(measures))
     return "\n\n".join([*map(align, tables), *_intervals(metrics.get("intervals", {"bounds": {}}))])
+
+
+def _summary(corner: str, scores: Mapping[str, Any]) -> list[list[str]]:
+    """Over everything and by distance."""
+    rows = [[corner, "mAP", "NDS", *(f"m{name}" for name in ERRORS), "boxes"]]
+    for name, part in ({"all": scores} | scores["ranges"]).items():
+        errors = [_plain(part[f"m{error}"]) for error in ERRORS]
+        rows.append([name, _percent(part["mAP"]), _percent(part["NDS"]), *errors, _boxes(part)])
+    return rows
 
 
 def _intervals(intervals: Mapping[str, Any]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,13 +30,14 @@ class PartScores:
     All may have leading axes, of evaluations that were made alike.
     """
 
+    thresholds_m: Sequence[float]  # T, of the protocol
     num_gt: Array  # [..., 12] int64, ground-truth boxes after the filters
-    ap: Array  # [..., 12, 4] by class and distance threshold
+    ap: Array  # [..., 12, T] by class and distance threshold
     errors: Array  # [..., 12, 5] by class and error, NaN where undefined for the class
 
     @property
     def class_ap(self) -> Array:
-        """AP of each class: mean over the four thresholds, [..., 12]."""
+        """AP of each class: mean over the thresholds, [..., 12]."""
         return self.ap.mean(axis=-1)
 
     @property
@@ -75,8 +76,8 @@ class PartScores:
 
     def by_class(self) -> dict[str, dict[str, Array]]:
         """AP, its parts by threshold and the errors of each class."""
-        names = ("AP", *(f"AP@{threshold}" for threshold in DISTANCE_THRESHOLDS_M), *ERRORS)
-        values = np.concatenate([self.class_ap[..., None], self.ap, self.errors], axis=-1)  # [..., 12, 10]
+        names = ("AP", *(f"AP@{threshold}" for threshold in self.thresholds_m), *ERRORS)
+        values = np.concatenate([self.class_ap[..., None], self.ap, self.errors], axis=-1)  # [..., 12, 6 + T]
         rows = zip(CLASSES, np.moveaxis(values, (-2, -1), (0, 1)), strict=True)
         return {label: dict(zip(names, of_class, strict=True)) for label, of_class in rows}
 
@@ -92,9 +93,9 @@ class PartScores:
 class SubsetScores(PartScores):
     """The scores of one evaluation with the curves they are read from."""
 
-    precision: Array  # [12, 4, 101] over recall
-    confidence: Array  # [12, 4, 101]
-    error_curves: Array  # [12, 5, 101] at 2 m
+    precision: Array  # [12, T, 101] over recall
+    confidence: Array  # [12, T, 101]
+    error_curves: Array  # [12, 5, 101] at the error threshold
 
     def as_dict(self, number: Callable[[Array], object], by_speed: bool = False) -> dict[str, object]:
         """As the base, with the number of boxes of each class."""

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self
 import torch
 from torch import Tensor, nn
 
+from src.geometry.constants import on_device
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
@@ -59,6 +60,10 @@ class ModelConfig:
         """The settings of a measurement: with so many times the Gaussians; with so many remembered frames (0: none,
         None: as configured); with so many cells remembered of each, whatever fresh weights call occupied. What a model
         does not have stays as it is."""
+        return self
+
+    def at_range(self, range_m: float) -> Self:
+        """The settings with a region of their own, not the `grid`, that reaches at least so far to each side."""
         return self
 
 
@@ -137,8 +142,10 @@ class Detector(nn.Module, ABC):
         with torch.autocast(batch.device.type, enabled=False):
             terms, counts = self.loss_terms(output, batch)
         with torch.no_grad():
-            values = (self.diagnostics(output) | counts).items()
-            shown = {name: torch.as_tensor(value, dtype=torch.float32, device=batch.device) for name, value in values}
+            values = self.diagnostics(output) | counts
+            known = {name: value for name, value in values.items() if not isinstance(value, Tensor)}
+            uploaded = dict(zip(known, on_device([*known.values()], torch.float32, batch.device), strict=True))
+            shown = {name: uploaded.get(name, value).float() for name, value in values.items()}
         total = sum(terms.values(), torch.zeros((), device=batch.device))
         return Objective(terms | {"total": total}, shown)
 

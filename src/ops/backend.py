@@ -21,6 +21,7 @@ INTERPRETER = "TRITON_INTERPRET"
 # Modules with an operation's kernel, imported when it first runs in that backend: Triton is a large import.
 KERNELS = {
     "farthest_points": "src.ops.kernels.farthest_point_triton",
+    "neighbour_table": "src.ops.kernels.neighbour_table_triton",
     "sparse_conv": "src.ops.kernels.sparse_conv_triton",
     "splat": "src.ops.kernels.splat_triton",
 }

@@ -1,78 +1,23 @@
-"""Kernel maps (rulebooks) of sparse convolution: which input site meets which output site at which kernel offset."""
+"""Building kernel maps (rulebooks) of sparse convolution from sets of sites."""
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from src.ops.segment_reduce import inverse_rows, segments
+from src.geometry.constants import constant
+from src.ops.kernel_map import KernelMap, TableMap, counts_kept
+from src.ops.neighbour_table import neighbour_table
 from src.ops.sites import HALO, Sites
 
 Size = int | tuple[int, ...]
 
 
-@dataclass(eq=False)
-class KernelMap:
-    """Pairs (input row, output row) of a sparse convolution, grouped by kernel offset.
-
-    Offsets run in C order over the kernel axes, as in a torch weight [Cout, Cin, k...]. `mirrored` marks a map whose
-    transpose is itself with the offsets reversed (submanifold); `identity` one in which output i sees input i only.
-    Within the block of an offset the inputs ascend, and so do the outputs. `cache` holds what was derived from the map.
-    """
-
-    inputs: Tensor  # [pairs] int32, input row
-    outputs: Tensor  # [pairs] int32, output row
-    counts: tuple[int, ...]  # pairs of each kernel offset; they lie one block after the other
-    num_inputs: int
-    num_outputs: int
-    mirrored: bool = False
-    identity: bool = False
-    cache: dict[Any, Any] = field(default_factory=dict, repr=False)
-
-    @property
-    def num_offsets(self) -> int:
-        """Number of kernel offsets K."""
-        return len(self.counts)
-
-    @property
-    def centre(self) -> int | None:
-        """The offset that joins every row with itself, None for a map that is not submanifold."""
-        return self.num_offsets // 2 if self.mirrored else None
-
-    @cached_property
-    def ends(self) -> Tensor:  # [K] int32
-        """End of each offset's block of pairs."""
-        return torch.tensor(list(itertools.accumulate(self.counts)), dtype=torch.int32, device=self.inputs.device)
-
-    @cached_property
-    def transposed(self) -> KernelMap:
-        """The map from its outputs to its inputs through the same offsets, as of a transposed convolution."""
-        return KernelMap(self.outputs, self.inputs, self.counts, self.num_outputs, self.num_inputs)
-
-    def keep_outputs(
-        self,
-        rows: Tensor,  # [m] int64, ascending
-    ) -> KernelMap:
-        """The map to these of its outputs only. Synchronises with a GPU."""
-        new = inverse_rows(rows, self.num_outputs).to(torch.int32).index_select(0, self.outputs)
-        kept = (new >= 0).nonzero().squeeze(1)
-        pairs = (values.index_select(0, kept) for values in (self.inputs, new))
-        return KernelMap(*pairs, tuple(_counts_kept(kept, self).tolist()), self.num_inputs, len(rows))
-
-    @cached_property
-    def by_output(self) -> tuple[Tensor, Tensor]:
-        """Pairs ordered by output row [pairs] int32 and the first pair of each row [num_outputs + 1] int32."""
-        return segments(self.outputs, self.num_outputs)
-
-    @cached_property
-    def by_input(self) -> tuple[Tensor, Tensor]:
-        """Pairs ordered by input row [pairs] int32 and the first pair of each row [num_inputs + 1] int32."""
-        return segments(self.inputs, self.num_inputs)
+def makes_tables(sites: Sites) -> bool:
+    """Whether maps of these sites are made as tables: on a GPU; a CPU multiplies pair by pair."""
+    return sites.device.type != "cpu"
 
 
 def submanifold_map(sites: Sites, kernel_size: Size) -> KernelMap:
@@ -124,6 +69,9 @@ def window_map(inputs: Sites, outputs: Sites, kernel_size: Size) -> KernelMap:
     if inputs.shape != outputs.shape:
         raise ValueError(f"a window joins sites of one grid, but got shapes {inputs.shape} and {outputs.shape}")
     kernel = _odd_kernel(outputs, kernel_size)
+    if makes_tables(outputs):
+        table, bits = neighbour_table(inputs.keys, _corners(outputs, kernel), _taps(outputs, kernel))
+        return TableMap(table, len(inputs), bits=bits)
     found, where = _search(
         inputs.keys, _corners(outputs, kernel), outputs.strides[1:], kernel, torch.Size(kernel).numel()
     )
@@ -143,6 +91,8 @@ def stacked_map(
     computing with the zeros.
     """
     base = submanifold_map(sites, kernel_size)
+    if makes_tables(sites):
+        return TableMap(*_stacked_table(base.table, parts))
     inputs, outputs, counts, first = [], [], [], 0
     for rows in parts:
         place = torch.full((len(sites),), -1, dtype=torch.int32, device=sites.device)
@@ -151,7 +101,7 @@ def stacked_map(
         kept = (seen >= 0).nonzero().squeeze(1)
         inputs.append(seen.index_select(0, kept))
         outputs.append(base.outputs.index_select(0, kept))
-        counts.append(_counts_kept(kept, base))
+        counts.append(counts_kept(kept, base))
         first += len(rows)
     return KernelMap(torch.cat(inputs), torch.cat(outputs), tuple(torch.cat(counts).tolist()), first, len(sites))
 
@@ -190,19 +140,35 @@ def _corners(sites: Sites, kernel: tuple[int, ...]) -> Tensor:  # [n] int64
     return sites.keys - sum(size // 2 * step for size, step in zip(kernel, sites.strides[1:], strict=True))
 
 
-def _counts_kept(
-    kept: Tensor,  # [n] int64, positions of pairs, ascending
-    base: KernelMap,
-) -> Tensor:  # [K] int64
-    """How many of each offset's pairs were kept."""
-    return torch.searchsorted(kept, base.ends.long()).diff(prepend=kept.new_zeros(1))
+def _stacked_table(
+    table: Tensor,  # [K, M] int32
+    parts: list[Tensor],
+) -> tuple[Tensor, int]:  # [P * K, M] int32, number of rows of the stack
+    """The table with the rows of each subset in turn."""
+    tables, first = [], 0
+    for rows in parts:
+        place = table.new_full((table.shape[1] + 1,), -1)  # the last is the place of none
+        place[rows] = torch.arange(first, first + len(rows), dtype=table.dtype, device=table.device)
+        tables.append(place[table.long()])
+        first += len(rows)
+    return torch.cat(tables), first
+
+
+def _taps(sites: Sites, kernel: tuple[int, ...]) -> Tensor:  # [K] int64
+    """What each kernel tap adds to the key of the first."""
+    cells = itertools.product(*(range(size) for size in kernel))
+    steps = tuple(sum(i * step for i, step in zip(cell, sites.strides[1:], strict=True)) for cell in cells)
+    return constant(steps, torch.int64, sites.device)
 
 
 def _build_submanifold(sites: Sites, kernel: tuple[int, ...]) -> KernelMap:
     """Search the offsets before the centre only; those behind it are their mirror images."""
     num, device = len(sites), sites.device
-    rows = torch.arange(num, dtype=torch.int32, device=device)
     half = torch.Size(kernel).numel() // 2
+    if half and makes_tables(sites):
+        table, bits = neighbour_table(sites.keys, _corners(sites, kernel), _taps(sites, kernel))
+        return TableMap(table, num, mirrored=True, bits=bits)
+    rows = torch.arange(num, dtype=torch.int32, device=device)
     if half == 0:
         return KernelMap(rows, rows, (num,), num, num, mirrored=True, identity=True)
     found, where = _search(sites.keys, _corners(sites, kernel), sites.strides[1:], kernel, half)
@@ -223,6 +189,9 @@ def _build_strided(
     sites: Sites, kernel: tuple[int, ...], stride: tuple[int, ...], padding: tuple[int, ...]
 ) -> tuple[KernelMap, Sites]:
     shape = _output_shape(sites.shape, kernel, stride, padding)
+    if makes_tables(sites) and max(padding) <= HALO:
+        out = _reached(sites, shape, kernel, stride, padding)
+        return _map_between(sites, out, kernel, stride, padding), out
     out = Sites(shape, sites.keys)
     cells = sites.indices()
     targets, valid = cells[:, 0] * out.strides[0], torch.ones_like(cells[:, 0], dtype=torch.bool)
@@ -246,16 +215,54 @@ def _build_temporal(
     # The temporal taps alone decide which outputs exist.
     ones = (1,) * (sites.ndim - 1)
     zeros = (0,) * (sites.ndim - 1)
-    _, reached = _build_strided(sites, (kernel[0], *ones), (stride[0], *ones), (padding[0], *zeros))
+    first = (kernel[0], *ones), (stride[0], *ones), (padding[0], *zeros)
+    if makes_tables(sites):
+        reached = _reached(sites, shape, *first)
+    else:
+        _, reached = _build_strided(sites, *first)
     out = Sites(shape, reached.keys)
-    cells = out.indices()
-    corner = cells[:, 0] * sites.strides[0]
-    for axis in range(sites.ndim):
-        corner = corner + (cells[:, axis + 1] * stride[axis] - padding[axis]) * sites.strides[axis + 1]
+    if makes_tables(sites):
+        return _map_between(sites, out, kernel, stride, padding), out
+    corner = _strided_corners(sites, out, stride, padding)
     found, where = _search(sites.keys, corner, sites.strides[1:], kernel, torch.Size(kernel).numel())
     hits, outputs, counts = _hits(found)
     inputs = where.reshape(-1).index_select(0, hits).to(torch.int32)
     return KernelMap(inputs, outputs, counts, len(sites), len(out)), out
+
+
+def _reached(
+    sites: Sites, shape: tuple[int, ...], kernel: tuple[int, ...], stride: tuple[int, ...], padding: tuple[int, ...]
+) -> Sites:
+    """Every cell of the coarse grid whose window holds a site. Waits for a GPU once, for their number."""
+    device, none = sites.device, torch.iinfo(torch.int64).max
+    coarse = Sites(shape, sites.keys)
+    taps = itertools.product(*(range(size) for size in kernel))
+    shifts = tuple(tuple(pad - k for pad, k in zip(padding, tap, strict=True)) for tap in taps)
+    cells = sites.indices()  # [n, 1 + d]
+    moved = cells[:, 1:] + constant(shifts, torch.int64, device)[:, None]  # [K, n, d]
+    steps, sizes = constant((stride, shape[1:]), torch.int64, device)
+    target = torch.div(moved, steps, rounding_mode="floor")
+    fits = ((target * steps == moved) & (target >= 0) & (target < sizes)).all(-1)
+    inner = (target * constant(coarse.strides[1:], torch.int64, device)).sum(-1) + cells[:, 0] * coarse.strides[0]
+    # What fits nowhere becomes the largest key, which is there at least once and cut off.
+    candidates = torch.cat([torch.where(fits, inner, none).flatten(), constant((none,), torch.int64, device)])
+    return Sites(shape, torch.unique(candidates)[:-1])
+
+
+def _strided_corners(sites: Sites, out: Sites, stride: tuple[int, ...], padding: tuple[int, ...]) -> Tensor:  # [m]
+    """Key among `sites` of the first cell of each output's window."""
+    steps = (sites.strides[0], *(s * step for s, step in zip(stride, sites.strides[1:], strict=True)))
+    before = sum(pad * step for pad, step in zip(padding, sites.strides[1:], strict=True))
+    return (out.indices() * constant(steps, torch.int64, sites.device)).sum(1) - before
+
+
+def _map_between(
+    sites: Sites, out: Sites, kernel: tuple[int, ...], stride: tuple[int, ...], padding: tuple[int, ...]
+) -> KernelMap:
+    """The map between two sets that are known, as a table."""
+    corners = _strided_corners(sites, out, stride, padding)
+    table, bits = neighbour_table(sites.keys, corners, _taps(sites, kernel))
+    return TableMap(table, len(sites), bits=bits)
 
 
 def _search(

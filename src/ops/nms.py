@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from src.geometry.constants import on_device
 from src.geometry.tensor_transforms import rotate_back
 from src.ops.kernel_maps import submanifold_map
 from src.ops.sites import Sites
@@ -53,7 +54,7 @@ def _near_pairs(
     better = worse = torch.zeros(0, dtype=torch.int64, device=boxes.device)
     for first in range(0, len(blocks), at_once):
         starts, sizes, squares = zip(*blocks[first : first + at_once], strict=True)
-        starts, sizes = torch.tensor([starts, sizes], device=boxes.device)
+        starts, sizes = on_device((starts, sizes), torch.int64, boxes.device)
         place = torch.arange(max(size for _, size, _ in blocks[first : first + at_once]), device=boxes.device)
         present = place < sizes[:, None]
         x, y, half = F.embedding(torch.where(present, starts[:, None] + place, 0), table).unbind(2)  # [S, K] each
@@ -61,7 +62,7 @@ def _near_pairs(
         if squares[0] is None:
             reach = (half[:, :, None] + half[:, None]).square()
         else:
-            reach = boxes.new_tensor(squares)[:, None, None]
+            reach = on_device(squares, boxes.dtype, boxes.device)[:, None, None]
         near = (squared <= reach) & present[:, :, None] & present[:, None]
         block, row, column = near.triu(1).nonzero(as_tuple=True)
         better = torch.cat([better, starts[block] + row])

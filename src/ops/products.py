@@ -53,13 +53,15 @@ def multiply(
     b: Tensor,  # [k, m]
     bias: Tensor | None = None,  # [m]
 ) -> Tensor:  # [n, m]
-    """a @ b + bias without gradient. In float32 by oneDNN where MKL leaves half of a processor unused.
+    """a @ b + bias without gradient, in their own type whatever autocast says.
 
-    Operands must not be expanded ones: oneDNN takes a thousand times as long for a value that stands for many.
+    In float32 by oneDNN where MKL leaves half of a processor unused. Operands must not be expanded ones: oneDNN takes
+    a thousand times as long for a value that stands for many.
     """
     if a.dtype == torch.float32 and a.device.type == "cpu" and prefers_onednn():
         return torch.ops.mkldnn._linear_pointwise(a, b.t(), bias, "none", [], "")
-    return torch.mm(a, b) if bias is None else torch.addmm(bias, a, b)
+    with torch.autocast(a.device.type, enabled=False):
+        return torch.mm(a, b) if bias is None else torch.addmm(bias, a, b)
 
 
 def row_spans(rows: int, most: int) -> Iterator[slice]:

@@ -37,6 +37,16 @@ def gather_segment_sum(
     return F.embedding_bag(picks, values, starts, mode="sum", include_last_offset=True, per_sample_weights=weights)
 
 
+def segment_count(
+    rows: Tensor,  # [n] int64
+    num_rows: int,
+) -> Tensor:  # [num_rows] int64
+    """How many values share each row. Does not wait for a GPU, as bincount does."""
+    if rows.device.type == "cpu":  # where it is faster
+        return torch.bincount(rows, minlength=num_rows)
+    return rows.new_zeros(num_rows).index_add(0, rows, torch.ones_like(rows))
+
+
 def segment_sum(
     values: Tensor,  # [n, C]
     rows: Tensor,  # [n] int64
@@ -52,7 +62,7 @@ def segment_mean(
     num_rows: int,
 ) -> Tensor:  # [num_rows, C]
     """Scatter mean: values that share a row; absent rows are 0. Differentiable."""
-    counts = rows.new_zeros(num_rows).index_add(0, rows, torch.ones_like(rows))  # bincount would synchronise with a GPU
+    counts = segment_count(rows, num_rows)
     return segment_sum(values, rows, num_rows) / counts.clamp(min=1)[:, None].to(values.dtype)
 
 
@@ -201,4 +211,4 @@ def _starts(
     num_rows: int,
 ) -> Tensor:  # [num_rows + 1] int64
     """Where each row's pairs begin once the pairs are ordered by row."""
-    return F.pad(torch.bincount(rows, minlength=num_rows).cumsum(0), (1, 0))
+    return F.pad(segment_count(rows, num_rows).cumsum(0), (1, 0))

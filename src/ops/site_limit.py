@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import torch
-
 from src.ops.kernel_maps import KernelMap
-from src.ops.segment_reduce import rank_per_sample
+from src.ops.segment_reduce import rank_per_sample, segment_count
 from src.ops.sites import Sites, rows_of_keys
 
 
@@ -24,8 +22,7 @@ def limit_sites(
         raise ValueError(f"a limit on added sites needs one grid, but got shapes {before.shape} and {after.shape}")
     if len(after) <= limit:
         return kernel_map, after
-    ones = torch.ones_like(kernel_map.outputs, dtype=torch.int64)
-    scores = ones.new_zeros(len(after)).index_add(0, kernel_map.outputs, ones)  # at most one pair an offset
+    scores = segment_count(kernel_map.outputs.long(), len(after))  # at most one pair an offset
     scores = scores + kernel_map.num_offsets * (rows_of_keys(before.keys, after.keys) >= 0)
     order, rank = rank_per_sample(scores, after.indices()[:, 0])
     kept = order[rank < limit].sort().values

@@ -37,12 +37,12 @@ class Sites:
     ) -> tuple[Sites, Tensor]:
         """Sites of the given cells, and `order` [n] int64 such that `indices[order]` are in the order of the sites.
 
-        Raises ValueError for a cell outside `shape` or listed twice.
+        Raises ValueError for a cell outside `shape` or listed twice, which a CPU looks for: a GPU would have to wait.
         """
         empty = _checked_empty(indices, shape)
         keys, order = torch.sort(empty.keys_of(indices))
         sites = cls(empty.shape, keys)
-        if len(keys) > 1 and bool((keys[1:] == keys[:-1]).any()):
+        if indices.device.type == "cpu" and bool((keys[1:] == keys[:-1]).any()):
             raise ValueError(
                 f"indices: {len(keys) - len(torch.unique(keys))} cells are listed more than once, expected unique "
                 "cells; merge them first (Sites.unique gives the rows to merge into)"
@@ -57,7 +57,7 @@ class Sites:
     ) -> tuple[Sites, Tensor]:
         """Sites of the distinct cells, and the row [n] int64 of every given cell in them.
 
-        Raises ValueError for a cell outside `shape`.
+        Raises ValueError for a cell outside `shape`, which a CPU looks for: a GPU would have to wait.
         """
         empty = _checked_empty(indices, shape)
         keys, rows = torch.unique(empty.keys_of(indices), return_inverse=True)
@@ -70,13 +70,21 @@ class Sites:
         shape: tuple[int, ...],
     ) -> Sites:
         """Sites from plain row-major positions, which have the same order as the keys. Trusts its arguments."""
-        empty = cls(tuple(shape), linear)
-        keys = torch.zeros_like(linear)
-        rest = linear
-        for axis in reversed(range(1, len(shape))):
-            keys += torch.remainder(rest, shape[axis]) * empty.strides[axis]
-            rest = torch.div(rest, shape[axis], rounding_mode="floor")
-        return cls(tuple(shape), keys + rest * empty.strides[0])
+        sites = cls(tuple(shape), linear)
+        cells = _unravelled(linear, _row_major(sites.shape), (2**62, *sites.shape[1:]))
+        sites.keys = sites.keys_of(cells)
+        sites.cache["indices"] = cells
+        return sites
+
+    def on_grid(self, shape: tuple[int, ...], axes: tuple[int, ...] | None = None) -> Sites:
+        """The same cells on a grid of another size, with some of the axes (all of `shape` and the batch's) if given.
+
+        Trusts that they lie in it and are as many; they keep their order.
+        """
+        cells = self.indices() if axes is None else torch.stack([self.indices()[:, axis] for axis in axes], 1)
+        sites = Sites(tuple(shape), self.keys)
+        sites.keys = sites.keys_of(cells)
+        return sites
 
     @property
     def strides(self) -> tuple[int, ...]:
@@ -102,19 +110,13 @@ class Sites:
     def indices(self) -> Tensor:  # [n, 1 + d] int64
         """(batch, *cell) of every site, in order."""
         if "indices" not in self.cache:
-            rest, columns = self.keys, []
-            for stride in self.strides:
-                columns.append(torch.div(rest, stride, rounding_mode="floor"))
-                rest = rest - columns[-1] * stride
-            self.cache["indices"] = torch.stack(columns, 1)
+            sizes = (2**62, *(size + HALO for size in self.shape[1:]))
+            self.cache["indices"] = _unravelled(self.keys, self.strides, sizes)
         return self.cache["indices"]
 
     def linear(self) -> Tensor:  # [n] int64
         """Row-major position of every site, (batch * rows + row) * cols + col in 2D; sorted."""
-        position = torch.zeros_like(self.keys)
-        for size, column in zip(self.shape, self.indices().unbind(1), strict=True):
-            position = position * size + column
-        return position
+        return (self.indices() * constant(_row_major(self.shape), torch.int64, self.device)).sum(1)
 
     def rows_of(
         self,
@@ -131,6 +133,27 @@ class Sites:
     ) -> Tensor:  # [q] int64
         """Key of each cell, a site or not."""
         return (indices.long() * constant(self.strides, torch.int64, indices.device)).sum(1)
+
+
+def _row_major(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Step of a linear position per axis."""
+    return tuple(math.prod(shape[axis + 1 :]) for axis in range(len(shape)))
+
+
+def _unravelled(
+    positions: Tensor,  # [n] int64
+    strides: tuple[int, ...],
+    sizes: tuple[int, ...],  # of each axis, as the strides count them
+) -> Tensor:  # [n, axes] int64
+    """The place of each position on every axis."""
+    if positions.device.type == "cpu":  # where a division costs more than another pass
+        rest, columns = positions, []
+        for stride in strides:
+            columns.append(torch.div(rest, stride, rounding_mode="floor"))
+            rest = rest - columns[-1] * stride
+        return torch.stack(columns, 1)
+    steps, sizes = constant((strides, sizes), torch.int64, positions.device)
+    return torch.remainder(torch.div(positions[:, None], steps, rounding_mode="floor"), sizes)
 
 
 def rows_of_keys(
@@ -170,8 +193,9 @@ def _checked_empty(indices: Tensor, shape: tuple[int, ...]) -> Sites:
     sites = Sites(tuple(int(size) for size in shape), indices.new_empty(0, dtype=torch.int64))
     if math.prod(size + HALO for size in sites.shape) >= 2**63:
         raise ValueError(f"shape={sites.shape}: too many cells for 64-bit keys")
-    outside = (indices < 0) | (indices >= constant(sites.shape, torch.int64, indices.device))
-    if bool(outside.any()):
-        first = indices[outside.any(1)][0].tolist()
-        raise ValueError(f"indices: cell {first} lies outside shape {sites.shape}; drop such cells first")
+    if indices.device.type == "cpu":
+        outside = (indices < 0) | (indices >= constant(sites.shape, torch.int64, indices.device))
+        if bool(outside.any()):
+            first = indices[outside.any(1)][0].tolist()
+            raise ValueError(f"indices: cell {first} lies outside shape {sites.shape}; drop such cells first")
     return sites

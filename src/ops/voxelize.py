@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.constants import constant
-from src.ops.segment_reduce import inverse_rows, rank_per_sample, segment_mean
+from src.ops.segment_reduce import inverse_rows, rank_per_sample, segment_count, segment_mean
 from src.ops.sites import Sites
 
 
@@ -32,12 +32,12 @@ def voxelize(
     sites, rows, inside = voxel_rows(coordinates, batch, lower_m, voxel_size_m, shape, batch_size)
     values = points.index_select(0, inside)
     if max_voxels is not None and len(sites) > max_voxels:
-        kept = _densest(sites, torch.bincount(rows, minlength=len(sites)), max_voxels)
+        kept = _densest(sites, segment_count(rows, len(sites)), max_voxels)
         rows = inverse_rows(kept, len(sites)).index_select(0, rows)
         values, rows = values[rows >= 0], rows[rows >= 0]
         sites = Sites(sites.shape, sites.keys.index_select(0, kept))
     values = values.to(torch.promote_types(values.dtype, torch.float32))
-    return sites, segment_mean(values, rows, len(sites)), torch.bincount(rows, minlength=len(sites))
+    return sites, segment_mean(values, rows, len(sites)), segment_count(rows, len(sites))
 
 
 def voxel_rows(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -155,12 +156,17 @@ def _paint_views(
     bar.outline.set_visible(False)
 
 
-def draw_horizons(path: Path | str, scores: Mapping[str, float | None], title: str) -> None:
-    """Write a PNG of a world model's scores over time and distance, by their names in metrics.json."""
+def draw_horizons(path: Path | str, scores: Mapping[str, Any], title: str) -> None:
+    """Write a PNG of a world model's scores over time and distance with their intervals, from metrics.json."""
+    bounds = scores.get("intervals", {}).get("bounds", {})
     times = sorted({name.partition("@")[2] for name in scores if "@" in name}, key=lambda name: float(name[:-1]))
 
+    def bar(name: str, scale: float) -> tuple[float, float, float] | None:
+        value = scores.get(name)
+        return None if value is None else tuple(scale * x for x in (value, *bounds.get(name, (value, value))))
+
     def bars(names: Sequence[str], scale: float = 1.0) -> list[tuple[float, float, float] | None]:
-        return [None if (value := scores.get(name)) is None else (scale * value,) * 3 for name in names]
+        return [bar(name, scale) for name in names]
 
     panels = [
         BarPanel(
@@ -176,7 +182,8 @@ def draw_horizons(path: Path | str, scores: Mapping[str, float | None], title: s
     future = [time for time in times if f"cd@{time}" in scores]
     distances = ("0-50m", "50-150m", "150-250m")
     if future:
-        for kind, words in (("cd", "Chamfer distance, m^2"), ("cd_moving", "Chamfer distance of what moves, m^2")):
+        for kind, of in (("cd", ""), ("cd_moving", " of what moves"), ("cd_unseen", " where the input had not seen")):
+            words = f"Chamfer distance{of}, m^2"
             found = {name: bars([f"{prefix}{kind}@{time}" for time in future]) for prefix, name in own.items()}
             panels.append(BarPanel(words, future, found, 2))
         errors = {name: bars([f"{prefix}l1_{far}_3s" for far in distances]) for prefix, name in own.items()}

@@ -11,6 +11,8 @@ from src.structures.taxonomy import CLASSES
 DETECTION = "detection"
 """The task (`phase.task`) whose numbers have names here."""
 RANGES = ("0-25", "25-50", "50-100", "100-150")
+LONG_RANGES = ("0-50", "50-150", "150-250")
+"""Of the second score of detections (`phase.long_range`)."""
 SPEEDS = ("0-0.5", "0.5-10", "10-25", "25+")
 SOURCES = ("radar", "camera", "random", "history")
 """Where Gaussians come from."""
@@ -48,6 +50,9 @@ def _summary(prefix: str = "", title: str = "") -> dict[str, Metric]:
 METRICS = _summary()
 for _range in RANGES:
     METRICS |= _summary(f"ranges.{_range}.", f" {_range} m")
+METRICS |= _summary("long_range.", ", long range")
+for _range in LONG_RANGES:
+    METRICS |= _summary(f"long_range.ranges.{_range}.", f" {_range} m, long range")
 for _class in CLASSES:
     for _error, *_rest in (("AP", "%", 100.0, 1, True), ("AVE", "m/s", 1.0, 2, False)):
         _name = f"classes.{_class}.{_error}"

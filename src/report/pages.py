@@ -13,6 +13,7 @@ from src.report.metric_names import DETECTION, SPEEDS, Metric
 from src.report.plain_yaml import load_plain_yaml
 from src.report.results import RunResult
 from src.report.score_tables import (
+    BY_LONG_RANGE,
     BY_RANGE,
     BY_SPEED,
     CAR_BY_SPEED,
@@ -135,13 +136,13 @@ def phase_page(runs: list[RunResult], scale: str) -> str:
     """
     if runs[0].task == DETECTION:
         experiments = group_runs(runs, lambda run: NAMES.get((run.phase, *run.settings)))
-        tables = [score_table(experiments, columns) for columns in (SUMMARY, BY_RANGE)]
+        tables = [score_table(experiments, columns) for columns in (SUMMARY, BY_RANGE, BY_LONG_RANGE)]
         tables += [class_table(experiments), cost_table(experiments)]
         what = f"{', '.join(map(str, sorted({run.epochs for run in runs})))} epochs"
     else:
         experiments, what = group_runs(runs, lambda run: None), f"task {runs[0].task}"
         tables = [score_table(experiments, metrics_of(runs[0])), cost_table(experiments, epochs=True)]
-    return _page(runs[0].phase, scale, what, runs) + "\n\n".join(tables) + "\n"
+    return _page(runs[0].phase, scale, what, runs) + "\n\n".join(filter(None, tables)) + "\n"
 
 
 def compared_experiments(runs: list[RunResult]) -> list[Experiment]:

@@ -107,6 +107,12 @@ class Intervals(TypedDict):
     bounds: dict[str, Bounds]
 
 
+class LongRangeScores(RangeScores):
+    """By the second protocol."""
+
+    ranges: dict[str, RangeScores]
+
+
 class Scores(Errors):
     """What tables read of a detection run's metrics.json."""
 
@@ -117,6 +123,7 @@ class Scores(Errors):
     ranges: dict[str, RangeScores]
     speeds: NotRequired[dict[str, SpeedScores]]  # older runs have none of these
     measures: NotRequired[dict[str, Score | None]]
+    long_range: NotRequired[LongRangeScores]
     intervals: NotRequired[Intervals]
 
 
@@ -334,6 +341,9 @@ def _flat_scores(scores: Scores) -> dict[str, float | None]:
     groups = {"": scores, "measures.": scores.get("measures", {})}
     groups |= {f"classes.{name}.": part for name, part in scores["classes"].items()}
     groups |= {f"ranges.{name}.": part for name, part in scores["ranges"].items()}
+    if (long_range := scores.get("long_range")) is not None:
+        groups["long_range."] = long_range
+        groups |= {f"long_range.ranges.{name}.": part for name, part in long_range["ranges"].items()}
     values = {prefix + key: value for prefix, part in groups.items() for key, value in part.items()}
     values = {name: value for name, value in values.items() if name in METRICS}
     for name, part in scores.get("speeds", {}).items():
@@ -372,6 +382,9 @@ def _slim(scores: dict[str, Any]) -> dict[str, Any]:
     for split in ("ranges", "speeds"):
         if split in slim:
             slim[split] = {name: shortened(part) for name, part in slim[split].items()}
+    if (further := slim.get("long_range")) is not None:
+        ranges = {name: shortened(part) for name, part in further["ranges"].items()}
+        slim["long_range"] = shortened(further) | {"ranges": ranges}
     if "intervals" in slim:
         bounds = {path: values for path, values in slim["intervals"]["bounds"].items() if _named({path: values})}
         slim["intervals"] = slim["intervals"] | {"bounds": bounds}

@@ -9,13 +9,15 @@ from typing import NamedTuple
 
 from src.report.comparisons import compare
 from src.report.escaping import as_code
-from src.report.metric_names import DETECTION, FORECASTS, METRICS, RANGES, SPEEDS, Metric
+from src.report.metric_names import DETECTION, FORECASTS, LONG_RANGES, METRICS, RANGES, SPEEDS, Metric
 from src.report.results import RunResult
 from src.report.sweep_file import MAX_COLUMNS
 from src.report.sweep_table import format_score
 
 CAR_AP = METRICS["classes.car.AP"]
 BY_RANGE = [METRICS[f"ranges.{name}.mAP"] for name in RANGES]
+BY_LONG_RANGE = [METRICS[f"long_range.{name}"] for name in ("mAP", "NDS")]
+BY_LONG_RANGE += [METRICS[f"long_range.ranges.{name}.mAP"] for name in LONG_RANGES]
 BY_SPEED = [METRICS[f"speeds.{name}.mAP_present"] for name in SPEEDS]
 CAR_BY_SPEED = [METRICS[f"speeds.{name}.car.AP"] for name in SPEEDS]
 ERROR_BY_SPEED = [METRICS[f"speeds.{name}.mAVE_present"] for name in SPEEDS]

@@ -49,6 +49,8 @@ class Boxes3D(TensorFields):
 
     def __getitem__(self, rows: Tensor) -> Boxes3D:
         """The boxes at `rows` (a boolean mask or indices)."""
+        if rows.dtype == torch.bool:
+            rows = rows.nonzero().squeeze(1)  # once: each field's mask would make a GPU wait
         return self.map(lambda value: value[rows])
 
     def bev(self) -> Tensor:

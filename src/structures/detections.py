@@ -72,6 +72,7 @@ class EvaluationSet:
 
     tokens: list[str]  # S sample tokens
     ego_centers: Array  # [S, 3] float64 m, global: ego pose of the LIDAR_LEFT key frame
+    ego_rotations: Array  # [S, 4] quaternion (w, x, y, z) of that pose, global_from_ego
     scene_tags: list[tuple[str, ...]]  # S: the tags of each sample's scene
     ground_truth: DetectionTable
     racks: DetectionTable
@@ -81,7 +82,7 @@ class EvaluationSet:
 
     def __post_init__(self) -> None:
         samples = (len(self.tokens),)
-        wanted = {"ego_centers": (*samples, 3), "scenes": samples, "times_s": samples}
+        wanted = {"ego_centers": (*samples, 3), "ego_rotations": (*samples, 4), "scenes": samples, "times_s": samples}
         wanted["instances"] = (len(self.ground_truth),)
         found = {name: getattr(self, name).shape for name in wanted}
         if found != wanted or len(self.scene_tags) != len(self.tokens):

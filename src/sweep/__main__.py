@@ -30,7 +30,15 @@ from src.report.time_left import progress_line
 from src.sweep.compose import compose_sweep
 from src.sweep.latency_runs import measure_latencies
 from src.sweep.launcher import Launcher
-from src.sweep.plan import Plan, RunIdentity, compose_file, join_overrides, make_plan, split_machine
+from src.sweep.plan import (
+    Plan,
+    RunIdentity,
+    compose_file,
+    join_overrides,
+    make_plan,
+    split_machine,
+    without_published,
+)
 from src.sweep.record_writer import RecordWriter
 from src.sweep.run_status import is_done
 from src.sweep.runner import Runner
@@ -58,6 +66,8 @@ def main(overrides: list[str]) -> None:
     seeds = list(range(config.seed, config.seed + command.seeds))
     common = [override for override in common if key_of(override) != "seed"]
     plan = make_plan(sweep, common, seeds, identify)
+    if command.published:
+        plan = without_published(plan, read_results(reports, plan.scale)[0])
     if command.dry_run:
         print(describe(plan, outputs))
         return
@@ -164,14 +174,18 @@ def describe(plan: Plan, outputs: Path) -> str:
         return "\n".join(
             [*lines, f"# a search of {plan.sweep.trials} trials for the best {plan.sweep.objective}:", *space]
         )
-    finished = sum(is_done(outputs / run_id) for run_id in plan.specs)
+    finished = sum(run_id in plan.published or is_done(outputs / run_id) for run_id in plan.specs)
     results = len(plan.rows) * len(plan.seeds)
     lines.append(
         f"# {len(plan.rows)} rows x {len(plan.seeds)} seeds = {results} results of {len(plan.specs)} runs, "
         f"{finished} finished"
     )
     for spec in plan.specs.values():
-        state = "finished" if is_done(outputs / spec.run_id) else "to train"
+        state = "to train"
+        if spec.run_id in plan.published:
+            state = "has its result"
+        elif is_done(outputs / spec.run_id):
+            state = "finished"
         rows = plan.labels(spec.run_id) or [spec.label]
         same = f" ({len(rows)} rows that coincide share it)" if len(rows) > 1 else ""
         needs = f", starts from {spec.needs}" if spec.needs else ""

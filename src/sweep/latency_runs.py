@@ -21,6 +21,7 @@ def measure_latencies(record: SweepRecord, outputs: Path, command: Callable[[Pat
     measured = 0
     for label, by_seed in record.rows.items():
         done = [run_id for _, run_id in sorted(by_seed.items()) if record.runs[run_id].state == "done"]
+        done = [run_id for run_id in done if run_id not in runner.plan.published]  # they left no weights here
         if any((outputs / run_id / "latency.json").is_file() for run_id in done) or not done:
             continue
         folder = outputs / done[0]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from src.errors import ConfigError, HorizonError
@@ -59,6 +59,7 @@ class Plan:
     changes: list[str] = field(default_factory=list)  # by the command line, of every row; see `changes_of`
     rows: dict[str, dict[int, str]] = field(default_factory=dict)  # run id by label and seed
     specs: dict[str, RunSpec] = field(default_factory=dict)  # by run id, what is needed before what needs it
+    published: frozenset[str] = frozenset()  # runs that are not trained since their results are there
 
     @property
     def study(self) -> str:
@@ -138,6 +139,19 @@ def make_plan(sweep: SweepConfig, common: list[str], seeds: list[int], identify:
         for spec in [*needed, *own]:
             plan.specs.setdefault(spec.run_id, labelled.get(spec.run_id, spec))
     return plan
+
+
+def without_published(plan: Plan, results: Collection[str]) -> Plan:
+    """The plan without training what has a result, by its run id, nor weights that only such runs start from.
+
+    A run with a result is trained all the same where one without begins from its weights.
+    """
+    needed: set[str | None] = set()
+    for spec in reversed(plan.specs.values()):
+        if spec.run_id in needed or (spec.run_id not in results and plan.labels(spec.run_id)):
+            needed |= {spec.run_id, spec.needs}
+    specs = {run_id: spec for run_id, spec in plan.specs.items() if run_id in needed or plan.labels(run_id)}
+    return replace(plan, specs=specs, published=frozenset(specs) - needed)
 
 
 def compose_file(sweep: SweepConfig, common: list[str], identify: Identify) -> RunIdentity:

@@ -27,10 +27,10 @@ class RecordWriter:
         self._done: set[str] = set()
 
     def is_done(self, run_id: str) -> bool:
-        """Whether the run is finished and has a score; a finished run is not checked again."""
+        """Whether the run is finished and has a score, or counts by its result; a finished run is not checked again."""
         if run_id not in self._done and is_done(self.outputs / run_id):
             self._done.add(run_id)
-        return run_id in self._done
+        return run_id in self._done or run_id in self.plan.published
 
     def write(self) -> SweepRecord:
         """Build and write the current record. A full disk is only logged: finished runs do not depend on it."""

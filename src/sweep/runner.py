@@ -98,7 +98,7 @@ class Runner:
         What cannot be written is logged, and with `strictly` raises OSError.
         """
         for spec in self.specs():
-            if self.writer.is_done(spec.run_id) and spec.run_id not in self._published:
+            if self.writer.is_done(spec.run_id) and spec.run_id not in self._published | self.plan.published:
                 self._publish(spec.run_id, strictly)
 
     def specs(self) -> list[RunSpec]:

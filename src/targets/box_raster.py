@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import torch
 from torch import Tensor
 
@@ -10,7 +12,7 @@ from src.geometry.box_cells import cells_in_boxes
 from src.ops.segment_reduce import inverse_rows
 from src.ops.sites import rows_of_keys
 from src.structures.boxes import Boxes3D
-from src.targets.supervision import join_boxes, supervised_boxes
+from src.targets.supervision import box_samples, join_boxes, supervised_boxes
 
 
 class BoxRaster:
@@ -46,7 +48,8 @@ class BoxRaster:
         keys = torch.div(code, 2 * num, rounding_mode="floor")
         first = torch.ones_like(keys, dtype=torch.bool)
         first[1:] = keys[1:] != keys[:-1]
-        self.keys, code = keys[first], code[first]
+        rows = first.nonzero().squeeze(1)
+        self.keys, code = keys[rows], code[rows]
         self.inside = code % (2 * num) < num
         self.velocities = self.boxes.velocities[order[code % num]]
 
@@ -79,9 +82,12 @@ class BoxRaster:
         keys: Tensor,  # [q] int64
     ) -> Tensor:  # [q] bool
         """Which cells no enlarged box covers, supervised or not: whatever returns there, nothing annotated moves."""
-        sample = torch.repeat_interleave(torch.tensor([len(boxes) for boxes in self.annotated], device=keys.device))
-        covered = torch.unique(_box_cell_keys(join_boxes(self.annotated), sample, self.grid, self.margin_m)[1])
-        return (keys >= 0) & (rows_of_keys(covered, keys) < 0)
+        return (keys >= 0) & (rows_of_keys(self._covered, keys) < 0)
+
+    @cached_property
+    def _covered(self) -> Tensor:  # [pairs] int64, sorted, cells of any enlarged box, repeated
+        joined, sample = join_boxes(self.annotated), box_samples(self.annotated)
+        return _box_cell_keys(joined, sample, self.grid, self.margin_m)[1].sort().values
 
     def _at(self, values: Tensor, keys: Tensor, elsewhere: float) -> Tensor:
         rows = rows_of_keys(self.keys, keys)

@@ -7,6 +7,7 @@ from enum import Enum
 import torch
 from torch import Tensor
 
+from src.geometry.constants import constant
 from src.geometry.ragged import enumerate_windows
 from src.targets.projection import BoxViews
 
@@ -47,7 +48,8 @@ def lid_index(
     num_bins: int,
 ) -> Tensor:  # [...] int64
     """Bin of each depth, lower edge included; -1 outside [low, high), for NaN and for infinity."""
-    edges = lid_edges(depth_range_m, num_bins, depths_m.dtype, depths_m.device)
+    edges = tuple(lid_edges(depth_range_m, num_bins, depths_m.dtype).tolist())
+    edges = constant(edges, depths_m.dtype, depths_m.device)
     bins = torch.searchsorted(edges, depths_m.contiguous(), right=True) - 1
     return bins.where((depths_m >= edges[0]) & (depths_m < edges[-1]), -1)
 
@@ -65,7 +67,7 @@ def paint_depth(
     Boxes out of the depth range are painted, too, and leave background: what stands before an object hides it.
     """
     rows, cols = image_size_px[0] // stride_px, image_size_px[1] // stride_px
-    limit = seen.hulls_px.new_tensor([cols, rows])
+    limit = constant((cols, rows), seen.hulls_px.dtype, seen.hulls_px.device)
     low = (seen.hulls_px[:, :2] / stride_px).floor().long()
     high = torch.minimum((seen.hulls_px[:, 2:] / stride_px).ceil(), limit).long()
     owners, row, col = enumerate_windows(low, high - 1)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import constant
 from src.geometry.ragged import enumerate_items
 from src.ops.sites import Sites
 from src.structures.boxes import Boxes3D
@@ -55,7 +57,7 @@ class HeadTargets:
     codes: Tensor  # [K, CODE_SIZE], see CODE_SIZE; velocities NaN where unknown
     attributes: Tensor  # [K] int64, -1 for none
     num_distant: int
-    num_shared: int
+    num_shared: Tensor  # [] int64
 
 
 def gaussian_radius(
@@ -91,7 +93,8 @@ def head_targets(
     joined, batch = _first_of_each_group(joined, batch)
     g = grid.to_cells(joined.centers[:, :2])
     rows, near = _nearest_cells(g, batch, sites)
-    joined, batch, g, rows = joined[near], batch[near], g[near], rows[near]
+    kept = near.nonzero().squeeze(1)
+    joined, batch, g, rows = joined[kept], batch[kept], g[kept], rows[kept]
 
     cell = sites.indices()[rows, 1:].flip(1).to(g.dtype)  # [K, 2] (col, row)
     radius = gaussian_radius(joined.sizes[:, 0] / grid.cell_m, joined.sizes[:, 1] / grid.cell_m, MIN_OVERLAP)
@@ -101,8 +104,9 @@ def head_targets(
     )
     codes = [g - cell, joined.centers[:, 2:], joined.sizes.log()]
     codes += [joined.yaws.cos()[:, None], joined.yaws.sin()[:, None], joined.velocities]
-    groups = joined.labels.new_tensor(GROUP_OF_CLASS)[joined.labels]
-    _, shared, sharers = torch.unique(rows * len(HEAD_GROUPS) + groups, return_inverse=True, return_counts=True)
+    groups = constant(GROUP_OF_CLASS, torch.int64, rows.device)[joined.labels]
+    places = (rows * len(HEAD_GROUPS) + groups).sort().values
+    equal = places[1:] == places[:-1]
     return HeadTargets(
         heatmap=heatmap,
         rows=rows,
@@ -111,7 +115,7 @@ def head_targets(
         codes=torch.cat(codes, dim=1),
         attributes=joined.attributes,
         num_distant=len(near) - len(rows),
-        num_shared=int((sharers[shared] > 1).sum()),
+        num_shared=(F.pad(equal, (1, 0)) | F.pad(equal, (0, 1))).sum() if len(rows) else torch.zeros_like(rows).sum(),
     )
 
 
@@ -119,10 +123,10 @@ def _first_of_each_group(boxes: Boxes3D, batch: Tensor) -> tuple[Boxes3D, Tensor
     """At most MAX_OBJECTS_PER_GROUP boxes of every sample and group, in their order."""
     if len(boxes) <= MAX_OBJECTS_PER_GROUP:
         return boxes, batch
-    owner = batch * len(HEAD_GROUPS) + boxes.labels.new_tensor(GROUP_OF_CLASS)[boxes.labels]
-    order = owner.argsort(stable=True)
-    counts = torch.bincount(owner)
-    kept = order[enumerate_items(counts)[1] < MAX_OBJECTS_PER_GROUP].sort().values
+    owner = batch * len(HEAD_GROUPS) + constant(GROUP_OF_CLASS, torch.int64, batch.device)[boxes.labels]
+    owner, order = owner.sort(stable=True)
+    place = torch.arange(len(owner), device=owner.device) - torch.searchsorted(owner, owner)
+    kept = order[place < MAX_OBJECTS_PER_GROUP].sort().values
     return boxes[kept], batch[kept]
 
 
@@ -146,7 +150,7 @@ def _pairs_in_bands(
     rows = start[owners] + offsets
     cells = sites.indices()[:, 1:].to(g.dtype)
     squared = (cells[rows, 1] - g[owners, 0]) ** 2 + (cells[rows, 0] - g[owners, 1]) ** 2
-    within = squared <= reach[owners] ** 2
+    within = (squared <= reach[owners] ** 2).nonzero().squeeze(1)
     return owners[within], rows[within], squared[within]
 
 
@@ -158,9 +162,8 @@ def _nearest_cells(
     """Row of the nearest site of each object, and whether there is one within MAX_DISTANCE_CELLS."""
     owners, rows, squared = _pairs_in_bands(g, torch.full_like(g[:, 0], MAX_DISTANCE_CELLS), batch, sites)
     least = g.new_full((len(g),), torch.inf).scatter_reduce_(0, owners, squared, "amin")
-    nearest = squared == least[owners]
     found = torch.full_like(batch, len(sites))
-    found.scatter_reduce_(0, owners[nearest], rows[nearest], "amin")
+    found.scatter_reduce_(0, owners, torch.where(squared == least[owners], rows, len(sites)), "amin")
     return found, found < len(sites)
 
 

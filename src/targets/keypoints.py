@@ -27,18 +27,19 @@ def keypoint_heatmap(
     cells = (seen.centers_px / stride_px).floor()  # [V, 2] (col, row)
     inside = (cells >= 0).all(1) & (cells[:, 0] < cols) & (cells[:, 1] < rows)
     drawn = inside & (seen.depths_m >= depth_range_m[0]) & (seen.depths_m < depth_range_m[1])
-    col, row = cells[drawn].long().unbind(1)
-    view, center, hull = seen.views[drawn], seen.centers_px[drawn], seen.hulls_px[drawn]
+    col, row = torch.where(drawn[:, None], cells, -1).long().unbind(1)
+    view, center, hull = seen.views, seen.centers_px, seen.hulls_px
 
     margin = torch.cat([center - hull[:, :2], hull[:, 2:] - center], dim=1).amin(1)
     radius = (margin / stride_px).ceil().clamp(1, MAX_RADIUS_CELLS).long()
     cell = torch.stack([col, row], 1)
-    owners, down, right = enumerate_windows(cell - radius[:, None], cell + radius[:, None])
+    reach = torch.where(drawn, radius, -1)[:, None]  # nothing where it is not drawn
+    owners, down, right = enumerate_windows(cell - reach, cell + reach)
     squared = (down - row[owners]) ** 2 + (right - col[owners]) ** 2
     values = torch.exp(-squared / (2 * ((2 * radius + 1)[owners] / 6) ** 2))
 
     within = (down >= 0) & (down < rows) & (right >= 0) & (right < cols)
-    flat = ((view[owners] * rows + down) * cols + right)[within]
-    heatmap = center.new_zeros(num_views * rows * cols)
-    heatmap.scatter_reduce_(0, flat, values[within].to(heatmap.dtype), "amax")
-    return heatmap.view(num_views, rows, cols)
+    flat = torch.where(within, (view[owners] * rows + down) * cols + right, num_views * rows * cols)
+    heatmap = center.new_zeros(num_views * rows * cols + 1)  # one more place, for what lies outside
+    heatmap.scatter_reduce_(0, flat, values.to(heatmap.dtype), "amax")
+    return heatmap[:-1].view(num_views, rows, cols)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from src.geometry.constants import constant
 from src.geometry.tensor_transforms import rotate
 from src.structures.boxes import Boxes3D
 
@@ -14,6 +15,7 @@ NEAR_M = 0.1
 """Corners closer than this to the image plane have no projection; box edges are cut there."""
 
 CORNERS = ((1, 1), (1, -1), (-1, -1), (-1, 1))
+SIGNS = tuple((x, y, z) for z in (-1, 1) for x, y in CORNERS)
 EDGES = tuple((i, (i + 1) % 4) for i in range(4)) + tuple((i + 4, (i + 1) % 4 + 4) for i in range(4))
 EDGES += tuple((i, i + 4) for i in range(4))
 
@@ -43,7 +45,7 @@ def view_boxes(
     center = _homogeneous(boxes.centers[:, None]) @ pix.transpose(-1, -2)  # [K, N, 1, 3]
     corner = _homogeneous(_corners(boxes)) @ pix.transpose(-1, -2)  # [K, N, 8, 3]
     low, high = _hull(corner)  # [K, N, 2]
-    size = low.new_tensor([width, height])
+    size = constant((width, height), low.dtype, low.device)
     low, high = low.clamp(min=0), torch.minimum(high, size)
     meets = (low < high).all(-1) & image_valid[batch]
     rows, cameras = meets.nonzero(as_tuple=True)
@@ -58,7 +60,7 @@ def view_boxes(
 
 
 def _corners(boxes: Boxes3D) -> Tensor:  # [K, 8, 3], the lower four first
-    signs = boxes.sizes.new_tensor([(x, y, z) for z in (-1, 1) for x, y in CORNERS])
+    signs = constant(SIGNS, boxes.sizes.dtype, boxes.sizes.device)
     local = 0.5 * signs * boxes.sizes[:, None]
     cos, sin = boxes.yaws.cos()[:, None], boxes.yaws.sin()[:, None]
     along, across, up = local.unbind(-1)
@@ -76,7 +78,7 @@ def _hull(corners: Tensor) -> tuple[Tensor, Tensor]:  # [K, N, 8, 3] -> low, hig
     would shrink to its far end.
     """
     depth = corners[..., 2]
-    start, end = corners.new_tensor(EDGES).long().unbind(1)
+    start, end = constant(EDGES, torch.int64, corners.device).unbind(1)
     share = (NEAR_M - depth[..., start]) / (depth[..., end] - depth[..., start])
     crossing = (depth[..., start] < NEAR_M) != (depth[..., end] < NEAR_M)
     cut = corners[..., start, :] + share[..., None].nan_to_num() * (corners[..., end, :] - corners[..., start, :])

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import on_device
 from src.structures.boxes import Boxes3D
 
 
@@ -20,16 +21,22 @@ def supervised_boxes(
     A box without any lidar or radar point (`num_points` 0), with its centre outside the grid, with a value that is
     not finite (velocities excepted) or with a size of zero supervises nothing. `num_points` None counts as seen.
     """
-    kept = []
-    for sample in boxes:
-        usable = grid.contains(sample.centers[:, :2]) & (sample.sizes > 0).all(1)
-        values = torch.cat([sample.centers, sample.sizes, sample.yaws[:, None]], dim=1)
-        usable &= values.isfinite().all(1)
-        if sample.num_points is not None:
-            usable &= sample.num_points > 0
-        kept.append(sample[usable])
-    counts = torch.tensor([len(sample) for sample in kept], device=kept[0].centers.device)
-    return join_boxes(kept), torch.repeat_interleave(counts)
+    joined, sample = join_boxes(boxes), box_samples(boxes)
+    usable = grid.contains(joined.centers[:, :2]) & (joined.sizes > 0).all(1)
+    values = torch.cat([joined.centers, joined.sizes, joined.yaws[:, None]], dim=1)
+    usable &= values.isfinite().all(1)
+    seen = [torch.ones_like(part.labels) if part.num_points is None else part.num_points for part in boxes]
+    usable &= torch.cat(seen) > 0
+    rows = usable.nonzero().squeeze(1)
+    return joined[rows], sample[rows]
+
+
+def box_samples(
+    boxes: list[Boxes3D],
+) -> Tensor:  # [K] int64, the sample of each box of all samples
+    """Whose the boxes of `join_boxes` are."""
+    owners = [row for row, sample in enumerate(boxes) for _ in range(len(sample))]
+    return on_device(owners, torch.int64, boxes[0].centers.device)
 
 
 def join_boxes(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -11,9 +13,10 @@ from torch import nn
 
 from src.data.datamodule import DetectionDataModule
 from src.geometry.bev_grid import BEVGrid
-from src.metrics.bootstrap import with_intervals
+from src.metrics.bootstrap import LONG_RANGE, score_report
 from src.metrics.detection import DetectionScores, score_detections
 from src.metrics.diagnostics import FrameDiagnosis, diagnose
+from src.metrics.protocol import Protocol
 from src.metrics.score_text import format_scores
 from src.metrics.submission import to_ego, to_global
 from src.models.detector import Detector
@@ -76,7 +79,7 @@ class Evaluator(nn.Module, ABC):
 
 
 class DetectionEvaluator(Evaluator):
-    """3D boxes by the official TruckScenes metric.
+    """3D boxes by the official TruckScenes metric, and by a protocol of one's own beside it (`long_range`).
 
     A sample that several processes (or a padded batch) saw counts once. After `compute`, `scores` and `detections` are
     the same on every process, boxes in the order of the evaluation set whoever saw what.
@@ -85,9 +88,9 @@ class DetectionEvaluator(Evaluator):
     headline = "mAP"
     monitored = ("mAP", "NDS")
 
-    def __init__(self, evaluation_set: EvaluationSet) -> None:
+    def __init__(self, evaluation_set: EvaluationSet, long_range: Protocol | None = None) -> None:
         super().__init__()
-        self.evaluation_set = evaluation_set
+        self.evaluation_set, self.long_range = evaluation_set, long_range
         self.boxes: dict[int, DetectionTable] = {}  # by sample, a row of the evaluation set's tokens
         self.diagnoses: dict[int, FrameDiagnosis] = {}  # by sample as well
         self.scores: DetectionScores | None = None
@@ -95,9 +98,9 @@ class DetectionEvaluator(Evaluator):
         self.content: dict[str, Any] | None = None  # of metrics.json
 
     @classmethod
-    def of(cls, datamodule: DetectionDataModule) -> DetectionEvaluator:
+    def of(cls, datamodule: DetectionDataModule, long_range: Protocol | None = None) -> DetectionEvaluator:
         """All annotations of the validation split."""
-        return cls(datamodule.evaluation_set())
+        return cls(datamodule.evaluation_set(), long_range)
 
     def reset(self) -> None:
         """Forget the boxes of an earlier pass."""
@@ -127,9 +130,9 @@ class DetectionEvaluator(Evaluator):
         return self.scores.overall.headline()
 
     def as_dict(self) -> dict[str, Any]:
-        """See `with_intervals`, which is asked once: a validation in the middle of a training does without."""
+        """See `score_report`; asked once: a validation in the middle of a training does without."""
         if self.content is None:
-            self.content = with_intervals(self.scores)
+            self.content = score_report(self.evaluation_set, self.detections, self.scores, self.long_range)
         return self.content
 
     @staticmethod
@@ -141,12 +144,16 @@ class DetectionEvaluator(Evaluator):
         """Bars by class and distance."""
         scores, panels = self.as_dict(), []
         bounds = scores["intervals"]["bounds"]
-        for what, group, metric in (("AP by class, %", "classes", "AP"), ("mAP by distance, %", "ranges", "mAP")):
-            bars = []
-            for name, values in scores[group].items():
-                low, high = bounds.get(f"{group}.{name}.{metric}", 2 * [values[metric]])
+        shown = [("AP by class, %", "classes.", "AP"), ("mAP by distance, %", "ranges.", "mAP")]
+        if self.long_range is not None:
+            near = f"{self.long_range.error_threshold_m:g} m"
+            shown.append((f"mAP by distance, matches within {near}, %", f"{LONG_RANGE}.ranges.", "mAP"))
+        for what, path, metric in shown:
+            groups, bars = reduce(getitem, path.split(".")[:-1], scores), []
+            for name, values in groups.items():
+                low, high = bounds.get(f"{path}{name}.{metric}", 2 * [values[metric]])
                 bars.append((100 * values[metric], 100 * low, 100 * high))
-            panels.append(BarPanel(what, [name.replace("_", " ") for name in scores[group]], {title: bars}))
+            panels.append(BarPanel(what, [name.replace("_", " ") for name in groups], {title: bars}))
         draw_comparison(folder / "scores.png", panels, title)
 
     def write(self, folder: Path, save: SaveTable) -> list[str]:

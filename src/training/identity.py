@@ -88,5 +88,7 @@ def run_identity(tree: dict[str, Any], source: str | None = None) -> str:
             tree["data"].pop(key)
     if tree["data"].get("timeline") is None:
         tree["data"].pop("timeline", None)  # a run of key frames is what it was before there were others
+    if tree["phase"].get("long_range") is None:
+        tree["phase"].pop("long_range", None)  # and one of the official score alone
     digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:8]
     return f"{tree['model']['name']}-{tree['phase']['name']}-{tree['scale']}-{digest}"

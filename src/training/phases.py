@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from src.data.datamodule import DetectionDataModule
 from src.errors import ConfigError, require_least
+from src.metrics.protocol import Protocol
 from src.training.evaluator import DetectionEvaluator, Evaluator
 from src.training.module import TrainingModule
 from src.training.temporal_module import TemporalModule
@@ -33,6 +35,7 @@ class PhaseConfig:
     frozen_statistics: bool  # norms that came with the weights of `init_from` use their running statistics in training
     epochs: int
     validate_every: int  # epochs
+    long_range: Protocol | None  # a second score of detections, beside the official one
     options: dict[str, Any]  # what the phase says to the model's family
 
     def __post_init__(self) -> None:
@@ -47,4 +50,13 @@ class PhaseConfig:
         known = [f"val/{name}" for name in EVALUATORS[self.task].monitored]
         if self.monitor not in known:
             raise ConfigError(f"phase.monitor={self.monitor}: must be one of {', '.join(known)}, larger being better")
+        if self.long_range is not None and self.task != "detection":
+            raise ConfigError(
+                f"phase.long_range scores detections, but phase.task={self.task}; give phase.long_range=null"
+            )
         require_least(self, "phase", {"epochs": 1, "validate_every": 1})
+
+    def evaluator(self, datamodule: DetectionDataModule) -> Evaluator:
+        """What scores a validation of these data."""
+        kind = EVALUATORS[self.task]
+        return kind.of(datamodule) if self.long_range is None else kind.of(datamodule, self.long_range)

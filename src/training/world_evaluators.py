@@ -15,12 +15,13 @@ import torch
 from torch import Tensor
 
 from src.data.datamodule import DetectionDataModule
+from src.data.rays import TRUE_MARGIN_M
 from src.data.schema import DatasetIndex
 from src.data.timeline import TimelineConfig
 from src.data.true_geometry import TRUTH_FOLDER, TrueGeometry
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.metrics.bootstrap import LEVEL, NUM_DRAWS, SEED, interval
+from src.metrics.bootstrap import interval, intervals_of
 from src.metrics.diagnostics import ratios
 from src.metrics.forecast_text import format_forecast, format_occupancy
 from src.metrics.forecasting import HORIZONS_S, ForecastScores, median_errors, score_forecast, sums_by_sample
@@ -42,8 +43,6 @@ SAMPLING = RaySampling(min_free_m=1.5, depth_m=0.1, num_queries=4096, ray_balanc
 """Places along rays that are asked for: as the paper's training draws them, fewer."""
 MOVING_MPS = 1.0
 """What is faster over ground moves."""
-TRUE_MARGIN_M = 0.3
-"""Boxes are grown by it where it is asked what a measured point belongs to."""
 SLICE_WINDOW, SLICE_CELL_M = ((-40.0, 40.0), (-40.0, 40.0)), 1.0
 """Where the true geometry is compared with, above the ground."""
 SUBSETS = ("", "_moving", "_unseen")
@@ -215,13 +214,13 @@ class OccupancyEvaluator(Evaluator):
 
     def _intervals(self, sums: Mapping[str, Array], scenes: Array) -> dict[str, Any]:
         """As those of a detection's metrics.json: scenes are drawn again with replacement."""
-        names, scenes = np.unique(scenes, return_inverse=True)
-        bounds = {}
-        if len(names) > 1:
-            draws = np.random.default_rng(SEED).multinomial(len(names), np.full(len(names), 1 / len(names)), NUM_DRAWS)
-            drawn = self._ratios(sums, draws[:, scenes])
-            bounds = {name: found for name, values in drawn.items() if (found := interval(values)) is not None}
-        return {"scenes": len(names), "draws": NUM_DRAWS, "level": LEVEL, "bounds": bounds}
+        _, places = np.unique(scenes, return_inverse=True)
+
+        def bounds(draws: Array) -> dict[str, list[float]]:
+            drawn = self._ratios(sums, draws[:, places])
+            return {name: found for name, values in drawn.items() if (found := interval(values)) is not None}
+
+        return intervals_of(scenes, bounds)
 
     def as_dict(self) -> dict[str, Any]:
         """Every number by its name, null where undefined, and `intervals`."""

@@ -110,10 +110,37 @@ def test_model_that_reads_lidar_alone(outputs, tmp_path):
     assert result["lidar_points"] > 0 and "radar_points" not in result
 
 
-@pytest.mark.parametrize(("suite", "why"), [("scaling", "reads lidar"), ("ops", "radar backbone")])
-def test_a_suite_that_makes_no_sense_for_a_model_says_why(suite, why):
-    with pytest.raises(ConfigError, match=f"suite={suite} .*centerpoint|suite={suite} .*{why}"):
-        main([f"suite={suite}", "scale=debug", "model=centerpoint", "phase=phase1", "data.world.lidar=true"])
+LRS = ("model=lrs4fusion", "phase=lrs_occupancy", "model.late_encoder.max_sites=[4000,2000,1000,500]")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_profiler")
+def test_model_that_learns_from_rays_alone(outputs, tmp_path):
+    """No world is written for it."""
+    result = measured("model_lrs4fusion_lrs_occupancy_debug", outputs / "none", tmp_path, "suite=model", *LRS)
+    parts = column(result["time by part"], "part", "f+b ms")
+    whole = "whole: frame to answers, step to gradients"
+    assert {"pointnet", "unet", "stem", "late_encoder", "temporal", "decoders", whole} <= set(parts)
+    assert all(parts[name] > 0 for name in ("unet", "late_encoder", "decoders", whole)) and "neck" not in parts
+    assert result["lidar_points"] == 1500 and result["state"]["sites_1"] > 0
+    assert not list(outputs.glob("none/worlds/*"))
+
+
+@pytest.mark.slow
+def test_scaling_of_a_model_that_reads_lidar(outputs, tmp_path, monkeypatch):
+    monkeypatch.setattr(scaling, "LIDAR_RANGES_M", (40.0, 80.0))
+    result = measured("scaling_lrs4fusion_lrs_occupancy_debug", outputs, tmp_path, "suite=scaling", *LRS)
+    rows = result["range, fixed scene"]
+    assert [row["range, fixed scene"] for row in rows] == [40, 80] and {row["lidar points"] for row in rows} == {1500}
+    assert {row["model"] for row in rows} == {"lrs4fusion"} and all(row["unet ms"] > 0 for row in rows)
+    (growth,) = result["growth"]
+    assert (growth["from"], growth["to"]) == (40, 80) and growth["lrs4fusion time x"] > 0
+    assert (tmp_path / "scaling_lrs4fusion_lrs_occupancy_debug.png").is_file()
+
+
+def test_a_suite_that_makes_no_sense_for_a_model_says_why():
+    with pytest.raises(ConfigError, match="suite=ops .*centerpoint|suite=ops .*radar backbone"):
+        main(["suite=ops", "scale=debug", "model=centerpoint", "phase=phase1", "data.world.lidar=true"])
 
 
 @pytest.mark.slow

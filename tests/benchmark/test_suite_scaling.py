@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from src.benchmark.cases import CELLS_PER_VEHICLE
-from src.benchmark.scenes import ROADS, Highway, highway_frame, highway_points
+from src.benchmark.scenes import ROADS, Highway, highway_frame, highway_points, lidar_frame
 from src.benchmark.suite_scaling import NOMINAL_M, RANGES_M, Point, configs_of, growth_rows, settings_at, sweeps_of
 from src.config import compose_config
 
@@ -53,6 +53,30 @@ def test_a_longer_road_begins_as_the_shorter_one():
 def test_twice_the_traffic_gives_twice_its_returns():
     numbers = [len(highway_points(replace(ROAD, num_vehicles=number))) for number in (0, 20, 40)]
     assert numbers[0] == 400 and abs(numbers[1] - 600) <= 2 and abs(numbers[2] - 800) <= 2
+
+
+def test_lidar_rays_end_on_the_road_and_what_stands_beside_it():
+    road = replace(ROAD, lidar_returns=2000, reach_m=100.0)
+    frame = lidar_frame(road)
+    points, rays = frame.lidar_points[:, :3], frame.rays
+    assert len(points) == 2000 and torch.equal(points, rays.points)
+    assert torch.equal(lidar_frame(road).rays.ranges, rays.ranges)
+    torch.testing.assert_close(rays.directions.norm(dim=1), torch.ones(2000))
+    assert points[:, :2].abs().max() < 100.5 and points[:, 1].abs().max() < 30.1 and points[:, 2].min() > -0.1
+    ground, beside = points[:, 2] < 0.1, (points[:, 1].abs() - 13.0).abs() < 0.1
+    assert ground.float().mean() > 0.3 and (beside & ~ground).sum() > 50
+    on_vehicles = ~ground & (points[:, 1].abs() < 12.0)
+    empty = lidar_frame(replace(road, num_vehicles=0)).lidar_points
+    assert on_vehicles.sum() > 50 and not ((empty[:, 2] > 0.2) & (empty[:, 1].abs() < 12.0)).any()
+    assert rays.steps.bincount().tolist() == [500] * 4
+
+
+def test_a_region_reaches_so_far_in_whole_voxels_of_the_coarsest_level():
+    settings = compose_config(["scale=paper", "data=synthetic", "model=lrs4fusion", "phase=lrs_occupancy"])[0].model
+    roi = settings.at_range(100.0).roi
+    assert roi.upper_m[:2] == [100.0, 100.0] and roi.lower_m == [-100.0, -100.0, -12.0]
+    assert 300.0 <= settings.at_range(300.0).roi.upper_m[0] < 302.0
+    settings.at_range(300.0).roi.build(5)  # or an error
 
 
 def test_a_point_ahead_of_a_camera_is_seen_where_it_should_be():

@@ -42,6 +42,7 @@ def golden_set(golden) -> EvaluationSet:
     return EvaluationSet(
         tokens=tokens,
         ego_centers=np.array([sample["ego_translation"] for sample in golden["samples"]]),
+        ego_rotations=np.tile([1.0, 0.0, 0.0, 0.0], (len(tokens), 1)),
         scene_tags=[tuple(sample["scene_description"].split(";")) for sample in golden["samples"]],
         ground_truth=table_of(golden["gt"], tokens),
         racks=table_of(golden["bicycle_racks"], tokens),

@@ -87,6 +87,7 @@ def laid_end_to_end(evaluation_set, predictions, diagnoses, draw):
     columns = {
         "tokens": [str(row) for row in range(len(rows))],
         "ego_centers": evaluation_set.ego_centers[samples],
+        "ego_rotations": evaluation_set.ego_rotations[samples],
         "scene_tags": [evaluation_set.scene_tags[sample] for sample in samples],
         "ground_truth": DetectionTable.concatenate(truths),
         "racks": DetectionTable.concatenate(racks),

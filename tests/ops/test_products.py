@@ -30,6 +30,14 @@ def test_other_types_are_multiplied_as_they_are(library):
         assert torch.equal(multiply(a.to(dtype), b.to(dtype)), a.to(dtype) @ b.to(dtype))
 
 
+def test_autocast_does_not_round_what_its_caller_keeps_in_float32(library):
+    a, b, bias = torch.rand(256, 64), torch.rand(64, 64), torch.rand(64)
+    with torch.autocast("cpu", torch.bfloat16):
+        plain, with_bias = multiply(a, b), multiply(a, b, bias)
+    torch.testing.assert_close(plain.double(), a.double() @ b.double(), rtol=1e-5, atol=0)
+    torch.testing.assert_close(with_bias.double(), a.double() @ b.double() + bias.double(), rtol=1e-5, atol=0)
+
+
 def test_large_products_of_float32_take_bfloat16_in_its_context(monkeypatch):
     monkeypatch.setattr(products, "multiplies_bfloat16", lambda: True)
     large, short, narrow = torch.zeros(4096, 64), torch.zeros(128, 64), torch.zeros(4096, 16)

@@ -47,6 +47,23 @@ def test_a_run_is_published_and_read(published, reports):
     assert read_results(reports, "mini") == ({result.run_id: result}, {}) and read_results(reports, "debug") == ({}, {})
 
 
+def test_the_second_score_of_detections_is_read_by_name(write_run, reports):
+    folder = write_run("a", [], 0, 0.3)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    own = {name: metrics[name] for name in ("mAP", "NDS", "mAVE", "classes")}
+    path = "long_range.ranges.150-250.mAP"
+    (folder / "metrics.json").write_text(
+        json.dumps(
+            metrics
+            | {"long_range": own | {"mAP": 0.6, "ranges": {"150-250": own | {"mAP": 0.1}}}}
+            | {"intervals": {"scenes": 20, "draws": 500, "level": 0.95, "bounds": {path: [0.0, 0.2]}}}
+        )
+    )
+    result = read_result(publish_result(folder, reports))
+    assert result.metrics["mAP"] == 0.3 and result.metrics["long_range.mAP"] == 0.6
+    assert result.metrics[path] == 0.1 and result.intervals == {path: [0.0, 0.2]}
+
+
 def with_intervals(folder, bounds, scenes=20):
     path = folder / "metrics.json"
     metrics = json.loads(path.read_text()) | {"measures": {"moving_AP": 0.4, "moving_boxes": 9, "history_near": None}}

@@ -10,7 +10,7 @@ from pathlib import Path
 from src.errors import HorizonError
 from src.report.sweep_file import DimensionConfig, RowConfig, SweepConfig
 from src.sweep.launcher import Launcher
-from src.sweep.plan import make_plan
+from src.sweep.plan import make_plan, without_published
 from src.sweep.record_writer import RecordWriter
 from src.sweep.runner import Runner
 from src.sweep.search import Search
@@ -27,10 +27,12 @@ def make_sweep(rows=None, space=None, **more):
     return SweepConfig(name="fake", title="t", question="q", rows=rows, space=space, **more)
 
 
-def make_runner(folder, sweep, seeds=(0,), common=(), workers=1, definition=None, storage=None, publish=None):
+def make_runner(
+    folder, sweep, seeds=(0,), common=(), workers=1, definition=None, storage=None, publish=None, results=()
+):
     outputs, reports = Path(folder) / "outputs", Path(folder) / "reports"
     common = [*common, f"paths.outputs={outputs}"]
-    plan = make_plan(sweep, common, list(seeds), identify)
+    plan = without_published(make_plan(sweep, common, list(seeds), identify), results)
     definition = definition or {"format": 1, "kind": "search" if sweep.is_search else "rows"}
     study = SweepStudy(outputs, plan.study, storage or default_storage(outputs), definition)
     writer = RecordWriter(plan, study, "the command", outputs, reports)

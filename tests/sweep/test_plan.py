@@ -4,7 +4,7 @@ import pytest
 
 from src.errors import ConfigError
 from src.report.sweep_record import suffix_of
-from src.sweep.plan import changes_of, join_overrides, make_plan, split_machine
+from src.sweep.plan import changes_of, join_overrides, make_plan, split_machine, without_published
 from tests.sweep.fake_sweep import make_sweep
 from tests.sweep.fake_train import identify
 
@@ -47,6 +47,24 @@ def test_a_run_that_no_row_shows_says_what_it_is_for():
     first, second = plan.specs.values()
     assert first.label == "weights for b" and plan.labels(first.run_id) == [] and second.needs == first.run_id
     assert first.command == "python -m src.train phase=phase1 seed=0 paths.outputs=o"
+
+
+def test_what_has_a_result_is_not_trained_nor_what_only_it_starts_from():
+    rows = {"one": ["phase=phase1"], "two": ["phase=phase2"], "three": ["phase=phase2", "optim.lr=1"]}
+    plan = make_plan(make_sweep(rows), [], [0], identify)
+    one, two, three = (plan.rows[row][0] for row in rows)
+    lr = plan.specs[three].needs
+    assert list(plan.specs) == [one, lr, two, three]
+
+    rest = without_published(plan, {two})
+    assert list(rest.specs) == [one, lr, two, three] and rest.published == {two}
+    rest = without_published(plan, {three})  # nothing else starts from the weights of that learning rate
+    assert list(rest.specs) == [one, two, three] and rest.published == {three}
+    rest = without_published(plan, {one, lr, three})  # the weights that row two starts from are not there
+    assert list(rest.specs) == [one, two, three] and rest.published == {three}
+    rest = without_published(plan, {one, two, three})
+    assert list(rest.specs) == [one, two, three] and len(rest.published) == 3
+    assert without_published(plan, set()) == plan
 
 
 def test_a_row_that_does_not_compose_is_named_with_its_file():

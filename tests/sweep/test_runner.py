@@ -89,6 +89,19 @@ def test_what_rows_start_from_comes_first_and_is_shared(tmp_path):
     assert set(trained(tmp_path).values()) == {1} and record.count("done") == 3
 
 
+def test_rows_with_a_result_are_done_without_training(tmp_path):
+    rows = {"one": ["phase=phase1"], "two": ["phase=phase2"], "three": ["phase=phase2", "model.dptf=null"]}
+    results = make_runner(tmp_path / "elsewhere", make_sweep(rows)).plan.rows
+    published = []
+    runner = make_runner(
+        tmp_path, make_sweep(rows), results={results["one"][0], results["two"][0]}, publish=published.append
+    )
+    record = runner.run()
+    assert record.count("done") == 3 and record.runs[results["two"][0]].log is None
+    assert trained(tmp_path) == {results["one"][0]: 1, results["three"][0]: 1}  # row three starts from row one
+    assert {path.name for path in published} == {results["one"][0], results["three"][0]}
+
+
 def test_a_failed_row_is_reported_and_retried_by_the_next_call(tmp_path):
     rows = {"good": ["model.x=1"], "bad": ["model.x=2"], "killed": ["model.x=3"]}
     bad = fault(tmp_path, ["model.x=2", "seed=0"], "5", "3")

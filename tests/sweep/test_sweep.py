@@ -177,8 +177,7 @@ def test_a_real_sweep_ends_with_its_table_and_goes_on_from_there(sweeps, places,
         made = json.loads((outputs / run_id / "run.json").read_text())
         assert [o for o in made["overrides"] if not o.startswith(("paths.", "trainer."))] == run.overrides
         assert run.overrides == ["phase=phase1", run.overrides[1], "scale=debug", "phase.epochs=1", "seed=0"]
-        # What the runner costs beside the training process: under two seconds on a quiet machine.
-        assert run.ended - run.started < made["seconds"]["all"] + 60
+        assert run.ended - run.started >= made["seconds"]["all"]
         assert (tmp_path / "reports" / "results" / f"{run_id}.json").is_file()
     for suffix in ("md", "csv", "tex"):
         assert (tmp_path / "reports" / "tables" / f"{record.stem}.{suffix}").is_file()

@@ -136,7 +136,10 @@ def test_numbers_of_the_second_paper_are_those_reported():
     assert {row.label: row.paper for row in history.paper_rows} == wanted and not any(r.paper for r in history.rows)
     ours = [row for row in tables["table5_longrange_detection"]["rows"] if row["method"].startswith("LRS4Fusion")]
     assert ["w/o pre-train" in row["method"] for row in ours] == [True, False]
-    assert [row.paper for row in pretraining.rows] == [{"mAP": row["mAP_full"]} for row in ours]
+    names = {"": "mAP_full", "ranges.0-50.": "mAP_SR", "ranges.50-150.": "mAP_MR", "ranges.150-250.": "mAP_LR"}
+    assert [row.paper for row in pretraining.rows] == [
+        {f"long_range.{path}mAP": row[key] for path, key in names.items()} for row in ours
+    ]
     configs = [build_config(tree_of("paper", overrides_of(pretraining, row))) for row in pretraining.rows]
     assert [config.phase.init_from for config in configs] == [None, "lrs_occupancy"]
 

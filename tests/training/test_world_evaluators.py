@@ -124,7 +124,9 @@ def test_a_model_that_knows_is_right_at_every_time(tmp_path):
     assert found["cd_unseen_3s"] == pytest.approx(0, abs=1e-8)  # behind the wall nothing had been seen
     assert "velocity_error_moving" not in found and "cd_moving_3s" not in found  # nobody knows what moves
     assert found["intervals"]["scenes"] == 2 and found["intervals"]["bounds"]["cd_gain_3s"] == pytest.approx([1, 1])
-    assert "Chamfer, unseen" in evaluator.describe(found) and "3.0s" in evaluator.describe(found)
+    text = evaluator.describe(found)
+    (unseen,) = [line for line in text.splitlines() if line.startswith("Chamfer, unseen")]
+    assert unseen.split()[-3:] == ["100.0", "[100.0,", "100.0]"] and "below, % 1s" in text and "3.0s" in text
 
 
 def _mean_secant():

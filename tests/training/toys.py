@@ -161,7 +161,8 @@ def toy_trainer(
     )  # fmt: skip
     phase = PhaseConfig(
         name="toy", module="TemporalModule", task="detection", monitor="val/mAP", temporal=True, init_from=None,
-        train_missing=False, frozen_statistics=False, epochs=epochs, validate_every=validate_every, options={},
+        train_missing=False, frozen_statistics=False, epochs=epochs, validate_every=validate_every, long_range=None,
+        options={},
     )  # fmt: skip
     loggers = build_loggers(folder, resume, None) if is_main_process() else []
     trainer = build_trainer(folder, config, phase, precision=precision, ema_decay=ema, loggers=loggers)

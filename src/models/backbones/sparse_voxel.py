@@ -140,9 +140,8 @@ class VoxelEncoder(nn.Module):
         )
         if self.point_count_channel:
             features = torch.cat([features, counts.to(features.dtype).log()[:, None]], dim=1)
-        cells = sites.indices() if self.ndim == 3 else sites.indices()[:, [0, 2, 3]]
-        sites, _ = Sites.from_indices(cells, (batch_size, *self.input_shape))  # sorted already: the order is kept
-        return SparseMap(sites, features)
+        axes = None if self.ndim == 3 else (0, 2, 3)
+        return SparseMap(sites.on_grid((batch_size, *self.input_shape), axes), features)
 
     def encode(self, voxels: SparseMap) -> SparseBEV:
         """Voxel features to the map."""

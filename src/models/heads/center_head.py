@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import constant
 from src.losses.classification import penalty_reduced_focal
 from src.losses.normalizers import full_precision, mean_over_ranks
 from src.losses.regression import masked_l1
@@ -30,6 +31,7 @@ from src.models.layers.dense import AllCells, DenseConvNormReLU
 from src.models.layers.doppler import Doppler
 from src.models.layers.sparse import ConvNormReLU, SubmanifoldConv
 from src.ops.nms import maxpool_peaks
+from src.ops.segment_reduce import segment_count
 from src.structures.boxes import Boxes3D
 from src.structures.sparse_bev import SparseBEV
 from src.structures.taxonomy import ATTRIBUTES, CLASSES, MAX_BOXES_PER_SAMPLE
@@ -125,7 +127,7 @@ class CenterHead(nn.Module):
         widths = (*CODE_WIDTHS, len(ATTRIBUTES)) if self.learned else CODE_WIDTHS
         self.regressions = nn.ModuleList(Branches(channels, widths) for _ in HEAD_GROUPS)
         in_group_order = [CLASSES.index(name) for group in HEAD_GROUPS for name in group]
-        self.class_columns = [in_group_order.index(label) for label in range(len(CLASSES))]
+        self.class_columns = tuple(in_group_order.index(label) for label in range(len(CLASSES)))
 
     def forward(
         self,
@@ -138,7 +140,7 @@ class CenterHead(nn.Module):
             logits = checkpointed_branches(list(self.heatmaps), bev.features)
         else:  # prepared for inference
             logits = self.heatmaps[0](bev.features)
-        logits = logits[:, self.class_columns]
+        logits = logits.index_select(1, constant(self.class_columns, torch.int64, logits.device))
         codes = None
         if self.training and self.config.train_regression is TrainRegression.all:
             codes = torch.stack([checkpointed_branches([part], bev.features) for part in self.regressions], dim=1)
@@ -158,7 +160,7 @@ class CenterHead(nn.Module):
         if output.codes is not None:
             return _measured(output, output.codes[rows, groups], rows)
         order = groups.argsort(stable=True)
-        counts = torch.bincount(groups, minlength=len(HEAD_GROUPS)).tolist()
+        counts = segment_count(groups, len(HEAD_GROUPS)).tolist()
         return _measured(output, self._regress_by_group(output, rows[order], counts)[order.argsort()], rows)
 
     def _regress_by_group(
@@ -207,7 +209,7 @@ class CenterHead(nn.Module):
             "shared_objects": targets.num_shared,
         }
         diagnostics = {name: count / len(boxes) for name, count in counts.items()}
-        group_of_class = targets.labels.new_tensor(GROUP_OF_CLASS)
+        group_of_class = constant(GROUP_OF_CLASS, torch.int64, targets.labels.device)
         zeros = output.logits.new_zeros(len(HEAD_GROUPS))
         terms: dict[str, Tensor] = {}
         if heatmap_weight is not None:
@@ -219,8 +221,9 @@ class CenterHead(nn.Module):
             return Objective(terms, diagnostics)
         predicted = self.regress(output, targets.rows, targets.groups)
         if box_weight is not None:
-            errors = masked_l1(predicted[:, :CODE_SIZE], targets.codes) * zeros.new_tensor(self.code_weights)
-            objects = torch.bincount(targets.groups, minlength=len(HEAD_GROUPS))
+            code_weights = constant(self.code_weights, zeros.dtype, zeros.device)
+            errors = masked_l1(predicted[:, :CODE_SIZE], targets.codes) * code_weights
+            objects = segment_count(targets.groups, len(HEAD_GROUPS))
             sums = zeros.index_add(0, targets.groups, errors.sum(1))
             terms["box"] = box_weight * (sums / mean_over_ranks(objects)).sum()
         if self.learned:

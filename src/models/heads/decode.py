@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant
+from src.geometry.constants import constant, on_device
 from src.ops.nms import conflicting_pairs, greedy_survivors
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import ATTRIBUTES, CLASS_ATTRIBUTE_PREFIX, CLASS_RANGE_M, CLASSES
@@ -172,7 +172,7 @@ def suppress(
             row = next(survivors, None)
         chosen[block % len(chosen)] += [row for row in kept[:MAX_BOXES_PER_GROUP] if near[row]]
     best = [sorted(rows, key=lambda row: -scores[row])[:max_boxes] for rows in chosen]  # stable: ties by group
-    return [boxes[torch.tensor(rows, dtype=torch.int64, device=boxes.labels.device)] for rows in best]
+    return [boxes[on_device(rows, torch.int64, boxes.labels.device)] for rows in best]
 
 
 def rule_attributes(

@@ -106,7 +106,7 @@ def ocsf_losses(
         batch_size, *plane = cells.occupied.shape
         focal, dice = occupancy_losses(cells.log_free, cells.support, raster.keys, batch_size, math.prod(plane))
         if config.occupancy_focal_weight is not None:
-            normalizer = mean_over_ranks(raster.keys.new_tensor(len(raster.keys)))
+            normalizer = mean_over_ranks(raster.keys.new_full((), len(raster.keys)))
             terms["occupancy_focal"] = config.occupancy_focal_weight * focal / normalizer
         if config.occupancy_dice_weight is not None:
             terms["occupancy_dice"] = config.occupancy_dice_weight * dice

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import constant
 from src.ops.segment_reduce import segment_sum
 from src.ops.sites import rows_of_keys
 
@@ -64,7 +65,7 @@ class Doppler:
         offsets = torch.cartesian_prod(reach, reach)  # [25, 2] (row, col)
         weights = (WINDOW_CELLS + 1 - offsets.abs()).prod(dim=1).to(xy.dtype)
         cells = grid.cell_of(xy)[:, None] + offsets  # [P, 25, 2]
-        limit = torch.tensor(grid.cells, device=xy.device)
+        limit = constant(tuple(grid.cells), torch.int64, xy.device)
         point, offset = ((cells >= 0) & (cells < limit)).all(dim=2).nonzero().unbind(1)
         row, col = cells[point, offset].unbind(1)
         linear = (radar_batch[inside][point] * grid.rows + row) * grid.cols + col

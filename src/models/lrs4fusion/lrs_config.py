@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import ClassVar
+from typing import ClassVar, Self
 
 from src.errors import ConfigError, require_least
 from src.geometry.voxel_grid import VoxelGrid
@@ -122,6 +123,14 @@ class LRS4FusionConfig(ModelConfig):
                 "model.temporal.velocity_compensation=true needs model.decoders.velocity=true, which predicts it"
             )
         self.roi.build(len(self.unet.encoder_channels))
+
+    def at_range(self, range_m: float) -> Self:
+        """As near to it as whole voxels of the coarsest level allow; as high as before."""
+        step = 2 ** (len(self.unet.encoder_channels) - 1)
+        half = [math.ceil(2 * range_m / (step * size)) * step * size / 2 for size in self.roi.voxel_m[:2]]
+        lower, upper = ([sign * x for x in half] for sign in (-1, 1))
+        roi = replace(self.roi, lower_m=[*lower, self.roi.lower_m[2]], upper_m=[*upper, self.roi.upper_m[2]])
+        return replace(self, roi=roi)
 
     @property
     def keys_of_temporal_phase(self) -> tuple[str, ...]:

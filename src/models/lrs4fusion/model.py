@@ -136,7 +136,7 @@ class LRS4Fusion(Detector, WorldModel):
             indices = volume.indices
             centres = self.temporal.grid.centre_of(indices[:, 1:])
             now = torch.cat([centres, torch.zeros_like(centres[:, :1])], dim=1)
-            speeds = self._in_parts(self.velocity, volumes, now, indices[:, 0])
+            speeds = torch.cat(_in_parts(partial(self.decoders.velocities, volumes), now, indices[:, 0]))
         return self.temporal.remember(volume, speeds, batch)
 
     def transition(self, batch: FrameBatch, memory: VolumeMemory | None) -> VolumeMemory | None:
@@ -147,53 +147,15 @@ class LRS4Fusion(Detector, WorldModel):
         """The memory that `VolumeMemory.state` described."""
         return VolumeMemory.from_state(state)
 
-    def answers(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> tuple[Tensor, Tensor | None]:  # [Q], [Q]
-        """Logits of occupancy and radial velocities (m/s) of queries [Q, 4] and their samples [Q]; see `Decoders`."""
-        return self.decoders(volumes, queries, batch)
-
-    def occupancy_logits(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> Tensor:  # [Q]
-        """The first of `answers` alone."""
-        return self.decoders.occupancy_logits(volumes, queries, batch)
-
-    def velocity(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> Tensor:  # [Q] m/s
-        """The second of `answers` alone. Raises ConfigError for a model that predicts none."""
-        return self.decoders.velocities(volumes, queries, batch)
-
-    def ray_ranges(
-        self,
-        volumes: Volumes,
-        origins: Tensor,  # [R, 3] m, aug frame
-        directions: Tensor,  # [R, 3] of length 1
-        times_s: Tensor,  # [R] from the frame's time
-        batch: Tensor,  # [R] int64, sample of each ray
-    ) -> Tensor:  # [R] m
-        """Ranges that a LiDAR would measure; gradients go to the ray head alone.
-
-        Raises ConfigError for a model without ray head, that is of another stage than `forecast`.
-        """
-        if self.ray_head is None:
-            raise ConfigError(f"phase.options.stage={self.stage}: ranges of rays need the stage {LRSStage.forecast}")
-        return self.ray_head(self.ray_occupancy(volumes, origins, directions, times_s, batch))
-
     @torch.no_grad()
-    def ray_occupancy(
-        self, volumes: Volumes, origins: Tensor, directions: Tensor, times_s: Tensor, batch: Tensor
-    ) -> Tensor:  # [R, N]
+    def ray_occupancy(self, volumes: Volumes, rays: RayBundle) -> Tensor:  # [R, N]
         """Probability of occupancy at the ray head's samples along every ray."""
         samples = self.ray_head.samples_m
-        points = origins[:, None] + samples[:, None] * directions[:, None]  # [R, N, 3]
-        queries = torch.cat([points, times_s[:, None, None].expand(-1, len(samples), 1)], dim=2).flatten(0, 1)
-        logits = self._in_parts(self.occupancy_logits, volumes, queries, batch.repeat_interleave(len(samples)))
-        return logits.view(len(origins), len(samples)).sigmoid()
-
-    @staticmethod
-    @torch.no_grad()
-    def _in_parts(
-        ask: Callable[[Volumes, Tensor, Tensor], Tensor], volumes: Volumes, queries: Tensor, batch: Tensor
-    ) -> Tensor:  # [Q]
-        """The answers to many queries, a part of them at a time, without gradient."""
-        parts = zip(queries.split(QUERIES_AT_ONCE), batch.split(QUERIES_AT_ONCE), strict=True)
-        return torch.cat([ask(volumes, *part) for part in parts])
+        points = rays.origins[:, None] + samples[:, None] * rays.directions[:, None]  # [R, N, 3]
+        queries = torch.cat([points, rays.times_s[:, None, None].expand(-1, len(samples), 1)], dim=2).flatten(0, 1)
+        ask = partial(self.decoders.occupancy_logits, volumes)
+        logits = torch.cat(_in_parts(ask, queries, rays.batch.repeat_interleave(len(samples))))
+        return logits.view(len(rays), len(samples)).sigmoid()
 
     @property
     def bounds(self) -> Bounds:
@@ -205,16 +167,16 @@ class LRS4Fusion(Detector, WorldModel):
         """Of the stage `forecast` alone."""
         return self.ray_head is not None
 
-    @torch.no_grad()
     def look_up(self, output: LRSOutput, queries: Tensor, batch: Tensor) -> tuple[Tensor, Tensor | None]:
         """As in `WorldModel`."""
-        parts = zip(queries.split(QUERIES_AT_ONCE), batch.split(QUERIES_AT_ONCE), strict=True)
-        logits, speeds = zip(*(self.answers(output.volumes, *part) for part in parts), strict=True)
+        logits, speeds = zip(*_in_parts(partial(self.decoders, output.volumes), queries, batch), strict=True)
         return torch.cat(logits).sigmoid(), None if speeds[0] is None else torch.cat(speeds)
 
     def forecast(self, output: LRSOutput, rays: RayBundle) -> Tensor:  # [R] m
-        """As in `WorldModel`, by `ray_ranges`."""
-        return self.ray_ranges(output.volumes, rays.origins, rays.directions, rays.times_s, rays.batch)
+        """As in `WorldModel`; gradients go to the ray head alone."""
+        if self.ray_head is None:
+            raise ConfigError(f"phase.options.stage={self.stage}: ranges of rays need the stage {LRSStage.forecast}")
+        return self.ray_head(self.ray_occupancy(output.volumes, rays))
 
     def loss_terms(self, output: LRSOutput, batch: FrameBatch) -> Objective:
         """Weighted terms of the stage: `heatmap` and `box`; `occupancy` and `velocity`; or `range`.
@@ -230,8 +192,7 @@ class LRS4Fusion(Detector, WorldModel):
                 "data.num_future_frames=2"
             )
         if self.stage is LRSStage.occupancy:
-            answer = partial(self.answers, output.volumes)
-            return occupancy_objective(answer, batch.rays, self.bounds, weights)
+            return occupancy_objective(partial(self.decoders, output.volumes), batch.rays, self.bounds, weights)
         return range_objective(partial(self.forecast, output), batch.rays, self.bounds, weights)
 
     def decode(self, output: LRSOutput) -> list[Boxes3D]:
@@ -248,3 +209,10 @@ class LRS4Fusion(Detector, WorldModel):
             values[f"sites_{scale + 1}"] = len(volume) / frames
             values[f"dropped_sites_{scale + 1}"] = dropped / frames
         return values
+
+
+@torch.no_grad()
+def _in_parts(ask: Callable[[Tensor, Tensor], Any], queries: Tensor, batch: Tensor) -> list[Any]:
+    """The answers to many queries [Q, 4] and their samples [Q], a part of them at a time, without gradient."""
+    parts = zip(queries.split(QUERIES_AT_ONCE), batch.split(QUERIES_AT_ONCE), strict=True)
+    return [ask(*part) for part in parts]

@@ -7,9 +7,13 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from src.benchmark.scenes import ROADS
+from src.benchmark.scenes import lidar_frame as made_frame
 from src.errors import ConfigError
 from src.models.deploy.inference import prepare_for_inference
 from src.structures.boxes import Boxes3D
+from src.structures.ray_bundle import RayBundle
+from src.targets.occupancy_rays import sample_queries
 from tests.models.learning import gradients_are_finite, train_step
 from tests.models.lrs4fusion.lrs_frames import cloud, lidar_frame, lrs_config, lrs_model
 from tests.models.moving import pose, tensors_of
@@ -36,6 +40,36 @@ def frame(counts=(400, 300), time_s=0.0, seed=0):
 def some_queries(count, batch_size=2):
     unit = torch.rand(count, 4, generator=torch.Generator().manual_seed(0))
     return (unit - 0.5) * torch.tensor([60.0, 60.0, 8.0, 6.0]), torch.arange(count) % batch_size
+
+
+def some_rays():
+    directions = F.normalize(torch.randn(6, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    return RayBundle(
+        origins=torch.tensor([[1.0, 0.0, 2.0]]).repeat(6, 1), directions=directions, ranges=torch.full((6,), 20.0),
+        times_s=torch.linspace(0, 3, 6), speeds=torch.full((6,), torch.nan), steps=torch.arange(6),
+        batch=torch.tensor([0, 0, 0, 1, 1, 1]),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "clouds",
+    [[cloud(0), cloud(0)], [cloud(0), cloud(200)], [cloud(50) + torch.tensor([500.0, 0, 0, 0, 0]), cloud(200)]],
+    ids=["no returns", "one without returns", "one beyond the region"],
+)
+@pytest.mark.parametrize(("options", "term"), [(OCCUPANCY, "occupancy"), (FORECAST, "range")])
+def test_frames_without_points_inside_teach_finite_steps_and_are_remembered_as_nothing(clouds, options, term):
+    model = lrs_model(options).train()
+    rays = some_rays()
+    output, memory = model(replace(lidar_frame(clouds), rays=rays))
+    assert sum(row == 0 for row in memory.frames[0].voxels.rows.tolist()) == 0
+    later, _ = model(replace(lidar_frame([cloud(100), cloud(100)], 0.5), rays=rays), memory)
+    for out in (output, later):
+        terms = model.loss(out, replace(lidar_frame(clouds), rays=rays)).terms
+        assert term in terms and terms["total"].isfinite()
+    terms["total"].backward()
+    assert all(p.grad.isfinite().all() for p in model.parameters() if p.grad is not None)
+    probability, _ = model.look_up(later, *some_queries(50))
+    assert probability.isfinite().all()
 
 
 def test_sensors_and_stages_that_there_are():
@@ -69,39 +103,36 @@ def test_occupancy_trains_everything_and_has_no_boxes():
     q, owner = some_queries(200)
     output, memory = model(batch)
     later, _ = model(frame(time_s=0.5), memory)
-    logits, speeds = model.answers(later.volumes, q, owner)
-    assert torch.equal(model.occupancy_logits(later.volumes, q, owner), logits)
-    assert torch.equal(model.velocity(later.volumes, q, owner), speeds)
+    logits, speeds = model.decoders(later.volumes, q, owner)
+    assert torch.equal(model.decoders.occupancy_logits(later.volumes, q, owner), logits)
+    assert torch.equal(model.decoders.velocities(later.volumes, q, owner), speeds)
     (logits.square().sum() + (speeds - 1).square().sum()).backward()
     zero = {name for name, p in model.named_parameters() if p.grad is None}
     assert zero == set() and model.head is None and model.ray_head is None
     with pytest.raises(ConfigError, match="boxes need the stage detection"):
         model.decode(output)
     with pytest.raises(ConfigError, match="ranges of rays need the stage forecast"):
-        model.ray_ranges(output.volumes, q[:, :3], q[:, :3], q[:, 3], owner)
+        model.forecast(output, some_rays())
 
 
 def test_forecasts_train_the_ray_head_alone(monkeypatch):
     model = lrs_model(FORECAST).train()
     before = {name: value.clone() for name, value in model.named_buffers()}
-    volumes = model(frame())[0].volumes
+    output = model(frame())[0]
     assert all(torch.equal(value, before[name]) for name, value in model.named_buffers())
-    origins, owner = torch.tensor([[1.0, 0.0, 2.0]]).repeat(6, 1), torch.tensor([0, 0, 0, 1, 1, 1])
-    directions = F.normalize(torch.randn(6, 3, generator=torch.Generator().manual_seed(0)), dim=1)
-    times = torch.linspace(0, 3, 6)
-    asked = (volumes, origins, directions, times, owner)
-    ranges = model.ray_ranges(*asked)
+    rays, volumes = some_rays(), output.volumes
+    ranges = model.forecast(output, rays)
     assert ranges.shape == (6,)
     ranges.sum().backward()
     assert {name.partition(".")[0] for name, p in model.named_parameters() if p.grad is not None} == {"ray_head"}
-    occupancy = model.ray_occupancy(*asked)
-    n = len(model.ray_head.samples_m)
-    samples = torch.cat([origins[4] + model.ray_head.samples_m[:, None] * directions[4], times[4].expand(n, 1)], 1)
-    expected = model.occupancy_logits(volumes, samples, owner[4].expand(n)).sigmoid()
+    occupancy = model.ray_occupancy(volumes, rays)
+    away = model.ray_head.samples_m[:, None]
+    samples = torch.cat([rays.origins[4] + away * rays.directions[4], rays.times_s[4].expand_as(away)], 1)
+    expected = model.decoders.occupancy_logits(volumes, samples, rays.batch[4].expand(len(away))).sigmoid()
     torch.testing.assert_close(occupancy[4], expected)
     monkeypatch.setattr("src.models.lrs4fusion.model.QUERIES_AT_ONCE", 100)
-    torch.testing.assert_close(model.ray_occupancy(*asked), occupancy)
-    assert model.ray_ranges(volumes, *(value[:0] for value in asked[1:])).shape == (0,)
+    torch.testing.assert_close(model.ray_occupancy(volumes, rays), occupancy)
+    assert model.forecast(output, rays[:0]).shape == (0,)
 
 
 def test_the_memory_changes_features_and_no_site():
@@ -167,22 +198,19 @@ def test_prepared_for_inference_it_gives_the_same():
     torch.testing.assert_close(a.head.logits, b.head.logits, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_occupancy_of_one_scene_is_learnt():
-    """A wall ahead, free before it and matter behind its face: from points on the face alone."""
-    model = lrs_model(OCCUPANCY, "model.temporal=null").train()
-    generator = torch.Generator().manual_seed(0)
-    face = torch.rand(600, 5, generator=generator) * torch.tensor([0.0, 40.0, 4.0, 20.0, 0.0])
-    face[:, :3] += torch.tensor([20.0, -20.0, -2.0])
-    batch = lidar_frame([face])
-    unit = torch.rand(3000, 4, generator=generator)
-    q = unit * torch.tensor([4.8, 36.0, 3.0, 0.0]) + torch.tensor([17.6, -18.0, -1.5, 0.0])
-    target, owner = (q[:, 0] > 20.0).float(), torch.zeros(3000, dtype=torch.int64)
-    optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
-    for _ in range(25):
-        logits = model.occupancy_logits(model.encode(batch), q, owner)
-        loss = F.binary_cross_entropy_with_logits(logits, target)
-        optimizer.zero_grad()
-        loss.backward()
+    """By the phase's own loss from rays alone, asked at other places along them: IoU at a threshold of a half."""
+    model = lrs_model(OCCUPANCY, "model.temporal=null", "model.loss.sampling.num_queries=1024").train()
+    batch = made_frame(replace(ROADS["debug"], reach_m=40.0))
+    optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 70)
+    for _ in range(70):
+        model.loss(model(batch)[0], batch).terms["total"].backward()
         optimizer.step()
-    found, truth = logits > 0, target > 0.5
-    assert (found & truth).sum() / (found | truth).sum() > 0.9
+        optimizer.zero_grad()
+        schedule.step()
+    asked = sample_queries(batch.rays, model.bounds, model.config.loss.sampling, torch.Generator().manual_seed(1))
+    queries = torch.cat([asked.points, asked.times_s[:, None]], dim=1)
+    found = model.look_up(model(batch)[0], queries, asked.batch)[0] > 0.5
+    assert (found & asked.occupied).sum() / (found | asked.occupied).sum() > 0.9

@@ -13,7 +13,12 @@ from triton.runtime.jit import JITFunction
 from src.geometry.bev_grid import BEVGrid
 from src.ops.gaussian_cells import gaussian_cells
 from src.ops.kernel_maps import submanifold_map
-from src.ops.kernels import farthest_point_triton, sparse_conv_triton, splat_triton
+from src.ops.kernels import (
+    farthest_point_triton,
+    neighbour_table_triton,
+    sparse_conv_triton,
+    splat_triton,
+)
 from src.ops.sites import Sites
 
 
@@ -42,11 +47,12 @@ def compile_only(launch):
 def main():
     driver.set_active(Target())
     JITFunction.run = compile_only(JITFunction.run)
-    for module in (farthest_point_triton, sparse_conv_triton, splat_triton):
+    for module in (farthest_point_triton, neighbour_table_triton, sparse_conv_triton, splat_triton):
         module.runs_kernels = lambda tensor: True
     valid = torch.ones(2, 700, dtype=torch.bool)
     farthest_point_triton.farthest_points_triton(torch.zeros(2, 700, 2), valid, torch.zeros(2).long(), 20)
 
+    neighbour_table_triton.neighbour_table_triton(*(torch.arange(size) for size in (80, 80, 9)))
     kernel_map = submanifold_map(Sites.from_linear(torch.arange(80), (1, 8, 10)), 3)
     for dtype, c_in, c_out in ((torch.float32, 5, 16), (torch.bfloat16, 96, 128)):
         features, weight = torch.zeros(80, c_in, dtype=dtype), torch.zeros(9, c_in, c_out, dtype=dtype)

@@ -1,0 +1,134 @@
+"""Triton's kernels on the simulated device: each launch is counted, and its plain form fills the output.
+
+The code around the kernels is that of a GPU. Gradients are not computed: nothing is launched or waited for by their
+values.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from types import ModuleType
+from typing import Any
+from unittest.mock import patch
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from src.benchmark.simulated_device import SimTensor, count_launch, host_values
+from src.ops import backend
+from src.ops.farthest_point import farthest_points_reference
+from src.ops.neighbour_table import neighbour_table_reference
+from src.ops.splat import log1mexp
+
+
+@contextmanager
+def simulated_kernels() -> Iterator[None]:
+    """Within the context tensors of the simulated device take the Triton path, whether Triton is installed or not."""
+    with ExitStack() as stack:
+        try:
+            importlib.import_module("triton")
+        except ImportError:
+            stack.enter_context(patch.dict(sys.modules, _stub()))  # and what is imported meanwhile goes with it
+        stack.enter_context(patch.object(backend, "_chosen", backend.TRITON))
+        for path in backend.KERNELS.values():
+            module = importlib.import_module(path)
+            stack.enter_context(patch.object(module, "runs_kernels", lambda tensor: isinstance(tensor, SimTensor)))
+            for name, function in KERNELS.items():
+                if hasattr(module, name):
+                    stack.enter_context(patch.object(module, name, _Launcher(name, function)))
+        yield
+
+
+def _stub() -> dict[str, ModuleType]:
+    """What the kernels' modules need of Triton to be imported."""
+    triton, language = ModuleType("triton"), ModuleType("triton.language")
+    triton.jit = lambda function=None, **options: function or (lambda own: own)
+    triton.cdiv = lambda a, b: -(-a // b)
+    triton.next_power_of_2 = lambda n: 1 << max(n - 1, 0).bit_length()
+    triton.language, language.constexpr = language, lambda value=None: value
+    return {"triton": triton, "triton.language": language}
+
+
+class _Launcher:
+    """Stands for a jitted kernel: `kernel[grid](...)` counts one launch and runs the plain form."""
+
+    def __init__(self, name: str, function: Callable[..., None] | None) -> None:
+        self.name, self.function = name, function
+
+    def __getitem__(self, grid: tuple[int, ...]) -> Callable[..., None]:
+        def launch(*args: Any, **options: Any) -> None:
+            count_launch(self.name, grid, *args)
+            if self.function is not None:
+                with torch.no_grad(), torch.utils._python_dispatch._disable_current_modes():
+                    self.function(*host_values(args))
+
+        return launch
+
+
+def _sample(points: Tensor, valid: Tensor, start: Tensor, picks: Tensor, num: int, count: int) -> None:
+    picks.copy_(farthest_points_reference(points, valid.bool(), start, count))
+
+
+def _search(keys: Tensor, corners: Tensor, taps: Tensor, table: Tensor, bits: Tensor, *sizes: int) -> None:
+    for out, found in zip((table, bits), neighbour_table_reference(keys, corners, taps), strict=True):
+        out.copy_(found)
+
+
+def _gather_product(
+    rows: Tensor, weight: Tensor, bias: Tensor, out: Tensor, order: Tensor, table: Tensor, *sizes: int
+) -> None:
+    total = torch.zeros(out.shape)
+    for matrix, seen in zip(weight.float(), table.long(), strict=True):
+        hit = (seen >= 0).nonzero().squeeze(1)
+        total.index_add_(0, hit, rows[seen[hit]].float() @ matrix)
+    out.copy_(total if bias.data_ptr() == out.data_ptr() else total + bias.float())
+
+
+def _log_free(
+    q: Tensor, gaussian: Tensor, surprise: Tensor, starts: Tensor, out: Tensor, num: int, extra: float, least: float
+) -> None:
+    own = (surprise[gaussian] + 0.5 * q + extra).clamp(min=least)
+    out.copy_(_segment_sum(log1mexp(own)[:, None], starts)[:, 0])
+
+
+def _cell_features(
+    q: Tensor, gaussian: Tensor, features: Tensor, starts: Tensor, rows: Tensor, out: Tensor, channels: int
+) -> None:
+    out.copy_(_segment_sum(torch.exp(-0.5 * q)[:, None] * features[gaussian], starts)[rows])
+
+
+def _nearest_cell(
+    q: Tensor, cell: Tensor, by_gaussian: Tensor, starts: Tensor, place: Tensor, support: Tensor, peak: Tensor,
+    peak_q: Tensor,
+) -> None:  # fmt: skip
+    for gaussian, (first, last) in enumerate(zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True)):
+        pairs = by_gaussian[first:last]
+        pairs = pairs[place[cell[pairs].long()] >= 0]
+        if len(pairs):
+            least = q[pairs].min()
+            peak[gaussian] = support[cell[pairs[q[pairs] == least]].long().min()]
+            peak_q[gaussian] = least
+
+
+def _segment_sum(values: Tensor, starts: Tensor) -> Tensor:
+    if len(values) == 0:
+        return values.new_zeros(len(starts) - 1, values.shape[1])
+    picks = torch.arange(len(values))
+    return F.embedding_bag(picks, values, starts.long(), mode="sum", include_last_offset=True)
+
+
+KERNELS: dict[str, Callable[..., None] | None] = {
+    "_sample": _sample,
+    "_search": _search,
+    "_gather_product": _gather_product,
+    "_span_product": None,
+    "_log_free": _log_free,
+    "_cell_features": _cell_features,
+    "_nearest_cell": _nearest_cell,
+    "_gaussian_gradient": None,
+}
+"""The plain form of every kernel, None where its values are a gradient."""
