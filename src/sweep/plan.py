@@ -158,17 +158,18 @@ def make_plan(
     return plan
 
 
-def without_published(plan: Plan, results: Collection[str]) -> Plan:
+def without_published(plan: Plan, results: Collection[str], training: bool = True) -> Plan:
     """The plan without training what has a result, by its run id, nor weights that only such runs start from.
 
-    A run with a result is trained all the same where one without begins from its weights.
+    A run with a result is trained all the same where one without begins from its weights; not where nothing is trained
+    at all.
     """
     needed: set[str | None] = set()
-    for spec in reversed(plan.specs.values()):
+    for spec in reversed(plan.specs.values()) if training else ():
         if spec.run_id in needed or (spec.run_id not in results and plan.labels(spec.run_id)):
             needed |= {spec.run_id, spec.needs}
     specs = {run_id: spec for run_id, spec in plan.specs.items() if run_id in needed or plan.labels(run_id)}
-    return replace(plan, specs=specs, published=frozenset(specs) - needed)
+    return replace(plan, specs=specs, published=frozenset(specs) & set(results) - needed)
 
 
 def compose_file(sweep: SweepConfig, common: list[str], identify: Identify) -> RunIdentity:
