@@ -25,5 +25,21 @@ def on_device(
     device: torch.device,
 ) -> Tensor:
     """The tensor of these values; from pinned memory, because a copy from other memory waits for a GPU."""
-    tensor = torch.tensor(values, dtype=dtype)
-    return tensor if device.type == "cpu" else tensor.pin_memory().to(device, non_blocking=True)
+    return upload([torch.tensor(values, dtype=dtype)], device)[0]
+
+
+def upload(
+    tensors: Sequence[Tensor],
+    device: torch.device,
+) -> list[Tensor]:
+    """The tensors on a device: from the host one copy for all of a type, for which it does not wait."""
+    if not tensors or tensors[0].device.type == device.type:
+        return list(tensors)
+    found = list(tensors)
+    for dtype in dict.fromkeys(tensor.dtype for tensor in tensors):
+        places = [place for place, tensor in enumerate(tensors) if tensor.dtype == dtype]
+        joined = torch.cat([tensors[place].flatten() for place in places]).pin_memory()
+        parts = joined.to(device, non_blocking=True).split([tensors[place].numel() for place in places])
+        for place, part in zip(places, parts, strict=True):
+            found[place] = part.view(tensors[place].shape)
+    return found

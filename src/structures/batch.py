@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -41,7 +41,7 @@ class FrameBatch(TensorFields):
     images: Tensor | None = None  # [B, N, 3, H, W] uint8 RGB
     image_valid: Tensor | None = None  # [B, N] bool, False where a camera is missing
     pix_from_aug: Tensor | None = None  # [B, N, 4, 4] float32: P_n over (0, 0, 0, 1); (u*d, v*d, d, 1) = P (x, y, z, 1)
-    boxes: list[Boxes3D] | None = None  # B, aug frame
+    boxes: list[Boxes3D] | None = None  # B, aug frame, on the host
     streams: Tensor | None = None  # [B] int64, unique: the stream that each row is the next frame of; None: unordered
     starts: Tensor | None = None  # [B] bool, the row begins a clip: memory of its stream ends; given with `streams`
     skipped: dict[str, int] = field(default_factory=dict)  # unreadable files skipped, by channel
@@ -108,6 +108,12 @@ class FrameBatch(TensorFields):
 
     def __len__(self) -> int:
         return len(self.tokens)
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> FrameBatch:
+        """The same on another device, but for the annotations: targets begin on the host, which waits for no sizes."""
+        past = tuple(frame.to(device, non_blocking) for frame in self.past)
+        moved = super(FrameBatch, replace(self, boxes=None, past=())).to(device, non_blocking)
+        return replace(moved, boxes=self.boxes, past=past)
 
     @property
     def device(self) -> torch.device:

@@ -21,6 +21,12 @@ class TensorFields:
         """The same on another device."""
         return self.map(lambda value: value.to(device, non_blocking=non_blocking))
 
+    def tensors(self) -> list[Tensor]:
+        """Every tensor, in the order in which `map` takes them."""
+        found: list[Tensor] = []
+        self.map(lambda value: found.append(value) or value)
+        return found
+
     def pin_memory(self) -> Self:
         """The same in page-locked memory, for the loader's transfer to a GPU."""
         return self.map(lambda value: value.pin_memory())

@@ -9,10 +9,11 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import cells_in_boxes
+from src.geometry.constants import upload
 from src.ops.segment_reduce import inverse_rows
 from src.ops.sites import rows_of_keys
 from src.structures.boxes import Boxes3D
-from src.targets.supervision import box_samples, join_boxes, supervised_boxes
+from src.targets.supervision import box_samples, join_boxes, supervised_boxes, upload_boxes
 
 
 class BoxRaster:
@@ -34,24 +35,28 @@ class BoxRaster:
         annotated: list[Boxes3D],  # B, augmented ego frame
         grid: BEVGrid,
         margin_m: float,
+        device: torch.device | None = None,  # of the cells that will be asked for; None: that of the boxes
     ) -> None:
         self.annotated, self.grid, self.margin_m = annotated, grid, margin_m
-        self.boxes, self.sample = supervised_boxes(annotated, grid)
-        num = max(len(self.boxes), 1)
-        order = self.boxes.velocities.norm(dim=1).nan_to_num(nan=torch.inf).argsort(descending=True, stable=True)
-        rank = inverse_rows(order, len(self.boxes))
+        self.device = annotated[0].centers.device if device is None else device
+        boxes, sample = supervised_boxes(annotated, grid)
+        num = max(len(boxes), 1)
+        order = boxes.velocities.norm(dim=1).nan_to_num(nan=torch.inf).argsort(descending=True, stable=True)
+        rank = inverse_rows(order, len(boxes))
         codes = []  # (cell, whether only in the margin, rank) as one number
         for in_margin, enlarged_m in enumerate(sorted({0.0, margin_m})):
-            owners, keys = _box_cell_keys(self.boxes, self.sample, grid, enlarged_m)
+            owners, keys = _box_cell_keys(boxes, sample, grid, enlarged_m)
             codes.append((2 * keys + in_margin) * num + rank[owners])
         code = torch.cat(codes).sort().values
         keys = torch.div(code, 2 * num, rounding_mode="floor")
         first = torch.ones_like(keys, dtype=torch.bool)
         first[1:] = keys[1:] != keys[:-1]
         rows = first.nonzero().squeeze(1)
-        self.keys, code = keys[rows], code[rows]
-        self.inside = code % (2 * num) < num
-        self.velocities = self.boxes.velocities[order[code % num]]
+        keys, code = keys[rows], code[rows]
+        found = (sample, keys, code % (2 * num) < num, boxes.velocities[order[code % num]])
+        self.boxes, self.sample, self.keys, self.inside, self.velocities = upload_boxes(
+            boxes, *found, device=self.device
+        )
 
     def in_boxes(
         self,
@@ -87,7 +92,7 @@ class BoxRaster:
     @cached_property
     def _covered(self) -> Tensor:  # [pairs] int64, sorted, cells of any enlarged box, repeated
         joined, sample = join_boxes(self.annotated), box_samples(self.annotated)
-        return _box_cell_keys(joined, sample, self.grid, self.margin_m)[1].sort().values
+        return upload([_box_cell_keys(joined, sample, self.grid, self.margin_m)[1].sort().values], self.device)[0]
 
     def _at(self, values: Tensor, keys: Tensor, elsewhere: float) -> Tensor:
         rows = rows_of_keys(self.keys, keys)

@@ -14,7 +14,7 @@ from src.geometry.ragged import enumerate_items
 from src.ops.sites import Sites
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CLASSES
-from src.targets.supervision import supervised_boxes
+from src.targets.supervision import supervised_boxes, upload_boxes
 
 HEAD_GROUPS: tuple[tuple[str, ...], ...] = (
     ("car",),
@@ -90,7 +90,7 @@ def head_targets(
     exp(-|cell - g|^2 / 2 sigma^2) and exp(-|cell - j|^2 / 2 sigma^2) over the objects of a class.
     """
     joined, batch = supervised_boxes(boxes, grid)
-    joined, batch = _first_of_each_group(joined, batch)
+    joined, batch = upload_boxes(*_first_of_each_group(joined, batch), device=sites.device)
     g = grid.to_cells(joined.centers[:, :2])
     rows, near = _nearest_cells(g, batch, sites)
     kept = near.nonzero().squeeze(1)

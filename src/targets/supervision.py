@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import on_device
+from src.geometry.constants import on_device, upload
 from src.structures.boxes import Boxes3D
 
 
@@ -29,6 +29,18 @@ def supervised_boxes(
     usable &= torch.cat(seen) > 0
     rows = usable.nonzero().squeeze(1)
     return joined[rows], sample[rows]
+
+
+def upload_boxes(
+    boxes: Boxes3D,
+    *tensors: Tensor,
+    device: torch.device,
+) -> tuple[Boxes3D, *tuple[Tensor, ...]]:
+    """Boxes and what belongs to them on a device."""
+    own = boxes.tensors()
+    moved = upload([*own, *tensors], device)
+    fields_of_boxes = iter(moved)
+    return boxes.map(lambda _: next(fields_of_boxes)), *moved[len(own) :]
 
 
 def box_samples(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from src.models.layers.norm import MapNorm
+
 
 class BasicBlock(nn.Module):
     """Two 3x3 convolutions around an identity (He et al. 2016, Fig. 5 left)."""
@@ -15,9 +17,9 @@ class BasicBlock(nn.Module):
     def __init__(self, in_channels: int, width: int, stride: int) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(in_channels, width, 3, stride, 1, bias=False)
-        self.bn1 = nn.BatchNorm2d(width)
+        self.bn1 = MapNorm(width)
         self.conv2 = nn.Conv2d(width, width, 3, 1, 1, bias=False)
-        self.bn2 = nn.BatchNorm2d(width)
+        self.bn2 = MapNorm(width)
         self.downsample = _projection(in_channels, width, stride)
 
     def forward(
@@ -39,11 +41,11 @@ class Bottleneck(nn.Module):
         super().__init__()
         out_channels = width * self.expansion
         self.conv1 = nn.Conv2d(in_channels, width, 1, bias=False)
-        self.bn1 = nn.BatchNorm2d(width)
+        self.bn1 = MapNorm(width)
         self.conv2 = nn.Conv2d(width, width, 3, stride, 1, bias=False)
-        self.bn2 = nn.BatchNorm2d(width)
+        self.bn2 = MapNorm(width)
         self.conv3 = nn.Conv2d(width, out_channels, 1, bias=False)
-        self.bn3 = nn.BatchNorm2d(out_channels)
+        self.bn3 = MapNorm(out_channels)
         self.downsample = _projection(in_channels, out_channels, stride)
 
     def forward(
@@ -61,7 +63,7 @@ def _projection(in_channels: int, out_channels: int, stride: int) -> nn.Module:
         return nn.Identity()
     return nn.Sequential(
         nn.Conv2d(in_channels, out_channels, 1, stride, bias=False),
-        nn.BatchNorm2d(out_channels),
+        MapNorm(out_channels),
     )
 
 
@@ -77,7 +79,7 @@ class ResNet(nn.Module):
     def __init__(self, block: type[BasicBlock] | type[Bottleneck], widths: list[int], blocks: list[int]) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(3, widths[0], 7, 2, 3, bias=False)
-        self.bn1 = nn.BatchNorm2d(widths[0])
+        self.bn1 = MapNorm(widths[0])
         self.maxpool = nn.MaxPool2d(3, 2, 1)
         channels = widths[0]
         for stage, (width, count) in enumerate(zip(widths, blocks, strict=True)):

@@ -91,7 +91,7 @@ class CRTFusion(CameraRadarDetector):
             present = batch.image_valid.flatten()[:, None, None].expand_as(target)
             total = (sigmoid_focal(output.views.foreground_logits, target) * present).sum()
             terms["foreground"] = weights.foreground_weight * total / mean_over_ranks(present.sum())
-        raster = BoxRaster(batch.boxes, self.grid, margin_m=0.0)
+        raster = BoxRaster(batch.boxes, self.grid, margin_m=0.0, device=batch.device)
         if weights.occupancy_weight is not None:
             terms["occupancy"] = weights.occupancy_weight * occupancy_loss(output.motion, raster)
         if weights.velocity_weight is not None:

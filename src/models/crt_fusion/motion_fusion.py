@@ -15,6 +15,7 @@ from src.geometry.tensor_transforms import transform_points_xy, transform_vector
 from src.models.camera_radar import TemporalConfig
 from src.models.crt_fusion.motion_estimator import CellMotion
 from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
+from src.models.layers.norm import MapNorm
 from src.models.memory import FrameMemory, RememberedFrame, StoredRows, moving
 from src.ops.bilinear_scatter import bilinear_scatter
 from src.ops.concat_conv import concat_conv2d
@@ -101,7 +102,7 @@ class MotionGuidedFusion(nn.Module):
         self.gates = nn.Conv2d(slots * channels, slots * channels, 1)
         self.reduce = DenseConvNormReLU(slots * (channels + 1), channels, 1)  # a map and its age each
         self.refine = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        self.norm = nn.BatchNorm2d(channels)
+        self.norm = MapNorm(channels)
         nn.init.zeros_(self.norm.weight)  # untrained, the memory adds exactly zero
 
     @torch.no_grad()

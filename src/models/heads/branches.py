@@ -73,5 +73,4 @@ def _norm_statistics(
         for part, its_mean, its_variance in zip(parts, mean.split(widths), unbiased.split(widths), strict=True):
             part.norm.running_mean.lerp_(its_mean, part.norm.momentum)
             part.norm.running_var.lerp_(its_variance, part.norm.momentum)
-            part.norm.num_batches_tracked.add_(1)
     return mean, variance

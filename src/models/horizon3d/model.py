@@ -128,7 +128,8 @@ class Horizon3D(Detector):
         """Terms of Eq. 10 as weighted."""
         config, boxes, weights = self.config, batch.boxes, self.config.loss
         terms, counts = self.head.loss(output.head, boxes, weights.heatmap_weight, weights.box_weight)
-        raster = BoxRaster(boxes, self.grid, config.ocsf.margin_m if config.ocsf is not None else 0.0)
+        margin_m = config.ocsf.margin_m if config.ocsf is not None else 0.0
+        raster = BoxRaster(boxes, self.grid, margin_m, batch.device)
         if output.kggi is not None and output.ocsf is not None:
             terms |= kggi_losses(output.kggi, output.radar_bev, output.views, raster, config.kggi, weights)
             terms |= ocsf_losses(output.ocsf, raster, weights)

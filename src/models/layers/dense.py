@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from src.models.layers.norm import MapNorm
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV
 
@@ -20,7 +21,7 @@ class DenseConvNormReLU(nn.Module):
     ) -> None:
         super().__init__()
         self.conv = nn.Conv2d(in_channels, out_channels, kernel_size, stride, kernel_size // 2, bias=bias)
-        self.norm = nn.BatchNorm2d(out_channels)
+        self.norm = MapNorm(out_channels)
 
     def forward(
         self,

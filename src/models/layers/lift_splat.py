@@ -16,7 +16,7 @@ from src.ops.segment_reduce import inverse_rows, weighted_segment_sum
 from src.structures.batch import FrameBatch
 from src.targets.depth import lid_centres, paint_depth
 from src.targets.projection import view_boxes
-from src.targets.supervision import supervised_boxes
+from src.targets.supervision import supervised_boxes, upload_boxes
 
 
 @dataclass(kw_only=True)
@@ -152,7 +152,7 @@ class LiftSplat(nn.Module):
         image_size_px: tuple[int, int],  # (H, W)
     ) -> Tensor:  # [B*N, h, w] int64
         """Depth bin at the pixels of annotated boxes, -1 elsewhere, as Horizon3D's camera branch (method 4.3)."""
-        joined, sample = supervised_boxes(batch.boxes, self.grid)
+        joined, sample = upload_boxes(*supervised_boxes(batch.boxes, self.grid), device=batch.device)
         seen = view_boxes(joined, sample, batch.pix_from_aug, batch.image_valid, image_size_px)
         bins = (self.config.depth_range, self.config.num_depth_bins)
         return paint_depth(seen, batch.image_valid.numel(), image_size_px, *bins, self.config.image_stride_px)

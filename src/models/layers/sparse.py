@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from src.models.layers.norm import normalize
 from src.ops.kernel_maps import (
     KernelMap,
     Size,
@@ -145,7 +146,7 @@ class RowNorm(nn.BatchNorm1d):
             return x * self.weight + self.bias  # keeps the parameters in the graph, which DDP expects on every rank
         if self.training and len(x) < 2:
             return F.batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, False, 0.0, self.eps)
-        return super().forward(x)
+        return normalize(self, x)
 
 
 class LinearNormReLU(nn.Module):
