@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd.function import FunctionCtx, once_differentiable
 
 from src.losses.normalizers import full_precision
 
 PEAK_CLAMP = 1e-4
 DEPTH_CLAMP = 1e-6
 FOCAL_ALPHA = 0.25
+EXACT_SOFTPLUS = 50.0
+"""log(1 + e^x) is x from here on, in float64 too."""
 
 
 def penalty_reduced_focal(
@@ -22,10 +27,9 @@ def penalty_reduced_focal(
     Peaks cost -(1 - S)^2 log S, all others -(1 - y)^4 S^2 log(1 - S). S is kept in [1e-4, 1 - 1e-4]; where that binds
     the gradient is 0.
     """
-    score = full_precision(logits).sigmoid().clamp(PEAK_CLAMP, 1 - PEAK_CLAMP)
-    peak = -((1 - score) ** 2) * score.log()
-    rest = -((1 - target) ** 4) * score**2 * (1 - score).log()
-    return torch.where(target == 1, peak, rest)
+    logits = full_precision(logits)
+    peak = (target == 1).to(logits.dtype)
+    return _Focal.apply(logits, torch.rsub(peak, 1, alpha=2), (1 - target) ** 4 + peak, PEAK_CLAMP)
 
 
 def sigmoid_focal(
@@ -34,10 +38,40 @@ def sigmoid_focal(
 ) -> Tensor:  # [...]
     """Focal loss per element with alpha 0.25 and gamma 2, stable for any logit."""
     logits = full_precision(logits)
-    score = logits.sigmoid()
-    positive = -FOCAL_ALPHA * (1 - score) ** 2 * F.logsigmoid(logits)
-    negative = -(1 - FOCAL_ALPHA) * score**2 * F.logsigmoid(-logits)
-    return torch.where(target, positive, negative)
+    positive = target.to(logits.dtype)
+    scale = torch.rsub(positive, 1 - FOCAL_ALPHA, alpha=1 - 2 * FOCAL_ALPHA)
+    return _Focal.apply(logits, torch.rsub(positive, 1, alpha=2), scale, None)
+
+
+class _Focal(torch.autograd.Function):
+    """-scale q^2 log(1 - q), q the probability of what is wrong, kept in [clamp, 1 - clamp] if that is given.
+
+    The gradient scale q^2 (q - 2 (1 - q) log(1 - q)) is made on the way: a third of the launches, nothing else kept.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: FunctionCtx,
+        logits: Tensor,  # [...]
+        sign: Tensor,  # [...] -1 where the score should be 1, else 1
+        scale: Tensor,  # [...]
+        clamp: float | None,
+    ) -> Tensor:  # [...]
+        wrong = logits * sign
+        q, surprise = wrong.sigmoid(), F.softplus(wrong, threshold=EXACT_SOFTPLUS)
+        if clamp is not None:
+            free, q = q, q.clamp(clamp, 1 - clamp)
+            surprise = surprise.clamp_(-math.log1p(-clamp), -math.log(clamp))
+            sign = sign * (free == q)
+        weight = q * q * scale
+        ctx.save_for_backward(torch.addcmul(q, 1 - q, surprise, value=2).mul_(weight).mul_(sign))
+        return weight * surprise
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None, None, None]:
+        (slope,) = ctx.saved_tensors
+        return grad * slope, None, None, None
 
 
 def depth_cross_entropy(

@@ -10,6 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
+from src.geometry.constants import constant
+
 # Pairs multiplied at a time in `paired_dot`: cache-sized on a CPU, few launches on a GPU.
 CPU_CHUNK = 1024
 GPU_CHUNK = 65536
@@ -21,8 +23,8 @@ def segments(
 ) -> tuple[Tensor, Tensor]:
     """Stable order of the pairs by row [pairs], and the start of each row's segment [num_rows + 1], int32."""
     ordered, order = torch.sort(rows, stable=True)
-    starts = torch.searchsorted(ordered, torch.arange(num_rows + 1, dtype=rows.dtype, device=rows.device))
-    return order.to(torch.int32), starts.to(torch.int32)
+    edges = torch.arange(num_rows + 1, dtype=rows.dtype, device=rows.device)
+    return order.to(torch.int32), torch.searchsorted(ordered, edges, out_int32=True)
 
 
 def gather_segment_sum(
@@ -44,7 +46,7 @@ def segment_count(
     """How many values share each row. Does not wait for a GPU, as bincount does."""
     if rows.device.type == "cpu":  # where it is faster
         return torch.bincount(rows, minlength=num_rows)
-    return rows.new_zeros(num_rows).index_add(0, rows, torch.ones_like(rows))
+    return rows.new_zeros(num_rows).index_add_(0, rows, constant((1,), rows.dtype, rows.device).expand_as(rows))
 
 
 def segment_sum(

@@ -118,8 +118,7 @@ class SecondFPN16(nn.Module):
             nn.ConvTranspose2d(at_32, part, 2, 2, bias=False),
         )
         self.branches = nn.ModuleList(
-            nn.Sequential(conv, MapNorm(part, eps=1e-3, momentum=0.01), nn.ReLU(inplace=True))
-            for conv in resample
+            nn.Sequential(conv, MapNorm(part, eps=1e-3, momentum=0.01), nn.ReLU(inplace=True)) for conv in resample
         )
 
     def forward(

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from src.geometry.constants import constant
 from src.losses.normalizers import full_precision
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.sparse import RowNorm
@@ -54,7 +55,11 @@ def checkpointed_branches(
         scale = torch.cat([part.norm.weight for part in parts]) * (variance + parts[0].norm.eps).rsqrt()
         shift = torch.cat([part.norm.bias for part in parts]) - mean * scale
         outputs = [output for part in parts for output in part.outputs]
-        out_weight, out_bias = torch.block_diag(*(out.weight for out in outputs)), torch.cat([o.bias for o in outputs])
+        rows, out_bias = torch.cat([o.weight for o in outputs]), torch.cat([o.bias for o in outputs])
+        owner = [number for number, out in enumerate(outputs) for _ in range(len(out.weight))]
+        own = tuple(tuple(number == row for number in range(len(outputs))) for row in owner)
+        blocks = constant(own, rows.dtype, rows.device)  # [O, branches], 1 where an output belongs to a branch
+        out_weight = (rows[:, None] * blocks[:, :, None]).flatten(1)  # [O, H], block diagonal
     return checkpointed_mlp(x, (weight * scale[:, None]).t(), shift, out_weight.t(), out_bias)
 
 

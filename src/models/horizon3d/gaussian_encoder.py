@@ -88,9 +88,14 @@ class AnchorEncoder(nn.Module):
         self.merged = MergedEmbeddings(list(self.embed.values()), self.output[0])
         self.embed, self.output = None, self.output[1:]
 
+    def joined(self) -> JoinedEmbeddings | None:
+        """What `forward` may take to embed all attributes at once, with gradients; once for several sets."""
+        return None if self.merged is not None else JoinedEmbeddings.of(list(self.embed.values()))
+
     def forward(
         self,
         gaussians: GaussianSet,
+        joined: JoinedEmbeddings | None = None,
     ) -> Tensor:  # [B, G, C]
         """e of the layer's equations."""
         with torch.autocast(gaussians.means.device.type, enabled=False):
@@ -101,9 +106,49 @@ class AnchorEncoder(nn.Module):
                 "opacity": gaussians.opacity_logits.sigmoid()[..., None],
                 "velocity": gaussians.velocities / self.bounds.max_speed_mps,
             }
+            if joined is not None:
+                return self.output(joined(torch.cat(list(inputs.values()), dim=-1)))
             if self.merged is None:
                 return self.output(sum(self.embed[name](value) for name, value in inputs.items()))
             return self.output(self.merged(torch.cat(list(inputs.values()), dim=-1)))
+
+
+@dataclass
+class JoinedEmbeddings:
+    """K `linear_relu_norm` of inputs side by side, for few launches: their weights, through which gradients pass."""
+
+    eps: float
+    first: tuple[Tensor, Tensor]  # [K * C, widths], [K * C]
+    inner: tuple[Tensor, Tensor]  # scale and shift of the first norm, [K, C] each
+    second: tuple[Tensor, Tensor]  # [K, C, C] in, out; [K, 1, C]
+    outer: tuple[Tensor, Tensor]  # scale and shift of the second norm, [K, 1, C] each
+
+    @classmethod
+    def of(cls, parts: Sequence[nn.Sequential]) -> JoinedEmbeddings:
+        """Of these networks, in the order of their inputs."""
+
+        def stacked(number: int, name: str) -> Tensor:
+            return torch.stack([getattr(part[number], name) for part in parts])
+
+        return cls(
+            parts[0][2].eps,
+            (torch.block_diag(*(part[0].weight for part in parts)), stacked(0, "bias").flatten()),
+            (stacked(2, "weight"), stacked(2, "bias")),
+            (stacked(3, "weight").transpose(1, 2), stacked(3, "bias")[:, None]),
+            (stacked(5, "weight")[:, None], stacked(5, "bias")[:, None]),
+        )
+
+    def __call__(
+        self,
+        x: Tensor,  # [B, G, widths]
+    ) -> Tensor:  # [B, G, C]
+        """Sum of what all make of their inputs."""
+        parts, _, channels = self.second[0].shape
+        hidden = F.linear(x.flatten(0, 1), *self.first).relu().view(-1, parts, channels)
+        hidden = torch.addcmul(self.inner[1], F.layer_norm(hidden, (channels,), eps=self.eps), self.inner[0])
+        hidden = torch.baddbmm(self.second[1], hidden.transpose(0, 1), self.second[0]).relu()  # [K, B * G, C]
+        hidden = torch.addcmul(self.outer[1], F.layer_norm(hidden, (channels,), eps=self.eps), self.outer[0])
+        return hidden.sum(0).view(*x.shape[:2], channels)
 
 
 class MergedEmbeddings(nn.Module):
@@ -293,8 +338,10 @@ class GaussianEncoder(nn.Module):
             self.image_value(level.flatten(0, 1)).unflatten(0, level.shape[:2]) for level in views.levels
         ]  # L x [B, N, C, h, w]
         gaussians = _measured(gaussians, doppler)
+        joined = self.anchor.joined() if torch.is_grad_enabled() else None
         for layer in self.layers:
-            gaussians = _measured(layer(gaussians, self.anchor(gaussians), radar_bev, views, values), doppler)
+            embedding = self.anchor(gaussians) if joined is None else self.anchor(gaussians, joined)
+            gaussians = _measured(layer(gaussians, embedding, radar_bev, views, values), doppler)
         return gaussians
 
 

@@ -128,7 +128,12 @@ def test_a_merged_anchor_encoder_equals_its_parts(count):
         nn.init.normal_(parameter)
     names = {"means": (2,), "scales": (2,), "directions": (2,), "opacity_logits": (), "velocities": (2,)}
     gaussians = SimpleNamespace(**{name: torch.randn(2, count, *size).double() for name, size in names.items()})
-    expected = anchor(gaussians)
+    expected, joined = anchor(gaussians), anchor(gaussians, anchor.joined())
+    torch.testing.assert_close(joined, expected)
+    pull, parameters = torch.randn_like(expected), list(anchor.parameters())
+    wanted, found = (torch.autograd.grad((x * pull).sum(), parameters) for x in (expected, joined))
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other)
     anchor.merge_for_inference()
     torch.testing.assert_close(anchor(gaussians), expected)
 
