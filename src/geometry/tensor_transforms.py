@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.autograd.function import FunctionCtx, once_differentiable
 
 
 def invert_rigid(
@@ -30,6 +31,31 @@ def rotate(
 ) -> tuple[Tensor, Tensor]:  # x and y; all shapes broadcast
     """R(theta) (along, across): from a heading's own axes to those of the frame."""
     return cosine * along - sine * across, sine * along + cosine * across
+
+
+def unit_vectors(
+    vectors: Tensor,  # [..., d]
+    eps: float,
+) -> Tensor:  # [..., d]
+    """v / max(|v|, eps), as torch's `normalize`, with half the launches backward: (g - u (u g)) / |v|."""
+    return _UnitVectors.apply(vectors, eps)
+
+
+class _UnitVectors(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: FunctionCtx, vectors: Tensor, eps: float) -> Tensor:
+        norm = torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
+        length = norm.clamp(min=eps)
+        unit = vectors / length
+        ctx.save_for_backward(unit, norm, length)
+        return unit
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None]:
+        unit, norm, length = ctx.saved_tensors
+        along = (grad * unit).sum(-1, keepdim=True) * (norm == length)  # a vector below eps is only scaled
+        return torch.addcmul(grad, unit, along, value=-1) / length, None
 
 
 def rotate_back(

@@ -90,30 +90,31 @@ def head_targets(
     exp(-|cell - g|^2 / 2 sigma^2) and exp(-|cell - j|^2 / 2 sigma^2) over the objects of a class.
     """
     joined, batch = supervised_boxes(boxes, grid)
-    joined, batch = upload_boxes(*_first_of_each_group(joined, batch), device=sites.device)
+    joined, batch = _first_of_each_group(joined, batch)
     g = grid.to_cells(joined.centers[:, :2])
-    rows, near = _nearest_cells(g, batch, sites)
-    kept = near.nonzero().squeeze(1)
-    joined, batch, g, rows = joined[kept], batch[kept], g[kept], rows[kept]
-
-    cell = sites.indices()[rows, 1:].flip(1).to(g.dtype)  # [K, 2] (col, row)
     radius = gaussian_radius(joined.sizes[:, 0] / grid.cell_m, joined.sizes[:, 1] / grid.cell_m, MIN_OVERLAP)
     sigma = (2 * radius.floor().clamp(min=MIN_RADIUS_CELLS) + 1) / 6
-    heatmap = _draw(
-        torch.cat([g, cell]), sigma.repeat(2), batch.repeat(2), joined.labels.repeat(2), sites, len(CLASSES)
-    )
-    codes = [g - cell, joined.centers[:, 2:], joined.sizes.log()]
-    codes += [joined.yaws.cos()[:, None], joined.yaws.sin()[:, None], joined.velocities]
-    groups = constant(GROUP_OF_CLASS, torch.int64, rows.device)[joined.labels]
+    own = [joined.centers[:, 2:], joined.sizes.log(), joined.yaws.cos()[:, None], joined.yaws.sin()[:, None]]
+    codes = torch.cat([*own, joined.velocities], dim=1)  # without the offset, which the cell decides
+    groups = constant(GROUP_OF_CLASS, torch.int64, batch.device)[joined.labels]
+    # What the boxes alone decide is known; the rest needs the cells, where they lie.
+    joined, batch, g, sigma, codes, groups = upload_boxes(joined, batch, g, sigma, codes, groups, device=sites.device)
+    rows, near = _nearest_cells(g, batch, sites)
+    kept = near.nonzero().squeeze(1)
+    batch, g, rows, sigma, codes, groups = (x[kept] for x in (batch, g, rows, sigma, codes, groups))
+    labels, attributes = joined.labels[kept], joined.attributes[kept]
+
+    cell = sites.indices()[rows, 1:].flip(1).to(g.dtype)  # [K, 2] (col, row)
+    heatmap = _draw(torch.cat([g, cell]), sigma.repeat(2), batch.repeat(2), labels.repeat(2), sites, len(CLASSES))
     places = (rows * len(HEAD_GROUPS) + groups).sort().values
     equal = places[1:] == places[:-1]
     return HeadTargets(
         heatmap=heatmap,
         rows=rows,
-        labels=joined.labels,
+        labels=labels,
         groups=groups,
-        codes=torch.cat(codes, dim=1),
-        attributes=joined.attributes,
+        codes=torch.cat([g - cell, codes], dim=1),
+        attributes=attributes,
         num_distant=len(near) - len(rows),
         num_shared=(F.pad(equal, (1, 0)) | F.pad(equal, (0, 1))).sum() if len(rows) else torch.zeros_like(rows).sum(),
     )

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from src.benchmark.simulated_device import DEVICE, SimulatedDevice
+from src.geometry.constants import upload
 from src.ops.segment_reduce import segment_sum
 from tests.running import command
 
@@ -55,6 +56,15 @@ def test_values_are_those_of_the_cpu():
     with SimulatedDevice():
         found = segment_sum(values.to(DEVICE), rows.to(DEVICE), 4).cpu()
     assert torch.equal(found, segment_sum(values, rows, 4))
+
+
+def test_tensors_of_one_type_are_uploaded_together():
+    host = [torch.tensor([[1.0, 2.0]]), torch.tensor([3]), torch.zeros(0, 2), torch.tensor([True, False])]
+    with SimulatedDevice() as tally:
+        moved = upload([*host, host[1] + 1], torch.device(DEVICE))
+        assert tally.totals()["uploads"] == 3 and tally.totals()["waits"] == 0
+        found = [tensor.cpu() for tensor in moved]
+    assert all(torch.equal(one, other) for one, other in zip(found, [*host, torch.tensor([4])], strict=True))
 
 
 def test_a_frame_and_a_training_step_keep_their_budgets(tmp_path):

@@ -1,6 +1,7 @@
 import math
 
 import torch
+import torch.nn.functional as F
 
 from src.geometry.tensor_transforms import (
     invert_projection,
@@ -12,6 +13,7 @@ from src.geometry.tensor_transforms import (
     transform_points_xy,
     transform_vectors,
     transform_vectors_xy,
+    unit_vectors,
 )
 from tests.models.moving import UTM, bda, pose
 
@@ -63,3 +65,12 @@ def test_points_and_vectors_of_space_equal_the_homogeneous_product():
     for last, transform in ((1.0, transform_points), (0.0, transform_vectors)):
         full = torch.cat([points, torch.full((2, 1), last, dtype=torch.float64)], 1)
         torch.testing.assert_close(transform(matrix, points), (matrix @ full[..., None])[:, :3, 0])
+
+
+def test_unit_vectors_and_their_gradient():
+    vectors = torch.tensor([[3.0, 4.0], [1e-3, 0.0], [0.0, 0.0], [-2.0, 0.5]], dtype=torch.float64, requires_grad=True)
+    pull = torch.tensor([[0.3, -1.0], [2.0, 1.0], [1.0, 1.0], [0.0, 4.0]], dtype=torch.float64)
+    found, wanted = unit_vectors(vectors, 0.01), F.normalize(vectors, dim=-1, eps=0.01)
+    torch.testing.assert_close(found, wanted)
+    gradients = [torch.autograd.grad(x, vectors, pull)[0] for x in (found, wanted)]
+    torch.testing.assert_close(*gradients)

@@ -80,3 +80,15 @@ def test_losses_leave_half_precision() -> None:
     assert penalty_reduced_focal(logits, torch.tensor([1.0, 0.0])).dtype == torch.float32
     assert sigmoid_focal(logits, torch.tensor([True, False])).dtype == torch.float32
     assert depth_cross_entropy(logits.reshape(1, 2, 1, 1), torch.tensor([[[0]]])).dtype == torch.float32
+
+
+@pytest.mark.parametrize("clamped", [False, True])
+def test_gradients_of_focal_losses(clamped: bool) -> None:
+    draw = torch.Generator().manual_seed(0)
+    logits = (3 * torch.randn(40, generator=draw)).double().requires_grad_()
+    target = torch.rand(40, generator=draw).double()
+    target[target > 0.8] = 1.0
+    if clamped:
+        assert torch.autograd.gradcheck(lambda x: penalty_reduced_focal(x, target), logits)
+    else:
+        assert torch.autograd.gradcheck(lambda x: sigmoid_focal(x, target == 1), logits)

@@ -72,6 +72,13 @@ def test_rays_and_past_frames_move_with_the_batch_and_fit_it():
         dataclasses.replace(rays([0, 1, 2]), ranges=torch.ones(3).double())
 
 
+def test_annotations_stay_on_the_host():
+    boxes = [Boxes3D.empty()] * 3
+    moved = batch(boxes=boxes, past=(batch(boxes=boxes),)).to("meta")
+    for frame in (moved, *moved.past):
+        assert frame.timestamps_s.is_meta and frame.boxes[0].centers.device.type == "cpu"
+
+
 def test_a_sample_may_lack_points_boxes_and_images():
     assert len(batch()) == 3
     bare = batch(images=None, image_valid=None, pix_from_aug=None, boxes=None)

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.tensor_transforms import rotate
+from src.geometry.tensor_transforms import rotate, unit_vectors
 from src.models.horizon3d.cross_attention import (
     ImageCrossAttention,
     RadarCrossAttention,
@@ -59,7 +59,7 @@ class GaussianBounds:
         low, high = self.scale_range_m
         return {
             "scales": low + (high - low) * scale.sigmoid(),
-            "directions": F.normalize(rotation, dim=-1, eps=1e-6),
+            "directions": unit_vectors(rotation, eps=1e-6),
             "opacity_logits": opacity.squeeze(-1),
             "velocities": self.max_speed_mps * torch.tanh(velocity * (self.velocity_unit_mps / self.max_speed_mps)),
         }
@@ -237,7 +237,7 @@ class Refinement(nn.Module):
         """Attributes are float32 also under autocast."""
         raw = self.output(self.trunk(x)) * self.output_scale  # [B, G, 9]
         shift = self.bounds.max_mean_shift_m * (2.0 * raw[..., :2].sigmoid() - 1.0)
-        means = torch.minimum(torch.maximum(gaussians.means + shift, self.lower_m), self.upper_m)
+        means = (gaussians.means + shift).clamp(self.lower_m, self.upper_m)
         return replace(gaussians, means=means, **self.bounds.activate(raw[..., 2:]))
 
 
