@@ -19,8 +19,8 @@ from src.models.horizon3d.loss import cell_losses, gaussian_velocity_loss, kggi_
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import OCSF
 from src.models.horizon3d.output import Horizon3DOutput
-from src.models.horizon3d.views import CameraViews
 from src.models.layers.doppler import Doppler
+from src.models.layers.views import CameraViews
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
