@@ -67,7 +67,7 @@ class DistanceAttention(nn.Module):
         self,
         query: Tensor,  # [B, Q, C]
         centers: Tensor,  # [B, Q, 3] m
-        keys: Tensor,  # [B, G, C], G at least 1
+        keys: Tensor,  # [B, G, C]
         key_centers: Tensor,  # [B, G, 3] m
         valid: Tensor,  # [B, G] bool
     ) -> Tensor:  # [B, Q, C]
