@@ -134,7 +134,7 @@ FULL_SIZE = {
         "identity_start": False,
     },
     "model.doppler": {"gaussians": True, "cells": False, "boxes": True},
-    "model.head": {"nms": "per_group", "score_threshold": 0.1, "max_boxes": 500, "attributes": "rule"},
+    "model.head": {"nms": "maxpool", "score_threshold": 0.1, "max_boxes": 500, "attributes": "rule"},
     "model.loss": {
         "kggi_weight": 1.0, "ocsf_weight": 5.0, "heatmap_weight": 1.0, "box_weight": 0.25, "keypoint_weight": 1.0,
         "depth_weight": 1.0, "radar_objectness_weight": 1.0, "occupancy_focal_weight": 1.0,

@@ -96,10 +96,8 @@ def write_pages(
     Of another task than detection: `<phase>_<task>_<scale>.md`.
     """
     pages, faults = {}, []
-    with_settings = {result.phase: result.model for result in results.values() if result.settings}
-    defaults = {
-        phase: defaults_of(config.scale, phase, model) for phase, model in with_settings.items() if phase in PHASES
-    }
+    models = {result.phase: result.model for result in results.values() if result.phase in PHASES}
+    defaults = {phase: defaults_of(config.scale, phase, model) for phase, model in models.items()}
     detection = [run for run in results.values() if run.task == DETECTION]
     groups = {phase: runs_on_page(detection, phase, in_sweeps, defaults) for phase in PHASES}
     for run in results.values():
@@ -139,15 +137,18 @@ def write_page(reports: Path, name: str, scale: str, runs: list[RunResult]) -> P
 
 
 def write_claims(reports: Path, scale: str, records: list[SweepRecord], results: dict[str, RunResult]) -> list[Path]:
-    """`README.md` of the claims and its picture, once any has a result; sweeps that a command line changed are others.
+    """The page of the claims and its picture, once any has a result; sweeps that a command line changed are others.
 
+    `README.md` at the default scale, `claims_<scale>.md` at another.
     Raises ConfigError for a file of claims that is wrong.
     """
     by_sweep = {record.name: record for record in records if not record.changes}
     findings = [(claim, judge(claim, by_sweep, results)) for claim in load_claims(load_sweep)]
     if not any(finding.found for _, found in findings for finding in found):
         return []
-    path, picture = reports / "README.md", f"pictures/claims_{scale}.png"
+    is_default = scale == compose_config([])[0].scale
+    path = reports / ("README.md" if is_default else f"claims_{scale}.md")
+    picture = f"pictures/claims_{scale}.png"
     draw_claims(reports / picture, findings, scale)
     write_whole(path, claims_page(findings, scale, picture))
     return [path]

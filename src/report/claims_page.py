@@ -1,4 +1,4 @@
-"""`reports/README.md`: what was run, and which of the paper's claims hold here, each with the command that says so."""
+"""The page of the claims: what was run, and which hold here, each with the command that says so."""
 
 from __future__ import annotations
 

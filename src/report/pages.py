@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,7 +12,7 @@ import yaml
 from src.report.escaping import as_code
 from src.report.metric_names import DETECTION, SPEEDS, Metric
 from src.report.plain_yaml import load_plain_yaml
-from src.report.results import RunResult
+from src.report.results import NOT_A_SETTING, RunResult
 from src.report.score_tables import (
     BY_LONG_RANGE,
     BY_RANGE,
@@ -30,7 +31,7 @@ from src.report.score_tables import (
     metrics_of,
     score_table,
 )
-from src.training.identity import key_of
+from src.training.identity import OUTSIDE_IDENTITY, TEMPORAL_DATA_KEYS, YOUNGER_KEYS, is_of, key_of
 
 PHASES_OF = {"phase2": ("phase1", "phase2")}
 """Whose runs a phase's page reads; other phases' pages read their own."""
@@ -87,12 +88,15 @@ def runs_on_page(
 
     Phase 1 continued from phase 1 is what phase 2 is compared with, so it is on that page and not on its own; phase 1
     is there without its ablations. Runs of sweeps (their ids are `in_sweeps`) have tables of their own: of them only
-    experiments that have a name here are shown. `defaults` are the configurations of runs without settings, by phase.
+    experiments that have a name here are shown. `defaults` are the configurations of runs without settings, by phase:
+    a run is called by what differs from these, so an older default never passes for today's.
     """
     names = NAMES_OF_COMPARISON if phase in PHASES_OF else NAMES
     shown = []
     for result in results:
-        run = replace(result, overrides=without_defaults(result.overrides, defaults.get(result.phase, {})))
+        overrides = without_defaults(result.overrides, defaults.get(result.phase, {}))
+        overrides += changed_since(result, defaults.get(result.phase, {}))
+        run = replace(result, overrides=overrides)
         if phase in PHASES_OF:
             belongs = run.phase == phase or (run.phase in PHASES_OF[phase] and (not run.settings or _is_continued(run)))
         else:
@@ -112,6 +116,30 @@ def without_defaults(overrides: list[str], defaults: dict[str, Any]) -> list[str
     other = {key: override for key, override in last.items() if not _is_default(key, override, defaults)}
     parts = tuple(f"{key}." for key in other)  # inside one, another choice has other defaults
     return [override for key, override in last.items() if key in other or key.startswith(parts)]
+
+
+def changed_since(run: RunResult, defaults: dict[str, Any]) -> list[str]:
+    """What a run had by default and today's `defaults` say otherwise, as overrides.
+
+    Keys that only one of the two knows are left out, except younger ones with a value of before.
+    """
+    free = [*map(key_of, run.overrides), *OUTSIDE_IDENTITY, *NOT_A_SETTING, "phase.name"]
+    if not run.config["phase"].get("temporal", True):
+        free += [f"data.{key}" for key in TEMPORAL_DATA_KEYS]
+    had = YOUNGER_KEYS | _leaves(run.config)
+    return [
+        f"{key}={json.dumps(had[key]) if not isinstance(had[key], str) else had[key]}"
+        for key, today in _leaves(defaults).items()
+        if key in had and had[key] != today and not is_of(key, free)
+    ]
+
+
+def _leaves(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values by dotted key."""
+    leaves: dict[str, Any] = {}
+    for key, value in tree.items():
+        leaves |= _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return leaves
 
 
 def _is_default(key: str, override: str, defaults: dict[str, Any]) -> bool:

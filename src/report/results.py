@@ -9,18 +9,18 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, NotRequired
+from typing import Annotated, Any
 
 import yaml
 from pydantic import Field, with_config
 from pydantic_core import from_json
-from typing_extensions import TypedDict
 
 from src.errors import DataError
 from src.files.atomic_write import write_whole
-from src.report.json_format import ANY_KEYS, OPEN, Count, Many, Measure, read_all, read_as, read_json
+from src.report.json_format import OPEN, Count, Many, Measure, read_all, read_as, read_json
 from src.report.metric_names import DETECTION, METRICS
 from src.report.plain_yaml import load_plain_yaml
+from src.report.result_schema import Bounds, DataNames, Latency, OtherScores, PeakMemory, Scores, Seconds
 from src.training.identity import OUTSIDE_IDENTITY, is_of, key_of, without_keys
 
 FORMAT = 1
@@ -39,130 +39,6 @@ KEPT_OF_A_CLASS = ("AP", "AVE", "num_gt")
 """Within a range or a speed class; the run's metrics.json has the rest."""
 
 Point = tuple[int, float]  # step, value
-Share = Annotated[float, Field(ge=0, le=1 + 1e-12)]
-"""From 0 to 1; a mean of ones may be 1.0000000000000002."""
-Score = Annotated[float, Field(ge=-1e6, le=1e6)]
-
-
-@with_config(OPEN)
-class Errors(TypedDict):
-    """Mean errors of true positives; absent where the run was not scored by them, null without ground truth."""
-
-    mATE: NotRequired[Score | None]
-    mASE: NotRequired[Score | None]
-    mAOE: NotRequired[Score | None]
-    mAAE: NotRequired[Score | None]
-
-
-@with_config(OPEN)
-class ClassScores(TypedDict):
-    AP: Share
-    AVE: NotRequired[Score | None]
-
-
-class RangeScores(Errors):
-    mAP: Share
-    NDS: NotRequired[Share | None]
-    mAVE: NotRequired[Score | None]
-    classes: dict[str, dict[str, Any]]
-
-
-@with_config(OPEN)
-class ClassCount(TypedDict):
-    """One class within a speed class."""
-
-    num_gt: Count
-
-
-class CarScores(ClassCount):
-    """The car within a speed class."""
-
-    AP: Share
-    AVE: Score
-
-
-@with_config(OPEN)
-class SpeedClasses(TypedDict, extra_items=ClassCount):
-    """The classes within a speed class, by name."""
-
-    car: CarScores
-
-
-@with_config(OPEN)
-class SpeedScores(TypedDict):
-    mAP_present: Share | None
-    mAVE_present: Score | None
-    classes: SpeedClasses
-
-
-Bounds = Annotated[list[Score], Field(min_length=2, max_length=2)]
-"""[low, high] of a score."""
-
-
-@with_config(OPEN)
-class Intervals(TypedDict):
-    """How sure scores are, by their paths in metrics.json."""
-
-    scenes: Count
-    bounds: dict[str, Bounds]
-
-
-class LongRangeScores(RangeScores):
-    """By the second protocol."""
-
-    ranges: dict[str, RangeScores]
-
-
-class Scores(Errors):
-    """What tables read of a detection run's metrics.json."""
-
-    mAP: Share
-    NDS: Share
-    mAVE: Score
-    classes: dict[str, ClassScores]
-    ranges: dict[str, RangeScores]
-    speeds: NotRequired[dict[str, SpeedScores]]  # older runs have none of these
-    measures: NotRequired[dict[str, Score | None]]
-    long_range: NotRequired[LongRangeScores]
-    intervals: NotRequired[Intervals]
-
-
-@with_config(OPEN)
-class OtherScores(TypedDict, extra_items=Measure | dict[str, Any] | None):
-    """metrics.json of another task: numbers by name and their intervals are read, what else is nested is not."""
-
-    intervals: NotRequired[Intervals]
-
-
-@with_config(ANY_KEYS)
-class Latency(TypedDict):
-    """What tables read of latency.json; the rest is kept as it is."""
-
-    ms: dict[str, Score]
-    fps: Score
-    memory_gb: Score
-    spread_ms: NotRequired[dict[str, Score]]
-    load: NotRequired[Score]  # older files have neither this nor the next
-    cores: NotRequired[Score]
-
-
-class DataNames(TypedDict, extra_items=str):
-    """What a run was trained and scored on: also version, train_split, split."""
-
-    name: str
-    root: str  # the folder's name: of a world its digest
-
-
-class Seconds(TypedDict, extra_items=Measure):
-    """Durations: also fit."""
-
-    all: Measure
-
-
-class PeakMemory(TypedDict, extra_items=Count):
-    """MiB: also largest_worker."""
-
-    process: Count
 
 
 @with_config(OPEN)

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 from src.report.comparisons import Comparison
 from src.report.metric_names import Metric
-from src.report.results import Latency, RunResult
+from src.report.result_schema import Latency
+from src.report.results import RunResult
 from src.report.sweep_record import SweepRecord
 from src.report.sweep_table import SweepRow, SweepTable
 

@@ -54,7 +54,8 @@ def write_run(tmp_path: Path) -> Callable[..., Path]:
                 "car": {"AP": value, "AVE": 2 - value, "num_gt": 3}}}  # fmt: skip
             metrics["speeds"] = {s: part for s in SPEEDS}
         config = {"model": {"name": "horizon3d", "ocsf": {"margin_m": 4.8}}, "phase": {"name": phase}, "seed": seed,
-                  "data": {"root": str(tmp_path), "version": "v1"}, "backbone": {"weights": f"{tmp_path}/r50.pth"},
+                  "data": {"root": str(tmp_path), "version": "v1.2-trainval"},
+                  "backbone": {"file": f"{tmp_path}/r50.pth"},
                   "paths": {"outputs": str(tmp_path)}, "out": None}  # fmt: skip
         curves = "step,epoch,loss/total,val/mAP,lr\n4,0,5.5,,0.1\n4,0,,0.1,\n9,1,4.5,,0.1\n9,1,,0.2,\n"
         (folder / "run.json").write_text(json.dumps(record))

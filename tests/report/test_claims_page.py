@@ -13,8 +13,8 @@ def report(tmp_path, monkeypatch, capsys):
     """Writes all pages of the runs under `tmp_path`; returns the folder and what was printed."""
     monkeypatch.setattr(export, "export_dashboard", lambda *arguments: None)
 
-    def run():
-        main(["phase=phase1", "scale=mini", f"paths.outputs={tmp_path}", f"paths.reports={tmp_path / 'reports'}"])
+    def run(scale="mini"):
+        main(["phase=phase1", f"scale={scale}", f"paths.outputs={tmp_path}", f"paths.reports={tmp_path / 'reports'}"])
         return tmp_path / "reports", capsys.readouterr().out
 
     return run
@@ -24,13 +24,14 @@ def report(tmp_path, monkeypatch, capsys):
 def write_sweep(write_run, make_record, tmp_path):
     """Writes the record of a sweep and a run for each row and seed; every score is the row's value for that seed."""
 
-    def write(name, rows, changes=()):
-        record = make_record(dict.fromkeys(rows, {}), seeds=max(map(len, rows.values())), name=name)
+    def write(name, rows, changes=(), scale="mini"):
+        record = make_record(dict.fromkeys(rows, {}), seeds=max(map(len, rows.values())), name=name, scale=scale)
         record.changes = list(changes)
         for label, values in rows.items():
             for seed, value in enumerate(values):
-                write_run(record.rows[label][seed].rpartition("-")[2], [f"x={label}"], seed, value, speeds=True)
-        write_record(record_path(tmp_path / "reports", name, "mini", changes), record)
+                end = record.rows[label][seed].rpartition("-")[2]
+                write_run(end, [f"x={label}"], seed, value, speeds=True, scale=scale)
+        write_record(record_path(tmp_path / "reports", name, scale, changes), record)
 
     return write
 
@@ -64,3 +65,13 @@ def test_without_a_result_of_any_claim_there_is_no_page(report, write_sweep):
     write_sweep("layers", {"1 layer": [0.10], "2 layers": [0.2]}, changes=["phase.epochs=1"])
     reports, said = report()
     assert "README" not in said and not (reports / "README.md").exists()
+
+
+def test_another_scale_has_a_page_of_its_own(report, write_sweep):
+    rows = {"1 layer": [0.10, 0.1], "2 layers": [0.2, 0.3]}
+    write_sweep("layers", rows)
+    write_sweep("layers", rows, scale="debug")
+    default = (report()[0] / "README.md").read_text()
+    reports, _ = report("debug")
+    assert (reports / "README.md").read_text() == default
+    assert "# The paper's claims, scale debug" in (reports / "claims_debug.md").read_text()

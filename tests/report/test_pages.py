@@ -6,7 +6,7 @@ from PIL import Image
 from src.dashboard import single_file as export
 from src.errors import DataError
 from src.report.__main__ import main
-from src.report.pages import without_defaults
+from src.report.pages import changed_since, without_defaults
 from src.report.results import result_path
 from src.report.sweep_record import record_path, write_record
 
@@ -216,3 +216,16 @@ def test_overrides_that_say_the_default_are_none():
     assert without_defaults(other, defaults) == other  # backbone.lr is inside a backbone with a default of its own
     assert without_defaults(["model.margin_m=0.8", "model.margin_m=4.8"], defaults) == []  # the later wins
     assert without_defaults(["model.margin_m=4.8", "model.margin_m=0.8"], {}) == ["model.margin_m=0.8"]
+
+
+def test_an_older_default_is_a_setting_today(make_result):
+    today = {"seed": 0, "phase": {"name": "phase2", "temporal": True, "epochs": 4},
+             "data": {"stream_sets": 5, "timeline": "key", "root": None},
+             "model": {"head": {"nms": "maxpool"}, "kggi": {"init": "both"}, "new": 1}}  # fmt: skip
+    then = {"seed": 1, "phase": {"name": "phase2", "temporal": True, "epochs": 6}, "data": {"stream_sets": 8},
+            "model": {"head": {"nms": "per_group"}, "kggi": {"init": "random"}, "gone": 2}}  # fmt: skip
+    run = make_result("a", {}, config=then, overrides=["phase.epochs=6", "model.kggi={init: random}"])
+    assert changed_since(run, today) == ["data.stream_sets=8", "data.timeline=null", "model.head.nms=per_group"]
+    then["phase"]["temporal"] = False  # what changes nothing there
+    assert changed_since(run, today) == ["data.timeline=null", "model.head.nms=per_group"]
+    assert changed_since(run, then) == []

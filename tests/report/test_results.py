@@ -130,7 +130,7 @@ def test_no_path_of_the_machine_is_published(write_run, reports, tmp_path):
     assert str(tmp_path) not in text and "/x/" not in text and "here" not in text
     names = [re.sub("@[0-9a-f]{8}$", "@", override) for override in result.overrides]
     assert names == ["phase.init_from=last.ckpt@", "backbone.weights=r50.pth@", "++model.file=y@", "model=horizon3d"]
-    assert result.config["backbone"]["weights"].startswith("r50.pth@")
+    assert result.config["backbone"]["file"].startswith("r50.pth@")
     assert not {"paths", "out"} & result.config.keys() and "root" not in result.config["data"]
     other = read_result(publish_result(write_run("b", ["phase.init_from=/elsewhere/last.ckpt"], 0, 0.3), reports))
     assert other.settings[0] != result.settings[-1]  # two files of one name are two experiments

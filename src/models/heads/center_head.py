@@ -63,7 +63,7 @@ class TrainRegression(Enum):
 class HeadConfig:
     """Settings of the head (`model.head`). Raises ConfigError for impossible values."""
 
-    nms: Suppression  # per_group: the table of method 7
+    nms: Suppression  # method 7
     score_threshold: float  # boxes at or below are dropped
     max_boxes: int  # per sample, best scores
     attributes: AttributeSource

@@ -141,7 +141,7 @@ MODELS = {
     "other neck": ("phase=phase1", "backbone.neck=secondfpn16"),
     "dense": ("phase=phase2", "model=dense_bev"),
     "crt_fusion": (
-        "phase=phase2", "model=crt_fusion", "model.head.score_threshold=0.02",
+        "phase=phase2", "model=crt_fusion", "model.head.score_threshold=0.015",
         "model.temporal.occupancy_threshold=0.01",
     ),
     "sparc": ("phase=phase2", "model=sparc"),
