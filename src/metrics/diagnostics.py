@@ -59,7 +59,7 @@ def diagnose(
         remembered, sums = None, {}
         if evidence.gaussians is not None:
             remembered, sums = _compare_gaussians(evidence.gaussians, sample, boxes)
-        found.append(FrameDiagnosis(_count_returns(batch, sample, boxes), occupied, remembered, sums))
+        found.append(FrameDiagnosis(count_returns(batch, sample, boxes), occupied, remembered, sums))
     return found
 
 
@@ -137,7 +137,8 @@ def ratios(
     return found
 
 
-def _count_returns(batch: FrameBatch, sample: int, boxes: Boxes3D) -> Array:  # [k] int64
+def count_returns(batch: FrameBatch, sample: int, boxes: Boxes3D) -> Array:  # [k] int64
+    """Points of the sample's radar and LiDAR input inside each of its boxes."""
     half = 0.5 * boxes.sizes[:, 2]
     heights = torch.stack([boxes.centers[:, 2] - half, boxes.centers[:, 2] + half], dim=1)
     counts = torch.zeros(len(boxes), dtype=torch.int64, device=boxes.centers.device)

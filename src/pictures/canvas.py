@@ -76,4 +76,5 @@ class Canvas:
             return
         self.figure.canvas.draw()
         picture = Image.fromarray(np.asarray(self.figure.canvas.buffer_rgba())).convert("RGB")
-        picture.quantize(256, dither=Image.Dither.NONE).save(path, format="PNG", optimize=True)
+        picture = picture.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)  # keeps rare colours
+        picture.save(path, format="PNG", optimize=True)

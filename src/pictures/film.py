@@ -43,7 +43,7 @@ class Film:
             canvas = Image.new("RGB", self._pictures[0].size, "white")
             canvas.paste(picture)
             picture = canvas
-        self._pictures.append(picture.quantize(256, dither=Image.Dither.NONE))
+        self._pictures.append(picture.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE))
         self._times_s.append(time_s)
 
     def write_animation(self, path: Path) -> None:

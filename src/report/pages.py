@@ -88,7 +88,8 @@ def runs_on_page(
 
     Phase 1 continued from phase 1 is what phase 2 is compared with, so it is on that page and not on its own; phase 1
     is there without its ablations. Runs of sweeps (their ids are `in_sweeps`) have tables of their own: of them only
-    experiments that have a name here are shown. `defaults` are the configurations of runs without settings, by phase:
+    experiments that have a name here are shown. Weights that were scored once more with other settings are left to the
+    tables of their sweeps. `defaults` are the configurations of runs without settings, by phase:
     a run is called by what differs from these, so an older default never passes for today's.
     """
     names = NAMES_OF_COMPARISON if phase in PHASES_OF else NAMES
@@ -101,6 +102,7 @@ def runs_on_page(
             belongs = run.phase == phase or (run.phase in PHASES_OF[phase] and (not run.settings or _is_continued(run)))
         else:
             belongs = run.phase == phase and not _is_continued(run)
+        belongs = belongs and run.epochs > 0
         known = (run.phase, *_settings_without_dropout(run)) in names or _is_continued(run)
         if belongs and (known or run.run_id not in in_sweeps):
             shown.append(run)

@@ -33,6 +33,7 @@ class RowConfig:
     paper: dict[str, float] = field(default_factory=dict)  # the paper's numbers by metric, in the paper's units
     x: float | None = None  # place on the plot's horizontal axis
     baseline: str | None = None  # label of the row this one is compared with, where it is not the file's
+    weights: str | None = None  # label of the row whose weights are scored with these overrides, untrained
     scales: Many[str] | None = None  # trained at these scales only, elsewhere the paper's numbers stand alone
 
 
@@ -142,6 +143,13 @@ class SweepConfig:
                 raise ConfigError(f"{where}: baseline {baseline!r} is not the label of a row ({', '.join(own)})")
             if any(row.label == baseline and row.scales is not None for row in self.rows):
                 raise ConfigError(f"{where}: baseline {baseline!r} must be for every scale; leave its scales out")
+        trained = [row.label for row in self.rows if row.weights is None and row.scales is None]
+        for row in self.rows:
+            if row.weights is not None and row.weights not in trained:
+                raise ConfigError(
+                    f"{where}, row {row.label!r}: weights {row.weights!r} must be the label of a row that is trained "
+                    f"at every scale ({', '.join(trained) or 'there is none'})"
+                )
         for row in [*self.rows, *self.paper_rows]:
             for metric in row.paper:
                 find_metric(metric, f"{where}, row {row.label!r}, paper", self.task)

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from src.errors import ConfigError, DataError, HorizonError, InterruptedRunError
@@ -47,6 +49,8 @@ def main(overrides: list[str]) -> None:
     for look in LOOKS:
         plans = study.plans(look, study.results())
         for plan in plans:
+            if not study.options.workers and not any(study.finished(plan)):
+                continue  # nothing to record
             logger.info("%s", study.progress(plans, look, study.results()))
             command = study.commands[plan.sweep.name]
             try:
@@ -55,6 +59,8 @@ def main(overrides: list[str]) -> None:
                 raise
             except HorizonError as error:  # costs no other sweep
                 problems.append(f"{plan.study}: {error}")
+        if not study.options.workers and not all(chain.from_iterable(map(study.finished, plans))):
+            break  # a look is taken at all its pairs
     print(study.verdicts())
     if problems:
         raise HorizonError("\n".join(problems))
@@ -102,8 +108,12 @@ class Study:
                 continue
             seeds = {row.label: range(look if row.label in rows else first) for row in command.sweep.rows}
             plan = make_plan(command.sweep, self.common, seeds, self.identify)
-            plans.append(without_published(plan, results) if command.published else plan)
+            plans.append(without_published(plan, results, command.workers > 0) if command.published else plan)
         return plans
+
+    def finished(self, plan: Plan) -> Iterator[bool]:
+        """Of each run whether it is finished, here or by its result."""
+        return (run_id in plan.published or is_done(self.outputs / run_id) for run_id in plan.specs)
 
     def progress(self, plans: list[Plan], look: int, results: dict[str, RunResult]) -> str:
         """How far a look is, over all its sweeps, and the time left as far as runs finished here tell it."""

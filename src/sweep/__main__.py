@@ -67,7 +67,7 @@ def main(overrides: list[str]) -> None:
     common = [override for override in common if key_of(override) != "seed"]
     plan = make_plan(sweep, common, seeds, identify)
     if command.published:
-        plan = without_published(plan, read_results(reports, plan.scale)[0])
+        plan = without_published(plan, read_results(reports, plan.scale)[0], command.workers > 0)
     if command.dry_run:
         print(describe(plan, outputs))
         return
@@ -111,7 +111,7 @@ def run_plan(
     if runner.stop.requested:
         print(progress_line(record, command.workers, time.time()))
         raise InterruptedRunError(f"the sweep was stopped; nothing finished is lost, resume it with\n    {again}")
-    if plan.sweep.latency:
+    if plan.sweep.latency and command.workers:
         measured = measure_latencies(record, outputs, partial(latency_command, outputs), runner)
         logger.info("latency measured of %d runs", measured)
     finish(record, runner, outputs, reports, again)

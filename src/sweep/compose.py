@@ -55,9 +55,9 @@ class SweepCommand:
     sweep: Any = None  # SweepConfig, of a file that Hydra does not read
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "workers"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name} must be at least 1, but got {getattr(self, name)}")
+        for name, least in (("seeds", 1), ("workers", 0)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"{name} must be at least {least}, but got {getattr(self, name)}")
         if self.seeds > MOST_SEEDS:
             raise ConfigError(f"seeds must be at most {MOST_SEEDS}, but got {self.seeds}; seed=... says the first one")
 

@@ -124,19 +124,31 @@ def make_plan(
     plan = Plan(sweep, scale, every, changes_of(sweep, common))
     if sweep.is_search:
         return plan
+    rows = {row.label: row for row in sweep.rows}
+
+    def specs_of(row: RowConfig, seed: int) -> list[RunSpec]:
+        """Its run, preceded by those whose weights it starts from."""
+        overrides = join_overrides(sweep.overrides, row.overrides, common, [f"seed={seed}"])
+        sources = specs_of(rows[row.weights], seed) if row.weights is not None else []
+        if sources:
+            untrained = [f"phase.init_from={sources[-1].run_id}", "phase.epochs=0"]
+            overrides = join_overrides(overrides, untrained)
+        found = _compose(sweep, row, overrides, common, identify)
+        if found.scale != scale:
+            raise ConfigError(
+                f"sweeps/{sweep.name}.yaml, row {row.label!r}: scale={found.scale}, but the sweep is of scale "
+                f"{scale}; a table never mixes scales, give scale=... on the command line"
+            )
+        if not sources:
+            return run_specs_of(overrides, seed, row.label, identify)
+        own, machine = split_machine(overrides)
+        return [*sources, RunSpec(found.run_id, own, seed, row.label, sources[-1].run_id, machine)]
+
     for seed in every:
         needed: list[RunSpec] = []
         own: list[RunSpec] = []
         for row in (row for row in sweep.rows if seed in by_row[row.label]):
-            joined = join_overrides(sweep.overrides, row.overrides, common)
-            overrides = join_overrides(joined, [f"seed={seed}"])
-            found = _compose(sweep, row, overrides, common, identify)
-            if found.scale != scale:
-                raise ConfigError(
-                    f"sweeps/{sweep.name}.yaml, row {row.label!r}: scale={found.scale}, but the sweep is of scale "
-                    f"{scale}; a table never mixes scales, give scale=... on the command line"
-                )
-            *sources, spec = run_specs_of(overrides, seed, row.label, identify)
+            *sources, spec = specs_of(row, seed)
             needed += sources
             own.append(spec)
             plan.rows.setdefault(row.label, {})[seed] = spec.run_id
@@ -146,17 +158,18 @@ def make_plan(
     return plan
 
 
-def without_published(plan: Plan, results: Collection[str]) -> Plan:
+def without_published(plan: Plan, results: Collection[str], training: bool = True) -> Plan:
     """The plan without training what has a result, by its run id, nor weights that only such runs start from.
 
-    A run with a result is trained all the same where one without begins from its weights.
+    A run with a result is trained all the same where one without begins from its weights; not where nothing is trained
+    at all.
     """
     needed: set[str | None] = set()
-    for spec in reversed(plan.specs.values()):
+    for spec in reversed(plan.specs.values()) if training else ():
         if spec.run_id in needed or (spec.run_id not in results and plan.labels(spec.run_id)):
             needed |= {spec.run_id, spec.needs}
     specs = {run_id: spec for run_id, spec in plan.specs.items() if run_id in needed or plan.labels(run_id)}
-    return replace(plan, specs=specs, published=frozenset(specs) - needed)
+    return replace(plan, specs=specs, published=frozenset(specs) & set(results) - needed)
 
 
 def compose_file(sweep: SweepConfig, common: list[str], identify: Identify) -> RunIdentity:

@@ -132,6 +132,8 @@ def fit(
                         callback.on_train_end(trainer, module)  # puts the moving average in their place
                 if trainer.max_epochs % trainer.check_val_every_n_epoch == 0:
                     trainer.loggers = []  # they have the scores of the last epoch already
+                if trainer.max_epochs == 0:
+                    trainer.save_checkpoint(interruption.last)  # no epoch's end has
             if module.evaluated_step != trainer.global_step:
                 trainer.validate(module, datamodule=datamodule, verbose=False)  # the last epoch was not to be validated
     except SystemExit as error:  # Lightning's way to end on a KeyboardInterrupt

@@ -23,7 +23,7 @@ from src.errors import CheckpointError, ConfigError, DataError, DivergedError, H
 from src.models.detector import Detector
 from src.reliability.checkpoints import OpenCheckpoint, load_model_weights, open_checkpoint
 from src.reliability.processes import die_with_parent
-from src.training.identity import TEMPORAL_DATA_KEYS, is_of, run_identity
+from src.training.identity import RUN_ID, TEMPORAL_DATA_KEYS, is_of, run_identity
 from src.training.run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ class WeightSource:
 
     identity: str  # run id, or a digest of the file
     checkpoint: Path
-    overrides: list[str] | None  # of the run that makes it; None for a given file
+    overrides: list[str] | None  # of the run that makes it; None for a given file or run
     folder: RunFolder | None
 
     @property
@@ -70,17 +70,21 @@ def find_source(
 ) -> WeightSource | None:
     """The run or file that `phase.init_from` names, finished or not; None for fresh weights.
 
-    A phase's name means the run of the same command in that phase, less the overrides of what only the later phase has.
-    Raises CheckpointError when a given file does not exist.
+    A phase's name means the run of the same command in that phase, less the overrides of what only the later phase has;
+    a run id that run, trained or not. Raises CheckpointError when a given file does not exist.
     """
     name = config.phase.init_from
     if name is None:
         return None
     if name not in phases:
         path = Path(name)
+        if RUN_ID.fullmatch(name) and not path.is_file():
+            folder = RunFolder(Path(config.paths.outputs), name)
+            return WeightSource(name, folder.checkpoints / "last.ckpt", None, folder)
         if not path.is_file():
             raise CheckpointError(
-                f"phase.init_from={name}: there is no such checkpoint, and no phase of that name ({', '.join(phases)})"
+                f"phase.init_from={name}: there is no such checkpoint, and no phase ({', '.join(phases)}) or run of "
+                "that name"
             )
         return WeightSource(hashlib.sha256(path.read_bytes()).hexdigest()[:16], path, None, None)
     kept = [override for override in overrides if not is_of(override, OF_THIS_RUN)]
@@ -100,9 +104,14 @@ def train_source(source: WeightSource, train_missing: bool, processes_exist: boo
     """Train the run that a phase starts from, in a process of its own, which prints its progress here.
 
     `processes_exist` says that ranks are already running side by side, so none of them can start a training of all.
-    Raises ConfigError when it may not be trained here, the error of its exit code when it fails, and CheckpointError
-    when it had finished before and has lost its weights since.
+    Raises ConfigError when only its id is known, or it may not be trained here, the error of its exit code when it
+    fails, and CheckpointError when it had finished before and has lost its weights since.
     """
+    if source.overrides is None:
+        raise ConfigError(
+            f"phase.init_from={source.identity}: {source.folder.path} holds no finished run with its weights; train "
+            "it first, or give the path of a checkpoint"
+        )
     reason = None
     if not train_missing:
         reason = "phase.train_missing=false"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import re
 from collections.abc import Iterable
 from typing import Any
 
@@ -40,6 +41,10 @@ YOUNGER_KEYS = {"data.timeline": None, "phase.long_range": None, "model.radar_en
 
 At this value a key is no part of an identity, and a checkpoint without the key has it.
 """
+
+
+RUN_ID = re.compile(r"[a-z0-9_]+-[a-z0-9_]+-[a-z0-9_]+-[0-9a-f]{8}")
+"""What `run_identity` returns."""
 
 
 def key_of(override: str) -> str:

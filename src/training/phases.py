@@ -30,10 +30,10 @@ class PhaseConfig:
     task: str  # what a validation scores, one of EVALUATORS
     monitor: str  # logged number that best.ckpt is chosen by, larger being better
     temporal: bool  # clips in order with memory; false: shuffled single frames, and the model has no temporal part
-    init_from: str | None  # a phase, that is the run of the same command in that phase; or the path of a checkpoint
+    init_from: str | None  # a phase, that is the run of the same command in it; a run id; or a checkpoint's path
     train_missing: bool  # train the run that init_from names when it has not finished yet
     frozen_statistics: bool  # norms that came with the weights of `init_from` use their running statistics in training
-    epochs: int
+    epochs: int  # 0: the weights of `init_from` as they are, scored with this run's settings
     validate_every: int  # epochs
     long_range: Protocol | None  # a second score of detections, beside the official one
     options: dict[str, Any]  # what the phase says to the model's family
@@ -54,7 +54,9 @@ class PhaseConfig:
             raise ConfigError(
                 f"phase.long_range scores detections, but phase.task={self.task}; give phase.long_range=null"
             )
-        require_least(self, "phase", {"epochs": 1, "validate_every": 1})
+        require_least(self, "phase", {"epochs": 0, "validate_every": 1})
+        if self.epochs == 0 and self.init_from is None:
+            raise ConfigError("phase.epochs=0 scores the weights of phase.init_from, which is null; name a run or file")
 
     def evaluator(self, datamodule: DetectionDataModule) -> Evaluator:
         """What scores a validation of these data."""

@@ -94,6 +94,15 @@ def test_further_epochs_must_be_as_many(both_phases, write_run, report):
 
 
 @pytest.mark.slow
+def test_weights_scored_once_more_are_left_to_their_sweeps(both_phases, write_run, report):
+    before = [report(phase) for phase in ("phase1", "phase2")]
+    again = ["phase.epochs=0", "model.head.nms=circle"]
+    write_run("one", [*again, "phase.init_from=horizon3d-phase1-mini-0123abcd"], 0, 0.9, epochs=0)
+    write_run("two", [*again, "phase.init_from=horizon3d-phase2-mini-0123abcd"], 0, 0.9, phase="phase2", epochs=0)
+    assert [report(phase) for phase in ("phase1", "phase2")] == before
+
+
+@pytest.mark.slow
 def test_an_unnamed_setting_shows_itself_last(both_phases, write_run, report):
     write_run("a", ["model.dptf.gaussian_path.sampling=random"], 0, 0.9, phase="phase2")
     names = list(rows(report("phase2"), "| experiment | mAP, % | NDS, % | mAVE, m/s |"))

@@ -7,6 +7,7 @@ import pytest
 from src.errors import ConfigError, HorizonError, InterruptedRunError
 from src.report.claims import load_claims
 from src.report.results import RunResult
+from src.report.sweep_record import read_record
 from src.study import __main__ as study
 from src.sweep import compose as sweep_config
 from src.sweep.__main__ import Identifier, definition
@@ -40,6 +41,10 @@ class FakeIdentifier(Identifier):
         return identify(overrides)
 
 
+def record_of(folder, sweep):
+    return read_record(folder / "reports" / "sweeps" / f"{sweep}_debug.json")
+
+
 @pytest.fixture
 def places(tmp_path, monkeypatch):
     """Two sweeps and two claims on them, and the overrides that keep everything in the test's folder."""
@@ -63,7 +68,7 @@ def trained(monkeypatch):
     def run_plan(plan, command, common, identify, outputs, reports, again):
         new = {}
         for spec in plan.specs.values():
-            if spec.run_id in results or spec.run_id in plan.published:
+            if spec.run_id in results or spec.run_id in plan.published or not command.workers:
                 continue
             new.setdefault(spec.label, []).append(spec.seed)
             value = 0.1 + GAIN.get(spec.label, [0.0] * 12)[spec.seed] / 100
@@ -174,6 +179,22 @@ def test_what_has_a_result_elsewhere_is_not_trained(places, trained, tmp_path):
     del results[gone]
     study.main([*places, "published=true", f"paths.outputs={tmp_path / 'another'}"])
     assert [new for _, new in calls if new] == [{"none": [1]}]
+
+
+def test_without_workers_no_look_follows_an_incomplete_one(places, trained, tmp_path, capsys):
+    calls, results = trained
+    study.main(places)
+    before = capsys.readouterr().out
+    of_results = [*places, "published=true", "workers=0", f"paths.outputs={tmp_path / 'another'}"]
+    calls.clear()
+    study.main(of_results)
+    assert calls == [("margin", {}), ("layers", {}), ("layers", {})] and capsys.readouterr().out == before
+    margin = {run for runs in record_of(tmp_path, "margin").rows.values() for run in runs.values()}
+    for run_id in [run_id for run_id, result in results.items() if result.seed == 2 or run_id not in margin]:
+        del results[run_id]
+    calls.clear()
+    study.main(of_results)
+    assert calls == [("margin", {})] and "margin: undecided" in capsys.readouterr().out
 
 
 def test_another_experiment_has_records_of_its_own(places, trained, tmp_path):

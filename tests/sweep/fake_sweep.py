@@ -32,7 +32,7 @@ def make_runner(
 ):
     outputs, reports = Path(folder) / "outputs", Path(folder) / "reports"
     common = [*common, f"paths.outputs={outputs}"]
-    plan = without_published(make_plan(sweep, common, list(seeds), identify), results)
+    plan = without_published(make_plan(sweep, common, list(seeds), identify), results, workers > 0)
     definition = definition or {"format": 1, "kind": "search" if sweep.is_search else "rows"}
     study = SweepStudy(outputs, plan.study, storage or default_storage(outputs), definition)
     writer = RecordWriter(plan, study, "the command", outputs, reports)

@@ -38,7 +38,7 @@ def test_the_address_of_a_database_is_taken_as_it_is(sweeps, quote):
         (["+sweep=god"], r"no sweeps/god.yaml; did you mean good\? there are good"),
         (["+sweep=good", "workers=x"], "'x' of type 'str' could not be converted to Integer$"),
         (["+sweep=good", "seeds=1.5"], "1.5"),
-        (["+sweep=good", "workers=0"], "workers must be at least 1, but got 0"),
+        (["+sweep=good", "workers=-1"], "workers must be at least 0, but got -1"),
         (["+sweep=good", "worker=2"], r"worker: did you mean workers\?"),
         (["+sweep=good", "dryrun=true"], r"did you mean dry_run\?"),
         (["+sweep=good", "dry_run=perhaps"], "perhaps"),

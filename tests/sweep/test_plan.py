@@ -58,6 +58,22 @@ def test_a_run_that_no_row_shows_says_what_it_is_for():
     assert first.command == "python -m src.train phase=phase1 seed=0 paths.outputs=o"
 
 
+def test_a_row_may_score_the_weights_of_another():
+    """Of the same seed, trained first though it stands later; no matter what its own overrides would have trained."""
+    sweep = make_sweep({"few": ["phase=phase2", "model.x=1"], "all": ["phase=phase2"]})
+    sweep.rows[0].weights = "all"
+    plan = make_plan(sweep, ["optim.lr=1"], [3, 4], identify)
+    labels = [(spec.label, spec.seed) for spec in plan.specs.values()]
+    assert labels == [(row, seed) for seed in (3, 4) for row in ("weights for all", "all", "few")]
+    for seed in (3, 4):
+        trained, scored = (plan.specs[plan.rows[row][seed]] for row in ("all", "few"))
+        assert scored.needs == trained.run_id and trained.needs is not None
+        own = {f"phase.init_from={trained.run_id}", "phase.epochs=0", "model.x=1", "optim.lr=1", f"seed={seed}"}
+        assert set(scored.overrides) == own | {"phase=phase2"}
+    rest = without_published(plan, {plan.rows["all"][3], plan.rows["all"][4], plan.rows["few"][4]})
+    assert plan.rows["all"][3] not in rest.published and plan.rows["all"][4] in rest.published
+
+
 def test_what_has_a_result_is_not_trained_nor_what_only_it_starts_from():
     rows = {"one": ["phase=phase1"], "two": ["phase=phase2"], "three": ["phase=phase2", "optim.lr=1"]}
     plan = make_plan(make_sweep(rows), [], [0], identify)

@@ -102,6 +102,18 @@ def test_rows_with_a_result_are_done_without_training(tmp_path):
     assert {path.name for path in published} == {results["one"][0], results["three"][0]}
 
 
+def test_without_workers_what_there_is_is_recorded(tmp_path):
+    """A row with a result counts though another would be trained from its weights."""
+    rows = {"one": ["phase=phase1"], "two": ["phase=phase2"], "three": ["phase=phase1", "optim.lr=1"]}
+    plan = make_runner(tmp_path / "elsewhere", make_sweep(rows)).plan
+    one = plan.rows["one"][0]
+    record = make_runner(tmp_path, make_sweep(rows), results={one}, workers=0).run()
+    assert {label: record.runs[runs[0]].state for label, runs in record.rows.items()} == {
+        "one": "done", "two": "waiting", "three": "waiting"
+    }  # fmt: skip
+    assert not trained(tmp_path) and record == record_of(tmp_path)
+
+
 def test_a_failed_row_is_reported_and_retried_by_the_next_call(tmp_path):
     rows = {"good": ["model.x=1"], "bad": ["model.x=2"], "killed": ["model.x=3"]}
     bad = fault(tmp_path, ["model.x=2", "seed=0"], "5", "3")

@@ -317,6 +317,11 @@ def test_what_the_mistakes_are_made_from_is_right(written):
         (GOOD | {"rows": [{"label": "a", "paper": {"mAP": float("nan")}}]}, "mAP must be a valid number, but is 'NaN'"),
         (GOOD | {"baseline": "c"}, r"baseline 'c' is not the label of a row \(a, b\)"),
         (GOOD | {"rows": [{"label": "a"}, {"label": "b", "baseline": "c"}]}, "baseline 'c' is not the label"),
+        (GOOD | {"rows": [{"label": "a"}, {"label": "b", "weights": "c"}]}, r"row 'b': weights 'c' must be.* \(a\)"),
+        (
+            GOOD | {"rows": [{"label": "a", "weights": "b"}, {"label": "b", "weights": "a"}]},
+            r"row 'a': weights 'b' must be the label of a row that is trained at every scale \(there is none\)",
+        ),
         (GOOD | {"rows": [{"label": "a", "scales": ["paper"]}]}, "baseline 'a' must be for every scale"),
         (GOOD | {"tables": [{"name": "t", "title": "T", "columns": ["mAP"], "rows": ["z"]}]}, "t: there is no row z"),
         (GOOD | {"tables": GOOD["tables"] * 2}, r"two tables have one name \(t, t\)"),

@@ -141,6 +141,17 @@ def test_a_file_counts_by_its_content(tmp_path):
     assert run_a != source_of("phase=phase2")[1]
 
 
+def test_a_run_is_named_by_its_id(tmp_path):
+    """It need not have finished to be planned with, but to be started from."""
+    name = "horizon3d-phase2-debug-0123abcd"
+    source, run = source_of("phase=phase1", f"phase.init_from={name}", f"paths.outputs={tmp_path}")
+    assert source.identity == name and source.checkpoint == tmp_path / name / "checkpoints" / "last.ckpt"
+    assert run not in (identity("phase=phase1"), source_of("phase=phase1", f"phase.init_from={name[:-1]}e")[1])
+    assert not source.ready
+    with pytest.raises(ConfigError, match=f"phase.init_from={name}: .*{name} holds no finished run with its weights"):
+        train_source(source, train_missing=True, processes_exist=False)
+
+
 @pytest.mark.parametrize("name", ["nowhere.ckpt", "phase9", "."])
 def test_a_file_that_does_not_exist(name):
     with pytest.raises(CheckpointError, match=rf"init_from={name}.*no such checkpoint.*phase1, phase2"):
@@ -502,6 +513,28 @@ def test_phase_1_for_further_epochs(handed_over, caplog):
     run = outputs / source_of(*own)[1]
     assert record(run)["initialized_from"] == first.name and record(run)["epochs"] == 2 and run != first
     assert f"weights from {first / 'checkpoints' / 'last.ckpt'}; new: 0 tensors in nothing" in caplog.text
+
+
+@pytest.mark.slow
+def test_weights_are_scored_once_more_with_other_settings(handed_over, tmp_path):
+    """Without an epoch: the scores and the weights of the run they come from, unless a setting of inference differs."""
+    outputs, _, second, _ = handed_over
+    untrained = ("phase=phase2", f"phase.init_from={second.name}", "phase.epochs=0")
+
+    def scored(*settings):
+        call("train", "scale=debug", f"paths.outputs={outputs}", "trainer.num_pictures=0", *untrained, *settings)
+        return outputs / source_of(*untrained, *settings)[1]
+
+    same, few = scored(), scored("model.head.max_boxes=3")
+    assert (same / "metrics.json").read_text() == (second / "metrics.json").read_text()
+    assert (record(same)["epochs"], record(same)["steps"], record(same)["initialized_from"]) == (0, 0, second.name)
+    boxes = [json.loads((run / "submission.json").read_text())["results"].values() for run in (same, few)]
+    assert max(map(len, boxes[0])) > 3 >= max(map(len, boxes[1]))
+    weights = [torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"] for run in (second, few)]
+    assert weights[0].keys() == weights[1].keys()
+    assert all(torch.equal(value, weights[1][key]) for key, value in weights[0].items())
+    evaluate.main([f"checkpoint={few / 'checkpoints' / 'last.ckpt'}", f"out={tmp_path}", f"paths.outputs={outputs}"])
+    assert (tmp_path / "metrics.json").read_text() == (few / "metrics.json").read_text()
 
 
 @pytest.mark.slow

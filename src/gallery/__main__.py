@@ -1,0 +1,205 @@
+"""`python -m src.gallery runs=A,B`: what finished runs found and missed, chosen by rule, into `paths.reports`.
+
+Six frames by condition, the worst misses and the worst false positives of the last run, each as every run sees it, and
+a film of the first frame's scene.
+"""
+
+from __future__ import annotations
+
+import shlex
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from src.assembly import build_datamodule, data_root
+from src.config import Config, compose_config
+from src.data.datamodule import DetectionDataModule
+from src.errors import ConfigError, DataError
+from src.files.atomic_write import write_whole
+from src.geometry.transforms import quaternion_to_matrix
+from src.metrics.detection import match_parts
+from src.metrics.diagnostics import count_returns
+from src.metrics.extremes import frames_by_condition, worst_false_positives, worst_misses
+from src.metrics.protocol import OFFICIAL
+from src.metrics.submission import load_submission, to_ego
+from src.pictures.film import Film
+from src.pictures.gallery import GalleryFrame, draw_boxes, draw_whole_frames
+from src.reliability.command import run_command
+from src.structures.batch import FrameBatch
+from src.structures.detections import DetectionTable, EvaluationSet
+from src.structures.evidence import Evidence
+from src.structures.taxonomy import CLASSES
+from src.training.identity import key_of
+from src.training.run_folder import RunFolder, make_writable
+from src.training.snapshots import SHOWN_SCORE, boxes_of, scene_of, views_of
+
+COUNT = 6
+"""Frames by condition, misses and false positives each."""
+
+PAGE = """# Gallery, scale {scale}
+
+`{command}`: what the run `{last}` finds, beside {others}. Frames and boxes are chosen by rule, not by
+taste; what is drawn has a score of at least {score}.
+
+## By condition
+
+Of the tags of weather, daytime and lighting, the rarest first, each gives the first scene that stands for none yet; of
+that the middle key frame. Images show the boxes of `{last}`.
+
+![Six frames by condition](pictures/{conditions})
+
+## Worst misses
+
+Ground truth that no prediction of its class reaches within {error_m:g} m, whatever the score: with the most returns in
+the input, one of a class.
+
+![What the sensors saw best and the run missed](pictures/{misses})
+
+## Worst false positives
+
+Predictions without ground truth of their class within {far_m:g} m: of the highest score, one of a class.
+
+![What the run is surest of and is not there](pictures/{false_positives})
+
+## A scene
+
+![All key frames of the first scene above](pictures/{film})
+"""
+
+
+def main(overrides: list[str]) -> None:
+    """Write the sheets, the film and the page. Raises ConfigError for runs that are not there, DataError for others'
+    data."""
+    named = [override.partition("=")[2] for override in overrides if key_of(override) == "runs"]
+    runs = [name for name in named[-1].strip("[]").split(",") if name] if named else []
+    if not runs:
+        raise ConfigError("give runs=A,B: ids of finished runs of paths.outputs, the one that is looked at last")
+    config, _ = compose_config([override for override in overrides if key_of(override) != "runs"])
+    reports = Path(config.paths.reports)
+    make_writable(reports, "paths.reports")
+    datamodule = build_datamodule(config, data_root(config, write=False))
+    gallery = Gallery(config, datamodule, {run: read_boxes(config, datamodule, run) for run in runs})
+    said = [override for override in overrides if key_of(override) not in ("paths.outputs", "paths.reports")]
+    print(f"written: {gallery.write(reports, shlex.join(['python', '-m', 'src.gallery', *said]))}")
+
+
+def read_boxes(config: Config, datamodule: DetectionDataModule, run_id: str) -> DetectionTable:
+    """What a finished run detects. Raises ConfigError when it is not there, DataError when its data are others."""
+    folder = RunFolder(Path(config.paths.outputs), run_id)
+    if not folder.finished:
+        raise ConfigError(f"runs={run_id}: {folder.path} holds no finished run; train it first")
+    data, _ = folder.read_result()
+    if data.get("data") != datamodule.identity():
+        raise DataError(
+            f"runs={run_id}: it was scored on {data.get('data')}, but this command reads {datamodule.identity()}; give "
+            "the scale and the data of the run"
+        )
+    return load_submission(folder.path / "submission.json", datamodule.evaluation_set().tokens)
+
+
+class Gallery:
+    """The sheets of some runs on one split."""
+
+    def __init__(self, config: Config, datamodule: DetectionDataModule, found: dict[str, DetectionTable]) -> None:
+        self.config, self.datamodule, self.found = config, datamodule, found
+        self.evaluation_set: EvaluationSet = datamodule.evaluation_set()
+
+    def write(self, reports: Path, command: str) -> Path:
+        """Pictures and film below `reports/pictures`, and the page that shows them; its path."""
+        parts = match_parts(self.evaluation_set, list(self.found.values())[-1], {}, by_range=False, by_speed=False)
+        frames = frames_by_condition(self.evaluation_set, COUNT)
+        truth, predictions = self.evaluation_set.ground_truth, parts.ranking.predictions
+        returns = self._count_returns()
+        misses, false = worst_misses(parts, returns, COUNT), worst_false_positives(parts, COUNT)
+        film = self._scene(next(iter(frames)))
+        wanted = {*frames, *film, *truth.samples[misses].tolist(), *predictions.samples[false].tolist()}
+        batches = self._read(wanted)
+        scale = self.config.scale
+        names = [name.replace(f"-{scale}", "") for name in self.found]
+        pictures, last = reports / "pictures", names[-1]
+        sheets = {name: f"gallery_{name}_{scale}.png" for name in ("conditions", "misses", "false_positives")}
+        whole = [self._frame(batches[sample], sample, tag) for sample, tag in frames.items()]
+        draw_whole_frames(pictures / sheets["conditions"], "By condition", whole, names, SHOWN_SCORE)
+        missed = [
+            self._around(batches[int(truth.samples[row])], truth, row, f"{returns[row]} returns") for row in misses
+        ]
+        draw_boxes(pictures / sheets["misses"], f"Worst misses of {last}", missed, names, SHOWN_SCORE)
+        wrong = [
+            self._around(
+                batches[int(predictions.samples[row])], predictions, row, f"score {predictions.scores[row]:.2f}"
+            )
+            for row in false
+        ]
+        draw_boxes(pictures / sheets["false_positives"], f"Worst false positives of {last}", wrong, names, SHOWN_SCORE)
+        self._film(pictures / f"gallery_{scale}.gif", {sample: batches[sample] for sample in film}, names)
+        path = reports / f"gallery_{scale}.md"
+        write_whole(path, self._page(sheets, f"gallery_{scale}.gif", command))
+        return path
+
+    def _scene(self, sample: int) -> list[int]:
+        """All samples of its scene, in order."""
+        of_scene = np.flatnonzero(self.evaluation_set.scenes == self.evaluation_set.scenes[sample])
+        return of_scene[np.argsort(self.evaluation_set.times_s[of_scene], kind="stable")].tolist()
+
+    def _count_returns(self) -> np.ndarray:
+        """Points of what the model reads inside each ground truth [k]."""
+        truth = self.evaluation_set.ground_truth
+        returns = np.zeros(len(truth), np.int64)
+        for frame in self.datamodule.stream():
+            rows = truth.samples == self.evaluation_set.index_of[frame.tokens[0]]
+            returns[rows] = count_returns(frame, 0, frame.boxes[0])
+        return returns
+
+    def _read(self, wanted: set[int]) -> dict[int, FrameBatch]:
+        """The frames of these samples."""
+        tokens = {self.evaluation_set.tokens[sample]: sample for sample in wanted}
+        return {tokens[frame.tokens[0]]: frame for frame in self.datamodule.stream() if frame.tokens[0] in tokens}
+
+    def _frame(self, batch: FrameBatch, sample: int, title: str) -> GalleryFrame:
+        """A frame as every run sees it."""
+        scenes = []
+        for table in self.found.values():
+            boxes = to_ego(table[table.samples == sample], self._pose(sample))
+            scenes.append(scene_of(batch, boxes, Evidence(), self.config.grid.build()).drawable(SHOWN_SCORE))
+        name = f"{title}, sample {batch.tokens[0][:12]}"
+        return GalleryFrame(name, scenes, views_of(batch))
+
+    def _around(self, batch: FrameBatch, table: DetectionTable, row: int, what: str) -> GalleryFrame:
+        """The frame of one box, titled by it."""
+        sample = int(table.samples[row])
+        box = boxes_of(to_ego(table[[row]], self._pose(sample)))
+        distance = float(np.linalg.norm(box.centers[0, :2]))
+        title = f"{CLASSES[table.labels[row]].replace('_', ' ')} at {distance:.0f} m, {what}"
+        return replace(self._frame(batch, sample, title), box=replace(box, scores=None))
+
+    def _pose(self, sample: int) -> np.ndarray:
+        """global_from_ego [4, 4] of a sample."""
+        pose = np.eye(4)
+        pose[:3, :3] = quaternion_to_matrix(self.evaluation_set.ego_rotations[sample])
+        pose[:3, 3] = self.evaluation_set.ego_centers[sample]
+        return pose
+
+    def _film(self, path: Path, batches: dict[int, FrameBatch], names: list[str]) -> None:
+        film = Film()
+        with tempfile.TemporaryDirectory() as folder:
+            for number, (sample, batch) in enumerate(batches.items(), start=1):
+                picture = Path(folder) / "frame.png"
+                frame = self._frame(batch, sample, f"frame {number}")
+                draw_whole_frames(picture, "", [frame], names, SHOWN_SCORE)
+                film.add(picture, float(batch.timestamps_s))
+        film.write_animation(path)
+
+    def _page(self, sheets: dict[str, str], film: str, command: str) -> str:
+        """The page, with the rules by which its frames were chosen."""
+        *others, last = self.found
+        return PAGE.format(
+            scale=self.config.scale, last=last, others=", ".join(f"`{name}`" for name in others) or "no other run",
+            command=command, count=COUNT, error_m=OFFICIAL.error_threshold_m, far_m=OFFICIAL.thresholds_m[-1],
+            score=SHOWN_SCORE, film=film, **sheets,
+        )  # fmt: skip
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,57 @@
+"""`python -m src.gallery`: pages of real runs, and what it refuses."""
+
+import json
+import shutil
+
+import pytest
+from PIL import Image
+
+from tests.running import call
+
+SHEETS = ["gallery_conditions_debug.png", "gallery_false_positives_debug.png", "gallery_misses_debug.png"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """(outputs, the one run in it)."""
+    outputs = tmp_path_factory.mktemp("outputs")
+    call("train", "phase=phase1", "scale=debug", f"paths.outputs={outputs}", "trainer.num_pictures=0")
+    (run,) = outputs.glob("horizon3d-phase1-debug-*")
+    return outputs, run
+
+
+def refused(outputs, *overrides, expect):
+    return call("gallery.__main__", "scale=debug", f"paths.outputs={outputs}", *overrides, expect=expect).stderr
+
+
+@pytest.mark.slow
+def test_the_page_shows_its_pictures_and_its_command(trained, tmp_path):
+    outputs, run = trained
+    shutil.copytree(run, outputs / "another")
+    names = f"runs={run.name},another"
+    places = (f"paths.outputs={outputs}", f"paths.reports={tmp_path}")
+    said = call("gallery.__main__", "scale=debug", names, *places).stdout
+    page = tmp_path / "gallery_debug.md"
+    assert f"written: {page}" in said
+    text = page.read_text()
+    assert f"python -m src.gallery scale=debug {names}`" in text and str(tmp_path) not in text
+    assert "the run `another` finds, beside" in text
+    assert sorted(path.name for path in (tmp_path / "pictures").glob("*.png")) == SHEETS
+    assert all(f"(pictures/{name})" in text for name in [*SHEETS, "gallery_debug.gif"])
+    with Image.open(tmp_path / "pictures" / "gallery_debug.gif") as film:
+        assert film.n_frames == 3  # of a debug scene
+
+
+@pytest.mark.slow
+def test_what_it_refuses(trained, tmp_path):
+    outputs, run = trained
+    assert "give runs=A,B" in refused(outputs, expect=3)
+    assert "runs=nowhere: " in refused(outputs, "runs=nowhere", expect=3)
+    other = shutil.copytree(run, outputs / "other")
+    record = json.loads((other / "run.json").read_text())
+    (other / "run.json").write_text(json.dumps(record | {"data": record["data"] | {"root": "0123"}}))
+    assert "runs=other: it was scored on" in refused(outputs, "runs=other", expect=4)
+    (other / "run.json").write_text(json.dumps(record))
+    (other / "submission.json").unlink()
+    assert "submission.json" in refused(outputs, "runs=other", f"paths.reports={tmp_path}", expect=4)
+    assert not list(tmp_path.glob("*.md"))
