@@ -20,7 +20,7 @@ REFLECTIVITY = {"ground": 0.1, "slat": 0.2}
 """Of an actor it follows from its colour."""
 DETECTABLE = -np.log(0.1) / 0.1
 """Echo over reflectivity at the reach: a surface of 0.1 that faces the sensor is seen with a chance of 0.9."""
-NEWTON_STEPS, EXACT_M = 12, 1e-7
+NEWTON_STEPS, EXACT_M = 12, 1e-5
 
 
 @dataclass(kw_only=True)
@@ -110,7 +110,7 @@ def scene_blocks(scene: Scene, time_s: float, ego_s: float) -> Blocks:
     """What stands and moves on the road around a place along it."""
     middles, velocities, yaws = scene.boxes(time_s)
     slats, slat_sizes, slat_yaws = scene.road.slats(ego_s - LONG_BEAMS.reach_m, ego_s + LONG_BEAMS.reach_m)
-    paint = np.array([np.mean(actor.colour) for actor in scene.actors])
+    paint = np.array([actor.colour for actor in scene.actors]).mean(1)
     return Blocks(
         middles=np.concatenate([middles, slats]),
         velocities=np.concatenate([velocities, np.zeros_like(slats)]),
@@ -169,12 +169,12 @@ def _near_misses(
 
     Returns the column and the block of each pair of these [P], and the pair and the row of each ray [K].
     """
-    level = np.maximum(np.hypot(directions[..., 0], directions[..., 1]), 1e-12)
-    ahead = directions[..., :2].sum(1)
-    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
+    level = np.maximum(np.sqrt(directions[..., 0] ** 2 + directions[..., 1] ** 2), 1e-12)
+    middle = directions.shape[1] // 2
+    ahead = directions[:, middle, :2] / level[:, middle, None]
     aside = np.abs(ahead[:, :1] * directions[..., 1] - ahead[:, 1:] * directions[..., 0]) / level
     forwards = ahead[:, :1] * directions[..., 0] + ahead[:, 1:] * directions[..., 1] > 0
-    lean = np.where(forwards, aside, 1.0).max(1)[:, None]  # the largest sine between a ray's bearing and its column's
+    lean = np.where(forwards, aside, 1.0).max(1)[:, None]  # the largest sine between a ray's bearing and the middle's
     x, y = (
         blocks.middles[:, axis] + after_s[:, None] * blocks.velocities[:, axis] - origins[:, axis, None]
         for axis in (0, 1)
@@ -186,8 +186,8 @@ def _near_misses(
     column, owner = np.nonzero(beside & (ahead[:, :1] * x + ahead[:, 1:] * y >= -room))
     distance, around = distance[column, owner], around[owner]
     nearest, farthest = np.maximum(distance - around, 1e-12), distance + around
-    middle = blocks.middles[owner, 2] + after_s[column] * blocks.velocities[owner, 2] - origins[column, 2]
-    top, bottom = middle + 0.5 * blocks.sizes[owner, 2], middle - 0.5 * blocks.sizes[owner, 2]
+    z = blocks.middles[owner, 2] + after_s[column] * blocks.velocities[owner, 2] - origins[column, 2]
+    top, bottom = z + 0.5 * blocks.sizes[owner, 2], z - 0.5 * blocks.sizes[owner, 2]
     highest, lowest = np.maximum(top / nearest, top / farthest), np.minimum(bottom / nearest, bottom / farthest)
     inside = distance <= around
     highest[inside], lowest[inside] = np.inf, -np.inf
@@ -205,31 +205,35 @@ def _ground_hits(
     slowly that it meets the first crossing.
     """
     ranges, slant = np.full(directions.shape[:2], np.inf), np.zeros(directions.shape[:2])
-    sensor_s = road.along(origins[:, :2], np.full(len(origins), guess_s), rounds=4)
+    sensor_s = road.along(origins[:, :2], np.full(len(origins), guess_s), rounds=2)
     heading, slope = road.heading_at(sensor_s)[:, None], road.slope_at(sensor_s)[:, None]
     forward = np.cos(heading) * directions[..., 0] + np.sin(heading) * directions[..., 1]
     sinking = slope * forward - directions[..., 2]  # of a ray above the ground, per metre
     height = origins[:, 2] - road.height_at(sensor_s)
     ray = np.flatnonzero(sinking * 1.5 * reach_m > height[:, None])
     column = ray // directions.shape[1]
-    distance = height[column] / sinking.flat[ray]
-    s = sensor_s[column] + distance * forward.flat[ray]
-    open_rays = np.concatenate([directions.reshape(-1, 3)[ray], origins[column]], 1).T
+    distance = height.take(column) / sinking.take(ray)
+    s = sensor_s.take(column) + distance * forward.take(ray)
+    lines = np.concatenate([directions.reshape(-1, 3).take(ray, 0).T, origins.take(column, 0).T])
     for _ in range(NEWTON_STEPS):
-        dx, dy, dz, x, y, z = open_rays
+        dx, dy, dz, x, y, z = lines
         (road_x, road_y, heading, ground, slope), gain = road.profile_at(s)
         cos, sin = np.cos(heading), np.sin(heading)
         aside_x, aside_y = x + distance * dx - road_x, y + distance * dy - road_y
         stretch = 1.0 / (1.0 - gain[2] * (cos * aside_y - sin * aside_x))  # of s against metres at that side
         ahead, forward = cos * aside_x + sin * aside_y, cos * dx + sin * dy
         rise = np.maximum(slope * stretch * forward - dz, 1e-4)
-        nearer = np.clip(distance + (z + distance * dz - ground - slope * stretch * ahead) / rise, 0.0, 2 * reach_m)
-        s = s + stretch * (ahead + (nearer - distance) * forward)
-        going = np.abs(nearer - distance) > EXACT_M
-        met = ~going & (nearer < 1.5 * reach_m)
-        ranges.flat[ray[met]] = nearer[met]
-        slant.flat[ray[met]] = (np.maximum(slope * forward - dz, 1e-4) / np.sqrt(1 + slope**2))[met]
-        ray, s, distance, open_rays = ray[going], s[going], nearer[going], open_rays[:, going]
+        nearer = distance + (z + distance * dz - ground - slope * stretch * ahead) / rise
+        nearer = np.minimum(np.maximum(nearer, 0.0), 2 * reach_m)
+        step = nearer - distance
+        s = s + stretch * (ahead + step * forward)
+        going = np.abs(step) > EXACT_M
+        met = np.flatnonzero(~going & (nearer < 1.5 * reach_m))
+        ranges.reshape(-1)[ray.take(met)] = nearer.take(met)
+        cosine = np.maximum(slope * forward - dz, 1e-4) / np.sqrt(1 + slope**2)
+        slant.reshape(-1)[ray.take(met)] = cosine.take(met)
+        going = np.flatnonzero(going)
+        ray, s, distance, lines = ray.take(going), s.take(going), nearer.take(going), lines.take(going, 1)
     return ranges, slant
 
 
