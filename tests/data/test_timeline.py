@@ -11,7 +11,8 @@ from src.data.cache import load_index
 from src.data.clips import FrameKey
 from src.data.datamodule import DetectionDataModule
 from src.data.rays import radar_speeds
-from src.data.reader import FrameReader, OnBadFile
+from src.data.reader import FrameReader
+from src.data.sensor_files import OnBadFile
 from src.data.timeline import LidarTimeline, RadialSpeeds, SweepTimeline, TimelineConfig
 from src.errors import ConfigError, DataError
 from src.geometry.transforms import invert_rigid
