@@ -216,6 +216,8 @@ def _ground_hits(
     s = sensor_s.take(column) + distance * forward.take(ray)
     lines = np.concatenate([directions.reshape(-1, 3).take(ray, 0).T, origins.take(column, 0).T])
     for _ in range(NEWTON_STEPS):
+        if not len(ray):
+            break
         dx, dy, dz, x, y, z = lines
         (road_x, road_y, heading, ground, slope), gain = road.profile_at(s)
         cos, sin = np.cos(heading), np.sin(heading)
