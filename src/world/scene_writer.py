@@ -188,9 +188,10 @@ class SceneWriter:
 
     def _to_local(self, mount: Mount, points: Array, times_s: Array) -> Array:
         """Each point [P, 3] of a sensor by the ego pose at its own time."""
-        rotations, translations = self.scene.ego.poses(times_s)
+        moments, which = np.unique(times_s, return_inverse=True)
+        rotations, translations = self.scene.ego.poses(moments)
         in_ego = points.astype(np.float64) @ mount.rotation.T + mount.translation
-        return np.einsum("pij,pj->pi", rotations, in_ego) + translations
+        return np.einsum("pij,pj->pi", rotations[which], in_ego) + translations[which]
 
     def _truths(
         self, pixels: list[tuple[Array, Array]], radar: list[Array], lidar: list[Array] | None
