@@ -224,8 +224,9 @@ def _ground_hits(
         aside_x, aside_y = x + distance * dx - road_x, y + distance * dy - road_y
         stretch = 1.0 / (1.0 - gain[2] * (cos * aside_y - sin * aside_x))  # of s against metres at that side
         ahead, forward = cos * aside_x + sin * aside_y, cos * dx + sin * dy
-        rise = np.maximum(slope * stretch * forward - dz, 1e-4)
-        nearer = distance + (z + distance * dz - ground - slope * stretch * ahead) / rise
+        climb = gain[3] * stretch  # of the ground, per metre ahead
+        rise = np.maximum(climb * forward - dz, 1e-4)
+        nearer = distance + (z + distance * dz - ground - climb * ahead) / rise
         nearer = np.minimum(np.maximum(nearer, 0.0), 2 * reach_m)
         step = nearer - distance
         s = s + stretch * (ahead + step * forward)
