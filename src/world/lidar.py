@@ -21,6 +21,7 @@ REFLECTIVITY = {"ground": 0.1, "slat": 0.2}
 DETECTABLE = -np.log(0.1) / 0.1
 """Echo over reflectivity at the reach: a surface of 0.1 that faces the sensor is seen with a chance of 0.9."""
 NEWTON_STEPS, EXACT_M = 12, 1e-5
+"""A ray has met the ground when a step is shorter; one that never does grazes it and gives no echo."""
 
 
 @dataclass(kw_only=True)
@@ -145,7 +146,7 @@ def _block_hits(
     origins: Array, directions: Array, after_s: Array, blocks: Blocks
 ) -> tuple[Array, Array, Array, Array]:  # [H] each
     """Where rays enter blocks: the ray's flat place in [A, E], the distance, the cosine of the slant and the block."""
-    column, owner, pair, row = _near_misses(origins, directions, after_s, blocks)
+    column, owner, pair, row = _candidates(origins, directions, after_s, blocks)
     cos, sin = np.cos(blocks.yaws[owner]), np.sin(blocks.yaws[owner])
     x, y, z = (origins[column] - blocks.middles[owner] - after_s[column, None] * blocks.velocities[owner]).T
     start = np.stack([cos * x + sin * y, cos * y - sin * x, z])[:, pair]  # [3, K], in the axes of the block
@@ -162,7 +163,7 @@ def _block_hits(
     return ray[hit], enter[hit], cosine, owner[pair[hit]]
 
 
-def _near_misses(
+def _candidates(
     origins: Array, directions: Array, after_s: Array, blocks: Blocks
 ) -> tuple[Array, Array, Array, Array]:
     """Which rays meet the upright cylinders around blocks, and perhaps a few more.
@@ -222,7 +223,8 @@ def _ground_hits(
         (road_x, road_y, heading, ground, slope), gain = road.profile_at(s)
         cos, sin = np.cos(heading), np.sin(heading)
         aside_x, aside_y = x + distance * dx - road_x, y + distance * dy - road_y
-        stretch = 1.0 / (1.0 - gain[2] * (cos * aside_y - sin * aside_x))  # of s against metres at that side
+        # Of s against metres at that side; infinite at the centre of a bend.
+        stretch = 1.0 / np.maximum(1.0 - gain[2] * (cos * aside_y - sin * aside_x), 0.1)
         ahead, forward = cos * aside_x + sin * aside_y, cos * dx + sin * dy
         climb = gain[3] * stretch  # of the ground, per metre ahead
         rise = np.maximum(climb * forward - dz, 1e-4)
