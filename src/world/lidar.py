@@ -163,9 +163,7 @@ def _block_hits(
     return ray[hit], enter[hit], cosine, owner[pair[hit]]
 
 
-def _candidates(
-    origins: Array, directions: Array, after_s: Array, blocks: Blocks
-) -> tuple[Array, Array, Array, Array]:
+def _candidates(origins: Array, directions: Array, after_s: Array, blocks: Blocks) -> tuple[Array, Array, Array, Array]:
     """Which rays meet the upright cylinders around blocks, and perhaps a few more.
 
     Returns the column and the block of each pair of these [P], and the pair and the row of each ray [K].
