@@ -19,8 +19,8 @@ from src.models.horizon3d.loss import cell_losses, gaussian_velocity_loss, kggi_
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import OCSF
 from src.models.horizon3d.output import Horizon3DOutput
-from src.models.horizon3d.views import CameraViews
 from src.models.layers.doppler import Doppler
+from src.models.layers.views import CameraViews
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
@@ -92,7 +92,7 @@ class Horizon3D(Detector):
         views = kggi = ocsf = None
         doppler = self._measure_doppler(batch)
         if self.image_encoder is not None:
-            views = self._encode_views(batch)
+            views = CameraViews.encode(self.image_encoder, batch)
             kggi = self.kggi(radar_bev, views, warped_memory.history if warped_memory is not None else None)
             ocsf = self.ocsf(kggi.gaussians, radar_bev, views, doppler["gaussians"])
             fused = ocsf.fused_bev
@@ -113,16 +113,6 @@ class Horizon3D(Detector):
         if any(wanted.values()):
             measured = Doppler.measure(batch.radar_points, batch.radar_batch, self.grid)
         return {name: measured if its else None for name, its in wanted.items()}
-
-    def _encode_views(self, batch: FrameBatch) -> CameraViews:
-        if batch.images is None or batch.image_valid is None or batch.pix_from_aug is None:
-            raise ValueError("FrameBatch.images is None, but this model uses images; read them with the frames")
-        if batch.images.shape[1] != len(CAMERAS):
-            raise ValueError(f"FrameBatch.images must hold {len(CAMERAS)} views, but got {batch.images.shape[1]}")
-        height, width = batch.images.shape[-2:]
-        return CameraViews(
-            self.image_encoder(batch.images), batch.pix_from_aug, batch.image_valid, (int(height), int(width))
-        )
 
     def loss_terms(self, output: Horizon3DOutput, batch: FrameBatch) -> Objective:
         """Terms of Eq. 10 as weighted."""

@@ -17,8 +17,8 @@ from src.models.horizon3d.loss import Horizon3DLossConfig, VelocityGroups
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom
-from src.models.horizon3d.views import CameraViews
 from src.models.layers.doppler import DopplerConfig
+from src.models.layers.views import CameraViews
 from src.structures.batch import FrameBatch
 from src.targets.depth import DepthTarget
 from tests.models.surroundings import DIAGONALS, camera_matrices, random_boxes
