@@ -108,10 +108,14 @@ class Horizon3D(Detector):
 
     def _measure_doppler(self, batch: FrameBatch) -> dict[str, Doppler | None]:
         """For whom the configuration wants it."""
-        wanted = vars(self.config.doppler)
-        measured = None
+        config, measured = self.config.doppler, None
+        wanted = {name: getattr(config, name) for name in ("gaussians", "cells", "boxes")}
         if any(wanted.values()):
-            measured = Doppler.measure(batch.radar_points, batch.radar_batch, self.grid)
+            points, owners = batch.radar_points, batch.radar_batch
+            if self.training and config.withheld:
+                known = torch.rand(len(batch), device=owners.device)[owners] >= config.withheld
+                points, owners = points[known], owners[known]
+            measured = Doppler.measure(points, owners, self.grid)
         return {name: measured if its else None for name, its in wanted.items()}
 
     def _encode_views(self, batch: FrameBatch) -> CameraViews:
