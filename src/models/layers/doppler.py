@@ -33,8 +33,8 @@ class DopplerConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.withheld < 1:
             raise ConfigError(
-                f"model.doppler.withheld={self.withheld}: a share of frames, at least 0 and below 1; without the radar's "
-                "velocities at all set model.doppler.gaussians, .cells and .boxes to false"
+                f"model.doppler.withheld={self.withheld}: a share of frames, at least 0 and below 1; for none of the "
+                "radar's velocities set model.doppler.gaussians, .cells and .boxes to false"
             )
 
 
