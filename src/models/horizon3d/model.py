@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from src.errors import ConfigError
@@ -108,10 +109,14 @@ class Horizon3D(Detector):
 
     def _measure_doppler(self, batch: FrameBatch) -> dict[str, Doppler | None]:
         """For whom the configuration wants it."""
-        wanted = vars(self.config.doppler)
-        measured = None
+        config, measured = self.config.doppler, None
+        wanted = {name: getattr(config, name) for name in ("gaussians", "cells", "boxes")}
         if any(wanted.values()):
-            measured = Doppler.measure(batch.radar_points, batch.radar_batch, self.grid)
+            points, owners = batch.radar_points, batch.radar_batch
+            if self.training and config.withheld:
+                known = torch.rand(len(batch), device=owners.device)[owners] >= config.withheld
+                points, owners = points[known], owners[known]
+            measured = Doppler.measure(points, owners, self.grid)
         return {name: measured if its else None for name, its in wanted.items()}
 
     def loss_terms(self, output: Horizon3DOutput, batch: FrameBatch) -> Objective:
