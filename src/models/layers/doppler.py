@@ -31,11 +31,8 @@ class DopplerConfig:
     withheld: float  # share of the frames of training in which none does
 
     def __post_init__(self) -> None:
-        if not 0 <= self.withheld < 1:
-            raise ConfigError(
-                f"model.doppler.withheld={self.withheld}: a share of frames, at least 0 and below 1; for none of the "
-                "radar's velocities set model.doppler.gaussians, .cells and .boxes to false"
-            )
+        if not 0 <= self.withheld <= 1:
+            raise ConfigError(f"model.doppler.withheld={self.withheld}: must be a share of frames, 0 to 1")
 
 
 @dataclass
