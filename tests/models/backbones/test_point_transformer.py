@@ -1,6 +1,5 @@
 """Radar points in patches of a space-filling curve: the curve by hand, a plain loop as oracle, padding, no points."""
 
-
 import pytest
 import torch
 
