@@ -46,15 +46,16 @@ def test_phase_2_composes_at_every_scale(scale):
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
-@pytest.mark.parametrize("name", ["dense_bev", "crt_fusion"])
-def test_detectors_on_a_dense_map_compose_at_every_scale(scale, phase, name):
+@pytest.mark.parametrize("name", ["dense_bev", "crt_fusion", "sparc"])
+def test_other_detectors_of_radar_and_cameras_compose_at_every_scale(scale, phase, name):
     """At the same range and cell; phase 1 drops what its settings name as temporal."""
     config, tree = compose_config([f"scale={scale}", "data.root=x", f"model={name}", f"phase={phase}"])
     model = config.model
     assert model.name == tree["model"]["name"] == name and config.grid.cells == [384, 384]
     assert (model.temporal is None) == (tree["model"]["temporal"] is None) == (phase == "phase1")
     assert (model.memory_frames > 0) == (model.memory_max_age_s == 6.0) == (phase == "phase2")
-    assert model.view_transform.num_depth_bins in (16, 80) and model.view_transform.depth_range == (1.0, 160.0)
+    lifted = model.queries if name == "sparc" else model.view_transform
+    assert lifted.num_depth_bins in (16, 80) and lifted.depth_range == (1.0, 160.0)
 
 
 @pytest.mark.slow
@@ -132,7 +133,7 @@ FULL_SIZE = {
         "refine_from": "self_encoding", "gate_kernel_size": 1,
         "identity_start": False,
     },
-    "model.doppler": {"gaussians": True, "cells": False, "boxes": True},
+    "model.doppler": {"gaussians": True, "cells": False, "boxes": True, "withheld": 0.0},
     "model.head": {"nms": "maxpool", "score_threshold": 0.1, "max_boxes": 500, "attributes": "rule"},
     "model.loss": {
         "kggi_weight": 1.0, "ocsf_weight": 5.0, "heatmap_weight": 1.0, "box_weight": 0.25, "keypoint_weight": 1.0,
@@ -173,7 +174,7 @@ FULL_SIZE_PHASE_2 = {
         "train_missing": True, "temporal": True,
     },
     "phase.options": {"velocity_code_weight": 1.0},
-    "model.doppler": {"gaussians": True, "cells": True, "boxes": True},
+    "model.doppler": {"gaussians": True, "cells": True, "boxes": True, "withheld": 0.0},
     "model.dptf": {"max_age_s": 6.0, "min_speed_mps": 1.0},
     "model.dptf.bev_path": {
         "num_frames": 8, "memory_threshold": 0.1, "max_cells_per_frame": 4096, "velocity_compensation": True,
@@ -242,6 +243,7 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["model=dense_bev", "model.view_transform.image_stride_px=0"], "image_stride_px=0"),
         (["model=dense_bev", "phase=phase2", "model.temporal.num_frames=0"], "num_frames=0.*model.temporal=null"),
         (["model=crt_fusion", "phase=phase2", "model.temporal.occupancy_threshold=1"], "occupancy_threshold=1"),
+        (["model=sparc", "phase=phase2", "model.temporal.queries_per_frame=0"], "queries_per_frame=0"),
         (["phase=phase2", "phase.name=phase1"], "phase.name=phase1.*phase=\\.\\.\\."),
         (["phase.options.velocity_code_weight=-1"], "velocity_code_weight"),
         (["optim.final_lr_ratio=-1"], "final_lr_ratio"),

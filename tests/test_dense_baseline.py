@@ -1,4 +1,4 @@
-"""Detectors on a dense map by the commands people type, at debug scale: phase 1, phase 2, evaluation, streaming."""
+"""Other detectors of radar and cameras by the commands people type, at debug scale: phases, evaluation, streaming."""
 
 import json
 
@@ -14,7 +14,7 @@ from tests.running import call
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module", params=["dense_bev", "crt_fusion"])
+@pytest.fixture(scope="module", params=["dense_bev", "crt_fusion", "sparc"])
 def family(request):
     return request.param
 
@@ -39,7 +39,7 @@ def test_both_phases_leave_what_is_promised(trained, outputs, family):
         names = ("config.yaml", "metrics.json", "metrics.csv", "run.json", "submission.json", "checkpoints/last.ckpt")
         assert all((folder / name).is_file() for name in names), folder
         header = (folder / "metrics.csv").read_text().splitlines()[0].split(",")
-        assert {"loss/heatmap", "loss/box", "loss/depth", "loss/total", "state/pillars"} <= set(header)
+        assert {"loss/heatmap", "loss/box", "loss/depth", "loss/total", "state/objects"} <= set(header)
         assert list((folder / "pictures").glob("frame_*.png"))
     assert "state/remembered_frames" in header
     log = (trained / "log.txt").read_text()

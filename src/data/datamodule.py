@@ -29,8 +29,9 @@ from src.data.clips import (
 from src.data.data_config import DataConfig
 from src.data.evaluation_set import evaluation_set
 from src.data.frame_loader import FrameLoader, collate, collate_in_worker, init_worker
-from src.data.reader import FrameReader, OnBadFile
+from src.data.reader import FrameReader
 from src.data.schema import CHANNELS, DatasetIndex
+from src.data.sensor_files import OnBadFile
 from src.data.splits import split_samples
 from src.errors import ConfigError, DataError, HorizonError
 from src.structures.batch import FrameBatch

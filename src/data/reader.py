@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import logging
-import os
-from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from enum import Enum
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 
 from src.data.augment import AugmentationConfig, draw_bev_transform, draw_crop, frame_generator
-from src.data.compensation import Sweeps, compensate_clouds, ego_motion, motion_known, place_sweep, reached
+from src.data.compensation import Sweeps, compensate_clouds, ego_motion, place_sweep
 from src.data.images import read_image, width_fit
-from src.data.pcd import LidarCloud, read_lidar_points, read_radar_points
+from src.data.pcd import LidarCloud
 from src.data.rays import RADAR_WINDOW_S, TRUE_MARGIN_M, lidar_rays, radar_speeds, without_ego_body
 from src.data.schema import CHANNELS, DatasetIndex
+from src.data.sensor_files import OnBadFile, SensorFiles, Skipped
 from src.data.timeline import LidarTimeline, RadialSpeeds, SweepTimeline, TimelineConfig
 from src.data.true_geometry import TrueGeometry
-from src.errors import DataError
 from src.geometry.camera import pixels_from_points
 from src.geometry.transforms import invert_rigid, pose_matrix, quaternion_to_matrix, yaw_of
 from src.structures.batch import LIDAR_POINT_FIELDS, RADAR_POINT_FIELDS, FrameBatch
@@ -31,29 +27,6 @@ from src.structures.ray_bundle import RayBundle
 from src.structures.taxonomy import CAMERAS, LIDARS, RADARS, REFERENCE_CHANNEL
 
 Array = np.ndarray
-T = TypeVar("T")
-
-MAX_SCAN_S = 0.3
-"""Points further in time from their sweep are of another clock; a LiDAR takes 0.1 s for a sweep."""
-
-_log = logging.getLogger(__name__)
-
-
-class OnBadFile(Enum):
-    """What an unreadable sensor file, or one whose ego pose no truck can have, does."""
-
-    error = "error"
-    skip = "skip"  # counted; a radar or LiDAR file gives no points, an image a masked camera
-
-
-@dataclass
-class _Skipped:
-    """What a frame does without, and the sweeps that it has read."""
-
-    sweeps: dict[int, LidarCloud | None] = field(default_factory=dict)  # by row; frames of a timeline share them
-    channels: Counter[str] = field(default_factory=Counter)
-    files: list[str] = field(default_factory=list)
-    lost: bool = False  # the key frame's own pose is wrong, so that no annotation is where it says
 
 
 @dataclass(kw_only=True)
@@ -85,9 +58,7 @@ class FrameReader:
     def __init__(self, index: DatasetIndex, settings: ReaderSettings) -> None:
         self.index = index
         self.settings = settings
-        self._root = os.path.realpath(index.root)
-        self._folders: dict[str, str] = {}  # where the folders of files lead to
-        self._reported: set[str] = set()
+        self._files = SensorFiles(index, settings.on_bad_file, settings.deskew_lidar)
         self._preceding = _preceding(index)  # [N] row of the scene's sample before, -1 for none
         self.timeline = settings.timeline and LidarTimeline(index, settings.timeline)
         self._radars: SweepTimeline | None = None  # made on first need
@@ -118,7 +89,7 @@ class FrameReader:
         if bev is not None and clip is not None:
             aug_from_ego = draw_bev_transform(bev, frame_generator(seed, epoch, clip))
         global_from_ego = self._global_from_ego(sample)
-        skipped = _Skipped(lost=self._lost(sample))
+        skipped = Skipped(lost=self._files.lost(sample))
         batch = self._key_frame(sample, aug_from_ego)
         if self.settings.num_sweeps:
             batch |= self._radar_points(sample, global_from_ego, aug_from_ego, skipped)
@@ -164,52 +135,14 @@ class FrameReader:
         sample: int,
         global_from_ego: Array,  # [4, 4]
         aug_from_ego: Array,  # [4, 4]
-        skipped: _Skipped,
+        skipped: Skipped,
     ) -> dict[str, torch.Tensor]:
-        files = self._files(sample, RADARS, self.settings.num_sweeps, skipped)
-        rows, clouds = self._clouds(sample, files, lambda path, row: read_radar_points(path), skipped)
+        files = self._files.of_frame(sample, RADARS, self.settings.num_sweeps, skipped)
+        rows, clouds = self._files.radar_clouds(sample, files, skipped)
         times_us = self.index.data_times_us[rows]
         ages_s = 1e-6 * (self.index.frame_times_us[sample] - times_us)
         sweeps = self._sweeps(rows, clouds, times_us)
         return radar_tensors(sweeps, ages_s, global_from_ego, aug_from_ego, self.settings)
-
-    def _files(self, sample: int, channels: tuple[str, ...], count: int, skipped: _Skipped) -> list[int]:
-        """Rows of the key frame's files and the sweeps before it of each channel, fewer at a scene's start."""
-        rows = self.index.key_data[sample, [CHANNELS.index(channel) for channel in channels]]
-        for channel, row in zip(channels, rows, strict=True):
-            if row < 0 and count:
-                skipped.channels[f"{channel} (not recorded)"] += 1
-        return self._with_sweeps_before(rows, count)
-
-    def _with_sweeps_before(self, rows: Array, count: int) -> list[int]:
-        """Of each sensor `count` files that end with the given one; -1 stands for none."""
-        files = []
-        for row in rows.tolist():
-            for _ in range(count):
-                if row < 0:
-                    break
-                files.append(row)
-                row = int(self.index.data_previous[row])
-        return files
-
-    def _clouds(
-        self,
-        sample: int,
-        files: list[int],  # rows
-        read: Callable[[str, int], T],  # of the path and the row of the file
-        skipped: _Skipped,
-    ) -> tuple[Array, list[T]]:  # [S] int64 rows of the files
-        """What could be read of these files of sensors of one kind."""
-        owners = [CHANNELS[channel] for channel in self.index.data_channels[files]]
-        kept, clouds = [], []
-        for row, channel in zip(
-            *self._with_known_poses(sample, np.array(files, np.int64), owners, skipped), strict=True
-        ):
-            cloud = self._guarded(sample, channel, row, partial(read, row=row), skipped)
-            if cloud is not None:
-                kept.append(row)
-                clouds.append(cloud)
-        return np.array(kept, np.int64), clouds
 
     def _sweeps(
         self,
@@ -236,21 +169,12 @@ class FrameReader:
         sample: int,
         global_from_ego: Array,  # [4, 4]
         aug_from_ego: Array,  # [4, 4]
-        skipped: _Skipped,
+        skipped: Skipped,
     ) -> dict[str, torch.Tensor]:
-        files = self._files(sample, LIDARS, self.settings.num_lidar_sweeps, skipped)
-        rows, clouds = self._lidar_clouds(sample, files, skipped)
+        files = self._files.of_frame(sample, LIDARS, self.settings.num_lidar_sweeps, skipped)
+        rows, clouds = self._files.lidar_clouds(sample, files, skipped)
         aug_from_global = aug_from_ego @ invert_rigid(global_from_ego)
         return self._placed(rows, clouds, aug_from_global, int(self.index.frame_times_us[sample]))
-
-    def _lidar_clouds(self, sample: int, files: list[int], skipped: _Skipped) -> tuple[Array, list[LidarCloud]]:
-        """As `_clouds`; a file is read once in a frame, and if it is bad counts once."""
-        fresh = [row for row in files if row not in skipped.sweeps]
-        skipped.sweeps |= dict.fromkeys(fresh)
-        rows, clouds = self._clouds(sample, fresh, self._lidar_cloud, skipped)
-        skipped.sweeps |= zip(rows.tolist(), clouds, strict=True)
-        kept = [row for row in files if skipped.sweeps[row] is not None]
-        return np.array(kept, np.int64), [skipped.sweeps[row] for row in kept]
 
     def _placed(
         self,
@@ -272,27 +196,12 @@ class FrameReader:
             self.settings.lidar_origins if origins is None else origins,
         )
 
-    def _lidar_cloud(self, path: str, row: int) -> LidarCloud:
-        """One file, its points' times checked against the table's."""
-        cloud = read_lidar_points(path)
-        stamp = int(self.index.data_times_us[row])
-        if not self.settings.deskew_lidar:
-            return LidarCloud(cloud.points, np.full_like(cloud.times_us, stamp))
-        away = np.abs(cloud.times_us - stamp)
-        if len(away) and away.max() > 1e6 * MAX_SCAN_S:
-            at = int(np.argmax(away))
-            raise DataError(
-                f"{path}: point {at} was measured at {cloud.times_us[at]} us, more than {MAX_SCAN_S} s from its sweep, "
-                f"{stamp} us; with data.deskew_lidar=false times of points are not used"
-            )
-        return cloud
-
     # ---------------------------------------------------------------- LiDAR of the timeline
 
-    def _past_frame(self, sample: int, step: int, aug_from_ego: Array, skipped: _Skipped) -> FrameBatch:
+    def _past_frame(self, sample: int, step: int, aug_from_ego: Array, skipped: Skipped) -> FrameBatch:
         """The LiDAR frame at a moment, in the ego frame of its LIDAR_LEFT sweep or else of the first there is."""
-        files = self._with_sweeps_before(self.timeline.sweeps(sample, step), self.settings.num_lidar_sweeps)
-        rows, clouds = self._lidar_clouds(sample, files, skipped)
+        files = self._files.with_sweeps_before(self.timeline.sweeps(sample, step), self.settings.num_lidar_sweeps)
+        rows, clouds = self._files.lidar_clouds(sample, files, skipped)
         frame, aug_from_global = self._key_frame(sample, aug_from_ego), np.eye(4)
         if len(rows):
             own = rows[np.argmax(self.index.data_channels[rows] == CHANNELS.index(REFERENCE_CHANNEL))]
@@ -306,12 +215,12 @@ class FrameReader:
             }
         return FrameBatch(**frame, **self._placed(rows, clouds, aug_from_global, time_us if len(rows) else 0))
 
-    def _rays(self, sample: int, steps: Sequence[int], aug_from_global: Array, skipped: _Skipped) -> RayBundle:
+    def _rays(self, sample: int, steps: Sequence[int], aug_from_global: Array, skipped: Skipped) -> RayBundle:
         """Returns of one sweep of each LiDAR at each moment; a moment without sweeps gives no rays."""
         frame_time_us, parts = int(self.index.frame_times_us[sample]), []
         for step in steps:
-            files = self._with_sweeps_before(self.timeline.sweeps(sample, step), 1)
-            rows, clouds = self._lidar_clouds(sample, files, skipped)
+            files = self._files.with_sweeps_before(self.timeline.sweeps(sample, step), 1)
+            rows, clouds = self._files.lidar_clouds(sample, files, skipped)
             mounts = self.index.ego_from_sensor[self.index.data_calibrations[rows]]
             clouds = list(map(without_ego_body, clouds, mounts))
             parts.append(lidar_rays(self._placed(rows, clouds, aug_from_global, frame_time_us, origins=True), step))
@@ -321,7 +230,7 @@ class FrameReader:
         find = self._true_speeds if source is RadialSpeeds.exact else self._radar_speeds
         return replace(rays, speeds=torch.from_numpy(find(sample, rays, aug_from_global, skipped).astype(np.float32)))
 
-    def _true_speeds(self, sample: int, rays: RayBundle, aug_from_global: Array, skipped: _Skipped) -> Array:  # [R]
+    def _true_speeds(self, sample: int, rays: RayBundle, aug_from_global: Array, skipped: Skipped) -> Array:  # [R]
         """By the true motion that a synthetic world knows, in metres of the augmented frame."""
         scene = int(self.index.sample_scenes[sample])
         if self._truth is None or self._truth[0] != scene:
@@ -332,7 +241,7 @@ class FrameReader:
         velocities = self._truth[1].velocities(points, times_us, TRUE_MARGIN_M) @ aug_from_global[:3, :3].T
         return (velocities * rays.directions.double().numpy()).sum(1)
 
-    def _radar_speeds(self, sample: int, rays: RayBundle, aug_from_global: Array, skipped: _Skipped) -> Array:  # [R]
+    def _radar_speeds(self, sample: int, rays: RayBundle, aug_from_global: Array, skipped: Skipped) -> Array:  # [R]
         """By the radar returns beside the rays' ends."""
         index, frame_time_us = self.index, int(self.index.frame_times_us[sample])
         if self._radars is None:
@@ -342,7 +251,7 @@ class FrameReader:
         for step in rays.steps.unique().tolist():
             own_us = times_us[rays.steps.numpy() == step]
             files |= set(self._radars.between(sample, own_us.min() - window_us, own_us.max() + window_us).tolist())
-        rows, clouds = self._clouds(sample, sorted(files), lambda path, row: read_radar_points(path), skipped)
+        rows, clouds = self._files.radar_clouds(sample, sorted(files), skipped)
         sweeps = self._sweeps(rows, clouds, index.data_times_us[rows])
         ages_s = 1e-6 * (frame_time_us - index.data_times_us[rows])
         unmoved, pose = replace(self.settings, propagate_points=False), self._global_from_ego(sample)
@@ -358,7 +267,7 @@ class FrameReader:
         aug_from_ego: Array,  # [4, 4]
         augmentation: AugmentationConfig | None,
         rng: np.random.Generator,
-        skipped: _Skipped,
+        skipped: Skipped,
     ) -> dict[str, torch.Tensor]:
         """Images at network size and P_n by each camera's own pose; a missing camera stays black and masked."""
         index, settings = self.index, self.settings
@@ -378,7 +287,7 @@ class FrameReader:
             if row < 0:
                 skipped.channels[f"{channel} (not recorded)"] += 1
                 continue
-            if not self._with_known_poses(sample, rows[view : view + 1], [channel], skipped)[1]:
+            if not self._files.with_known_poses(sample, rows[view : view + 1], [channel], skipped)[1]:
                 continue
             source_px = tuple(int(n) for n in index.data_sizes[row])
             crop = (
@@ -387,7 +296,7 @@ class FrameReader:
                 else draw_crop(ida, rng, source_px, settings.image_size_px)
             )
             read = partial(read_image, source_px=source_px, crop=crop)
-            image = self._guarded(sample, channel, row, read, skipped)
+            image = self._files.guarded(sample, channel, row, read, skipped)
             if image is not None:
                 images[view], valid[view] = image, True
             pix_from_aug[view] = pixels_from_points(
@@ -421,79 +330,6 @@ class FrameReader:
             attributes=torch.from_numpy(index.box_attributes[rows].astype(np.int64)),
             num_points=torch.from_numpy(index.box_points[rows].astype(np.int64)),
         )
-
-    # ---------------------------------------------------------------- files
-
-    def _guarded(self, sample: int, channel: str, row: int, read: Callable[[str], T], skipped: _Skipped) -> T | None:
-        """Read a sensor file; when it cannot be, raise or count and return None, as `on_bad_file` says."""
-        name = self.index.filename(row)
-        try:
-            return read(self._inside(name))
-        except DataError as error:
-            if self.settings.on_bad_file is OnBadFile.error:
-                remedy = "restore the file, or skip and count such files with data.on_bad_file=skip"
-                raise DataError(f"{error} (sample {self.index.sample_tokens[sample]}); {remedy}") from error
-            skipped.channels[channel] += 1
-            skipped.files.append(name)
-            if name not in self._reported:
-                self._reported.add(name)
-                _log.warning("skipped: %s", error)
-            return None
-
-    def _with_known_poses(
-        self,
-        sample: int,
-        rows: Array,  # [S] int64, of files
-        channels: list[str],  # S
-        skipped: _Skipped,
-    ) -> tuple[list[int], list[str]]:
-        """Files that the truck can have recorded where their poses say; for others raise or count, as `on_bad_file`."""
-        index, poses = self.index, self.index.data_poses[rows]
-        good = reached(index, poses, index.frame_poses[sample])
-        if self.settings.on_bad_file is OnBadFile.error:
-            if not good.all():
-                name = index.filename(int(rows[np.argmin(good)]))
-                raise DataError(
-                    f"{index.root / index.version}/ego_pose.json: from the pose of {name} a truck cannot have come to "
-                    f"that of its key frame, sample {index.sample_tokens[sample]}, so the table is damaged there; "
-                    "unpack the release again, or skip and count such files with data.on_bad_file=skip"
-                )
-            return rows.tolist(), channels  # where the poses around a sweep jump `ego_motion` says so
-        if set(channels) <= set(RADARS):
-            good &= motion_known(index, index.data_times_us[rows])
-        elif set(channels) <= set(LIDARS) and self.settings.deskew_lidar:
-            good &= motion_known(index, index.pose_times_us[poses])
-        for row, channel in zip(rows[~good].tolist(), np.array(channels)[~good].tolist(), strict=True):
-            name = index.filename(row)
-            skipped.channels[f"{channel} (ego pose)"] += 1
-            skipped.files.append(name)
-            if name not in self._reported:
-                self._reported.add(name)
-                _log.warning("skipped: the ego pose of %s is not one that a truck can have driven to", name)
-        return rows[good].tolist(), np.array(channels)[good].tolist()
-
-    def _lost(self, sample: int) -> bool:
-        """Whether none of a key frame's files was recorded where a truck could have come from its pose."""
-        rows = self.index.key_data[sample]
-        poses = self.index.data_poses[rows[rows >= 0]]
-        poses = poses[poses != self.index.frame_poses[sample]]
-        return len(poses) > 0 and not reached(self.index, poses, self.index.frame_poses[sample]).any()
-
-    def _inside(self, name: str) -> str:
-        """The file's path, refused when a symbolic link leads out of the data set.
-
-        A folder is followed once: sixty files of a frame lie in a dozen folders.
-        """
-        folder, _, file = name.rpartition("/")
-        if folder not in self._folders:
-            self._folders[folder] = os.path.realpath(os.path.join(self._root, folder))
-        path = f"{self._folders[folder]}/{file}"
-        if os.path.islink(path):
-            path = os.path.realpath(path)
-        if not path.startswith(f"{self._root}/"):
-            stated = os.path.join(self._root, name)
-            raise DataError(f"{stated}: leads to {path}, which is outside the dataset folder")
-        return path
 
 
 def _preceding(index: DatasetIndex) -> Array:  # [N] int64

@@ -13,7 +13,8 @@ from PIL import Image
 from src.data.compensation import Sweeps
 from src.data.images import MAX_PIXELS, resample, width_fit
 from src.data.pcd import LIDAR_FIELDS, RADAR_FIELDS
-from src.data.reader import MAX_SCAN_S, ReaderSettings, lidar_tensors, radar_tensors
+from src.data.reader import ReaderSettings, lidar_tensors, radar_tensors
+from src.data.sensor_files import MAX_SCAN_S
 from src.errors import DataError
 from src.geometry.camera import pixels_from_points
 from src.geometry.transforms import invert_rigid

@@ -54,7 +54,7 @@ def diagnose(
 ) -> list[FrameDiagnosis]:
     """Compare what a batch's samples were made of with their annotations."""
     found = []
-    for sample, boxes in enumerate(truth):
+    for sample, boxes in enumerate(boxes.to(batch.device) for boxes in truth):
         occupied = None if evidence.cells is None else _hold_occupied_cells(evidence.cells, sample, boxes)
         remembered, sums = None, {}
         if evidence.gaussians is not None:

@@ -20,21 +20,9 @@ from src.models.backbones.pillars import PillarConfig, PillarEncoder
 from src.models.detector import Detector, ModelConfig, Objective
 from src.models.heads.center_head import BoxOptions, CenterHead, HeadConfig, HeadOutput
 from src.models.layers.lift_splat import LiftedViews, LiftSplatConfig
+from src.models.memory import TemporalConfig
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
-
-
-@dataclass(kw_only=True)
-class TemporalConfig:
-    """Settings of the temporal part (`model.temporal`). Raises ConfigError when there is nothing to remember."""
-
-    num_frames: int  # remembered key frames
-    max_age_s: float  # older ones are not used
-
-    def __post_init__(self) -> None:
-        require_least(self, "model.temporal", {"num_frames": 1}, "; model.temporal=null means no memory")
-        if not self.max_age_s > 0:
-            raise ConfigError(f"model.temporal.max_age_s={self.max_age_s}: must be positive")
 
 
 @dataclass(kw_only=True)

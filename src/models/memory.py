@@ -9,10 +9,23 @@ from typing import Generic, Self, TypeVar
 import torch
 from torch import Tensor
 
-from src.errors import ConfigError
+from src.errors import ConfigError, require_least
 from src.geometry.tensor_transforms import invert_rigid
 from src.structures.batch import MAX_EGO_SPEED_MPS, FrameBatch
 from src.structures.tensor_fields import TensorFields
+
+
+@dataclass(kw_only=True)
+class TemporalConfig:
+    """Settings of the temporal part (`model.temporal`). Raises ConfigError when there is nothing to remember."""
+
+    num_frames: int  # remembered key frames
+    max_age_s: float  # older ones are not used
+
+    def __post_init__(self) -> None:
+        require_least(self, "model.temporal", {"num_frames": 1}, "; model.temporal=null means no memory")
+        if not self.max_age_s > 0:
+            raise ConfigError(f"model.temporal.max_age_s={self.max_age_s}: must be positive")
 
 
 @dataclass

@@ -79,6 +79,18 @@ def segment_max(
     return zeros.scatter_reduce(0, index, values, "amax", include_self=False)
 
 
+def segment_softmax(
+    scores: Tensor,  # [n]
+    rows: Tensor,  # [n] int64
+    num_rows: int,
+) -> Tensor:  # [n]
+    """Softmax over the scores that share a row. Differentiable."""
+    with torch.no_grad():  # softmax does not change with what is subtracted
+        highest = scores.new_zeros(num_rows).scatter_reduce(0, rows, scores, "amax", include_self=False)
+    weights = (scores - highest[rows]).exp()
+    return weights / F.embedding(rows, segment_sum(weights[:, None], rows, num_rows)).squeeze(1)
+
+
 class _SegmentSum(torch.autograd.Function):
     @staticmethod
     def forward(ctx: FunctionCtx, values: Tensor, rows: Tensor, num_rows: int) -> Tensor:

@@ -36,7 +36,12 @@ They are left out of its identity, of its result, and of what a sweep records of
 TEMPORAL_DATA_KEYS = ("groups_per_scene", "stream_sets", "past_frames", "sensor_dropout")
 """Of `data`: what changes nothing of a phase without memory."""
 
-YOUNGER_KEYS = {"data.timeline": None, "phase.long_range": None, "model.radar_encoder.pruning_ratio": 0.0}
+YOUNGER_KEYS = {
+    "data.timeline": None,
+    "phase.long_range": None,
+    "model.radar_encoder.pruning_ratio": 0.0,
+    "model.doppler.withheld": 0.0,
+}
 """Keys that runs were made without, with the value that does what was done then.
 
 At this value a key is no part of an identity, and a checkpoint without the key has it.

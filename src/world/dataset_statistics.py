@@ -159,7 +159,13 @@ def count_inside(
     points: Array,  # [P, 3] m
 ) -> Array:  # [B]
     """How many of the points lie in each upright box, borders included."""
-    cos, sin = np.cos(yaws)[:, None], np.sin(yaws)[:, None]
-    x, y, z = np.moveaxis(points[None] - centres[:, None], -1, 0)
-    inside = (np.abs(cos * x + sin * y) <= half[:, :1]) & (np.abs(cos * y - sin * x) <= half[:, 1:2])
-    return (inside & (np.abs(z) <= half[:, 2:])).sum(1)
+    points = points[np.argsort(points[:, 0])]
+    around = np.hypot(half[:, 0], half[:, 1]) + 1e-6  # more than rounding takes off
+    first, last = (np.searchsorted(points[:, 0], centres[:, 0] + side * around) for side in (-1, 1))
+    counts = np.zeros(len(centres), dtype=np.int64)
+    for box in np.flatnonzero(last > first):
+        x, y, z = (points[first[box] : last[box]] - centres[box]).T
+        cos, sin = np.cos(yaws[box]), np.sin(yaws[box])
+        inside = (np.abs(cos * x + sin * y) <= half[box, 0]) & (np.abs(cos * y - sin * x) <= half[box, 1])
+        counts[box] = np.count_nonzero(inside & (np.abs(z) <= half[box, 2]))
+    return counts

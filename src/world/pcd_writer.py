@@ -44,7 +44,10 @@ def lidar_pcd(
     """
     sizes = [LIDAR_TYPE[name].itemsize for name in LIDAR_TYPE.names]
     plain = b"".join(np.ascontiguousarray(points[name]).tobytes() for name in LIDAR_TYPE.names)
-    runs = (plain[at : at + 32] for at in range(0, len(plain), 32))
-    packed = b"".join(bytes([len(run) - 1]) + run for run in runs)
+    full = len(plain) // 32
+    runs = np.full((full, 33), 31, dtype=np.uint8)  # a run's length less one, then the run
+    runs[:, 1:] = np.frombuffer(plain, np.uint8, 32 * full).reshape(full, 32)
+    last = plain[32 * full :]
+    packed = runs.tobytes() + (bytes([len(last) - 1]) + last if last else b"")
     header = _header(LIDAR_TYPE.names, sizes, ["F", "F", "F", "F", "U"], len(points), "binary_compressed")
     return header + struct.pack("<II", len(packed), len(plain)) + packed

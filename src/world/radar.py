@@ -196,19 +196,19 @@ class Radars:
         rng, ego_s = self.rng, float(self.scene.ego.tracks.road_state(time_s)[0][0])
         near = np.abs(self.scenery.clutter_s - ego_s) < self.config.radar_reach_m + 20
         points, rcs = self.scenery.clutter[near], self.scenery.clutter_rcs_db[near]
-        seen = np.einsum("rpi,rij->rpj", points[None] - origin[:, None], rotation)
-        ray = seen - self.places[:, None]
+        radar, index = np.nonzero(self._ahead(points, rotation, origin))
+        seen = np.einsum("ki,kij->kj", points[index] - origin[radar], rotation[radar])
+        ray = seen - self.places[radar]
         distance = np.linalg.norm(ray, axis=-1)
-        azimuth = _wrap(np.arctan2(ray[..., 1], ray[..., 0]) - self.boresight[:, None])
-        signal = _strength(rcs, distance, azimuth)
+        azimuth = _wrap(np.arctan2(ray[:, 1], ray[:, 0]) - self.boresight[radar])
+        signal = _strength(rcs[index], distance, azimuth)
         mean = CLUTTER_RETURNS * signal / (1 + signal)
         in_view = (np.abs(azimuth) < RADAR_AZIMUTH_RAD) & (distance < self.config.radar_reach_m) & (distance > 3.0)
-        count = rng.poisson(np.where(in_view, mean, 0.0))
-        radar, index = np.nonzero(count)
-        radar, index = np.repeat(radar, count[radar, index]), np.repeat(index, count[radar, index])
+        returned = np.repeat(np.arange(len(radar)), rng.poisson(np.where(in_view, mean, 0.0)))
+        radar, index, seen, ray = radar[returned], index[returned], seen[returned], ray[returned]
         across, height = self.scenery.clutter_d[near][index], self.scenery.clutter_height[near][index]
-        kept = self._arrives(hiding, radar, ray[radar, index], across, height)
-        radar, index = radar[kept], index[kept]
+        kept = self._arrives(hiding, radar, ray, across, height)
+        radar, index, seen = radar[kept], index[kept], seen[kept]
         fading = self._fading_db(len(radar))
         number = len(self.places)
         tarmac = rng.poisson(self.config.tarmac_returns * self.config.clutter_density, number)
@@ -216,9 +216,22 @@ class Radars:
         angle = self.boresight[which] + np.clip(rng.normal(0, 0.5, len(which)), -1.0, 1.0)
         span = 9.0 + rng.gamma(1.6, 10.0, len(which))
         surface = np.stack([span * np.cos(angle), span * np.sin(angle), np.full(len(which), -1.95)], 1)
-        point = np.concatenate([seen[radar, index], self.places[which] + surface])
+        point = np.concatenate([seen, self.places[which] + surface])
         strength = np.concatenate([rcs[index] + fading - CLUTTER_SHARE_DB, rng.normal(-15, 3, len(which))])
         return _Returns(np.concatenate([radar, which]), point, np.zeros_like(point), strength)
+
+    def _ahead(self, points: Array, rotation: Array, origin: Array) -> Array:  # [R, P] bool
+        """Which points [P, 3] (local coordinates) each radar may have in view, by where they are in the plane.
+
+        Beyond 10 m the truck's sway and slope turn the bearing of no point by as much as 5 degrees.
+        """
+        place = np.einsum("rij,rj->ri", rotation, self.places) + origin
+        yaw = self.boresight + yaw_of(rotation)
+        x, y = (points[:, axis] - place[:, axis, None] for axis in (0, 1))
+        forward = np.cos(yaw)[:, None] * x + np.sin(yaw)[:, None] * y
+        away = x * x + y * y
+        ahead = (forward > 0) & (forward * forward > np.cos(RADAR_AZIMUTH_RAD + np.radians(5.0)) ** 2 * away)
+        return (ahead | (away < 10.0**2)) & (away < (self.config.radar_reach_m + 1.0) ** 2)
 
     def _ghosts(self, found: _Returns) -> tuple[_Returns, _Returns]:
         """Multipath copies (farther away, weaker, nearly the same Doppler) and returns from nowhere."""

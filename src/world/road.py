@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -82,6 +83,23 @@ class Road:
     def slope_at(self, s: Array) -> Array:
         """dz/ds, upwards positive."""
         return (self.height_at(np.asarray(s) + 1.0) - self.height_at(np.asarray(s) - 1.0)) / 2.0
+
+    @cached_property
+    def _profile(self) -> tuple[Array, Array]:
+        """Rows x, y, heading, height and slope at every metre, and what each gains until the next: [5, S], [5, S]."""
+        slope = self.slope_at(START_M + np.arange(len(self.z)))
+        rows = np.stack([*self.xy.T, self.heading_rad, self.z, slope])
+        return rows, np.diff(rows, append=rows[:, -1:])
+
+    def profile_at(self, s: Array) -> tuple[Array, Array]:
+        """Rows x, y (m), heading (rad), height (m) and slope at places [K], and what each gains in a metre there:
+        [5, K] both. The values of `place(s, 0)`, `heading_at` and `slope_at` in one look-up.
+        """
+        rows, gains = self._profile
+        index = np.minimum(np.maximum(s - START_M, 0.0), len(self.z) - 1.001)
+        low = index.astype(np.int64)
+        gain = gains.take(low, axis=1)
+        return rows.take(low, axis=1) + (index - low) * gain, gain
 
     def curvature_at(self, s: Array) -> Array:
         """1/m, left turns positive."""

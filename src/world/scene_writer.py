@@ -22,7 +22,7 @@ from src.world.labels import (
     labelled,
     visibility_level,
 )
-from src.world.lidar import scan_lidars
+from src.world.lidar import Lidars
 from src.world.motion import LEAD_IN_S
 from src.world.pcd_writer import LIDAR_TYPE, lidar_pcd, radar_pcd
 from src.world.radar import Radars
@@ -166,15 +166,15 @@ class SceneWriter:
         """All sweeps of six lidars, or empty key frames of LIDAR_LEFT; returns, if scanned, the points of each key
         frame in local coordinates.
         """
-        rng = scene_rng(self.config, self.index, 6)
         mounts = [self.rig[name] for name in LIDARS]
+        lidars = Lidars(self.config, self.scene, mounts, scene_rng(self.config, self.index, 6))
         sweeps = self.config.lidar_sweeps_per_key_frame if self.config.lidar else 1
         points = []
         for frame, is_key, base in self._firings(LIDAR_RATE_HZ, sweeps):
             time = self._quantised(base + self.rig[REFERENCE_CHANNEL].delay_s)
             clouds = {REFERENCE_CHANNEL: np.zeros(0, dtype=LIDAR_TYPE)}
             if self.config.lidar:
-                clouds = scan_lidars(self.config, self.scene, mounts, time, self._stamp(time), rng)
+                clouds = lidars.sweep(time, self._stamp(time))
             for name, cloud in clouds.items():
                 self._store(name, frame, is_key, time, lidar_pcd(cloud), len(cloud))
             if is_key:
@@ -188,9 +188,10 @@ class SceneWriter:
 
     def _to_local(self, mount: Mount, points: Array, times_s: Array) -> Array:
         """Each point [P, 3] of a sensor by the ego pose at its own time."""
-        rotations, translations = self.scene.ego.poses(times_s)
+        moments, which = np.unique(times_s, return_inverse=True)
+        rotations, translations = self.scene.ego.poses(moments)
         in_ego = points.astype(np.float64) @ mount.rotation.T + mount.translation
-        return np.einsum("pij,pj->pi", rotations, in_ego) + translations
+        return np.einsum("pij,pj->pi", rotations[which], in_ego) + translations[which]
 
     def _truths(
         self, pixels: list[tuple[Array, Array]], radar: list[Array], lidar: list[Array] | None

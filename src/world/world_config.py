@@ -12,7 +12,7 @@ from src.errors import ConfigError
 GENERATOR = "highway-3"
 """Changes whenever the same config would give other bytes, so that old worlds are not mistaken for new ones."""
 
-LIDAR_GENERATOR = "lidar-2"
+LIDAR_GENERATOR = "lidar-3"
 """The same of what is written only with `lidar`; worlds without stay what they are."""
 
 RADAR_RATE_HZ = 20

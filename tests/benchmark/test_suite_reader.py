@@ -18,7 +18,7 @@ from src.benchmark.suite_reader import (
 )
 from src.benchmark.timing import timed_parts
 from src.config import compose_config
-from src.data import images, reader
+from src.data import images, sensor_files
 from src.data.images import read_image, width_fit
 from src.data.pcd import read_radar_points
 from src.structures.taxonomy import RADARS
@@ -56,7 +56,7 @@ def test_every_part_of_the_suite(config):
 
 
 def test_measuring_leaves_the_reader_as_it_was(config):
-    places = [(images, "decode"), (images, "resample"), (images, "turn"), (reader, "read_radar_points")]
+    places = [(images, "decode"), (images, "resample"), (images, "turn"), (sensor_files, "read_radar_points")]
     before = [getattr(module, name) for module, name in places]
     with pytest.raises(RuntimeError), timed_parts(torch.nn.Module(), STAGES, time.process_time):
         assert images.resample is not before[1]

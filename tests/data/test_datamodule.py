@@ -18,7 +18,7 @@ from src.data.clips import scenes_of, shuffled_frames
 from src.data.data_config import DataConfig
 from src.data.datamodule import DetectionDataModule
 from src.data.frame_loader import collate, dead_workers_named
-from src.data.reader import OnBadFile
+from src.data.sensor_files import OnBadFile
 from src.errors import ConfigError, DataError, HorizonError
 from src.structures.taxonomy import RADARS
 from tests.data.tiny_set import FIVE_HERTZ, START_S, VERSION, DataSet, Writer, token

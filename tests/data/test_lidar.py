@@ -8,8 +8,9 @@ from src.data.augment import AugmentationConfig, BevAugmentationConfig
 from src.data.cache import load_index
 from src.data.compensation import deskew
 from src.data.pcd import read_lidar_points
-from src.data.reader import FrameReader, OnBadFile
+from src.data.reader import FrameReader
 from src.data.schema import CHANNELS
+from src.data.sensor_files import OnBadFile
 from src.errors import DataError
 from src.geometry.transforms import invert_rigid, rigid
 from src.structures.taxonomy import LIDARS

@@ -12,7 +12,8 @@ from src.data.augment import AugmentationConfig, BevAugmentationConfig, ImageAug
 from src.data.cache import load_index
 from src.data.compensation import Sweeps, compensate_clouds, ego_motion
 from src.data.pcd import read_radar_points
-from src.data.reader import FrameReader, OnBadFile, radar_tensors
+from src.data.reader import FrameReader, radar_tensors
+from src.data.sensor_files import OnBadFile
 from src.errors import DataError
 from src.geometry.camera import project
 from src.geometry.transforms import invert_rigid, quaternion_to_matrix, rigid

@@ -11,7 +11,8 @@ from src.data.cache import load_index
 from src.data.clips import FrameKey
 from src.data.datamodule import DetectionDataModule
 from src.data.rays import radar_speeds
-from src.data.reader import FrameReader, OnBadFile
+from src.data.reader import FrameReader
+from src.data.sensor_files import OnBadFile
 from src.data.timeline import LidarTimeline, RadialSpeeds, SweepTimeline, TimelineConfig
 from src.errors import ConfigError, DataError
 from src.geometry.transforms import invert_rigid
@@ -255,7 +256,7 @@ def test_in_the_world_true_speeds_are_those_of_the_motion_and_radar_says_the_sam
     still, moving = both & (exact == 0), both & (np.abs(exact) > 5)
     assert np.median(np.abs(radar[still])) < 0.3  # lrs 2.5
     assert moving.sum() > 50 and np.median(np.abs(radar[moving] - exact[moving])) < 1.0
-    assert json.loads((root / "world.json").read_text())["generator"].endswith("lidar-2")
+    assert json.loads((root / "world.json").read_text())["generator"].endswith("lidar-3")
     (root / "truth" / f"{index.scene_names[0]}.npz").unlink()
     exact_settings = replace(settings, timeline=replace(FIVE_HERTZ, radial_speeds=RadialSpeeds.exact))
     with pytest.raises(DataError, match="only a synthetic world"):

@@ -14,7 +14,8 @@ import numpy as np
 from PIL import Image
 
 from src.data.cache import load_index
-from src.data.reader import FrameReader, OnBadFile, ReaderSettings
+from src.data.reader import FrameReader, ReaderSettings
+from src.data.sensor_files import OnBadFile
 from src.data.timeline import RadialSpeeds, TimelineConfig
 from src.geometry.camera import pixels_from_points, project
 from src.geometry.transforms import invert_rigid, matrix_to_quaternion, rigid

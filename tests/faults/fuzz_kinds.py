@@ -30,8 +30,9 @@ from src.data.cache import load_index
 from src.data.evaluation_set import evaluation_set
 from src.data.images import read_image, width_fit
 from src.data.pcd import RADAR_FIELDS, read_lidar_points, read_radar_points
-from src.data.reader import FrameReader, OnBadFile
+from src.data.reader import FrameReader
 from src.data.schema import CHANNELS, TABLES, DatasetIndex, build_index
+from src.data.sensor_files import OnBadFile
 from src.data.splits import split_samples
 from src.errors import CheckpointError, DataError, HorizonError
 from src.metrics.submission import load_submission

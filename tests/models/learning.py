@@ -40,7 +40,8 @@ def samples_do_not_mix(model, pair, make_batch):
             single = make_batch(points=(0,), boxes=(0,))
             single.radar_points, single.radar_batch = pair.radar_points[rows], pair.radar_batch[rows] * 0
             single.images = pair.images[sample][None]
-            torch.testing.assert_close(model(single)[0].head.logits, both[sample], atol=1e-4, rtol=1e-4)
+            logits = model(single)[0].head.logits.view(-1, 12)
+            torch.testing.assert_close(logits, both[sample], atol=1e-4, rtol=1e-4)
 
 
 def weight_multiplies_or_switches_off(model, batch, name, terms):
@@ -54,3 +55,21 @@ def weight_multiplies_or_switches_off(model, batch, name, terms):
     torch.testing.assert_close(double[term], 2.0 * plain[term])
     setattr(loss, name, None)
     assert set(model.loss(output, batch).terms) == terms - {term}
+
+
+def average_precision(found, truth, label):
+    """Mean precision at each object's recall, both frames ranked together; a hit is within 0.8 m and counts once."""
+    ranked = sorted(
+        ((float(s), frame, c) for frame, boxes in enumerate(found)
+         for s, c, name in zip(boxes.scores, boxes.centers[:, :2], boxes.labels, strict=True) if name == label),
+        key=lambda entry: -entry[0],
+    )  # fmt: skip
+    open_objects = [boxes.centers[boxes.labels == label, :2].clone() for boxes in truth]
+    hits, precisions = 0, []
+    for rank, (_, frame, centre) in enumerate(ranked, 1):
+        near = (open_objects[frame] - centre).norm(dim=1) < 0.8
+        if near.any():
+            open_objects[frame][near.nonzero()[0]] = torch.inf
+            hits += 1
+            precisions.append(hits / rank)
+    return sum(precisions) / sum(len(boxes.centers[boxes.labels == label]) for boxes in truth)

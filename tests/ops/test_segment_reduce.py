@@ -8,6 +8,7 @@ from src.ops.segment_reduce import (
     rank_per_sample,
     segment_max,
     segment_mean,
+    segment_softmax,
     segment_sum,
     segments,
     topk_per_sample,
@@ -91,3 +92,15 @@ def test_segment_max_by_hand():
     out.backward(torch.tensor([[1.0, 2], [3, 4], [5, 6], [7, 8]]).double())
     assert values.grad.tolist() == [[0, 6], [5, 0], [1, 2]]
     assert segment_max(values[:0], torch.zeros(0, dtype=torch.int64), 2).tolist() == [[0, 0], [0, 0]]
+
+
+def test_segment_softmax_is_one_of_every_row():
+    scores = torch.tensor([1.0, 80.0, 2.0, 90.0, -200.0], dtype=torch.float64, requires_grad=True)
+    rows = torch.tensor([0, 2, 0, 2, 3])
+    found = segment_softmax(scores, rows, 5)
+    wanted = torch.zeros(5, dtype=torch.float64)
+    for row in (0, 2, 3):
+        wanted[rows == row] = scores.detach()[rows == row].softmax(0)
+    torch.testing.assert_close(found.detach(), wanted)
+    assert torch.autograd.gradcheck(lambda x: segment_softmax(x, rows, 5), scores)
+    assert segment_softmax(scores[:0], rows[:0], 2).shape == (0,)

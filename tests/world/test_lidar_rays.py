@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from src.geometry.transforms import rotation_zyx
 from src.structures.taxonomy import LIDARS
-from src.world.lidar import Blocks, cast_rays, detection_chance, scan_lidars
+from src.world.lidar import Blocks, Lidars, cast_rays, detection_chance
 from src.world.rig import LONG_LIDARS, SHORT_BEAMS
 from src.world.road import END_M, START_M, Road
 from src.world.scene_writer import SceneWriter
@@ -91,6 +92,15 @@ def test_on_a_hilly_bend_rays_end_at_the_ground_and_not_before(config):
         assert (height(share)[met] > 0).all()
 
 
+def test_one_look_up_gives_what_the_road_is_at_a_place(config):
+    road = make_scene(config, 0).road
+    s = np.random.default_rng(0).uniform(START_M + 2, END_M - 2, 200)
+    (x, y, heading, height, slope), gain = road.profile_at(s)
+    np.testing.assert_allclose(np.stack([x, y, height], 1), road.place(s, 0 * s), atol=1e-9)
+    np.testing.assert_allclose([heading, slope], [road.heading_at(s), road.slope_at(s)], atol=1e-12)
+    np.testing.assert_allclose(gain[2], np.diff(road.heading_rad)[np.floor(s - START_M).astype(int)])
+
+
 def test_what_stands_behind_something_is_not_seen():
     rays = np.array([[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]])
     wall, hidden = one_block([20, 0, 2], [1, 4, 4], 0.0), one_block([50, 0, 2], [4, 4, 4], 0.0)
@@ -99,12 +109,41 @@ def test_what_stands_behind_something_is_not_seen():
     assert ranges[0, 0] == pytest.approx(19.5) and ranges[0, 1] == np.inf
 
 
+def test_among_many_blocks_around_a_tilted_sensor_no_hit_is_lost():
+    rng = np.random.default_rng(1)
+    count, after = 80, np.linspace(-0.05, 0.05, 90)
+    bearing, away = rng.uniform(-np.pi, np.pi, count), rng.uniform(0, 60, count)
+    blocks = Blocks(
+        middles=np.stack([away * np.cos(bearing), away * np.sin(bearing), rng.uniform(100, 130, count)], 1),
+        velocities=rng.normal(0, 15, (count, 3)), sizes=rng.uniform(0.05, 9, (count, 3)),
+        yaws=rng.uniform(-np.pi, np.pi, count), reflectivity=rng.uniform(0, 1, count),
+    )  # fmt: skip
+    azimuth, elevation = np.meshgrid(np.linspace(-3, 3, 90), np.radians(np.linspace(-45, 45, 24)), indexing="ij")
+    rays = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    rays = np.stack(rays, -1) @ rotation_zyx(0.4, 0.3, -0.2).T
+    origins = np.stack([25.0 * after, 0 * after, 115.0 + 0 * after], 1)
+    ranges, echo, _ = cast_rays(origins, rays, after, blocks, straight_road(0.0), 0.0, 80.0)
+
+    turn = rotation_zyx(blocks.yaws, 0 * away, 0 * away)  # every ray against every block
+    offset = origins[:, None] - blocks.middles - after[:, None, None] * blocks.velocities
+    start = np.einsum("nji,anj->ani", turn, offset)[:, None]
+    heading = np.einsum("nji,aej->aeni", turn, rays)
+    one, two = (-0.5 * blocks.sizes - start) / heading, (0.5 * blocks.sizes - start) / heading
+    enter, leave = np.minimum(one, two).max(-1), np.maximum(one, two).min(-1)
+    enter[(enter >= leave) | (enter <= 0)] = np.inf
+    nearest = enter.min(-1)
+    hit = np.isfinite(nearest) & (nearest < ranges + 1e-6)
+    assert 300 < hit.sum() < 0.9 * hit.size
+    np.testing.assert_allclose(ranges[hit], nearest[hit], atol=1e-9)
+    assert not (nearest < ranges - 1e-6).any() and (ranges[~hit] > 100).all()
+
+
 @pytest.fixture(scope="module")
 def scanned(make_config, tmp_path_factory):
     writer = SceneWriter(make_config(lidar=True), 0, tmp_path_factory.mktemp("lidar"))
     mounts = [writer.rig[name] for name in LIDARS]
-    clouds = scan_lidars(writer.config, writer.scene, mounts, 0.3, 300_000, np.random.default_rng(0))
-    return writer, clouds
+    lidars = Lidars(writer.config, writer.scene, mounts, np.random.default_rng(0))
+    return writer, lidars.sweep(0.3, 300_000)
 
 
 def test_two_lidars_see_far_and_four_near(scanned):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from src.world.lidar import scan_lidars
+from src.world.lidar import Lidars
 from src.world.scene_writer import SceneWriter
 
 
@@ -19,7 +19,7 @@ def test_the_screen_on_the_median_hides_what_is_far_on_the_other_side(make_confi
     def across_and_ahead(screen_m):
         """Where the points lie by the nearest metre of the centre line, and how far from the truck along it."""
         scanned = replace(scene, road=replace(scene.road, screen_m=screen_m))
-        cloud = scan_lidars(config, scanned, [mount], 0.0, 0, np.random.default_rng(0))["LIDAR_LEFT"]
+        cloud = Lidars(config, scanned, [mount], np.random.default_rng(0)).sweep(0.0, 0)["LIDAR_LEFT"]
         points = np.stack([cloud["x"], cloud["y"], cloud["z"]], 1)
         local = (points @ mount.rotation.T + mount.translation) @ rotation.T + translation
         offset = local[:, None, :2] - line[None, 600:1200]

@@ -64,22 +64,33 @@ class PillarEncoder(nn.Module):
         batch_size: int,
     ) -> Tensor:  # [B, C, rows, cols] float32, channels last
         """The map; points outside the grid or its height band are left out."""
+        pillars, cells, _ = self.encode(radar_points, radar_batch)
+        shape = (batch_size, self.grid.rows, self.grid.cols)
+        whole = pillars.new_zeros(torch.Size(shape).numel(), pillars.shape[1])
+        return map_of_rows(whole.index_copy(0, cells, pillars), shape)
+
+    def encode(
+        self,
+        radar_points: Tensor,  # [P, 7] as above
+        radar_batch: Tensor,  # [P] int64 sample of each point
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [V, C] float32, [V] int64, [V, 7]
+        """Pillars of one cell alone, their linear keys (sample * rows + row) * cols + col, ascending, and the means of
+        their points; points outside the grid or its height band are left out."""
         with torch.autocast(radar_points.device.type, enabled=False):
-            features, cells, rows = self.describe(radar_points.float(), radar_batch)
+            features, cells, rows, means = self.describe(radar_points.float(), radar_batch)
             for layer, norm in zip(self.layers, self.norms, strict=True):
                 points = F.relu(norm(layer(features)))
                 pillars = segment_max(points, rows, len(cells))  # [V, width]
                 features = torch.cat([points, F.embedding(rows, pillars)], dim=1)
-            shape = (batch_size, self.grid.rows, self.grid.cols)
-            whole = pillars.new_zeros(torch.Size(shape).numel(), pillars.shape[1])
-            return map_of_rows(whole.index_copy(0, cells, pillars), shape)
+        return pillars, cells, means
 
     def describe(
         self,
         points: Tensor,  # [P, 7]
         batch: Tensor,  # [P] int64
-    ) -> tuple[Tensor, Tensor, Tensor]:  # [n, 13], [V] int64, [n] int64
-        """Features of the points inside, linear keys of the pillars they form, and the pillar of each point."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # [n, 13], [V] int64, [n] int64, [V, 7]
+        """Features of the points inside, linear keys of the pillars they form, the pillar of each point, and the mean
+        point of each pillar."""
         low, high = self.grid.z_range_m
         inside = self.grid.contains(points[:, :2]) & (points[:, 2] >= low) & (points[:, 2] < high)
         kept = inside.nonzero().squeeze(1)
@@ -88,7 +99,9 @@ class PillarEncoder(nn.Module):
         keys = (batch * self.grid.rows + cell[:, 0]) * self.grid.cols + cell[:, 1]
         cells, rows = torch.unique(keys, return_inverse=True)
         from_centre = (points[:, :2] - self.grid.centre_of(cell)) / self.grid.cell_m
-        mean = F.embedding(rows, segment_mean(points[:, :3], rows, len(cells)))
-        from_mean = (points[:, :3] - mean) / points.new_tensor([self.grid.cell_m, self.grid.cell_m, POINT_SCALES[2]])
+        means = segment_mean(points, rows, len(cells))
+        units = points.new_tensor([self.grid.cell_m, self.grid.cell_m, POINT_SCALES[2]])
+        from_mean = (points[:, :3] - F.embedding(rows, means[:, :3])) / units
         count = torch.bincount(rows, minlength=len(cells)).to(points.dtype).log()[rows]
-        return torch.cat([points / self.point_scales, from_centre, from_mean, count[:, None]], dim=1), cells, rows
+        features = torch.cat([points / self.point_scales, from_centre, from_mean, count[:, None]], dim=1)
+        return features, cells, rows, means

@@ -12,11 +12,10 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
-from src.models.camera_radar import TemporalConfig
 from src.models.crt_fusion.motion_estimator import CellMotion
 from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
 from src.models.layers.norm import MapNorm
-from src.models.memory import FrameMemory, RememberedFrame, StoredRows, moving
+from src.models.memory import FrameMemory, RememberedFrame, StoredRows, TemporalConfig, moving
 from src.ops.bilinear_scatter import bilinear_scatter
 from src.ops.concat_conv import concat_conv2d
 from src.ops.segment_reduce import topk_per_sample

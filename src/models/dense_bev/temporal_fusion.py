@@ -13,10 +13,9 @@ from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy
-from src.models.camera_radar import TemporalConfig
 from src.models.layers.dense import DenseConvNormReLU
 from src.models.layers.norm import MapNorm
-from src.models.memory import FrameMemory, Motion, RememberedFrame
+from src.models.memory import FrameMemory, Motion, RememberedFrame, TemporalConfig
 from src.ops.concat_conv import concat_conv2d
 from src.structures.batch import FrameBatch
 

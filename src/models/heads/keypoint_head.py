@@ -1,13 +1,21 @@
-"""Camera heads of KGGI: where objects are in the images, and their depth (method 4.2)."""
+"""Camera heads: where objects are in the images, their depth, and what both are compared with (method 4.2, 4.3)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from src.geometry.bev_grid import BEVGrid
+from src.losses.classification import depth_cross_entropy, penalty_reduced_focal
+from src.losses.normalizers import mean_over_ranks
 from src.models.layers.full_precision import FullPrecisionConv2d
+from src.models.layers.views import CameraViews
+from src.targets.depth import paint_depth
+from src.targets.keypoints import keypoint_heatmap
+from src.targets.projection import BoxViews
 
 # Probability 0.1 for every pixel at the start, so that the focal loss is not drowned by background.
 KEYPOINT_BIAS = -2.19
@@ -69,3 +77,67 @@ def keypoint_scores(
         return scores
     peaks = F.max_pool2d(scores, nms_cells, stride=1, padding=nms_cells // 2)
     return scores * (scores == peaks)
+
+
+def lift_keypoints(
+    maps: CameraMaps,
+    views: CameraViews,
+    depth_centres_m: Tensor,  # [D]
+    grid: BEVGrid,
+    count: int,  # K
+    nms_cells: int | None,
+) -> tuple[Tensor, Tensor, Tensor]:  # [B, K, 3] aug metres, [B, K] bool, [B, K, C]
+    """The K best pixels of all views of a sample by S times confidence, lifted into the grid without gradient, whether
+    there was another at all, and their features."""
+    with torch.no_grad():
+        depth, confidence = most_likely_depth(maps.depth_logits, depth_centres_m)  # [B, N, h, w] each
+        points = views.lift(depth)
+        scores = keypoint_scores(maps, nms_cells) * confidence
+        scores = scores * (grid.contains(points[..., :2]) & views.valid[:, :, None, None])
+        # One ranking over the pixels of all views of a sample.
+        best, picks = scores.flatten(1).topk(min(count, scores[0].numel()), dim=1)
+        missing = count - picks.shape[1]
+        best, picks = F.pad(best, (0, missing)), F.pad(picks, (0, missing))  # [B, K]
+        points = points.flatten(1, 3).gather(1, picks[..., None].expand(-1, -1, 3))
+    local = maps.features.movedim(2, -1).flatten(1, 3)  # [B, N*h*w, C]
+    return points, best > 0, local.gather(1, picks[..., None].expand(-1, -1, local.shape[-1]))
+
+
+def most_likely_depth(
+    logits: Tensor,  # [B, N, D, h, w]
+    centres_m: Tensor,  # [D]
+) -> tuple[Tensor, Tensor]:  # [B, N, h, w] m, [B, N, h, w] in 0..1
+    """Mean depth over the most likely bin and its two neighbours, and the probability of the three (method 4.2)."""
+    probabilities = logits.float().softmax(2)
+    last = len(centres_m) - 1
+    window = probabilities.argmax(2, keepdim=True) + torch.arange(-1, 2, device=logits.device).view(3, 1, 1)
+    inside = (window >= 0) & (window <= last)  # [B, N, 3, h, w]
+    window = window.clamp(0, last)
+    chosen = probabilities.gather(2, window) * inside
+    confidence = chosen.sum(2)
+    return (chosen * centres_m[window]).sum(2) / confidence, confidence
+
+
+def camera_losses(
+    maps: CameraMaps,
+    views: CameraViews,
+    seen: BoxViews,
+    depth_range_m: tuple[float, float],
+    keypoint_weight: float | None,
+    depth_weight: float | None,
+) -> dict[str, Tensor]:
+    """Weighted terms `keypoint` and `depth` (method 4.3); a weight of None leaves its term out."""
+    terms = {}
+    if keypoint_weight is not None:
+        logits = maps.keypoint_logits.flatten(0, 1)  # [B*N, h, w]
+        target = keypoint_heatmap(seen, len(logits), views.image_size_px, depth_range_m, views.finest_stride_px)
+        present = views.valid.flatten()[:, None, None]  # a missing camera says nothing about what is absent
+        total = (penalty_reduced_focal(logits, target) * present).sum()
+        terms["keypoint"] = keypoint_weight * (total / mean_over_ranks((target == 1).sum()))
+    if depth_weight is not None:
+        logits = maps.depth_logits.flatten(0, 1)  # [B*N, D, h, w]
+        bins = (depth_range_m, logits.shape[1])
+        target = paint_depth(seen, len(logits), views.image_size_px, *bins, views.finest_stride_px)
+        total = depth_cross_entropy(logits, target)
+        terms["depth"] = depth_weight * total / mean_over_ranks((target >= 0).sum())
+    return terms

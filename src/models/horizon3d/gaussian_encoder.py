@@ -12,18 +12,14 @@ from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import rotate, unit_vectors
-from src.models.horizon3d.cross_attention import (
-    ImageCrossAttention,
-    RadarCrossAttention,
-    attention_linear,
-    linear_relu_norm,
-)
+from src.models.horizon3d.cross_attention import RadarCrossAttention
 from src.models.horizon3d.temporal_attention import TemporalSelfAttention
-from src.models.horizon3d.views import CameraViews
 from src.models.layers.doppler import Doppler
 from src.models.layers.full_precision import FullPrecisionLinear
+from src.models.layers.image_attention import ImageCrossAttention, attention_linear, linear_relu_norm
 from src.models.layers.merging import block_diagonal, joined_linear
 from src.models.layers.sparse import SubmanifoldConv
+from src.models.layers.views import CameraViews
 from src.ops.segment_reduce import segment_mean
 from src.ops.sites import Sites
 from src.structures.gaussians import GaussianSet

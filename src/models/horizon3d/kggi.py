@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
-from src.models.heads.keypoint_head import KEYPOINT_BIAS, CameraKeypointHead, CameraMaps, keypoint_scores
+from src.models.heads.keypoint_head import KEYPOINT_BIAS, CameraKeypointHead, CameraMaps, lift_keypoints
 from src.models.horizon3d.gaussian_encoder import RAW_ATTRIBUTES, GaussianBounds
-from src.models.horizon3d.views import CameraViews
 from src.models.layers.full_precision import FullPrecisionLinear
+from src.models.layers.views import CameraViews
 from src.ops.segment_reduce import topk_per_sample
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV
@@ -174,20 +174,9 @@ class KGGI(nn.Module):
         return self._gaussians(Source.RADAR, means, valid, F.embedding(picks, features))
 
     def _camera_gaussians(self, camera: CameraMaps, views: CameraViews) -> GaussianSet:
-        with torch.no_grad():
-            depth, confidence = most_likely_depth(camera.depth_logits, self.depth_centres_m)  # [B, N, h, w] each
-            xy = views.lift(depth)[..., :2]
-            scores = keypoint_scores(camera, self.config.keypoint_nms_cells) * confidence
-            scores = scores * (self.grid.contains(xy) & views.valid[:, :, None, None])
-            # One ranking over the pixels of all views of a sample.
-            wanted = self.config.num_camera_keypoints
-            best, picks = scores.flatten(1).topk(min(wanted, scores[0].numel()), dim=1)
-            missing = wanted - picks.shape[1]
-            best, picks = F.pad(best, (0, missing)), F.pad(picks, (0, missing))  # [B, K]
-            means = xy.flatten(1, 3).gather(1, picks[..., None].expand(-1, -1, 2))
-        local = camera.features.movedim(2, -1).flatten(1, 3)  # [B, N*h*w, C]
-        local = local.gather(1, picks[..., None].expand(-1, -1, local.shape[-1]))
-        return self._gaussians(Source.CAMERA, means, best > 0, local)
+        wanted, window = self.config.num_camera_keypoints, self.config.keypoint_nms_cells
+        points, valid, local = lift_keypoints(camera, views, self.depth_centres_m, self.grid, wanted, window)
+        return self._gaussians(Source.CAMERA, points[..., :2], valid, local)
 
     def _gaussians(
         self,
@@ -211,18 +200,3 @@ class KGGI(nn.Module):
             valid=valid,
             **self.bounds.activate(raw),
         )
-
-
-def most_likely_depth(
-    logits: Tensor,  # [B, N, D, h, w]
-    centres_m: Tensor,  # [D]
-) -> tuple[Tensor, Tensor]:  # [B, N, h, w] m, [B, N, h, w] in 0..1
-    """Mean depth over the most likely bin and its two neighbours, and the probability of the three (method 4.2)."""
-    probabilities = logits.float().softmax(2)
-    last = len(centres_m) - 1
-    window = probabilities.argmax(2, keepdim=True) + torch.arange(-1, 2, device=logits.device).view(3, 1, 1)
-    inside = (window >= 0) & (window <= last)  # [B, N, 3, h, w]
-    window = window.clamp(0, last)
-    chosen = probabilities.gather(2, window) * inside
-    confidence = chosen.sum(2)
-    return (chosen * centres_m[window]).sum(2) / confidence, confidence

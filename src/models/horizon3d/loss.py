@@ -9,20 +9,19 @@ from enum import Enum
 import torch
 from torch import Tensor
 
-from src.losses.classification import depth_cross_entropy, penalty_reduced_focal, sigmoid_focal
+from src.losses.classification import sigmoid_focal
 from src.losses.loss_weights import LossWeights
 from src.losses.normalizers import mean_over_ranks
 from src.losses.regression import masked_l1, masked_smooth_l1
 from src.losses.segmentation import dice, lovasz_foreground, occupancy_losses
+from src.models.heads.keypoint_head import camera_losses
 from src.models.horizon3d.bev_path import CellPrediction
 from src.models.horizon3d.kggi import KGGIConfig, KGGIOutput
 from src.models.horizon3d.ocsf import OCSFOutput
-from src.models.horizon3d.views import CameraViews
+from src.models.layers.views import CameraViews
 from src.structures.sparse_bev import SparseBEV
 from src.targets.box_raster import BoxRaster
-from src.targets.depth import paint_depth
-from src.targets.keypoints import keypoint_heatmap
-from src.targets.projection import BoxViews, view_boxes
+from src.targets.projection import view_boxes
 
 MOVING_MPS = 1.0
 """A box that is faster moves."""
@@ -83,14 +82,8 @@ def kggi_losses(
         return _times(terms, config.kggi_weight)
 
     seen = view_boxes(raster.boxes, raster.sample, views.pix_from_aug, views.valid, views.image_size_px)
-    if config.keypoint_weight is not None:
-        terms["keypoint"] = config.keypoint_weight * _keypoint_loss(kggi, views, seen, settings)
-    if config.depth_weight is not None:
-        logits = kggi.camera.depth_logits.flatten(0, 1)  # [B*N, D, h, w]
-        bins = (settings.depth_range, settings.num_depth_bins)
-        target = paint_depth(seen, len(logits), views.image_size_px, *bins, views.finest_stride_px)
-        total = depth_cross_entropy(logits, target)
-        terms["depth"] = config.depth_weight * total / mean_over_ranks((target >= 0).sum())
+    weights = (config.keypoint_weight, config.depth_weight)
+    terms |= camera_losses(kggi.camera, views, seen, settings.depth_range, *weights)
     return _times(terms, config.kggi_weight)
 
 
@@ -181,13 +174,6 @@ def _sum_of_means(
     zeros = errors.new_zeros(3)
     counts = zeros.index_add(0, group, (~target.isnan()).sum(1).to(zeros.dtype))
     return (zeros.index_add(0, group, errors.sum(1)) / mean_over_ranks(counts)).sum()
-
-
-def _keypoint_loss(kggi: KGGIOutput, views: CameraViews, seen: BoxViews, settings: KGGIConfig) -> Tensor:
-    logits = kggi.camera.keypoint_logits.flatten(0, 1)  # [B*N, h, w]
-    target = keypoint_heatmap(seen, len(logits), views.image_size_px, settings.depth_range, views.finest_stride_px)
-    present = views.valid.flatten()[:, None, None]  # a missing camera says nothing about what is absent
-    return (penalty_reduced_focal(logits, target) * present).sum() / mean_over_ranks((target == 1).sum())
 
 
 def _times(terms: dict[str, Tensor], weight: float) -> dict[str, Tensor]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from src.errors import ConfigError
@@ -19,8 +20,8 @@ from src.models.horizon3d.loss import cell_losses, gaussian_velocity_loss, kggi_
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import OCSF
 from src.models.horizon3d.output import Horizon3DOutput
-from src.models.horizon3d.views import CameraViews
 from src.models.layers.doppler import Doppler
+from src.models.layers.views import CameraViews
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
@@ -92,7 +93,7 @@ class Horizon3D(Detector):
         views = kggi = ocsf = None
         doppler = self._measure_doppler(batch)
         if self.image_encoder is not None:
-            views = self._encode_views(batch)
+            views = CameraViews.encode(self.image_encoder, batch)
             kggi = self.kggi(radar_bev, views, warped_memory.history if warped_memory is not None else None)
             ocsf = self.ocsf(kggi.gaussians, radar_bev, views, doppler["gaussians"])
             fused = ocsf.fused_bev
@@ -108,21 +109,15 @@ class Horizon3D(Detector):
 
     def _measure_doppler(self, batch: FrameBatch) -> dict[str, Doppler | None]:
         """For whom the configuration wants it."""
-        wanted = vars(self.config.doppler)
-        measured = None
+        config, measured = self.config.doppler, None
+        wanted = {name: getattr(config, name) for name in ("gaussians", "cells", "boxes")}
         if any(wanted.values()):
-            measured = Doppler.measure(batch.radar_points, batch.radar_batch, self.grid)
+            points, owners = batch.radar_points, batch.radar_batch
+            if self.training and config.withheld:
+                known = torch.rand(len(batch), device=owners.device)[owners] >= config.withheld
+                points, owners = points[known], owners[known]
+            measured = Doppler.measure(points, owners, self.grid)
         return {name: measured if its else None for name, its in wanted.items()}
-
-    def _encode_views(self, batch: FrameBatch) -> CameraViews:
-        if batch.images is None or batch.image_valid is None or batch.pix_from_aug is None:
-            raise ValueError("FrameBatch.images is None, but this model uses images; read them with the frames")
-        if batch.images.shape[1] != len(CAMERAS):
-            raise ValueError(f"FrameBatch.images must hold {len(CAMERAS)} views, but got {batch.images.shape[1]}")
-        height, width = batch.images.shape[-2:]
-        return CameraViews(
-            self.image_encoder(batch.images), batch.pix_from_aug, batch.image_valid, (int(height), int(width))
-        )
 
     def loss_terms(self, output: Horizon3DOutput, batch: FrameBatch) -> Objective:
         """Terms of Eq. 10 as weighted."""

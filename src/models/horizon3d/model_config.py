@@ -10,12 +10,12 @@ from src.errors import ConfigError
 from src.models.backbones.sparse_voxel import RadarEncoderConfig
 from src.models.detector import ModelConfig
 from src.models.heads.center_head import HeadConfig
-from src.models.horizon3d.cross_attention import NUM_HEADS
 from src.models.horizon3d.dptf import DPTFConfig
 from src.models.horizon3d.kggi import KGGIConfig
 from src.models.horizon3d.loss import Horizon3DLossConfig
 from src.models.horizon3d.ocsf import OCSFConfig
 from src.models.layers.doppler import DopplerConfig
+from src.models.layers.image_attention import NUM_HEADS
 
 CHANNEL_MULTIPLE = 4 * NUM_HEADS
 """C splits into attention heads of at least 4 channels and into groups of 4 for the camera head's norm."""

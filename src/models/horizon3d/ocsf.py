@@ -13,8 +13,8 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.gaussian_encoder import FIXED_POINTS, EncoderLayer, GaussianBounds, GaussianEncoder
 from src.models.horizon3d.sparse_fusion import SparseFusion
 from src.models.horizon3d.splatting import GaussianSplat, splat_set
-from src.models.horizon3d.views import CameraViews
 from src.models.layers.doppler import Doppler
+from src.models.layers.views import CameraViews
 from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV
 

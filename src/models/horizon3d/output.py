@@ -13,7 +13,7 @@ from src.models.horizon3d.dptf import DPTFOutput, warped_evidence
 from src.models.horizon3d.kggi import KGGIOutput
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import OCSFOutput
-from src.models.horizon3d.views import CameraViews
+from src.models.layers.views import CameraViews
 from src.structures.evidence import Evidence, SplattedCells
 from src.structures.sparse_bev import SparseBEV
 

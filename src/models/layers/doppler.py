@@ -8,6 +8,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
 from src.ops.radial_change import NUM_BINS, radial_bin, radial_change
@@ -21,12 +22,17 @@ WINDOW_CELLS = 2
 class DopplerConfig:
     """Whose predicted velocities take their radial part from the radar, where it measures a near one (`model.doppler`).
 
-    A part that a phase or a model lacks is not asked.
+    A part that a phase or a model lacks is not asked. Raises ConfigError for an impossible share.
     """
 
     gaussians: bool
     cells: bool
     boxes: bool
+    withheld: float  # share of the frames of training in which none does
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.withheld <= 1:
+            raise ConfigError(f"model.doppler.withheld={self.withheld}: must be a share of frames, 0 to 1")
 
 
 @dataclass
@@ -74,6 +80,6 @@ class Doppler:
         """The velocities with the measured radial part that is nearest to theirs; as they are where none is near.
 
         The gradient passes as if nothing had been replaced, so that the radial part is learnt as far as it leads to a
-        wrong measurement or to none.
+        wrong measurement or to none; whole, where `withheld` frames have no measurement.
         """
         return velocities + radial_change(velocities, cells, self.keys, self.velocities, self.grid)

@@ -13,6 +13,7 @@ from src.models.crt_fusion.model import CRTFusionLossConfig
 from tests.models.crt_fusion.crt_frames import SMALL, crt_model
 from tests.models.dense_bev.dense_frames import GRID, backbone, make_batch
 from tests.models.learning import (
+    average_precision,
     gradients_are_finite,
     parameters_that_stay,
     samples_do_not_mix,
@@ -144,21 +145,3 @@ def test_two_frames_are_overfitted():
     with torch.no_grad():
         found = model.decode(model(batch)[0])  # in training mode: two frames are all the statistics there are
     assert np.mean([average_precision(found, batch.boxes, label) for label in range(5)]) > 0.9
-
-
-def average_precision(found, truth, label):
-    """Mean precision at each object's recall, both frames ranked together; a hit is within 0.8 m and counts once."""
-    ranked = sorted(
-        ((float(s), frame, c) for frame, boxes in enumerate(found)
-         for s, c, name in zip(boxes.scores, boxes.centers[:, :2], boxes.labels, strict=True) if name == label),
-        key=lambda entry: -entry[0],
-    )  # fmt: skip
-    open_objects = [boxes.centers[boxes.labels == label, :2].clone() for boxes in truth]
-    hits, precisions = 0, []
-    for rank, (_, frame, centre) in enumerate(ranked, 1):
-        near = (open_objects[frame] - centre).norm(dim=1) < 0.8
-        if near.any():
-            open_objects[frame][near.nonzero()[0]] = torch.inf
-            hits += 1
-            precisions.append(hits / rank)
-    return sum(precisions) / sum(len(boxes.centers[boxes.labels == label]) for boxes in truth)

@@ -9,11 +9,12 @@ from src.models.backbones.bev_decoder import BEVDecoderConfig
 from src.models.backbones.image import ImageEncoderConfig, NeckName
 from src.models.backbones.pillars import PillarConfig
 from src.models.backbones.weights import BackboneName
-from src.models.camera_radar import CameraRadarLossConfig, TemporalConfig
+from src.models.camera_radar import CameraRadarLossConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig
 from src.models.heads.center_head import BoxOptions, HeadConfig, TrainRegression
 from src.models.heads.decode import AttributeSource, Suppression
 from src.models.layers.lift_splat import LiftSplatConfig
+from src.models.memory import TemporalConfig
 from src.structures.batch import FrameBatch
 from tests.models import moving
 from tests.models.surroundings import AXES, camera_matrices, random_boxes

@@ -17,8 +17,8 @@ from src.models.horizon3d.loss import Horizon3DLossConfig, VelocityGroups
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, OCSFConfig, RefineFrom
-from src.models.horizon3d.views import CameraViews
 from src.models.layers.doppler import DopplerConfig
+from src.models.layers.views import CameraViews
 from src.structures.batch import FrameBatch
 from src.targets.depth import DepthTarget
 from tests.models.surroundings import DIAGONALS, camera_matrices, random_boxes
@@ -162,7 +162,7 @@ def make_config():
             kggi=None if radar_only else KGGIConfig(**kggi),
             ocsf=None if radar_only else OCSFConfig(**ocsf),
             dptf=dptf,
-            doppler=DopplerConfig(**{name: name in doppler for name in ("gaussians", "cells", "boxes")}),
+            doppler=DopplerConfig(**{name: name in doppler for name in ("gaussians", "cells", "boxes")}, withheld=0.0),
             head=head_config(),
             loss=Horizon3DLossConfig(**loss),
         )

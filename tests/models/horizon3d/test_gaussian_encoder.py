@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 import torch
 
-from src.models.horizon3d.cross_attention import ImageCrossAttention, RadarCrossAttention
+from src.models.horizon3d.cross_attention import RadarCrossAttention
 from src.models.horizon3d.gaussian_encoder import (
     EncoderLayer,
     GaussianBounds,
@@ -15,6 +15,7 @@ from src.models.horizon3d.gaussian_encoder import (
     Refinement,
     SelfEncoding,
 )
+from src.models.layers.image_attention import ImageCrossAttention
 from src.ops.sites import Sites
 from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from src.errors import ConfigError
-from src.models.heads.keypoint_head import CameraMaps, keypoint_scores
+from src.models.heads.keypoint_head import CameraMaps, keypoint_scores, most_likely_depth
 from src.models.horizon3d.gaussian_encoder import GaussianBounds
-from src.models.horizon3d.kggi import KGGI, Initialization, most_likely_depth
+from src.models.horizon3d.kggi import KGGI, Initialization
 from src.ops.sites import Sites
 from src.structures.gaussians import Source
 from src.structures.sparse_bev import SparseBEV

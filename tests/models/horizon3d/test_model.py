@@ -17,6 +17,7 @@ from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, RefineFrom
 from src.models.layers.doppler import Doppler
+from src.ops.radial_change import NUM_BINS
 from src.structures.boxes import Boxes3D
 from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
 
@@ -181,6 +182,19 @@ def test_velocities_are_those_that_the_radar_measures_along_the_line_of_sight(ma
         torch.testing.assert_close(doppler.impose(velocities, cells), velocities, atol=1e-4, rtol=0)
         assert (doppler.impose(0 * velocities, cells).norm(dim=1) > 0.3).sum() > 10
     assert parameters_that_stay(make_model(doppler=("gaussians", "boxes")), batch, lr=1e-2) == []
+
+
+def test_withheld_frames_measure_nothing_in_training_alone(make_model, make_batch):
+    model, batch = make_model(doppler=("gaussians", "boxes")), make_batch(boxes=(12, 12))
+    model.config.doppler.withheld = 0.5
+    owners = []
+    for seed in range(12):
+        torch.manual_seed(seed)
+        doppler = model.train()._measure_doppler(batch)["boxes"]
+        owners.append(tuple((doppler.keys // NUM_BINS // (model.grid.rows * model.grid.cols)).unique().tolist()))
+    assert set(owners) == {(), (0,), (1,), (0, 1)}
+    whole = Doppler.measure(batch.radar_points, batch.radar_batch, model.grid)
+    torch.testing.assert_close(model.eval()._measure_doppler(batch)["boxes"].velocities, whole.velocities)
 
 
 @pytest.mark.slow

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from src.geometry.tensor_transforms import invert_projection, pixel_centres
+from src.structures.batch import FrameBatch
+from src.structures.taxonomy import CAMERAS
 
 MIN_DEPTH_M = 0.5
 """Points nearer to the image plane count as invisible (method 5.3)."""
@@ -24,6 +27,20 @@ class CameraViews:
     pix_from_aug: Tensor  # [B, N, 4, 4]: (x, y, z, 1) in aug metres -> (u*d, v*d, d, 1)
     valid: Tensor  # [B, N] bool, False where the camera is missing
     image_size_px: tuple[int, int]  # (H, W)
+
+    @classmethod
+    def encode(
+        cls,
+        encoder: Callable[[Tensor], list[Tensor]],  # images to pyramid
+        batch: FrameBatch,
+    ) -> CameraViews:
+        """The images of a batch. Raises ValueError where it has none, or another number of views."""
+        if batch.images is None or batch.image_valid is None or batch.pix_from_aug is None:
+            raise ValueError("FrameBatch.images is None, but this model uses images; read them with the frames")
+        if batch.images.shape[1] != len(CAMERAS):
+            raise ValueError(f"FrameBatch.images must hold {len(CAMERAS)} views, but got {batch.images.shape[1]}")
+        height, width = batch.images.shape[-2:]
+        return cls(encoder(batch.images), batch.pix_from_aug, batch.image_valid, (int(height), int(width)))
 
     @property
     def finest_stride_px(self) -> int:

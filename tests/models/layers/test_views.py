@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from src.models.horizon3d.views import CameraViews
+from src.models.layers.views import CameraViews
 
 
 def make_views(pix_from_aug, size=(64, 96), valid=None):

@@ -1,0 +1,184 @@
+"""A head for object queries: boxes relative to their queries, the set-prediction loss, decoding without suppression."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import constant, on_device
+from src.losses.classification import sigmoid_focal
+from src.losses.normalizers import mean_over_ranks
+from src.losses.regression import masked_l1
+from src.models.detector import Objective
+from src.models.heads.decode import Suppression, boxes_from_codes, rule_attributes, suppress, top_candidates
+from src.models.layers.full_precision import FullPrecisionLinear
+from src.ops.assignment import assign
+from src.structures.boxes import Boxes3D
+from src.structures.queries import SPEED_UNIT_MPS, Queries
+from src.structures.taxonomy import CLASSES, MAX_BOXES_PER_SAMPLE
+from src.targets.heatmap import CODE_SIZE
+from src.targets.supervision import supervised_boxes, upload_boxes
+
+INITIAL_SIZE_M = (4.5, 2.0, 1.8)
+"""Length, width and height before the head has learnt any."""
+CLASS_COST, BOX_COST = 2.0, 0.25
+"""Of the assignment, as in DETR3D and what came of it; velocities cost nothing there."""
+
+
+@dataclass(kw_only=True)
+class QueryHeadConfig:
+    """Settings of the head (`model.head`). Raises ConfigError for impossible values."""
+
+    score_threshold: float  # boxes at or below are dropped
+    max_boxes: int  # per sample, best scores
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.score_threshold < 1:
+            raise ConfigError(f"model.head.score_threshold={self.score_threshold}: must be in 0..1, 1 excluded")
+        if not 1 <= self.max_boxes <= MAX_BOXES_PER_SAMPLE:
+            raise ConfigError(
+                f"model.head.max_boxes={self.max_boxes}: must be in 1..{MAX_BOXES_PER_SAMPLE}; evaluators refuse more"
+            )
+
+
+@dataclass
+class QueryPrediction:
+    """What one layer of a decoder predicts for the queries of B samples."""
+
+    logits: Tensor  # [B, Q, 12] float32, columns as taxonomy.CLASSES
+    codes: Tensor  # [B, Q, CODE_SIZE] float32: centre (m), log sizes (log m), cos, sin of the yaw, velocity (m/s)
+    valid: Tensor  # [B, Q] bool
+
+
+class SetPredictionHead(nn.Module):
+    """Two networks of two layers, shared by all layers of a decoder as in StreamPETR."""
+
+    def __init__(self, config: QueryHeadConfig, channels: int, grid: BEVGrid, velocity_code_weight: float) -> None:
+        super().__init__()
+        self.config, self.grid = config, grid
+        self.code_weights = (1.0,) * (CODE_SIZE - 2) + (velocity_code_weight,) * 2
+        self.classes, self.box = (
+            nn.Sequential(
+                nn.Linear(channels, channels),
+                nn.LayerNorm(channels),
+                nn.ReLU(),
+                FullPrecisionLinear(channels, width),
+            )
+            for width in (len(CLASSES), CODE_SIZE)
+        )
+        for layer in (self.classes[-1], self.box[-1]):
+            nn.init.normal_(layer.weight, std=0.01)
+            nn.init.zeros_(layer.bias)
+        with torch.no_grad():
+            self.box[-1].bias[3:6] = torch.tensor(INITIAL_SIZE_M).log()
+            self.box[-1].bias[6] = 1.0
+
+    def forward(
+        self,
+        features: Tensor,  # [B, Q, C]
+        queries: Queries,
+    ) -> QueryPrediction:
+        """Scores, centres and velocities as changes of the queries' own."""
+        logits = queries.logits.float() + self.classes(features)
+        centers, shape, velocities = self.box(features).split([3, CODE_SIZE - 5, 2], dim=-1)
+        centers, velocities = queries.centers + centers, queries.velocities + SPEED_UNIT_MPS * velocities
+        return QueryPrediction(logits, torch.cat([centers, shape, velocities], dim=-1), queries.valid)
+
+    def loss(
+        self,
+        predictions: list[QueryPrediction],  # of each layer, of the same queries
+        boxes: list[Boxes3D] | None,  # B, augmented ego frame
+        class_weight: float | None,
+        box_weight: float | None,
+    ) -> Objective:
+        """Weighted terms `class` and `box`, summed over layers, with an assignment of its own in each.
+
+        Focal loss of every query, L1 of those that an object is assigned to; both over the objects that found one. A
+        weight of None leaves its term out. Raises ValueError for a batch without annotations.
+        """
+        if boxes is None:
+            raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
+        logits, codes, valid = (
+            torch.stack([getattr(one, name) for one in predictions]).flatten(1, 2)
+            for name in ("logits", "codes", "valid")
+        )  # [L, B * Q, ...]
+        objects, samples = upload_boxes(*supervised_boxes(boxes, self.grid), device=codes.device)
+        wanted = box_codes(objects)
+        layers, rows, own = self.match(predictions, objects.labels, wanted, samples)
+        matched = mean_over_ranks(torch.tensor(len(rows) / len(predictions), device=codes.device))
+        terms = {}
+        if class_weight is not None:
+            target = torch.zeros_like(logits, dtype=torch.bool)
+            target[layers, rows, objects.labels[own]] = True
+            focal = (sigmoid_focal(logits, target) * valid[..., None]).sum()
+            terms["class"] = class_weight * focal / matched
+        if box_weight is not None:
+            weights = constant(self.code_weights, torch.float32, codes.device)
+            errors = masked_l1(codes[layers, rows], wanted[own]) * weights
+            terms["box"] = box_weight * errors.sum() / matched
+        frames, found = len(boxes), len(rows) / len(predictions)
+        return Objective(terms, {"objects": len(objects) / frames, "missed_objects": (len(objects) - found) / frames})
+
+    @torch.no_grad()
+    def match(
+        self,
+        predictions: list[QueryPrediction],
+        labels: Tensor,  # [K] int64, of the objects of all samples
+        wanted: Tensor,  # [K, CODE_SIZE]
+        samples: Tensor,  # [K] int64, ascending
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [n] int64 each: layer, row of B * Q, row of the objects
+        """The pairs of query and object, one for one in every layer and sample, whose costs have the least sum.
+
+        Synchronises with a GPU once.
+        """
+        valid, size = predictions[0].valid, predictions[0].valid.shape[1]
+        costs = torch.stack([self.costs(one, labels, wanted, samples) for one in predictions])  # [L, K, Q]
+        parts = [costs, valid, samples]
+        flat = torch.cat([part.float().flatten() for part in parts]).cpu().split([part.numel() for part in parts])
+        costs, valid, owners = (one.view(part.shape).numpy() for one, part in zip(flat, parts, strict=True))
+        pairs = [np.zeros((3, 0), np.int64)]
+        for sample, usable in enumerate(valid):
+            queries, objects = np.flatnonzero(usable), np.flatnonzero(owners == sample)
+            for layer, cost in enumerate(costs):
+                own, rows = assign(cost[objects][:, queries])
+                pairs.append(np.stack([np.full_like(own, layer), sample * size + queries[rows], objects[own]]))
+        return on_device(np.concatenate(pairs, axis=1), torch.int64, labels.device).unbind(0)
+
+    def costs(
+        self, prediction: QueryPrediction, labels: Tensor, wanted: Tensor, samples: Tensor
+    ) -> Tensor:  # [K, Q] float32
+        """Of each object and each query of its sample: what focal loss and L1 would change by."""
+        logits = prediction.logits.float()
+        yes = torch.ones_like(logits, dtype=torch.bool)
+        gain = (sigmoid_focal(logits, yes) - sigmoid_focal(logits, ~yes))[samples]  # [K, Q, 12]
+        kind = gain.gather(2, labels[:, None, None].expand(-1, gain.shape[1], 1)).squeeze(2)
+        apart = (prediction.codes[samples, :, : CODE_SIZE - 2] - wanted[:, None, : CODE_SIZE - 2]).abs().sum(2)
+        return CLASS_COST * kind + BOX_COST * apart
+
+    @torch.no_grad()
+    def decode(self, prediction: QueryPrediction) -> list[Boxes3D]:
+        """Boxes of each sample, best first, at most `max_boxes`: a query gives one for each class above the threshold.
+
+        Nothing is suppressed: in training an object is one query's.
+        """
+        batch_size, size = prediction.valid.shape
+        scores = prediction.logits.sigmoid() * prediction.valid[..., None]
+        sample = torch.arange(batch_size, device=scores.device).repeat_interleave(size)
+        best = top_candidates(scores.flatten(0, 1), sample, batch_size, self.config.score_threshold)
+        codes = prediction.codes.flatten(0, 1)[best.rows]
+        codes = torch.cat([self.grid.to_cells(codes[:, :2]), codes[:, 2:]], dim=1)  # as offsets from the first cell
+        cells = codes.new_zeros(len(codes), 2, dtype=torch.int64)
+        boxes = boxes_from_codes(cells, codes, best.labels, best.scores, self.grid)
+        boxes.attributes = rule_attributes(boxes)
+        return suppress(boxes, best.counts, Suppression.maxpool, self.config.max_boxes)
+
+
+def box_codes(boxes: Boxes3D) -> Tensor:  # [K, CODE_SIZE], as in `QueryPrediction`
+    """What a query of each box should say."""
+    heading = torch.stack([boxes.yaws.cos(), boxes.yaws.sin()], dim=1)
+    return torch.cat([boxes.centers, boxes.sizes.log(), heading, boxes.velocities], dim=1)

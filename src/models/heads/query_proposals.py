@@ -1,0 +1,121 @@
+"""Where object queries start: at radar points, at lifted camera keypoints, and at learnt places."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from src.errors import ConfigError, require_least
+from src.geometry.bev_grid import BEVGrid
+from src.models.backbones.point_transformer import RadarPoints
+from src.models.heads.center_head import HEATMAP_BIAS
+from src.models.heads.keypoint_head import CameraKeypointHead, CameraMaps, lift_keypoints
+from src.models.layers.full_precision import FullPrecisionLinear
+from src.models.layers.views import CameraViews
+from src.ops.nms import maxpool_peaks
+from src.ops.segment_reduce import topk_per_sample
+from src.structures.queries import UNKNOWN_LOGIT, Queries
+from src.structures.taxonomy import CLASSES
+from src.targets.depth import lid_centres
+
+
+@dataclass(kw_only=True)
+class ProposalConfig:
+    """Settings of the queries (`model.queries`). Raises ConfigError for values that cannot work."""
+
+    num_radar: int  # at the best peaks among the radar points
+    num_camera: int  # at the best keypoints of the images, lifted by their depth
+    num_learned: int  # at learnt places
+    num_depth_bins: int  # D, linearly increasing widths
+    depth_range_m: list[float]  # [nearest, farthest] along the optical axis
+    keypoint_nms_cells: int  # odd window of local maxima in the keypoint map
+
+    def __post_init__(self) -> None:
+        least = {field.name: 1 for field in fields(self) if field.name != "depth_range_m"}
+        require_least(self, "model.queries", least)
+        low_high = self.depth_range_m
+        if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
+            raise ConfigError(
+                f"model.queries.depth_range_m={low_high}: must be [near, far] in metres with 0 < near < far"
+            )
+        if self.keypoint_nms_cells % 2 == 0:
+            raise ConfigError(f"model.queries.keypoint_nms_cells={self.keypoint_nms_cells}: must be odd")
+
+    @property
+    def depth_range(self) -> tuple[float, float]:
+        """(nearest, farthest) in metres."""
+        return self.depth_range_m[0], self.depth_range_m[1]
+
+
+@dataclass
+class Proposals:
+    """The queries of B frames and the maps they come from."""
+
+    queries: Queries
+    heatmap_logits: Tensor  # [M, 12] float32, of the radar points
+    camera: CameraMaps
+
+
+class QueryProposals(nn.Module):
+    """Queries that start at something: StreamPETR's all start at learnt places, which takes long to learn.
+
+    Radar points and pixels are ranked without gradient; the features of those chosen carry it.
+    """
+
+    def __init__(self, config: ProposalConfig, channels: int, image_channels: int, grid: BEVGrid) -> None:
+        super().__init__()
+        self.config, self.grid = config, grid
+        self.heatmap = nn.Sequential(
+            nn.Linear(channels, channels), nn.ReLU(), FullPrecisionLinear(channels, len(CLASSES))
+        )
+        nn.init.constant_(self.heatmap[-1].bias, HEATMAP_BIAS)
+        self.camera_head = CameraKeypointHead(image_channels, channels, config.num_depth_bins)
+        self.from_radar, self.from_camera = nn.Linear(channels, channels), nn.Linear(channels, channels)
+        self.learned_features = nn.Parameter(0.02 * torch.randn(config.num_learned, channels))
+        # In units of the half extent, so that one step of Adam is of the order of a metre.
+        self.learned_places = nn.Parameter(torch.empty(config.num_learned, 2).uniform_(-0.7, 0.7))
+        centres = lid_centres(config.depth_range, config.num_depth_bins)
+        self.register_buffer("depth_centres_m", centres, persistent=False)
+        extent = torch.tensor([grid.centre_m, grid.half_extent_m])
+        self.register_buffer("extent_m", extent, persistent=False)
+
+    def forward(self, radar: RadarPoints, views: CameraViews) -> Proposals:
+        """Radar, camera and learnt queries, in this order."""
+        logits, camera = self.heatmap(radar.bev.features), self.camera_head(views.levels[0])
+        parts = [self._radar(logits.detach(), radar), self._camera(camera, views), self._learned(len(views.valid))]
+        return Proposals(Queries.concatenate(parts), logits, camera)
+
+    def _radar(self, logits: Tensor, radar: RadarPoints) -> Queries:
+        """The peaks of the heat map of any class; they bring their class, their place and their radial velocity."""
+        bev = radar.bev
+        scores = (logits.sigmoid() * maxpool_peaks(logits.sigmoid(), bev.sites)).amax(1)
+        rows = topk_per_sample(scores, bev.indices[:, 0], bev.batch_size, self.config.num_radar)
+        picks = torch.where(rows >= 0, rows, len(bev))  # one more row, which padding reads
+        features, means, known = (F.pad(table, (0, 0, 0, 1)) for table in (bev.features, radar.means, logits))
+        valid = (rows >= 0) & (F.embedding(picks, F.pad(scores, (0, 1))[:, None]).squeeze(-1) > 0)
+        point = F.embedding(picks, means)
+        return Queries(
+            self.from_radar(F.embedding(picks, features)), point[..., :3], point[..., 4:6], known[picks], valid
+        )
+
+    def _camera(self, camera: CameraMaps, views: CameraViews) -> Queries:
+        wanted, window = self.config.num_camera, self.config.keypoint_nms_cells
+        points, valid, local = lift_keypoints(camera, views, self.depth_centres_m, self.grid, wanted, window)
+        points, local = (torch.where(valid[..., None], value, 0.0) for value in (points, local))
+        return self._unknown(self.from_camera(local), points, valid)
+
+    def _learned(self, batch_size: int) -> Queries:
+        middle, half = self.extent_m.unbind(0)
+        xy = middle + half * self.learned_places
+        centers = F.pad(xy, (0, 1)).expand(batch_size, -1, -1)
+        features = self.learned_features.expand(batch_size, -1, -1)
+        return self._unknown(features, centers, torch.ones(centers.shape[:2], dtype=torch.bool, device=xy.device))
+
+    @staticmethod
+    def _unknown(features: Tensor, centers: Tensor, valid: Tensor) -> Queries:
+        """Of no known class, standing."""
+        logits = centers.new_full((*valid.shape, len(CLASSES)), UNKNOWN_LOGIT)
+        return Queries(features, centers, torch.zeros_like(centers[..., :2]), logits, valid)

@@ -1,0 +1,97 @@
+"""Deformable attention from queries to the images of all views (Eq. 2, method 5.3)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from src.geometry.bev_grid import BEVGrid
+from src.models.layers.views import CameraViews
+from src.ops.deform_sample import deform_attend_images
+
+NUM_HEADS = 4
+INITIAL_HEIGHT_M = 1.0
+
+
+def linear_relu_norm(in_channels: int, channels: int) -> nn.Sequential:
+    """Linear, ReLU, LayerNorm, twice."""
+    layers: list[nn.Module] = []
+    for width in (in_channels, channels):
+        layers += [nn.Linear(width, channels), nn.ReLU(), nn.LayerNorm(channels)]
+    return nn.Sequential(*layers)
+
+
+def attention_linear(in_channels: int, out_channels: int, zero: bool = False) -> nn.Linear:
+    """Linear layer with zero bias and Xavier (or zero) weights."""
+    layer = nn.Linear(in_channels, out_channels)
+    nn.init.zeros_(layer.bias)
+    if zero:
+        nn.init.zeros_(layer.weight)
+    else:
+        nn.init.xavier_uniform_(layer.weight)
+    return layer
+
+
+class ImageCrossAttention(nn.Module):
+    """Deformable attention from queries to the image pyramids of all views (DCA_I of Eq. 2).
+
+    The softmax runs jointly over the visible (view, level, point) triples of a query; without any, the result before
+    the output layer is exactly zero. With a grid the points lie on the plane and take a height within its band.
+    """
+
+    def __init__(
+        self, channels: int, num_points: int, num_views: int, num_levels: int, grid: BEVGrid | None = None
+    ) -> None:
+        super().__init__()
+        self.per_view = (NUM_HEADS, num_levels, num_points)
+        self.num_views = num_views
+        self.height = None
+        if grid is not None:
+            self.height = attention_linear(channels, num_points)
+            low, high = self.z_range_m = grid.z_range_m
+            share = min(max((INITIAL_HEIGHT_M - low) / (high - low), 0.01), 0.99)
+            nn.init.constant_(self.height.bias, math.log(share / (1.0 - share)))
+        self.camera = linear_relu_norm(12, channels)
+        self.logits = attention_linear(channels, num_views * math.prod(self.per_view), zero=True)
+        self.output = attention_linear(channels, channels)
+
+    def forward(
+        self,
+        features: Tensor,  # [B, G, C]
+        query: Tensor,  # [B, G, C] features + anchor embedding
+        points: Tensor,  # [B, G, P, 2] aug metres, [B, G, P, 3] without a grid
+        views: CameraViews,
+        values: list[Tensor],  # L x [B, N, C, h, w]
+    ) -> Tensor:  # [B, G, C]
+        """Samples of every visible point on every level."""
+        if self.height is not None:
+            low, high = self.z_range_m
+            z = low + (high - low) * self.height(features).float().sigmoid()  # [B, G, P]
+            points = torch.cat([points, z[..., None]], dim=-1)
+        pixels, visible = views.project(points)
+        weights = self._weights(query, views.pix_from_aug, visible)
+        gathered = deform_attend_images(values, pixels, views.image_size_px, weights, visible)
+        if not gathered.requires_grad:
+            # Nothing visible: zero gradients rather than none, since DDP expects one per parameter on every rank.
+            gathered = gathered + 0.0 * (weights.sum() + pixels.sum() + sum(level.float().sum() for level in values))
+        return self.output(gathered.to(values[0].dtype))
+
+    def _weights(
+        self,
+        query: Tensor,  # [B, G, C]
+        pix_from_aug: Tensor,  # [B, N, 4, 4]
+        visible: Tensor,  # [B, G, N, P] bool
+    ) -> Tensor:  # [B, G, heads, N, L, P], zero where invisible
+        rows = F.normalize(pix_from_aug[:, :, :3].float(), dim=-1)  # pixel-scaled rows would drown the metric one
+        camera = self.camera(rows.flatten(2))  # [B, N, C]
+        # Every view has its own rows of one linear layer on (f + e + cam_n); the camera's share is added separately.
+        weight = self.logits.weight.unflatten(0, (self.num_views, -1))  # [N, heads*L*P, C]
+        logits = self.logits(query).unflatten(-1, (self.num_views, -1))  # [B, G, N, heads*L*P]
+        logits = logits + torch.einsum("bnc,nkc->bnk", camera.to(weight.dtype), weight)[:, None]
+        logits = logits.float().unflatten(-1, self.per_view).transpose(2, 3)  # [B, G, heads, N, L, P]
+        seen = visible[:, :, None, :, None].expand_as(logits)
+        logits = logits.masked_fill(~seen, torch.finfo(logits.dtype).min)
+        return logits.flatten(3).softmax(-1).view_as(logits) * seen

@@ -1,0 +1,34 @@
+"""Object queries: what a set-prediction detector asks about each sample."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from src.structures.tensor_fields import TensorFields
+
+SPEED_UNIT_MPS = 10.0
+"""In which networks state velocities of queries; metres per second alone learn too slowly."""
+UNKNOWN_LOGIT = -4.6
+"""Where scores of queries start of which nothing is known: probability 0.01."""
+
+
+@dataclass
+class Queries(TensorFields):
+    """Q queries of each of B samples, in the augmented ego frame; padding is not `valid`, but finite."""
+
+    features: Tensor  # [B, Q, C]
+    centers: Tensor  # [B, Q, 3] m, where each looks and what its box is relative to
+    velocities: Tensor  # [B, Q, 2] m/s over ground, likewise
+    logits: Tensor  # [B, Q, 12] what is known of its class before it has looked, columns as taxonomy.CLASSES
+    valid: Tensor  # [B, Q] bool
+
+    def __len__(self) -> int:
+        return self.valid.shape[1]
+
+    @classmethod
+    def concatenate(cls, parts: list[Queries]) -> Queries:
+        """The queries of all parts, side by side."""
+        return cls(**{field.name: torch.cat([getattr(one, field.name) for one in parts], 1) for field in fields(cls)})
