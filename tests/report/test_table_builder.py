@@ -216,6 +216,21 @@ def test_a_setting_that_was_typed_though_it_is_the_default_is_the_same(make_reco
     assert sweep_tables(make_record({"a": {}}, seeds=2), results)[0].rows[0].done == 2
 
 
+def test_weights_that_a_row_scores_are_of_its_seeds(make_record, results_of):
+    """Their runs have ids of their own; other weights are another configuration."""
+
+    def row_of(*sources):
+        results = {}
+        for seed, source in enumerate(sources):
+            config = {"seed": seed, "phase": {"init_from": source, "epochs": 0}}
+            results |= results_of({f"a{seed}": 0.1}, config=config)
+        return sweep_tables(make_record({"a": {}}, seeds=2), results)[0].rows[0]
+
+    assert row_of("horizon3d-phase1-mini-0123abcd", "horizon3d-phase1-mini-4567cdef").done == 2
+    with pytest.raises(DataError, match="row a: .* differ in more than their seed"):
+        row_of("phase1", "horizon3d-phase1-mini-4567cdef")
+
+
 def timed(result, total, spread, **load):
     """The result with a latency of this total and range of the middle half."""
     result.latency = {"ms": {"total": total}, "spread_ms": {"total": spread}, "processor": "CPU", "threads": 1} | load
