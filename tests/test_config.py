@@ -46,16 +46,19 @@ def test_phase_2_composes_at_every_scale(scale):
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
-@pytest.mark.parametrize("name", ["dense_bev", "crt_fusion", "sparc"])
-def test_other_detectors_of_radar_and_cameras_compose_at_every_scale(scale, phase, name):
+@pytest.mark.parametrize("name", ["dense_bev", "crt_fusion", "sparc", "petr"])
+def test_other_detectors_without_lidar_compose_at_every_scale(scale, phase, name):
     """At the same range and cell; phase 1 drops what its settings name as temporal."""
     config, tree = compose_config([f"scale={scale}", "data.root=x", f"model={name}", f"phase={phase}"])
     model = config.model
     assert model.name == tree["model"]["name"] == name and config.grid.cells == [384, 384]
     assert (model.temporal is None) == (tree["model"]["temporal"] is None) == (phase == "phase1")
     assert (model.memory_frames > 0) == (model.memory_max_age_s == 6.0) == (phase == "phase2")
-    lifted = model.queries if name == "sparc" else model.view_transform
-    assert lifted.num_depth_bins in (16, 80) and lifted.depth_range == (1.0, 160.0)
+    lifted = getattr(model, {"sparc": "queries", "petr": "position"}.get(name, "view_transform"))
+    assert lifted.num_depth_bins in ((16, 32, 64) if name == "petr" else (16, 80)) and lifted.depth_range == (
+        1.0,
+        160.0,
+    )
 
 
 @pytest.mark.slow
@@ -244,6 +247,7 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["model=dense_bev", "phase=phase2", "model.temporal.num_frames=0"], "num_frames=0.*model.temporal=null"),
         (["model=crt_fusion", "phase=phase2", "model.temporal.occupancy_threshold=1"], "occupancy_threshold=1"),
         (["model=sparc", "phase=phase2", "model.temporal.queries_per_frame=0"], "queries_per_frame=0"),
+        (["model=petr", "model.num_queries=0"], "model.num_queries=0"),
         (["phase=phase2", "phase.name=phase1"], "phase.name=phase1.*phase=\\.\\.\\."),
         (["phase.options.velocity_code_weight=-1"], "velocity_code_weight"),
         (["optim.final_lr_ratio=-1"], "final_lr_ratio"),

@@ -136,8 +136,8 @@ def points_of(batch: FrameBatch) -> dict[str, Tensor]:
 
 
 def configs_of(config: Config) -> dict[str, Config]:
-    """By name the configured model with fresh weights, then all others that read radar and cameras in this phase, at
-    the same scale, grid and backbone."""
+    """By name the configured model with fresh weights, then all others of this phase that need no LiDAR, at the same
+    scale, grid and backbone."""
     configs = {config.model.name: replace(config, checkpoint=None)}
     if reads_lidar(config):
         return configs

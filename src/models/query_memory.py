@@ -16,6 +16,7 @@ from src.geometry.tensor_transforms import transform_points, transform_vectors_x
 from src.models.heads.query_head import QueryPrediction
 from src.models.memory import FrameMemory, RememberedFrame, TemporalConfig, motions, moving
 from src.structures.batch import FrameBatch
+from src.structures.evidence import Evidence, WarpedPoints
 from src.structures.queries import SPEED_UNIT_MPS, UNKNOWN_LOGIT, Queries
 from src.structures.taxonomy import CLASSES
 
@@ -93,6 +94,22 @@ class RecalledQueries:
     def older(self) -> Queries:
         """Those of the frames before."""
         return self.queries.map(lambda value: value[:, self.per_frame :])
+
+    def diagnostics(self) -> dict[str, Tensor | float]:
+        """What is remembered, per stream."""
+        streams = len(self.usable)
+        return {
+            "remembered_frames": self.usable.sum() / streams,
+            "remembered_queries": self.queries.valid.sum() / streams,
+        }
+
+    def evidence(self) -> Evidence:
+        """Where those of the first stream are now."""
+        known = self.queries.valid[0]
+        queries = self.queries.map(lambda value: value[0][known])
+        return Evidence(
+            warped_cells=WarpedPoints(queries.centers[:, :2], queries.velocities, self.elapsed_s[0][known], True)
+        )
 
 
 class MotionNorm(nn.Module):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from src.structures.taxonomy import CLASSES
 from src.structures.tensor_fields import TensorFields
 
 SPEED_UNIT_MPS = 10.0
@@ -32,3 +33,9 @@ class Queries(TensorFields):
     def concatenate(cls, parts: list[Queries]) -> Queries:
         """The queries of all parts, side by side."""
         return cls(**{field.name: torch.cat([getattr(one, field.name) for one in parts], 1) for field in fields(cls)})
+
+    @classmethod
+    def unknown(cls, features: Tensor, centers: Tensor, valid: Tensor) -> Queries:  # [B, Q, C], [B, Q, 3], [B, Q]
+        """Of no known class, standing."""
+        logits = centers.new_full((*valid.shape, len(CLASSES)), UNKNOWN_LOGIT)
+        return cls(features, centers, torch.zeros_like(centers[..., :2]), logits, valid)

@@ -164,7 +164,8 @@ def test_numbers_of_all_methods_are_those_reported():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("label", "name"), [("BEVFusion", "dense_bev"), ("CRT-Fusion", "crt_fusion"), ("SpaRC", "sparc")]
+    ("label", "name"),
+    [("BEVFusion", "dense_bev"), ("CRT-Fusion", "crt_fusion"), ("SpaRC", "sparc"), ("PETR", "petr")],
 )
 def test_another_method_is_trained_as_ours(label, name):
     """Same phase, data and backbone as the row it is compared with, and the same settings of a head of its kind; only
@@ -177,9 +178,9 @@ def test_another_method_is_trained_as_ours(label, name):
         assert (baseline.model.name, own.model.name) == (name, "horizon3d")
         for part in ("data", "backbone", "phase", "optim", "grid", "precision", "seed"):
             assert getattr(baseline, part) == getattr(own, part), (scale, part)
-        for key in ("nms", "score_threshold", "max_boxes", "attributes") if name != "sparc" else ():
+        for key in ("nms", "score_threshold", "max_boxes", "attributes") if name not in ("sparc", "petr") else ():
             assert getattr(baseline.model.head, key) == getattr(own.model.head, key)
-        for key in ("heatmap_weight", "box_weight"):
+        for key in ("heatmap_weight", "box_weight") if name != "petr" else ("box_weight",):
             assert getattr(baseline.model.loss, key) == getattr(own.model.loss, key)
         assert baseline.model.memory_max_age_s == own.model.memory_max_age_s and baseline.model.memory_frames > 0
 
@@ -246,9 +247,9 @@ def test_tables_have_names_of_their_own():
 def test_a_row_for_one_scale_is_the_papers_alone_at_others():
     sweep = load_sweep(OTHER_METHODS)
     small, full = sweep.at_scale("mini"), sweep.at_scale("paper")
-    trained = ["Horizon3D", "BEVFusion", "CRT-Fusion", "SpaRC"]
-    assert [row.label for row in small.rows] == trained and len(full.rows) == 6
-    for paper_row, row in zip(small.paper_rows, full.rows[4:], strict=False):
+    trained = ["Horizon3D", "BEVFusion", "CRT-Fusion", "SpaRC", "PETR"]
+    assert [row.label for row in small.rows] == trained and len(full.rows) == 7
+    for paper_row, row in zip(small.paper_rows, full.rows[5:], strict=False):
         assert paper_row.label == row.label and paper_row.paper == row.paper and "V2-99" in row.label
     assert full.rows == sweep.rows and small.baseline == "Horizon3D"
 

@@ -17,7 +17,7 @@ from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.views import CameraViews
 from src.ops.nms import maxpool_peaks
 from src.ops.segment_reduce import topk_per_sample
-from src.structures.queries import UNKNOWN_LOGIT, Queries
+from src.structures.queries import Queries
 from src.structures.taxonomy import CLASSES
 from src.targets.depth import lid_centres
 
@@ -105,17 +105,11 @@ class QueryProposals(nn.Module):
         wanted, window = self.config.num_camera, self.config.keypoint_nms_cells
         points, valid, local = lift_keypoints(camera, views, self.depth_centres_m, self.grid, wanted, window)
         points, local = (torch.where(valid[..., None], value, 0.0) for value in (points, local))
-        return self._unknown(self.from_camera(local), points, valid)
+        return Queries.unknown(self.from_camera(local), points, valid)
 
     def _learned(self, batch_size: int) -> Queries:
         middle, half = self.extent_m.unbind(0)
         xy = middle + half * self.learned_places
         centers = F.pad(xy, (0, 1)).expand(batch_size, -1, -1)
         features = self.learned_features.expand(batch_size, -1, -1)
-        return self._unknown(features, centers, torch.ones(centers.shape[:2], dtype=torch.bool, device=xy.device))
-
-    @staticmethod
-    def _unknown(features: Tensor, centers: Tensor, valid: Tensor) -> Queries:
-        """Of no known class, standing."""
-        logits = centers.new_full((*valid.shape, len(CLASSES)), UNKNOWN_LOGIT)
-        return Queries(features, centers, torch.zeros_like(centers[..., :2]), logits, valid)
+        return Queries.unknown(features, centers, torch.ones(centers.shape[:2], dtype=torch.bool, device=xy.device))

@@ -25,7 +25,7 @@ from src.models.query_memory import QueryMemory, QueryMemoryConfig, QueryPropaga
 from src.models.sparc.frustum_fusion import FrustumFusionConfig, SparseFrustumFusion
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
-from src.structures.evidence import Evidence, WarpedPoints
+from src.structures.evidence import Evidence
 from src.structures.queries import Queries
 from src.structures.taxonomy import CAMERAS
 from src.targets.heatmap import head_targets
@@ -175,16 +175,8 @@ class SpaRC(Detector):
         """Radar points, queries and what is remembered, per frame."""
         frames = len(output.head.valid)
         values = {"radar_points": len(output.radar.bev) / frames, "queries": output.head.valid.sum() / frames}
-        if output.recalled is not None:
-            values["remembered_frames"] = output.recalled.usable.sum() / frames
-            values["remembered_queries"] = output.recalled.queries.valid.sum() / frames
-        return values
+        return values if output.recalled is None else values | output.recalled.diagnostics()
 
     def evidence(self, output: SpaRCOutput) -> Evidence:
         """Where remembered queries of the first sample are now."""
-        if output.recalled is None:
-            return Evidence()
-        known = output.recalled.queries.valid[0]
-        queries = output.recalled.queries.map(lambda value: value[0][known])
-        elapsed = output.recalled.elapsed_s[0][known]
-        return Evidence(warped_cells=WarpedPoints(queries.centers[:, :2], queries.velocities, elapsed, True))
+        return Evidence() if output.recalled is None else output.recalled.evidence()

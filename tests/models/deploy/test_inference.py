@@ -150,6 +150,7 @@ MODELS = {
         "model.temporal.occupancy_threshold=0.01",
     ),
     "sparc": ("phase=phase2", "model=sparc"),
+    "petr": ("phase=phase2", "model=petr"),
 }  # fmt: skip
 
 

@@ -1,0 +1,74 @@
+"""PETR's 3D position embedding: what a feature pixel could be looking at, at every depth, told to its feature."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from src.errors import ConfigError, require_least
+from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import constant
+from src.models.layers.views import CameraViews
+from src.targets.depth import lid_centres
+
+HIDDEN_RATIO = 4
+EDGE = 1e-5
+"""Normalised coordinates are kept so far from 0 and 1 before their logit is taken: what lies outside says no more."""
+
+
+@dataclass(kw_only=True)
+class PositionEmbeddingConfig:
+    """Settings of the position embedding (`model.position`). Raises ConfigError for values that cannot work."""
+
+    num_depth_bins: int  # D places on the ray of each pixel, further and further apart
+    depth_range_m: list[float]  # [nearest, farthest] along the optical axis
+    z_range_m: list[float]  # that coordinates are normalised by, with the grid's extent in x and y
+
+    def __post_init__(self) -> None:
+        require_least(self, "model.position", {"num_depth_bins": 1})
+        low_high = self.depth_range_m
+        if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
+            raise ConfigError(
+                f"model.position.depth_range_m={low_high}: must be [near, far] in metres with 0 < near < far"
+            )
+        if len(self.z_range_m) != 2 or not self.z_range_m[0] < self.z_range_m[1]:
+            raise ConfigError(f"model.position.z_range_m={self.z_range_m}: must be [low, high] in metres, ascending")
+
+    @property
+    def depth_range(self) -> tuple[float, float]:
+        """(nearest, farthest) in metres."""
+        return self.depth_range_m[0], self.depth_range_m[1]
+
+
+class PositionEmbedding(nn.Module):
+    """MLP(logit(normalised D places of the pixel's ray)) (PETR, Sec. 3.2 and 3.3).
+
+    Runs in float32 also under autocast: places of 150 m would be rounded to half a metre.
+    """
+
+    full_precision_parts = ("",)
+
+    def __init__(self, config: PositionEmbeddingConfig, channels: int, grid: BEVGrid) -> None:
+        super().__init__()
+        (x, y), (half_x, half_y) = grid.centre_m, grid.half_extent_m
+        low, high = config.z_range_m
+        self.low, self.size = (x - half_x, y - half_y, low), (2 * half_x, 2 * half_y, high - low)
+        depths = lid_centres(config.depth_range, config.num_depth_bins)
+        self.register_buffer("depths_m", depths, persistent=False)
+        hidden = HIDDEN_RATIO * channels
+        self.mlp = nn.Sequential(nn.Linear(3 * config.num_depth_bins, hidden), nn.ReLU(), nn.Linear(hidden, channels))
+
+    def forward(self, views: CameraViews) -> Tensor:  # [B, N, h, w, C] float32
+        """Of every pixel of the finest level; a missing camera's are finite and say nothing."""
+        with torch.autocast(views.pix_from_aug.device.type, enabled=False):
+            places = self.places(views)
+            low, size = constant((self.low, self.size), torch.float32, places.device)
+            return self.mlp(((places - low) / size).logit(EDGE).flatten(-2))
+
+    def places(self, views: CameraViews) -> Tensor:  # [B, N, h, w, D, 3] aug metres
+        """The places at every depth; a ray is straight, so two of them tell all."""
+        shape = (*views.valid.shape, *views.levels[0].shape[-2:])
+        near, far = (views.lift(torch.full(shape, depth, device=views.valid.device)) for depth in (0.0, 1.0))
+        return near[..., None, :] + self.depths_m[:, None] * (far - near)[..., None, :]
