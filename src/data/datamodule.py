@@ -110,7 +110,7 @@ def drop_sensors(frame: FrameBatch, share: float, draw: tuple[int, ...]) -> Fram
 
 def without_sensors(frame: FrameBatch) -> FrameBatch:
     """The frame without points and images."""
-    names = ("radar_points", "radar_batch", "lidar_points", "lidar_batch", "lidar_origins")
+    names = ("radar_points", "radar_batch", "lidar_points", "lidar_batch", "lidar_origins", "lidar_speeds")
     changes = {name: getattr(frame, name)[:0] for name in names if getattr(frame, name) is not None}
     if frame.images is not None:
         changes |= {"images": torch.zeros_like(frame.images), "image_valid": torch.zeros_like(frame.image_valid)}

@@ -173,8 +173,31 @@ class FrameReader:
     ) -> dict[str, torch.Tensor]:
         files = self._files.of_frame(sample, LIDARS, self.settings.num_lidar_sweeps, skipped)
         rows, clouds = self._files.lidar_clouds(sample, files, skipped)
-        aug_from_global = aug_from_ego @ invert_rigid(global_from_ego)
-        return self._placed(rows, clouds, aug_from_global, int(self.index.frame_times_us[sample]))
+        aug_from_global, time_us = aug_from_ego @ invert_rigid(global_from_ego), int(self.index.frame_times_us[sample])
+        return self._input(sample, rows, clouds, aug_from_global, time_us, skipped)
+
+    def _input(
+        self,
+        sample: int,
+        rows: Array,  # [S]
+        clouds: list[LidarCloud],
+        aug_from_global: Array,  # [4, 4]
+        frame_time_us: int,
+        skipped: Skipped,
+    ) -> dict[str, torch.Tensor]:
+        """`lidar_tensors` of these files; with the speed of each point where the timeline has a source of speeds."""
+        known = self.settings.timeline is not None and self.settings.timeline.radial_speeds is not RadialSpeeds.none
+        tensors = self._placed(rows, clouds, aug_from_global, frame_time_us, origins=True if known else None)
+        if not known:
+            return tensors
+        directed = (tensors["lidar_points"][:, :3] != tensors["lidar_origins"]).any(1)
+        rays = lidar_rays({name: value[directed] for name, value in tensors.items()}, step=0)
+        speeds = torch.full((len(directed),), torch.nan)
+        if len(rays):
+            speeds[directed] = self._speeds(sample, rays, aug_from_global, frame_time_us, skipped)
+        if not self.settings.lidar_origins:
+            del tensors["lidar_origins"]
+        return tensors | {"lidar_speeds": speeds}
 
     def _placed(
         self,
@@ -213,7 +236,8 @@ class FrameReader:
                 "timestamps_s": torch.tensor([1e-6 * time_us], dtype=torch.float64),
                 "global_from_ego": torch.from_numpy(global_from_ego[None]),
             }
-        return FrameBatch(**frame, **self._placed(rows, clouds, aug_from_global, time_us if len(rows) else 0))
+        time_us = time_us if len(rows) else 0
+        return FrameBatch(**frame, **self._input(sample, rows, clouds, aug_from_global, time_us, skipped))
 
     def _rays(self, sample: int, steps: Sequence[int], aug_from_global: Array, skipped: Skipped) -> RayBundle:
         """Returns of one sweep of each LiDAR at each moment; a moment without sweeps gives no rays."""
@@ -224,26 +248,41 @@ class FrameReader:
             mounts = self.index.ego_from_sensor[self.index.data_calibrations[rows]]
             clouds = list(map(without_ego_body, clouds, mounts))
             parts.append(lidar_rays(self._placed(rows, clouds, aug_from_global, frame_time_us, origins=True), step))
-        rays, source = RayBundle.join(parts), self.settings.timeline.radial_speeds
-        if source is RadialSpeeds.none or not len(rays):
+        rays = RayBundle.join(parts)
+        if self.settings.timeline.radial_speeds is RadialSpeeds.none or not len(rays):
             return rays
-        find = self._true_speeds if source is RadialSpeeds.exact else self._radar_speeds
-        return replace(rays, speeds=torch.from_numpy(find(sample, rays, aug_from_global, skipped).astype(np.float32)))
+        return replace(rays, speeds=self._speeds(sample, rays, aug_from_global, frame_time_us, skipped))
 
-    def _true_speeds(self, sample: int, rays: RayBundle, aug_from_global: Array, skipped: Skipped) -> Array:  # [R]
+    def _speeds(
+        self,
+        sample: int,
+        rays: RayBundle,
+        aug_from_global: Array,  # [4, 4] of the frame that the rays are in
+        frame_time_us: int,  # from which their times count
+        skipped: Skipped,
+    ) -> torch.Tensor:  # [R] float32
+        """By the timeline's source."""
+        find = self._true_speeds if self.settings.timeline.radial_speeds is RadialSpeeds.exact else self._radar_speeds
+        return torch.from_numpy(find(sample, rays, aug_from_global, frame_time_us, skipped).astype(np.float32))
+
+    def _true_speeds(
+        self, sample: int, rays: RayBundle, aug_from_global: Array, frame_time_us: int, skipped: Skipped
+    ) -> Array:  # [R]
         """By the true motion that a synthetic world knows, in metres of the augmented frame."""
         scene = int(self.index.sample_scenes[sample])
         if self._truth is None or self._truth[0] != scene:
             self._truth = scene, TrueGeometry.read(self.index.root, str(self.index.scene_names[scene]))
         global_from_aug = np.linalg.inv(aug_from_global)
         points = rays.points.double().numpy() @ global_from_aug[:3, :3].T + global_from_aug[:3, 3]
-        times_us = self.index.frame_times_us[sample] + np.round(1e6 * rays.times_s.double().numpy()).astype(np.int64)
+        times_us = frame_time_us + np.round(1e6 * rays.times_s.double().numpy()).astype(np.int64)
         velocities = self._truth[1].velocities(points, times_us, TRUE_MARGIN_M) @ aug_from_global[:3, :3].T
         return (velocities * rays.directions.double().numpy()).sum(1)
 
-    def _radar_speeds(self, sample: int, rays: RayBundle, aug_from_global: Array, skipped: Skipped) -> Array:  # [R]
+    def _radar_speeds(
+        self, sample: int, rays: RayBundle, aug_from_global: Array, frame_time_us: int, skipped: Skipped
+    ) -> Array:  # [R]
         """By the radar returns beside the rays' ends."""
-        index, frame_time_us = self.index, int(self.index.frame_times_us[sample])
+        index = self.index
         if self._radars is None:
             self._radars = SweepTimeline(index, RADARS)
         times_us = frame_time_us + np.round(1e6 * rays.times_s.double().numpy()).astype(np.int64)

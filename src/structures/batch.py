@@ -38,6 +38,7 @@ class FrameBatch(TensorFields):
     lidar_points: Tensor | None = None  # [L, 5] float32: x, y, z (m, aug), intensity as stored, dt (s)
     lidar_batch: Tensor | None = None  # [L] int64, sample of each point, ascending
     lidar_origins: Tensor | None = None  # [L, 3] float32 m, aug: where the sensor was when it measured the point
+    lidar_speeds: Tensor | None = None  # [L] float32 m/s over ground along the point's ray, away > 0; NaN where unknown
     images: Tensor | None = None  # [B, N, 3, H, W] uint8 RGB
     image_valid: Tensor | None = None  # [B, N] bool, False where a camera is missing
     pix_from_aug: Tensor | None = None  # [B, N, 4, 4] float32: P_n over (0, 0, 0, 1); (u*d, v*d, d, 1) = P (x, y, z, 1)
@@ -61,6 +62,8 @@ class FrameBatch(TensorFields):
         self._expect("aug_from_ego", (b, 4, 4), torch.float32)
         self._check_points("radar", len(RADAR_POINT_FIELDS))
         self._check_points("lidar", len(LIDAR_POINT_FIELDS))
+        if self.lidar_speeds is not None:
+            self._expect("lidar_speeds", (0 if self.lidar_points is None else len(self.lidar_points),), torch.float32)
         if self.lidar_origins is not None:
             self._expect(
                 "lidar_origins", (0 if self.lidar_points is None else len(self.lidar_points), 3), torch.float32

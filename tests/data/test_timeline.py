@@ -235,6 +235,20 @@ def test_a_radar_return_beside_a_ray_tells_its_speed():
     np.testing.assert_allclose(radar_speeds(rays, radar), expected, rtol=1e-5)
 
 
+def inputs_have_the_speeds_of_their_rays(frame, rays):
+    """Of one moment; rays leave out what ends on the truck itself."""
+    assert len(frame.lidar_speeds) == len(frame.lidar_points) >= len(rays)
+    assert frame.lidar_speeds.isfinite().sum() >= rays.speeds.isfinite().sum() > 0
+    ends = dict(zip(map(tuple, rays.points.round(decimals=2).tolist()), rays.speeds.tolist(), strict=True))
+    places = map(tuple, frame.lidar_points[:, :3].round(decimals=2).tolist())
+    both = [
+        (ends[place], speed) for place, speed in zip(places, frame.lidar_speeds.tolist(), strict=True) if place in ends
+    ]
+    wanted, found = np.array(both).T
+    same = np.isclose(wanted, found, atol=1e-3) | (np.isnan(wanted) & np.isnan(found))
+    assert len(both) > 0.5 * len(rays) and same.mean() > 0.999  # two points of a centimetre may differ
+
+
 @pytest.mark.slow
 def test_in_the_world_true_speeds_are_those_of_the_motion_and_radar_says_the_same(tmp_path):
     """On moving matter alone; what stands has none."""
@@ -248,8 +262,12 @@ def test_in_the_world_true_speeds_are_those_of_the_motion_and_radar_says_the_sam
     for source in (RadialSpeeds.exact, RadialSpeeds.radar):
         timeline = replace(FIVE_HERTZ, radial_speeds=source)
         settings = reader_settings(**(ONLY_LIDAR | {"timeline": timeline}), num_future_frames=2)
-        rays = FrameReader(index, settings).read(1, None, targets=[-2, 0, 2]).rays
+        frame = FrameReader(index, settings).read(1, None, history=[-2], targets=[-2, 0, 2])
+        rays = frame.rays
         speeds[source] = rays.speeds.numpy()
+        inputs_have_the_speeds_of_their_rays(frame, rays[rays.steps == 0])
+        fast, past = (rays.speeds[rays.steps == -2].abs() > 5).sum(), frame.past[0].lidar_speeds.abs() > 5
+        assert past.sum() > 0.9 * fast > 0  # "0.3 m above the ground" is another in another ego frame
     exact, radar = speeds.values()
     assert not np.isnan(exact).any() and 0.02 < (np.abs(exact) > 1).mean() < 0.5 and (exact == 0).mean() > 0.5
     both = ~np.isnan(radar)

@@ -238,7 +238,8 @@ def test_a_disk_that_refuses_the_dump_does_not_hide_the_fault(tmp_path, monkeypa
 def test_a_dump_keeps_lidar_past_frames_and_rays(tmp_path):
     def cloud(count):
         points, owners = torch.randn(count, 5), torch.arange(count) % 2
-        return {"lidar_points": points, "lidar_batch": owners.sort()[0], "lidar_origins": torch.randn(count, 3)}
+        own = {"lidar_origins": torch.randn(count, 3), "lidar_speeds": torch.randn(count)}
+        return {"lidar_points": points, "lidar_batch": owners.sort()[0], **own}
 
     bare = replace(toy_batch([3, 7], [True, False]), radar_points=None, radar_batch=None)
     past, numbers, two = replace(bare, streams=None, starts=None, **cloud(3)), torch.randn(2), torch.arange(2)
@@ -248,7 +249,7 @@ def test_a_dump_keeps_lidar_past_frames_and_rays(tmp_path):
     _, found = read_dump(write_dump(tmp_path, toy_module().model, {}, batch, **named))
     assert found.radar_points is None and [len(frame.lidar_points) for frame in found.past] == [3, 0]
     for one, other in ((found, batch), (found.past[0], past)):
-        for name in ("lidar_points", "lidar_batch", "lidar_origins", "global_from_ego"):
+        for name in ("lidar_points", "lidar_batch", "lidar_origins", "lidar_speeds", "global_from_ego"):
             assert torch.equal(getattr(one, name), getattr(other, name))
     assert torch.equal(found.rays.points, rays.points) and torch.equal(found.rays.steps, rays.steps)
 

@@ -30,6 +30,7 @@ LIDAR = {
     "lidar_points": torch.arange(25.0).reshape(5, 5),
     "lidar_batch": torch.tensor([0, 1, 1, 2, 2]),
     "lidar_origins": torch.arange(15.0).reshape(5, 3),
+    "lidar_speeds": torch.tensor([1.0, -2.0, 4.0, 0.0, 3.0]),
 }
 NO_RADAR = {"radar_points": None, "radar_batch": None}
 NO_CAMERA = {"images": None, "image_valid": None, "pix_from_aug": None}
@@ -107,6 +108,7 @@ def test_a_sample_may_lack_points_boxes_and_images():
         ("lidar_batch", torch.tensor([0, 1, 0, 2, 2])),
         ("lidar_batch", torch.tensor([0, 1, 1, 2, 3])),
         ("lidar_origins", torch.zeros(4, 3)),
+        ("lidar_speeds", torch.zeros(4)),
         ("images", torch.zeros(3, 4, 3, 8, 16)),
         ("images", torch.zeros(2, 4, 3, 8, 16, dtype=torch.uint8)),
         ("image_valid", None),

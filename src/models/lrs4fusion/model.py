@@ -118,7 +118,8 @@ class LRS4Fusion(Detector, WorldModel):
         """The volumes alone; raises as `forward`."""
         if batch.lidar_points is None or batch.lidar_batch is None:
             raise ValueError("FrameBatch.lidar_points is None, but this model uses LiDAR; read it with the frames")
-        x = self.stem(self.unet(self.pointnet(batch.lidar_points, batch.lidar_batch, len(batch))))
+        voxels = self.pointnet(batch.lidar_points, batch.lidar_batch, len(batch), batch.lidar_speeds)
+        x = self.stem(self.unet(voxels))
         if self.temporal is None:
             return self.late_encoder(x)
         warped = self.temporal.recall(memory, batch)

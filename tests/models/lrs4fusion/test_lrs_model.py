@@ -214,3 +214,14 @@ def test_occupancy_of_one_scene_is_learnt():
     queries = torch.cat([asked.points, asked.times_s[:, None]], dim=1)
     found = model.look_up(model(batch)[0], queries, asked.batch)[0] > 0.5
     assert (found & asked.occupied).sum() / (found | asked.occupied).sum() > 0.9
+
+
+def test_measured_speeds_are_an_input():
+    """Unknown ones are none at all."""
+    model, batch = lrs_model(OCCUPANCY, "model.temporal=null").eval(), frame((300,))
+    speeds = torch.full((300,), torch.nan)
+    some = torch.where(torch.arange(300) % 2 == 0, 9.0, torch.nan)
+    without, unknown, known = (
+        model.encode(replace(batch, lidar_speeds=value)).scales[0].features for value in (None, speeds, some)
+    )
+    assert torch.equal(without, unknown) and not torch.equal(without, known)
