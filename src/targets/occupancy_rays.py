@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 import torch
 from torch import Tensor
@@ -16,6 +17,13 @@ BALANCE_M = (50.0, 150.0)
 """Between the shares of `ray_balance`."""
 
 
+class FreePlaces(Enum):
+    """Where on rays the free places lie."""
+
+    along_rays = "along_rays"  # uniform between the sensor and the return: far away most places drawn are occupied
+    at_return_ranges = "at_return_ranges"  # at every range as many as occupied ones
+
+
 @dataclass(kw_only=True)
 class RaySampling:
     """How places are drawn along rays (`model.loss.sampling`). Raises ConfigError for values that cannot work."""
@@ -23,6 +31,7 @@ class RaySampling:
     min_free_m: float  # eps: free from here on, as seen from the sensor
     depth_m: float  # delta: occupied so far behind the return
     num_queries: int  # of each sample and target time, half of them occupied
+    free_places: FreePlaces
     ray_balance: bool  # equal mass to returns nearer than 50 m, 50 to 150 m and beyond; else rays uniform over returns
 
     def __post_init__(self) -> None:
@@ -57,7 +66,8 @@ def sample_queries(
 
     With o a ray's origin, r its direction and d its range: Q+ are o + s r with s ~ U(d, d + delta), Q- with
     s ~ U(eps, d), both cut to the bounds; what lies behind d + delta is unknown and never drawn. Rays are drawn with
-    replacement among those that have such a stretch inside, so a return beyond the bounds still says what is free.
+    replacement among those that have such a stretch inside, so a return beyond the bounds still says what is free. With
+    `at_return_ranges` the s of Q- are those of Q+, each on a ray that goes on further.
     """
     enter, leave = clip_rays(rays, bounds)
     stretches = (
@@ -75,11 +85,18 @@ def sample_queries(
         for rows in usable
     ]
     whole = (counts[0].sum(1) > 0) & (counts[1].sum(1) > 0)
-    parts = []
+    parts, along, num_each = [], rays.ranges[:0], sampling.num_queries // 2
     for occupied, (low, high), rows, count in zip((True, False), stretches, usable, counts, strict=True):
-        drawn = _draw_rows(group * num_bins + bins, rows, count, whole, sampling.num_queries // 2, generator)
+        matched = not occupied and sampling.free_places is FreePlaces.at_return_ranges
+        if matched:
+            owners = whole.nonzero().squeeze(1).repeat_interleave(num_each)
+            drawn = _draw_longer(group, high, rows, owners, along, generator)
+        else:
+            drawn = _draw_rows(group * num_bins + bins, rows, count, whole, num_each, generator)
         share = torch.rand(len(drawn), generator=generator, device=drawn.device)
-        along = low[drawn] + share * (high[drawn] - low[drawn])
+        spread = low[drawn] + share * (high[drawn] - low[drawn])
+        # Beyond the furthest ray none goes on: there, as without matching, anywhere along it.
+        along = torch.where(along < high[drawn], along.maximum(low[drawn]), spread) if matched else spread
         parts.append(
             OccupancyQueries(
                 points=rays.origins[drawn] + along[:, None] * rays.directions[drawn],
@@ -125,6 +142,25 @@ def _draw_rows(
     chosen = torch.searchsorted(filled.cumsum(1), nth + 1)
     within = (draws[1] * counts.gather(1, chosen)).long()
     return order[(starts.gather(1, chosen) + within).flatten()]
+
+
+def _draw_longer(
+    group: Tensor,  # [R] int64
+    ends: Tensor,  # [R] m, how far the ray is free
+    usable: Tensor,  # [R] bool
+    owners: Tensor,  # [n] int64, group of each draw; all hold a usable ray
+    ranges: Tensor,  # [n] m
+    generator: torch.Generator | None,
+) -> Tensor:  # [n] int64, rows of rays
+    """A ray of the group that is free beyond the range, each as likely; the group's longest where none is."""
+    span = float(ends.max()) + 1.0
+    place = group * span + ends.double()
+    order = usable.nonzero().squeeze(1)
+    order = order[place[order].argsort(stable=True)]
+    last = torch.searchsorted(place[order], (owners + 1) * span)
+    first = torch.searchsorted(place[order], owners * span + ranges.double(), right=True).minimum(last - 1)
+    draws = torch.rand(len(owners), generator=generator, device=owners.device, dtype=torch.float64)
+    return order[first + (draws * (last - first)).long()]
 
 
 def draw_rays(

@@ -5,10 +5,12 @@ import torch
 
 from src.errors import ConfigError
 from src.structures.ray_bundle import RayBundle
-from src.targets.occupancy_rays import RaySampling, clip_rays, sample_queries
+from src.targets.occupancy_rays import FreePlaces, RaySampling, clip_rays, sample_queries
 
 BOUNDS = ((-100.0, 250.0), (-100.0, 100.0), (-12.0, 12.0))  # lrs 2.1
-SAMPLING = RaySampling(min_free_m=1.5, depth_m=0.1, num_queries=2000, ray_balance=False)
+SAMPLING = RaySampling(
+    min_free_m=1.5, depth_m=0.1, num_queries=2000, free_places=FreePlaces.along_rays, ray_balance=False
+)
 
 
 def bundle(ends, *, origin=(0.0, 0.0, 2.0), steps=None, batch=None, speeds=None, times=None):
@@ -106,6 +108,29 @@ def test_rays_are_uniform_or_balanced_over_distance(balanced, shares):
     torch.testing.assert_close(found, torch.tensor(shares), atol=0.02, rtol=0)
     far_alone = sample_queries(rays[rays.ranges > 150], BOUNDS, sampling, seeded())  # empty bins get nothing
     assert far_alone.occupied.sum() == 10_000
+
+
+def test_free_places_at_the_ranges_of_returns():
+    """As many as occupied ones at every range, on rays that go on; the furthest ray itself is free all along."""
+    ends = [[10.0, 0, 2]] * 60 + [[40.0, 0, 2]] * 30 + [[0.0, 80.0, 2]] * 10
+    ends, batch = ends + [[30.0, 0, 2]] * 2 + [[60.0, 0, 2]], [0] * 100 + [1] * 3
+    rays = bundle(ends, batch=batch, times=[0.01 * row for row in range(103)])
+    changes = {"free_places": FreePlaces.at_return_ranges, "num_queries": 20_000}
+    queries = sample_queries(rays, BOUNDS, RaySampling(**(vars(SAMPLING) | changes)), seeded())
+    along = (queries.points - rays.origins[0]).norm(dim=1)
+    free = (queries.batch == 0) & ~queries.occupied
+    assert free.sum() == 10_000 and (along[free] < 80.0).all()
+    for d, share in ((10.0, 0.6), (40.0, 0.3)):
+        near = free & (along > d - 1e-3) & (along < d + 0.1 + 1e-3)
+        assert float(near.sum()) / 10_000 == pytest.approx(share, abs=0.03)
+        own = (queries.times_s[near] * 100).round().long()
+        assert (rays.ranges[own] > d + 0.1).all()  # not the rays that end there
+        longer = int((rays.ranges[:100] > d + 0.1).sum())
+        assert len(own.unique()) == longer
+    rest = along[free & (along > 1.0) & (along < 9.9)]
+    assert 0 < len(rest) < 400  # the share of the furthest, spread
+    other = (queries.batch == 1) & ~queries.occupied
+    assert float((along[other].sub(30.05).abs() < 0.06).float().mean()) == pytest.approx(2 / 3, abs=0.03)
 
 
 def test_the_seed_decides():
