@@ -20,8 +20,9 @@ def masked_l1(
 def masked_smooth_l1(
     prediction: Tensor,  # [...]
     target: Tensor,  # [...], NaN where unknown
+    beta: float = 1.0,
 ) -> Tensor:  # [...]
-    """Smooth L1 with beta 1; 0 without gradient where the target is NaN."""
+    """Smooth L1, which is e^2 / (2 beta) below beta; 0 without gradient where the target is NaN."""
     prediction = full_precision(prediction)
     known = target.where(~target.isnan(), prediction.detach()).to(prediction.dtype)
-    return F.smooth_l1_loss(prediction, known, reduction="none", beta=1.0)
+    return F.smooth_l1_loss(prediction, known, reduction="none", beta=beta)

@@ -13,7 +13,7 @@ from src.errors import require_least
 from src.geometry.bounds import Bounds
 from src.losses.loss_weights import LossWeights
 from src.losses.normalizers import full_precision, mean_over_ranks
-from src.losses.regression import masked_l1
+from src.losses.regression import masked_smooth_l1
 from src.models.detector import Objective
 from src.structures.ray_bundle import RayBundle
 from src.targets.occupancy_rays import RaySampling, draw_rays, sample_queries
@@ -32,6 +32,7 @@ class LRSLossConfig(LossWeights):
     box_weight: float | None
     occupancy_weight: float  # w_o
     velocity_weight: float | None  # w_v
+    velocity_beta_mps: float  # errors below it count by their square, e^2 / (2 beta): 0 for a plain L1
     moving_weight: float  # of the error of what is measured to move faster than MOVING_MPS, within the mean
     range_weight: float
     rays_per_frame: int  # rays of each sample and target time that the ray head learns from
@@ -39,7 +40,7 @@ class LRSLossConfig(LossWeights):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_least(self, "model.loss", {"rays_per_frame": 1, "moving_weight": 1})
+        require_least(self, "model.loss", {"rays_per_frame": 1, "moving_weight": 1, "velocity_beta_mps": 0})
 
 
 def occupancy_objective(answer: Answer, rays: RayBundle, bounds: Bounds, config: LRSLossConfig) -> Objective:
@@ -61,7 +62,7 @@ def occupancy_objective(answer: Answer, rays: RayBundle, bounds: Bounds, config:
     }
     if config.velocity_weight is not None and speeds is not None:
         weights = 1 + (config.moving_weight - 1) * (queries.speeds.abs() > MOVING_MPS)
-        errors = weights * masked_l1(speeds, queries.speeds)
+        errors = weights * masked_smooth_l1(speeds, queries.speeds, config.velocity_beta_mps)
         valid = mean_over_ranks(weights[~queries.speeds.isnan()].sum())
         terms["velocity"] = config.velocity_weight * known.any() * errors.sum() / valid
     return Objective(terms, counts)

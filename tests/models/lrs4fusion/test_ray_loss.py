@@ -40,6 +40,12 @@ def test_terms_are_weighted_means_over_queries():
     assert counts["iou"] == 1 and counts["known_speeds"] == 1
 
 
+def test_small_errors_of_speed_count_by_their_square():
+    changed = settings(velocity_beta_mps=1.5)
+    terms, _ = occupancy_objective(perfect(2.0), rays_along_x([20.0] * 8, 3.0), BOUNDS, changed)
+    assert terms["velocity"] == pytest.approx(0.5 * 1**2 / (2 * 1.5) + 0.5 * (2 - 0.5 * 1.5))
+
+
 def test_unknown_speeds_count_neither_as_error_nor_in_the_mean():
     rays = rays_along_x([20.0] * 8, torch.tensor([3.0, float("nan")] * 4))
     torch.manual_seed(0)
@@ -105,6 +111,7 @@ def test_rays_are_drawn_without_replacement_from_each_sample_and_time():
     [
         ("rays_per_frame=0", r"model.loss.rays_per_frame"),
         ("moving_weight=0.5", r"model.loss.moving_weight"),
+        ("velocity_beta_mps=-1", r"model.loss.velocity_beta_mps"),
         ("sampling.num_queries=3", r"model.loss.sampling.num_queries=3: must be even"),
         ("sampling.depth_m=0", r"model.loss.sampling.depth_m=0.0: must be above 0"),
     ],
