@@ -17,6 +17,7 @@ from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.lrs4fusion.lrs_config import LRS4FusionConfig
 from src.models.lrs4fusion.model import LRS4Fusion
+from src.models.radargnn.model import RadarGNN, RadarGNNConfig
 from src.models.sparc.model import SpaRC, SpaRCConfig
 
 FAMILIES: dict[str, tuple[type[ModelConfig], type[Detector]]] = {
@@ -24,6 +25,7 @@ FAMILIES: dict[str, tuple[type[ModelConfig], type[Detector]]] = {
     "dense_bev": (DenseBEVConfig, DenseBEV),
     "crt_fusion": (CRTFusionConfig, CRTFusion),
     "sparc": (SpaRCConfig, SpaRC),
+    "radargnn": (RadarGNNConfig, RadarGNN),
     "centerpoint": (CenterPointConfig, CenterPoint),
     "lrs4fusion": (LRS4FusionConfig, LRS4Fusion),
 }
