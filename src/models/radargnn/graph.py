@@ -145,7 +145,8 @@ def nearest_neighbours(
     step = max(1, MAX_PAIRS // longest)
     for first in range(0, len(xy), step):
         rows = own[first : first + step]
-        apart = (padded[sample[rows]] - xy[rows, None]).square().sum(2)  # [rows, longest]
+        axes = zip(padded.unbind(2), xy[rows].unbind(1), strict=True)
+        apart = sum((all_of[sample[rows]] - one[:, None]).square_() for all_of, one in axes)  # [rows, longest]
         apart.scatter_(1, (rows - starts[sample[rows]])[:, None], torch.inf)
         squared[rows], places[rows] = apart.topk(kept, dim=1, largest=False)
     present = F.pad(squared.isfinite(), (0, count - kept))

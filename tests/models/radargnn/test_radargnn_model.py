@@ -9,6 +9,7 @@ import torch
 
 from src.config import compose_config
 from src.errors import ConfigError
+from src.models import build_model
 from src.models.radargnn.graph import GraphConfig, Invariance, build_graph
 from src.models.radargnn.model import MessagePassing, RadarGNNLossConfig, RadarGNNOutput
 from src.structures.boxes import Boxes3D
@@ -195,6 +196,15 @@ def test_annotations_are_needed():
 def test_mistakes_are_named(overrides, message):
     with pytest.raises(ConfigError, match=message):
         gnn_model(overrides)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scale", "low", "high"), [("paper", 1.2e6, 1.3e6), ("mini", 1e5, 2e5), ("debug", 0, 1e4)])
+def test_it_composes_at_every_scale_without_cameras(scale, low, high):
+    config, _ = compose_config([f"scale={scale}", *SMALL[1:]])
+    assert config.image_size_px is None and config.grid.cells == [384, 384]
+    model = build_model(config.model, config.grid.build(), None, config.phase.options)
+    assert low < sum(p.numel() for p in model.parameters()) < high
 
 
 def test_there_is_no_second_phase():
