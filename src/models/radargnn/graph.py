@@ -14,10 +14,8 @@ from src.errors import require_least
 from src.geometry.constants import constant
 from src.geometry.tensor_transforms import rotate, rotate_back, unit_vectors
 from src.models.backbones.sparse_voxel import POINT_SCALES
-from src.ops.segment_reduce import segment_count
+from src.ops.nearest_neighbours import nearest_neighbours
 
-MAX_PAIRS = 8_000_000
-"""Distances that are looked at together, which bounds the memory."""
 EDGE_UNIT_M = 5.0
 MIN_SPEED_MPS = 1e-6
 """Below it a point has no direction of motion; its angles count as right ones, as in the public code."""
@@ -47,14 +45,9 @@ class GraphConfig:
         require_least(self, "model.graph", {"num_neighbours": 1})
 
     @property
-    def node_features(self) -> int:
-        """Width of `PointGraph.nodes`."""
-        return 5 if self.invariance is Invariance.rigid else 6
-
-    @property
-    def edge_features(self) -> int:
-        """Width of `PointGraph.edges`."""
-        return 5 if self.invariance is Invariance.rigid else 2
+    def widths(self) -> tuple[int, int]:
+        """Of `PointGraph.nodes` and `PointGraph.edges`."""
+        return (5, 5) if self.invariance is Invariance.rigid else (6, 2)
 
 
 @dataclass
@@ -73,7 +66,7 @@ class PointGraph:
     def to_local(
         self,
         codes: Tensor,  # [m, CODE_SIZE] centre (m), log sizes, cos, sin of the yaw, velocity (m/s); aug frame
-        rows: Tensor,  # [m] int64, the point of each
+        rows: Tensor | slice,  # [m] int64, the point of each
     ) -> Tensor:  # [m, CODE_SIZE]
         """Box codes relative to points: centre and velocity less theirs, all directions turned to their axes."""
         points = self.points[rows]
@@ -83,13 +76,13 @@ class PointGraph:
     def to_frame(
         self,
         codes: Tensor,  # [m, CODE_SIZE] of `to_local`
-        rows: Tensor,  # [m] int64, the point of each
+        rows: Tensor | slice,
     ) -> Tensor:  # [m, CODE_SIZE]
         """The inverse of `to_local`."""
         codes, points = self._turn(codes, rows, rotate), self.points[rows]
         return torch.cat([codes[:, :2] + points[:, :2], codes[:, 2:8], codes[:, 8:] + points[:, 4:6]], dim=1)
 
-    def _turn(self, codes: Tensor, rows: Tensor, turn: Callable[..., tuple[Tensor, Tensor]]) -> Tensor:
+    def _turn(self, codes: Tensor, rows: Tensor | slice, turn: Callable[..., tuple[Tensor, Tensor]]) -> Tensor:
         cosine, sine = self.axes[rows].unbind(1)
         offset, heading, velocity = (
             torch.stack(turn(cosine, sine, *codes[:, first : first + 2].unbind(1)), dim=1) for first in (0, 6, 8)
@@ -113,44 +106,18 @@ def build_graph(
         rigid = config.invariance is Invariance.rigid
         edges = pair_features(points[:, None, 4:6], near[..., 4:6], offsets) if rigid else offsets / EDGE_UNIT_M
         ahead = constant((1.0, 0.0), points.dtype, points.device).expand(len(points), 2)
-        axes = _directions(offsets, present, ahead) if rigid else ahead
+        distance = offsets.norm(dim=2)
+        distance, first = distance.masked_fill(~present | (distance < MIN_DISTANCE_M), torch.inf).min(dim=1)
+        chosen = offsets.gather(1, first[:, None, None].expand(-1, 1, 2)).squeeze(1)
+        known = distance.isfinite()[:, None] & rigid
+        axes = torch.where(known, unit_vectors(chosen, MIN_DISTANCE_M), ahead)
         scales = constant(POINT_SCALES, points.dtype, points.device)
         motion = points[:, 4:6] / scales[4:6]
         motion = motion.norm(dim=1, keepdim=True) if rigid else motion
         heard = torch.zeros_like(sample).index_add(0, neighbours.flatten(), present.flatten().long())
-        degree = (heard / config.num_neighbours)[:, None]
         z, rcs, dt = ((points / scales)[:, column, None] for column in (2, 3, 6))
-        nodes = torch.cat([z, rcs, motion, dt, degree], dim=1)
+        nodes = torch.cat([z, rcs, motion, dt, heard[:, None] / config.num_neighbours], dim=1)
     return PointGraph(points, sample, batch_size, neighbours, present, axes, nodes, edges * present[..., None])
-
-
-def nearest_neighbours(
-    xy: Tensor,  # [n, 2] m, finite
-    sample: Tensor,  # [n] int64, ascending
-    batch_size: int,
-    count: int,
-) -> tuple[Tensor, Tensor]:  # [n, count] int64, [n, count] bool
-    """The other points of the same sample nearest in x and y, nearest first, and which of them exist.
-
-    Where a sample has fewer, a point's own row stands. Every point is compared with all of its sample.
-    """
-    own = torch.arange(len(xy), device=xy.device)
-    counts = segment_count(sample, batch_size)
-    starts = counts.cumsum(0) - counts
-    longest = int(counts.max()) if len(xy) else 1
-    padded = xy.new_full((batch_size, longest, 2), torch.inf)
-    padded[sample, own - starts[sample]] = xy
-    kept = min(count, longest)
-    squared, places = xy.new_zeros(len(xy), kept), sample.new_zeros(len(xy), kept)
-    step = max(1, MAX_PAIRS // longest)
-    for first in range(0, len(xy), step):
-        rows = own[first : first + step]
-        axes = zip(padded.unbind(2), xy[rows].unbind(1), strict=True)
-        apart = sum((all_of[sample[rows]] - one[:, None]).square_() for all_of, one in axes)  # [rows, longest]
-        apart.scatter_(1, (rows - starts[sample[rows]])[:, None], torch.inf)
-        squared[rows], places[rows] = apart.topk(kept, dim=1, largest=False)
-    present = F.pad(squared.isfinite(), (0, count - kept))
-    return torch.where(present, F.pad(places, (0, count - kept)) + starts[sample][:, None], own[:, None]), present
 
 
 def pair_features(
@@ -167,15 +134,3 @@ def pair_features(
     distance = offsets.norm(dim=-1) / EDGE_UNIT_M
     angles = [(a * b).sum(-1) for a, b in ((ours, theirs), (ours, directions), (theirs, directions))]
     return torch.stack([distance, *angles, (heard - velocities).norm(dim=-1) / POINT_SCALES[4]], dim=-1)
-
-
-def _directions(
-    offsets: Tensor,  # [n, k, 2] m, nearest first
-    present: Tensor,  # [n, k] bool
-    otherwise: Tensor,  # [n, 2]
-) -> Tensor:  # [n, 2]
-    """Unit vectors to the nearest neighbour that lies elsewhere; `otherwise` for a point without."""
-    distance = offsets.norm(dim=2)
-    distance, nearest = distance.masked_fill(~present | (distance < MIN_DISTANCE_M), torch.inf).min(dim=1)
-    chosen = offsets.gather(1, nearest[:, None, None].expand(-1, 1, 2)).squeeze(1)
-    return torch.where(distance.isfinite()[:, None], unit_vectors(chosen, MIN_DISTANCE_M), otherwise)

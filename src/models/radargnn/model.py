@@ -11,15 +11,43 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import constant
+from src.geometry.tensor_transforms import rotate_back
+from src.losses.classification import sigmoid_focal
 from src.losses.loss_weights import LossWeights
+from src.losses.normalizers import mean_over_ranks
+from src.losses.regression import masked_l1
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.detector import Detector, ModelConfig, Objective
 from src.models.heads.center_head import BoxOptions
+from src.models.heads.decode import Suppression
+from src.models.heads.query_head import INITIAL_SIZE_M, QueryHeadConfig, box_codes, decode_codes
+from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.sparse import RowNorm
 from src.models.radargnn.graph import GraphConfig, PointGraph, build_graph
-from src.models.radargnn.head import PointHead, PointHeadConfig, PointPrediction
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
+from src.structures.queries import SPEED_UNIT_MPS
+from src.structures.taxonomy import CLASSES
+from src.targets.heatmap import CODE_SIZE
+from src.targets.supervision import supervised_boxes, upload_boxes
+
+SCORE_BIAS = -4.6
+"""Probability 0.01 for every point and class at the start: most returns are of no object."""
+
+
+@dataclass(kw_only=True)
+class PointHeadConfig(QueryHeadConfig):
+    """Settings of the head (`model.head`). Raises ConfigError for impossible values."""
+
+    nms: Suppression  # of the boxes that points of one object give
+    hidden_channels: int  # of the box network; the class network is linear
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.nms is Suppression.maxpool:
+            raise ConfigError("model.head.nms=maxpool: works on cells, but this model's boxes are of points")
+        require_least(self, "model.head", {"hidden_channels": 1})
 
 
 @dataclass(kw_only=True)
@@ -32,8 +60,7 @@ class RadarGNNLossConfig(LossWeights):
 
 @dataclass(kw_only=True)
 class RadarGNNConfig(ModelConfig):
-    """Settings of the model (`model`); `channels` is the width of the last layer. Raises ConfigError for values that
-    cannot work."""
+    """Settings of the model (`model`); `channels` is that of the last layer. Raises ConfigError for impossible ones."""
 
     graph: GraphConfig
     node_channels: list[int]  # layers of the nodes' embedding
@@ -44,15 +71,23 @@ class RadarGNNConfig(ModelConfig):
 
     def __post_init__(self) -> None:
         require_least(self, "model", {"channels": 1})
-        for name, empty in {"node_channels": False, "edge_channels": False, "layer_channels": True}.items():
-            widths = getattr(self, name)
-            if not (widths or empty) or any(width < 1 for width in widths):
-                raise ConfigError(f"model.{name}={widths}: must be {'' if empty else 'one or more '}positive widths")
+        for name in ("node_channels", "edge_channels", "layer_channels"):
+            if min(getattr(self, name), default=0) < 1:
+                raise ConfigError(f"model.{name}={getattr(self, name)}: must be one or more positive widths")
 
     @property
     def sensors(self) -> tuple[str, ...]:
         """Radar alone."""
         return ("radar",)
+
+
+@dataclass
+class PointPrediction:
+    """What the head says of n points."""
+
+    graph: PointGraph
+    logits: Tensor  # [n, 12] float32, columns as taxonomy.CLASSES
+    codes: Tensor  # [n, CODE_SIZE] float32, relative to the points (`PointGraph.to_local`)
 
 
 @dataclass
@@ -68,7 +103,7 @@ class MessagePassing(nn.Module):
 
     norm_pairs = (("update", "norm"),)
 
-    def __init__(self, channels: int, edge_channels: int, out_channels: int) -> None:
+    def __init__(self, channels: int, out_channels: int, edge_channels: int) -> None:
         super().__init__()
         self.sizes = (channels, channels, edge_channels)
         self.message = nn.Linear(sum(self.sizes), sum(self.sizes))
@@ -94,56 +129,120 @@ class MessagePassing(nn.Module):
         return torch.where(graph.present.any(1, keepdim=True), F.linear(x, own, self.message.bias) + most, 0.0)
 
 
-class GraphEncoder(nn.Module):
-    """Embeds nodes and edges and passes messages along the edges."""
+class PointHead(nn.Module):
+    """A linear layer for the class, a network of two for the box."""
 
-    def __init__(self, config: RadarGNNConfig, grid: BEVGrid) -> None:
+    def __init__(self, config: PointHeadConfig, channels: int, grid: BEVGrid, velocity_code_weight: float) -> None:
         super().__init__()
-        self.config, self.grid = config.graph, grid
-        self.nodes = _mlp(config.graph.node_features, config.node_channels)
-        self.edges = _mlp(config.graph.edge_features, config.edge_channels)
-        widths = [config.node_channels[-1], *config.layer_channels, config.channels]
-        edge = config.edge_channels[-1]
-        self.layers = nn.ModuleList(MessagePassing(before, edge, after) for before, after in pairwise(widths))
+        self.config, self.grid = config, grid
+        self.code_weights = (1.0,) * (CODE_SIZE - 2) + (velocity_code_weight,) * 2
+        hidden, self.classes = config.hidden_channels, FullPrecisionLinear(channels, len(CLASSES))
+        self.box = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), FullPrecisionLinear(hidden, CODE_SIZE))
+        nn.init.constant_(self.classes.bias, SCORE_BIAS)
+        with torch.no_grad():
+            self.box[-1].bias.zero_()
+            self.box[-1].bias[3:6] = torch.tensor(INITIAL_SIZE_M).log()
+            self.box[-1].bias[6] = 1.0
 
     def forward(
         self,
-        radar_points: Tensor,  # [P, 7] x, y, z (m, aug frame), rcs (dB), vx, vy (m/s), dt (s)
-        radar_batch: Tensor,  # [P] int64 sample of each point, ascending
-        batch_size: int,
-    ) -> tuple[Tensor, PointGraph]:  # [n, C] and the graph of the n points it is of
-        """Points outside the grid or its height band are left out."""
-        low, high = self.grid.z_range_m
-        inside = self.grid.contains(radar_points[:, :2]) & (radar_points[:, 2] >= low) & (radar_points[:, 2] < high)
-        rows = inside.nonzero().squeeze(1)
-        graph = build_graph(self.config, radar_points[rows], radar_batch[rows], batch_size)
-        x, edges = self.nodes(graph.nodes), self.edges(graph.edges)
-        for layer in self.layers:
-            x = layer(x, edges, graph)
-        return x, graph
+        features: Tensor,  # [n, C]
+        graph: PointGraph,
+    ) -> PointPrediction:
+        """Of every point."""
+        shape, velocities = self.box(features).split([CODE_SIZE - 2, 2], dim=1)
+        codes = torch.cat([shape, SPEED_UNIT_MPS * velocities], dim=1)
+        return PointPrediction(graph, self.classes(features), codes)
+
+    def loss(
+        self,
+        prediction: PointPrediction,
+        boxes: list[Boxes3D] | None,  # B, augmented ego frame
+        class_weight: float | None,
+        box_weight: float | None,
+    ) -> Objective:
+        """Weighted terms `class`, focal loss of every point, and `box`, L1 of those within an object; both over the
+        latter's number. A weight of None leaves its term out.
+
+        Diagnostics, per frame: objects, and those without a point within them, which teach nothing. Raises ValueError
+        for a batch without annotations.
+        """
+        if boxes is None:
+            raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
+        graph, logits = prediction.graph, prediction.logits
+        objects, samples = upload_boxes(*supervised_boxes(boxes, self.grid), device=logits.device)
+        owner, held = self.owners(graph, objects, samples)
+        rows = (owner >= 0).nonzero().squeeze(1)
+        own, terms, found = owner[rows], {}, mean_over_ranks((owner >= 0).sum())
+        if class_weight is not None:
+            target = torch.zeros_like(logits, dtype=torch.bool)
+            target[rows, objects.labels[own]] = True
+            terms["class"] = class_weight * sigmoid_focal(logits, target).sum() / found
+        if box_weight is not None:
+            wanted = graph.to_local(box_codes(objects)[own], rows)
+            weights = constant(self.code_weights, torch.float32, logits.device)
+            errors = masked_l1(prediction.codes[rows], wanted) * weights
+            terms["box"] = box_weight * errors.sum() / found
+        return Objective(terms, {"objects": len(objects) / len(boxes), "missed_objects": (~held).sum() / len(boxes)})
+
+    @torch.no_grad()
+    def owners(
+        self,
+        graph: PointGraph,
+        objects: Boxes3D,  # K of all samples
+        samples: Tensor,  # [K] int64
+    ) -> tuple[Tensor, Tensor]:  # [n] int64, [K] bool
+        """The object within whose footprint each point lies, -1 for none, the one with the nearest centre of several;
+        and which objects hold a point."""
+        if len(objects) == 0:
+            return torch.full_like(graph.sample, -1), torch.zeros_like(objects.labels, dtype=torch.bool)
+        offset = graph.points[:, None, :2] - objects.centers[:, :2]  # [n, K, 2]
+        along, across = rotate_back(objects.yaws.cos(), objects.yaws.sin(), *offset.unbind(2))
+        half = 0.5 * objects.sizes[:, :2]
+        inside = (along.abs() <= half[:, 0]) & (across.abs() <= half[:, 1]) & (graph.sample[:, None] == samples)
+        distance, nearest = offset.square().sum(2).masked_fill(~inside, torch.inf).min(dim=1)
+        return torch.where(distance.isfinite(), nearest, -1), inside.any(0)
+
+    @torch.no_grad()
+    def decode(self, prediction: PointPrediction) -> list[Boxes3D]:
+        """Boxes of each sample, best first, at most `max_boxes`: what suppression leaves of one for each point and
+        class above the threshold."""
+        graph, scores = prediction.graph, prediction.logits.sigmoid()
+        codes = graph.to_frame(prediction.codes, slice(None))
+        return decode_codes(scores, codes, graph.sample, graph.batch_size, self.grid, self.config, self.config.nms)
 
 
 class RadarGNN(Detector):
     """Radar points to a graph to boxes. Raises ConfigError for values that cannot work."""
 
     phase_options = BoxOptions
-    latency_parts = {
-        "radar_encoder": ("radar_encoder.forward",),
-        "detection_head": ("head.forward", "head.decode"),
-    }
+    latency_parts = {"radar_encoder": ("encode",), "detection_head": ("head.forward", "head.decode")}
 
     def __init__(
         self, config: RadarGNNConfig, grid: BEVGrid, backbone: ImageEncoderConfig | None, options: BoxOptions
     ) -> None:
         super().__init__()
         self.config, self.grid = config, grid
-        self.radar_encoder = GraphEncoder(config, grid)
+        node, edge = config.graph.widths
+        self.nodes, self.edges = _mlp(node, config.node_channels), _mlp(edge, config.edge_channels)
+        widths = [config.node_channels[-1], *config.layer_channels, config.channels]
+        self.layers = nn.ModuleList(MessagePassing(*pair, config.edge_channels[-1]) for pair in pairwise(widths))
         self.head = PointHead(config.head, config.channels, grid, options.velocity_code_weight)
 
     def forward(self, batch: FrameBatch, memory: None = None) -> tuple[RadarGNNOutput, None]:
-        """Detect in B frames."""
-        features, graph = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
-        return RadarGNNOutput(self.head(features, graph)), None
+        """Detect in B frames. Points outside the grid or its height band are left out."""
+        return RadarGNNOutput(self.head(*self.encode(batch))), None
+
+    def encode(self, batch: FrameBatch) -> tuple[Tensor, PointGraph]:  # [n, C]
+        """Features of the n points inside, and their graph."""
+        points, (low, high) = batch.radar_points, self.grid.z_range_m
+        inside = self.grid.contains(points[:, :2]) & (points[:, 2] >= low) & (points[:, 2] < high)
+        rows = inside.nonzero().squeeze(1)
+        graph = build_graph(self.config.graph, points[rows], batch.radar_batch[rows], len(batch))
+        x, edges = self.nodes(graph.nodes), self.edges(graph.edges)
+        for layer in self.layers:
+            x = layer(x, edges, graph)
+        return x, graph
 
     def loss_terms(self, output: RadarGNNOutput, batch: FrameBatch) -> Objective:
         """Weighted terms `class` and `box`."""
@@ -156,8 +255,7 @@ class RadarGNN(Detector):
 
     def diagnostics(self, output: RadarGNNOutput) -> dict[str, Tensor | float]:
         """Radar points per frame."""
-        graph = output.head.graph
-        return {"radar_points": len(graph.points) / graph.batch_size}
+        return {"radar_points": len(output.head.logits) / output.head.graph.batch_size}
 
 
 def _mlp(inputs: int, widths: list[int]) -> nn.Sequential:
