@@ -39,8 +39,9 @@ def latency_of(outputs, folder, monkeypatch, *own):
         (["phase=phase1"], ALL_PARTS),
         (["phase=phase1", "model.kggi=null", "model.ocsf=null"], {"radar_encoder", "detection_head", "total"}),
         (["phase=phase1", "model=centerpoint", "data.world.lidar=true"], {"lidar_encoder", "detection_head", "total"}),
+        (["phase=phase1", "model=radargnn"], {"radar_encoder", "detection_head", "total"}),
     ],
-    ids=["with memory", "single frames", "radar only", "LiDAR only"],
+    ids=["with memory", "single frames", "radar only", "LiDAR only", "radar graph"],
 )
 def test_latency_of_the_parts_makes_up_that_of_a_frame(outputs, tmp_path, monkeypatch, capsys, own, parts):
     result = latency_of(outputs, tmp_path, monkeypatch, *own)

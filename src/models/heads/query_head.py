@@ -169,13 +169,27 @@ class SetPredictionHead(nn.Module):
         batch_size, size = prediction.valid.shape
         scores = prediction.logits.sigmoid() * prediction.valid[..., None]
         sample = torch.arange(batch_size, device=scores.device).repeat_interleave(size)
-        best = top_candidates(scores.flatten(0, 1), sample, batch_size, self.config.score_threshold)
-        codes = prediction.codes.flatten(0, 1)[best.rows]
-        codes = torch.cat([self.grid.to_cells(codes[:, :2]), codes[:, 2:]], dim=1)  # as offsets from the first cell
-        cells = codes.new_zeros(len(codes), 2, dtype=torch.int64)
-        boxes = boxes_from_codes(cells, codes, best.labels, best.scores, self.grid)
-        boxes.attributes = rule_attributes(boxes)
-        return suppress(boxes, best.counts, Suppression.maxpool, self.config.max_boxes)
+        codes, method = prediction.codes.flatten(0, 1), Suppression.maxpool
+        return decode_codes(scores.flatten(0, 1), codes, sample, batch_size, self.grid, self.config, method)
+
+
+def decode_codes(
+    scores: Tensor,  # [n, 12]
+    codes: Tensor,  # [n, CODE_SIZE], as in `QueryPrediction`
+    sample: Tensor,  # [n] int64, ascending
+    batch_size: int,
+    grid: BEVGrid,
+    config: QueryHeadConfig,
+    method: Suppression,  # `maxpool`: nothing is suppressed
+) -> list[Boxes3D]:
+    """Boxes of each sample, best first, at most `max_boxes`: one for each row and class above the threshold."""
+    best = top_candidates(scores, sample, batch_size, config.score_threshold)
+    codes = codes[best.rows]
+    codes = torch.cat([grid.to_cells(codes[:, :2]), codes[:, 2:]], dim=1)  # as offsets from the first cell
+    cells = codes.new_zeros(len(codes), 2, dtype=torch.int64)
+    boxes = boxes_from_codes(cells, codes, best.labels, best.scores, grid)
+    boxes.attributes = rule_attributes(boxes)
+    return suppress(boxes, best.counts, method, config.max_boxes)
 
 
 def box_codes(boxes: Boxes3D) -> Tensor:  # [K, CODE_SIZE], as in `QueryPrediction`

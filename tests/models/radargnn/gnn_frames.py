@@ -1,0 +1,16 @@
+"""A RadarGNN of a few thousand parameters for the frames of the dense baseline's tests."""
+
+import torch
+
+from src.config import compose_config
+from src.models import build_model
+from tests.models.dense_bev.dense_frames import GRID
+
+SMALL = ("scale=debug", "model=radargnn", "data.root=x", "phase=phase1")
+
+
+def gnn_model(*overrides, seed=0):
+    """Fresh weights with the random state fixed; no backbone."""
+    torch.manual_seed(seed)
+    config, _ = compose_config([*SMALL, *overrides])
+    return build_model(config.model, GRID, None, config.phase.options)
