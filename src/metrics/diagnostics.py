@@ -35,6 +35,13 @@ SEEN_POINTS = 3
 SEEN_S = 4.1
 """How long before it must have been seen to be remembered: eight key frames, whose times jitter by milliseconds."""
 UNKNOWN_POINTS = -1
+COVERS = {
+    Source.RADAR: "radar_covers",
+    Source.CAMERA: "camera_covers",
+    Source.RANDOM: "random_covers",
+    Source.HISTORY: "remembered_share",
+}
+"""Measures of the share of objects that Gaussians of a source cover."""
 
 
 @dataclass
@@ -43,7 +50,7 @@ class FrameDiagnosis:
 
     points: Array  # [k] int64, returns inside each box of all that the model reads, accumulated sweeps included
     occupied: Array | None  # [k] bool, an occupied cell lies inside the box
-    remembered: Array | None  # [k] bool, a remembered Gaussian covers it
+    covered: Array | None  # [k, 4] bool, a Gaussian of each `Source` covers it
     sums: dict[str, tuple[float, float]]  # total and count of each mean over Gaussians
 
 
@@ -56,10 +63,10 @@ def diagnose(
     found = []
     for sample, boxes in enumerate(boxes.to(batch.device) for boxes in truth):
         occupied = None if evidence.cells is None else _hold_occupied_cells(evidence.cells, sample, boxes)
-        remembered, sums = None, {}
+        covered, sums = None, {}
         if evidence.gaussians is not None:
-            remembered, sums = _compare_gaussians(evidence.gaussians, sample, boxes)
-        found.append(FrameDiagnosis(count_returns(batch, sample, boxes), occupied, remembered, sums))
+            covered, sums = _compare_gaussians(evidence.gaussians, sample, boxes)
+        found.append(FrameDiagnosis(count_returns(batch, sample, boxes), occupied, covered, sums))
     return found
 
 
@@ -72,20 +79,21 @@ def sums_by_sample(
     """Total and count of every measure in each sample; the measure is the ratio of their sums, see `ratios`.
 
     `hidden_recall`: share that is found, at whatever score, of the objects that hide but were seen before (`hidden`);
-    `unoccupied_recall`: of those without an occupied cell inside. `remembered_share`: share of the objects that a
-    remembered Gaussian covers. Of all three only ground truth that counts.
+    `unoccupied_recall`: of those without an occupied cell inside. `<source>_covers`, of history
+    `remembered_share`: share of the objects that a Gaussian covers. Of all these only ground truth that counts.
     `<source>_gaussians`: how many a frame has; `<source>_near`: share of them near an object; `<source>_faint`: share
     below FAINT_OPACITY; `<source>_velocity_error`: m/s, of those inside a box that moves at FAST_MPS or faster, to its
     velocity; the sources are those of `Source`.
     """
     truth, num_samples = evaluation_set.ground_truth, len(evaluation_set.tokens)
     points = np.full(len(truth), UNKNOWN_POINTS)
-    occupied, remembered = (np.full(len(truth), np.nan) for _ in range(2))  # 0 or 1, NaN where not known
+    occupied = np.full(len(truth), np.nan)  # 0 or 1, NaN where not known, as `covered`
+    covered = np.full((len(truth), len(COVERS)), np.nan)
     of_gaussians: dict[str, Array] = {}
     for sample, diagnosis in diagnoses.items():
         rows = np.flatnonzero(truth.samples == sample)
         points[rows] = diagnosis.points
-        for column, values in ((occupied, diagnosis.occupied), (remembered, diagnosis.remembered)):
+        for column, values in ((occupied, diagnosis.occupied), (covered, diagnosis.covered)):
             if values is not None:
                 column[rows] = values
         for name, sums in diagnosis.sums.items():
@@ -100,8 +108,10 @@ def sums_by_sample(
         sums["hidden_recall"] = of_objects(found, hidden(points, evaluation_set))
     if not np.isnan(occupied).all():
         sums["unoccupied_recall"] = of_objects(found, occupied == 0)
-    if "history_gaussians" in of_gaussians and of_gaussians["history_gaussians"][:, 0].any():
-        sums["remembered_share"] = of_objects(remembered == 1, ~np.isnan(remembered))
+    for source, name in COVERS.items():
+        how_many = of_gaussians.get(f"{source.name.lower()}_gaussians")
+        if how_many is not None and how_many[:, 0].any():
+            sums[name] = of_objects(covered[:, source] == 1, ~np.isnan(covered[:, source]))
     return sums | dict(sorted(of_gaussians.items()))
 
 
@@ -159,7 +169,7 @@ def _hold_occupied_cells(cells: SplattedCells, sample: int, boxes: Boxes3D) -> A
 def _compare_gaussians(
     gaussians: GaussianSet, sample: int, boxes: Boxes3D
 ) -> tuple[Array, dict[str, tuple[float, float]]]:
-    """Which boxes the remembered Gaussians cover, and `FrameDiagnosis.sums`."""
+    """`FrameDiagnosis.covered` and `FrameDiagnosis.sums`."""
     valid = gaussians.valid[sample]
     means, sources = gaussians.means[sample][valid].float(), gaussians.sources[sample][valid]
     distances = footprint_distances(means, boxes.bev())  # [g, k]
@@ -175,8 +185,8 @@ def _compare_gaussians(
         sums[f"{name}_near"] = (int(near[own].sum()), count)
         sums[f"{name}_faint"] = (int(faint[own].sum()), count)
         sums[f"{name}_velocity_error"] = (float(wrong.sum()), len(wrong))
-    remembered = (distances[sources == Source.HISTORY] <= NEAR_M).any(dim=0)
-    return remembered.cpu().numpy(), sums
+    covered = torch.stack([(distances[sources == source] <= NEAR_M).any(dim=0) for source in COVERS], dim=1)
+    return covered.cpu().numpy(), sums
 
 
 def _velocity_errors(

@@ -12,6 +12,9 @@ MEASURES = {
     "moving_AP": "AP of moving vehicles",
     "hidden_recall": "recall of hidden objects, seen before",
     "unoccupied_recall": "recall of objects without an occupied cell",
+    "radar_covers": "objects that radar Gaussians cover",
+    "camera_covers": "objects that camera Gaussians cover",
+    "random_covers": "objects that random Gaussians cover",
     "remembered_share": "objects that history covers",
 }
 

@@ -69,6 +69,9 @@ for _key, _words, *_rest in (
     ("moving_AP", "AP of moving vehicles", "%", 100.0, 1, True),
     ("hidden_recall", "recall of hidden objects", "%", 100.0, 1, True),
     ("unoccupied_recall", "recall without an occupied cell", "%", 100.0, 1, True),
+    ("radar_covers", "objects that radar Gaussians cover", "%", 100.0, 1, True),
+    ("camera_covers", "objects that camera Gaussians cover", "%", 100.0, 1, True),
+    ("random_covers", "objects that random Gaussians cover", "%", 100.0, 1, True),
     ("remembered_share", "objects that history covers", "%", 100.0, 1, True),
 ):
     METRICS[f"measures.{_key}"] = Metric(f"measures.{_key}", _words, *_rest)

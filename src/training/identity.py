@@ -41,6 +41,7 @@ YOUNGER_KEYS = {
     "phase.long_range": None,
     "model.radar_encoder.pruning_ratio": 0.0,
     "model.doppler.withheld": 0.0,
+    "model.dptf.gaussian_path.forget_refuted": False,
 }
 """Keys that runs were made without, with the value that does what was done then.
 

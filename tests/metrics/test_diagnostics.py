@@ -97,9 +97,11 @@ def test_gaussians_by_source():
             assert measures[f"{source}_{name}"] == (value if value is None else pytest.approx(value)), (source, name)
 
 
-def test_objects_that_history_covers_are_those_that_count():
-    assert measured(Evidence(GAUSSIANS))["remembered_share"] == pytest.approx(1 / 3)
-    assert measured(Evidence(GAUSSIANS), (True, True, False))["remembered_share"] == pytest.approx(1 / 2)
+@pytest.mark.parametrize(("name", "objects"), [("remembered_share", 1), ("radar_covers", 2), ("camera_covers", 0)])
+def test_objects_that_gaussians_cover_are_those_that_count(name, objects):
+    assert measured(Evidence(GAUSSIANS))[name] == pytest.approx(objects / 3)
+    assert measured(Evidence(GAUSSIANS), (True, True, False))[name] == pytest.approx(objects / 2)
+    assert "random_covers" not in measured(Evidence(GAUSSIANS)), "there is none"
 
 
 def test_padding_says_nothing_and_no_memory_has_no_share():
@@ -116,7 +118,7 @@ def test_cells_and_points_in_boxes():
     points = [(10, 0, 1), (12, 1, 1.5), (10, 0, 2), (0, 8, 1)]
     (found,) = diagnose(Evidence(cells=cells), batch_of(points), [BOXES])
     assert found.occupied.tolist() == [True, False, False], "the second is only reached, the third is another sample's"
-    assert found.points.tolist() == [2, 1, 0] and found.remembered is None
+    assert found.points.tolist() == [2, 1, 0] and found.covered is None
 
 
 def test_samples_add_up():

@@ -118,6 +118,8 @@ class DPTF(nn.Module):
             if self.config.gaussian_path.velocity_from is VelocityFrom.cells:
                 gaussians = _with_cell_velocities(gaussians, ocsf.splat.peak_cells, fused, output.cells)
             gaussians = self.gaussian_path.store(gaussians, active, batch)
+            if self.config.gaussian_path.forget_refuted and output.history is not None:
+                past = self.gaussian_path.without_refuted(past, output.history, active)
         frame = MemoryFrame(
             batch.timestamps_s,
             batch.global_from_ego,

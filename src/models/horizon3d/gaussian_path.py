@@ -56,6 +56,7 @@ class GaussianPathConfig:
     sampling: Sampling
     velocity_from: VelocityFrom
     velocity_compensation: bool  # move history by its own velocity; off: by the ego motion alone (Table 6)
+    forget_refuted: bool  # what is no longer active once refined does not return from the frame that remembers it
     self_attention: SelfAttentionConfig | None
 
     def __post_init__(self) -> None:
@@ -141,6 +142,23 @@ class GaussianPath(nn.Module):
             elapsed_s=zeros,
             valid=zeros.bool(),
         )
+
+    def without_refuted(
+        self,
+        memory: Memory,  # that `recall` read
+        history: GaussianSet,  # what it gave, K_hist of each sample
+        active: Tensor,  # [B, G] bool, of all refined Gaussians, history last
+    ) -> Memory:
+        """The memory less the Gaussians that returned as history and are not active any more."""
+        refuted = (history.valid & ~active[:, -history.valid.shape[1] :]).split(self.config.gaussians_per_frame, dim=1)
+        refuted = iter(refuted)
+
+        def confirmed(frame: MemoryFrame) -> MemoryFrame:
+            if frame.gaussians is None:
+                return frame
+            return replace(frame, gaussians=replace(frame.gaussians, valid=frame.gaussians.valid & ~next(refuted)))
+
+        return memory.mapped(confirmed)
 
     @torch.no_grad()
     def store(

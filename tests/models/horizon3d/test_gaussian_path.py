@@ -32,6 +32,7 @@ def make_path(**changes):
         "sampling": Sampling.farthest_point,
         "velocity_from": VelocityFrom.gaussian,
         "velocity_compensation": True,
+        "forget_refuted": True,
         "self_attention": None,
     }
     torch.manual_seed(0)
@@ -355,6 +356,24 @@ def test_streams_do_not_mix():
         alone = path.recall(past, make_frame(later[stream : stream + 1], [afters[stream]], [augs[stream]]), 6.0)
         for field in fields(GaussianSet):
             torch.testing.assert_close(getattr(together, field.name)[stream], getattr(alone, field.name)[0])
+
+
+@pytest.mark.parametrize("fixed_capacity", [False, True])
+def test_what_returned_and_is_not_active_any_more_does_not_return_again(fixed_capacity):
+    path, earlier, now = make_path(num_frames=3), make_frame([0.0, 0.0]), make_frame([1.0, 1.0])
+    path.fixed_capacity = fixed_capacity
+    newer, older = (make_gaussians(b=2, g=5, seed=seed, speed_mps=0.0) for seed in (1, 2))
+    older.means[1, 3] = torch.tensor([400.0, 0.0])  # outside the grid: not asked, so not refuted
+    older.valid[1, 0] = False
+    memory = Memory((*remembered(earlier, newer).frames, *remembered(earlier, older).frames))
+    history = path.recall(memory, now, max_age_s=6.0)
+    active = torch.zeros(2, 7 + history.valid.shape[1], dtype=torch.bool)
+    active[:, :7] = True  # of the frame itself
+    active[0, 7 + 2] = active[1, 7 + 5 + 4] = True  # of the newer frame, of the older one
+    first, second = path.without_refuted(memory, history, active).frames
+    assert first.gaussians.valid.tolist() == [[False, False, True, False, False], [False] * 5]
+    assert second.gaussians.valid.tolist() == [[False] * 5, [False, False, False, True, True]]
+    assert older.valid.sum() == 9, "a memory is a value: the one that was read stays"
 
 
 def test_four_frames_of_256_are_the_papers_1024_newest_first():
