@@ -14,7 +14,7 @@ from tests.running import call
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module", params=["dense_bev", "crt_fusion", "sparc", "petr"])
+@pytest.fixture(scope="module", params=["dense_bev", "crt_fusion", "sparc", "petr", "rctrans"])
 def family(request):
     return request.param
 
@@ -39,7 +39,7 @@ def test_both_phases_leave_what_is_promised(trained, outputs, family):
         names = ("config.yaml", "metrics.json", "metrics.csv", "run.json", "submission.json", "checkpoints/last.ckpt")
         assert all((folder / name).is_file() for name in names), folder
         header = (folder / "metrics.csv").read_text().splitlines()[0].split(",")
-        learnt = {"loss/class"} if family == "petr" else {"loss/heatmap", "loss/depth"}
+        learnt = {"loss/class"} if family in ("petr", "rctrans") else {"loss/heatmap", "loss/depth"}
         assert {*learnt, "loss/box", "loss/total", "state/objects"} <= set(header)
         assert list((folder / "pictures").glob("frame_*.png"))
     assert "state/remembered_frames" in header

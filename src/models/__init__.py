@@ -19,6 +19,7 @@ from src.models.lrs4fusion.lrs_config import LRS4FusionConfig
 from src.models.lrs4fusion.model import LRS4Fusion
 from src.models.petr.model import PETR, PETRConfig
 from src.models.radargnn.model import RadarGNN, RadarGNNConfig
+from src.models.rctrans.model import RCTrans, RCTransConfig
 from src.models.sparc.model import SpaRC, SpaRCConfig
 
 FAMILIES: dict[str, tuple[type[ModelConfig], type[Detector]]] = {
@@ -27,6 +28,7 @@ FAMILIES: dict[str, tuple[type[ModelConfig], type[Detector]]] = {
     "crt_fusion": (CRTFusionConfig, CRTFusion),
     "sparc": (SpaRCConfig, SpaRC),
     "petr": (PETRConfig, PETR),
+    "rctrans": (RCTransConfig, RCTrans),
     "radargnn": (RadarGNNConfig, RadarGNN),
     "centerpoint": (CenterPointConfig, CenterPoint),
     "lrs4fusion": (LRS4FusionConfig, LRS4Fusion),

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
+import torch
 from torch import Tensor, nn
 
 from src.errors import ConfigError
@@ -65,12 +66,16 @@ class QueryOutput:
     """One frame through the model."""
 
     layers: list[QueryPrediction]  # of the decoder
+    head: QueryPrediction  # of the layer that boxes are taken from
     recalled: RecalledQueries | None  # None in phase 1
 
-    @property
-    def head(self) -> QueryPrediction:
-        """What the last layer predicts."""
-        return self.layers[-1]
+
+class Answers(NamedTuple):
+    """The fields of `QueryOutput`, in their order."""
+
+    layers: list[QueryPrediction]
+    head: QueryPrediction
+    recalled: RecalledQueries | None
 
 
 class QueryDetector(Detector):
@@ -104,10 +109,30 @@ class QueryDetector(Detector):
         """Make `decoder`, called with queries, further ones to look at, what is seen and the head, and what lies
         before it."""
 
+    def add_anchors(self, count: int) -> None:
+        """Make the learnt places that `anchor_queries` start at."""
+        # In units of the half extent, so that one step of Adam is of the order of a metre; uniform at first (PETR 3.4).
+        self.anchors = nn.Parameter(torch.empty(count, 3).uniform_(-1.0, 1.0))
+        (low, high), z = self.grid.z_range_m, sum(self.grid.z_range_m) / 2
+        extent = torch.tensor([(*self.grid.centre_m, z), (*self.grid.half_extent_m, (high - low) / 2)])
+        self.register_buffer("extent_m", extent, persistent=False)
+
+    def anchor_queries(self, batch_size: int) -> Queries:
+        """Queries at the learnt anchors, whose features begin at zero."""
+        middle, half = self.extent_m.unbind(0)
+        centers = (middle + half * self.anchors).expand(batch_size, -1, -1)
+        features = centers.new_zeros(*centers.shape[:2], self.config.channels)
+        return Queries.unknown(features, centers, torch.ones_like(centers[..., 0], dtype=torch.bool))
+
     @property
     def image_backbone(self) -> nn.Module:
         """Backbone without its neck."""
         return self.image_encoder.backbone
+
+    @property
+    def answering_layer(self) -> int:
+        """The decoder's layer whose boxes count and whose queries are remembered."""
+        return -1
 
     def ask(
         self,
@@ -115,17 +140,21 @@ class QueryDetector(Detector):
         memory: QueryMemory | None,
         queries: Queries,  # of this frame
         *seen: Any,  # as the decoder takes it
-    ) -> tuple[list[QueryPrediction], RecalledQueries | None, QueryMemory | None]:
-        """What every layer predicts for these queries and those of the last frame, what was remembered, and the memory
-        with this frame, detached. Raises ValueError for a memory of another number of streams."""
+    ) -> tuple[Answers, QueryMemory | None]:
+        """What the decoder says to these queries and those of the last frame, and the memory with this frame, detached.
+
+        Raises ValueError for a memory of another number of streams.
+        """
         if self.temporal is None:
-            return self.decoder(queries, None, *seen, self.head)[0], None, None
+            layers, _ = self.decoder(queries, None, *seen, self.head)
+            return Answers(layers, layers[self.answering_layer], None), None
         if memory is not None and memory.frames and memory.batch_size != len(batch):
             raise ValueError(f"the memory holds {memory.batch_size} streams, but the batch {len(batch)} frames")
         recalled = self.temporal.recall(memory, batch)
         queries = Queries.concatenate([queries, recalled.newest])
         layers, features = self.decoder(queries, recalled.older, *seen, self.head)
-        return layers, recalled, self.temporal.remember(memory, batch, features, layers[-1])
+        head, own = layers[self.answering_layer], features[self.answering_layer]
+        return Answers(layers, head, recalled), self.temporal.remember(memory, batch, own, head)
 
     def restore_memory(self, state: list[dict[str, Any]]) -> QueryMemory:
         """The memory that `QueryMemory.state` described."""

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import nn
 
 from src.errors import require_least
+from src.models.layers.position_embedding import PositionEmbedding, PositionEmbeddingConfig
 from src.models.layers.views import CameraViews
 from src.models.petr.decoder import PETRDecoder, PETRDecoderConfig
-from src.models.petr.position_embedding import PositionEmbedding, PositionEmbeddingConfig
 from src.models.query_detector import QueryDetector, QueryDetectorConfig, QueryOutput
 from src.models.query_memory import QueryMemory
 from src.structures.batch import FrameBatch
-from src.structures.queries import Queries
 
 
 @dataclass(kw_only=True)
@@ -54,11 +52,7 @@ class PETR(QueryDetector):
         config, grid, channels = self.config, self.grid, self.config.channels
         self.image_value = nn.Linear(self.image_encoder.channels, channels)
         self.position = PositionEmbedding(config.position, channels, grid)
-        # In units of the half extent, so that one step of Adam is of the order of a metre; uniform at first (Sec. 3.4).
-        self.anchors = nn.Parameter(torch.empty(config.num_queries, 3).uniform_(-1.0, 1.0))
-        (low, high), z = grid.z_range_m, sum(grid.z_range_m) / 2
-        extent = torch.tensor([(*grid.centre_m, z), (*grid.half_extent_m, (high - low) / 2)])
-        self.register_buffer("extent_m", extent, persistent=False)
+        self.add_anchors(config.num_queries)
         self.decoder = PETRDecoder(config.decoder, channels, grid)
 
     def forward(self, batch: FrameBatch, memory: QueryMemory | None = None) -> tuple[QueryOutput, QueryMemory | None]:
@@ -70,12 +64,5 @@ class PETR(QueryDetector):
         value = self.image_value(views.levels[0].movedim(2, -1))  # [B, N, h, w, C]
         valid = views.valid[:, :, None, None].expand(value.shape[:-1]).flatten(1)
         images = ((value + self.position(views)).flatten(1, 3), value.flatten(1, 3), valid)
-        layers, recalled, memory = self.ask(batch, memory, self.anchor_queries(len(batch)), images)
-        return QueryOutput(layers, recalled), memory
-
-    def anchor_queries(self, batch_size: int) -> Queries:
-        """Queries at the learnt anchors, whose features begin at zero."""
-        middle, half = self.extent_m.unbind(0)
-        centers = (middle + half * self.anchors).expand(batch_size, -1, -1)
-        features = centers.new_zeros(*centers.shape[:2], self.config.channels)
-        return Queries.unknown(features, centers, torch.ones_like(centers[..., 0], dtype=torch.bool))
+        answers, memory = self.ask(batch, memory, self.anchor_queries(len(batch)), images)
+        return QueryOutput(*answers), memory
