@@ -15,12 +15,16 @@ from src.losses.loss_weights import LossWeights
 from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.detector import Detector, ModelConfig, Objective
 from src.models.heads.center_head import BoxOptions
+from src.models.heads.keypoint_head import CameraMaps, camera_losses
 from src.models.heads.query_head import QueryHeadConfig, QueryPrediction, SetPredictionHead
+from src.models.layers.views import CameraViews
 from src.models.query_memory import QueryMemory, QueryMemoryConfig, QueryPropagation, RecalledQueries
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
 from src.structures.queries import Queries
+from src.targets.projection import view_boxes
+from src.targets.supervision import supervised_boxes, upload_boxes
 
 
 @dataclass(kw_only=True)
@@ -29,6 +33,14 @@ class QueryLossConfig(LossWeights):
 
     class_weight: float | None  # of every layer's queries
     box_weight: float | None
+
+
+@dataclass(kw_only=True)
+class CameraQueryLossConfig(QueryLossConfig):
+    """Weights of the terms of a model that also finds objects in the images."""
+
+    keypoint_weight: float | None  # of the images
+    depth_weight: float | None
 
 
 @dataclass(kw_only=True)
@@ -165,6 +177,17 @@ class QueryDetector(Detector):
         weights = self.config.loss
         terms, counts = self.head.loss(output.layers, batch.boxes, weights.class_weight, weights.box_weight)
         return Objective(terms, counts)
+
+    def camera_terms(
+        self, maps: CameraMaps, views: CameraViews, depth_range_m: tuple[float, float], batch: FrameBatch
+    ) -> dict[str, Tensor]:
+        """Weighted terms `keypoint` and `depth`, of a model with `CameraQueryLossConfig`."""
+        wanted = (self.config.loss.keypoint_weight, self.config.loss.depth_weight)
+        if wanted == (None, None):
+            return {}
+        boxes, samples = upload_boxes(*supervised_boxes(batch.boxes, self.grid), device=batch.device)
+        seen = view_boxes(boxes, samples, views.pix_from_aug, views.valid, views.image_size_px)
+        return camera_losses(maps, views, seen, depth_range_m, *wanted)
 
     def decode(self, output: QueryOutput) -> list[Boxes3D]:
         """Boxes of each frame, best first."""

@@ -7,6 +7,7 @@ from src.models import build_model
 from tests.models.dense_bev.dense_frames import GRID, backbone
 
 FAMILIES = {
+    "far3d": ("model.queries.depth_range_m=[1,40]", "model.num_queries=32"),
     "petr": ("model.position.depth_range_m=[1,40]", "model.num_queries=32"),
     "rctrans": ("model.position.depth_range_m=[1,40]", "model.num_queries=32", "model.pillar_cells=2"),
     "sparc": ("model.radar_encoder.channels=32", "model.queries.depth_range_m=[1,40]", "model.queries.num_radar=40"),

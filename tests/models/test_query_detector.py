@@ -20,14 +20,21 @@ from tests.models.learning import (
 )
 from tests.models.query_frames import FAMILIES, settings, small_model
 
-TERMS = {name: {"class", "box", "total"} for name in ("petr", "rctrans")}
-TERMS |= {"sparc": {"class", "box", "heatmap", "keypoint", "depth", "total"}}
+TERMS = {name: {"class", "box", "total"} for name in FAMILIES}
+TERMS["far3d"] |= {"keypoint", "depth"}
+TERMS["sparc"] |= {"keypoint", "depth", "heatmap"}
 MILLIONS = {
+    "far3d": {"paper": (34, 46), "mini": (2.0, 3.0)},
     "petr": {"paper": (34, 44), "mini": (2.0, 3.0)},
     "rctrans": {"paper": (50, 65), "mini": (2.0, 3.0)},
     "sparc": {"paper": (34, 44), "mini": (2.3, 3.0)},
 }
-OVERFITTING = {"petr": (300, 150, 3e-3), "rctrans": (240, 150, 2e-3), "sparc": (150, 100, 3e-3)}
+OVERFITTING = {
+    "far3d": (240, 150, 2e-3),
+    "petr": (300, 150, 3e-3),
+    "rctrans": (240, 150, 2e-3),
+    "sparc": (150, 100, 3e-3),
+}
 """Steps, how many before the end the rate begins to fall, and the rate."""
 EVERY = [(b, n) for b in range(2) for n in range(4)]
 

@@ -170,6 +170,7 @@ def test_numbers_of_all_methods_are_those_reported():
         ("CRT-Fusion", "crt_fusion"),
         ("SpaRC", "sparc"),
         ("PETR", "petr"),
+        ("Far3D", "far3d"),
         ("RCTrans", "rctrans"),
     ],  # fmt: skip
 )

@@ -36,6 +36,19 @@ class GlobalAttention(nn.Module):
         gathered = F.scaled_dot_product_attention(*heads, attn_mask=(valid | ~some)[:, None, None])
         return self.output(gathered.transpose(1, 2).flatten(2) * some[..., None])
 
+    def among(
+        self,
+        x: Tensor,  # [B, Q, C]
+        embedding: Tensor,  # [B, Q, C]
+        valid: Tensor,  # [B, Q] bool
+        past: tuple[Tensor, Tensor, Tensor] | None,  # further keys [B, n, C], values [B, n, C], valid [B, n]
+    ) -> Tensor:  # [B, Q, C]
+        """What queries gather from one another and from the past; keys hold their embedding, values do not."""
+        own = (x + embedding, x, valid)
+        if past is not None:
+            own = tuple(torch.cat([one, two.to(one.dtype)], dim=1) for one, two in zip(own, past, strict=True))
+        return self(x + embedding, *own)
+
 
 class GlobalDecoderLayer(nn.Module):
     """Self-attention, attention to the tokens of a sensor and an MLP, each added and normalised (DETR's order)."""
@@ -57,9 +70,6 @@ class GlobalDecoderLayer(nn.Module):
     ) -> Tensor:  # [B, Q, C]
         """The queries' features after this layer."""
         x = queries.features
-        own = (x + embedding, x, queries.valid)
-        if past is not None:
-            own = tuple(torch.cat([one, two.to(one.dtype)], dim=1) for one, two in zip(own, past, strict=True))
-        x = self.norms[0](x + self.self_attention(x + embedding, *own))
+        x = self.norms[0](x + self.self_attention.among(x, embedding, queries.valid, past))
         x = self.norms[1](x + self.image_attention(x + embedding, *tokens))
         return self.norms[2](x + self.mlp(x))

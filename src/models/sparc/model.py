@@ -11,27 +11,22 @@ from src.losses.classification import penalty_reduced_focal
 from src.losses.normalizers import mean_over_ranks
 from src.models.backbones.point_transformer import PointTransformer, PointTransformerConfig, RadarPoints
 from src.models.detector import Objective
-from src.models.heads.keypoint_head import camera_losses
 from src.models.heads.query_proposals import ProposalConfig, Proposals, QueryProposals
 from src.models.layers.query_decoder import QueryDecoder, QueryDecoderConfig
 from src.models.layers.views import CameraViews
-from src.models.query_detector import QueryDetector, QueryDetectorConfig, QueryLossConfig, QueryOutput
+from src.models.query_detector import CameraQueryLossConfig, QueryDetector, QueryDetectorConfig, QueryOutput
 from src.models.query_memory import QueryMemory
 from src.models.sparc.frustum_fusion import FrustumFusionConfig, SparseFrustumFusion
 from src.structures.batch import FrameBatch
 from src.structures.taxonomy import CAMERAS
 from src.targets.heatmap import head_targets
-from src.targets.projection import view_boxes
-from src.targets.supervision import supervised_boxes, upload_boxes
 
 
 @dataclass(kw_only=True)
-class SpaRCLossConfig(QueryLossConfig):
+class SpaRCLossConfig(CameraQueryLossConfig):
     """Weights of the terms (`model.loss`); null switches a term off, uncomputed."""
 
     heatmap_weight: float | None  # of the radar points
-    keypoint_weight: float | None  # of the images
-    depth_weight: float | None
 
 
 @dataclass(kw_only=True)
@@ -96,12 +91,7 @@ class SpaRC(QueryDetector):
             target = head_targets(batch.boxes, output.radar.bev.sites, self.grid).heatmap
             total = penalty_reduced_focal(output.proposals.heatmap_logits, target).sum()
             terms["heatmap"] = weights.heatmap_weight * total / mean_over_ranks((target == 1).sum())
-        if weights.keypoint_weight is not None or weights.depth_weight is not None:
-            views = output.views
-            boxes, samples = upload_boxes(*supervised_boxes(batch.boxes, self.grid), device=batch.device)
-            seen = view_boxes(boxes, samples, views.pix_from_aug, views.valid, views.image_size_px)
-            wanted = (weights.keypoint_weight, weights.depth_weight)
-            terms |= camera_losses(output.proposals.camera, views, seen, self.config.queries.depth_range, *wanted)
+        terms |= self.camera_terms(output.proposals.camera, output.views, self.config.queries.depth_range, batch)
         return Objective(terms, counts)
 
     def diagnostics(self, output: SpaRCOutput) -> dict[str, Tensor | float]:
