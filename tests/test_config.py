@@ -46,7 +46,7 @@ def test_phase_2_composes_at_every_scale(scale):
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
-@pytest.mark.parametrize("name", ["dense_bev", "crt_fusion", "sparc", "petr"])
+@pytest.mark.parametrize("name", ["dense_bev", "crt_fusion", "sparc", "petr", "far3d", "rctrans"])
 def test_other_detectors_without_lidar_compose_at_every_scale(scale, phase, name):
     """At the same range and cell; phase 1 drops what its settings name as temporal."""
     config, tree = compose_config([f"scale={scale}", "data.root=x", f"model={name}", f"phase={phase}"])
@@ -54,11 +54,10 @@ def test_other_detectors_without_lidar_compose_at_every_scale(scale, phase, name
     assert model.name == tree["model"]["name"] == name and config.grid.cells == [384, 384]
     assert (model.temporal is None) == (tree["model"]["temporal"] is None) == (phase == "phase1")
     assert (model.memory_frames > 0) == (model.memory_max_age_s == 6.0) == (phase == "phase2")
-    lifted = getattr(model, {"sparc": "queries", "petr": "position"}.get(name, "view_transform"))
-    assert lifted.num_depth_bins in ((16, 32, 64) if name == "petr" else (16, 80)) and lifted.depth_range == (
-        1.0,
-        160.0,
-    )
+    parts = {"sparc": "queries", "far3d": "queries", "petr": "position", "rctrans": "position"}
+    lifted = getattr(model, parts.get(name, "view_transform"))
+    assert lifted.num_depth_bins in ((16, 32, 64) if parts.get(name) == "position" else (16, 80))
+    assert lifted.depth_range == (1.0, 160.0)
 
 
 @pytest.mark.slow

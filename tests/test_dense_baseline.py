@@ -14,7 +14,7 @@ from tests.running import call
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module", params=["dense_bev", "crt_fusion", "sparc", "petr"])
+@pytest.fixture(scope="module", params=["dense_bev", "crt_fusion", "sparc", "petr", "far3d", "rctrans"])
 def family(request):
     return request.param
 
@@ -39,16 +39,16 @@ def test_both_phases_leave_what_is_promised(trained, outputs, family):
         names = ("config.yaml", "metrics.json", "metrics.csv", "run.json", "submission.json", "checkpoints/last.ckpt")
         assert all((folder / name).is_file() for name in names), folder
         header = (folder / "metrics.csv").read_text().splitlines()[0].split(",")
-        learnt = {"loss/class"} if family == "petr" else {"loss/heatmap", "loss/depth"}
+        learnt = {"petr": {"loss/class"}, "far3d": {"loss/keypoint", "loss/depth"}, "rctrans": {"loss/class"}}
+        learnt = learnt.get(family, {"loss/heatmap", "loss/depth"})
         assert {*learnt, "loss/box", "loss/total", "state/objects"} <= set(header)
         assert list((folder / "pictures").glob("frame_*.png"))
     assert "state/remembered_frames" in header
     log = (trained / "log.txt").read_text()
     assert "weights from" in log and "in temporal" in log
     meta = json.loads((trained / "submission.json").read_text())["meta"]
-    assert (
-        meta["use_camera"] and meta["use_radar"] == (family != "petr") and "memory of up to 6 s" in meta["description"]
-    )
+    assert meta["use_camera"] and meta["use_radar"] == (family not in ("petr", "far3d"))
+    assert "memory of up to 6 s" in meta["description"]
     weights = [read_checkpoint(folder / "checkpoints" / "last.ckpt")["state_dict"] for folder in (first, trained)]
     assert {key for key in weights[1] if key not in weights[0]} == {key for key in weights[1] if ".temporal." in key}
 

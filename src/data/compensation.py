@@ -8,7 +8,7 @@ import numpy as np
 
 from src.data.schema import DatasetIndex
 from src.errors import DataError
-from src.geometry.transforms import quaternion_to_matrix, rotation_vector
+from src.geometry.transforms import pose_matrix, quaternion_to_matrix, rotation_vector
 from src.structures.batch import LIDAR_POINT_FIELDS, MAX_EGO_SPEED_MPS
 
 Array = np.ndarray
@@ -27,6 +27,29 @@ class Sweeps:
     global_from_ego: Array  # [S, 4, 4] ego poses
     velocity: Array  # [S, 3] m/s of the ego at its pose, its own axes
     rate: Array  # [S, 3] rad/s, same axes
+
+
+def ego_poses(
+    index: DatasetIndex,
+    rows: Array,  # [...] int64, of the pose table
+) -> Array:  # [..., 4, 4] global_from_ego
+    """The ego's poses."""
+    return pose_matrix(index.pose_rotations[rows], index.pose_translations[rows])
+
+
+def read_sweeps(
+    index: DatasetIndex,
+    rows: Array,  # [S] of the files
+    clouds: list[Array],
+    times_us: Array | None,  # [S] at which the ego's motion is that of its sweep; None: it is not asked for
+) -> Sweeps:
+    """The sweeps of these files with their mounts, poses and motion."""
+    global_from_ego = ego_poses(index, index.data_poses[rows])
+    velocity = rate = np.zeros((len(rows), 3))
+    if times_us is not None:
+        velocity, rate = ego_motion(index, times_us, global_from_ego[:, :3, :3])
+    mounts = index.ego_from_sensor[index.data_calibrations[rows]]
+    return Sweeps(clouds=clouds, ego_from_sensor=mounts, global_from_ego=global_from_ego, velocity=velocity, rate=rate)
 
 
 def ego_motion(

@@ -11,17 +11,18 @@ import numpy as np
 import torch
 
 from src.data.augment import AugmentationConfig, draw_bev_transform, draw_crop, frame_generator
-from src.data.compensation import Sweeps, compensate_clouds, ego_motion, place_sweep
+from src.data.compensation import ego_poses, read_sweeps
 from src.data.images import read_image, width_fit
 from src.data.pcd import LidarCloud
-from src.data.rays import RADAR_WINDOW_S, TRUE_MARGIN_M, lidar_rays, radar_speeds, without_ego_body
+from src.data.point_tensors import lidar_tensors, radar_tensors
+from src.data.rays import lidar_rays, without_ego_body
+from src.data.return_speeds import ReturnSpeeds
 from src.data.schema import CHANNELS, DatasetIndex
 from src.data.sensor_files import OnBadFile, SensorFiles, Skipped
-from src.data.timeline import LidarTimeline, RadialSpeeds, SweepTimeline, TimelineConfig
-from src.data.true_geometry import TrueGeometry
+from src.data.timeline import LidarTimeline, RadialSpeeds, TimelineConfig
 from src.geometry.camera import pixels_from_points
-from src.geometry.transforms import invert_rigid, pose_matrix, quaternion_to_matrix, yaw_of
-from src.structures.batch import LIDAR_POINT_FIELDS, RADAR_POINT_FIELDS, FrameBatch
+from src.geometry.transforms import invert_rigid, quaternion_to_matrix, yaw_of
+from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.ray_bundle import RayBundle
 from src.structures.taxonomy import CAMERAS, LIDARS, RADARS, REFERENCE_CHANNEL
@@ -61,8 +62,9 @@ class FrameReader:
         self._files = SensorFiles(index, settings.on_bad_file, settings.deskew_lidar)
         self._preceding = _preceding(index)  # [N] row of the scene's sample before, -1 for none
         self.timeline = settings.timeline and LidarTimeline(index, settings.timeline)
-        self._radars: SweepTimeline | None = None  # made on first need
-        self._truth: tuple[int, TrueGeometry] | None = None  # of the scene read last, by its row
+        source = settings.timeline.radial_speeds if settings.timeline is not None else RadialSpeeds.none
+        unknown = source is RadialSpeeds.none
+        self._speeds = None if unknown else ReturnSpeeds(index, self._files, source, settings.min_distance_m)
 
     def read(
         self,
@@ -123,10 +125,7 @@ class FrameReader:
         }
 
     def _global_from_ego(self, sample: int) -> Array:  # [4, 4]
-        return self._pose(self.index.frame_poses[sample])
-
-    def _pose(self, row: int) -> Array:  # [4, 4]
-        return pose_matrix(self.index.pose_rotations[row], self.index.pose_translations[row])
+        return ego_poses(self.index, self.index.frame_poses[sample])
 
     # ---------------------------------------------------------------- radar and LiDAR
 
@@ -141,28 +140,9 @@ class FrameReader:
         rows, clouds = self._files.radar_clouds(sample, files, skipped)
         times_us = self.index.data_times_us[rows]
         ages_s = 1e-6 * (self.index.frame_times_us[sample] - times_us)
-        sweeps = self._sweeps(rows, clouds, times_us)
-        return radar_tensors(sweeps, ages_s, global_from_ego, aug_from_ego, self.settings)
-
-    def _sweeps(
-        self,
-        rows: Array,  # [S]
-        clouds: list[Array],
-        times_us: Array | None,  # [S] at which the ego's motion is that of its sweep; None: it is not asked for
-    ) -> Sweeps:
-        index = self.index
-        poses, calibrations = index.data_poses[rows], index.data_calibrations[rows]
-        global_from_ego = pose_matrix(index.pose_rotations[poses], index.pose_translations[poses])
-        velocity = rate = np.zeros((len(rows), 3))
-        if times_us is not None:
-            velocity, rate = ego_motion(index, times_us, global_from_ego[:, :3, :3])
-        return Sweeps(
-            clouds=clouds,
-            ego_from_sensor=index.ego_from_sensor[calibrations],
-            global_from_ego=global_from_ego,
-            velocity=velocity,
-            rate=rate,
-        )
+        sweeps = read_sweeps(self.index, rows, clouds, times_us)
+        how = (self.settings.min_distance_m, self.settings.propagate_points)
+        return radar_tensors(sweeps, ages_s, global_from_ego, aug_from_ego, *how)
 
     def _lidar_points(
         self,
@@ -186,15 +166,15 @@ class FrameReader:
         skipped: Skipped,
     ) -> dict[str, torch.Tensor]:
         """`lidar_tensors` of these files; with the speed of each point where the timeline has a source of speeds."""
-        known = self.settings.timeline is not None and self.settings.timeline.radial_speeds is not RadialSpeeds.none
-        tensors = self._placed(rows, clouds, aug_from_global, frame_time_us, origins=True if known else None)
-        if not known:
+        origins = None if self._speeds is None else True
+        tensors = self._placed(rows, clouds, aug_from_global, frame_time_us, origins)
+        if self._speeds is None:
             return tensors
         directed = (tensors["lidar_points"][:, :3] != tensors["lidar_origins"]).any(1)
         rays = lidar_rays({name: value[directed] for name, value in tensors.items()}, step=0)
         speeds = torch.full((len(directed),), torch.nan)
         if len(rays):
-            speeds[directed] = self._speeds(sample, rays, aug_from_global, frame_time_us, skipped)
+            speeds[directed] = self._speeds.along(sample, rays, aug_from_global, frame_time_us, skipped)
         if not self.settings.lidar_origins:
             del tensors["lidar_origins"]
         return tensors | {"lidar_speeds": speeds}
@@ -211,7 +191,7 @@ class FrameReader:
         pose_times_us = self.index.pose_times_us[self.index.data_poses[rows]]
         points = [cloud.points for cloud in clouds]
         return lidar_tensors(
-            self._sweeps(rows, points, pose_times_us if self.settings.deskew_lidar else None),
+            read_sweeps(self.index, rows, points, pose_times_us if self.settings.deskew_lidar else None),
             [1e-6 * (frame_time_us - cloud.times_us) for cloud in clouds],
             [1e-6 * (cloud.times_us - time_us) for cloud, time_us in zip(clouds, pose_times_us, strict=True)],
             aug_from_global,
@@ -228,7 +208,7 @@ class FrameReader:
         frame, aug_from_global = self._key_frame(sample, aug_from_ego), np.eye(4)
         if len(rows):
             own = rows[np.argmax(self.index.data_channels[rows] == CHANNELS.index(REFERENCE_CHANNEL))]
-            global_from_ego = self._pose(self.index.data_poses[own])
+            global_from_ego = ego_poses(self.index, self.index.data_poses[own])
             time_us = int(self.index.data_times_us[own])
             aug_from_global = aug_from_ego @ invert_rigid(global_from_ego)
             frame |= {
@@ -249,53 +229,9 @@ class FrameReader:
             clouds = list(map(without_ego_body, clouds, mounts))
             parts.append(lidar_rays(self._placed(rows, clouds, aug_from_global, frame_time_us, origins=True), step))
         rays = RayBundle.join(parts)
-        if self.settings.timeline.radial_speeds is RadialSpeeds.none or not len(rays):
+        if self._speeds is None or not len(rays):
             return rays
-        return replace(rays, speeds=self._speeds(sample, rays, aug_from_global, frame_time_us, skipped))
-
-    def _speeds(
-        self,
-        sample: int,
-        rays: RayBundle,
-        aug_from_global: Array,  # [4, 4] of the frame that the rays are in
-        frame_time_us: int,  # from which their times count
-        skipped: Skipped,
-    ) -> torch.Tensor:  # [R] float32
-        """By the timeline's source."""
-        find = self._true_speeds if self.settings.timeline.radial_speeds is RadialSpeeds.exact else self._radar_speeds
-        return torch.from_numpy(find(sample, rays, aug_from_global, frame_time_us, skipped).astype(np.float32))
-
-    def _true_speeds(
-        self, sample: int, rays: RayBundle, aug_from_global: Array, frame_time_us: int, skipped: Skipped
-    ) -> Array:  # [R]
-        """By the true motion that a synthetic world knows, in metres of the augmented frame."""
-        scene = int(self.index.sample_scenes[sample])
-        if self._truth is None or self._truth[0] != scene:
-            self._truth = scene, TrueGeometry.read(self.index.root, str(self.index.scene_names[scene]))
-        global_from_aug = np.linalg.inv(aug_from_global)
-        points = rays.points.double().numpy() @ global_from_aug[:3, :3].T + global_from_aug[:3, 3]
-        times_us = frame_time_us + np.round(1e6 * rays.times_s.double().numpy()).astype(np.int64)
-        velocities = self._truth[1].velocities(points, times_us, TRUE_MARGIN_M) @ aug_from_global[:3, :3].T
-        return (velocities * rays.directions.double().numpy()).sum(1)
-
-    def _radar_speeds(
-        self, sample: int, rays: RayBundle, aug_from_global: Array, frame_time_us: int, skipped: Skipped
-    ) -> Array:  # [R]
-        """By the radar returns beside the rays' ends."""
-        index = self.index
-        if self._radars is None:
-            self._radars = SweepTimeline(index, RADARS)
-        times_us = frame_time_us + np.round(1e6 * rays.times_s.double().numpy()).astype(np.int64)
-        window_us, files = round(1e6 * RADAR_WINDOW_S), set()
-        for step in rays.steps.unique().tolist():
-            own_us = times_us[rays.steps.numpy() == step]
-            files |= set(self._radars.between(sample, own_us.min() - window_us, own_us.max() + window_us).tolist())
-        rows, clouds = self._files.radar_clouds(sample, sorted(files), skipped)
-        sweeps = self._sweeps(rows, clouds, index.data_times_us[rows])
-        ages_s = 1e-6 * (frame_time_us - index.data_times_us[rows])
-        unmoved, pose = replace(self.settings, propagate_points=False), self._global_from_ego(sample)
-        tensors = radar_tensors(sweeps, ages_s, pose, aug_from_global @ pose, unmoved)
-        return radar_speeds(rays, tensors["radar_points"].double().numpy())
+        return replace(rays, speeds=self._speeds.along(sample, rays, aug_from_global, frame_time_us, skipped))
 
     # ---------------------------------------------------------------- cameras
 
@@ -316,10 +252,7 @@ class FrameReader:
         ida = augmentation.image if augmentation is not None else None
         rows = index.key_data[sample, [CHANNELS.index(channel) for channel in CAMERAS]]
         poses, calibrations = index.data_poses[rows], index.data_calibrations[rows]
-        global_from_cam = (
-            pose_matrix(index.pose_rotations[poses], index.pose_translations[poses])
-            @ index.ego_from_sensor[calibrations]
-        )
+        global_from_cam = ego_poses(index, poses) @ index.ego_from_sensor[calibrations]
         cam_from_aug = invert_rigid(global_from_cam) @ global_from_ego @ np.linalg.inv(aug_from_ego)
         for view, channel in enumerate(CAMERAS):
             row = int(rows[view])
@@ -377,43 +310,3 @@ def _preceding(index: DatasetIndex) -> Array:  # [N] int64
     linked = np.diff(index.sample_scenes[order]) == 0
     preceding[order[1:][linked]] = order[:-1][linked]
     return preceding
-
-
-def radar_tensors(
-    sweeps: Sweeps,
-    ages_s: Array,  # [S] key frame minus sweep
-    global_from_ego: Array,  # [4, 4] ego(t)
-    aug_from_ego: Array,  # [4, 4]
-    settings: ReaderSettings,
-) -> dict[str, torch.Tensor]:
-    """The radar of a batch of one: moved to ego(t), compensated for the ego motion by the full mount (method 1.3)."""
-    points = np.zeros((0, len(RADAR_POINT_FIELDS)))
-    if sweeps.clouds:
-        least_m, propagated = settings.min_distance_m, settings.propagate_points
-        points = compensate_clouds(sweeps, invert_rigid(global_from_ego), ages_s, least_m, propagated)
-        linear = aug_from_ego[:3, :3]
-        points[:, :3] = points[:, :3] @ linear.T + aug_from_ego[:3, 3]
-        points[:, 4:6] = points[:, 4:6] @ linear[:2, :2].T
-    owners = torch.zeros(len(points), dtype=torch.int64)
-    return {"radar_points": torch.from_numpy(points.astype(np.float32, order="C")), "radar_batch": owners}
-
-
-def lidar_tensors(
-    sweeps: Sweeps,
-    ages_s: list[Array],  # S of [n] key frame's time less the point's
-    offsets_s: list[Array],  # S of [n] the point's time less that of its sweep's pose
-    aug_from_global: Array,  # [4, 4]
-    min_distance_m: float,  # as `ReaderOptions`
-    origins: bool,
-) -> dict[str, torch.Tensor]:
-    """The LiDAR of a batch of one, in the (augmented) ego frame of the key frame."""
-    placed = [(np.zeros((0, len(LIDAR_POINT_FIELDS)), np.float32), np.zeros((0, 3), np.float32))]
-    mounts, targets = sweeps.ego_from_sensor, aug_from_global @ sweeps.global_from_ego
-    columns = (sweeps.clouds, ages_s, offsets_s, mounts, targets, sweeps.velocity, sweeps.rate)
-    placed += [place_sweep(*sweep, min_distance_m, origins) for sweep in zip(*columns, strict=True)]
-    points, starts = zip(*placed, strict=True)
-    tensors = {"lidar_points": torch.from_numpy(np.concatenate(points))}
-    tensors["lidar_batch"] = torch.zeros(len(tensors["lidar_points"]), dtype=torch.int64)
-    if origins:
-        tensors["lidar_origins"] = torch.from_numpy(np.concatenate(starts))
-    return tensors

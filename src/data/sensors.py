@@ -13,7 +13,8 @@ from PIL import Image
 from src.data.compensation import Sweeps
 from src.data.images import MAX_PIXELS, resample, width_fit
 from src.data.pcd import LIDAR_FIELDS, RADAR_FIELDS
-from src.data.reader import ReaderSettings, lidar_tensors, radar_tensors
+from src.data.point_tensors import lidar_tensors, radar_tensors
+from src.data.reader import ReaderSettings
 from src.data.sensor_files import MAX_SCAN_S
 from src.errors import DataError
 from src.geometry.camera import pixels_from_points
@@ -102,7 +103,8 @@ def frame_from_sensors(
     }
     if settings.num_sweeps:
         sweeps, ages_s, _ = _newest(RadarSweep, RADAR_FIELDS, settings.num_sweeps, radars, timestamp_s, global_from_ego)
-        batch |= radar_tensors(sweeps, np.array(ages_s), global_from_ego, np.eye(4), settings)
+        how = (settings.min_distance_m, settings.propagate_points)
+        batch |= radar_tensors(sweeps, np.array(ages_s), global_from_ego, np.eye(4), *how)
     if settings.num_lidar_sweeps:
         fields, count = LIDAR_FIELDS[:4], settings.num_lidar_sweeps
         sweeps, ages_s, point_ages_s = _newest(

@@ -13,12 +13,14 @@ from src.models.centerpoint.model import CenterPoint, CenterPointConfig
 from src.models.crt_fusion.model import CRTFusion, CRTFusionConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig
 from src.models.detector import Detector, ModelConfig
+from src.models.far3d.model import Far3D, Far3DConfig
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.lrs4fusion.lrs_config import LRS4FusionConfig
 from src.models.lrs4fusion.model import LRS4Fusion
 from src.models.petr.model import PETR, PETRConfig
 from src.models.radargnn.model import RadarGNN, RadarGNNConfig
+from src.models.rctrans.model import RCTrans, RCTransConfig
 from src.models.sparc.model import SpaRC, SpaRCConfig
 
 FAMILIES: dict[str, tuple[type[ModelConfig], type[Detector]]] = {
@@ -27,6 +29,8 @@ FAMILIES: dict[str, tuple[type[ModelConfig], type[Detector]]] = {
     "crt_fusion": (CRTFusionConfig, CRTFusion),
     "sparc": (SpaRCConfig, SpaRC),
     "petr": (PETRConfig, PETR),
+    "far3d": (Far3DConfig, Far3D),
+    "rctrans": (RCTransConfig, RCTrans),
     "radargnn": (RadarGNNConfig, RadarGNN),
     "centerpoint": (CenterPointConfig, CenterPoint),
     "lrs4fusion": (LRS4FusionConfig, LRS4Fusion),

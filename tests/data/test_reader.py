@@ -12,7 +12,8 @@ from src.data.augment import AugmentationConfig, BevAugmentationConfig, ImageAug
 from src.data.cache import load_index
 from src.data.compensation import Sweeps, compensate_clouds, ego_motion
 from src.data.pcd import read_radar_points
-from src.data.reader import FrameReader, radar_tensors
+from src.data.point_tensors import radar_tensors
+from src.data.reader import FrameReader
 from src.data.sensor_files import OnBadFile
 from src.errors import DataError
 from src.geometry.camera import project
@@ -246,7 +247,8 @@ def test_real_sweep_is_explained_by_one_speed(data_set):
     mounts = rigid(quaternion_to_matrix([np.cos(turn), 0, 0, np.sin(turn)]), [5.26, 1.23, 2.01])[None]
     sweeps = Sweeps(clouds=[read_radar_points(path)], ego_from_sensor=mounts, global_from_ego=np.eye(4)[None],
                     velocity=velocity, rate=rate)  # fmt: skip
-    points = radar_tensors(sweeps, np.zeros(1), np.eye(4), np.eye(4), reader_settings())["radar_points"].numpy()
+    how = (reader_settings().min_distance_m, False)
+    points = radar_tensors(sweeps, np.zeros(1), np.eye(4), np.eye(4), *how)["radar_points"].numpy()
     slow = np.linalg.norm(points[:, 4:6], axis=1) < 0.6
     assert len(points) == 612 and slow.sum() >= 535
 

@@ -16,7 +16,7 @@ from src.models.sparc.model import SpaRCConfig
 from tests.models.dense_bev.dense_frames import drive, fill, pose
 from tests.models.learning import gradients_are_finite
 from tests.models.moving import bare_frame, bda
-from tests.models.sparc.sparc_frames import sparc_model
+from tests.models.query_frames import small_model
 
 WIDE = BEVGrid(cells=(200, 200), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
 ADDED = re.compile(SpaRCConfig.new_in_temporal_phase)
@@ -157,7 +157,7 @@ def test_mistakes_are_named():
 @pytest.fixture
 def pair():
     """A phase-1 model and the phase-2 model that took its weights."""
-    first, second = sparc_model(seed=1), sparc_model(phase="phase2", seed=3)
+    first, second = small_model("sparc", seed=1), small_model("sparc", phase="phase2", seed=3)
     new = second.load_state_dict(first.state_dict(), strict=False)
     assert new.missing_keys and all(ADDED.match(key) for key in new.missing_keys) and not new.unexpected_keys
     return first, second

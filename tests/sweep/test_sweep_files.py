@@ -165,7 +165,14 @@ def test_numbers_of_all_methods_are_those_reported():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("label", "name"),
-    [("BEVFusion", "dense_bev"), ("CRT-Fusion", "crt_fusion"), ("SpaRC", "sparc"), ("PETR", "petr")],
+    [
+        ("BEVFusion", "dense_bev"),
+        ("CRT-Fusion", "crt_fusion"),
+        ("SpaRC", "sparc"),
+        ("PETR", "petr"),
+        ("Far3D", "far3d"),
+        ("RCTrans", "rctrans"),
+    ],  # fmt: skip
 )
 def test_another_method_is_trained_as_ours(label, name):
     """Same phase, data and backbone as the row it is compared with, and the same settings of a head of its kind; only
@@ -178,9 +185,10 @@ def test_another_method_is_trained_as_ours(label, name):
         assert (baseline.model.name, own.model.name) == (name, "horizon3d")
         for part in ("data", "backbone", "phase", "optim", "grid", "precision", "seed"):
             assert getattr(baseline, part) == getattr(own, part), (scale, part)
-        for key in ("nms", "score_threshold", "max_boxes", "attributes") if name not in ("sparc", "petr") else ():
+        dense = name in ("dense_bev", "crt_fusion")  # others have a head of queries
+        for key in ("nms", "score_threshold", "max_boxes", "attributes") if dense else ():
             assert getattr(baseline.model.head, key) == getattr(own.model.head, key)
-        for key in ("heatmap_weight", "box_weight") if name != "petr" else ("box_weight",):
+        for key in ("heatmap_weight", "box_weight") if dense or name == "sparc" else ("box_weight",):
             assert getattr(baseline.model.loss, key) == getattr(own.model.loss, key)
         assert baseline.model.memory_max_age_s == own.model.memory_max_age_s and baseline.model.memory_frames > 0
 

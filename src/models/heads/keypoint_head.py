@@ -94,13 +94,20 @@ def lift_keypoints(
         points = views.lift(depth)
         scores = keypoint_scores(maps, nms_cells) * confidence
         scores = scores * (grid.contains(points[..., :2]) & views.valid[:, :, None, None])
-        # One ranking over the pixels of all views of a sample.
-        best, picks = scores.flatten(1).topk(min(count, scores[0].numel()), dim=1)
-        missing = count - picks.shape[1]
-        best, picks = F.pad(best, (0, missing)), F.pad(picks, (0, missing))  # [B, K]
+        best, picks = best_pixels(scores, count)
         points = points.flatten(1, 3).gather(1, picks[..., None].expand(-1, -1, 3))
     local = maps.features.movedim(2, -1).flatten(1, 3)  # [B, N*h*w, C]
     return points, best > 0, local.gather(1, picks[..., None].expand(-1, -1, local.shape[-1]))
+
+
+def best_pixels(
+    scores: Tensor,  # [B, N, h, w]
+    count: int,  # K
+) -> tuple[Tensor, Tensor]:  # [B, K] scores, [B, K] int64 places in N * h * w
+    """One ranking over the pixels of all views of a sample; where there are fewer, score and place are 0."""
+    best, picks = scores.flatten(1).topk(min(count, scores[0].numel()), dim=1)
+    missing = count - picks.shape[1]
+    return F.pad(best, (0, missing)), F.pad(picks, (0, missing))
 
 
 def most_likely_depth(

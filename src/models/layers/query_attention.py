@@ -20,28 +20,41 @@ PENALTY_RANGE = (-2.0, 1.0)
 """Heads start with penalties of softplus(-2) = 0.13 to softplus(1) = 1.3 per metre."""
 
 
-class QueryEmbedding(nn.Module):
-    """Sines of a query's place and its velocity, by an MLP. Runs in float32: autocast would round places of 150 m."""
+class PlaceEmbedding(nn.Module):
+    """Sines of places, and what else is told of each, by an MLP; in float32, since autocast would round 150 m."""
 
     full_precision_parts = ("",)
 
-    def __init__(self, channels: int, grid: BEVGrid) -> None:
+    def __init__(self, channels: int, grid: BEVGrid, extra: int = 0, coordinates: int = 3) -> None:
         super().__init__()
         (low, high), (x, y) = grid.z_range_m, grid.half_extent_m
-        self.middle = (*grid.centre_m, 0.5 * (low + high))
-        self.half = (x, y, 0.5 * (high - low))
-        inputs = 3 * 2 * FREQUENCIES + 2
+        self.middle = (*grid.centre_m, 0.5 * (low + high))[:coordinates]
+        self.half = (x, y, 0.5 * (high - low))[:coordinates]
+        inputs = coordinates * 2 * FREQUENCIES + extra
         self.mlp = nn.Sequential(nn.Linear(inputs, channels), nn.ReLU(), nn.Linear(channels, channels))
+
+    def forward(
+        self,
+        places: Tensor,  # [..., coordinates] m; further coordinates are left out
+        *extra: Tensor,  # [..., n] each
+    ) -> Tensor:  # [..., C]
+        with torch.autocast(places.device.type, enabled=False):
+            middle, half = constant((self.middle, self.half), torch.float32, places.device)
+            octaves = math.pi * 2.0 ** torch.arange(FREQUENCIES, device=places.device)
+            shares = (places[..., : len(self.half)].float() - middle) / half
+            phase = (shares[..., None] * octaves).flatten(-2)  # [..., coordinates * frequencies]
+            return self.mlp(torch.cat([phase.sin(), phase.cos(), *(value.float() for value in extra)], dim=-1))
+
+
+class QueryEmbedding(PlaceEmbedding):
+    """Sines of a query's place, and its velocity."""
+
+    def __init__(self, channels: int, grid: BEVGrid) -> None:
+        super().__init__(channels, grid, extra=2)
 
     def forward(self, queries: Queries) -> Tensor:  # [B, Q, C]
         """Of every query."""
-        with torch.autocast(queries.centers.device.type, enabled=False):
-            centers = queries.centers.float()
-            middle, half = constant((self.middle, self.half), torch.float32, centers.device)
-            octaves = math.pi * 2.0 ** torch.arange(FREQUENCIES, device=centers.device)
-            phase = (((centers - middle) / half)[..., None] * octaves).flatten(2)  # [B, Q, 3 * frequencies]
-            inputs = [phase.sin(), phase.cos(), queries.velocities.float() / SPEED_UNIT_MPS]
-            return self.mlp(torch.cat(inputs, dim=-1))
+        return super().forward(queries.centers, queries.velocities.float() / SPEED_UNIT_MPS)
 
 
 class DistanceAttention(nn.Module):

@@ -99,16 +99,16 @@ class QueryDecoder(nn.Module):
 
     def forward(
         self, queries: Queries, past: Queries | None, radar: PaddedPoints, views: CameraViews, head: SetPredictionHead
-    ) -> tuple[list[QueryPrediction], Tensor]:  # of each layer, [B, Q, C]
-        """What every layer predicts, and the features that the last one predicts from."""
+    ) -> tuple[list[QueryPrediction], list[Tensor]]:  # of each layer, and [B, Q, C]
+        """What every layer predicts, and the features that it predicts from."""
         values = [self.image_value(x.flatten(0, 1)).unflatten(0, x.shape[:2]) for x in views.levels]
         if past is not None:
             past = replace(past, features=past.features + self.embedding(past))
-        predictions, features = [], queries.features
+        predictions, features = [], []
         for layer in self.layers:
             x = layer(queries, self.embedding(queries), past, radar, views, values)
-            features = self.norm(x)
-            predictions.append(head(features, queries))
+            features.append(self.norm(x))
+            predictions.append(head(features[-1], queries))
             codes = predictions[-1].codes.detach()
             queries = replace(queries, features=x, centers=codes[..., :3], velocities=codes[..., -2:])
         return predictions, features

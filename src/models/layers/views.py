@@ -74,3 +74,12 @@ class CameraViews:
             points = rays * depth.float()[..., None]  # [B, N, h, w, 3] (u*d, v*d, d)
             lifted = torch.einsum("bnij,bnhwj->bnhwi", aug_from_pix[..., :3], points)
             return lifted + aug_from_pix[:, :, None, None, :, 3]
+
+    def lift_pixels(
+        self,
+        points: Tensor,  # [B, Q, N, 3] (u * d, v * d, d)
+    ) -> Tensor:  # [B, Q, N, 3] aug metres
+        """3D points at any pixels, without gradient; those of a missing camera are finite."""
+        with torch.no_grad(), torch.autocast(points.device.type, enabled=False):
+            aug_from_pix = invert_projection(self.pix_from_aug, self.valid)[:, None, :, :3]  # [B, 1, N, 3, 4]
+            return (aug_from_pix[..., :3] @ points.float()[..., None]).squeeze(-1) + aug_from_pix[..., 3]

@@ -152,6 +152,8 @@ MODELS = {
     "radargnn": ("phase=phase1", "model=radargnn", "model.head.score_threshold=0.005"),
     "sparc": ("phase=phase2", "model=sparc"),
     "petr": ("phase=phase2", "model=petr"),
+    "far3d": ("phase=phase2", "model=far3d", "model.queries.score_threshold=0.01"),
+    "rctrans": ("phase=phase2", "model=rctrans"),
 }  # fmt: skip
 
 

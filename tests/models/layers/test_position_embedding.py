@@ -1,4 +1,4 @@
-"""What makes PETR: every pixel knows where it could be looking, and every query looks at all of them."""
+"""Every pixel knows where it could be looking, and every query what the pixel that sees it knows."""
 
 import math
 
@@ -6,11 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from src.models.heads.query_head import QueryHeadConfig, SetPredictionHead
+from src.models.layers.position_embedding import EDGE, PositionEmbedding, PositionEmbeddingConfig
 from src.models.layers.views import CameraViews
-from src.models.petr.decoder import GlobalAttention, PETRDecoder, PETRDecoderConfig
-from src.models.petr.position_embedding import EDGE, PositionEmbedding, PositionEmbeddingConfig
-from src.structures.queries import Queries
 from tests.models.dense_bev.dense_frames import GRID, SIZE, make_batch
 
 DEPTHS, NEAR, FAR, LOW, HIGH = 5, 2.0, 32.0, -10.0, 10.0
@@ -61,37 +58,18 @@ def test_a_missing_camera_has_a_finite_embedding():
 
 
 @torch.no_grad()
-def test_attention_is_a_softmax_over_all_valid_keys():
-    torch.manual_seed(0)
-    part = GlobalAttention(8, 2)
-    query, key, value = torch.randn(2, 3, 8), torch.randn(2, 5, 8), torch.randn(2, 5, 8)
-    valid = torch.tensor([[True, False, True, True, False], [False] * 5])
-    found = part(query, key, value, valid)
-    q, k, v = part.query(query)[0], part.key(key)[0], part.value(value)[0]
-    for row in range(3):
-        heads = []
-        for head in (slice(0, 4), slice(4, 8)):
-            scores = [float(q[row, head] @ k[j, head]) / 2.0 for j in (0, 2, 3)]
-            total = sum(map(math.exp, scores))
-            heads.append(sum(math.exp(s) / total * v[j, head] for s, j in zip(scores, (0, 2, 3), strict=True)))
-        torch.testing.assert_close(found[0, row], part.output(torch.cat(heads)))
-    torch.testing.assert_close(found[1], part.output.bias.expand(3, 8))
-    key[:, 1], value[:, 4] = 1e3, -1e3
-    torch.testing.assert_close(part(query, key, value, valid), found)
-
-
-def test_every_layers_boxes_are_relative_to_the_anchors():
-    torch.manual_seed(0)
-    head = SetPredictionHead(QueryHeadConfig(score_threshold=0.0, max_boxes=10), 8, GRID, 1.0)
-    nn.init.constant_(head.box[-1].bias, 0.0)
-    with torch.no_grad():
-        head.box[-1].bias[0] = 3.0
-        head.box[-1].weight.zero_()
-    decoder = PETRDecoder(PETRDecoderConfig(num_layers=3, num_heads=2), 8, GRID)
-    centers = torch.randn(1, 4, 3)
-    queries = Queries.unknown(torch.zeros(1, 4, 8), centers, torch.ones(1, 4, dtype=torch.bool))
-    images = (torch.randn(1, 6, 8), torch.randn(1, 6, 8), torch.ones(1, 6, dtype=torch.bool))
-    layers, _ = decoder(queries, None, images, head)
-    for layer in layers:
-        torch.testing.assert_close(layer.codes[..., :3], centers + torch.tensor([3.0, 0.0, 0.0]))
-    assert not torch.equal(layers[0].logits, layers[2].logits)
+def test_a_points_embedding_is_that_of_the_pixels_that_see_it():
+    """At pixel centres, in one view and in two that overlap; of a point that nothing sees it is zero."""
+    part, batch = embedding(), make_batch()
+    batch.pix_from_aug[:, 2] = batch.pix_from_aug[:, 0]
+    views = views_of(batch)
+    of_pixels, places = part(views), part.places(views)
+    in_one, in_two = places[1, 1, 2, 3, 2], places[1, 0, 1, 4, 3]
+    points = torch.stack([in_one, in_two, torch.tensor([0.0, 0.0, 50.0])])
+    found = part.of_points(points.expand(2, 3, 3), views)[1]
+    torch.testing.assert_close(found[0], of_pixels[1, 1, 2, 3], atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(found[1], 2 * of_pixels[1, 0, 1, 4], atol=1e-3, rtol=1e-3)
+    assert not found[2].any()
+    batch.image_valid[1, 0] = False
+    found = part.of_points(points.expand(2, 3, 3), views_of(batch))[1]
+    torch.testing.assert_close(found[1], of_pixels[1, 0, 1, 4], atol=1e-3, rtol=1e-3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
@@ -62,13 +63,40 @@ class PositionEmbedding(nn.Module):
 
     def forward(self, views: CameraViews) -> Tensor:  # [B, N, h, w, C] float32
         """Of every pixel of the finest level; a missing camera's are finite and say nothing."""
-        with torch.autocast(views.pix_from_aug.device.type, enabled=False):
-            places = self.places(views)
+        return self.embed(self.places(views))
+
+    def of_points(
+        self,
+        points: Tensor,  # [B, Q, 3] aug metres
+        views: CameraViews,
+    ) -> Tensor:  # [B, Q, C] float32
+        """Of the pixel that each point is seen at, summed over the views that see it; zero where none does."""
+        pixels, visible = views.project(points[:, :, None])  # [B, Q, N, 1, 2], [B, Q, N, 1]
+        seen = self.embed(self.on_rays(pixels.squeeze(3), views))  # [B, Q, N, C]
+        return torch.where(visible, seen, 0.0).sum(2)
+
+    def embed(self, places: Tensor) -> Tensor:  # [..., D, 3] aug metres -> [..., C]
+        """The network on logits of normalised coordinates."""
+        with torch.autocast(places.device.type, enabled=False):
             low, size = constant((self.low, self.size), torch.float32, places.device)
             return self.mlp(((places - low) / size).logit(EDGE).flatten(-2))
 
     def places(self, views: CameraViews) -> Tensor:  # [B, N, h, w, D, 3] aug metres
-        """The places at every depth; a ray is straight, so two of them tell all."""
+        """The places at every depth on the ray of each pixel of the finest level."""
         shape = (*views.valid.shape, *views.levels[0].shape[-2:])
         near, far = (views.lift(torch.full(shape, depth, device=views.valid.device)) for depth in (0.0, 1.0))
+        return self.between(near, far)
+
+    def on_rays(
+        self,
+        pixels: Tensor,  # [B, Q, N, 2] (u, v)
+        views: CameraViews,
+    ) -> Tensor:  # [B, Q, N, D, 3] aug metres
+        """The places at every depth on the rays of these pixels."""
+        rays = F.pad(pixels, (0, 1), value=1.0)
+        near, far = (views.lift_pixels(depth * rays) for depth in (0.0, 1.0))
+        return self.between(near, far)
+
+    def between(self, near: Tensor, far: Tensor) -> Tensor:  # [..., 3] at depths 0 and 1 m -> [..., D, 3]
+        """A ray is straight, so two of its places tell all."""
         return near[..., None, :] + self.depths_m[:, None] * (far - near)[..., None, :]

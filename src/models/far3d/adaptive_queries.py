@@ -1,0 +1,92 @@
+"""Far3D's adaptive queries: objects found in the images, lifted to where their depth puts them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from src.errors import ConfigError, require_least
+from src.geometry.bev_grid import BEVGrid
+from src.models.heads.keypoint_head import (
+    CameraKeypointHead,
+    CameraMaps,
+    best_pixels,
+    keypoint_scores,
+    most_likely_depth,
+)
+from src.models.layers.views import CameraViews
+from src.structures.queries import Queries
+from src.targets.depth import lid_centres
+
+
+@dataclass(kw_only=True)
+class AdaptiveQueryConfig:
+    """Settings of the adaptive queries (`model.queries`). Raises ConfigError for values that cannot work."""
+
+    num_proposals: int  # at most, of a frame
+    score_threshold: float  # of a pixel that a query starts at
+    num_depth_bins: int  # D, linearly increasing widths
+    depth_range_m: list[float]  # [nearest, farthest] along the optical axis
+    keypoint_nms_cells: int  # odd window of local maxima in the keypoint map
+
+    def __post_init__(self) -> None:
+        require_least(self, "model.queries", {"num_proposals": 1, "num_depth_bins": 1, "keypoint_nms_cells": 1})
+        low_high = self.depth_range_m
+        if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
+            raise ConfigError(
+                f"model.queries.depth_range_m={low_high}: must be [near, far] in metres with 0 < near < far"
+            )
+        if self.keypoint_nms_cells % 2 == 0:
+            raise ConfigError(f"model.queries.keypoint_nms_cells={self.keypoint_nms_cells}: must be odd")
+        if not 0 < self.score_threshold < 1:
+            raise ConfigError(f"model.queries.score_threshold={self.score_threshold}: must be between 0 and 1")
+
+    @property
+    def depth_range(self) -> tuple[float, float]:
+        """(nearest, farthest) in metres."""
+        return self.depth_range_m[0], self.depth_range_m[1]
+
+
+class AdaptiveQueries(nn.Module):
+    """The best pixels of all views above a score, each at its most likely depth.
+
+    A query's features are told of what the image shows there and of how far its score is above the threshold, in log
+    odds; neither place nor features carry gradient back (public code), the camera losses teach both.
+    """
+
+    def __init__(self, config: AdaptiveQueryConfig, channels: int, image_channels: int, grid: BEVGrid) -> None:
+        super().__init__()
+        self.config, self.grid = config, grid
+        self.head = CameraKeypointHead(image_channels, channels, config.num_depth_bins)
+        self.context = nn.Sequential(nn.Linear(channels + 1, channels), nn.ReLU(), nn.Linear(channels, channels))
+        centres = lid_centres(config.depth_range, config.num_depth_bins)
+        self.register_buffer("depth_centres_m", centres, persistent=False)
+
+    def forward(self, views: CameraViews) -> tuple[Queries, CameraMaps]:
+        """The queries [B, num_proposals] and the maps that they come from."""
+        maps, threshold = self.head(views.levels[0]), self.config.score_threshold
+        with torch.no_grad():
+            depth, _ = most_likely_depth(maps.depth_logits, self.depth_centres_m)
+            places = views.lift(depth)  # [B, N, h, w, 3]
+            inside = self.grid.contains(places[..., :2]) & views.valid[:, :, None, None]
+            scores = keypoint_scores(maps, self.config.keypoint_nms_cells) * inside
+            best, picks = best_pixels(scores, self.config.num_proposals)
+            valid = best > threshold
+            centers, seen = (
+                torch.where(valid[..., None], _at(picks, table), 0.0)
+                for table in (places, maps.features.movedim(2, -1))
+            )
+            odds = torch.where(valid, best.logit(1e-6) - math.log(threshold / (1 - threshold)), 0.0)
+        features = self.context(torch.cat([seen, odds[..., None].to(seen.dtype)], dim=-1))
+        return Queries.unknown(features, centers, valid), maps
+
+
+def _at(
+    picks: Tensor,  # [B, K] int64
+    table: Tensor,  # [B, N, h, w, C]
+) -> Tensor:  # [B, K, C]
+    rows = table.flatten(1, 3)
+    return rows.gather(1, picks[..., None].expand(-1, -1, rows.shape[-1]))

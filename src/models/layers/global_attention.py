@@ -1,0 +1,75 @@
+"""Attention to everything there is, and the decoder layer of queries that is made of it (DETR, PETR)."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from src.models.layers.image_attention import attention_linear
+from src.structures.queries import Queries
+
+FFN_RATIO = 8
+"""2,048 of 256 channels."""
+
+
+class GlobalAttention(nn.Module):
+    """Multi-head attention to all keys that are valid; a sample without any gets zeros before the output layer."""
+
+    def __init__(self, channels: int, num_heads: int) -> None:
+        super().__init__()
+        self.num_heads = num_heads
+        self.query, self.key, self.value, self.output = (attention_linear(channels, channels) for _ in range(4))
+
+    def forward(
+        self,
+        query: Tensor,  # [B, Q, C]
+        key: Tensor,  # [B, G, C]
+        value: Tensor,  # [B, G, C]
+        valid: Tensor,  # [B, G] bool
+    ) -> Tensor:  # [B, Q, C]
+        """What each query gathers."""
+        split = (self.num_heads, -1)
+        parts = (layer(x) for layer, x in ((self.query, query), (self.key, key), (self.value, value)))
+        heads = (x.unflatten(-1, split).transpose(1, 2) for x in parts)
+        some = valid.any(1)[:, None]
+        gathered = F.scaled_dot_product_attention(*heads, attn_mask=(valid | ~some)[:, None, None])
+        return self.output(gathered.transpose(1, 2).flatten(2) * some[..., None])
+
+    def among(
+        self,
+        x: Tensor,  # [B, Q, C]
+        embedding: Tensor,  # [B, Q, C]
+        valid: Tensor,  # [B, Q] bool
+        past: tuple[Tensor, Tensor, Tensor] | None,  # further keys [B, n, C], values [B, n, C], valid [B, n]
+    ) -> Tensor:  # [B, Q, C]
+        """What queries gather from one another and from the past; keys hold their embedding, values do not."""
+        own = (x + embedding, x, valid)
+        if past is not None:
+            own = tuple(torch.cat([one, two.to(one.dtype)], dim=1) for one, two in zip(own, past, strict=True))
+        return self(x + embedding, *own)
+
+
+class GlobalDecoderLayer(nn.Module):
+    """Self-attention, attention to the tokens of a sensor and an MLP, each added and normalised (DETR's order)."""
+
+    def __init__(self, channels: int, num_heads: int) -> None:
+        super().__init__()
+        self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
+        self.self_attention = GlobalAttention(channels, num_heads)
+        self.image_attention = GlobalAttention(channels, num_heads)  # or radar's; checkpoints know the name
+        hidden = FFN_RATIO * channels
+        self.mlp = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), nn.Linear(hidden, channels))
+
+    def forward(
+        self,
+        queries: Queries,
+        embedding: Tensor,  # [B, Q, C]
+        past: tuple[Tensor, Tensor, Tensor] | None,  # further keys [B, n, C], values [B, n, C], valid [B, n]
+        tokens: tuple[Tensor, Tensor, Tensor],  # keys [B, G, C], values [B, G, C], valid [B, G]
+    ) -> Tensor:  # [B, Q, C]
+        """The queries' features after this layer."""
+        x = queries.features
+        x = self.norms[0](x + self.self_attention.among(x, embedding, queries.valid, past))
+        x = self.norms[1](x + self.image_attention(x + embedding, *tokens))
+        return self.norms[2](x + self.mlp(x))

@@ -1,0 +1,203 @@
+"""What detectors whose boxes come from object queries have in common (method 13.2, 13.3)."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Self
+
+import torch
+from torch import Tensor, nn
+
+from src.errors import ConfigError
+from src.geometry.bev_grid import BEVGrid
+from src.losses.loss_weights import LossWeights
+from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
+from src.models.detector import Detector, ModelConfig, Objective
+from src.models.heads.center_head import BoxOptions
+from src.models.heads.keypoint_head import CameraMaps, camera_losses
+from src.models.heads.query_head import QueryHeadConfig, QueryPrediction, SetPredictionHead
+from src.models.layers.views import CameraViews
+from src.models.query_memory import QueryMemory, QueryMemoryConfig, QueryPropagation, RecalledQueries
+from src.structures.batch import FrameBatch
+from src.structures.boxes import Boxes3D
+from src.structures.evidence import Evidence
+from src.structures.queries import Queries
+from src.targets.projection import view_boxes
+from src.targets.supervision import supervised_boxes, upload_boxes
+
+
+@dataclass(kw_only=True)
+class QueryLossConfig(LossWeights):
+    """Weights of the terms (`model.loss`); null switches a term off, uncomputed."""
+
+    class_weight: float | None  # of every layer's queries
+    box_weight: float | None
+
+
+@dataclass(kw_only=True)
+class CameraQueryLossConfig(QueryLossConfig):
+    """Weights of the terms of a model that also finds objects in the images."""
+
+    keypoint_weight: float | None  # of the images
+    depth_weight: float | None
+
+
+@dataclass(kw_only=True)
+class QueryDetectorConfig(ModelConfig):
+    """Settings of the model (`model`). Raises ConfigError for parts that do not go together."""
+
+    temporal_part: ClassVar[str] = "temporal"
+    new_in_temporal_phase: ClassVar[str] = r"temporal\."
+
+    temporal: QueryMemoryConfig | None  # null: single frames, phase 1
+    head: QueryHeadConfig
+    loss: QueryLossConfig
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Both always: without cameras there is nothing to fuse."""
+        return ("camera", "radar")
+
+    @property
+    def image_strides_px(self) -> tuple[int, ...] | None:
+        """Levels of the image pyramid that are used; None: all that the neck offers."""
+        return None
+
+    def scaled(
+        self, gaussians: float = 1.0, memory_frames: int | None = None, cells_per_frame: int | None = None
+    ) -> Self:
+        """Remembered frames: queries are no Gaussians, and of each frame as many are remembered."""
+        if memory_frames is None or self.temporal is None:
+            return self
+        return replace(self, temporal=replace(self.temporal, num_frames=memory_frames) if memory_frames else None)
+
+
+@dataclass
+class QueryOutput:
+    """One frame through the model."""
+
+    layers: list[QueryPrediction]  # of the decoder
+    head: QueryPrediction  # of the layer that boxes are taken from
+    recalled: RecalledQueries | None  # None in phase 1
+
+
+class Answers(NamedTuple):
+    """The fields of `QueryOutput`, in their order."""
+
+    layers: list[QueryPrediction]
+    head: QueryPrediction
+    recalled: RecalledQueries | None
+
+
+class QueryDetector(Detector):
+    """An image encoder, what the family sees and asks, a decoder of queries, and the best of them remembered.
+
+    Raises ConfigError when parts, grid and backbone do not fit.
+    """
+
+    phase_options = BoxOptions
+    latency_parts = {
+        "image_encoder": ("image_encoder.forward",),
+        "temporal_fusion": ("temporal.recall", "temporal.remember"),
+        "detection_head": ("decoder.forward", "head.decode"),
+    }
+
+    def __init__(
+        self, config: QueryDetectorConfig, grid: BEVGrid, backbone: ImageEncoderConfig | None, options: BoxOptions
+    ) -> None:
+        super().__init__()
+        if backbone is None:
+            raise ConfigError(f"backbone=null: the queries of model={config.name} look at images; choose a backbone")
+        self.config, self.grid = config, grid
+        self.image_encoder = ImageEncoder(backbone, config.image_strides_px)
+        self.build()
+        past = config.temporal
+        self.temporal = QueryPropagation(past, config.channels, grid) if past is not None else None
+        self.head = SetPredictionHead(config.head, config.channels, grid, options.velocity_code_weight)
+
+    @abstractmethod
+    def build(self) -> None:
+        """Make `decoder`, called with queries, further ones to look at, what is seen and the head, and what lies
+        before it."""
+
+    def add_anchors(self, count: int) -> None:
+        """Make the learnt places that `anchor_queries` start at."""
+        # In units of the half extent, so that one step of Adam is of the order of a metre; uniform at first (PETR 3.4).
+        self.anchors = nn.Parameter(torch.empty(count, 3).uniform_(-1.0, 1.0))
+        (low, high), z = self.grid.z_range_m, sum(self.grid.z_range_m) / 2
+        extent = torch.tensor([(*self.grid.centre_m, z), (*self.grid.half_extent_m, (high - low) / 2)])
+        self.register_buffer("extent_m", extent, persistent=False)
+
+    def anchor_queries(self, batch_size: int) -> Queries:
+        """Queries at the learnt anchors, whose features begin at zero."""
+        middle, half = self.extent_m.unbind(0)
+        centers = (middle + half * self.anchors).expand(batch_size, -1, -1)
+        features = centers.new_zeros(*centers.shape[:2], self.config.channels)
+        return Queries.unknown(features, centers, torch.ones_like(centers[..., 0], dtype=torch.bool))
+
+    @property
+    def image_backbone(self) -> nn.Module:
+        """Backbone without its neck."""
+        return self.image_encoder.backbone
+
+    @property
+    def answering_layer(self) -> int:
+        """The decoder's layer whose boxes count and whose queries are remembered."""
+        return -1
+
+    def ask(
+        self,
+        batch: FrameBatch,
+        memory: QueryMemory | None,
+        queries: Queries,  # of this frame
+        *seen: Any,  # as the decoder takes it
+    ) -> tuple[Answers, QueryMemory | None]:
+        """What the decoder says to these queries and those of the last frame, and the memory with this frame, detached.
+
+        Raises ValueError for a memory of another number of streams.
+        """
+        if self.temporal is None:
+            layers, _ = self.decoder(queries, None, *seen, self.head)
+            return Answers(layers, layers[self.answering_layer], None), None
+        if memory is not None and memory.frames and memory.batch_size != len(batch):
+            raise ValueError(f"the memory holds {memory.batch_size} streams, but the batch {len(batch)} frames")
+        recalled = self.temporal.recall(memory, batch)
+        queries = Queries.concatenate([queries, recalled.newest])
+        layers, features = self.decoder(queries, recalled.older, *seen, self.head)
+        head, own = layers[self.answering_layer], features[self.answering_layer]
+        return Answers(layers, head, recalled), self.temporal.remember(memory, batch, own, head)
+
+    def restore_memory(self, state: list[dict[str, Any]]) -> QueryMemory:
+        """The memory that `QueryMemory.state` described."""
+        return QueryMemory.from_state(state)
+
+    def loss_terms(self, output: QueryOutput, batch: FrameBatch) -> Objective:
+        """Weighted terms `class` and `box`."""
+        weights = self.config.loss
+        terms, counts = self.head.loss(output.layers, batch.boxes, weights.class_weight, weights.box_weight)
+        return Objective(terms, counts)
+
+    def camera_terms(
+        self, maps: CameraMaps, views: CameraViews, depth_range_m: tuple[float, float], batch: FrameBatch
+    ) -> dict[str, Tensor]:
+        """Weighted terms `keypoint` and `depth`, of a model with `CameraQueryLossConfig`."""
+        wanted = (self.config.loss.keypoint_weight, self.config.loss.depth_weight)
+        if wanted == (None, None):
+            return {}
+        boxes, samples = upload_boxes(*supervised_boxes(batch.boxes, self.grid), device=batch.device)
+        seen = view_boxes(boxes, samples, views.pix_from_aug, views.valid, views.image_size_px)
+        return camera_losses(maps, views, seen, depth_range_m, *wanted)
+
+    def decode(self, output: QueryOutput) -> list[Boxes3D]:
+        """Boxes of each frame, best first."""
+        return self.head.decode(output.head)
+
+    def diagnostics(self, output: QueryOutput) -> dict[str, Tensor | float]:
+        """Queries and what is remembered, per frame."""
+        values = {"queries": output.head.valid.sum() / len(output.head.valid)}
+        return values if output.recalled is None else values | output.recalled.diagnostics()
+
+    def evidence(self, output: QueryOutput) -> Evidence:
+        """Where remembered queries of the first sample are now."""
+        return Evidence() if output.recalled is None else output.recalled.evidence()
