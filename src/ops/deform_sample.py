@@ -8,6 +8,7 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
+from src.ops.fixed_shapes import fixed_shapes
 from src.ops.segment_reduce import inverse_rows, weighted_segment_sum
 from src.ops.sites import Sites
 
@@ -26,6 +27,10 @@ def sample_sparse_bev(
     """
     _check_bev(values, sites, points, batch, grid)
     rows, weights = _corners(sites, points.reshape(-1, 2), batch.reshape(-1), grid)
+    if fixed_shapes() is not None:
+        picks, shares = rows.clamp(min=0), weights * (rows >= 0)
+        sampled = F.embedding_bag(picks, values.to(weights.dtype), mode="sum", per_sample_weights=shares)
+        return sampled.to(values.dtype).view(*points.shape[:-1], values.shape[1])
     present = (rows.reshape(-1) >= 0).nonzero().squeeze(1)
     sampled = weighted_segment_sum(
         values.to(weights.dtype),
@@ -177,10 +182,11 @@ def _corners(
     return torch.where(inside, rows, -1), weights
 
 
-def _row_table(sites: Sites) -> Tensor:  # [B * rows * cols] int64
+def _row_table(sites: Sites) -> Tensor:  # [B * rows * cols + 1] int64
     """Row of every cell of the grid, -1 where absent; made once per set of sites."""
     if "row_table" not in sites.cache:
-        sites.cache["row_table"] = inverse_rows(sites.linear(), max(torch.Size(sites.shape).numel(), 1))
+        # One more, which padding takes in fixed shapes.
+        sites.cache["row_table"] = inverse_rows(sites.linear(), torch.Size(sites.shape).numel() + 1)
     return sites.cache["row_table"]
 
 

@@ -132,15 +132,15 @@ def _take(values: Tensor, rows: Tensor) -> Tensor:
 
 def topk_per_sample(
     scores: Tensor,  # [M]
-    sample: Tensor,  # [M] int64
+    sample: Tensor,  # [M] int64; `batch_size` for padding
     batch_size: int,
     count: int,
 ) -> Tensor:  # [B, count] int64
     """Rows of the highest scores of each sample, best first, ties by row; -1 where a sample has fewer."""
     order, rank = rank_per_sample(scores, sample)
-    rows = order.new_full((batch_size, count + 1), -1)
+    rows = order.new_full((batch_size + 1, count + 1), -1)
     rows[sample[order], rank.clamp(max=count)] = order  # all beyond the last place meet in one column that is dropped
-    return rows[:, :count]
+    return rows[:batch_size, :count]
 
 
 def rank_per_sample(

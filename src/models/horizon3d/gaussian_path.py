@@ -14,7 +14,7 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.time_embedding import TimeEmbedding
-from src.models.memory import motions, moving
+from src.models.memory import Motion, motions, moving
 from src.ops.farthest_point import farthest_points
 from src.structures.batch import FrameBatch
 from src.structures.gaussians import GaussianSet, Source
@@ -106,11 +106,19 @@ class GaussianPath(nn.Module):
         self, frames: list[MemoryFrame], batch: FrameBatch, max_age_s: float, min_speed_mps: float
     ) -> GaussianSet:
         """The Gaussians of T frames in one batch: launches cost more than the arithmetic."""
-        motion = motions(frames, batch, max_age_s)
         sets = [frame.gaussians for frame in frames]
         past = GaussianSet(
             **{field.name: torch.cat([getattr(one, field.name) for one in sets]) for field in fields(GaussianSet)}
-        )  # [T * B, n]
+        )
+        return self.move(past, motions(frames, batch, max_age_s), min_speed_mps)
+
+    def move(
+        self,
+        past: GaussianSet,  # [T * B, n]
+        motion: Motion,  # [T, B]
+        min_speed_mps: float,
+    ) -> GaussianSet:  # [B, T * n]
+        """Remembered Gaussians of T frames as history."""
         elapsed = motion.elapsed_s.flatten()[:, None].expand_as(past.valid)
         if self.config.velocity_compensation:
             past = replace(past, means=past.means + moving(past.velocities, min_speed_mps) * elapsed[..., None])
@@ -125,7 +133,7 @@ class GaussianPath(nn.Module):
             valid=valid,
         )
         # Sample by sample, newest first.
-        return moved.map(lambda value: value.unflatten(0, (len(frames), -1)).transpose(0, 1).flatten(1, 2))
+        return moved.map(lambda value: value.unflatten(0, motion.usable.shape).transpose(0, 1).flatten(1, 2))
 
     def _padding(self, batch_size: int, count: int) -> GaussianSet:
         ones = self.centre_m.new_ones(batch_size, count, 2)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
+from src.ops.fixed_shapes import fixed_shapes
 from src.ops.splat import Splat, splat_gaussians
 from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV
+
+FAR_M = 1e6
+"""Beyond any grid."""
 
 
 @dataclass
@@ -36,7 +40,11 @@ def splat_set(
 ) -> GaussianSplat:
     """Splat the valid Gaussians of every sample."""
     b, g = gaussians.valid.shape
-    picks = gaussians.valid.flatten().nonzero().squeeze(1)  # [V]
+    if fixed_shapes() is None:
+        picks = gaussians.valid.flatten().nonzero().squeeze(1)  # [V]
+    else:  # all of them: padding reaches no cell from where it is
+        picks = torch.arange(b * g, device=gaussians.valid.device)
+        gaussians = replace(gaussians, means=torch.where(gaussians.valid[..., None], gaussians.means, FAR_M))
     flat = {
         name: getattr(gaussians, name).flatten(0, 1).index_select(0, picks)
         for name in ("means", "scales", "directions", "opacity_logits", "features")
