@@ -53,14 +53,13 @@ class FixedShapes:
 
     def distinct(
         self,
-        keys: Tensor,  # [n] int64, any from `end` on is padding
+        keys: Tensor,  # [n] int64, any from `end` on is padding, of which there is some
         end: int,
         most: int,
-    ) -> Tensor:  # [min(n, most) + 1] int64
+    ) -> Tensor:  # [min(n, most + 1)] int64
         """The distinct keys in ascending order, `end` behind them."""
-        behind = constant((torch.iinfo(torch.int64).max,), torch.int64, keys.device)
-        ordered = torch.cat([keys.sort().values, behind])
-        last = self.places(ordered[:-1] != ordered[1:], min(most, len(keys)) + 1)  # the largest equal key's
+        ordered = keys.sort().values
+        last = self.places(ordered[:-1] != ordered[1:], min(most + 1, len(keys)))  # the last of equal ones
         found = ordered.index_select(0, last).clamp_(max=end)
         self.expect(found[-1:], end)
         return found

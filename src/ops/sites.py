@@ -186,7 +186,7 @@ def rows_of_keys(
 
 
 def padded_sites(
-    keys: Tensor,  # [n] int64, any order, repeats allowed; those from `end` on are padding
+    keys: Tensor,  # [n] int64, any order, repeats allowed; those from `end` on, of which there are some, are padding
     shape: tuple[int, ...],
 ) -> Sites:
     """The sites of these keys in fixed shapes."""

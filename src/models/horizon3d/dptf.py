@@ -113,7 +113,7 @@ class DPTF(nn.Module):
         if self.bev_path is not None:
             cells = self.bev_path.store(fused, output.cells, batch)
         if self.gaussian_path is not None:
-            gaussians = self.choose_gaussians(batch, fused, output, ocsf)
+            gaussians = self.gaussian_path.store(*self.candidates(fused, output, ocsf), batch)
         frame = MemoryFrame(
             batch.timestamps_s,
             batch.global_from_ego,
@@ -124,15 +124,15 @@ class DPTF(nn.Module):
         paths = (self.config.bev_path, self.config.gaussian_path)
         return past.push(frame, *(path.num_frames if path is not None else 0 for path in paths))
 
-    def choose_gaussians(
-        self, batch: FrameBatch, fused: SparseBEV, output: DPTFOutput, ocsf: OCSFOutput
-    ) -> GaussianSet:  # [B, gaussians_per_frame]
-        """Those of the frame that its Gaussian path remembers."""
+    def candidates(
+        self, fused: SparseBEV, output: DPTFOutput, ocsf: OCSFOutput
+    ) -> tuple[GaussianSet, Tensor]:  # G_L, [B, G] bool
+        """The Gaussians of a frame as they are remembered, and which of them are active."""
         active = ocsf.splat.active(self.config.gaussian_path.min_contribution)
         gaussians = ocsf.gaussians
         if self.config.gaussian_path.velocity_from is VelocityFrom.cells:
             gaussians = _with_cell_velocities(gaussians, ocsf.splat.peak_cells, fused, output.cells)
-        return self.gaussian_path.store(gaussians, active, batch)
+        return gaussians, active
 
 
 def _with_cell_velocities(

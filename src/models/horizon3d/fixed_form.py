@@ -43,8 +43,8 @@ class FixedHorizon3D(nn.Module):
 
     def fitted(self, frame: FrameBatch) -> FrameBatch | None:
         """The frame with as many points as there is room for; None where it has more."""
-        missing = self.capacities.points - len(frame.radar_points)
-        if missing < 0:
+        missing = self.capacities.points + 1 - len(frame.radar_points)  # at least one is padding
+        if missing < 1:
             return None
         read = ("timestamps_s", "global_from_ego", "aug_from_ego")
         views = ("images", "image_valid", "pix_from_aug") if self.model.image_encoder is not None else ()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -23,8 +23,8 @@ from src.structures.sparse_bev import SparseBEV
 FRAME_WIDTH = 20
 """Of a frame: time (s), pose [4, 4], and whether there is one, its cells and its Gaussians."""
 CELL_WIDTH, GAUSSIAN_WIDTH = 5, 10
-"""Beside the features: position 2, velocity 2, whether there is one; mean, scales, direction, velocity 2 each, opacity
-logit, whether there is one."""
+"""Beside the features, which come before the last: position 2, velocity 2, whether there is one; mean, scales,
+direction, velocity 2 each, opacity logit, whether there is one."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ class FixedMemory:
                 continue
             cells = gaussians = None
             if has_cells:
-                kept = self.cells[age][self.cells[age, :, 4] > 0]
-                xy, velocities, _, features = kept.split([2, 2, 1, kept.shape[1] - CELL_WIDTH], dim=1)
+                kept = self.cells[age][self.cells[age, :, -1] > 0]
+                xy, velocities, features, _ = kept.split([2, 2, kept.shape[1] - CELL_WIDTH, 1], dim=1)
                 cells = StoredCells(xy, velocities, features, torch.zeros_like(xy[:, 0], dtype=torch.int64))
             if has_gaussians:
                 gaussians = _gaussians_of(self.gaussians[age : age + 1])
@@ -106,7 +106,7 @@ class FixedMemory:
     def _warped(self, path: BEVPath, kept: Tensor, motion: Motion, min_speed_mps: float) -> WarpedCells:
         """As `BEVPath.recall`; cells that are not there lie in a sample that does not exist."""
         num, width = len(self.cells), self.cells.shape[2]
-        xy, velocities, valid, features = self.cells.split([2, 2, 1, width - CELL_WIDTH], dim=2)  # [T, K, ...] each
+        xy, velocities, features, valid = self.cells.split([2, 2, width - CELL_WIDTH, 1], dim=2)  # [T, K, ...] each
         matrix, elapsed = motion.aug_from_past[:num], motion.elapsed_s[:num]  # [T, 1, 4, 4], [T, 1]
         if path.config.velocity_compensation:
             xy = xy + moving(velocities, min_speed_mps) * elapsed[:, :, None]
@@ -143,8 +143,8 @@ class FixedMemory:
             best = _best_cells(dptf.bev_path, output.fused_bev, output.dptf.cells, cells.shape[1])
             cells = _taken(best, cells, order)
         if dptf.gaussian_path is not None:
-            chosen = dptf.choose_gaussians(batch, output.fused_bev, output.dptf, output.ocsf)
-            gaussians = _taken(_gaussian_rows(chosen), gaussians, order)
+            candidates = dptf.candidates(output.fused_bev, output.dptf, output.ocsf)
+            gaussians = _taken(_chosen_gaussians(dptf.gaussian_path, *candidates, batch), gaussians, order)
         return FixedMemory(frames, cells, gaussians)
 
 
@@ -167,26 +167,38 @@ def _best_cells(
     features = fused.features
     if torch.is_autocast_enabled(features.device.type):
         features = features.to(torch.get_autocast_dtype(features.device.type))
-    columns = (path.grid.centre_of(fused.indices[:, 1:]), cells.velocities, chosen[:, None].float(), features.float())
+    columns = (path.grid.centre_of(fused.indices[:, 1:]), cells.velocities, features.float(), chosen[:, None].float())
     rows = torch.cat(columns, dim=1).index_select(0, best)
     return F.pad(rows, (0, 0, 0, count - len(rows)))[None] if len(rows) < count else rows[None]
 
 
 def _cell_rows(cells: StoredCells) -> Tensor:  # [n, CELL_WIDTH + C]
-    return torch.cat([cells.xy, cells.velocities, torch.ones_like(cells.xy[:, :1]), cells.features.float()], dim=1)
+    return torch.cat([cells.xy, cells.velocities, cells.features.float(), torch.ones_like(cells.xy[:, :1])], dim=1)
+
+
+def _chosen_gaussians(
+    path: GaussianPath, gaussians: GaussianSet, active: Tensor, batch: FrameBatch
+) -> Tensor:  # [1, n, GAUSSIAN_WIDTH + C]
+    """As `GaussianPath.store`, of a frame that is not augmented."""
+    picks = path.sample(gaussians, active, batch)[0]
+    features = gaussians.features
+    if torch.is_autocast_enabled(features.device.type):
+        features = features.to(torch.get_autocast_dtype(features.device.type))
+    rows = _gaussian_rows(replace(gaussians, features=features))[0].index_select(0, picks.clamp(min=0))
+    return torch.cat([rows[:, :-1], (picks >= 0).float()[:, None]], dim=1)[None]
 
 
 def _gaussian_rows(gaussians: GaussianSet) -> Tensor:  # [B, n, GAUSSIAN_WIDTH + C]
-    single = (gaussians.opacity_logits[..., None], gaussians.valid[..., None].float())
     pairs = (gaussians.means, gaussians.scales, gaussians.directions, gaussians.velocities)
-    return torch.cat([*pairs, *single, gaussians.features.float()], dim=2)
+    rest = (gaussians.opacity_logits[..., None], gaussians.features.float(), gaussians.valid[..., None].float())
+    return torch.cat([*pairs, *rest], dim=2)
 
 
 def _gaussians_of(
     rows: Tensor,  # [T, n, GAUSSIAN_WIDTH + C]
 ) -> GaussianSet:  # [T, n]
-    widths = [2, 2, 2, 2, 1, 1, rows.shape[2] - GAUSSIAN_WIDTH]
-    means, scales, directions, velocities, opacity, valid, features = rows.split(widths, dim=2)
+    widths = [2, 2, 2, 2, 1, rows.shape[2] - GAUSSIAN_WIDTH, 1]
+    means, scales, directions, velocities, opacity, features, valid = rows.split(widths, dim=2)
     return GaussianSet(
         means=means,
         scales=scales,

@@ -208,8 +208,9 @@ class SelfEncoding(nn.Module):
         valid, (b, g) = gaussians.valid[..., None], gaussians.valid.shape
         sample = torch.arange(b, device=valid.device).view(b, 1, 1)
         indices = torch.cat([torch.where(valid, sample, b), self.grid.cell_of(gaussians.means)], dim=2)
-        sites, rows = Sites.unique(indices.flatten(0, 1), (b, *self.grid.cells))
-        return self._exchange(features.flatten(0, 1), sites, rows).unflatten(0, (b, g)) * valid
+        indices = F.pad(indices.flatten(0, 1), (0, 0, 0, 1), value=b)  # one more, which is padding in any case
+        sites, rows = Sites.unique(indices, (b, *self.grid.cells))
+        return self._exchange(features.flatten(0, 1), sites, rows[:-1]).unflatten(0, (b, g)) * valid
 
     def _exchange(
         self,

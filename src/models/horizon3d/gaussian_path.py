@@ -158,7 +158,7 @@ class GaussianPath(nn.Module):
         batch: FrameBatch,
     ) -> GaussianSet:  # [B, gaussians_per_frame] in the unaugmented ego frame
         """A subset of the active Gaussians of any source; padding where fewer are active."""
-        picks = self._sample(gaussians, active & gaussians.valid, batch)  # [B, K], -1 for none
+        picks = self.sample(gaussians, active, batch)
         rows = picks.clamp(min=0)
         chosen = gaussians.map(lambda value: _gather(value.detach(), rows))
         ego = chosen.transform(torch.linalg.inv_ex(batch.aug_from_ego).inverse)
@@ -167,8 +167,14 @@ class GaussianPath(nn.Module):
             features = features.to(torch.get_autocast_dtype(features.device.type))
         return replace(ego, features=features, valid=picks >= 0)
 
-    def _sample(self, gaussians: GaussianSet, active: Tensor, batch: FrameBatch) -> Tensor:
-        count = self.config.gaussians_per_frame
+    def sample(
+        self,
+        gaussians: GaussianSet,
+        active: Tensor,  # [B, G] bool
+        batch: FrameBatch,
+    ) -> Tensor:  # [B, gaussians_per_frame] int64, -1 for none
+        """Which of the active Gaussians are remembered."""
+        count, active = self.config.gaussians_per_frame, active & gaussians.valid
         opacity = gaussians.opacity_logits.detach()
         if self.config.sampling is Sampling.farthest_point:
             start = torch.where(active, opacity, -torch.inf).argmax(dim=1)
