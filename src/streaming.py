@@ -17,7 +17,9 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.deploy.inference import prepare_for_inference
 from src.models.deploy.static_parts import compile_static_parts, replay_image_encoder
+from src.models.deploy.whole_frames import WholeFrames
 from src.models.detector import Detector
+from src.ops.fixed_shapes import Capacities
 from src.ops.precision import Precision, computing
 from src.reliability.checkpoints import read_checkpoint
 from src.structures.batch import FrameBatch
@@ -51,13 +53,19 @@ class StreamingDetector:
         plain: bool = False,
         compiled: bool = False,
         cuda_graph: bool = False,
+        capacities: Capacities | None = None,
     ) -> None:
         """`model` is a trained one, of which a copy is prepared for inference, or that of another detector.
 
         `device` None is where the model is. `precision` (see `Precision`) None is float32, or what the model is
         prepared for. `plain` runs the model itself, in evaluation mode and as it was trained: slower, the same boxes up
         to rounding. `compiled` compiles the parts of fixed shape, which takes a minute at the first frames and pays on
-        a GPU; `cuda_graph` runs the image encoder as one CUDA graph, on a CPU it changes nothing.
+        a GPU.
+
+        `cuda_graph` makes `step` replay one CUDA graph, for a model that has a form of fixed shapes (Horizon3D); of
+        others the image encoder is one. On a CPU it changes nothing. A frame that exceeds a capacity of the fixed
+        shapes is detected without them; `whole_frames` counts such frames. `capacities` are others than the model's
+        own, and make `step` use fixed shapes on any device.
 
         Raises ConfigError for a device that is not there or switches that do not go together, ValueError for a model
         that is prepared for another precision.
@@ -65,12 +73,13 @@ class StreamingDetector:
         self.device = next(model.parameters()).device if device is None else torch.device(device)
         if self.device.type == "cuda" and not torch.cuda.is_available():
             raise ConfigError(f"device={device}: torch sees no GPU on this machine; use device=cpu")
-        if plain and (compiled or cuda_graph):
-            raise ConfigError("plain=True runs the model as trained; compiled and cuda_graph need it prepared")
+        if plain and (compiled or cuda_graph or capacities):
+            raise ConfigError("plain=True runs the model as trained; the other switches need it prepared")
         prepared = model.prepared_for
-        if prepared is not None and (plain or compiled or cuda_graph):
+        if prepared is not None and (plain or compiled or cuda_graph or capacities):
             raise ConfigError(
-                "plain, compiled and cuda_graph are for a trained model; that of another detector runs as it does there"
+                "plain, compiled, cuda_graph and capacities are for a trained model; "
+                "that of another detector runs as it does there"
             )
         if precision is None:
             precision = prepared or Precision.FULL
@@ -78,15 +87,35 @@ class StreamingDetector:
             raise ValueError(f"the model is prepared for precision={prepared}, but {precision} was asked for")
         if prepared is None and not plain:
             model = prepare_for_inference(model, precision)
-            if cuda_graph:
-                replay_image_encoder(model)
-            if compiled:
-                compile_static_parts(model)
         self.model = model.to(self.device).eval()
+        captured = cuda_graph and self.device.type == "cuda"
+        form = self.model.fixed_form(capacities) if captured or capacities else None
+        if capacities is not None and form is None:
+            raise ConfigError("capacities: this model has no form of fixed shapes as it is configured; leave them out")
+        if cuda_graph and form is None:
+            replay_image_encoder(self.model)
+        if compiled:
+            compile_static_parts(self.model)
+        self.whole_frames: WholeFrames | None = None
+        if form is not None:
+            with torch.inference_mode():
+                self.whole_frames = WholeFrames(form, self.device, captured)
         self.grid = grid
         self.settings = settings
         self.precision = precision
-        self.memory: Any = None
+        self._memory: Any = None
+
+    @property
+    def memory(self) -> Any:
+        """What is remembered, as the model takes it; None for nothing."""
+        return self._memory if self.whole_frames is None else self.whole_frames.memory
+
+    @memory.setter
+    def memory(self, memory: Any) -> None:
+        if self.whole_frames is None:
+            self._memory = memory
+        else:
+            self.whole_frames.memory = memory
 
     @classmethod
     def load(cls, checkpoint: Path | str, device: torch.device | str = "cpu", **switches: bool) -> Self:
@@ -132,18 +161,27 @@ class StreamingDetector:
 
         Raises ValueError for a batch that is not one frame, is augmented, or lacks what the model reads.
         """
+        if self.whole_frames is not None:
+            self._begin(frame)
+            with torch.inference_mode(), computing(self.precision, self.device):
+                boxes = self.whole_frames.step(frame)
+            if boxes is not None:
+                return boxes
         return self.run(frame)[0].to("cpu")
 
     @torch.inference_mode()
     def run(self, frame: FrameBatch) -> tuple[Boxes3D, Any]:
-        """As `step`, with the model's own output beside the boxes, both on the detector's device."""
-        self._check(frame)
-        if frame.starts is not None and bool(frame.starts[0]):
-            self.reset()
+        """As `step`, never in fixed shapes, with the model's own output beside the boxes, both on the device."""
+        self._begin(frame)
         with computing(self.precision, self.device):
             output, self.memory = self.model(frame.to(self.device), self.memory)
             (boxes,) = self.model.decode(output)
         return boxes, output
+
+    def _begin(self, frame: FrameBatch) -> None:
+        self._check(frame)
+        if frame.starts is not None and bool(frame.starts[0]):
+            self.reset()
 
     def _check(self, frame: FrameBatch) -> None:
         if len(frame) != 1:

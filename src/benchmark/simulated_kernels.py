@@ -21,6 +21,7 @@ from torch import Tensor
 from src.benchmark.simulated_device import SimTensor, count_launch, host_values
 from src.geometry.bev_grid import BEVGrid
 from src.ops import backend
+from src.ops.deform_sample import attend_cells_reference, attend_views_reference
 from src.ops.farthest_point import farthest_points_reference
 from src.ops.moved_keys import moved_keys_reference
 from src.ops.neighbour_table import neighbour_table_reference, turned_table_reference
@@ -94,10 +95,24 @@ def _move(keys: Tensor, plan: Tensor, taps: Tensor, out: Tensor, num: int, old_s
 def _nearest_radial(
     velocities: Tensor, cells: Tensor, keys: Tensor, measured: Tensor, out: Tensor, *rest: float
 ) -> None:
-    rows, cols, x_min, y_min, cell_m = rest[3:8]
+    out.copy_(radial_change_reference(velocities, cells, keys, measured, _grid(*rest[3:8])))
+
+
+def _attend_cells(
+    values: Tensor, table: Tensor, points: Tensor, batch: Tensor, weights: Tensor, out: Tensor, *rest: float
+) -> None:
+    out.copy_(attend_cells_reference(values, table, points, batch, weights, _grid(*rest[3:8])))
+
+
+def _attend_level(
+    image: Tensor, places: Tensor, weights: Tensor, out: Tensor, level: int, levels: int, *sizes: int
+) -> None:
+    out += attend_views_reference([image], places, weights[:, :, :, :, level : level + 1])
+
+
+def _grid(rows: int, cols: int, x_min: float, y_min: float, cell_m: float) -> BEVGrid:
     centre = (x_min + 0.5 * cols * cell_m, y_min + 0.5 * rows * cell_m)
-    grid = BEVGrid(cells=(rows, cols), cell_m=cell_m, centre_m=centre, z_range_m=(0.0, 1.0))
-    out.copy_(radial_change_reference(velocities, cells, keys, measured, grid))
+    return BEVGrid(cells=(rows, cols), cell_m=cell_m, centre_m=centre, z_range_m=(0.0, 1.0))
 
 
 def _gather_product(
@@ -148,6 +163,8 @@ def _segment_sum(values: Tensor, starts: Tensor) -> Tensor:
 
 
 KERNELS: dict[str, Callable[..., None] | None] = {
+    "_attend_cells": _attend_cells,
+    "_attend_level": _attend_level,
     "_sample": _sample,
     "_move": _move,
     "_nearest_radial": _nearest_radial,

@@ -16,6 +16,9 @@ from src.benchmark.scenes import Highway, highway_frame, highway_points
 from src.benchmark.simulated_device import DEVICE, SimulatedDevice, Tally
 from src.benchmark.simulated_kernels import simulated_kernels
 from src.config import Config
+from src.models.deploy.whole_frames import WholeFrames
+from src.ops.fixed_shapes import Capacities
+from src.ops.precision import computing
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CLASSES
@@ -25,6 +28,8 @@ IMAGE_SIZE_PX = (64, 128)
 """Few points and pixels: what is counted follows the code and hardly the values."""
 NUM_BOXES = 24
 SHOWN_PLACES = 12
+FIXED = "a frame in fixed shapes"
+ROOM = Capacities(points=1000, voxels=30000, cells=30000, pairs=150000)
 CPU = torch.device("cpu")
 
 
@@ -33,6 +38,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     case = make_case(config)
     frame, frame_parts = count(case, case.prepared, case.infer)
     step, step_parts = count(case, case.model, case.step)
+    fixed = count_in_fixed_shapes(case)
     return {
         "notes": [
             f"{config.model.name}, scale {config.scale}, {config.phase.name}, batch {len(case.batch)}, "
@@ -42,8 +48,11 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
             "Launches are operations that run on the device, factories included; a sort counts as one. Waits are the "
             "times that the host stands still for a value, a size or a blocking copy; dispatches all calls of torch, "
             "views included. A part within another is counted in both; the backward pass stands in its own row.",
+            "In fixed shapes a frame comes from the host in one upload, and its boxes return in one copy, the wait; "
+            f"memory and decoding stand in the rest. Counted with {ROOM}; the count does not depend on them.",
         ],
         "a frame": part_rows(frame, frame_parts),
+        **({} if fixed is None else {FIXED: part_rows(*fixed)}),
         "a training step": part_rows(step, step_parts),
         "places with most launches": place_rows(frame, step, "launches"),
         "places with waits": place_rows(frame, step, "waits"),
@@ -110,30 +119,54 @@ def made_boxes(seed: int) -> Boxes3D:
 
 def count(case: Case, model: torch.nn.Module, run: Callable[[], Any]) -> tuple[Tally, dict[str, Counter[str]]]:
     """The tally of a run on the simulated device, and that of each part; the case is on the CPU again afterwards."""
-    parts = parts_of(case.model)
-    found: dict[str, Counter[str]] = {}
     with SimulatedDevice() as tally, simulated_kernels():
         held = (case.model, case.prepared, case.batch, case.memory, case.device)
         moved = on_simulated_device(model)
         case.model = case.prepared = moved
         case.batch, case.memory = case.batch.to(DEVICE), case.memory and case.memory.to(DEVICE)
         case.device = torch.device(DEVICE)
-        run()  # fills the caches of constants
-        tally.__init__()
-
-        def counted(name: str, path: str, function: Callable[..., Any]) -> Callable[..., Any]:
-            def call(*arguments: Any, **named: Any) -> Any:
-                before = tally.totals()
-                result = function(*arguments, **named)
-                found.setdefault(name, Counter()).update(Counter(tally.totals()) - Counter(before))
-                return result
-
-            return call
-
-        with wrapped_parts(moved, parts, counted):
-            run()
+        parts = count_parts(tally, moved, parts_of(held[0]), run)
         case.model, case.prepared, case.batch, case.memory, case.device = held
-    return tally, found
+    return tally, parts
+
+
+def count_in_fixed_shapes(case: Case) -> tuple[Tally, dict[str, Counter[str]]] | None:
+    """The same of a frame that lies on the host, to its boxes there; None for a model that has no such form."""
+    if case.prepared.fixed_form() is None:
+        return None
+    frame = made_batch(1, ROAD, tuple(case.batch.images.shape[-2:]) if case.batch.images is not None else IMAGE_SIZE_PX)
+    with (
+        SimulatedDevice() as tally,
+        simulated_kernels(),
+        torch.no_grad(),
+        computing(case.precision, torch.device(DEVICE)),
+    ):
+        moved = on_simulated_device(case.prepared)
+        whole = WholeFrames(moved.fixed_form(ROOM), torch.device(DEVICE), captured=False)
+        parts = count_parts(tally, moved, parts_of(case.model), lambda: whole.step(frame))
+    return tally, parts
+
+
+def count_parts(
+    tally: Tally, model: torch.nn.Module, parts: dict[str, tuple[str, ...]], run: Callable[[], Any]
+) -> dict[str, Counter[str]]:
+    """The tally of each part of a run, which that of all is afterwards."""
+    found: dict[str, Counter[str]] = {}
+
+    def counted(name: str, path: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **named: Any) -> Any:
+            before = tally.totals()
+            result = function(*arguments, **named)
+            found.setdefault(name, Counter()).update(Counter(tally.totals()) - Counter(before))
+            return result
+
+        return call
+
+    run()  # fills the caches of constants
+    tally.__init__()
+    with wrapped_parts(model, parts, counted):
+        run()
+    return found
 
 
 def on_simulated_device(model: torch.nn.Module) -> torch.nn.Module:

@@ -24,10 +24,19 @@ def window_cells(
     Returns (window, row, col), ordered by window and row-major within. Windows outside the grid and NaN windows have no
     cells that any sensible test would keep.
     """
+    return enumerate_windows(*window_corners(centres, half_extents, grid))
+
+
+def window_corners(
+    centres: Tensor,  # [n, 2] (x, y) in cells
+    half_extents: Tensor,  # [n, 2] (x, y) in cells, not negative
+    grid: BEVGrid,
+) -> tuple[Tensor, Tensor]:  # [n, 2] int64 (col, row) each
+    """First and last cell of the windows of `window_cells`."""
     limit = constant((grid.cols, grid.rows), torch.int64, centres.device)
     low = torch.maximum((centres - half_extents).ceil(), torch.zeros_like(centres)).minimum(limit).long()  # [n, 2]
     high = torch.maximum((centres + half_extents).floor(), -torch.ones_like(centres)).minimum(limit - 1).long()
-    return enumerate_windows(low, high)
+    return low, high
 
 
 def cells_in_boxes(

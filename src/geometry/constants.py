@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 Values = tuple[float | int | bool, ...] | tuple[tuple[float | int | bool, ...], ...]
 
 
-@lru_cache(maxsize=256)
+@cache  # for good: a captured CUDA graph reads them
 def constant(values: Values, dtype: torch.dtype, device: torch.device) -> Tensor:
     """The tensor of these values; the same object every time, so nobody may write into it."""
     with torch.inference_mode(False):  # made in a validation, it must still serve a backward pass

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from src.geometry.constants import on_device
+from src.ops.fixed_shapes import Capacities
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
@@ -88,6 +89,25 @@ class TemporalMemory(Protocol):
         """Tensors and plain containers, for a checkpoint; `Detector.restore_memory` reads them."""
 
 
+class FixedForm(Protocol):
+    """A frame of one stream by a detector in fixed shapes (`ops/fixed_shapes.py`), which always launches the same."""
+
+    def fitted(self, frame: FrameBatch) -> FrameBatch | None:
+        """The frame, not augmented, in the form of all others; None where it is too large."""
+
+    def __call__(self, frame: FrameBatch, memory: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """A result of one tensor, and the memory with the frame added; as it was where the frame has overflowed."""
+
+    def boxes(self, result: Tensor) -> Boxes3D | None:
+        """Boxes of a result on the CPU, best first; None where the frame has overflowed."""
+
+    def pack_memory(self, memory: Any, device: torch.device) -> tuple[Tensor, ...]:
+        """What `forward` of the detector remembers of one stream, None for nothing, in fixed shapes."""
+
+    def unpack_memory(self, memory: tuple[Tensor, ...]) -> Any:
+        """And back, for `forward`. Waits for a GPU."""
+
+
 class Objective(NamedTuple):
     """What a training step minimises, and what it shows besides."""
 
@@ -128,6 +148,10 @@ class Detector(nn.Module, ABC):
         `memory` is what the call for the previous frames of the same streams returned, row by row (see
         `TemporalMemory.select`); None where there is none. A detector of single frames takes and returns None.
         """
+
+    def fixed_form(self, capacities: Capacities | None = None) -> FixedForm | None:
+        """How a frame runs in fixed shapes, None without; capacities None are the detector's own."""
+        return None
 
     def transition(self, batch: FrameBatch, memory: Any) -> Any:
         """The memory that `forward` gives, not detached; asked for where `trains_last_transition`."""

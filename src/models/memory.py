@@ -51,7 +51,20 @@ class RememberedFrame(TensorFields):
         Not usable: an absent stream, a frame that is not in the past or older than `max_age_s`, a pose that jumped.
         """
         ego_from_past, elapsed, driven = self._relative_pose(batch)
-        usable = self.present & driven & (elapsed <= max_age_s)
+        return self._usable_motion(batch, ego_from_past, elapsed, self.present & driven & (elapsed <= max_age_s))
+
+    def stacked_motion(self, batch: FrameBatch, max_age_s: float) -> tuple[Tensor, Motion]:
+        """Of T frames in one, newest first, each tensor with a leading axis [T]: which of them `FrameMemory.before`
+        keeps for a stream [T, B] bool, and the `motion` of those.
+        """
+        ego_from_past, elapsed, driven = self._relative_pose(batch)
+        past = self.present & (elapsed > 0)
+        kept = past & ~(past & ~driven)[:1]  # the newest tells whether the pose jumped
+        usable = kept & driven & (elapsed <= max_age_s)
+        return kept, self._usable_motion(batch, ego_from_past, elapsed, usable)
+
+    @staticmethod
+    def _usable_motion(batch: FrameBatch, ego_from_past: Tensor, elapsed: Tensor, usable: Tensor) -> Motion:
         matrix = batch.aug_from_ego.double() @ ego_from_past
         # What is not usable must not carry NaN or huge numbers into arithmetic that is masked afterwards.
         matrix = torch.where(usable[..., None, None], matrix, torch.eye(4, dtype=matrix.dtype, device=matrix.device))

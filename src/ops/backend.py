@@ -20,6 +20,8 @@ VARIABLE = "HORIZON3D_OPS"
 INTERPRETER = "TRITON_INTERPRET"
 # Modules with an operation's kernel, imported when it first runs in that backend: Triton is a large import.
 KERNELS = {
+    "attend_cells": "src.ops.kernels.attend_cells_triton",
+    "attend_views": "src.ops.kernels.attend_views_triton",
     "farthest_points": "src.ops.kernels.farthest_point_triton",
     "moved_keys": "src.ops.kernels.moved_keys_triton",
     "neighbour_table": "src.ops.kernels.neighbour_table_triton",

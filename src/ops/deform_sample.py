@@ -8,6 +8,8 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
+from src.ops.backend import implementation
+from src.ops.fixed_shapes import fixed_shapes
 from src.ops.segment_reduce import inverse_rows, weighted_segment_sum
 from src.ops.sites import Sites
 
@@ -25,7 +27,7 @@ def sample_sparse_bev(
     reach the values and the points. Computed in float32 at least, returned in the type of the values.
     """
     _check_bev(values, sites, points, batch, grid)
-    rows, weights = _corners(sites, points.reshape(-1, 2), batch.reshape(-1), grid)
+    rows, weights = _corners(_row_table(sites), points.reshape(-1, 2), batch.reshape(-1), grid)
     present = (rows.reshape(-1) >= 0).nonzero().squeeze(1)
     sampled = weighted_segment_sum(
         values.to(weights.dtype),
@@ -54,11 +56,33 @@ def deform_attend_bev(
             "expected values [M, heads, c], points [Q, P, 2] and weights [Q, heads, P], got "
             f"{list(values.shape)}, {list(points.shape)} and {list(weights.shape)}"
         )
+    if not torch.is_grad_enabled() and (values.device.type != "cpu" or fixed_shapes() is not None):
+        _check_bev(values, sites, points, batch[:, None].expand(points.shape[:2]), grid)
+        return implementation(attend_cells_reference)(values, _row_table(sites), points, batch, weights, grid)
     queries, num_points, _ = points.shape
     # Whole rows once, then the heads: fewer, wider segments than one per head.
     sampled = sample_sparse_bev(
         values.flatten(1), sites, points, batch[:, None].expand(queries, num_points), grid
     )  # [Q, P, C]
+    by_head = sampled.view(queries, num_points, *values.shape[1:])
+    return (by_head * weights.transpose(1, 2).unsqueeze(3)).sum(1).flatten(1)
+
+
+def attend_cells_reference(
+    values: Tensor,  # [M, heads, C / heads]
+    table: Tensor,  # [B * rows * cols (+ 1)] int64, row of every cell, -1 where absent
+    points: Tensor,  # [Q, P, 2] (x, y) metres
+    batch: Tensor,  # [Q] int64
+    weights: Tensor,  # [Q, heads, P]
+    grid: BEVGrid,
+) -> Tensor:  # [Q, C]
+    """`deform_attend_bev` without gradient, whose shapes do not depend on what the points meet."""
+    queries, num_points, _ = points.shape
+    if len(values) == 0:
+        return weights.new_zeros(queries, values.shape[1] * values.shape[2])
+    rows, shares = _corners(table, points.flatten(0, 1), batch.repeat_interleave(num_points), grid)
+    rows, shares = rows.clamp(min=0), torch.where(rows >= 0, shares, 0.0)
+    sampled = F.embedding_bag(rows, values.flatten(1).to(shares.dtype), mode="sum", per_sample_weights=shares)
     by_head = sampled.view(queries, num_points, *values.shape[1:])
     return (by_head * weights.transpose(1, 2).unsqueeze(3)).sum(1).flatten(1)
 
@@ -102,11 +126,12 @@ def _attend_images(
     if pixels.device.type == "cpu":
         out = _sum_by_image(images, places, weights, seen)
     else:
-        out = _sum_of_all_images(images, places, weights)
+        attend = attend_views_reference if torch.is_grad_enabled() else implementation(attend_views_reference)
+        out = attend(images, places, weights)
     return out.to(values[0].dtype)
 
 
-def _sum_of_all_images(
+def attend_views_reference(
     images: list[Tensor],  # per level [B * N, heads * c, H_l, W_l]
     places: Tensor,  # [B * N, Q, P, 2] in -1..1 of the image
     weights: Tensor,  # [B, Q, heads, N, L, P]
@@ -152,7 +177,7 @@ def _sum_by_image(
 
 
 def _corners(
-    sites: Sites,
+    table: Tensor,  # of `_row_table`
     points: Tensor,  # [n, 2]
     batch: Tensor,  # [n]
     grid: BEVGrid,
@@ -173,14 +198,15 @@ def _corners(
     inside = ((row >= 0) & (row < grid.rows)).unsqueeze(2) & ((col >= 0) & (col < grid.cols)).unsqueeze(1)
     linear = (batch[:, None] * grid.rows + row).unsqueeze(2) * grid.cols + col.unsqueeze(1)
     inside, linear = inside.flatten(1), linear.flatten(1)
-    rows = _row_table(sites).index_select(0, torch.where(inside, linear, 0).flatten()).view_as(linear)
+    rows = table.index_select(0, torch.where(inside, linear, 0).flatten()).view_as(linear)
     return torch.where(inside, rows, -1), weights
 
 
-def _row_table(sites: Sites) -> Tensor:  # [B * rows * cols] int64
+def _row_table(sites: Sites) -> Tensor:  # [B * rows * cols + 1] int64
     """Row of every cell of the grid, -1 where absent; made once per set of sites."""
     if "row_table" not in sites.cache:
-        sites.cache["row_table"] = inverse_rows(sites.linear(), max(torch.Size(sites.shape).numel(), 1))
+        # One more, which padding takes in fixed shapes.
+        sites.cache["row_table"] = inverse_rows(sites.linear(), torch.Size(sites.shape).numel() + 1)
     return sites.cache["row_table"]
 
 

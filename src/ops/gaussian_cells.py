@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -9,8 +10,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.box_cells import window_cells
+from src.geometry.box_cells import window_cells, window_corners
+from src.geometry.ragged import enumerate_some_windows
 from src.geometry.tensor_transforms import rotate_back
+from src.ops.fixed_shapes import fixed_shapes
 from src.ops.segment_reduce import inverse_rows
 
 # Windows are widened by this before the exact test, so that rounding cannot lose a cell.
@@ -21,12 +24,13 @@ WINDOW_SLACK_CELLS = 1e-3
 class GaussianCellPairs:
     """(Gaussian, cell) pairs in the order of the cells, and the way back to the order of the Gaussians.
 
-    By Gaussian, the pairs of one Gaussian stand in the order of their cells.
+    By Gaussian, the pairs of one Gaussian stand in the order of their cells. In fixed shapes padding stands behind the
+    pairs of the cells and among those of the Gaussians, at infinite distance from a cell beyond the last.
     """
 
     gaussian: Tensor  # [pairs] int64
     cell: Tensor  # [pairs] int64, row in the support, ascending
-    delta: Tensor  # [pairs, 2] cell centre - mean, metres
+    delta: Tensor | None  # [pairs, 2] cell centre - mean, metres; None without gradient
     q: Tensor  # [pairs] squared Mahalanobis distance
     in_turn: Tensor  # [pairs] int64, 0, 1, 2, ...
     cell_starts: Tensor  # [n + 1] int64, first pair of each support cell
@@ -49,15 +53,27 @@ def gaussian_cells(
     variances = torch.stack([(turned * squares).sum(1), (turned.flip(1) * squares).sum(1)], 1)  # Sigma_xx, Sigma_yy
     centres = grid.to_cells(means) - 0.5
     reach = support_sigmas * variances.sqrt() / grid.cell_m + WINDOW_SLACK_CELLS
-    gaussian, row, col = window_cells(centres, reach, grid)
+    fixed = fixed_shapes()
+    if fixed is None:
+        gaussian, row, col = window_cells(centres, reach, grid)
+        owner = gaussian
+    else:
+        low, high = window_corners(centres, reach, grid)
+        gaussian, row, col, total = enumerate_some_windows(low, high, fixed.capacities.pairs)
+        fixed.expect(-total, -fixed.capacities.pairs)
+        owner = gaussian.clamp(max=len(means) - 1)
     # Offsets are taken from the nearest cell centre: float32 would lose five digits on coordinates of 150 m.
     nearest = centres.round()
     rest = (means.double() - grid.centre_of(nearest.flip(1), torch.float64)).to(means.dtype)  # [G, 2] m
-    table = torch.cat([nearest, rest, directions, scales], 1).index_select(0, gaussian)
+    table = torch.cat([nearest, rest, directions, scales], 1).index_select(0, owner)
     base_x, base_y, rest_x, rest_y, cosine, sine, size_x, size_y = table.unbind(1)  # [candidates] each
     delta_x, delta_y = (col - base_x) * grid.cell_m - rest_x, (row - base_y) * grid.cell_m - rest_y
     along, across = rotate_back(cosine, sine, delta_x, delta_y)
     q = (along / size_x).square() + (across / size_y).square()
+    if fixed is not None:
+        near = (q <= support_sigmas**2) & (gaussian < len(means))
+        linear = (batch.index_select(0, owner) * grid.rows + row) * grid.cols + col
+        return _padded_pairs(gaussian, owner, linear, q, near, batch_size * grid.rows * grid.cols, len(means))
     near = (q <= support_sigmas**2).nonzero().squeeze(1)
 
     gaussian = gaussian.index_select(0, near)  # ascending
@@ -79,3 +95,31 @@ def gaussian_cells(
         gaussian_starts=torch.searchsorted(gaussian, owners),
     )
     return pairs, support.long()
+
+
+def _padded_pairs(
+    gaussian: Tensor,  # [pairs] int64, ascending, `num` for none
+    owner: Tensor,  # [pairs] int64, the same with a Gaussian that exists
+    linear: Tensor,  # [pairs] int64, cells
+    q: Tensor,  # [pairs]
+    near: Tensor,  # [pairs] bool, what is a pair
+    num_cells: int,
+    num: int,
+) -> tuple[GaussianCellPairs, Tensor]:
+    """The pairs in fixed shapes; the support are all cells, and the one beyond them."""
+    small = torch.int32 if num_cells < 2**31 - 1 else torch.int64
+    linear, order = torch.sort(torch.where(near, linear, num_cells).to(small), stable=True)
+    support = torch.arange(num_cells + 1, device=linear.device)
+    # Padding belongs to no cell: the last one ends where it begins.
+    starts = torch.searchsorted(linear, F.pad(support, (0, 1), value=num_cells).to(small))
+    pairs = GaussianCellPairs(
+        gaussian=owner.index_select(0, order),
+        cell=linear.long(),
+        delta=None,
+        q=torch.where(near, q, math.inf).index_select(0, order),
+        in_turn=torch.arange(len(order), device=order.device),
+        cell_starts=starts,
+        by_gaussian=inverse_rows(order, len(order)),
+        gaussian_starts=torch.searchsorted(gaussian, torch.arange(num + 1, device=gaussian.device)),
+    )
+    return pairs, support

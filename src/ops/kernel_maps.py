@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from src.geometry.constants import constant
+from src.ops.fixed_shapes import fixed_shapes
 from src.ops.kernel_map import KernelMap, TableMap, counts_kept
 from src.ops.moved_keys import NONE, moved_keys
 from src.ops.neighbour_table import neighbour_table
-from src.ops.sites import HALO, Sites
+from src.ops.sites import HALO, Sites, padded_sites
 
 Size = int | tuple[int, ...]
 
@@ -216,7 +217,7 @@ def _build_strided(
     sites: Sites, kernel: tuple[int, ...], stride: tuple[int, ...], padding: tuple[int, ...]
 ) -> tuple[KernelMap, Sites]:
     shape = _output_shape(sites.shape, kernel, stride, padding)
-    if makes_tables(sites) and max(padding) <= HALO:
+    if (makes_tables(sites) or fixed_shapes() is not None) and max(padding) <= HALO:
         out = _reached(sites, shape, kernel, stride, padding)
         return _map_between(sites, out, kernel, stride, padding), out
     out = Sites(shape, sites.keys)
@@ -243,7 +244,7 @@ def _build_temporal(
     ones = (1,) * (sites.ndim - 1)
     zeros = (0,) * (sites.ndim - 1)
     first = (kernel[0], *ones), (stride[0], *ones), (padding[0], *zeros)
-    if makes_tables(sites):
+    if makes_tables(sites) or fixed_shapes() is not None:
         reached = _reached(sites, shape, *first)
     else:
         _, reached = _build_strided(sites, *first)
@@ -266,6 +267,8 @@ def _reached(
     ones, zeros = (1,) * sites.ndim, (0,) * sites.ndim
     candidates = _moved(sites, coarse, ones, stride, (zeros, shape[1:]), shifts)
     candidates = (candidates if kept is None else torch.where(kept, candidates, NONE)).flatten()
+    if fixed_shapes() is not None:
+        return padded_sites(candidates, shape)
     # What fits nowhere is the largest key, which is there at least once and cut off.
     return Sites(shape, torch.unique(torch.cat([candidates, constant((NONE,), torch.int64, sites.device)]))[:-1])
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from src.geometry.constants import on_device
 from src.geometry.tensor_transforms import rotate_back
+from src.ops.fixed_shapes import fixed_shapes
 from src.ops.kernel_maps import submanifold_map
 from src.ops.sites import Sites
 
@@ -99,6 +100,10 @@ def maxpool_peaks(
     if len(sites) == 0:
         return torch.zeros_like(scores, dtype=torch.bool)
     maps = submanifold_map(sites, 3)
+    if fixed_shapes() is not None:
+        table = maps.table.t()  # [M, 9]
+        around = torch.where(table < 0, len(scores), table)
+        return scores == F.embedding_bag(around, F.pad(scores, (0, 0, 0, 1), value=-torch.inf), mode="max")
     order, starts = maps.by_output
     picks = maps.inputs.index_select(0, order)
     scores = scores.detach()

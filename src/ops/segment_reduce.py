@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
 from src.geometry.constants import constant
+from src.ops.fixed_shapes import fixed_shapes
 
 # Pairs multiplied at a time in `paired_dot`: cache-sized on a CPU, few launches on a GPU.
 CPU_CHUNK = 1024
@@ -64,6 +65,10 @@ def segment_mean(
     num_rows: int,
 ) -> Tensor:  # [num_rows, C]
     """Scatter mean: values that share a row; absent rows are 0. Differentiable."""
+    if fixed_shapes() is not None:
+        ordered, order = torch.sort(rows, stable=True)
+        starts = torch.searchsorted(ordered, torch.arange(num_rows + 1, device=rows.device))
+        return F.embedding_bag(order, values, starts, mode="mean", include_last_offset=True)
     counts = segment_count(rows, num_rows)
     return segment_sum(values, rows, num_rows) / counts.clamp(min=1)[:, None].to(values.dtype)
 
@@ -132,15 +137,15 @@ def _take(values: Tensor, rows: Tensor) -> Tensor:
 
 def topk_per_sample(
     scores: Tensor,  # [M]
-    sample: Tensor,  # [M] int64
+    sample: Tensor,  # [M] int64; `batch_size` for padding
     batch_size: int,
     count: int,
 ) -> Tensor:  # [B, count] int64
     """Rows of the highest scores of each sample, best first, ties by row; -1 where a sample has fewer."""
     order, rank = rank_per_sample(scores, sample)
-    rows = order.new_full((batch_size, count + 1), -1)
+    rows = order.new_full((batch_size + 1, count + 1), -1)
     rows[sample[order], rank.clamp(max=count)] = order  # all beyond the last place meet in one column that is dropped
-    return rows[:, :count]
+    return rows[:batch_size, :count]
 
 
 def rank_per_sample(

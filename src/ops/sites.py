@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.constants import constant
+from src.ops.fixed_shapes import fixed_shapes
 
 # Empty cells kept behind the last cell of every spatial axis. A key moved by up to HALO cells along any axis, in either
 # direction, lands in such a gap and never on a cell of the next row, so look-ups need no bounds test.
@@ -23,6 +24,7 @@ class Sites:
     `shape` is (batch, *spatial), for example (B, rows, cols) or (B, z, y, x); `keys` [n] int64 are sorted and unique.
     `cache` holds what was derived from this set (kernel maps), so every layer that works on the same `Sites` object
     shares them. Build with `from_indices`, `unique` or `from_linear`; the constructor trusts its arguments.
+    In fixed shapes (`ops/fixed_shapes.py`) padding stands behind the sites, its key `end` in every row.
     """
 
     shape: tuple[int, ...]
@@ -60,7 +62,11 @@ class Sites:
         Raises ValueError for a cell outside `shape`, which a CPU looks for: a GPU would have to wait.
         """
         empty = _checked_empty(indices, shape)
-        keys, rows = torch.unique(empty.keys_of(indices), return_inverse=True)
+        keys = empty.keys_of(indices)
+        if fixed_shapes() is not None:
+            sites = padded_sites(keys, empty.shape)
+            return sites, sites.nearest_rows(keys)
+        keys, rows = torch.unique(keys, return_inverse=True)
         return cls(empty.shape, keys), rows
 
     @classmethod
@@ -95,6 +101,11 @@ class Sites:
         return tuple(reversed(strides))
 
     @property
+    def end(self) -> int:
+        """The key behind the last cell's."""
+        return self.shape[0] * self.strides[0]
+
+    @property
     def ndim(self) -> int:
         """Number of spatial axes."""
         return len(self.shape) - 1
@@ -126,6 +137,13 @@ class Sites:
         upper = constant(self.shape, torch.int64, indices.device)
         inside = ((indices >= 0) & (indices < upper)).all(1)
         return torch.where(inside, rows_of_keys(self.keys, self.keys_of(indices)), -1)
+
+    def nearest_rows(
+        self,
+        keys: Tensor,  # [q] int64
+    ) -> Tensor:  # [q] int64
+        """Row of each key; a row that exists also where the key does not. In fixed shapes padding for padding."""
+        return torch.searchsorted(self.keys, keys).clamp_(max=len(self) - 1)
 
     def keys_of(
         self,
@@ -167,6 +185,16 @@ def rows_of_keys(
     return torch.where(keys[rows] == wanted, rows, -1)
 
 
+def padded_sites(
+    keys: Tensor,  # [n] int64, any order, repeats allowed; those from `end` on, of which there are some, are padding
+    shape: tuple[int, ...],
+) -> Sites:
+    """The sites of these keys in fixed shapes."""
+    fixed, sites = fixed_shapes(), Sites(shape, keys)
+    sites.keys = fixed.distinct(keys, sites.end, fixed.most_sites(shape))
+    return sites
+
+
 def union(a: Sites, b: Sites) -> tuple[Sites, Tensor, Tensor]:
     """Sites of either set, and the rows of a [len a] and of b [len b] in it, both int64.
 
@@ -177,7 +205,11 @@ def union(a: Sites, b: Sites) -> tuple[Sites, Tensor, Tensor]:
     if a is b:
         rows = torch.arange(len(a), device=a.device)
         return a, rows, rows
-    keys = torch.unique(torch.cat([a.keys, b.keys]))
+    keys = torch.cat([a.keys, b.keys])
+    if fixed_shapes() is not None:
+        joint = padded_sites(keys, a.shape)
+        return joint, joint.nearest_rows(a.keys), joint.nearest_rows(b.keys)
+    keys = torch.unique(keys)
     return Sites(a.shape, keys), torch.searchsorted(keys, a.keys), torch.searchsorted(keys, b.keys)
 
 
@@ -193,7 +225,7 @@ def _checked_empty(indices: Tensor, shape: tuple[int, ...]) -> Sites:
     sites = Sites(tuple(int(size) for size in shape), indices.new_empty(0, dtype=torch.int64))
     if math.prod(size + HALO for size in sites.shape) >= 2**63:
         raise ValueError(f"shape={sites.shape}: too many cells for 64-bit keys")
-    if indices.device.type == "cpu":
+    if indices.device.type == "cpu" and fixed_shapes() is None:  # where padding is outside
         outside = (indices < 0) | (indices >= constant(sites.shape, torch.int64, indices.device))
         if bool(outside.any()):
             first = indices[outside.any(1)][0].tolist()

@@ -13,6 +13,7 @@ from torch.autograd.function import FunctionCtx
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import rotate_back
 from src.ops.backend import implementation
+from src.ops.fixed_shapes import fixed_shapes
 from src.ops.gaussian_cells import GaussianCellPairs, gaussian_cells
 from src.ops.segment_reduce import gather_segment_sum, inverse_rows, rank_per_sample, weighted_segment_sum
 from src.ops.sites import Sites
@@ -39,7 +40,7 @@ class Splat:
     occupied_rows: Tensor  # [w] int64, row of each occupied cell in the support
     peak_cell: Tensor  # [G] int64, linear key of the occupied cell where it contributes most, -1 if it reaches none
     peak_contribution: Tensor  # [G] a_i there, 0 if it reaches none
-    num_cut: int  # occupied cells dropped by the max_cells guard
+    num_cut: int  # occupied cells dropped by the max_cells guard; in fixed shapes more of them overflow
 
     @property
     def active(self) -> Tensor:  # [G] bool
@@ -210,7 +211,7 @@ def splat_reference(
     occupied_rows, num_cut = occupied_cells(log_free.detach(), *choice)
 
     # Pairs of the occupied cells, and their order by Gaussian.
-    cell = inverse_rows(occupied_rows, len(support)).index_select(0, pairs.cell)
+    cell = occupied_places(occupied_rows, support).index_select(0, pairs.cell)
     kept = cell >= 0
     chosen = kept.nonzero().squeeze(1)
     gaussian, cell = pairs.gaussian.index_select(0, chosen), cell.index_select(0, chosen)
@@ -230,13 +231,38 @@ def occupied_cells(
     cells_per_sample: int,
 ) -> tuple[Tensor, int]:
     """Rows of the support above the threshold, at most `max_cells` a sample, and how many were dropped for that."""
-    rows = (-torch.expm1(log_free) > threshold).nonzero().squeeze(1)
+    occupied = -torch.expm1(log_free) > threshold
+    if fixed_shapes() is not None:
+        return _padded_occupied(occupied, max_cells), 0
+    rows = occupied.nonzero().squeeze(1)
     if len(rows) <= max_cells:
         return rows, 0
     sample = torch.div(support.index_select(0, rows), cells_per_sample, rounding_mode="floor")
     order, rank = rank_per_sample(-log_free.index_select(0, rows), sample)
     kept = rows[order[rank < max_cells]].sort().values
     return kept, len(rows) - len(kept)
+
+
+def _padded_occupied(
+    occupied: Tensor,  # [n] bool, of which the last is no cell
+    max_cells: int,
+) -> Tensor:  # [at most max_cells + 1]
+    """Rows of the occupied cells in fixed shapes; padding takes the last."""
+    fixed, last = fixed_shapes(), len(occupied) - 1
+    rows = fixed.places(occupied, min(max_cells, fixed.capacities.cells, last) + 1).clamp_(max=last)
+    fixed.expect(rows[-1:], last)
+    return rows
+
+
+def occupied_places(
+    occupied_rows: Tensor,  # [w]
+    support: Tensor,  # [n]
+) -> Tensor:  # [n] int64
+    """Which occupied cell each cell of the support is, -1 for none."""
+    places = inverse_rows(occupied_rows, len(support))
+    if fixed_shapes() is not None:
+        places[-1:] = -1
+    return places
 
 
 def _nearest_cell(

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.constants import constant
+from src.ops.fixed_shapes import fixed_shapes
 from src.ops.segment_reduce import inverse_rows, rank_per_sample, segment_count, segment_mean
 from src.ops.sites import Sites
 
@@ -24,14 +25,14 @@ def voxelize(
 
     Voxel i of an axis covers [lower + i * size, lower + (i + 1) * size). Points outside the grid or with a coordinate
     that is not finite are left out. Where a sample has more than `max_voxels` voxels, those with the most points stay,
-    on ties those with the lowest index. Means are float32 at least, whatever autocast says, and the same for any order
-    of the points up to rounding. Raises ValueError for shapes that do not fit together.
+    on ties those with the lowest index; in fixed shapes all stay. Means are float32 at least, whatever autocast says,
+    and the same for any order of the points up to rounding. Raises ValueError for shapes that do not fit together.
     """
     if len(points) != len(batch):
         raise ValueError(f"expected one row of points for each entry of batch [{len(batch)}], got {len(points)}")
     sites, rows, inside = voxel_rows(coordinates, batch, lower_m, voxel_size_m, shape, batch_size)
     values = points.index_select(0, inside)
-    if max_voxels is not None and len(sites) > max_voxels:
+    if max_voxels is not None and len(sites) > max_voxels and fixed_shapes() is None:
         kept = _densest(sites, segment_count(rows, len(sites)), max_voxels)
         rows = inverse_rows(kept, len(sites)).index_select(0, rows)
         values, rows = values[rows >= 0], rows[rows >= 0]
@@ -50,7 +51,8 @@ def voxel_rows(
 ) -> tuple[Sites, Tensor, Tensor]:
     """Sites [V] of the voxels that hold points; of the n points inside, the voxel and which they are, both [n] int64.
 
-    What is inside, and what raises ValueError, is as for `voxelize`.
+    What is inside, and what raises ValueError, is as for `voxelize`. In fixed shapes n is P, and points outside have
+    padding for their voxel.
     """
     ndim = len(shape)
     if coordinates.shape != (len(batch), ndim):
@@ -65,7 +67,12 @@ def voxel_rows(
         (place / constant(tuple(voxel_size_m), torch.float64, coordinates.device)).floor().flip(1)
     )  # [P, d] (z, y, x)
     limit = constant(tuple(shape), torch.int64, cells.device)
-    inside = ((cells >= 0) & (cells < limit)).all(1).nonzero().squeeze(1)
+    inside = ((cells >= 0) & (cells < limit)).all(1)
+    if fixed_shapes() is not None:
+        samples, cells = torch.where(inside, batch, batch_size), torch.where(inside[:, None], cells, 0.0)
+        sites, rows = Sites.unique(torch.cat([samples[:, None], cells.long()], 1), (batch_size, *shape))
+        return sites, rows, torch.arange(len(batch), device=batch.device)
+    inside = inside.nonzero().squeeze(1)
     indices = torch.cat([batch[:, None].index_select(0, inside), cells.index_select(0, inside).long()], 1)
     sites, rows = Sites.unique(indices, (batch_size, *shape))
     return sites, rows, inside

@@ -6,7 +6,7 @@ import torch.nn.functional as F
 
 from src.geometry.bev_grid import BEVGrid
 from src.ops import deform_sample
-from src.ops.deform_sample import _sum_of_all_images, deform_attend_bev, deform_attend_images, sample_sparse_bev
+from src.ops.deform_sample import attend_views_reference, deform_attend_bev, deform_attend_images, sample_sparse_bev
 from src.ops.sites import Sites
 
 GRID = BEVGrid(cells=(6, 8), cell_m=0.8, centre_m=(0.4, -0.2), z_range_m=(-3.0, 5.0))
@@ -92,7 +92,7 @@ def test_bev_attention_against_dense_and_gradcheck():
 def form(request, monkeypatch):
     """What a CPU does, and what a GPU does."""
     if request.param == "all images":
-        monkeypatch.setattr(deform_sample, "_sum_by_image", lambda *inputs: _sum_of_all_images(*inputs[:3]))
+        monkeypatch.setattr(deform_sample, "_sum_by_image", lambda *inputs: attend_views_reference(*inputs[:3]))
 
 
 def pyramid(batch=2, queries=5, views=3, heads=2, points=4, seed=0):

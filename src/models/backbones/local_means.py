@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
+from src.ops.fixed_shapes import fixed_shapes
 from src.ops.kernel_maps import submanifold_map
 from src.ops.segment_reduce import segment_sum
 from src.ops.sparse_conv import neighbour_sum
@@ -54,8 +55,11 @@ class LocalMeans(nn.Module):
         points = radar_points.float()
         cells = self.grid.cell_of(points[:, :2])
         rows = bev.sites.rows_of(torch.cat([radar_batch[:, None], cells], dim=1))
-        near = (rows >= 0).nonzero().squeeze(1)
-        points = points[near]
+        if fixed_shapes() is not None:
+            rows = torch.where(rows < 0, len(bev) - 1, rows)  # the last is padding
+        else:
+            near = (rows >= 0).nonzero().squeeze(1)
+            points, rows = points[near], rows[near]
         velocities = points[:, 4:6] / self.point_scales[4:6]
         speeds = velocities.norm(dim=1, keepdim=True)
         values = [
@@ -65,7 +69,7 @@ class LocalMeans(nn.Module):
             points[:, :2] / self.grid.cell_m,
             points[:, 2:] / self.point_scales[2:],
         ]
-        sums = segment_sum(torch.cat(values, dim=1), rows[near], len(bev))
+        sums = segment_sum(torch.cat(values, dim=1), rows, len(bev))
         window = submanifold_map(bev.sites, 3)
         for _ in range(PASSES):
             sums = neighbour_sum(sums, window)

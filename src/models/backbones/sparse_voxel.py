@@ -148,7 +148,7 @@ class VoxelEncoder(nn.Module):
             self.max_voxels,
         )
         if self.point_count_channel:
-            features = torch.cat([features, counts.to(features.dtype).log()[:, None]], dim=1)
+            features = torch.cat([features, counts.clamp(min=1).to(features.dtype).log()[:, None]], dim=1)
         axes = None if self.ndim == 3 else (0, 2, 3)
         return SparseMap(sites.on_grid((batch_size, *self.input_shape), axes), features)
 

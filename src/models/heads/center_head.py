@@ -162,10 +162,10 @@ class CenterHead(nn.Module):
         statistics come from the chosen cells and an even sample of the others.
         """
         if output.codes is not None:
-            return _measured(output, output.codes[rows, groups], rows)
+            return measured_codes(output, output.codes[rows, groups], rows)
         order = groups.argsort(stable=True)
         counts = segment_count(groups, len(HEAD_GROUPS)).tolist()
-        return _measured(output, self._regress_by_group(output, rows[order], counts)[order.argsort()], rows)
+        return measured_codes(output, self._regress_by_group(output, rows[order], counts)[order.argsort()], rows)
 
     def _regress_by_group(
         self,
@@ -248,7 +248,7 @@ class CenterHead(nn.Module):
         else:
             groups = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts)).to(best.rows.device)
             codes = output.codes[best.rows, groups]
-        codes = _measured(output, codes, best.rows)
+        codes = measured_codes(output, codes, best.rows)
         boxes = boxes_from_codes(cells[best.rows, 1:], codes[:, :CODE_SIZE], best.labels, best.scores, self.grid)
         if self.learned:
             boxes.attributes = learned_attributes(codes[:, CODE_SIZE:], best.labels)
@@ -257,7 +257,7 @@ class CenterHead(nn.Module):
         return suppress(boxes, best.counts, self.config.nms, self.config.max_boxes)
 
 
-def _measured(
+def measured_codes(
     output: HeadOutput,
     codes: Tensor,  # [n, CODE_SIZE (+ 11)]
     rows: Tensor,  # [n] int64, cells

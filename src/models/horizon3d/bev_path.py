@@ -18,6 +18,7 @@ from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.merging import block_diagonal, joined_convs
 from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv, TemporalConv
 from src.models.memory import motions, moving
+from src.ops.fixed_shapes import fixed_shapes
 from src.ops.segment_reduce import segment_mean, topk_per_sample
 from src.ops.sites import Sites
 from src.structures.batch import FrameBatch
@@ -173,13 +174,14 @@ class BEVPath(nn.Module):
 
     def aggregate(self, fused: SparseBEV, warped: WarpedCells | None) -> SparseBEV:
         """F_out = F_fuse + what sparse convolutions over time make of both, on the sites of either."""
-        b, (rows, cols) = fused.batch_size, self.grid.cells
-        shape = (b, self.num_slots, rows, cols)
+        b = fused.batch_size
+        shape = (b, self.num_slots, *self.grid.cells)
         cell = fused.indices
         now = torch.full_like(cell[:, :1], self.config.num_frames)
         indices = torch.cat([cell[:, :1], now, cell[:, 1:]], dim=1)
         # All cells of a slot have one age: embed it once per (sample, slot) and look it up; unused slots hold 0.
-        ages, features = self.time.mlp[0].bias.new_zeros(b * self.num_slots), fused.features
+        samples = b if fixed_shapes() is None else b + 1  # padding has one of its own
+        ages, features = self.time.mlp[0].bias.new_zeros(samples * self.num_slots), fused.features
         if warped is not None:
             ages[warped.indices[:, 0] * self.num_slots + warped.indices[:, 1]] = warped.elapsed_s
             indices = torch.cat([warped.indices, indices])
@@ -192,10 +194,11 @@ class BEVPath(nn.Module):
             x = conv(x)
             y = norm(x.features)
             x = x.with_features(y if number == len(self.convs) - 1 else F.relu(y))
-        if len(x.sites) == len(fused.sites):  # only the current cells: keep their kernel maps
+        if len(x.sites) == len(fused.sites) and fixed_shapes() is None:  # only the current cells: keep their maps
             return fused.with_features(fused.features + x.features)
-        sites = Sites.from_linear(x.sites.linear(), (b, rows, cols))
-        spread = fused.features.new_zeros(x.features.shape).index_copy(0, sites.rows_of(cell), fused.features)
+        sites = Sites.from_linear(x.sites.linear(), (b, *self.grid.cells))
+        rows = sites.nearest_rows(fused.sites.keys)
+        spread = fused.features.new_zeros(x.features.shape).index_copy(0, rows, fused.features)
         return SparseBEV(sites, spread + x.features)
 
 

@@ -113,11 +113,8 @@ class DPTF(nn.Module):
         if self.bev_path is not None:
             cells = self.bev_path.store(fused, output.cells, batch)
         if self.gaussian_path is not None:
-            active = ocsf.splat.active(self.config.gaussian_path.min_contribution)
-            gaussians = ocsf.gaussians
-            if self.config.gaussian_path.velocity_from is VelocityFrom.cells:
-                gaussians = _with_cell_velocities(gaussians, ocsf.splat.peak_cells, fused, output.cells)
-            gaussians = self.gaussian_path.store(gaussians, active, batch)
+            found, active = self.candidates(fused, output, ocsf)
+            gaussians = self.gaussian_path.store(found, active, batch)
             if self.config.gaussian_path.forget_refuted and output.history is not None:
                 past = self.gaussian_path.without_refuted(past, output.history, active)
         frame = MemoryFrame(
@@ -129,6 +126,16 @@ class DPTF(nn.Module):
         )
         paths = (self.config.bev_path, self.config.gaussian_path)
         return past.push(frame, *(path.num_frames if path is not None else 0 for path in paths))
+
+    def candidates(
+        self, fused: SparseBEV, output: DPTFOutput, ocsf: OCSFOutput
+    ) -> tuple[GaussianSet, Tensor]:  # G_L, [B, G] bool
+        """The Gaussians of a frame as they are remembered, and which of them are active."""
+        active = ocsf.splat.active(self.config.gaussian_path.min_contribution)
+        gaussians = ocsf.gaussians
+        if self.config.gaussian_path.velocity_from is VelocityFrom.cells:
+            gaussians = _with_cell_velocities(gaussians, ocsf.splat.peak_cells, fused, output.cells)
+        return gaussians, active
 
 
 def _with_cell_velocities(

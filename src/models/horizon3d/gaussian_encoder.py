@@ -20,6 +20,7 @@ from src.models.layers.image_attention import ImageCrossAttention, attention_lin
 from src.models.layers.merging import block_diagonal, joined_linear
 from src.models.layers.sparse import SubmanifoldConv
 from src.models.layers.views import CameraViews
+from src.ops.fixed_shapes import fixed_shapes
 from src.ops.segment_reduce import segment_mean
 from src.ops.sites import Sites
 from src.structures.gaussians import GaussianSet
@@ -192,17 +193,36 @@ class SelfEncoding(nn.Module):
     ) -> Tensor:  # [B, G, C]; zero for padding
         """No gradient reaches the means, which only choose cells."""
         b, g, c = features.shape
+        if fixed_shapes() is not None:
+            return self._of_all(features, gaussians)
         picks = gaussians.valid.flatten().nonzero().squeeze(1)  # [V]
         cells = self.grid.cell_of(gaussians.means.detach().flatten(0, 1).index_select(0, picks))
         sample = torch.div(picks, g, rounding_mode="floor")
         sites, rows = Sites.unique(torch.cat([sample[:, None], cells], dim=1), (b, *self.grid.cells))
         flat = features.flatten(0, 1).index_select(0, picks)  # [V, C]
-        x = SparseBEV(sites, segment_mean(flat, rows, len(sites)))
+        x = self._exchange(flat, sites, rows)
+        return x.new_zeros(b * g, c).index_copy(0, picks, x).unflatten(0, (b, g))
+
+    def _of_all(self, features: Tensor, gaussians: GaussianSet) -> Tensor:
+        """In fixed shapes: padding as Gaussians of a sample that does not exist."""
+        valid, (b, g) = gaussians.valid[..., None], gaussians.valid.shape
+        sample = torch.arange(b, device=valid.device).view(b, 1, 1)
+        indices = torch.cat([torch.where(valid, sample, b), self.grid.cell_of(gaussians.means)], dim=2)
+        indices = F.pad(indices.flatten(0, 1), (0, 0, 0, 1), value=b)  # one more, which is padding in any case
+        sites, rows = Sites.unique(indices, (b, *self.grid.cells))
+        return self._exchange(features.flatten(0, 1), sites, rows[:-1]).unflatten(0, (b, g)) * valid
+
+    def _exchange(
+        self,
+        features: Tensor,  # [V, C]
+        sites: Sites,
+        rows: Tensor,  # [V] int64, site of each
+    ) -> Tensor:  # [V, C]
+        x = SparseBEV(sites, segment_mean(features, rows, len(sites)))
         for conv, norm in zip(self.convs, self.norms, strict=True):
             x = conv(x)
             x = x.with_features(norm(x.features).relu())
-        x = self.output(x.features).index_select(0, rows)  # [V, C]
-        return x.new_zeros(b * g, c).index_copy(0, picks, x).unflatten(0, (b, g))
+        return self.output(x.features).index_select(0, rows)
 
 
 class Refinement(nn.Module):

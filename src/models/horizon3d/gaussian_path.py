@@ -14,7 +14,7 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.time_embedding import TimeEmbedding
-from src.models.memory import motions, moving
+from src.models.memory import Motion, motions, moving
 from src.ops.farthest_point import farthest_points
 from src.structures.batch import FrameBatch
 from src.structures.gaussians import GaussianSet, Source
@@ -107,11 +107,19 @@ class GaussianPath(nn.Module):
         self, frames: list[MemoryFrame], batch: FrameBatch, max_age_s: float, min_speed_mps: float
     ) -> GaussianSet:
         """The Gaussians of T frames in one batch: launches cost more than the arithmetic."""
-        motion = motions(frames, batch, max_age_s)
         sets = [frame.gaussians for frame in frames]
         past = GaussianSet(
             **{field.name: torch.cat([getattr(one, field.name) for one in sets]) for field in fields(GaussianSet)}
-        )  # [T * B, n]
+        )
+        return self.move(past, motions(frames, batch, max_age_s), min_speed_mps)
+
+    def move(
+        self,
+        past: GaussianSet,  # [T * B, n]
+        motion: Motion,  # [T, B]
+        min_speed_mps: float,
+    ) -> GaussianSet:  # [B, T * n]
+        """Remembered Gaussians of T frames as history."""
         elapsed = motion.elapsed_s.flatten()[:, None].expand_as(past.valid)
         if self.config.velocity_compensation:
             past = replace(past, means=past.means + moving(past.velocities, min_speed_mps) * elapsed[..., None])
@@ -126,7 +134,7 @@ class GaussianPath(nn.Module):
             valid=valid,
         )
         # Sample by sample, newest first.
-        return moved.map(lambda value: value.unflatten(0, (len(frames), -1)).transpose(0, 1).flatten(1, 2))
+        return moved.map(lambda value: value.unflatten(0, motion.usable.shape).transpose(0, 1).flatten(1, 2))
 
     def _padding(self, batch_size: int, count: int) -> GaussianSet:
         ones = self.centre_m.new_ones(batch_size, count, 2)
@@ -168,7 +176,7 @@ class GaussianPath(nn.Module):
         batch: FrameBatch,
     ) -> GaussianSet:  # [B, gaussians_per_frame] in the unaugmented ego frame
         """A subset of the active Gaussians of any source; padding where fewer are active."""
-        picks = self._sample(gaussians, active & gaussians.valid, batch)  # [B, K], -1 for none
+        picks = self.sample(gaussians, active, batch)
         rows = picks.clamp(min=0)
         chosen = gaussians.map(lambda value: _gather(value.detach(), rows))
         ego = chosen.transform(torch.linalg.inv_ex(batch.aug_from_ego).inverse)
@@ -177,8 +185,14 @@ class GaussianPath(nn.Module):
             features = features.to(torch.get_autocast_dtype(features.device.type))
         return replace(ego, features=features, valid=picks >= 0)
 
-    def _sample(self, gaussians: GaussianSet, active: Tensor, batch: FrameBatch) -> Tensor:
-        count = self.config.gaussians_per_frame
+    def sample(
+        self,
+        gaussians: GaussianSet,
+        active: Tensor,  # [B, G] bool
+        batch: FrameBatch,
+    ) -> Tensor:  # [B, gaussians_per_frame] int64, -1 for none
+        """Which of the active Gaussians are remembered."""
+        count, active = self.config.gaussians_per_frame, active & gaussians.valid
         opacity = gaussians.opacity_logits.detach()
         if self.config.sampling is Sampling.farthest_point:
             start = torch.where(active, opacity, -torch.inf).argmax(dim=1)

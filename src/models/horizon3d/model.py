@@ -13,8 +13,9 @@ from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.detector import Detector, Objective
 from src.models.heads.center_head import BoxOptions, CenterHead
-from src.models.horizon3d.dptf import DPTF
+from src.models.horizon3d.dptf import DPTF, WarpedMemory
 from src.models.horizon3d.dptf_memory import Memory
+from src.models.horizon3d.fixed_form import FixedHorizon3D
 from src.models.horizon3d.kggi import KGGI
 from src.models.horizon3d.loss import cell_losses, gaussian_velocity_loss, kggi_losses, ocsf_losses
 from src.models.horizon3d.model_config import Horizon3DConfig
@@ -22,6 +23,7 @@ from src.models.horizon3d.ocsf import OCSF
 from src.models.horizon3d.output import Horizon3DOutput
 from src.models.layers.doppler import Doppler
 from src.models.layers.views import CameraViews
+from src.ops.fixed_shapes import Capacities
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
@@ -88,7 +90,14 @@ class Horizon3D(Detector):
         """
         if memory is not None and memory.frames and memory.batch_size != len(batch):
             raise ValueError(f"the memory holds {memory.batch_size} streams, but the batch {len(batch)} frames")
-        warped_memory = self.dptf.recall(memory, batch) if self.dptf is not None else None
+        if self.dptf is None:
+            return self.detect(batch, None), None
+        warped_memory = self.dptf.recall(memory, batch)
+        output = self.detect(batch, warped_memory)
+        return output, self.dptf.remember(warped_memory.past, batch, output.fused_bev, output.dptf, output.ocsf)
+
+    def detect(self, batch: FrameBatch, warped_memory: WarpedMemory | None) -> Horizon3DOutput:
+        """What `forward` makes of a batch and of the memory brought to its time; None for single frames."""
         radar_bev = fused = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
         views = kggi = ocsf = None
         doppler = self._measure_doppler(batch)
@@ -98,10 +107,9 @@ class Horizon3D(Detector):
             ocsf = self.ocsf(kggi.gaussians, radar_bev, views, doppler["gaussians"])
             fused = ocsf.fused_bev
         if self.dptf is None:
-            return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, None, self.head(fused, doppler["boxes"])), None
+            return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, None, self.head(fused, doppler["boxes"]))
         dptf = self.dptf.aggregate(fused, warped_memory, doppler["cells"])
-        output = Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, dptf, self.head(dptf.bev, doppler["boxes"]))
-        return output, self.dptf.remember(warped_memory.past, batch, fused, dptf, ocsf)
+        return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, dptf, self.head(dptf.bev, doppler["boxes"]))
 
     def restore_memory(self, state: list[dict[str, Any]]) -> Memory:
         """The memory that `Memory.state` described."""
@@ -118,6 +126,10 @@ class Horizon3D(Detector):
                 points, owners = points[known], owners[known]
             measured = Doppler.measure(points, owners, self.grid)
         return {name: measured if its else None for name, its in wanted.items()}
+
+    def fixed_form(self, capacities: Capacities | None = None) -> FixedHorizon3D | None:
+        """See `Detector.fixed_form`."""
+        return FixedHorizon3D(self, capacities) if FixedHorizon3D.serves(self) else None
 
     def loss_terms(self, output: Horizon3DOutput, batch: FrameBatch) -> Objective:
         """Terms of Eq. 10 as weighted."""

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
+from src.ops.fixed_shapes import fixed_shapes
 from src.ops.splat import Splat, splat_gaussians
 from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV
+
+FAR_M = 1e6
+"""Beyond any grid."""
 
 
 @dataclass
@@ -36,21 +40,29 @@ def splat_set(
 ) -> GaussianSplat:
     """Splat the valid Gaussians of every sample."""
     b, g = gaussians.valid.shape
-    picks = gaussians.valid.flatten().nonzero().squeeze(1)  # [V]
-    flat = {
-        name: getattr(gaussians, name).flatten(0, 1).index_select(0, picks)
-        for name in ("means", "scales", "directions", "opacity_logits", "features")
-    }
+    picks = None
+    if fixed_shapes() is None:
+        picks = gaussians.valid.flatten().nonzero().squeeze(1)  # [V]
+        batch = torch.div(picks, g, rounding_mode="floor")
+    else:  # all of them: padding reaches no cell from where it is
+        gaussians = replace(gaussians, means=torch.where(gaussians.valid[..., None], gaussians.means, FAR_M))
+        batch = torch.arange(b, device=gaussians.means.device).repeat_interleave(g, output_size=b * g)
+    names = ("means", "scales", "directions", "opacity_logits", "features")
+    flat = {name: getattr(gaussians, name).flatten(0, 1) for name in names}
+    if picks is not None:
+        flat = {name: value.index_select(0, picks) for name, value in flat.items()}
     cells = splat_gaussians(
         **flat,
-        batch=torch.div(picks, g, rounding_mode="floor"),
+        batch=batch,
         grid=grid,
         batch_size=b,
         threshold=occupancy_threshold,
         max_cells=max_occupied_cells,
         support_sigmas=support_sigmas,
     )
-    peaks = picks.new_full((b * g,), -1).index_copy(0, picks, cells.peak_cell)
-    contributions = cells.peak_contribution.new_zeros(b * g).index_copy(0, picks, cells.peak_contribution)
+    peaks, contributions = cells.peak_cell, cells.peak_contribution
+    if picks is not None:
+        peaks = picks.new_full((b * g,), -1).index_copy(0, picks, peaks)
+        contributions = contributions.new_zeros(b * g).index_copy(0, picks, contributions)
     bev = SparseBEV(cells.occupied, cells.features)
     return GaussianSplat(cells, bev, peaks.view(b, g), contributions.view(b, g))

@@ -6,11 +6,14 @@ from dataclasses import dataclass
 from typing import Self
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
+from src.ops.fixed_shapes import fixed_shapes
+from src.ops.moved_keys import NONE
 from src.ops.radial_change import NUM_BINS, radial_bin, radial_change
 from src.ops.segment_reduce import segment_sum
 
@@ -43,7 +46,7 @@ class Doppler:
     """
 
     grid: BEVGrid
-    keys: Tensor  # [n] int64 ((b * rows + row) * cols + col) * NUM_BINS + bin, sorted, unique
+    keys: Tensor  # [n] int64 ((b * rows + row) * cols + col) * NUM_BINS + bin, sorted, unique; padding has the largest
     velocities: Tensor  # [n, 2] m/s over ground, augmented axes
 
     @classmethod
@@ -55,8 +58,11 @@ class Doppler:
         grid: BEVGrid,
     ) -> Self:
         """Of all points inside the grid."""
-        inside = grid.contains(radar_points[:, :2]).nonzero().squeeze(1)
-        xy, velocities = radar_points[inside, :2].float(), radar_points[inside, 4:6].float()
+        fixed = fixed_shapes()
+        if fixed is None:
+            inside = grid.contains(radar_points[:, :2]).nonzero().squeeze(1)
+            radar_points, radar_batch = radar_points[inside], radar_batch[inside]
+        xy, velocities = radar_points[:, :2].float(), radar_points[:, 4:6].float()
         approach = (velocities * xy).sum(dim=1).sign()
         bins = radial_bin(approach * velocities.norm(dim=1))
         reach = torch.arange(-WINDOW_CELLS, WINDOW_CELLS + 1, device=xy.device)
@@ -64,9 +70,17 @@ class Doppler:
         weights = (WINDOW_CELLS + 1 - offsets.abs()).prod(dim=1).to(xy.dtype)
         cells = grid.cell_of(xy)[:, None] + offsets  # [P, 25, 2]
         limit = constant(tuple(grid.cells), torch.int64, xy.device)
+        if fixed is not None:
+            within = ((cells >= 0) & (cells < limit)).all(dim=2) & grid.contains(xy)[:, None]
+            linear = (radar_batch[:, None] * grid.rows + cells[..., 0]) * grid.cols + cells[..., 1]
+            given = torch.where(within, linear * NUM_BINS + bins[:, None], NONE).flatten()
+            keys = fixed.distinct(given, NONE, len(given))
+            shares = (weights[:, None] * F.pad(velocities, (1, 0), value=1.0)[:, None]).flatten(0, 1)
+            sums = segment_sum(shares, torch.searchsorted(keys, given), len(keys))
+            return cls(grid, keys, sums[:, 1:] / sums[:, :1].clamp(min=1.0))
         point, offset = ((cells >= 0) & (cells < limit)).all(dim=2).nonzero().unbind(1)
         row, col = cells[point, offset].unbind(1)
-        linear = (radar_batch[inside][point] * grid.rows + row) * grid.cols + col
+        linear = (radar_batch[point] * grid.rows + row) * grid.cols + col
         keys, owners = torch.unique(linear * NUM_BINS + bins[point], return_inverse=True)
         weight = weights[offset][:, None]
         sums = segment_sum(torch.cat([weight, weight * velocities[point]], dim=1), owners, len(keys))

@@ -74,7 +74,7 @@ class ImageCrossAttention(nn.Module):
         pixels, visible = views.project(points)
         weights = self._weights(query, views.pix_from_aug, visible)
         gathered = deform_attend_images(values, pixels, views.image_size_px, weights, visible)
-        if not gathered.requires_grad:
+        if torch.is_grad_enabled() and not gathered.requires_grad:
             # Nothing visible: zero gradients rather than none, since DDP expects one per parameter on every rank.
             gathered = gathered + 0.0 * (weights.sum() + pixels.sum() + sum(level.float().sum() for level in values))
         return self.output(gathered.to(values[0].dtype))

@@ -103,8 +103,8 @@ class PrunedSparseConv(SparseConv):
     def forward(self, x: SparseMap) -> SparseMap:
         sample = x.sites.indices()[:, 0]
         order, rank = rank_per_sample(x.features.detach().abs().mean(1), sample)
-        counts = segment_count(sample, x.batch_size)
-        most = counts - (self.pruning_ratio * counts.double()).long()  # [B]
+        counts = segment_count(sample, x.batch_size + 1)  # one for padding
+        most = counts - (self.pruning_ratio * counts.double()).long()  # [B + 1]
         wide = torch.empty_like(sample, dtype=torch.bool).index_copy_(0, order, rank < most[sample[order]])
         return self.convolve(x, *pruned_map(x.sites, wide, self.kernel_size, self.stride, self.padding))
 

@@ -13,8 +13,7 @@ from torch.autograd.function import FunctionCtx
 
 from src.ops.backend import runs_kernels
 from src.ops.gaussian_cells import GaussianCellPairs
-from src.ops.segment_reduce import inverse_rows
-from src.ops.splat import CAP, Choice, occupied_cells, splat_reference
+from src.ops.splat import CAP, Choice, occupied_cells, occupied_places, splat_reference
 
 # Cells a program sums the free probability of, one lane each.
 CELLS = 128
@@ -77,7 +76,7 @@ class _Splat(torch.autograd.Function):
                     enable_fp_fusion=True,
                 )
             occupied_rows, num_cut = occupied_cells(log_free, *choice)
-            place = inverse_rows(occupied_rows, len(support))
+            place = occupied_places(occupied_rows, support)
             out = features.new_empty(len(occupied_rows), features.shape[1])
             if out.numel() > 0:
                 width = min(triton.next_power_of_2(features.shape[1]), MOST_CHANNELS)

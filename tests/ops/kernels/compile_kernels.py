@@ -14,6 +14,8 @@ from src.geometry.bev_grid import BEVGrid
 from src.ops.gaussian_cells import gaussian_cells
 from src.ops.kernel_maps import submanifold_map
 from src.ops.kernels import (
+    attend_cells_triton,
+    attend_views_triton,
     farthest_point_triton,
     moved_keys_triton,
     neighbour_table_triton,
@@ -50,8 +52,8 @@ def main():
     driver.set_active(Target())
     JITFunction.run = compile_only(JITFunction.run)
     kernels = (
-        *(farthest_point_triton, moved_keys_triton, neighbour_table_triton),
-        *(radial_change_triton, sparse_conv_triton, splat_triton),
+        *(attend_cells_triton, attend_views_triton, farthest_point_triton, moved_keys_triton),
+        *(neighbour_table_triton, radial_change_triton, sparse_conv_triton, splat_triton),
     )
     for module in kernels:
         module.runs_kernels = lambda tensor: True
@@ -75,6 +77,13 @@ def main():
     splat_triton.occupied_cells = lambda log_free, support, *choice: (torch.arange(len(support)), 0)
     grid = BEVGrid(cells=(8, 10), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
     radial_change_triton.radial_change_triton(torch.zeros(9, 2), *[torch.arange(9)] * 2, torch.zeros(9, 2), grid)
+    table, points, shares = torch.arange(80), torch.zeros(7, 3, 2), torch.zeros(7, 4, 3)
+    for dtype in (torch.float32, torch.bfloat16):
+        values = torch.zeros(80, 4, 32, dtype=dtype)
+        attend_cells_triton.attend_cells_triton(values, table, points, torch.zeros(7).long(), shares, grid)
+    attend_views_triton.attend_views_triton(
+        [torch.zeros(2, 128, 8, 9)], torch.zeros(2, 7, 3, 2), torch.zeros(1, 7, 4, 2, 1, 3)
+    )
     direction = torch.tensor([[1.0, 0.0]])
     gaussian = (torch.zeros(1, 2), torch.ones(1, 2), direction, torch.zeros(1), torch.zeros(1, 128))
     inputs = [x.requires_grad_() for x in gaussian]
