@@ -118,7 +118,8 @@ def config(bev: bool = True, gaussians: bool = True, compensated: bool = True) -
     )  # fmt: skip
     gaussian_path = GaussianPathConfig(
         num_frames=4, gaussians_per_frame=9, min_contribution=0.0, sampling=Sampling.random,
-        velocity_from=VelocityFrom.gaussian, velocity_compensation=compensated, self_attention=None,
+        velocity_from=VelocityFrom.gaussian, velocity_compensation=compensated, forget_refuted=False,
+        self_attention=None,
     )  # fmt: skip
     return DPTFConfig(
         max_age_s=6.0,

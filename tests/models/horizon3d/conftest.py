@@ -186,6 +186,7 @@ def dptf_config(bev_path=True, gaussian_path=True, max_age_s=6.0, min_speed_mps=
         "sampling": Sampling.farthest_point,
         "velocity_from": VelocityFrom.gaussian,
         "velocity_compensation": True,
+        "forget_refuted": False,
         "self_attention": SelfAttentionConfig(num_heads=4),
     }
     for part in (bev, gaussian):
