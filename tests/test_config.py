@@ -365,7 +365,7 @@ def test_a_second_score_of_detections_composes_and_an_older_checkpoint_has_none(
 
 @pytest.mark.parametrize("key", YOUNGER_KEYS)
 def test_what_was_made_before_there_was_a_key_is_what_it_was(key):
-    config, tree = compose_config(["scale=debug"])
+    config, tree = compose_config(["scale=debug", "phase=phase2"])
     older = without_keys(tree, [key])
     assert older != tree and run_identity(older) == run_identity(tree)
     assert restore_config(older, []) == config
