@@ -13,7 +13,7 @@ from torch.autograd.function import FunctionCtx
 from src.geometry.constants import constant
 
 # Pairs multiplied at a time in `paired_dot`: cache-sized on a CPU, few launches on a GPU.
-CPU_CHUNK = 1024
+CPU_CHUNK = 2048
 GPU_CHUNK = 65536
 
 
