@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import Self
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant
 from src.ops.radial_change import NUM_BINS, radial_bin, radial_change
-from src.ops.segment_reduce import segment_sum
+from src.ops.segment_reduce import gather_segment_sum
 
 WINDOW_CELLS = 2
 """A cell knows the points of its 5x5 neighbourhood; their weight falls off linearly along both axes."""
@@ -60,16 +60,19 @@ class Doppler:
         approach = (velocities * xy).sum(dim=1).sign()
         bins = radial_bin(approach * velocities.norm(dim=1))
         reach = torch.arange(-WINDOW_CELLS, WINDOW_CELLS + 1, device=xy.device)
-        offsets = torch.cartesian_prod(reach, reach)  # [25, 2] (row, col)
-        weights = (WINDOW_CELLS + 1 - offsets.abs()).prod(dim=1).to(xy.dtype)
-        cells = grid.cell_of(xy)[:, None] + offsets  # [P, 25, 2]
-        limit = constant(tuple(grid.cells), torch.int64, xy.device)
-        point, offset = ((cells >= 0) & (cells < limit)).all(dim=2).nonzero().unbind(1)
-        row, col = cells[point, offset].unbind(1)
-        linear = (radar_batch[inside][point] * grid.rows + row) * grid.cols + col
-        keys, owners = torch.unique(linear * NUM_BINS + bins[point], return_inverse=True)
-        weight = weights[offset][:, None]
-        sums = segment_sum(torch.cat([weight, weight * velocities[point]], dim=1), owners, len(keys))
+        falloff = (WINDOW_CELLS + 1 - reach.abs()).to(xy.dtype)
+        row, col = (places[:, None] + reach for places in grid.cell_of(xy).unbind(1))  # [P, 5] each
+        within = (((row >= 0) & (row < grid.rows))[:, :, None] & ((col >= 0) & (col < grid.cols))[:, None]).flatten()
+        linear = ((radar_batch[inside][:, None] * grid.rows + row) * grid.cols)[:, :, None] + col[:, None]  # [P, 5, 5]
+        chosen = within.nonzero().squeeze(1)
+        keys = (linear * NUM_BINS + bins[:, None, None]).flatten().index_select(0, chosen)
+        keys, order = torch.sort(keys, stable=True)
+        keys, counts = torch.unique_consecutive(keys, return_counts=True)
+        weighted = torch.cat([torch.ones_like(xy[:, :1]), velocities], dim=1)[:, None] * torch.outer(
+            falloff, falloff
+        ).view(-1, 1)
+        starts = F.pad(counts.cumsum(0), (1, 0))
+        sums = gather_segment_sum(weighted.flatten(0, 1), chosen.index_select(0, order), starts)
         return cls(grid, keys, sums[:, 1:] / sums[:, :1])
 
     def impose(
