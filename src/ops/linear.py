@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from src.ops.products import MOST_ROWS, multiply, product_type, row_spans, whole_steps
+from src.ops.products import MOST_ROWS, multiply, multiply_rows, product_type, row_spans, whole_steps
 
 LEAST_ROWS = 2048
 """Below, torch's own layer is as fast."""
@@ -41,7 +41,7 @@ class _Linear(torch.autograd.Function):
         if ctx.needs_input_grad[1]:
             grad_weight = torch.zeros_like(weight)
             for span in row_spans(len(x), MOST_ROWS):
-                grad_weight += multiply(whole_steps(x[span]).t().to(dtype), whole_steps(grad[span]).to(dtype))
+                grad_weight += multiply_rows(whole_steps(x[span]).to(dtype), whole_steps(grad[span]).to(dtype))
         return grad_x, grad_weight, grad.sum(0) if ctx.needs_input_grad[2] else None, None
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from src.ops import products
-from src.ops.products import bfloat16_products, multiplies_bfloat16, multiply, product_type, row_steps
+from src.ops.products import bfloat16_products, multiplies_bfloat16, multiply, multiply_rows, product_type, row_steps
 
 
 @pytest.fixture(params=[False, True], ids=["torch", "oneDNN"])
@@ -28,6 +28,18 @@ def test_other_types_are_multiplied_as_they_are(library):
     a, b = torch.randn(256, 64), torch.randn(64, 64)
     for dtype in (torch.float64, torch.bfloat16):
         assert torch.equal(multiply(a.to(dtype), b.to(dtype)), a.to(dtype) @ b.to(dtype))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float64])
+def test_the_positive_part_of_a_product(dtype, library):
+    a, b, bias = (torch.randn(*shape).to(dtype) for shape in ((300, 64), (64, 96), (96,)))
+    torch.testing.assert_close(multiply(a, b, bias, relu=True), torch.addmm(bias, a, b).clamp(min=0))
+
+
+@pytest.mark.parametrize("widths", [(12, 64), (64, 12)])
+def test_products_over_rows_whichever_operand_is_the_wider(widths, library):
+    a, b = torch.rand(300, widths[0]), torch.rand(300, widths[1])
+    torch.testing.assert_close(multiply_rows(a, b).double(), a.double().t() @ b.double(), rtol=1e-5, atol=0)
 
 
 def test_autocast_does_not_round_what_its_caller_keeps_in_float32(library):

@@ -11,11 +11,10 @@ from torch import Tensor
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.moved_keys import NONE
 from src.ops.radial_change import NUM_BINS, radial_bin, radial_change
-from src.ops.segment_reduce import segment_sum
+from src.ops.segment_reduce import gather_segment_sum, segment_sum
 
 WINDOW_CELLS = 2
 """A cell knows the points of its 5x5 neighbourhood; their weight falls off linearly along both axes."""
@@ -66,24 +65,22 @@ class Doppler:
         approach = (velocities * xy).sum(dim=1).sign()
         bins = radial_bin(approach * velocities.norm(dim=1))
         reach = torch.arange(-WINDOW_CELLS, WINDOW_CELLS + 1, device=xy.device)
-        offsets = torch.cartesian_prod(reach, reach)  # [25, 2] (row, col)
-        weights = (WINDOW_CELLS + 1 - offsets.abs()).prod(dim=1).to(xy.dtype)
-        cells = grid.cell_of(xy)[:, None] + offsets  # [P, 25, 2]
-        limit = constant(tuple(grid.cells), torch.int64, xy.device)
+        falloff = (WINDOW_CELLS + 1 - reach.abs()).to(xy.dtype)
+        row, col = (places[:, None] + reach for places in grid.cell_of(xy).unbind(1))  # [P, 5] each
+        within = ((row >= 0) & (row < grid.rows))[:, :, None] & ((col >= 0) & (col < grid.cols))[:, None]  # [P, 5, 5]
+        linear = ((radar_batch[:, None] * grid.rows + row) * grid.cols)[:, :, None] + col[:, None]
+        given = (linear * NUM_BINS + bins[:, None, None]).flatten()  # [25 P]
+        values = torch.cat([torch.ones_like(xy[:, :1]), velocities], dim=1)  # [P, 3]
+        weighted = (values[:, None] * torch.outer(falloff, falloff).view(-1, 1)).flatten(0, 1)
         if fixed is not None:
-            within = ((cells >= 0) & (cells < limit)).all(dim=2) & grid.contains(xy)[:, None]
-            linear = (radar_batch[:, None] * grid.rows + cells[..., 0]) * grid.cols + cells[..., 1]
-            given = torch.where(within, linear * NUM_BINS + bins[:, None], NONE).flatten()
+            given = torch.where((within & grid.contains(xy)[:, None, None]).flatten(), given, NONE)
             keys = fixed.distinct(given, NONE, len(given))
-            shares = (weights[:, None] * F.pad(velocities, (1, 0), value=1.0)[:, None]).flatten(0, 1)
-            sums = segment_sum(shares, torch.searchsorted(keys, given), len(keys))
+            sums = segment_sum(weighted, torch.searchsorted(keys, given), len(keys))
             return cls(grid, keys, sums[:, 1:] / sums[:, :1].clamp(min=1.0))
-        point, offset = ((cells >= 0) & (cells < limit)).all(dim=2).nonzero().unbind(1)
-        row, col = cells[point, offset].unbind(1)
-        linear = (radar_batch[point] * grid.rows + row) * grid.cols + col
-        keys, owners = torch.unique(linear * NUM_BINS + bins[point], return_inverse=True)
-        weight = weights[offset][:, None]
-        sums = segment_sum(torch.cat([weight, weight * velocities[point]], dim=1), owners, len(keys))
+        chosen = within.flatten().nonzero().squeeze(1)
+        keys, order = torch.sort(given.index_select(0, chosen), stable=True)
+        keys, counts = torch.unique_consecutive(keys, return_counts=True)
+        sums = gather_segment_sum(weighted, chosen.index_select(0, order), F.pad(counts.cumsum(0), (1, 0)))
         return cls(grid, keys, sums[:, 1:] / sums[:, :1])
 
     def impose(
