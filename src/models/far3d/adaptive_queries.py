@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from src.errors import ConfigError, require_least
+from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.heads.keypoint_head import (
     CameraKeypointHead,
@@ -17,37 +17,23 @@ from src.models.heads.keypoint_head import (
     keypoint_scores,
     most_likely_depth,
 )
+from src.models.heads.query_proposals import KeypointQueryConfig
 from src.models.layers.views import CameraViews
 from src.structures.queries import Queries
 from src.targets.depth import lid_centres
 
 
 @dataclass(kw_only=True)
-class AdaptiveQueryConfig:
-    """Settings of the adaptive queries (`model.queries`). Raises ConfigError for values that cannot work."""
+class AdaptiveQueryConfig(KeypointQueryConfig):
+    """Settings of the adaptive queries (`model.queries`)."""
 
     num_proposals: int  # at most, of a frame
     score_threshold: float  # of a pixel that a query starts at
-    num_depth_bins: int  # D, linearly increasing widths
-    depth_range_m: list[float]  # [nearest, farthest] along the optical axis
-    keypoint_nms_cells: int  # odd window of local maxima in the keypoint map
 
     def __post_init__(self) -> None:
-        require_least(self, "model.queries", {"num_proposals": 1, "num_depth_bins": 1, "keypoint_nms_cells": 1})
-        low_high = self.depth_range_m
-        if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
-            raise ConfigError(
-                f"model.queries.depth_range_m={low_high}: must be [near, far] in metres with 0 < near < far"
-            )
-        if self.keypoint_nms_cells % 2 == 0:
-            raise ConfigError(f"model.queries.keypoint_nms_cells={self.keypoint_nms_cells}: must be odd")
+        super().__post_init__()
         if not 0 < self.score_threshold < 1:
             raise ConfigError(f"model.queries.score_threshold={self.score_threshold}: must be between 0 and 1")
-
-    @property
-    def depth_range(self) -> tuple[float, float]:
-        """(nearest, farthest) in metres."""
-        return self.depth_range_m[0], self.depth_range_m[1]
 
 
 class AdaptiveQueries(nn.Module):

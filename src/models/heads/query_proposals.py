@@ -23,19 +23,17 @@ from src.targets.depth import lid_centres
 
 
 @dataclass(kw_only=True)
-class ProposalConfig:
-    """Settings of the queries (`model.queries`). Raises ConfigError for values that cannot work."""
+class KeypointQueryConfig:
+    """How queries start at objects found in the images (`model.queries`). Raises ConfigError for values that cannot
+    work; every other integer of a model's own must be at least 1."""
 
-    num_radar: int  # at the best peaks among the radar points
-    num_camera: int  # at the best keypoints of the images, lifted by their depth
-    num_learned: int  # at learnt places
     num_depth_bins: int  # D, linearly increasing widths
     depth_range_m: list[float]  # [nearest, farthest] along the optical axis
     keypoint_nms_cells: int  # odd window of local maxima in the keypoint map
 
     def __post_init__(self) -> None:
-        least = {field.name: 1 for field in fields(self) if field.name != "depth_range_m"}
-        require_least(self, "model.queries", least)
+        counts = [field.name for field in fields(self) if isinstance(getattr(self, field.name), int)]
+        require_least(self, "model.queries", dict.fromkeys(counts, 1))
         low_high = self.depth_range_m
         if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
             raise ConfigError(
@@ -48,6 +46,15 @@ class ProposalConfig:
     def depth_range(self) -> tuple[float, float]:
         """(nearest, farthest) in metres."""
         return self.depth_range_m[0], self.depth_range_m[1]
+
+
+@dataclass(kw_only=True)
+class ProposalConfig(KeypointQueryConfig):
+    """Settings of the queries (`model.queries`)."""
+
+    num_radar: int  # at the best peaks among the radar points
+    num_camera: int  # at the best keypoints of the images, lifted by their depth
+    num_learned: int  # at learnt places
 
 
 @dataclass
