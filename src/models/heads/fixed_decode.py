@@ -57,7 +57,7 @@ class FixedDecode(nn.Module):
         if self.peaks:
             scores = scores * maxpool_peaks(scores, sites)
         scores = scores * (sites.keys < sites.end)[:, None]
-        best, rows, labels = _best(scores, min(self.count, MOST_CLASSES * len(scores)))  # [groups, n] each
+        best, rows, labels = best_candidates(scores, min(self.count, MOST_CLASSES * len(scores)))  # [groups, n] each
         codes = self._regress(output.bev.features.index_select(0, rows.flatten()).unflatten(0, rows.shape))
         rows, labels, best = rows.flatten(), labels.flatten(), best.flatten()
         codes = measured_codes(output, codes.flatten(0, 1), rows)
@@ -101,7 +101,7 @@ class FixedDecode(nn.Module):
         return kept
 
 
-def _best(
+def best_candidates(
     scores: Tensor,  # [M, classes]
     count: int,
 ) -> Sequence[Tensor]:  # [groups, count] each: float32; int64, row; int64, index into CLASSES
