@@ -5,7 +5,7 @@ from src.ops.backend import implementation
 from src.ops.deform_sample import attend_views_reference
 
 
-@pytest.mark.parametrize(("samples", "queries"), [(2, 9), (1, 0), (1, 30)])
+@pytest.mark.parametrize(("samples", "queries"), [(2, 5), (1, 0)])
 @pytest.mark.parametrize("last", [False, True])
 def test_sums(device, samples, queries, last):
     """Channels first and last in memory; points beyond every edge of the image, and far away."""
