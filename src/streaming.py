@@ -19,6 +19,7 @@ from src.models.deploy.inference import prepare_for_inference
 from src.models.deploy.static_parts import compile_static_parts, replay_image_encoder
 from src.models.deploy.whole_frames import WholeFrames
 from src.models.detector import Detector
+from src.ops import backend
 from src.ops.fixed_shapes import Capacities
 from src.ops.precision import Precision, computing
 from src.reliability.checkpoints import read_checkpoint
@@ -63,9 +64,9 @@ class StreamingDetector:
         a GPU.
 
         `cuda_graph` makes `step` replay one CUDA graph, for a model that has a form of fixed shapes (Horizon3D); of
-        others the image encoder is one. On a CPU it changes nothing. A frame that exceeds a capacity of the fixed
-        shapes is detected without them; `whole_frames` counts such frames. `capacities` are others than the model's
-        own, and make `step` use fixed shapes on any device.
+        others, and without Triton's kernels, the image encoder is one. On a CPU it changes nothing. A frame that
+        exceeds a capacity of the fixed shapes is detected without them; `whole_frames` counts such frames. `capacities`
+        are others than the model's own, and make `step` use fixed shapes on any device.
 
         Raises ConfigError for a device that is not there or switches that do not go together, ValueError for a model
         that is prepared for another precision.
@@ -88,7 +89,8 @@ class StreamingDetector:
         if prepared is None and not plain:
             model = prepare_for_inference(model, precision)
         self.model = model.to(self.device).eval()
-        captured = cuda_graph and self.device.type == "cuda"
+        # What runs without Triton's kernels waits for counts, which a graph cannot hold.
+        captured = cuda_graph and self.device.type == "cuda" and backend.chosen() == backend.TRITON
         form = self.model.fixed_form(capacities) if captured or capacities else None
         if capacities is not None and form is None:
             raise ConfigError("capacities: this model has no form of fixed shapes as it is configured; leave them out")
@@ -118,7 +120,7 @@ class StreamingDetector:
             self.whole_frames.memory = memory
 
     @classmethod
-    def load(cls, checkpoint: Path | str, device: torch.device | str = "cpu", **switches: bool) -> Self:
+    def load(cls, checkpoint: Path | str, device: torch.device | str = "cpu", **switches: Any) -> Self:
         """Rebuild a checkpoint's own model from the configuration in it; `switches` as for the constructor.
 
         Raises CheckpointError when the file is missing, damaged or not of this project.
@@ -134,7 +136,7 @@ class StreamingDetector:
         checkpoint: dict[str, Any],
         path: Path,
         device: torch.device | str,
-        **switches: bool,
+        **switches: Any,
     ) -> Self:
         """The detector of a checkpoint that has been read already; `path` is for messages."""
         model = restored_model(config, checkpoint, path)

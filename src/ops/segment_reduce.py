@@ -131,7 +131,7 @@ class _PermuteRows(torch.autograd.Function):
 
 def _take(values: Tensor, rows: Tensor) -> Tensor:
     padded = F.pad(values, (0, 0, 0, 1))  # -1 takes the row of zeros behind them: a mask over rows takes twice as long
-    return padded.index_select(0, torch.remainder(rows, len(padded)))
+    return padded.index_select(0, torch.where(rows < 0, len(values), rows))
 
 
 def topk_per_sample(

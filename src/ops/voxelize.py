@@ -25,14 +25,18 @@ def voxelize(
 
     Voxel i of an axis covers [lower + i * size, lower + (i + 1) * size). Points outside the grid or with a coordinate
     that is not finite are left out. Where a sample has more than `max_voxels` voxels, those with the most points stay,
-    on ties those with the lowest index; in fixed shapes all stay. Means are float32 at least, whatever autocast says,
-    and the same for any order of the points up to rounding. Raises ValueError for shapes that do not fit together.
+    on ties those with the lowest index; in fixed shapes such a sample overflows. Means are float32 at least, whatever
+    autocast says, and the same for any order of the points up to rounding. Raises ValueError for shapes that do not fit
+    together.
     """
     if len(points) != len(batch):
         raise ValueError(f"expected one row of points for each entry of batch [{len(batch)}], got {len(points)}")
     sites, rows, inside = voxel_rows(coordinates, batch, lower_m, voxel_size_m, shape, batch_size)
     values = points.index_select(0, inside)
-    if max_voxels is not None and len(sites) > max_voxels and fixed_shapes() is None:
+    limited, fixed = max_voxels is not None and len(sites) > max_voxels, fixed_shapes()
+    if limited and fixed is not None:  # of one sample: padding follows the voxels
+        fixed.expect(sites.keys[max_voxels : max_voxels + 1], sites.end)
+    elif limited:
         kept = _densest(sites, segment_count(rows, len(sites)), max_voxels)
         rows = inverse_rows(kept, len(sites)).index_select(0, rows)
         values, rows = values[rows >= 0], rows[rows >= 0]

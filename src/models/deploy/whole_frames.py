@@ -55,7 +55,11 @@ class WholeFrames:
             boxes = self.form.boxes(self._run(fitted).cpu())
         if boxes is None:
             self.refused += 1
-            logger.info("frame %s exceeds a capacity, as %d of %d did", frame.tokens[0], self.refused, self.frames)
+            logger.info(
+                "frame %s exceeds a capacity (points, voxels, cells or pairs) and goes without fixed shapes, as %d of "
+                "%d frames did; StreamingDetector(capacities=...) states larger ones",
+                *(frame.tokens[0], self.refused, self.frames),
+            )
         return boxes
 
     def _run(self, frame: FrameBatch) -> Tensor:
@@ -79,17 +83,19 @@ class WholeFrames:
     def _capture(self) -> None:
         """Record `_step`; the memory is afterwards as it was before."""
         before = [tensor.clone() for tensor in self._memory]
-        stream = torch.cuda.Stream()
+        stream, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
         stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
-            for _ in range(WARM_UP_RUNS):
-                self._step()
-        torch.cuda.current_stream().wait_stream(stream)
-        for kept, old in zip(self._memory, before, strict=True):
-            kept.copy_(old)
-        self._graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self._graph):
-            self._result = self._step()
+        try:
+            with torch.cuda.stream(stream):
+                for _ in range(WARM_UP_RUNS):
+                    self._step()
+        finally:
+            torch.cuda.current_stream().wait_stream(stream)
+            for kept, old in zip(self._memory, before, strict=True):
+                kept.copy_(old)
+        with torch.cuda.graph(graph):
+            result = self._step()
+        self._graph, self._result = graph, result
 
 
 class PackedFrame:

@@ -56,7 +56,7 @@ class FixedDecode(nn.Module):
         sites, scores = output.bev.sites, output.logits.sigmoid()
         if self.peaks:
             scores = scores * maxpool_peaks(scores, sites)
-        scores = scores * (sites.keys < sites.end)[:, None]
+        scores = torch.where((sites.keys < sites.end)[:, None], scores, 0.0)  # padding may hold what is not finite
         best, rows, labels = best_candidates(scores, min(self.count, MOST_CLASSES * len(scores)))  # [groups, n] each
         codes = self._regress(output.bev.features.index_select(0, rows.flatten()).unflatten(0, rows.shape))
         rows, labels, best = rows.flatten(), labels.flatten(), best.flatten()

@@ -82,15 +82,17 @@ class FixedHorizon3D(nn.Module):
         return self.head.boxes(result[:-1].view(len(HEAD_GROUPS), -1, sum(WIDTHS)))
 
     def pack_memory(self, memory: Memory | None, device: torch.device) -> tuple[Tensor, ...]:
-        """The memory of one stream as `forward` takes it."""
+        """The memory of one stream as `forward` takes it. Raises ValueError for one of several."""
         if self.model.dptf is None:
             return ()
         found = Memory(()) if memory is None else memory
+        if found.batch_size > 1:
+            raise ValueError(f"the memory holds {found.batch_size} streams, but fixed shapes are for one")
         return FixedMemory.of(found, self.model.dptf, self.model.config.channels, device).tensors
 
     def unpack_memory(self, memory: tuple[Tensor, ...]) -> Memory | None:
         """And back, in float32; what is never read again is lost. Waits for a GPU."""
-        return FixedMemory(*memory).to_memory() if memory else None
+        return FixedMemory(*(tensor.clone() for tensor in memory)).to_memory() if memory else None
 
 
 def default_capacities(model: Horizon3D) -> Capacities:

@@ -10,6 +10,7 @@ import torch
 from src.benchmark.simulated_device import DEVICE, SimulatedDevice
 from src.benchmark.simulated_kernels import simulated_kernels
 from src.errors import ConfigError
+from src.geometry.constants import constant
 from src.models.deploy.whole_frames import PackedFrame, WholeFrames
 from src.ops.fixed_shapes import Capacities
 from src.streaming import StreamingDetector
@@ -117,12 +118,39 @@ def test_a_frame_beyond_a_capacity_goes_without_fixed_shapes(checkpoints, room, 
 
 
 @pytest.mark.slow
-def test_many_frames_of_varying_counts_take_no_more_memory(checkpoints):
+def test_more_voxels_than_the_model_takes_go_without_fixed_shapes(checkpoints):
+    fixed, plain = pair(checkpoints("phase=phase1", "model.radar_encoder.max_voxels=40"))
+    walk(fixed, plain, [make_frame(plain, 0.5 * k, seed=k, num_points=n) for k, n in enumerate((20, 150))])
+    assert fixed.whole_frames.refused == 1
+
+
+@pytest.mark.slow
+def test_a_memory_that_was_read_stays_as_it_was(checkpoints):
+    fixed, plain = pair(checkpoints("phase=phase2"))
+    frames = [make_frame(plain, time_s, seed=k, x_m=20 * time_s) for k, time_s in enumerate((0.0, 5.0, 0.5))]
+    for detector in (fixed, plain):
+        detector.step(frames[0])
+        kept = detector.memory
+        detector.reset()
+        detector.step(frames[1])  # another vehicle's
+        detector.memory = kept
+    assert fixed.memory.frames[0].timestamps_s.tolist() == frames[0].timestamps_s.tolist()
+    assert_same(fixed.step(frames[2]), plain.step(frames[2]))
+    two = plain.memory.select(torch.zeros(2, dtype=torch.int64), torch.tensor([True, False]))
+    with pytest.raises(ValueError, match="the memory holds 2 streams"):
+        fixed.memory = two
+
+
+@pytest.mark.slow
+def test_many_frames_of_varying_counts_stay_in_the_same_buffers_and_constants(checkpoints):
     detector = StreamingDetector.load(checkpoints("phase=phase2"), capacities=ROOM)
     counts = np.random.default_rng(0).integers(0, 200, 12)
     held = [tensor.data_ptr() for tensor in detector.whole_frames._memory]
     for k, count in enumerate(counts):
         detector.step(make_frame(detector, 0.5 * k, seed=k, num_points=int(count)))
+        if k == 0:
+            constants = constant.cache_info().currsize
+    assert constant.cache_info().currsize == constants, "a frame's counts are no constants"
     assert [tensor.data_ptr() for tensor in detector.whole_frames._memory] == held
     assert detector.whole_frames.refused == 0
 
