@@ -41,9 +41,9 @@ STAGES = {
     "resample": ("src.data.images:resample",),
     "mirror and rotate": ("src.data.images:turn",),
     "radar files": ("src.data.sensor_files:read_radar_points",),
-    "radar compensation": ("src.data.reader:compensate_clouds",),
+    "radar compensation": ("src.data.point_tensors:compensate_clouds",),
     "LiDAR files": ("src.data.sensor_files:read_lidar_points",),
-    "LiDAR compensation": ("src.data.reader:place_sweep",),
+    "LiDAR compensation": ("src.data.point_tensors:place_sweep",),
 }
 """Functions of the reader by the names under which it calls them; what is in none of them is `assembling`."""
 
