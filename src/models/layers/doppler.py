@@ -11,6 +11,7 @@ from torch import Tensor
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import constant
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.moved_keys import NONE
 from src.ops.radial_change import NUM_BINS, radial_bin, radial_change
@@ -18,6 +19,8 @@ from src.ops.segment_reduce import gather_segment_sum, segment_sum
 
 WINDOW_CELLS = 2
 """A cell knows the points of its 5x5 neighbourhood; their weight falls off linearly along both axes."""
+REACH = tuple(range(-WINDOW_CELLS, WINDOW_CELLS + 1))
+FALLOFF = tuple(WINDOW_CELLS + 1 - abs(offset) for offset in REACH)
 
 
 @dataclass(kw_only=True)
@@ -64,14 +67,15 @@ class Doppler:
         xy, velocities = radar_points[:, :2].float(), radar_points[:, 4:6].float()
         approach = (velocities * xy).sum(dim=1).sign()
         bins = radial_bin(approach * velocities.norm(dim=1))
-        reach = torch.arange(-WINDOW_CELLS, WINDOW_CELLS + 1, device=xy.device)
-        falloff = (WINDOW_CELLS + 1 - reach.abs()).to(xy.dtype)
+        reach = constant(REACH, torch.int64, xy.device)
+        falloff = constant(tuple(float(a * b) for a in FALLOFF for b in FALLOFF), xy.dtype, xy.device)  # [25]
         row, col = (places[:, None] + reach for places in grid.cell_of(xy).unbind(1))  # [P, 5] each
-        within = ((row >= 0) & (row < grid.rows))[:, :, None] & ((col >= 0) & (col < grid.cols))[:, None]  # [P, 5, 5]
+        in_row, in_col = row == row.clamp(0, grid.rows - 1), col == col.clamp(0, grid.cols - 1)
+        within = in_row[:, :, None] & in_col[:, None]  # [P, 5, 5]
         linear = ((radar_batch[:, None] * grid.rows + row) * grid.cols)[:, :, None] + col[:, None]
         given = (linear * NUM_BINS + bins[:, None, None]).flatten()  # [25 P]
-        values = torch.cat([torch.ones_like(xy[:, :1]), velocities], dim=1)  # [P, 3]
-        weighted = (values[:, None] * torch.outer(falloff, falloff).view(-1, 1)).flatten(0, 1)
+        values = F.pad(velocities, (1, 0), value=1.0)  # [P, 3]
+        weighted = (values[:, None] * falloff[:, None]).flatten(0, 1)
         if fixed is not None:
             given = torch.where((within & grid.contains(xy)[:, None, None]).flatten(), given, NONE)
             keys = fixed.distinct(given, NONE, len(given))
