@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import torch
@@ -61,9 +61,7 @@ class CameraRadarConfig(ModelConfig):
         self, gaussians: float = 1.0, memory_frames: int | None = None, cells_per_frame: int | None = None
     ) -> Self:
         """Remembered maps: there are no Gaussians, and which cells are remembered follows from the map alone."""
-        if memory_frames is None or self.temporal is None:
-            return self
-        return replace(self, temporal=replace(self.temporal, num_frames=memory_frames) if memory_frames else None)
+        return self._remembering(memory_frames)
 
 
 @dataclass

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import torch
@@ -62,6 +62,12 @@ class ModelConfig:
         None: as configured); with so many cells remembered of each, whatever fresh weights call occupied. What a model
         does not have stays as it is."""
         return self
+
+    def _remembering(self, frames: int | None) -> Self:
+        """Settings with so many remembered frames (0: none, None: as configured), where there is a memory."""
+        if frames is None or self._temporal is None:
+            return self
+        return replace(self, **{self.temporal_part: replace(self._temporal, num_frames=frames) if frames else None})
 
     def at_range(self, range_m: float) -> Self:
         """The settings with a region of their own, not the `grid`, that reaches at least so far to each side."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
@@ -68,9 +68,7 @@ class QueryDetectorConfig(ModelConfig):
         self, gaussians: float = 1.0, memory_frames: int | None = None, cells_per_frame: int | None = None
     ) -> Self:
         """Remembered frames: queries are no Gaussians, and of each frame as many are remembered."""
-        if memory_frames is None or self.temporal is None:
-            return self
-        return replace(self, temporal=replace(self.temporal, num_frames=memory_frames) if memory_frames else None)
+        return self._remembering(memory_frames)
 
 
 @dataclass
