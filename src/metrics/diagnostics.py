@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.box_cells import cells_in_boxes
@@ -83,7 +84,8 @@ def sums_by_sample(
     `remembered_share`: share of the objects that a Gaussian covers. Of all these only ground truth that counts.
     `<source>_gaussians`: how many a frame has; `<source>_near`: share of them near an object; `<source>_faint`: share
     below FAINT_OPACITY; `<source>_velocity_error`: m/s, of those inside a box that moves at FAST_MPS or faster, to its
-    velocity; the sources are those of `Source`.
+    velocity, and `<source>_radial_error` what of it lies along the ray from the vehicle, which a radar measures; the
+    sources are those of `Source`.
     """
     truth, num_samples = evaluation_set.ground_truth, len(evaluation_set.tokens)
     points = np.full(len(truth), UNKNOWN_POINTS)
@@ -175,29 +177,32 @@ def _compare_gaussians(
     distances = footprint_distances(means, boxes.bev())  # [g, k]
     near = (distances <= NEAR_M).any(dim=1)
     faint = gaussians.opacity_logits[sample][valid].sigmoid() < FAINT_OPACITY
-    errors = _velocity_errors(gaussians.velocities[sample][valid].float(), distances, boxes)
+    errors = _velocity_errors(gaussians.velocities[sample][valid].float(), means, distances, boxes)
     sums: dict[str, tuple[float, float]] = {}
     for source in Source:
         own = sources == source
         count = int(own.sum())
-        name, wrong = source.name.lower(), errors[own][~errors[own].isnan()]
+        name, wrong = source.name.lower(), errors[own & ~errors.isnan().any(dim=1)]
         sums[f"{name}_gaussians"] = (count, 1)
         sums[f"{name}_near"] = (int(near[own].sum()), count)
         sums[f"{name}_faint"] = (int(faint[own].sum()), count)
-        sums[f"{name}_velocity_error"] = (float(wrong.sum()), len(wrong))
+        for kind, total in zip(("velocity", "radial"), wrong.sum(dim=0).tolist(), strict=True):
+            sums[f"{name}_{kind}_error"] = (total, len(wrong))
     covered = torch.stack([(distances[sources == source] <= NEAR_M).any(dim=0) for source in COVERS], dim=1)
     return covered.cpu().numpy(), sums
 
 
 def _velocity_errors(
     velocities: Tensor,  # [g, 2] m/s
+    means: Tensor,  # [g, 2] m, from the vehicle
     distances: Tensor,  # [g, k] m
     boxes: Boxes3D,
-) -> Tensor:  # [g] m/s
+) -> Tensor:  # [g, 2] m/s, whole and its part along the ray
     """Of Gaussians within a fast box to its velocity; NaN elsewhere, where what stands beside the road may be meant."""
     if not len(boxes):
-        return velocities.new_full((len(velocities),), torch.nan)
+        return velocities.new_full((len(velocities), 2), torch.nan)
     nearest, box = distances.min(dim=1)
-    errors = (velocities - boxes.velocities[box]).norm(dim=1)
+    wrong = velocities - boxes.velocities[box]
+    errors = torch.stack([wrong.norm(dim=1), (wrong * F.normalize(means, dim=1)).sum(dim=1).abs()], dim=1)
     counted = (nearest == 0) & (boxes.velocities[box].norm(dim=1) >= FAST_MPS)
-    return torch.where(counted, errors, torch.nan)
+    return torch.where(counted[:, None], errors, torch.nan)

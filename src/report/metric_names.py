@@ -80,6 +80,7 @@ for _source in SOURCES:
         ("near", "Gaussians near an object", "%", 100.0, 1, True),
         ("faint", "Gaussians of opacity below 0.1", "%", 100.0, 1, False),
         ("velocity_error", "Gaussians' velocity error on movers", "m/s", 1.0, 2, False),
+        ("radial_error", "Gaussians' radial velocity error on movers", "m/s", 1.0, 2, False),
     ):
         METRICS[f"measures.{_source}_{_key}"] = Metric(f"measures.{_source}_{_key}", f"{_source} {_words}", *_rest)
 for _part in PARTS + FURTHER_PARTS:

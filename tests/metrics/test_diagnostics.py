@@ -101,6 +101,15 @@ def test_gaussians_by_source():
             assert measures[f"{source}_{name}"] == (value if value is None else pytest.approx(value)), (source, name)
 
 
+def test_only_the_radial_part_of_a_velocity_error_lies_along_the_ray():
+    one = gaussians_of((Source.RADAR, 9, 0.9, 17, 0.9))
+    one = replace(one, velocities=torch.tensor([[[17.0, 4.0]]]))  # (-3, 4) wrong, 5 m/s, seen along (10, 1)
+    measures = measured(Evidence(one))
+    assert measures["radar_velocity_error"] == pytest.approx(5)
+    assert measures["radar_radial_error"] == pytest.approx(26 / 101**0.5)
+    assert measures["camera_radial_error"] is None
+
+
 @pytest.mark.parametrize(("name", "objects"), [("remembered_share", 1), ("radar_covers", 2), ("camera_covers", 0)])
 def test_objects_that_gaussians_cover_are_those_that_count(name, objects):
     assert measured(Evidence(GAUSSIANS))[name] == pytest.approx(objects / 3)
