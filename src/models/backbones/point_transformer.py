@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.pillars import PillarConfig, PillarEncoder
+from src.models.layers.image_attention import feed_forward
 from src.models.layers.sparse import SubmanifoldConv
 from src.ops.segment_reduce import segment_count, topk_per_sample
 from src.ops.sites import Sites
@@ -108,8 +109,7 @@ class SerialisedBlock(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(2))
         self.query_key_value = nn.Linear(channels, 3 * channels)
         self.output = nn.Linear(channels, channels)
-        hidden = MLP_RATIO * channels
-        self.mlp = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), nn.Linear(hidden, channels))
+        self.mlp = feed_forward(channels, MLP_RATIO)
 
     def forward(self, bev: SparseBEV) -> SparseBEV:
         x = bev.features + self.position(bev).features

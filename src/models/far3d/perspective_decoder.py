@@ -12,7 +12,7 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.heads.query_head import QueryPrediction, SetPredictionHead
 from src.models.layers.global_attention import FFN_RATIO, GlobalAttention
-from src.models.layers.image_attention import ImageCrossAttention
+from src.models.layers.image_attention import ImageCrossAttention, feed_forward
 from src.models.layers.query_attention import QueryEmbedding
 from src.models.layers.views import CameraViews
 from src.structures.queries import Queries
@@ -71,8 +71,7 @@ class PerspectiveLayer(nn.Module):
         nn.init.zeros_(self.offsets.weight)
         nn.init.uniform_(self.offsets.bias, -INITIAL_REACH_M, INITIAL_REACH_M)
         self.image_attention = ImageCrossAttention(channels, config.num_points, num_views, num_levels)
-        hidden = FFN_RATIO * channels
-        self.mlp = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), nn.Linear(hidden, channels))
+        self.mlp = feed_forward(channels, FFN_RATIO)
 
     def forward(
         self,

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.models.layers.image_attention import attention_linear
+from src.models.layers.image_attention import attention_linear, feed_forward
 from src.structures.queries import Queries
 
 FFN_RATIO = 8
@@ -58,8 +58,7 @@ class GlobalDecoderLayer(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
         self.self_attention = GlobalAttention(channels, num_heads)
         self.image_attention = GlobalAttention(channels, num_heads)  # or radar's; checkpoints know the name
-        hidden = FFN_RATIO * channels
-        self.mlp = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), nn.Linear(hidden, channels))
+        self.mlp = feed_forward(channels, FFN_RATIO)
 
     def forward(
         self,

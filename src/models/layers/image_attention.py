@@ -24,6 +24,11 @@ def linear_relu_norm(in_channels: int, channels: int) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
+def feed_forward(channels: int, ratio: int) -> nn.Sequential:
+    """Linear to `ratio` times the channels, ReLU, linear back (the MLP of a transformer layer)."""
+    return nn.Sequential(nn.Linear(channels, ratio * channels), nn.ReLU(), nn.Linear(ratio * channels, channels))
+
+
 def attention_linear(in_channels: int, out_channels: int, zero: bool = False) -> nn.Linear:
     """Linear layer with zero bias and Xavier (or zero) weights."""
     layer = nn.Linear(in_channels, out_channels)

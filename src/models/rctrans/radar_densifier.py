@@ -11,6 +11,7 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
 from src.models.layers.global_attention import GlobalAttention
+from src.models.layers.image_attention import feed_forward
 from src.models.layers.query_attention import PlaceEmbedding
 
 DOWNS = 3
@@ -44,8 +45,7 @@ class CellAttention(nn.Module):
         self.embedding = PlaceEmbedding(channels, grid, coordinates=2)
         self.attention = GlobalAttention(channels, num_heads)
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(2))
-        hidden = FFN_RATIO * channels
-        self.mlp = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), nn.Linear(hidden, channels))
+        self.mlp = feed_forward(channels, FFN_RATIO)
 
     def forward(
         self,
