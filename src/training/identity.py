@@ -41,6 +41,8 @@ YOUNGER_KEYS = {
     "phase.long_range": None,
     "model.radar_encoder.pruning_ratio": 0.0,
     "model.doppler.withheld": 0.0,
+    "model.doppler.in_losses": True,
+    "model.doppler.along_heading": False,
     "model.dptf.gaussian_path.forget_refuted": False,
 }
 """Keys that runs were made without, with the value that does what was done then.

@@ -28,7 +28,7 @@ from src.models.heads.decode import (
     top_candidates,
 )
 from src.models.layers.dense import AllCells, DenseConvNormReLU
-from src.models.layers.doppler import Doppler
+from src.models.layers.doppler import Doppler, along_heading
 from src.models.layers.sparse import ConvNormReLU, SubmanifoldConv
 from src.ops.nms import maxpool_peaks
 from src.ops.segment_reduce import segment_count
@@ -162,10 +162,10 @@ class CenterHead(nn.Module):
         statistics come from the chosen cells and an even sample of the others.
         """
         if output.codes is not None:
-            return measured_codes(output, output.codes[rows, groups], rows)
+            return output.codes[rows, groups]
         order = groups.argsort(stable=True)
         counts = segment_count(groups, len(HEAD_GROUPS)).tolist()
-        return measured_codes(output, self._regress_by_group(output, rows[order], counts)[order.argsort()], rows)
+        return self._regress_by_group(output, rows[order], counts)[order.argsort()]
 
     def _regress_by_group(
         self,
@@ -224,6 +224,8 @@ class CenterHead(nn.Module):
         if box_weight is None and not self.learned:
             return Objective(terms, diagnostics)
         predicted = self.regress(output, targets.rows, targets.groups)
+        if output.doppler is not None and output.doppler.in_losses:
+            predicted = measured_codes(output, predicted, targets.rows)
         if box_weight is not None:
             code_weights = constant(self.code_weights, zeros.dtype, zeros.device)
             errors = masked_l1(predicted[:, :CODE_SIZE], targets.codes) * code_weights
@@ -248,7 +250,7 @@ class CenterHead(nn.Module):
         else:
             groups = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts)).to(best.rows.device)
             codes = output.codes[best.rows, groups]
-        codes = measured_codes(output, codes, best.rows)
+        codes = decoded_codes(output, codes, best.rows)
         boxes = boxes_from_codes(cells[best.rows, 1:], codes[:, :CODE_SIZE], best.labels, best.scores, self.grid)
         if self.learned:
             boxes.attributes = learned_attributes(codes[:, CODE_SIZE:], best.labels)
@@ -267,6 +269,20 @@ def measured_codes(
         return codes
     before, velocities, after = codes.split([CODE_SIZE - 2, 2, codes.shape[1] - CODE_SIZE], dim=1)
     return torch.cat([before, output.doppler.impose(velocities, output.bev.sites.linear()[rows]), after], dim=1)
+
+
+def decoded_codes(
+    output: HeadOutput,
+    codes: Tensor,  # [n, CODE_SIZE (+ 11)]
+    rows: Tensor,  # [n] int64, cells
+) -> Tensor:  # [n, CODE_SIZE (+ 11)]
+    """Codes as boxes are read from them: with measured velocities, along the heading if the radar's reader wants it."""
+    codes, doppler = measured_codes(output, codes, rows), output.doppler
+    if doppler is None or not doppler.along_heading:
+        return codes
+    before, heading, velocities, after = codes.split([CODE_SIZE - 4, 2, 2, codes.shape[1] - CODE_SIZE], dim=1)
+    positions = doppler.grid.centre_of(output.bev.indices[rows, 1:])
+    return torch.cat([before, heading, along_heading(velocities, heading, positions), after], dim=1)
 
 
 def _attribute_loss(logits: Tensor, targets: HeadTargets) -> Tensor:

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.geometry.constants import constant
-from src.models.heads.center_head import CenterHead, HeadOutput, measured_codes
+from src.models.heads.center_head import CenterHead, HeadOutput, decoded_codes
 from src.models.heads.decode import (
     MAX_BOXES_PER_GROUP,
     MAX_CANDIDATES_PER_GROUP,
@@ -60,7 +60,7 @@ class FixedDecode(nn.Module):
         best, rows, labels = best_candidates(scores, min(self.count, MOST_CLASSES * len(scores)))  # [groups, n] each
         codes = self._regress(output.bev.features.index_select(0, rows.flatten()).unflatten(0, rows.shape))
         rows, labels, best = rows.flatten(), labels.flatten(), best.flatten()
-        codes = measured_codes(output, codes.flatten(0, 1), rows)
+        codes = decoded_codes(output, codes.flatten(0, 1), rows)
         cells = output.bev.indices.index_select(0, rows)[:, 1:]
         boxes = boxes_from_codes(cells, codes[:, :CODE_SIZE], labels, best, self.head.grid)
         if self.head.learned:

@@ -58,6 +58,7 @@ class CellPrediction:
 
     occupancy_logits: Tensor  # [M] float32, delta before its sigmoid
     velocities: Tensor  # [M, 2] float32, u in m/s over ground, augmented axes
+    supervised: Tensor  # [M, 2] those that losses see, see `DopplerConfig`
 
 
 @dataclass
@@ -116,10 +117,10 @@ class BEVPath(nn.Module):
                 values.append(head[1](head[0](fused).features))
         if self.velocity is None:
             values = list(values[0].split([1, 2], dim=1))
-        velocities = VELOCITY_UNIT_MPS * values[1]
-        if doppler is not None:
-            velocities = doppler.impose(velocities, fused.sites.linear())
-        return CellPrediction(values[0].squeeze(1), velocities)
+        stated = VELOCITY_UNIT_MPS * values[1]
+        velocities = stated if doppler is None else doppler.impose(stated, fused.sites.linear())
+        in_losses = doppler is None or doppler.in_losses
+        return CellPrediction(values[0].squeeze(1), velocities, velocities if in_losses else stated)
 
     @torch.no_grad()
     def store(self, fused: SparseBEV, cells: CellPrediction, batch: FrameBatch) -> StoredCells:

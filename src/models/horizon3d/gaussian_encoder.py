@@ -348,8 +348,11 @@ class GaussianEncoder(nn.Module):
 
     def forward(
         self, gaussians: GaussianSet, radar_bev: SparseBEV, views: CameraViews, doppler: Doppler | None = None
-    ) -> GaussianSet:
-        """G_0 -> G_L; with `doppler` the radial part of their velocities is always the measured one."""
+    ) -> tuple[GaussianSet, Tensor]:
+        """G_0 -> G_L; with `doppler` the radial part of their velocities is always the measured one.
+
+        And the velocities [B, G, 2] that losses see.
+        """
         values = [
             self.image_value(level.flatten(0, 1)).unflatten(0, level.shape[:2]) for level in views.levels
         ]  # L x [B, N, C, h, w]
@@ -357,8 +360,10 @@ class GaussianEncoder(nn.Module):
         joined = self.anchor.joined() if torch.is_grad_enabled() else None
         for layer in self.layers:
             embedding = self.anchor(gaussians) if joined is None else self.anchor(gaussians, joined)
-            gaussians = _measured(layer(gaussians, embedding, radar_bev, views, values), doppler)
-        return gaussians
+            stated = layer(gaussians, embedding, radar_bev, views, values)
+            gaussians = _measured(stated, doppler)
+        in_losses = doppler is None or doppler.in_losses
+        return gaussians, (gaussians if in_losses else stated).velocities
 
 
 def _measured(gaussians: GaussianSet, doppler: Doppler | None) -> GaussianSet:

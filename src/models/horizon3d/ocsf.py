@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 
-from torch import nn
+from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
@@ -87,6 +87,7 @@ class OCSFOutput:
     gaussians: GaussianSet  # G_L
     splat: GaussianSplat
     fused_bev: SparseBEV  # F_fuse
+    supervised: Tensor  # [B, G, 2] velocities that losses see, see `DopplerConfig`
 
 
 class OCSF(nn.Module):
@@ -128,8 +129,8 @@ class OCSF(nn.Module):
     ) -> OCSFOutput:
         """G_0 to F_fuse."""
         config = self.config
-        gaussians = self.encoder(gaussians, radar_bev, views, doppler)
+        gaussians, supervised = self.encoder(gaussians, radar_bev, views, doppler)
         splat = splat_set(
             gaussians, self.grid, config.occupancy_threshold, config.max_occupied_cells, config.support_sigmas
         )
-        return OCSFOutput(gaussians, splat, self.fusion(splat.bev, radar_bev))
+        return OCSFOutput(gaussians, splat, self.fusion(splat.bev, radar_bev), supervised)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Self
 
@@ -19,6 +20,10 @@ from src.ops.segment_reduce import gather_segment_sum, segment_sum
 
 WINDOW_CELLS = 2
 """A cell knows the points of its 5x5 neighbourhood; their weight falls off linearly along both axes."""
+MOVING_MPS = 1.0
+"""What is slower does not drive (CRT-Fusion's least speed)."""
+LEAST_COSINE = 0.3
+"""Between heading and line of sight; at a wider angle the radial part says too little of the speed."""
 REACH = tuple(range(-WINDOW_CELLS, WINDOW_CELLS + 1))
 FALLOFF = tuple(WINDOW_CELLS + 1 - abs(offset) for offset in REACH)
 
@@ -34,6 +39,8 @@ class DopplerConfig:
     cells: bool
     boxes: bool
     withheld: float  # share of the frames of training in which none does
+    in_losses: bool  # losses see these velocities; else those that the network states
+    along_heading: bool  # a box that moves does so along its heading, with that radial part
 
     def __post_init__(self) -> None:
         if not 0 <= self.withheld <= 1:
@@ -50,6 +57,8 @@ class Doppler:
     grid: BEVGrid
     keys: Tensor  # [n] int64 ((b * rows + row) * cols + col) * NUM_BINS + bin, sorted, unique; padding has the largest
     velocities: Tensor  # [n, 2] m/s over ground, augmented axes
+    in_losses: bool = True  # see `DopplerConfig`
+    along_heading: bool = False  # see `DopplerConfig`
 
     @classmethod
     @torch.no_grad()
@@ -58,6 +67,7 @@ class Doppler:
         radar_points: Tensor,  # [P, 7] x, y, z (m, aug frame), rcs (dB), vx, vy (m/s), dt (s)
         radar_batch: Tensor,  # [P] int64
         grid: BEVGrid,
+        **options: bool,  # `in_losses` and `along_heading`
     ) -> Self:
         """Of all points inside the grid."""
         fixed = fixed_shapes()
@@ -80,12 +90,12 @@ class Doppler:
             given = torch.where((within & grid.contains(xy)[:, None, None]).flatten(), given, NONE)
             keys = fixed.distinct(given, NONE, len(given))
             sums = segment_sum(weighted, torch.searchsorted(keys, given), len(keys))
-            return cls(grid, keys, sums[:, 1:] / sums[:, :1].clamp(min=1.0))
+            return cls(grid, keys, sums[:, 1:] / sums[:, :1].clamp(min=1.0), **options)
         chosen = within.flatten().nonzero().squeeze(1)
         keys, order = torch.sort(given.index_select(0, chosen), stable=True)
         keys, counts = torch.unique_consecutive(keys, return_counts=True)
         sums = gather_segment_sum(weighted, chosen.index_select(0, order), F.pad(counts.cumsum(0), (1, 0)))
-        return cls(grid, keys, sums[:, 1:] / sums[:, :1])
+        return cls(grid, keys, sums[:, 1:] / sums[:, :1], **options)
 
     def impose(
         self,
@@ -98,3 +108,21 @@ class Doppler:
         wrong measurement or to none; whole, where `withheld` frames have no measurement.
         """
         return velocities + radial_change(velocities, cells, self.keys, self.velocities, self.grid)
+
+
+def along_heading(
+    velocities: Tensor,  # [n, 2] m/s over ground
+    headings: Tensor,  # [n, 2] cosine and sine of the yaw, of any length
+    positions: Tensor,  # [n, 2] m from the ego's origin, same axes
+) -> Tensor:  # [n, 2] m/s
+    """Velocities of what drives, turned into its heading: they keep their radial part, or the part along the heading.
+
+    The latter where heading and line of sight are nearly at right angles. What is slow stays as it is, and what moves
+    more than 45 degrees away from its heading, where one of both is wrong.
+    """
+    heading, sight = F.normalize(headings, dim=1), F.normalize(positions, dim=1)
+    along, radial, cosine = ((a * b).sum(1) for a, b in ((velocities, heading), (velocities, sight), (heading, sight)))
+    speed = torch.where(cosine.abs() > LEAST_COSINE, radial / cosine, along)
+    stated = velocities.norm(dim=1)
+    drives = (stated > MOVING_MPS) & (along.abs() > math.sqrt(0.5) * stated)
+    return torch.where(drives[:, None], speed[:, None] * heading, velocities)

@@ -162,7 +162,12 @@ def make_config():
             kggi=None if radar_only else KGGIConfig(**kggi),
             ocsf=None if radar_only else OCSFConfig(**ocsf),
             dptf=dptf,
-            doppler=DopplerConfig(**{name: name in doppler for name in ("gaussians", "cells", "boxes")}, withheld=0.0),
+            doppler=DopplerConfig(
+                **{name: name in doppler for name in ("gaussians", "cells", "boxes")},
+                withheld=0.0,
+                in_losses=True,
+                along_heading=False,
+            ),
             head=head_config(),
             loss=Horizon3DLossConfig(**loss),
         )

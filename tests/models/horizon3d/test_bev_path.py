@@ -31,7 +31,7 @@ def remember(path, batch, cells, velocities, scores=0.9):
     """Memory frame of occupied cells [n, 3] whose features tell their row in `cells`."""
     fused, order = bev_of(cells, path.grid, batch_size=len(batch))
     logits = torch.logit(torch.as_tensor(scores).expand(len(cells)))
-    stored = path.store(fused, CellPrediction(logits[order], velocities[order]), batch)
+    stored = path.store(fused, CellPrediction(logits[order], velocities[order], velocities[order]), batch)
     return MemoryFrame(batch.timestamps_s, batch.global_from_ego, torch.ones(len(batch)).bool(), stored, None)
 
 
@@ -288,7 +288,7 @@ def test_streams_with_different_motions_equal_single_streams():
             fused, _ = bev_of(cells, TINY, features, len(streams))
             warped = path.recall(memory, batch, 6.0)
             output = path.aggregate(fused, warped)
-            stored = path.store(fused, CellPrediction(torch.ones(len(cells)), velocities), batch)
+            stored = path.store(fused, CellPrediction(torch.ones(len(cells)), velocities, velocities), batch)
             present = torch.ones(len(streams)).bool()
             memory = memory.push(MemoryFrame(batch.timestamps_s, batch.global_from_ego, present, stored, None), 8, 0)
         return warped, output
@@ -343,7 +343,7 @@ def test_autocast_halves_stored_features_and_leaves_positions_alone():
     velocities = torch.tensor([[33.333, -4.567], [10.123, 1.0], [0.777, 0.0]])
     batch, now = bare_frame(0.0, [pose(1.0, 2.0, 0.3, UTM)], aug), bare_frame(0.5, [pose(9.0, 2.0, 0.4, UTM)], aug)
     fused, _ = bev_of(cells)
-    prediction = CellPrediction(torch.ones(3), velocities)
+    prediction = CellPrediction(torch.ones(3), velocities, velocities)
     plain = path.store(fused, prediction, batch)
     frame = MemoryFrame(batch.timestamps_s, batch.global_from_ego, torch.ones(1).bool(), plain, None)
     warped = path.recall(Memory((frame,)), now, 6.0)
@@ -377,6 +377,8 @@ def test_a_cells_velocity_takes_its_radial_part_from_the_radar():
     plain, found = path.predict(fused).velocities, path.predict(fused, doppler).velocities
     torch.testing.assert_close(found[0], torch.tensor([5.0, float(plain[0, 1].detach())]))
     assert torch.equal(found[1], plain[1])
+    for in_losses, wanted in ((True, found), (False, plain)):
+        assert torch.equal(path.predict(fused, replace(doppler, in_losses=in_losses)).supervised, wanted)
 
 
 def test_a_path_without_frames_or_with_an_impossible_threshold_is_refused():

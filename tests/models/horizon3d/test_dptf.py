@@ -39,9 +39,9 @@ def make_parts(make_dptf):
                 valid=torch.ones(b, 1, dtype=torch.bool),
             )
             peaks = fused.sites.linear()[:, None]
-            ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, peaks, zeros + 0.2), fused)
+            ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, peaks, zeros + 0.2), fused, gaussians.velocities)
             velocities = torch.tensor([[0.0, -4.0]]).expand(b, 2)
-            predicted = CellPrediction(torch.ones(b), velocities) if dptf.bev_path is not None else None
+            predicted = CellPrediction(torch.ones(b), velocities, velocities) if dptf.bev_path is not None else None
             past = dptf.recall(memory, batch).past
             return dptf.remember(past, batch, fused, DPTFOutput(None, None, predicted, fused), ocsf)
 

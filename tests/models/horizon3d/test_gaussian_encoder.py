@@ -143,7 +143,7 @@ def test_a_gaussian_that_no_camera_sees_is_finite_with_finite_gradients(grid, ma
     views.valid[:] = False
     gaussians = make_gaussians(places(10))
     gaussians.features.requires_grad_()
-    out = encoder(gaussians, make_radar(grid), views)
+    out, _ = encoder(gaussians, make_radar(grid), views)
     out.means.sum().backward()
     assert out.features.isfinite().all() and gaussians.features.grad.isfinite().all()
 
@@ -204,7 +204,7 @@ def test_padding_changes_nothing(grid, make_views, chained, early):
     first = GaussianSet(**{name: getattr(full, name)[:, :8] for name in GaussianSet.__dataclass_fields__})
     valid = torch.arange(12)[None] < 8
     padded = replace(full, valid=valid, features=torch.where(valid[..., None], full.features, 1e3))
-    a, b = encoder(first, radar, views), encoder(padded, radar, views)
+    (a, _), (b, _) = encoder(first, radar, views), encoder(padded, radar, views)
     torch.testing.assert_close(b.means[:, :8], a.means)
     torch.testing.assert_close(b.features[:, :8], a.features)
 
@@ -216,7 +216,7 @@ def test_order_of_attention_and_source_of_refinement_matter(grid, make_views):
         encoder = make_encoder(grid, layers=1, chained=chained, early=early)
         for parameter in encoder.parameters():  # the same weights in all three, large enough to tell them apart
             torch.nn.init.normal_(parameter, std=0.3, generator=torch.Generator().manual_seed(parameter.numel()))
-        results.append(encoder(gaussians, radar, views))
+        results.append(encoder(gaussians, radar, views)[0])
     parallel, chained, early = results
     assert not torch.allclose(parallel.features, chained.features, atol=1e-3)
     torch.testing.assert_close(parallel.features, early.features)  # features pass the same way,
@@ -226,5 +226,5 @@ def test_order_of_attention_and_source_of_refinement_matter(grid, make_views):
 def test_no_detach_between_layers(grid, make_views):
     encoder = make_encoder(grid)
     gaussians = make_gaussians(places(8))
-    encoder(gaussians, make_radar(grid), make_views()).scales.sum().backward()
+    encoder(gaussians, make_radar(grid), make_views())[0].scales.sum().backward()
     assert encoder.layers[0].refinement.output.weight.grad.abs().sum() > 0

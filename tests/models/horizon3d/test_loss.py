@@ -48,7 +48,8 @@ def scene():
     fused, _ = bev_of(cells, TINY, batch_size=2)
     boxes = [boxes_of((0.0, 0.0, 2.0, 1.0, 7.0, -2.0), (-2.5, -2.0, 1.0, 1.0, NAN, NAN)), boxes_of()]
     scores = torch.tensor([0.8, 0.3, 0.6, 0.1])
-    prediction = CellPrediction(torch.logit(scores), torch.tensor([[9.0, 9], [4, 1], [9, 9], [9, 9]]))
+    velocities = torch.tensor([[9.0, 9], [4, 1], [9, 9], [9, 9]])
+    prediction = CellPrediction(torch.logit(scores), velocities + 50.0, velocities)  # the second ones are supervised
     return prediction, fused, BoxRaster(boxes, TINY, 0.0)
 
 
@@ -79,9 +80,9 @@ def test_inner_and_outer_weights_multiply_and_null_switches_off(settings, scene)
 
 def test_velocity_is_supervised_only_in_boxes_of_known_velocity(settings, scene):
     prediction, fused, raster = scene
-    prediction.velocities.requires_grad_()
+    prediction.supervised.requires_grad_()
     cell_losses(prediction, fused, raster, settings())["cell_velocity"].backward()
-    assert prediction.velocities.grad.tolist() == [[0, 0], [-0.5, 0.5], [0, 0], [0, 0]]
+    assert prediction.supervised.grad.tolist() == [[0, 0], [-0.5, 0.5], [0, 0], [0, 0]]
     unknown = BoxRaster([boxes_of((0.0, 0.0, 2.0, 1.0, NAN, NAN)), boxes_of()], TINY, 0.0)
     assert not cell_losses(prediction, fused, unknown, settings())["cell_velocity"].any()
 
@@ -99,15 +100,15 @@ def test_nothing_to_supervise_is_finite_with_finite_gradients(settings, scene, e
     prediction, fused, raster = scene
     if empty != "boxes":
         fused, _ = bev_of(torch.zeros(0, 3, dtype=torch.int64), TINY, batch_size=2)
-        prediction = CellPrediction(torch.zeros(0), torch.zeros(0, 2))
+        prediction = CellPrediction(torch.zeros(0), torch.zeros(0, 2), torch.zeros(0, 2))
     if empty != "cells":
         raster = BoxRaster([boxes_of(), boxes_of()], TINY, 0.0)
     prediction.occupancy_logits.requires_grad_()
-    prediction.velocities.requires_grad_()
+    prediction.supervised.requires_grad_()
     found = cell_losses(prediction, fused, raster, settings())
     assert list(found) == NAMES and all(value.isfinite() for value in found.values())
     sum(found.values()).backward()
-    assert prediction.occupancy_logits.grad.isfinite().all() and not prediction.velocities.grad.any()
+    assert prediction.occupancy_logits.grad.isfinite().all() and not prediction.supervised.grad.any()
     assert not found["cell_velocity"].any() and not found["cell_lovasz"].any()
 
 
@@ -127,7 +128,7 @@ def test_gaussian_velocity_by_hand(settings):
         valid=torch.ones(1, 5, dtype=torch.bool),
     )
     peaks = torch.tensor([[2 * 6 + 2, 1 * 6 + 2, 4 * 6 + 3, 0, -1]])
-    ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, peaks, zeros), None)
+    ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, peaks, zeros), None, gaussians.velocities)
     boxes = [boxes_of((0.0, 0.0, 2.0, 1.0, 7.0, -2.0), (-2.5, -2.0, 1.0, 1.0, NAN, NAN))]
     wide, narrow = (BoxRaster(boxes, TINY, margin_m) for margin_m in (2.0, 0.0))
     # Margin 2 m in total: rows 1..3 around the first box, rows and columns 0..1 around the second.
@@ -151,7 +152,7 @@ def test_what_stands_and_the_ground_have_their_own_means(settings):
     boxes.num_points = torch.tensor([1, 1, 0])
     found = torch.tensor([[3.0, -1.0], [50.0, 50.0], [7.0, -1.0], [9.0, -2.0], [60.0, 0.0], [0.5, 4.0]])
     moving, standing, ground = (1 + 2) / 4, 4 / 2, (3 + 1) / 2
-    prediction = CellPrediction(torch.zeros(6), found)
+    prediction = CellPrediction(torch.zeros(6), found, found)
     for groups, expected in (
         (VelocityGroups.boxes, (1 + 2 + 4) / 6),
         (VelocityGroups.motion, moving + standing),

@@ -11,12 +11,12 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models import FAMILIES, build_model
 from src.models.backbones.image import ImageEncoderConfig
-from src.models.heads.center_head import BoxOptions
+from src.models.heads.center_head import BoxOptions, decoded_codes
 from src.models.horizon3d.kggi import Initialization
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, RefineFrom
-from src.models.layers.doppler import Doppler
+from src.models.layers.doppler import Doppler, along_heading
 from src.ops.radial_change import NUM_BINS
 from src.structures.boxes import Boxes3D
 from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
@@ -170,7 +170,7 @@ def test_velocities_are_those_that_the_radar_measures_along_the_line_of_sight(ma
     with torch.no_grad():
         output, _ = model.eval()(batch)
         every = torch.arange(len(output.head.bev))
-        codes = model.head.regress(output.head, every, 0 * every)
+        codes = decoded_codes(output.head, model.head.regress(output.head, every, 0 * every), every)
     doppler = Doppler.measure(batch.radar_points, batch.radar_batch, model.grid)
     gaussians = output.ocsf.gaussians
     sample, _ = gaussians.valid.nonzero().unbind(1)
@@ -182,6 +182,39 @@ def test_velocities_are_those_that_the_radar_measures_along_the_line_of_sight(ma
         torch.testing.assert_close(doppler.impose(velocities, cells), velocities, atol=1e-4, rtol=0)
         assert (doppler.impose(0 * velocities, cells).norm(dim=1) > 0.3).sum() > 10
     assert parameters_that_stay(make_model(doppler=("gaussians", "boxes")), batch, lr=1e-2) == []
+
+
+@pytest.mark.parametrize("in_losses", [True, False])
+def test_losses_may_see_velocities_as_the_network_states_them(make_model, make_batch, in_losses):
+    """Boxes' as of a model that measures none; of Gaussians those that the last layer states."""
+    batch, terms = make_batch(boxes=(12, 12)), []
+    for doppler in ((), ("boxes",), ("gaussians",)):
+        model = make_model(doppler=doppler)
+        model.config.doppler.in_losses = in_losses
+        torch.manual_seed(0)
+        with torch.no_grad():
+            output, _ = model.train()(batch)
+            terms.append(float(model.loss_terms(output, batch).terms["box"]))
+    assert (terms[1] == pytest.approx(terms[0], rel=1e-4)) != in_losses
+    valid, gaussians = output.ocsf.gaussians.valid, output.ocsf.gaussians
+    assert (output.ocsf.supervised is gaussians.velocities) == in_losses
+    assert ((output.ocsf.supervised - gaussians.velocities).norm(dim=-1)[valid].max() > 0.1) != in_losses
+
+
+def test_boxes_may_move_along_their_heading(make_model, make_batch):
+    model, batch = make_model(doppler=("boxes",)), make_batch(boxes=(12, 12))
+    with torch.no_grad():
+        output, _ = model.eval()(batch)
+        every = torch.arange(len(output.head.bev))
+        codes = model.head.regress(output.head, every, 0 * every)
+        codes[:, 6:8], codes[:, 8:10] = torch.tensor([0.0, 2.0]), torch.tensor([3.0, 20.0])
+        kept = decoded_codes(output.head, codes, every)
+        output.head.doppler.along_heading = True
+        turned = decoded_codes(output.head, codes, every)
+    assert torch.equal(turned[:, :8], kept[:, :8]) and (kept[:, 8] != 0).all()
+    positions = model.grid.centre_of(output.head.bev.indices[:, 1:])
+    torch.testing.assert_close(turned[:, 8:], along_heading(kept[:, 8:10], codes[:, 6:8], positions))
+    assert ((turned[:, 8] == 0) & (turned[:, 9] > 0)).float().mean() > 0.5
 
 
 def test_withheld_frames_measure_nothing_in_training_alone(make_model, make_batch):
