@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from src.assembly import build_datamodule, data_root
+from src.benchmark.counting import counted_work
 from src.benchmark.machine import busy_cores, describe_machine, processor
 from src.benchmark.page import page_of
 from src.benchmark.timing import clock, median_iqr, peak_bytes, timed_parts
@@ -58,6 +59,7 @@ def benchmark_latency(
     The spread is the interquartile range. Frames count once the memory is full, or as full as scenes are long.
     `load` is how many of the `cores` were at work when this began.
     `memory_gb` is the largest that torch held on a GPU, or the process with its libraries on a CPU, in 1e9 bytes.
+    `gflop` are those of one more frame, as `counted_work` sees them.
     """
     device, now, load = detector.device, clock(detector.device), busy_cores()
     parts = detector.model.latency_parts
@@ -68,22 +70,26 @@ def benchmark_latency(
     measured, number = [], 0  # the frame's place in its scene
     for seen, frame in enumerate(itertools.chain.from_iterable(datamodule.stream() for _ in itertools.count())):
         number = 0 if bool(frame.starts[0]) else number + 1
-        frame = frame.to(device)
+        frame, memory_is_full = frame.to(device), number >= full
+        if len(measured) == MEASURED_FRAMES and memory_is_full:
+            memory_gb = peak_bytes(device) / 1e9
+            with counted_work() as work:
+                detector.run(frame)
+            break
         with timed_parts(detector.model, parts, now) as seconds:
             begin = now()
             detector.run(frame)
             whole = now() - begin
-        if seen >= WARM_UP_FRAMES and number >= full:
+        if seen >= WARM_UP_FRAMES and memory_is_full and len(measured) < MEASURED_FRAMES:
             measured.append({name: 1e3 * value for name, value in (seconds | {"total": whole}).items()})
-        if len(measured) == MEASURED_FRAMES:
-            break
     columns = {name: [row[name] for row in measured] for name in (*parts, "total") if name in measured[0]}
     medians = {name: median_iqr(values) for name, values in columns.items()}
     return {
         "ms": {name: middle for name, (middle, _) in medians.items()},
         "spread_ms": {name: iqr for name, (_, iqr) in medians.items()},
         "fps": 1e3 / medians["total"][0],
-        "memory_gb": peak_bytes(device) / 1e9,
+        "memory_gb": memory_gb,
+        "gflop": work.flops / 1e9,
         "frames": len(measured),
         "device": str(device),
         "processor": torch.cuda.get_device_name() if device.type == "cuda" else processor(),

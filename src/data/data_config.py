@@ -18,6 +18,7 @@ class DataConfig(ReaderOptions):
     root: str | None  # folder of the data set; null with a world: a folder under paths.outputs
     version: str  # table folder, e.g. v1.2-trainval
     train_split: str
+    train_scenes: int | None  # the first so many of it; null: all
     split: str  # what validation and evaluation read
     batch_size: int  # total over all devices; the streams when clips are streamed
     groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; method 6.4
@@ -40,6 +41,8 @@ class DataConfig(ReaderOptions):
             "min_distance_m": 0,
         }
         require_least(self, "data", least_values)
+        if self.train_scenes is not None and self.train_scenes < 1:
+            raise ConfigError(f"data.train_scenes={self.train_scenes}: must be at least 1, or null for all")
         if not 0 <= self.sensor_dropout < 1:
             raise ConfigError(f"data.sensor_dropout={self.sensor_dropout}: must be at least 0 and below 1")
         if self.num_future_frames and self.timeline is None:

@@ -32,7 +32,7 @@ from src.data.frame_loader import FrameLoader, collate, collate_in_worker, init_
 from src.data.reader import FrameReader
 from src.data.schema import CHANNELS, DatasetIndex
 from src.data.sensor_files import OnBadFile
-from src.data.splits import split_samples
+from src.data.splits import first_scenes, split_samples
 from src.errors import ConfigError, DataError, HorizonError
 from src.structures.batch import FrameBatch
 from src.structures.detections import EvaluationSet
@@ -229,7 +229,7 @@ class DetectionDataModule(L.LightningDataModule):
         optimiser step per batch is assumed. Raises DataError when there are too few frames for one batch.
         """
         config, seed, index = self.config, self.seed, self.index
-        samples = split_samples(index, config.train_split)
+        samples = first_scenes(index, split_samples(index, config.train_split), config.train_scenes)
         if len(samples) < config.batch_size:
             raise DataError(
                 f"data.batch_size={config.batch_size}: the split {config.train_split!r} has only {len(samples)} "

@@ -38,6 +38,21 @@ def split_samples(index: DatasetIndex, split: str) -> np.ndarray:  # [n] int64
     return index.samples_of(found)
 
 
+def first_scenes(
+    index: DatasetIndex,
+    samples: np.ndarray,  # [n] int64, ascending
+    most: int | None,  # None: all
+) -> np.ndarray:  # [m] int64
+    """The samples of the first `most` scenes among these, in table order. Raises DataError where there are fewer."""
+    if most is None:
+        return samples
+    scenes = index.sample_scenes[samples]
+    names = np.unique(scenes)
+    if most > len(names):
+        raise DataError(f"data.train_scenes={most}: the split has only {len(names)} scenes; lower it, or null for all")
+    return samples[np.isin(scenes, names[:most])]
+
+
 def _read_splits(index: DatasetIndex) -> tuple[dict[str, list[str]], Path]:
     for folder in (index.root / index.version, index.root):
         path = folder / "splits.json"

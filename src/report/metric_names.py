@@ -87,6 +87,9 @@ for _part in PARTS + FURTHER_PARTS:
     METRICS[f"latency.{_part}"] = Metric(f"latency.{_part}", _part.replace("_", " "), "ms", 1.0, 1, False)
 METRICS["latency.fps"] = Metric("latency.fps", "frames per second", "1/s", 1.0, 2, True)
 METRICS["latency.memory_gb"] = Metric("latency.memory_gb", "memory", "GB", 1.0, 2, False)
+METRICS["latency.gflop"] = Metric("latency.gflop", "arithmetic of a frame", "GFLOP", 1.0, 1, False)
+METRICS["cost.parameters"] = Metric("cost.parameters", "parameters", "M", 1e-6, 2, False)
+METRICS["cost.training"] = Metric("cost.training", "training with its validation", "min", 1 / 60, 1, False)
 
 FORECASTS = {"iou": Metric("iou", "occupancy IoU along rays", "%", 100.0, 1)}
 """Of a world model's tasks, `occupancy` and `forecasting`, whose other numbers have no names here."""

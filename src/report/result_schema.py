@@ -112,7 +112,8 @@ class Latency(TypedDict):
     fps: Score
     memory_gb: Score
     spread_ms: NotRequired[dict[str, Score]]
-    load: NotRequired[Score]  # older files have neither this nor the next
+    gflop: NotRequired[Score]  # older files lack it, as the next two
+    load: NotRequired[Score]
     cores: NotRequired[Score]
 
 

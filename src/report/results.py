@@ -195,7 +195,8 @@ def read_result(path: Path) -> RunResult:
         fields |= {"intervals": bounds, "scenes": found["scenes"]}
     if (latency := fields["latency"]) is not None:
         numbers |= {f"latency.{part}": value for part, value in latency["ms"].items()}
-        numbers |= {f"latency.{name}": latency[name] for name in ("fps", "memory_gb")}
+        numbers |= {f"latency.{name}": latency[name] for name in ("fps", "memory_gb", "gflop") if name in latency}
+    numbers |= {"cost.parameters": fields["parameters"], "cost.training": fields["seconds"]["all"]}
     return RunResult(**fields | {"metrics": numbers})
 
 

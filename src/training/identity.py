@@ -38,6 +38,7 @@ TEMPORAL_DATA_KEYS = ("groups_per_scene", "stream_sets", "past_frames", "sensor_
 
 YOUNGER_KEYS = {
     "data.timeline": None,
+    "data.train_scenes": None,
     "phase.long_range": None,
     "model.radar_encoder.pruning_ratio": 0.0,
     "model.doppler.withheld": 0.0,

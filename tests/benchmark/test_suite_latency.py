@@ -52,6 +52,7 @@ def test_latency_of_the_parts_makes_up_that_of_a_frame(outputs, tmp_path, monkey
     assert all(0 < value < total for value in milliseconds.values()) and encoder <= milliseconds.get("ocsf", 0.0)
     assert 0.5 * total < sum(milliseconds.values()) < 1.25 * total  # medians of each; what is between parts is little
     assert result["fps"] == pytest.approx(1e3 / total) and 0.1 < result["memory_gb"] < 64
+    assert 1e-3 < result["gflop"] < 1e3
     assert (result["format"], result["frames"], result["device"]) == (1, 4, "cpu")
     assert result["threads"] == torch.get_num_threads() and result["precision"] == "32-true"
     assert result["processor"] and result["commit"] and result["load"] >= 0 and result["cores"] == os.cpu_count()

@@ -28,9 +28,10 @@ BEV = BevAugmentationConfig(scale=[0.95, 1.05], rotation_rad=0.4, flip_probabili
 
 def config(**changes):
     values = dict(
-        root=None, version=VERSION, train_split="train", split="val", batch_size=2, groups_per_scene=2, stream_sets=1,
-        past_frames=0, sensor_dropout=0.0, num_workers=0, num_sweeps=2, min_distance_m=1.0, propagate_points=False,
-        on_bad_file=OnBadFile.error, test_resize_offset=0.0, num_lidar_sweeps=1, lidar_origins=False,
+        root=None, version=VERSION, train_split="train", train_scenes=None, split="val", batch_size=2,
+        groups_per_scene=2, stream_sets=1, past_frames=0, sensor_dropout=0.0, num_workers=0, num_sweeps=2,
+        min_distance_m=1.0, propagate_points=False, on_bad_file=OnBadFile.error, test_resize_offset=0.0,
+        num_lidar_sweeps=1, lidar_origins=False,
         deskew_lidar=True, timeline=None, num_future_frames=0,
         augmentation=AugmentationConfig(image=None, bev=BEV),
     )  # fmt: skip
@@ -209,6 +210,16 @@ def test_impossible_settings(change):
 def test_too_few_frames_for_a_batch(data_set):
     with pytest.raises(DataError, match="data.batch_size=4.*only 3 frames"):
         module(data_set, batch_size=4).train_dataloader()
+
+
+@pytest.mark.parametrize("temporal", [False, True])
+def test_training_may_keep_to_the_first_scenes(drives, temporal):
+    few = module(drives, sensors=("radar",), temporal=temporal, train_scenes=2, groups_per_scene=1)
+    seen = {token for batch in few.train_dataloader() for token in batch.tokens}
+    assert seen == {token("sample", f"train-{scene}-{k}") for scene, length in ((0, 5), (1, 3)) for k in range(length)}
+    assert sum(len(batch) for batch in few.val_dataloader()) == 8
+    with pytest.raises(DataError, match="data.train_scenes=4: the split has only 3 scenes"):
+        module(drives, sensors=("radar",), train_scenes=4).train_dataloader()
 
 
 def test_batch_must_divide_among_devices(data_set):

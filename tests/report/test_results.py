@@ -298,7 +298,8 @@ def test_a_run_of_another_task_has_the_numbers_it_has(write_run, reports):
     path = publish_result(folder, reports)
     result = read_result(path)
     assert (result.task, result.headline) == ("segmentation", "IoU")
-    assert result.metrics == {"IoU": 1.0, "recall": 0.25, "lanes": None}
+    cost = {"cost.parameters": 2_500_000, "cost.training": 12.0}
+    assert result.metrics == {"IoU": 1.0, "recall": 0.25, "lanes": None} | cost
     assert result.intervals["IoU"] == [0.5, 1.5] and result.scenes == 3
     damage(path, lambda content: content.update(task="detection"))
     with pytest.raises(DataError, match="metrics.mAP is missing"):
