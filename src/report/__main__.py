@@ -16,10 +16,11 @@ from src.errors import ConfigError, DataError
 from src.files.atomic_write import write_whole
 from src.pictures.comparison import BarPanel, draw_comparison
 from src.pictures.forest import ForestGroup, ForestRow, draw_forest
+from src.pictures.trade_off import TradeOff, draw_trade_off
 from src.reliability.command import run_command
 from src.report.claims import Claim, Finding, judge, load_claims, verdict_of
 from src.report.claims_page import claims_page
-from src.report.metric_names import DETECTION, RANGES, SPEEDS
+from src.report.metric_names import DETECTION, RANGES, SPEEDS, find_metric
 from src.report.pages import (
     PHASES_OF,
     compared_experiments,
@@ -55,10 +56,12 @@ def main(overrides: list[str]) -> None:
     pages, of_pages = write_pages(config, results, {run for record in records for run in record.runs})
     faults += of_pages
     tables: list[Path] = []
+    pictures: list[Path] = []
     sound: list[SweepRecord] = []
     for record in records:
         with noted_in(faults):
             tables += write_sweep_tables(reports, record, results)
+            pictures += write_trade_off(reports, record, results)
             sound.append(record)
     claims: list[Path] = []
     with noted_in(faults):
@@ -73,7 +76,7 @@ def main(overrides: list[str]) -> None:
     if config.phase.name in pages:
         text = pages[config.phase.name].read_text()
         print(text[text.index("\n| ") + 1 :])
-    for path in [*pages.values(), *tables, *claims, dashboard]:
+    for path in [*pages.values(), *tables, *pictures, *claims, dashboard]:
         print(f"written: {path}")
     if faults:
         raise DataError("\n".join(["all else is written, but", *faults]))
@@ -173,6 +176,23 @@ def draw_claims(path: Path, findings: list[tuple[Claim, list[Finding]]], scale: 
             rows.append(ForestRow(label, measure.metric.title, verdict, numbers, *ends, *more))
         groups.append(ForestGroup(f"{number}. {claim.config.sentence}", str(verdict_of(found)), rows))
     draw_forest(path, groups, f"The paper's claims, scale {scale}", "difference of the two rows, points of percent")
+
+
+def write_trade_off(reports: Path, record: SweepRecord, results: dict[str, RunResult]) -> list[Path]:
+    """mAP over the milliseconds of a frame, where at least two rows of a sweep were timed."""
+    score, cost = (find_metric(name, record.name) for name in ("mAP", "latency.total"))
+    points = []
+    for label, runs in record.rows.items():
+        found = [results[run_id] for run_id in runs.values() if run_id in results]
+        accuracy, time = estimate(found, score), estimate(found, cost)
+        if accuracy is not None and time is not None:
+            points.append(TradeOff(label, time.mean, *accuracy))
+    if len(points) < 2:
+        return []
+    path = reports / "pictures" / f"{record.name}_latency_{record.scale}{record.suffix}.png"
+    title = f"{record.sweep.title}, scale {record.scale}"
+    draw_trade_off(path, points, title, "milliseconds from frame to boxes", score.heading)
+    return [path]
 
 
 def bar_panels(experiments: list[Experiment]) -> list[BarPanel]:

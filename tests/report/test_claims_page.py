@@ -1,5 +1,7 @@
 """The page of the claims and its picture, through the command's own entry."""
 
+import json
+
 import pytest
 from PIL import Image
 
@@ -75,3 +77,16 @@ def test_another_scale_has_a_page_of_its_own(report, write_sweep):
     reports, _ = report("debug")
     assert (reports / "README.md").read_text() == default
     assert "# The paper's claims, scale debug" in (reports / "claims_debug.md").read_text()
+
+
+def test_rows_of_a_sweep_that_were_timed_become_a_picture(report, write_sweep, tmp_path):
+    """One timed row alone is no picture; the claims beside are those of this sweep."""
+    write_sweep("layers", {"1 layer": [0.10], "2 layers": [0.12], "4 layers": [0.11]})
+    folders = sorted(path.parent for path in tmp_path.glob("*/run.json"))
+    picture = tmp_path / "reports" / "pictures" / "layers_latency_mini.png"
+    for folder, drawn in zip(folders[:2], (False, True), strict=True):
+        timed = {"ms": {"total": 250.0}, "spread_ms": {"total": 20.0}, "fps": 4.0, "memory_gb": 1.0}
+        (folder / "latency.json").write_text(json.dumps(timed))
+        _, said = report()
+        assert picture.is_file() == (f"written: {picture}" in said) == drawn
+    assert Image.open(picture).width == 1600

@@ -1,0 +1,65 @@
+"""Scores over what they cost: a point for each method."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.axes import Axes
+
+from src.pictures.canvas import SHEET_PX, Canvas
+from src.pictures.contents import MUTED
+from src.pictures.learning_curves import LINE_COLOURS
+
+HEIGHT_PX = 560
+
+
+@dataclass(frozen=True)
+class TradeOff:
+    """One method: a score with its interval, and what it costs."""
+
+    label: str
+    cost: float
+    score: float
+    low: float
+    high: float
+
+
+def efficient(points: Sequence[TradeOff]) -> list[TradeOff]:
+    """Those that no other one beats by a higher score at no higher cost, the cheapest first."""
+    kept: list[TradeOff] = []
+    for point in sorted(points, key=lambda point: (point.cost, -point.score)):
+        if not kept or point.score > kept[-1].score:
+            kept.append(point)
+    return kept
+
+
+def paint_points(axes: Axes, points: Sequence[TradeOff]) -> None:
+    """Points with intervals and labels, and a step line through the efficient ones."""
+    best = efficient(points)
+    axes.step([p.cost for p in best], [p.score for p in best], where="post", color="#ADB5BD", linewidth=1.2, zorder=1)
+    for number, point in enumerate(points):
+        colour = LINE_COLOURS[number % len(LINE_COLOURS)]
+        axes.vlines(point.cost, point.low, point.high, color=colour, linewidth=1.6, alpha=0.6)
+        axes.plot(point.cost, point.score, "o", color=colour, markersize=8)
+        place = {"xytext": (9, 5), "textcoords": "offset points"}
+        axes.annotate(point.label, (point.cost, point.score), **place, fontsize=10, color=colour, parse_math=False)
+
+
+def draw_trade_off(path: Path | str, points: Sequence[TradeOff], title: str, cost: str, score: str) -> None:
+    """Write a PNG of all points; `cost` and `score` name the axes, which begin at zero."""
+    canvas = Canvas(SHEET_PX, HEIGHT_PX)
+    canvas.text(16, 12, title, 20, bold=True)
+    canvas.text(16, 44, "bars: 95 % intervals over scenes; line: the best score at each cost", 13, colour=MUTED)
+    axes = canvas.axes(80, 80, SHEET_PX - 120, HEIGHT_PX - 150)
+    paint_points(axes, points)
+    axes.set(xlim=(0, 1.15 * max(p.cost for p in points)), ylim=(0, 1.08 * max(p.high for p in points)))
+    axes.grid(color="#E3E6EA", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors="#495057", labelsize=10, length=0)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    axes.set_xlabel(cost, color="#495057", fontsize=11, parse_math=False)
+    axes.set_ylabel(score, color="#495057", fontsize=11, parse_math=False)
+    canvas.save(path, photographs=False)
