@@ -187,6 +187,12 @@ def _register() -> None:
         store.store(group="model", name=f"schema_{name}", node=schema)
 
 
+def refuse_oracle(config: Config) -> None:
+    """Raises ConfigError for an oracle, which an evaluation alone may ask."""
+    if config.oracle is not Oracle.none:
+        raise ConfigError(f"oracle={config.oracle.value}: an option of python -m src.evaluate; leave it out")
+
+
 def compose_config(overrides: list[str]) -> tuple[Config, dict[str, Any]]:
     """Compose conf/ with command-line overrides into checked dataclasses.
 

@@ -22,7 +22,7 @@ from src.reliability.command import run_command
 from src.training.evaluator import Evaluator
 from src.training.fit import build_evaluation_trainer
 from src.training.identity import digest_of_changes
-from src.training.run_folder import make_writable, write_json
+from src.training.run_folder import make_writable, name_of, write_json
 from src.training.temporal_module import TemporalModule
 from src.training.true_motion import Oracle, TrueMotion
 
@@ -56,13 +56,6 @@ def main(overrides: list[str]) -> None:
     write_json(out / "metrics.json", metrics)
     print(text)
     print(f"\nwritten into {out}: {', '.join(written)}")
-
-
-def name_of(source: Path) -> str:
-    """The file's name, with its run's before it: every run has a last.ckpt, and one must not replace the other's."""
-    folder = source.resolve().parent
-    run = folder.parent.name if folder.name == "checkpoints" else folder.name
-    return f"{run}-{source.stem}"
 
 
 def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[Evaluator, list[str]]:

@@ -16,7 +16,7 @@ from src.models.deploy.inference import prepare_for_inference
 from src.reliability.checkpoints import read_checkpoint
 from src.reliability.command import run_command
 from src.structures.taxonomy import CAMERAS
-from src.training.run_folder import make_writable, run_of
+from src.training.run_folder import make_writable, name_of
 
 EXAMPLE_FRAMES = 2
 """One frame would be taken for a constant; the program takes any number."""
@@ -27,13 +27,13 @@ DESCRIPTION = "description.json"
 def main(overrides: list[str]) -> None:
     """Write the image encoder of a checkpoint, batch norms folded, in float32, into `out`.
 
-    Without `out` the file is named by the checkpoint's run and lies in `paths.outputs`/exports.
+    Without `out` the file is named by the checkpoint and its run and lies in `paths.outputs`/exports.
     """
     command, _ = compose_config(overrides)
     if command.checkpoint is None:
         raise ConfigError("give checkpoint=PATH of the trained model whose image encoder is to be exported")
     path = Path(command.checkpoint)
-    out = Path(command.out) if command.out else Path(command.paths.outputs) / "exports" / f"{run_of(path)}.pt2"
+    out = Path(command.out) if command.out else Path(command.paths.outputs) / "exports" / f"{name_of(path)}.pt2"
     if out.suffix != ".pt2" or out.is_dir():
         raise ConfigError(f"out={out}: must be a file that ends in .pt2")
     checkpoint = read_checkpoint(path)

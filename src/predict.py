@@ -10,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from src.assembly import build_datamodule, data_root, save_submission
-from src.config import Config, compose_config, restore_config
+from src.config import Config, compose_config, refuse_oracle, restore_config
 from src.data.splits import split_samples
 from src.errors import ConfigError
 from src.metrics.submission import to_global
@@ -25,7 +25,7 @@ from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
 from src.structures.skipped import SkippedFiles
 from src.training.identity import digest_of_changes
-from src.training.run_folder import make_writable, run_of
+from src.training.run_folder import make_writable, name_of
 from src.training.snapshots import SHOWN_SCORE, scene_of, views_of
 
 # The boxes of one frame and its global_from_ego.
@@ -40,6 +40,7 @@ def main(overrides: list[str]) -> None:
     command, _ = compose_config(overrides)
     if command.checkpoint is None or command.predictions is not None:
         raise ConfigError("give checkpoint=PATH (predictions=FILE.json is scored by python -m src.evaluate)")
+    refuse_oracle(command)
     tune_cpu_allocator()
     path = Path(command.checkpoint)
     checkpoint = read_checkpoint(path)
@@ -75,10 +76,10 @@ def main(overrides: list[str]) -> None:
 
 
 def output_folder(checkpoint: Path, command: Config, config: Config, overrides: list[str]) -> Path:
-    """`out`, or a folder named by the checkpoint's run (else its file), by what is predicted and by what is changed."""
+    """`out`, or a folder named by the checkpoint and its run, by what is predicted and by what is changed."""
     if command.out is not None:
         return Path(command.out)
-    name = run_of(checkpoint) + digest_of_changes(overrides)
+    name = name_of(checkpoint) + digest_of_changes(overrides)
     return Path(command.paths.outputs) / "predictions" / name / (command.scene or config.data.split)
 
 

@@ -138,7 +138,15 @@ class StreamingDetector:
         device: torch.device | str,
         **switches: Any,
     ) -> Self:
-        """The detector of a checkpoint that has been read already; `path` is for messages."""
+        """The detector of a checkpoint that has been read already; `path` is for messages.
+
+        Raises ConfigError for one of a phase that learns no boxes.
+        """
+        if config.phase.task != "detection":
+            raise ConfigError(
+                f"checkpoint={path}: {config.phase.name} of {config.model.name} learns no boxes (its task is "
+                f"{config.phase.task}); give a checkpoint of a phase of detection"
+            )
         model = restored_model(config, checkpoint, path)
         settings = config.data.reader_settings(config.model.sensors, config.image_size_px)
         return cls(model, config.grid.build(), settings, device, config.precision, **switches)

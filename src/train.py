@@ -13,9 +13,8 @@ from typing import Any
 import lightning as L
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
-from src.config import PHASES, Config, compose_config
+from src.config import PHASES, Config, compose_config, refuse_oracle
 from src.data.datamodule import DetectionDataModule
-from src.errors import ConfigError
 from src.pictures.learning_curves import draw_curves
 from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.checkpoints import OpenCheckpoint, open_checkpoint
@@ -38,7 +37,6 @@ from src.training.identity import run_identity
 from src.training.module import TrainingModule
 from src.training.result import print_result, run_record, show_finished
 from src.training.run_folder import Resume, RunFolder, write_json
-from src.training.true_motion import Oracle
 from src.training.wandb import WandbRun
 
 logger = logging.getLogger(__name__)
@@ -48,8 +46,7 @@ def main(overrides: list[str]) -> None:
     """Train one run, or show it when it has finished; start its processes first when there are to be several."""
     started = time.monotonic()
     config, tree = compose_config(overrides)
-    if config.oracle is not Oracle.none:
-        raise ConfigError(f"oracle={config.oracle.value}: an option of python -m src.evaluate; leave it out")
+    refuse_oracle(config)
     check_devices(*config.trainer.processes)
     source = find_source(config, overrides, compose_config, PHASES)
     folder = RunFolder(Path(config.paths.outputs), run_identity(tree, source.identity if source is not None else None))

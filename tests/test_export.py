@@ -33,13 +33,13 @@ def test_the_file_gives_the_features_of_the_detector(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_without_a_name_it_is_named_by_the_run(tmp_path, monkeypatch):
+def test_without_a_name_it_is_named_by_the_checkpoint(tmp_path, monkeypatch):
     folder = tmp_path / "outputs" / "some-run" / "checkpoints"
     folder.mkdir(parents=True)
     path = write_checkpoint(folder / "last.ckpt", "phase=phase1")
     monkeypatch.setattr(torch.export, "save", lambda program, out, extra_files: out.write_bytes(b"program"))
     export.main([f"checkpoint={path}", f"paths.outputs={tmp_path / 'outputs'}"])
-    assert (tmp_path / "outputs" / "exports" / "some-run.pt2").is_file()
+    assert (tmp_path / "outputs" / "exports" / "some-run-last.pt2").is_file()
 
 
 @pytest.mark.slow

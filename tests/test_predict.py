@@ -43,7 +43,7 @@ def results(folder):
 def whole(checkpoints, outputs):
     """Phase 2 over the split, into the folder that the command chooses."""
     run(checkpoints["phase2"], f"paths.outputs={outputs}")
-    return outputs / "predictions" / "run-phase2" / "val"
+    return outputs / "predictions" / "run-phase2-last" / "val"
 
 
 def by_place(box):
@@ -150,6 +150,8 @@ def test_bad_input_is_named(checkpoints, outputs, tmp_path):
         predict.main([*base])
     with pytest.raises(ConfigError, match="give checkpoint=PATH"):
         run(good, *base, "predictions=a.json")
+    with pytest.raises(ConfigError, match="oracle=motion: an option of python -m src.evaluate"):
+        run(good, *base, "oracle=motion")
     with pytest.raises(CheckpointError, match="does not exist"):
         run(tmp_path / "none.ckpt", *base)
     with pytest.raises(CheckpointError, match="is a folder"):

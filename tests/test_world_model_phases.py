@@ -129,6 +129,13 @@ def test_two_processes_learn_from_rays_and_score_every_frame_once(occupancy, out
     assert two["velocity_error_moving"] == pytest.approx(one["velocity_error_moving"], rel=1e-3)
 
 
+def test_what_learns_no_boxes_predicts_none(occupancy, outputs):
+    said = call(
+        "predict", f"checkpoint={occupancy / 'checkpoints' / 'last.ckpt'}", f"paths.outputs={outputs}", expect=3
+    )
+    assert "lrs_occupancy of lrs4fusion learns no boxes" in said.stderr
+
+
 def test_a_source_of_another_region_is_refused(occupancy, outputs):
     checkpoint = occupancy / "checkpoints" / "last.ckpt"
     arguments = ("phase=lrs_forecast", f'phase.init_from="{checkpoint}"', f"paths.outputs={outputs}")

@@ -14,13 +14,16 @@ from pydantic import with_config
 from src.errors import ConfigError
 from src.report.json_format import CLOSED, Count, Many
 from src.report.metric_names import DETECTION, find_metric
-from src.training.identity import key_of
+from src.training.identity import is_of, key_of
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """Of sweeps and tables: they are file names, parts of addresses and names of studies."""
 
 MAX_COLUMNS = 8
 """Of a table, its heads included."""
+
+OF_TRAINING = ("phase.epochs", "phase.init_from", "optim")
+"""Keys that change nothing of weights that are there."""
 
 
 @with_config(CLOSED)
@@ -149,6 +152,14 @@ class SweepConfig:
                 raise ConfigError(
                     f"{where}, row {row.label!r}: weights {row.weights!r} must be the label of a row that is trained "
                     f"at every scale ({', '.join(trained) or 'there is none'})"
+                )
+            trains = [
+                override for override in row.overrides if is_of(override, OF_TRAINING) or key_of(override) == "model"
+            ]
+            if row.weights is not None and trains:
+                raise ConfigError(
+                    f"{where}, row {row.label!r}: {', '.join(trains)} changes nothing of weights {row.weights!r}, "
+                    "which are scored as they are; leave it out, or leave weights out to train the row"
                 )
         for row in [*self.rows, *self.paper_rows]:
             for metric in row.paper:

@@ -165,10 +165,11 @@ class RunFolder:
         return contents[0], contents[1]
 
 
-def run_of(checkpoint: Path) -> str:
-    """The run whose checkpoint this is, else the file's name."""
-    folder = checkpoint.resolve().parent
-    return folder.parent.name if folder.name == "checkpoints" else checkpoint.stem
+def name_of(source: Path) -> str:
+    """The file's name, with its run's before it: every run has a last.ckpt, and one must not replace the other's."""
+    folder = source.resolve().parent
+    run = folder.parent.name if folder.name == "checkpoints" else folder.name
+    return f"{run}-{source.stem}"
 
 
 def make_writable(folder: Path, key: str) -> None:

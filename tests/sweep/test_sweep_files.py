@@ -328,6 +328,10 @@ def test_what_the_mistakes_are_made_from_is_right(written):
         (GOOD | {"rows": [{"label": "a"}, {"label": "b", "baseline": "c"}]}, "baseline 'c' is not the label"),
         (GOOD | {"rows": [{"label": "a"}, {"label": "b", "weights": "c"}]}, r"row 'b': weights 'c' must be.* \(a\)"),
         (
+            GOOD | {"rows": [{"label": "a"}, {"label": "b", "weights": "a", "overrides": ["phase.epochs=3"]}]},
+            "row 'b': phase.epochs=3 changes nothing of weights 'a'",
+        ),
+        (
             GOOD | {"rows": [{"label": "a", "weights": "b"}, {"label": "b", "weights": "a"}]},
             r"row 'a': weights 'b' must be the label of a row that is trained at every scale \(there is none\)",
         ),
