@@ -9,8 +9,8 @@ from torch import Tensor
 
 from src.models.backbones.bev_decoder import ConvFuser
 from src.models.camera_radar import CameraRadarConfig, CameraRadarDetector, CameraRadarOutput
-from src.models.dense_bev.temporal_fusion import MapMemory, TemporalFusion, WarpedMaps
 from src.models.layers.lift_splat import LiftSplat
+from src.models.map_memory import MapMemory, TemporalFusion, WarpedMaps
 from src.structures.batch import FrameBatch
 
 
