@@ -17,6 +17,7 @@ from src.models.layers.dense import DenseConvNormReLU
 MIN_CHANNELS = 16
 """Least width of what a strided stage reads: below it the backward pass of a strided 1x1 convolution with channels last
 writes beyond its memory on CPUs (oneDNN in torch 2.13; the process dies or computes nonsense)."""
+SQUEEZE_RATIO = 4
 
 
 @dataclass(kw_only=True)
@@ -55,6 +56,25 @@ class ConvFuser(nn.Module):
             half = torch.get_autocast_dtype(camera.device.type)
             camera, radar = camera.to(half), radar.to(half)
         return self.conv(torch.cat([camera, radar], dim=1))
+
+
+class SqueezeFuser(nn.Module):
+    """Camera and radar map side by side through a 1x1 convolution, then squeeze and excitation (HyDRa): each channel is
+    weighted by what the means of all over the map say (Hu et al. 2018)."""
+
+    def __init__(self, in_channels: int, channels: int) -> None:
+        super().__init__()
+        self.conv = DenseConvNormReLU(in_channels, channels, 1)
+        squeezed = channels // SQUEEZE_RATIO
+        self.excitation = nn.Sequential(nn.Linear(channels, squeezed), nn.ReLU(), nn.Linear(squeezed, channels))
+
+    def forward(
+        self,
+        camera: Tensor,  # [B, C_camera, rows, cols]
+        radar: Tensor,  # [B, C_radar, rows, cols]
+    ) -> Tensor:  # [B, C, rows, cols]
+        x = self.conv(torch.cat([camera, radar], dim=1))
+        return x * self.excitation(x.mean((2, 3))).sigmoid()[:, :, None, None]
 
 
 class GatedFuser(nn.Module):
