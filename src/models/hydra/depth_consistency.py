@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import require_least
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
 from src.models.layers.full_precision import FullPrecisionConv2d
@@ -42,7 +42,8 @@ class DepthConsistency(nn.Module):
 
     Lifting leaves cells empty that no pixel is sure to lie in. The likeliest foreground cells are queries that sample
     the images at points on their vertical by deformable attention, each sample weighted by how well the pixel's depth
-    agrees with the point's. What comes back is added to the map at these cells.
+    agrees with the point's. What comes back is added to the map at these cells. Raises ConfigError for more queries
+    than cells.
     """
 
     def __init__(
@@ -55,6 +56,10 @@ class DepthConsistency(nn.Module):
         grid: BEVGrid,
     ) -> None:
         super().__init__()
+        if config.num_queries > grid.rows * grid.cols:
+            raise ConfigError(
+                f"model.refinement.num_queries={config.num_queries}: the grid has only {grid.rows * grid.cols} cells"
+            )
         self.config, self.grid, self.depth_range = config, grid, depth_range_m
         self.foreground = nn.Sequential(
             DenseConvNormReLU(channels, channels // 2, 3), FullPrecisionConv2d(channels // 2, 1, 1)

@@ -14,6 +14,7 @@ from src.models.layers.dense import rows_of_map
 from src.models.layers.global_attention import GlobalAttention
 from src.models.layers.image_attention import feed_forward
 from src.models.layers.lift_splat import LiftedViews, LiftSplat, LiftSplatConfig
+from src.models.layers.views import CameraViews
 from src.ops.segment_reduce import segment_count, segment_mean
 from src.targets.depth import lid_index
 
@@ -66,17 +67,14 @@ class HeightAssociation(nn.Module):
 
     def forward(
         self,
-        level: Tensor,  # [B, N, C, h, w]
+        views: CameraViews,  # one level [B, N, C, h, w]
         radar_bev: Tensor,  # [B, C_radar, rows, cols], zero where no point fell
-        pix_from_aug: Tensor,  # [B, N, 4, 4]
-        valid: Tensor,  # [B, N] bool
-        image_size_px: tuple[int, int],  # (H, W)
     ) -> Tensor:  # [B*N, C, h, w]
         """The image features with radar; a missing camera takes none."""
-        columns = level.permute(0, 1, 4, 3, 2)  # [B, N, w, h, C]
+        columns = views.levels[0].permute(0, 1, 4, 3, 2)  # [B, N, w, h, C]
         x = self.pixels(columns).flatten(0, 2)  # [B*N*w, h, width]
         places = x + self.row_embedding
-        returns, seen = self.frustum(radar_bev, pix_from_aug, valid, image_size_px, level.shape[-1])
+        returns, seen = self.frustum(views, radar_bev)
         every = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)
         found = self.norms[0](returns + self.to_returns(returns + self.bin_embedding, places, x, every))
         x = self.norms[1](x + self.to_pixels(places, found + self.bin_embedding, found, seen))
@@ -85,19 +83,14 @@ class HeightAssociation(nn.Module):
         return changed.permute(0, 1, 4, 3, 2).flatten(0, 1)
 
     def frustum(
-        self,
-        radar_bev: Tensor,  # [B, C_radar, rows, cols]
-        pix_from_aug: Tensor,
-        valid: Tensor,
-        image_size_px: tuple[int, int],
-        width: int,  # w
+        self, views: CameraViews, radar_bev: Tensor
     ) -> tuple[Tensor, Tensor]:  # [B*N*w, D, width], [B*N*w, D] bool
         """The radar as every column sees it: the mean of the pillars in each depth bin, and where there are any."""
         cells = radar_bev.any(1).nonzero()  # [P, 3] (sample, row, col) of the pillars
         keys = (cells[:, 0] * self.grid.rows + cells[:, 1]) * self.grid.cols + cells[:, 2]
         pillars = self.returns(F.embedding(keys, rows_of_map(radar_bev)))
-        picks, bins = self.seen_at(cells, pix_from_aug, valid, image_size_px, width)
-        shape = (valid.numel() * width, self.num_bins)
+        picks, bins = self.seen_at(views, cells)
+        shape = (views.valid.numel() * views.levels[0].shape[-1], self.num_bins)
         total = torch.Size(shape).numel()
         returns = segment_mean(F.embedding(picks, pillars).float(), bins, total)
         return returns.view(*shape, -1), segment_count(bins, total).view(shape) > 0
@@ -105,29 +98,27 @@ class HeightAssociation(nn.Module):
     @torch.no_grad()
     def seen_at(
         self,
+        views: CameraViews,
         cells: Tensor,  # [P, 3] int64 (sample, row, col)
-        pix_from_aug: Tensor,
-        valid: Tensor,
-        image_size_px: tuple[int, int],
-        width: int,
     ) -> tuple[Tensor, Tensor]:  # [n], [n] int64
         """Pillars and the bins they fall into, ((b * N + view) * w + column) * D + bin, of all views that see them.
 
         A pillar lies on a vertical; the camera sees it where that crosses the plane of the image's middle row, however
         high that is: whether the row is above the road or below does not say whether a column looks at it.
         """
-        matrix = pix_from_aug.float()[cells[:, 0], :, :3]  # [P, N, 3, 4]
+        (rows, cols), width = views.image_size_px, views.levels[0].shape[-1]
+        matrix = views.pix_from_aug.float()[cells[:, 0], :, :3]  # [P, N, 3, 4]
         xy = self.grid.centre_of(cells[:, 1:])[:, None, None]  # [P, 1, 1, 2]
         ground = matrix[..., 0] * xy[..., 0] + matrix[..., 1] * xy[..., 1] + matrix[..., 3]  # (u d, v d, d) at z = 0
-        up, middle = matrix[..., 2], image_size_px[0] / 2
+        up, middle = matrix[..., 2], rows / 2
         height = (middle * ground[..., 2] - ground[..., 1]) / (up[..., 1] - middle * up[..., 2])  # v = middle there
         depth = ground[..., 2] + height * up[..., 2]
         u = (ground[..., 0] + height * up[..., 0]) / depth
         bins = lid_index(depth, self.depth_range, self.num_bins)  # -1 behind, too far, and of a missing camera's NaN
-        inside = (bins >= 0) & (u >= 0) & (u < image_size_px[1]) & valid[cells[:, 0]]
+        inside = (bins >= 0) & (u >= 0) & (u < cols) & views.valid[cells[:, 0]]
         pillar, view = inside.nonzero().unbind(1)
-        column = (u[pillar, view] * (width / image_size_px[1])).long().clamp(max=width - 1)
-        ray = (cells[pillar, 0] * valid.shape[1] + view) * width + column
+        column = (u[pillar, view] * (width / cols)).long().clamp(max=width - 1)
+        ray = (cells[pillar, 0] * matrix.shape[1] + view) * width + column
         return pillar, ray * self.num_bins + bins[pillar, view]
 
 
@@ -143,15 +134,11 @@ class HeightLift(LiftSplat):
 
     def forward(
         self,
-        level: Tensor,  # [B, N, C_I, h, w] image features
+        views: CameraViews,  # one level, the image features [B, N, C_I, h, w]
         radar_bev: Tensor,  # [B, C_radar, rows, cols]
-        pix_from_aug: Tensor,  # [B, N, 4, 4]
-        valid: Tensor,  # [B, N] bool
-        image_size_px: tuple[int, int],  # (H, W)
     ) -> HeightLiftedViews:
         """Pool all views of every sample; a missing view contributes nothing."""
-        hidden = self.trunk(self.association(level, radar_bev, pix_from_aug, valid, image_size_px))
+        hidden = self.trunk(self.association(views, radar_bev))
         context = self.context(hidden)
-        views = self.splat(self.depth(hidden), context, pix_from_aug, valid, image_size_px)
-        context = context.unflatten(0, valid.shape)
-        return HeightLiftedViews(views.bev, views.depth_logits, views.num_lifted, context)
+        lifted = self.splat(self.depth(hidden), context, views.pix_from_aug, views.valid, views.image_size_px)
+        return HeightLiftedViews(**vars(lifted), context=context.unflatten(0, views.valid.shape))

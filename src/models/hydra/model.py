@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch import Tensor
@@ -77,10 +77,10 @@ class HyDRa(CameraRadarDetector):
         Raises ValueError when images are absent, or when the memory is of another number of streams.
         """
         level, radar_bev = self.encode(batch, memory)
-        cameras = (batch.pix_from_aug, batch.image_valid, self.image_encoder.image_size_px)
-        views = self.view_transform(level, radar_bev, *cameras)
+        images = CameraViews([level], batch.pix_from_aug, batch.image_valid, self.image_encoder.image_size_px)
+        views = self.view_transform(images, radar_bev)
         fused = self.fuser(views.bev, radar_bev)
-        context = CameraViews([views.context], *cameras)
+        context = replace(images, levels=[views.context])
         fused, foreground = self.refinement(fused, radar_bev, context, views.depth_logits)
         current, warped_maps, memory_now = fused, None, None
         if self.temporal is not None:
