@@ -94,8 +94,8 @@ class DepthConsistency(nn.Module):
         points = self.points(query, centres)
         trust = self.trust(F.embedding(keys, rows_of_map(radar_bev)))
         weights = self.consistency(points, trust, views, depth_logits)
-        values = [self.value(context.flatten(0, 1)).unflatten(0, context.shape[:2])]
-        x = self.norm(x + self.attention(x, query, points, views, values, weights))
+        values = self.value(context.flatten(0, 1)).unflatten(0, context.shape[:2])
+        x = self.norm(x + self.attention(x, query, points, views, [values], weights))
         refined = rows.index_add(0, keys.flatten(), self.mlp(x).flatten(0, 1).to(rows.dtype))
         return map_of_rows(refined, logits.shape), logits
 

@@ -84,9 +84,7 @@ class HyDRa(CameraRadarDetector):
         fused, foreground = self.refinement(fused, radar_bev, context, views.depth_logits)
         current, warped_maps, memory_now = fused, None, None
         if self.temporal is not None:
-            warped_maps = self.temporal.recall(memory, batch)
-            current = self.temporal.aggregate(fused, warped_maps)
-            memory_now = self.temporal.remember(memory, batch, fused)
+            current, warped_maps, memory_now = self.temporal(memory, batch, fused)
         head = self.head(self.decoder(current))
         return HyDRaOutput(views, radar_bev, fused, head, foreground, warped_maps), memory_now
 
