@@ -20,6 +20,8 @@ from src.targets.depth import lid_index
 
 FFN_RATIO = 4
 """Of the public FB-BEV."""
+FOREGROUND_STRIDE = 2
+"""Cells of the map per place where foreground is predicted, along either axis; between these it is bilinear."""
 FOREGROUND_BIAS = -4.6
 """An untrained cell is foreground with probability 0.01."""
 RADAR_BIAS = -2.0
@@ -51,7 +53,6 @@ class DepthConsistency(nn.Module):
         config: DepthConsistencyConfig,
         channels: int,
         context_channels: int,
-        radar_channels: int,
         depth_range_m: tuple[float, float],
         grid: BEVGrid,
     ) -> None:
@@ -62,12 +63,12 @@ class DepthConsistency(nn.Module):
             )
         self.config, self.grid, self.depth_range = config, grid, depth_range_m
         self.foreground = nn.Sequential(
-            DenseConvNormReLU(channels, channels // 2, 3), FullPrecisionConv2d(channels // 2, 1, 1)
+            DenseConvNormReLU(channels, channels // 2, 3, FOREGROUND_STRIDE), FullPrecisionConv2d(channels // 2, 1, 1)
         )
         nn.init.constant_(self.foreground[1].bias, FOREGROUND_BIAS)
         self.place = PlaceEmbedding(channels, grid, coordinates=2)
         self.offset = attention_linear(channels, 3 * config.num_points, zero=True)
-        self.radar = nn.Linear(radar_channels, 1)
+        self.radar = nn.Linear(channels, 1)
         nn.init.constant_(self.radar.bias, RADAR_BIAS)
         self.value = nn.Conv2d(context_channels, channels, 1)
         self.attention = ImageCrossAttention(channels, config.num_points, len(CAMERAS), num_levels=1)
@@ -83,7 +84,8 @@ class DepthConsistency(nn.Module):
     ) -> tuple[Tensor, Tensor]:  # [B, C, rows, cols], [B, rows, cols] float32 logits
         """The refined map and the foreground that chose where."""
         (context,) = views.levels
-        logits, rows = self.foreground(fused).squeeze(1), rows_of_map(fused)
+        coarse, rows = self.foreground(fused), rows_of_map(fused)
+        logits = F.interpolate(coarse, size=fused.shape[2:], mode="bilinear", align_corners=False).squeeze(1)
         picks = logits.detach().flatten(1).topk(self.config.num_queries).indices  # [B, Q]
         keys = picks + torch.arange(len(picks), device=picks.device)[:, None] * logits[0].numel()
         row = torch.div(picks, self.grid.cols, rounding_mode="floor")
@@ -92,7 +94,7 @@ class DepthConsistency(nn.Module):
         x = F.embedding(keys, rows)
         query = x + self.place(centres).to(x.dtype)
         points = self.points(query, centres)
-        trust = self.trust(F.embedding(keys, rows_of_map(radar_bev)))
+        trust = self.trust(x, rows_of_map(radar_bev)[keys].any(-1))
         weights = self.consistency(points, trust, views, depth_logits)
         values = self.value(context.flatten(0, 1)).unflatten(0, context.shape[:2])
         x = self.norm(x + self.attention(x, query, points, views, [values], weights))
@@ -114,10 +116,11 @@ class DepthConsistency(nn.Module):
 
     def trust(
         self,
-        radar: Tensor,  # [B, Q, C_radar], zero where no point fell
+        x: Tensor,  # [B, Q, C]
+        returned: Tensor,  # [B, Q] bool, whether the radar returned anything from the cell
     ) -> Tensor:  # [B, Q] float32
         """How far the radar alone vouches that there is something in a cell: nothing where it returned nothing."""
-        return self.radar(radar).float().squeeze(-1).sigmoid() * radar.any(-1)
+        return self.radar(x).float().squeeze(-1).sigmoid() * returned
 
     def consistency(
         self,

@@ -66,9 +66,7 @@ class HyDRa(CameraRadarDetector):
         lift, encoder = config.view_transform, self.image_encoder
         self.view_transform = HeightLift(lift, encoder.channels, radar, encoder.image_size_px[0], self.grid)
         self.fuser = SqueezeFuser(lift.context_channels + radar, fused)
-        self.refinement = DepthConsistency(
-            config.refinement, fused, lift.context_channels, radar, lift.depth_range, self.grid
-        )
+        self.refinement = DepthConsistency(config.refinement, fused, lift.context_channels, lift.depth_range, self.grid)
         self.temporal = TemporalFusion(config.temporal, fused, self.grid) if config.temporal is not None else None
 
     def forward(self, batch: FrameBatch, memory: MapMemory | None = None) -> tuple[HyDRaOutput, MapMemory | None]:

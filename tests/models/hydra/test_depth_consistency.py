@@ -18,7 +18,7 @@ def make_refinement(num_queries=30, num_points=3):
     """With offsets, trust and weights that are no longer those of the start."""
     torch.manual_seed(0)
     module = DepthConsistency(
-        DepthConsistencyConfig(num_queries=num_queries, num_points=num_points), 8, 5, 4, RANGE_M, GRID
+        DepthConsistencyConfig(num_queries=num_queries, num_points=num_points), 8, 5, RANGE_M, GRID
     )
     for layer in (module.offset, module.attention.logits, module.foreground[1]):
         torch.nn.init.normal_(layer.weight, std=0.3)
@@ -71,20 +71,18 @@ def test_depth_agrees_where_the_pixel_puts_the_point():
 
 
 def test_radar_vouches_only_where_it_returned_something():
-    module = make_refinement()
-    radar = torch.zeros(1, 2, 4)
-    radar[0, 1] = 0.5
-    trust = module.trust(radar)
+    module, x = make_refinement(), torch.randn(1, 2, 8)
+    trust = module.trust(x, torch.tensor([[False, True]]))
     assert trust[0, 0] == 0.0
-    torch.testing.assert_close(trust[0, 1], module.radar(radar[0, 1]).sigmoid().squeeze())
-    untrained = DepthConsistency(module.config, 8, 5, 4, RANGE_M, GRID).trust(torch.full((1, 1, 4), 1e-6))
+    torch.testing.assert_close(trust[0, 1], module.radar(x[0, 1]).sigmoid().squeeze())
+    untrained = DepthConsistency(module.config, 8, 5, RANGE_M, GRID).trust(torch.zeros(1, 1, 8), torch.ones(1, 1))
     assert 0.05 < untrained.item() < 0.2
 
 
 def by_hand(module, fused, radar, views, depth_logits):
     """Query by query, point by point."""
     (context,), attention, out = views.levels, module.attention, fused.clone()
-    logits = module.foreground(fused).squeeze(1)
+    logits = F.interpolate(module.foreground(fused), size=GRID.cells, mode="bilinear").squeeze(1)
     heads, _, num_points = attention.per_view
     for b in range(len(fused)):
         camera = attention.camera(F.normalize(views.pix_from_aug[b, :, :3], dim=-1).flatten(1))  # [N, C]
@@ -94,7 +92,7 @@ def by_hand(module, fused, radar, views, depth_logits):
             query = x + module.place(centre[None])[0]
             trust = torch.zeros(())
             if radar[b, :, row, col].any():
-                trust = module.radar(radar[b, :, row, col]).sigmoid()
+                trust = module.radar(x).sigmoid()
             scores, shares, samples = [], [], []
             for n in range(4):
                 score = attention.logits(query) + F.linear(camera[n], attention.logits.weight)
@@ -147,11 +145,11 @@ def test_what_the_images_show_at_other_depths_does_not_matter(radar_too):
     assert torch.equal(one, two) != radar_too
 
 
-def test_gradients_reach_depth_radar_images_and_every_parameter():
+def test_gradients_reach_depth_images_and_every_parameter():
     module, (fused, radar, views, logits) = make_refinement().train(), make_inputs()
-    inputs = [fused, radar, views.levels[0], logits]
+    inputs = [fused, views.levels[0], logits]
     for x in inputs:
         x.requires_grad_()
-    refined, foreground = module(*inputs[:2], views, logits)
+    refined, foreground = module(fused, radar, views, logits)
     (refined.square().sum() + foreground.sum()).backward()
     assert all(x.grad.any() and x.grad.isfinite().all() for x in (*inputs, *module.parameters()))

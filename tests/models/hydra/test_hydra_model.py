@@ -128,11 +128,12 @@ def test_it_needs_a_backbone():
 def test_channels_are_weighted_by_the_means_of_all():
     torch.manual_seed(0)
     fuser, camera, radar = SqueezeFuser(5, 8).eval(), torch.randn(2, 2, 5, 6), torch.randn(2, 3, 5, 6)
+    joined = torch.cat([camera, radar], 1)
     with torch.no_grad():
-        joined = fuser.conv(torch.cat([camera, radar], 1))
         first, _, last = fuser.excitation
         weight = last(first(joined.flatten(2).mean(2)).clamp(min=0)).sigmoid()
-        torch.testing.assert_close(fuser(camera, radar), joined * weight.view(2, 8, 1, 1))
+        wanted = fuser.conv((joined * weight.view(2, 5, 1, 1)).permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+        torch.testing.assert_close(fuser(camera, radar), fuser.norm(wanted).clamp(min=0))
 
 
 # ---------------------------------------------------------------- memory
