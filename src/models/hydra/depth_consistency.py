@@ -57,10 +57,9 @@ class DepthConsistency(nn.Module):
         grid: BEVGrid,
     ) -> None:
         super().__init__()
-        if config.num_queries > grid.rows * grid.cols:
-            raise ConfigError(
-                f"model.refinement.num_queries={config.num_queries}: the grid has only {grid.rows * grid.cols} cells"
-            )
+        cells = grid.rows * grid.cols
+        if config.num_queries > cells:
+            raise ConfigError(f"model.refinement.num_queries={config.num_queries}: the grid has only {cells} cells")
         self.config, self.grid, self.depth_range = config, grid, depth_range_m
         self.foreground = nn.Sequential(
             DenseConvNormReLU(channels, channels // 2, 3, FOREGROUND_STRIDE), FullPrecisionConv2d(channels // 2, 1, 1)

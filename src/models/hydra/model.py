@@ -39,10 +39,7 @@ class HyDRaConfig(CameraRadarConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.fused_channels % NUM_HEADS:
-            raise ConfigError(
-                f"model.fused_channels={self.fused_channels}: must be a multiple of {NUM_HEADS}, the heads of the "
-                "attention to images"
-            )
+            raise ConfigError(f"model.fused_channels={self.fused_channels}: must be a multiple of {NUM_HEADS} heads")
 
 
 @dataclass
