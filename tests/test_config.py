@@ -46,7 +46,7 @@ def test_phase_2_composes_at_every_scale(scale):
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
-@pytest.mark.parametrize("name", ["dense_bev", "crt_fusion", "sparc", "petr", "far3d", "rctrans"])
+@pytest.mark.parametrize("name", ["dense_bev", "crt_fusion", "hydra", "sparc", "petr", "far3d", "rctrans"])
 def test_other_detectors_without_lidar_compose_at_every_scale(scale, phase, name):
     """At the same range and cell; phase 1 drops what its settings name as temporal."""
     config, tree = compose_config([f"scale={scale}", "data.root=x", f"model={name}", f"phase={phase}"])
@@ -247,6 +247,7 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["model=dense_bev", "model.view_transform.image_stride_px=0"], "image_stride_px=0"),
         (["model=dense_bev", "phase=phase2", "model.temporal.num_frames=0"], "num_frames=0.*model.temporal=null"),
         (["model=crt_fusion", "phase=phase2", "model.temporal.occupancy_threshold=1"], "occupancy_threshold=1"),
+        (["model=hydra", "model.fused_channels=18"], "model.fused_channels=18.*multiple of 4"),
         (["model=sparc", "phase=phase2", "model.temporal.queries_per_frame=0"], "queries_per_frame=0"),
         (["model=petr", "model.num_queries=0"], "model.num_queries=0"),
         (["phase=phase2", "phase.name=phase1"], "phase.name=phase1.*phase=\\.\\.\\."),

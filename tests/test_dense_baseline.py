@@ -14,7 +14,7 @@ from tests.running import call
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module", params=["dense_bev", "crt_fusion", "sparc", "petr", "far3d", "rctrans"])
+@pytest.fixture(scope="module", params=["dense_bev", "crt_fusion", "hydra", "sparc", "petr", "far3d", "rctrans"])
 def family(request):
     return request.param
 

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
-from src.losses.normalizers import full_precision
+from src.losses.normalizers import full_precision, mean_over_ranks
 
 PEAK_CLAMP = 1e-4
 DEPTH_CLAMP = 1e-6
@@ -41,6 +41,19 @@ def sigmoid_focal(
     positive = target.to(logits.dtype)
     scale = torch.rsub(positive, 1 - FOCAL_ALPHA, alpha=1 - 2 * FOCAL_ALPHA)
     return _Focal.apply(logits, torch.rsub(positive, 1, alpha=2), scale, None)
+
+
+def occupancy_focal(
+    logits: Tensor,  # [M]
+    occupied: Tensor,  # [K] int64, rows that are, each once
+) -> Tensor:  # []
+    """Focal loss, the mean over what is occupied and the mean over all others added (CRT-Fusion's public code)."""
+    target = torch.zeros_like(logits, dtype=torch.bool)
+    target[occupied] = True
+    focal = sigmoid_focal(logits, target)
+    inside, total = focal[occupied].sum(), focal.sum()
+    count = occupied.new_tensor(len(occupied))
+    return inside / mean_over_ranks(count) + (total - inside) / mean_over_ranks(len(focal) - count)
 
 
 class _Focal(torch.autograd.Function):

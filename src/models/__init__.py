@@ -16,6 +16,7 @@ from src.models.detector import Detector, ModelConfig
 from src.models.far3d.model import Far3D, Far3DConfig
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
+from src.models.hydra.model import HyDRa, HyDRaConfig
 from src.models.lrs4fusion.lrs_config import LRS4FusionConfig
 from src.models.lrs4fusion.model import LRS4Fusion
 from src.models.petr.model import PETR, PETRConfig
@@ -27,6 +28,7 @@ FAMILIES: dict[str, tuple[type[ModelConfig], type[Detector]]] = {
     "horizon3d": (Horizon3DConfig, Horizon3D),
     "dense_bev": (DenseBEVConfig, DenseBEV),
     "crt_fusion": (CRTFusionConfig, CRTFusion),
+    "hydra": (HyDRaConfig, HyDRa),
     "sparc": (SpaRCConfig, SpaRC),
     "petr": (PETRConfig, PETR),
     "far3d": (Far3DConfig, Far3D),

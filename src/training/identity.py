@@ -93,6 +93,11 @@ def _value_at(tree: dict[str, Any], key: str) -> Any:
     return node
 
 
+def as_before_younger_keys(tree: dict[str, Any]) -> dict[str, Any]:
+    """A copy of a configuration without the younger keys that have their value of before."""
+    return without_keys(tree, [key for key, before in YOUNGER_KEYS.items() if _value_at(tree, key) == before])
+
+
 def digest_of_changes(overrides: list[str]) -> str:
     """`-` and 8 hex digits of what the command line changes of a checkpoint's configuration; empty for no change.
 
@@ -114,7 +119,6 @@ def run_identity(tree: dict[str, Any], source: str | None = None) -> str:
     if not tree["phase"]["temporal"]:
         for key in TEMPORAL_DATA_KEYS:
             tree["data"].pop(key)
-    unchanged = [key for key, before in YOUNGER_KEYS.items() if _value_at(tree, key) == before]
-    tree = without_keys(tree, unchanged)
+    tree = as_before_younger_keys(tree)
     digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:8]
     return f"{tree['model']['name']}-{tree['phase']['name']}-{tree['scale']}-{digest}"

@@ -216,6 +216,17 @@ def test_a_setting_that_was_typed_though_it_is_the_default_is_the_same(make_reco
     assert sweep_tables(make_record({"a": {}}, seeds=2), results)[0].rows[0].done == 2
 
 
+def test_a_key_that_an_older_run_lacks_is_the_same_at_its_value_of_before(make_record, results_of):
+    older = results_of({"a0": 0.1}, config={"seed": 0, "data": {}})
+    for value, same in ((None, True), (4, False)):
+        results = older | results_of({"a1": 0.2}, config={"seed": 1, "data": {"train_scenes": value}})
+        if same:
+            assert sweep_tables(make_record({"a": {}}, seeds=2), results)[0].rows[0].done == 2
+        else:
+            with pytest.raises(DataError, match="differ in more than their seed"):
+                sweep_tables(make_record({"a": {}}, seeds=2), results)
+
+
 def test_weights_that_a_row_scores_are_of_its_seeds(make_record, results_of):
     """Their runs have ids of their own; other weights are another configuration."""
 

@@ -168,6 +168,7 @@ def test_numbers_of_all_methods_are_those_reported():
     [
         ("BEVFusion", "dense_bev"),
         ("CRT-Fusion", "crt_fusion"),
+        ("HyDRa", "hydra"),
         ("SpaRC", "sparc"),
         ("PETR", "petr"),
         ("Far3D", "far3d"),
@@ -185,7 +186,7 @@ def test_another_method_is_trained_as_ours(label, name):
         assert (baseline.model.name, own.model.name) == (name, "horizon3d")
         for part in ("data", "backbone", "phase", "optim", "grid", "precision", "seed"):
             assert getattr(baseline, part) == getattr(own, part), (scale, part)
-        dense = name in ("dense_bev", "crt_fusion")  # others have a head of queries
+        dense = name in ("dense_bev", "crt_fusion", "hydra")  # others have a head of queries
         for key in ("nms", "score_threshold", "max_boxes", "attributes") if dense else ():
             assert getattr(baseline.model.head, key) == getattr(own.model.head, key)
         for key in ("heatmap_weight", "box_weight") if dense or name == "sparc" else ("box_weight",):
@@ -255,9 +256,9 @@ def test_tables_have_names_of_their_own():
 def test_a_row_for_one_scale_is_the_papers_alone_at_others():
     sweep = load_sweep(OTHER_METHODS)
     small, full = sweep.at_scale("mini"), sweep.at_scale("paper")
-    trained = ["Horizon3D", "BEVFusion", "CRT-Fusion", "RadarGNN", "SpaRC", "PETR", "Far3D", "RCTrans"]
-    assert [row.label for row in small.rows] == trained and len(full.rows) == 11
-    for paper_row, row in zip(small.paper_rows, full.rows[8:], strict=False):
+    trained = ["Horizon3D", "BEVFusion", "CRT-Fusion", "HyDRa", "RadarGNN", "SpaRC", "PETR", "Far3D", "RCTrans"]
+    assert [row.label for row in small.rows] == trained and len(full.rows) == 12
+    for paper_row, row in zip(small.paper_rows, full.rows[9:], strict=False):
         assert paper_row.label == row.label and paper_row.paper == row.paper and "V2-99" in row.label
     assert full.rows == sweep.rows and small.baseline == "Horizon3D"
 

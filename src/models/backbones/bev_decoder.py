@@ -12,11 +12,13 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.resnet import BasicBlock
-from src.models.layers.dense import DenseConvNormReLU
+from src.models.layers.dense import DenseConvNormReLU, map_of_rows
+from src.models.layers.norm import MapNorm
 
 MIN_CHANNELS = 16
 """Least width of what a strided stage reads: below it the backward pass of a strided 1x1 convolution with channels last
 writes beyond its memory on CPUs (oneDNN in torch 2.13; the process dies or computes nonsense)."""
+SQUEEZE_RATIO = 4
 
 
 @dataclass(kw_only=True)
@@ -55,6 +57,38 @@ class ConvFuser(nn.Module):
             half = torch.get_autocast_dtype(camera.device.type)
             camera, radar = camera.to(half), radar.to(half)
         return self.conv(torch.cat([camera, radar], dim=1))
+
+
+class SqueezeFuser(nn.Module):
+    """Camera and radar map side by side, squeeze and excitation (HyDRa; Hu et al. 2018), then a 1x1 convolution.
+
+    Each channel is weighted by what the means of all over the map say; so are the convolution's weights, which comes to
+    the same. No gradient goes back through the means, in which a cell hardly counts.
+    """
+
+    norm_pairs = (("conv", "norm"),)
+
+    def __init__(self, in_channels: int, channels: int) -> None:
+        super().__init__()
+        squeezed = in_channels // SQUEEZE_RATIO
+        self.excitation = nn.Sequential(nn.Linear(in_channels, squeezed), nn.ReLU(), nn.Linear(squeezed, in_channels))
+        self.conv = nn.Linear(in_channels, channels, bias=False)
+        self.norm = MapNorm(channels)
+
+    def forward(
+        self,
+        camera: Tensor,  # [B, C_camera, rows, cols]
+        radar: Tensor,  # [B, C_radar, rows, cols]
+    ) -> Tensor:  # [B, C, rows, cols]
+        means = torch.cat([x.detach().mean((2, 3)) for x in (camera, radar)], dim=1)
+        weight = (self.excitation(means).sigmoid()[:, None] * self.conv.weight).transpose(1, 2)  # [B, both, C]
+        own, others = weight.split([camera.shape[1], radar.shape[1]], dim=1)
+        rows = [part.permute(0, 2, 3, 1).flatten(1, 2) for part in (camera, radar)]  # [B, rows * cols, channels] each
+        x = torch.baddbmm(rows[0] @ own, rows[1], others)
+        if self.conv.bias is not None:  # of the norm, prepared for inference
+            x = x + self.conv.bias
+        x = map_of_rows(x.flatten(0, 1), (len(camera), *camera.shape[2:]))
+        return F.relu(self.norm(x), inplace=True)
 
 
 class GatedFuser(nn.Module):

@@ -7,11 +7,11 @@ from typing import Any
 
 from torch import Tensor
 
-from src.losses.classification import sigmoid_focal
+from src.losses.classification import occupancy_focal, sigmoid_focal
 from src.losses.normalizers import mean_over_ranks
 from src.models.backbones.bev_decoder import GatedFuser
 from src.models.camera_radar import CameraRadarConfig, CameraRadarDetector, CameraRadarLossConfig, CameraRadarOutput
-from src.models.crt_fusion.motion_estimator import CellMotion, MotionEstimator, occupancy_loss, velocity_loss
+from src.models.crt_fusion.motion_estimator import CellMotion, MotionEstimator, velocity_loss
 from src.models.crt_fusion.motion_fusion import MotionFusionConfig, MotionGuidedFusion, MovedMaps, StackMemory
 from src.models.crt_fusion.radar_lift import RadarLift, RadarLiftConfig
 from src.models.detector import Objective
@@ -93,7 +93,7 @@ class CRTFusion(CameraRadarDetector):
             terms["foreground"] = weights.foreground_weight * total / mean_over_ranks(present.sum())
         raster = BoxRaster(batch.boxes, self.grid, margin_m=0.0, device=batch.device)
         if weights.occupancy_weight is not None:
-            terms["occupancy"] = weights.occupancy_weight * occupancy_loss(output.motion, raster)
+            terms["occupancy"] = weights.occupancy_weight * occupancy_focal(output.motion.occupancy_logits, raster.keys)
         if weights.velocity_weight is not None:
             terms["velocity"] = weights.velocity_weight * velocity_loss(output.motion, raster)
         return Objective(terms, counts)

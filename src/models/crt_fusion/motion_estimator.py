@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor, nn
 
-from src.losses.classification import sigmoid_focal
 from src.losses.normalizers import mean_over_ranks
 from src.losses.regression import masked_l1
 from src.models.layers.dense import DenseConvNormReLU, rows_of_map
@@ -44,16 +42,6 @@ class MotionEstimator(nn.Module):
     ) -> CellMotion:
         occupancy, velocity = rows_of_map(self.output(self.hidden(fused))).split([1, 2], dim=1)
         return CellMotion(occupancy.squeeze(1), VELOCITY_UNIT_MPS * velocity)
-
-
-def occupancy_loss(motion: CellMotion, raster: BoxRaster) -> Tensor:  # []
-    """Focal loss, the mean over the cells in boxes and the mean over all others added (public code)."""
-    target = torch.zeros_like(motion.occupancy_logits, dtype=torch.bool)
-    target[raster.keys] = True
-    focal = sigmoid_focal(motion.occupancy_logits, target)
-    inside, total = focal[raster.keys].sum(), focal.sum()
-    count = raster.keys.new_tensor(len(raster.keys))
-    return inside / mean_over_ranks(count) + (total - inside) / mean_over_ranks(len(focal) - count)
 
 
 def velocity_loss(motion: CellMotion, raster: BoxRaster) -> Tensor:  # []

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from src.models.backbones.bev_decoder import ConvFuser
 from src.models.camera_radar import CameraRadarConfig, CameraRadarDetector, CameraRadarOutput
-from src.models.dense_bev.temporal_fusion import MapMemory, TemporalFusion, WarpedMaps
 from src.models.layers.lift_splat import LiftSplat
+from src.models.map_memory import MapMemory, TemporalFusion, WarpedMaps
 from src.structures.batch import FrameBatch
 
 
@@ -46,13 +46,11 @@ class DenseBEV(CameraRadarDetector):
         """
         level, radar_bev = self.encode(batch, memory)
         views = self.view_transform(level, batch.pix_from_aug, batch.image_valid, self.image_encoder.image_size_px)
-        current = fused = self.fuser(views.bev, radar_bev)
-        warped_maps = None
+        fused = self.fuser(views.bev, radar_bev)
+        current, warped_maps, memory_now = fused, None, None
         if self.temporal is not None:
-            warped_maps = self.temporal.recall(memory, batch)
-            current, memory = self.temporal.aggregate(fused, warped_maps), self.temporal.remember(memory, batch, fused)
-        output = DenseBEVOutput(views, radar_bev, fused, self.head(self.decoder(current)), warped_maps)
-        return output, memory if self.temporal is not None else None
+            current, warped_maps, memory_now = self.temporal(memory, batch, fused)
+        return DenseBEVOutput(views, radar_bev, fused, self.head(self.decoder(current)), warped_maps), memory_now
 
     def restore_memory(self, state: list[dict[str, Any]]) -> MapMemory:
         """The memory that `MapMemory.state` described."""

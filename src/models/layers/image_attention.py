@@ -70,6 +70,7 @@ class ImageCrossAttention(nn.Module):
         points: Tensor,  # [B, G, P, 2] aug metres, [B, G, P, 3] without a grid
         views: CameraViews,
         values: list[Tensor],  # L x [B, N, C, h, w]
+        shares: Tensor | None = None,  # [B, G, N, P], what counts of each sample beside its weight; None: all
     ) -> Tensor:  # [B, G, C]
         """Samples of every visible point on every level."""
         if self.height is not None:
@@ -78,6 +79,8 @@ class ImageCrossAttention(nn.Module):
             points = torch.cat([points, z[..., None]], dim=-1)
         pixels, visible = views.project(points)
         weights = self._weights(query, views.pix_from_aug, visible)
+        if shares is not None:
+            weights = weights * shares[:, :, None, :, None]
         gathered = deform_attend_images(values, pixels, views.image_size_px, weights, visible)
         if torch.is_grad_enabled() and not gathered.requires_grad:
             # Nothing visible: zero gradients rather than none, since DDP expects one per parameter on every rank.

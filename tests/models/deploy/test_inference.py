@@ -149,6 +149,7 @@ MODELS = {
         "phase=phase2", "model=crt_fusion", "model.head.score_threshold=0.015",
         "model.temporal.occupancy_threshold=0.01",
     ),
+    "hydra": ("phase=phase2", "model=hydra"),
     "radargnn": ("phase=phase1", "model=radargnn", "model.head.score_threshold=0.005"),
     "sparc": ("phase=phase2", "model=sparc"),
     "petr": ("phase=phase2", "model=petr"),

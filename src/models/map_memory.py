@@ -86,6 +86,16 @@ class TemporalFusion(nn.Module):
         row, col = torch.meshgrid(torch.arange(grid.rows), torch.arange(grid.cols), indexing="ij")
         self.register_buffer("centres_m", grid.centre_of(torch.stack([row, col], -1)), persistent=False)
 
+    def forward(
+        self,
+        memory: MapMemory | None,
+        batch: FrameBatch,
+        fused: Tensor,  # [B, C, rows, cols]
+    ) -> tuple[Tensor, WarpedMaps, MapMemory]:
+        """The current map changed by the past, what of the past is in use, and the memory with the current map."""
+        warped_maps = self.recall(memory, batch)
+        return self.aggregate(fused, warped_maps), warped_maps, self.remember(memory, batch, fused)
+
     @torch.no_grad()
     def recall(self, memory: MapMemory | None, batch: FrameBatch) -> WarpedMaps:
         """The remembered maps with their motion to the batch's time and augmented frame."""

@@ -12,7 +12,7 @@ from torch import nn
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.dense_bev.model import DenseBEVConfig
-from src.models.dense_bev.temporal_fusion import MapMemory, TemporalFusion
+from src.models.map_memory import MapMemory, TemporalFusion
 from src.reliability.checkpoints import load_model_weights
 from tests.models.dense_bev.dense_frames import GRID, dense_model, drive, fill, memory_config, pose
 from tests.models.moving import bare_frame, bda
