@@ -15,6 +15,7 @@ import lightning as L
 from src.assembly import build_datamodule, build_module, data_root, save_submission
 from src.config import PHASES, Config, compose_config, refuse_oracle
 from src.data.datamodule import DetectionDataModule
+from src.errors import DataError
 from src.pictures.learning_curves import draw_curves
 from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.checkpoints import OpenCheckpoint, open_checkpoint
@@ -94,9 +95,12 @@ def prepare(
             weights = open_source(source)
         folder.open(config.resume)
         if folder.finished:
+            check_data(config, folder, folder.read_result()[0])
             show_finished(folder)
             return None
         resume = folder.newest_checkpoint()
+        if resume is not None:
+            check_data(config, folder, resume.content.get(DetectionDataModule.__qualname__, {}))
         folder.start_log(tree)
         return {"resume": resume and str(resume.path), "root": str(data_root(config))}
 
@@ -106,6 +110,23 @@ def prepare(
     if decided["resume"] is not None:
         return StartingPoint(Path(decided["root"]), resume=resume or open_checkpoint(Path(decided["resume"])))
     return StartingPoint(Path(decided["root"]), weights=weights or (source and open_source(source)))
+
+
+def check_data(config: Config, folder: RunFolder, recorded: dict[str, Any]) -> None:
+    """Raises DataError when `data.root` holds other samples than the run has recorded.
+
+    It may be away, or an empty mount point; older runs recorded none; without a root the world identifies the run.
+    """
+    root, samples = config.data.root, recorded.get("samples_digest")
+    if root is None or samples is None or not any(Path(root).glob("*")):
+        return
+    found = build_datamodule(config, data_root(config)).state_dict()
+    if found["samples_digest"] != samples:
+        raise DataError(
+            f"{folder.path} was trained on {recorded.get('data')} with the samples {samples}, but data.root={root} "
+            f"holds {found['data']} with the samples {found['samples_digest']}; give the data.root of the run, or "
+            "resume=restart to move it aside and train anew on these"
+        )
 
 
 def run(
@@ -121,6 +142,7 @@ def run(
     tune_cpu_allocator()
     L.seed_everything(config.seed, verbose=False)
     datamodule = build_datamodule(config, start.root)
+    data = datamodule.state_dict()  # the folder may be away when the first checkpoint is written
     module = build_module(config, tree, datamodule)
     if start.resume is not None:
         logger.info("resuming from %s", start.resume.path)
@@ -154,7 +176,7 @@ def run(
         module,
         run_id=folder.run_id,
         overrides=overrides,
-        data=datamodule.identity(),
+        **data,
         initialized_from=source.identity if source is not None else None,
         resumed=start.resume is not None,
         seconds={"fit": round(seconds, 1), "all": round(time.monotonic() - started, 1)},

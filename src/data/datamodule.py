@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import hashlib
+import json
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -166,6 +168,18 @@ class DetectionDataModule(L.LightningDataModule):
             "split": self.config.split,
             "root": self.root.name,
         }
+
+    @cached_property
+    def samples_digest(self) -> str:
+        """16 hex digits of the tokens of what training and validation read, in order: other data have others."""
+        config, index = self.config, self.index
+        training = first_scenes(index, split_samples(index, config.train_split), config.train_scenes)
+        tokens = [index.sample_tokens[rows].tolist() for rows in (training, split_samples(index, config.split))]
+        return hashlib.sha256(json.dumps(tokens).encode()).hexdigest()[:16]
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint and run.json say of the data."""
+        return {"data": self.identity(), "samples_digest": self.samples_digest}
 
     def validation_clips(self, count: int, length: int) -> list[list[FrameBatch]]:
         """Up to `count` clips that end at different frames spread evenly over what validation reads, in stream 0.

@@ -25,8 +25,10 @@ from src.report.pages import (
     PHASES_OF,
     compared_experiments,
     comparison_page,
+    left_out,
     phase_page,
     runs_on_page,
+    split_by_data,
     without_dropout,
 )
 from src.report.results import RunResult, finished_runs, publish_result, read_results
@@ -53,8 +55,7 @@ def main(overrides: list[str]) -> None:
     results, broken = read_results(reports, config.scale)
     records, broken_records = read_records(reports, config.scale)
     faults += [*map(str, broken.values()), *map(str, broken_records.values())]
-    pages, of_pages = write_pages(config, results, {run for record in records for run in record.runs})
-    faults += of_pages
+    pages = write_pages(config, results, {run for record in records for run in record.runs})
     tables: list[Path] = []
     pictures: list[Path] = []
     sound: list[SweepRecord] = []
@@ -91,14 +92,8 @@ def noted_in(faults: list[str]) -> Iterator[None]:
         faults.append(str(error))
 
 
-def write_pages(
-    config: Config, results: dict[str, RunResult], in_sweeps: Collection[str]
-) -> tuple[dict[str, Path], list[str]]:
-    """`<phase>_<scale>.md` of every phase that has runs, and what is wrong with the others.
-
-    Of another task than detection: `<phase>_<task>_<scale>.md`.
-    """
-    pages, faults = {}, []
+def write_pages(config: Config, results: dict[str, RunResult], in_sweeps: Collection[str]) -> dict[str, Path]:
+    """`<phase>_<scale>.md` of every phase that has runs; of another task than detection `<phase>_<task>_<scale>.md`."""
     models = {result.phase: result.model for result in results.values() if result.phase in PHASES}
     defaults = {phase: defaults_of(config.scale, phase, model) for phase, model in models.items()}
     detection = [run for run in results.values() if run.task == DETECTION]
@@ -106,14 +101,8 @@ def write_pages(
     for run in results.values():
         if run.task != DETECTION and run.phase in PHASES and run.run_id not in in_sweeps:
             groups.setdefault(f"{run.phase}_{run.task}", []).append(run)
-    for name, runs in groups.items():
-        if runs:
-            try:
-                pages[name] = write_page(Path(config.paths.reports), name, config.scale, runs)
-            except ValueError as error:
-                kept = f"{config.paths.reports}/results"
-                faults.append(f"{kept}: {error}; keep results on different data in different paths.reports")
-    return pages, faults
+    reports = Path(config.paths.reports)
+    return {name: write_page(reports, name, config.scale, runs) for name, runs in groups.items() if runs}
 
 
 def defaults_of(scale: str, phase: str, model: str) -> dict[str, Any]:
@@ -126,7 +115,8 @@ def defaults_of(scale: str, phase: str, model: str) -> dict[str, Any]:
 
 
 def write_page(reports: Path, name: str, scale: str, runs: list[RunResult]) -> Path:
-    """One phase's page; phase 2's holds its runs against phase 1's, and has a picture."""
+    """One phase's page of `runs` on its default data; phase 2's holds its runs against phase 1's, with a picture."""
+    runs, others = split_by_data(runs, name if name in PHASES_OF else runs[0].phase)
     if name in PHASES_OF:
         experiments = compared_experiments(runs)
         picture = f"pictures/{name}_{scale}.png"
@@ -135,7 +125,7 @@ def write_page(reports: Path, name: str, scale: str, runs: list[RunResult]) -> P
     else:
         text = phase_page(runs, scale)
     path = reports / f"{name}_{scale}.md"
-    write_whole(path, text)
+    write_whole(path, text + left_out(others))
     return path
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import yaml
 
-from src.report.escaping import as_code
+from src.report.escaping import as_code, escape_markdown
 from src.report.metric_names import DETECTION, SPEEDS, Metric
 from src.report.plain_yaml import load_plain_yaml
 from src.report.results import NOT_A_SETTING, RunResult
@@ -107,6 +108,27 @@ def runs_on_page(
         if belongs and (known or run.run_id not in in_sweeps):
             shown.append(run)
     return shown if any(run.phase == phase for run in shown) else []
+
+
+def split_by_data(runs: list[RunResult], phase: str) -> tuple[list[RunResult], list[RunResult]]:
+    """The runs on the phase's default data, which a page shows, and those on other data.
+
+    Default is what most of the phase's own runs without settings read, else most of its runs.
+    """
+    own = [run for run in runs if run.phase == phase]
+    plain = Counter(run.dataset for run in own if not run.settings)
+    every = Counter(run.dataset for run in own)
+    default = max(every, key=lambda data: (plain[data], every[data], data))
+    kept = [run for run in runs if run.dataset == default]
+    return kept, [run for run in runs if run.dataset != default]
+
+
+def left_out(others: list[RunResult]) -> str:
+    """The line of a page that says which runs are not on it; none where there are none."""
+    if not others:
+        return ""
+    named = ", ".join(f"{as_code([run.run_id])} ({escape_markdown(run.dataset)})" for run in others)
+    return f"\nLeft out, since a table never mixes data: {named}.\n"
 
 
 def without_defaults(overrides: list[str], defaults: dict[str, Any]) -> list[str]:

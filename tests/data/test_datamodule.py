@@ -544,3 +544,13 @@ def test_lightning_resumes_in_the_middle_of_an_epoch(
     assert len([entry for entry in first if entry[0] != "validation"]) == stop_at
     assert first + rest == whole
     assert not [warning for warning in recwarn if "resumable" in str(warning.message)]
+
+
+def test_the_digest_is_of_the_samples_that_are_read(drives):
+    first, again = module(drives), module(drives)
+    assert first.samples_digest == again.samples_digest and len(first.samples_digest) == 16
+    others = (
+        module(drives, **changes) for changes in ({"train_scenes": 2}, {"train_split": "val"}, {"split": "train"})
+    )
+    assert len({first.samples_digest, *(other.samples_digest for other in others)}) == 4
+    assert first.state_dict() == {"data": first.identity(), "samples_digest": first.samples_digest}

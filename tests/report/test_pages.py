@@ -136,10 +136,26 @@ def test_no_run_of_the_phase_itself(write_run, report):
             report(phase)
 
 
-def test_other_data_is_refused(both_phases, write_run, report):
-    write_run("other", ["phase=phase2"], 5, 0.3, phase="phase2", root="elsewhere")
-    with pytest.raises(DataError, match="never mixes data.*different paths.reports"):
-        report("phase2")
+def test_runs_on_other_data_are_left_out_and_named(both_phases, write_run, report):
+    before = [report(phase) for phase in ("phase1", "phase2")]
+    write_run("other", ["phase=phase2"], 5, 0.9, phase="phase2", root="elsewhere")
+    for end in ("more", "most", "even"):  # runs without settings decide, not these three
+        write_run(end, [f"x={end}"], 0, 0.9, root="world|3")
+    said = "\nLeft out, since a table never mixes data: "
+    assert (
+        report("phase1")
+        == before[0]
+        + said
+        + ", ".join(f"`horizon3d-phase1-mini-{end}` (synthetic highway world\\|3)" for end in ("even", "more", "most"))
+        + ".\n"
+    )
+    assert report("phase2") == before[1] + said + "`horizon3d-phase2-mini-other` (synthetic highway elsewhere).\n"
+
+
+def test_without_a_plain_run_the_data_of_most_are_shown(write_run, report):
+    for end, root in (("a", "z"), ("b", "world"), ("c", "world")):
+        write_run(end, [f"x={end}"], 0, 0.3, root=root)
+    assert list(rows(report("phase1"), "| experiment | mAP, % |")) == ["`x=b`", "`x=c`"]
 
 
 @pytest.mark.slow

@@ -118,6 +118,13 @@ def test_publishing_again_changes_nothing_until_the_run_does(write_run, reports)
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
+def test_a_digest_of_the_samples_makes_no_other_result(write_run, reports):
+    folder = write_run("a", [], 0, 0.3)
+    before = publish_result(folder, reports).read_bytes()
+    damage(folder / "run.json", lambda record: record.update(samples_digest="0123456789abcdef"))
+    assert publish_result(folder, reports).read_bytes() == before
+
+
 def test_no_path_of_the_machine_is_published(write_run, reports, tmp_path):
     machine = [
         f"paths.outputs={tmp_path}", "paths.reports=/r", "phase.train_missing=false",
