@@ -1,5 +1,9 @@
 """What any detector must do: learn with every parameter, keep samples apart, weigh its losses."""
 
+from dataclasses import replace
+
+import numpy as np
+import pytest
 import torch
 
 
@@ -55,6 +59,47 @@ def weight_multiplies_or_switches_off(model, batch, name, terms):
     torch.testing.assert_close(double[term], 2.0 * plain[term])
     setattr(loss, name, None)
     assert set(model.loss(output, batch).terms) == terms - {term}
+
+
+def missing_cameras_do_not_matter(model, batch, missing):
+    """Pixels of cameras [(sample, camera)] that are not there change nothing; losses and gradients are finite."""
+    for sample, camera in missing:
+        batch.image_valid[sample, camera] = False
+        batch.pix_from_aug[sample, camera] = 0.0
+    output, terms = train_step(model, batch)
+    assert all(value.isfinite() for value in terms.values()) and gradients_are_finite(model)
+    model.eval()
+    before = model(batch)[0]
+    for sample, camera in missing:
+        batch.images[sample, camera] = 255 - batch.images[sample, camera]
+    after = model(batch)[0]
+    assert torch.equal(before.head.logits, after.head.logits)
+    assert torch.equal(model.loss(before, batch).terms["total"], model.loss(after, batch).terms["total"])
+    return output, terms
+
+
+def images_and_annotations_are_needed(model, batch):
+    """Their absence is named."""
+    output = model(batch)[0]
+    with pytest.raises(ValueError, match="FrameBatch.boxes is None"):
+        model.loss(output, replace(batch, boxes=None))
+    with pytest.raises(ValueError, match="FrameBatch.images is None"):
+        model(replace(batch, images=None))
+
+
+def overfitted_precision(model, batch, steps, rate, falling):
+    """AP at one cell, averaged over the classes present, after so many steps on two frames; the last `falling` ones
+    bring the learning rate to zero."""
+    optimizer = torch.optim.AdamW(model.parameters())
+    for step in range(steps):
+        for group in optimizer.param_groups:
+            group["lr"] = rate * min(1.0, (steps - step) / falling)
+        train_step(model, batch)
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 35.0)
+        optimizer.step()
+    with torch.no_grad():
+        found = model.decode(model(batch)[0])  # in training mode: two frames are all the statistics there are
+    return np.mean([average_precision(found, batch.boxes, label) for label in range(5)])
 
 
 def average_precision(found, truth, label):

@@ -1,8 +1,7 @@
 """What every query detector must do: bad input, samples that must not mix, memory, weights, learning, sizes."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
-import numpy as np
 import pytest
 import torch
 
@@ -12,8 +11,10 @@ from src.errors import ConfigError
 from src.models import build_model
 from tests.models.dense_bev.dense_frames import GRID, drive, fill, make_batch
 from tests.models.learning import (
-    average_precision,
     gradients_are_finite,
+    images_and_annotations_are_needed,
+    missing_cameras_do_not_matter,
+    overfitted_precision,
     samples_do_not_mix,
     train_step,
     weight_multiplies_or_switches_off,
@@ -68,18 +69,8 @@ def test_empty_inputs_give_finite_losses(family, shape, phase):
 @pytest.mark.parametrize("missing", [EVERY[1:2], EVERY])
 def test_missing_cameras(family, missing):
     model, batch = small_model(family), make_batch()
-    for sample, camera in missing:
-        batch.image_valid[sample, camera] = False
-        batch.pix_from_aug[sample, camera] = 0.0
-    _, terms = train_step(model, batch)
-    assert all(value.isfinite() for value in terms.values()) and gradients_are_finite(model)
-    model.eval()
+    missing_cameras_do_not_matter(model, batch, missing)
     before = model(batch)[0]
-    for sample, camera in missing:
-        batch.images[sample, camera] = 255 - batch.images[sample, camera]
-    after = model(batch)[0]
-    assert torch.equal(before.head.logits, after.head.logits)
-    assert torch.equal(model.loss(before, batch).terms["total"], model.loss(after, batch).terms["total"])
     batch.images[1, 3] = 255 - batch.images[1, 3]
     assert torch.equal(before.head.logits, model(batch)[0].head.logits) == (missing == EVERY)
 
@@ -119,11 +110,8 @@ def test_autocast_keeps_boxes_and_losses_in_float32(family, phase):
 
 def test_what_is_missing_or_does_not_fit_is_refused(family):
     model, batch = small_model(family, phase="phase2"), make_batch()
-    output, memory = model(batch)
-    with pytest.raises(ValueError, match="FrameBatch.boxes is None"):
-        model.loss(output, replace(batch, boxes=None))
-    with pytest.raises(ValueError, match="FrameBatch.images is None"):
-        model(replace(batch, images=None))
+    _, memory = model(batch)
+    images_and_annotations_are_needed(model, batch)
     with pytest.raises(ValueError, match="2 streams, but the batch 1 frames"):
         model(make_batch(points=(9,), boxes=(0,)), memory)
     config = settings(family)
@@ -151,14 +139,4 @@ def test_two_frames_are_overfitted(family):
     """Over 0.9 AP at one cell, averaged over the classes present."""
     model, batch = small_model(family), make_batch(boxes=(5, 4))
     steps, falling, rate = OVERFITTING[family]
-    optimizer = torch.optim.AdamW(model.parameters())
-    for step in range(steps):
-        for group in optimizer.param_groups:
-            group["lr"] = rate * min(1.0, (steps - step) / falling)
-        train_step(model, batch)
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 35.0)
-        optimizer.step()
-    with torch.no_grad():
-        found = model.decode(model(batch)[0])  # in training mode: two frames are all the statistics there are
-    precision = np.mean([average_precision(found, batch.boxes, label) for label in range(5)])
-    assert precision > 0.9, precision
+    assert overfitted_precision(model, batch, steps, rate, falling) > 0.9

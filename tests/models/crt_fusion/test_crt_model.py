@@ -1,8 +1,7 @@
 """The whole of CRT-Fusion: gradients, bad input, samples and cameras that must not matter, learning, sizes."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
-import numpy as np
 import pytest
 import torch
 
@@ -13,8 +12,10 @@ from src.models.crt_fusion.model import CRTFusionLossConfig
 from tests.models.crt_fusion.crt_frames import SMALL, crt_model
 from tests.models.dense_bev.dense_frames import GRID, backbone, make_batch
 from tests.models.learning import (
-    average_precision,
     gradients_are_finite,
+    images_and_annotations_are_needed,
+    missing_cameras_do_not_matter,
+    overfitted_precision,
     parameters_that_stay,
     samples_do_not_mix,
     train_step,
@@ -53,20 +54,9 @@ def test_empty_inputs_give_finite_losses(shape):
 @pytest.mark.parametrize("missing", [EVERY[1:2], EVERY])
 def test_missing_cameras(missing):
     model, batch = crt_model(), make_batch()
-    for sample, camera in missing:
-        batch.image_valid[sample, camera] = False
-        batch.pix_from_aug[sample, camera] = 0.0
-    output, terms = train_step(model, batch)
-    assert all(value.isfinite() for value in terms.values()) and gradients_are_finite(model)
+    output, terms = missing_cameras_do_not_matter(model, batch, missing)
     if missing == EVERY:
         assert output.views.num_lifted == terms["depth"] == terms["foreground"] == 0
-    model.eval()
-    before = model(batch)[0]
-    for sample, camera in missing:
-        batch.images[sample, camera] = 255 - batch.images[sample, camera]
-    after = model(batch)[0]
-    assert torch.equal(before.head.logits, after.head.logits)
-    assert torch.equal(model.loss(before, batch).terms["total"], model.loss(after, batch).terms["total"])
 
 
 def test_two_samples_do_not_mix():
@@ -91,11 +81,7 @@ def test_autocast_keeps_positions_and_losses_in_float32():
 
 def test_images_and_annotations_are_needed_where_they_are():
     model, batch = crt_model(), make_batch()
-    output, _ = model(batch)
-    with pytest.raises(ValueError, match="FrameBatch.boxes is None"):
-        model.loss(output, replace(batch, boxes=None))
-    with pytest.raises(ValueError, match="FrameBatch.images is None"):
-        model(replace(batch, images=None))
+    images_and_annotations_are_needed(model, batch)
 
 
 @pytest.mark.parametrize(
@@ -134,14 +120,4 @@ def test_sizes_stand_beside_horizon3ds(scale, low, high):
 def test_two_frames_are_overfitted():
     """Over 0.9 AP at one cell, averaged over the classes present."""
     model, batch = crt_model(), make_batch(boxes=(5, 4))
-    optimizer = torch.optim.AdamW(model.parameters(), lr=4e-3)
-    steps = 140
-    for step in range(steps):
-        for group in optimizer.param_groups:
-            group["lr"] = 4e-3 * min(1.0, (steps - step) / 100)
-        train_step(model, batch)
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 35.0)
-        optimizer.step()
-    with torch.no_grad():
-        found = model.decode(model(batch)[0])  # in training mode: two frames are all the statistics there are
-    assert np.mean([average_precision(found, batch.boxes, label) for label in range(5)]) > 0.9
+    assert overfitted_precision(model, batch, 140, 4e-3, 100) > 0.9

@@ -3,7 +3,6 @@
 import math
 from dataclasses import fields, replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -15,8 +14,8 @@ from src.models.radargnn.model import MessagePassing, RadarGNNLossConfig, RadarG
 from src.structures.boxes import Boxes3D
 from tests.models.dense_bev.dense_frames import make_batch
 from tests.models.learning import (
-    average_precision,
     gradients_are_finite,
+    overfitted_precision,
     parameters_that_stay,
     train_step,
     weight_multiplies_or_switches_off,
@@ -218,14 +217,4 @@ def test_two_frames_are_overfitted(invariance):
         "model.head.hidden_channels=64", "model.graph.num_neighbours=8", f"model.graph.invariance={invariance}",
     )  # fmt: skip
     model, batch = gnn_model(*wide), on_boxes(make_batch(points=(60, 50), boxes=(5, 4)))
-    optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3)
-    steps = 300
-    for step in range(steps):
-        for group in optimizer.param_groups:
-            group["lr"] = 3e-3 * min(1.0, (steps - step) / 150)
-        train_step(model, batch)
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 35.0)
-        optimizer.step()
-    with torch.no_grad():
-        found = model.decode(model(batch)[0])  # in training mode: two frames are all the statistics there are
-    assert np.mean([average_precision(found, batch.boxes, label) for label in range(5)]) > 0.9
+    assert overfitted_precision(model, batch, 300, 3e-3, 150) > 0.9
