@@ -85,7 +85,8 @@ def test_a_run_without_map_is_finished_tabled_and_shown(tmp_path, monkeypatch, c
 
     sweep.main(["+sweep=frames", *places])  # trains nothing, as the run is done
     result = read_result(result_path(reports, folder.name))
-    assert result.metrics == {"frames": frames, "per_batch": 2.0}
+    cost = {"cost.parameters": record["parameters"], "cost.training": record["seconds"]["all"]}
+    assert result.metrics == {"frames": frames, "per_batch": 2.0} | cost
     table = (reports / "tables" / "frames_debug.md").read_text()
     assert f"| as it is | {frames:.3f} | – |" in table
     report.main(["phase=phase1", *places])

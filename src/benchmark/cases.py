@@ -118,12 +118,12 @@ def expect_trained_occupancy(case: Case, num_cells: int) -> None:
         return
     encode, opaque = ocsf.encoder.forward, None
 
-    def forward(*inputs: Any) -> GaussianSet:
-        gaussians = encode(*inputs)
+    def forward(*inputs: Any) -> tuple[GaussianSet, Tensor]:
+        gaussians, velocities = encode(*inputs)
         if opaque is None:
-            return gaussians
+            return gaussians, velocities
         logits = torch.where(opaque, OPAQUE, -OPAQUE).expand_as(gaussians.opacity_logits)
-        return replace(gaussians, opacity_logits=logits)
+        return replace(gaussians, opacity_logits=logits), velocities
 
     def output() -> Any:
         with torch.no_grad(), case.computing():

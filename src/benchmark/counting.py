@@ -91,9 +91,13 @@ class _Counter(TorchDispatchMode):
     def __torch_dispatch__(
         self, func: Any, types: tuple[type, ...], args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        kwargs = kwargs or {}
+        kwargs, packet = kwargs or {}, func.overloadpacket
+        if packet not in FLOPS:  # in inference mode a linear layer comes whole
+            with self:
+                result = func.decompose(*args, **kwargs)
+            if result is not NotImplemented:
+                return result
         result = func(*args, **kwargs)
-        packet = func.overloadpacket
         if not func.is_view and packet not in FREE:
             inputs = [args, {name: value for name, value in kwargs.items() if name != "out"}]
             self.work.bytes += sum(x.nbytes for x in tree_leaves([inputs, result]) if isinstance(x, Tensor))

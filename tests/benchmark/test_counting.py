@@ -41,6 +41,16 @@ def test_convolution(bias):
     assert work.flops == 2 * (2 * 10 * 12) * 8 * 3 * 9
 
 
+def test_inference_mode_hides_nothing():
+    """Layers come whole there, not as the products that they are made of."""
+    linear, conv = torch.nn.Linear(4, 5), torch.nn.Conv2d(4, 5, 3)
+    with torch.inference_mode(), counted_work() as work:
+        linear(torch.randn(3, 4))
+        conv(torch.randn(1, 4, 8, 8))
+        torch.matmul(torch.randn(3, 4), torch.randn(4, 3))
+    assert work.flops == 2 * 3 * 4 * 5 + 2 * 36 * 5 * 4 * 9 + 2 * 3 * 4 * 3
+
+
 def test_grouped_products():
     rows, matrices = torch.randn(10, 8), torch.randn(3, 8, 16)
     ends = torch.tensor([3, 5, 10], dtype=torch.int32)
