@@ -117,10 +117,10 @@ class BEVPath(nn.Module):
                 values.append(head[1](head[0](fused).features))
         if self.velocity is None:
             values = list(values[0].split([1, 2], dim=1))
-        stated = VELOCITY_UNIT_MPS * values[1]
-        velocities = stated if doppler is None else doppler.impose(stated, fused.sites.linear())
+        regressed = VELOCITY_UNIT_MPS * values[1]
+        velocities = regressed if doppler is None else doppler.impose(regressed, fused.sites.linear())
         in_losses = doppler is None or doppler.in_losses
-        return CellPrediction(values[0].squeeze(1), velocities, velocities if in_losses else stated)
+        return CellPrediction(values[0].squeeze(1), velocities, velocities if in_losses else regressed)
 
     @torch.no_grad()
     def store(self, fused: SparseBEV, cells: CellPrediction, batch: FrameBatch) -> StoredCells:

@@ -360,10 +360,10 @@ class GaussianEncoder(nn.Module):
         joined = self.anchor.joined() if torch.is_grad_enabled() else None
         for layer in self.layers:
             embedding = self.anchor(gaussians) if joined is None else self.anchor(gaussians, joined)
-            stated = layer(gaussians, embedding, radar_bev, views, values)
-            gaussians = _measured(stated, doppler)
+            regressed = layer(gaussians, embedding, radar_bev, views, values)
+            gaussians = _measured(regressed, doppler)
         in_losses = doppler is None or doppler.in_losses
-        return gaussians, (gaussians if in_losses else stated).velocities
+        return gaussians, (gaussians if in_losses else regressed).velocities
 
 
 def _measured(gaussians: GaussianSet, doppler: Doppler | None) -> GaussianSet:

@@ -124,8 +124,7 @@ class Horizon3D(Detector):
             if self.training and config.withheld:
                 known = torch.rand(len(batch), device=owners.device)[owners] >= config.withheld
                 points, owners = points[known], owners[known]
-            options = {"in_losses": config.in_losses, "along_heading": config.along_heading}
-            measured = Doppler.measure(points, owners, self.grid, **options)
+            measured = Doppler.measure(points, owners, self.grid, config.in_losses, config.along_heading)
         return {name: measured if its else None for name, its in wanted.items()}
 
     def fixed_form(self, capacities: Capacities | None = None) -> FixedHorizon3D | None:

@@ -39,7 +39,7 @@ class DopplerConfig:
     cells: bool
     boxes: bool
     withheld: float  # share of the frames of training in which none does
-    in_losses: bool  # losses see these velocities; else those that the network states
+    in_losses: bool  # losses see these velocities; else those that the network regresses
     along_heading: bool  # a box that moves does so along its heading, with that radial part
 
     def __post_init__(self) -> None:
@@ -67,7 +67,8 @@ class Doppler:
         radar_points: Tensor,  # [P, 7] x, y, z (m, aug frame), rcs (dB), vx, vy (m/s), dt (s)
         radar_batch: Tensor,  # [P] int64
         grid: BEVGrid,
-        **options: bool,  # `in_losses` and `along_heading`
+        in_losses: bool = True,
+        along_heading: bool = False,
     ) -> Self:
         """Of all points inside the grid."""
         fixed = fixed_shapes()
@@ -90,12 +91,12 @@ class Doppler:
             given = torch.where((within & grid.contains(xy)[:, None, None]).flatten(), given, NONE)
             keys = fixed.distinct(given, NONE, len(given))
             sums = segment_sum(weighted, torch.searchsorted(keys, given), len(keys))
-            return cls(grid, keys, sums[:, 1:] / sums[:, :1].clamp(min=1.0), **options)
+            return cls(grid, keys, sums[:, 1:] / sums[:, :1].clamp(min=1.0), in_losses, along_heading)
         chosen = within.flatten().nonzero().squeeze(1)
         keys, order = torch.sort(given.index_select(0, chosen), stable=True)
         keys, counts = torch.unique_consecutive(keys, return_counts=True)
         sums = gather_segment_sum(weighted, chosen.index_select(0, order), F.pad(counts.cumsum(0), (1, 0)))
-        return cls(grid, keys, sums[:, 1:] / sums[:, :1], **options)
+        return cls(grid, keys, sums[:, 1:] / sums[:, :1], in_losses, along_heading)
 
     def impose(
         self,
