@@ -57,8 +57,8 @@ def main(overrides):
     if (folder / "run.json").exists():
         print("shown again")
         return
+    signal.signal(signal.SIGTERM, lambda *_: (note("interrupted"), sys.exit(6)))  # before a test can know it has begun
     note("begin")
-    signal.signal(signal.SIGTERM, lambda *_: (note("interrupted"), sys.exit(6)))
     print("environment", os.environ.get("OMP_NUM_THREADS"), os.environ.get("CUDA_VISIBLE_DEVICES"))
     source = identify(overrides).source
     assert source is None or (outputs / identify(source).run_id / "run.json").is_file(), "started before its source"
