@@ -135,8 +135,7 @@ FULL_SIZE = {
         "refine_from": "self_encoding", "gate_kernel_size": 1,
         "identity_start": False,
     },
-    "model.doppler": {"gaussians": True, "cells": False, "boxes": True, "withheld": 0.0, "in_losses": True,
-        "along_heading": False,},
+    "model.doppler": {"gaussians": True, "cells": False, "boxes": True, "in_losses": False, "along_heading": True},
     "model.head": {"nms": "maxpool", "score_threshold": 0.1, "max_boxes": 500, "attributes": "rule"},
     "model.loss": {
         "kggi_weight": 1.0, "ocsf_weight": 5.0, "heatmap_weight": 1.0, "box_weight": 0.25, "keypoint_weight": 1.0,
@@ -177,8 +176,7 @@ FULL_SIZE_PHASE_2 = {
         "train_missing": True, "temporal": True,
     },
     "phase.options": {"velocity_code_weight": 1.0},
-    "model.doppler": {"gaussians": True, "cells": True, "boxes": True, "withheld": 0.0, "in_losses": True,
-        "along_heading": False,},
+    "model.doppler": {"gaussians": True, "cells": True, "boxes": True, "in_losses": False, "along_heading": True},
     "model.dptf": {"max_age_s": 6.0, "min_speed_mps": 1.0},
     "model.dptf.bev_path": {
         "num_frames": 8, "memory_threshold": 0.1, "max_cells_per_frame": 4096, "velocity_compensation": True,

@@ -121,9 +121,6 @@ class Horizon3D(Detector):
         wanted = {name: getattr(config, name) for name in ("gaussians", "cells", "boxes")}
         if any(wanted.values()):
             points, owners = batch.radar_points, batch.radar_batch
-            if self.training and config.withheld:
-                known = torch.rand(len(batch), device=owners.device)[owners] >= config.withheld
-                points, owners = points[known], owners[known]
             measured = Doppler.measure(points, owners, self.grid, config.in_losses, config.along_heading)
         return {name: measured if its else None for name, its in wanted.items()}
 

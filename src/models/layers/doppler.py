@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
 from src.ops.fixed_shapes import fixed_shapes
@@ -32,19 +31,14 @@ FALLOFF = tuple(WINDOW_CELLS + 1 - abs(offset) for offset in REACH)
 class DopplerConfig:
     """Whose predicted velocities take their radial part from the radar, where it measures a near one (`model.doppler`).
 
-    A part that a phase or a model lacks is not asked. Raises ConfigError for an impossible share.
+    A part that a phase or a model lacks is not asked.
     """
 
     gaussians: bool
     cells: bool
     boxes: bool
-    withheld: float  # share of the frames of training in which none does
     in_losses: bool  # losses see these velocities; else those that the network regresses
     along_heading: bool  # a box that moves does so along its heading, with that radial part
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.withheld <= 1:
-            raise ConfigError(f"model.doppler.withheld={self.withheld}: must be a share of frames, 0 to 1")
 
 
 @dataclass
@@ -106,7 +100,7 @@ class Doppler:
         """The velocities with the measured radial part that is nearest to theirs; as they are where none is near.
 
         The gradient passes as if nothing had been replaced, so that the radial part is learnt as far as it leads to a
-        wrong measurement or to none; whole, where `withheld` frames have no measurement.
+        wrong measurement or to none; whole, where losses see the velocities of before (`in_losses` false).
         """
         return velocities + radial_change(velocities, cells, self.keys, self.velocities, self.grid)
 

@@ -164,7 +164,6 @@ def make_config():
             dptf=dptf,
             doppler=DopplerConfig(
                 **{name: name in doppler for name in ("gaussians", "cells", "boxes")},
-                withheld=0.0,
                 in_losses=True,
                 along_heading=False,
             ),

@@ -17,7 +17,6 @@ from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, RefineFrom
 from src.models.layers.doppler import Doppler, along_heading
-from src.ops.radial_change import NUM_BINS
 from src.structures.boxes import Boxes3D
 from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
 
@@ -215,19 +214,6 @@ def test_boxes_may_move_along_their_heading(make_model, make_batch):
     positions = model.grid.centre_of(output.head.bev.indices[:, 1:])
     torch.testing.assert_close(turned[:, 8:], along_heading(kept[:, 8:10], codes[:, 6:8], positions))
     assert ((turned[:, 8] == 0) & (turned[:, 9] > 0)).float().mean() > 0.5
-
-
-def test_withheld_frames_measure_nothing_in_training_alone(make_model, make_batch):
-    model, batch = make_model(doppler=("gaussians", "boxes")), make_batch(boxes=(12, 12))
-    model.config.doppler.withheld = 0.5
-    owners = []
-    for seed in range(12):
-        torch.manual_seed(seed)
-        doppler = model.train()._measure_doppler(batch)["boxes"]
-        owners.append(tuple((doppler.keys // NUM_BINS // (model.grid.rows * model.grid.cols)).unique().tolist()))
-    assert set(owners) == {(), (0,), (1,), (0, 1)}
-    whole = Doppler.measure(batch.radar_points, batch.radar_batch, model.grid)
-    torch.testing.assert_close(model.eval()._measure_doppler(batch)["boxes"].velocities, whole.velocities)
 
 
 @pytest.mark.slow
