@@ -11,10 +11,13 @@ from src.report.result_schema import Latency
 from src.report.results import RunResult
 from src.report.sweep_record import SweepRecord
 from src.report.sweep_table import SweepRow, SweepTable
+from src.training.identity import key_of
 
 SYNTHETIC = "synthetic highway"
 MAIN = ("mAP", "NDS")
 """Metrics that the finding is about; in a table without them it is about all."""
+OF_EVERY_CAPTION = ("phase", "model")
+"""Common overrides that a table's title and rows tell."""
 NAMED = 3
 """Orderings that hold are named up to this number."""
 
@@ -27,7 +30,8 @@ def describe_table(table: SweepTable, record: SweepRecord, results: dict[str, Ru
         any_result = next(iter(results.values()))
         data = f"Data: {any_result.dataset}, split {any_result.data.get('split', 'unknown')}"
     parts = [data, f"scale {record.scale}"]
-    parts += [f"with {' '.join(record.changes)}"] if record.changes else []
+    common = [override for override in record.sweep.overrides if key_of(override) not in OF_EVERY_CAPTION]
+    parts += [f"with {' '.join(common + record.changes)}"] if common or record.changes else []
     parts += describe_epochs(results.values())
     parts.append(f"seed{'s' if len(seeds) > 1 else ''} {_listed(seeds)}{', of which means' if len(seeds) > 1 else ''}")
     parts += describe_machines(results.values())
