@@ -1,5 +1,6 @@
 """Every shipped configuration composes; every mistake is named."""
 
+import json
 import math
 import os
 import re
@@ -364,9 +365,9 @@ def test_a_second_score_of_detections_composes_and_an_older_checkpoint_has_none(
                         "phase.monitor=val/iou"])  # fmt: skip
 
 
-@pytest.mark.parametrize("key", YOUNGER_KEYS)
-def test_what_was_made_before_there_was_a_key_is_what_it_was(key):
-    config, tree = compose_config(["scale=debug", "phase=phase2"])
+@pytest.mark.parametrize(("key", "before"), YOUNGER_KEYS.items())
+def test_what_was_made_before_there_was_a_key_is_what_it_was(key, before):
+    config, tree = compose_config(["scale=debug", "phase=phase2", f"{key}={json.dumps(before)}"])
     older = without_keys(tree, [key])
     assert older != tree and run_identity(older) == run_identity(tree)
     assert restore_config(older, []) == config
