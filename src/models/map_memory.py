@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy
-from src.models.layers.dense import DenseConvNormReLU
+from src.models.layers.dense import DenseConvNormReLU, MapConv2d
 from src.models.layers.norm import MapNorm
 from src.models.memory import FrameMemory, Motion, RememberedFrame, TemporalConfig
 from src.ops.concat_conv import concat_conv2d
@@ -80,7 +80,7 @@ class TemporalFusion(nn.Module):
         super().__init__()
         self.config, self.grid = config, grid
         self.reduce = DenseConvNormReLU((config.num_frames + 1) * channels, channels, 1)
-        self.refine = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.refine = MapConv2d(channels, channels, 3, padding=1, bias=False)
         self.norm = MapNorm(channels)
         nn.init.zeros_(self.norm.weight)  # untrained, the memory adds exactly zero
         row, col = torch.meshgrid(torch.arange(grid.rows), torch.arange(grid.cols), indexing="ij")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import torch.nn.functional as F
 from torch import Tensor
+
+from src.ops.map_conv import map_conv2d
 
 
 def concat_conv2d(
@@ -23,7 +24,7 @@ def concat_conv2d(
     if first is None:
         raise ValueError("maps: expected at least one")
     own, *slices = weight.split(first.shape[1], dim=1)
-    total = F.conv2d(first, own, bias)
+    total = map_conv2d(first, own, bias)
     for part, weight_slice in zip(maps, slices, strict=False):
-        total = total + F.conv2d(part.to(first.dtype), weight_slice)
+        total = total + map_conv2d(part.to(first.dtype), weight_slice)
     return total

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.resnet import BasicBlock
-from src.models.layers.dense import DenseConvNormReLU, map_of_rows
+from src.models.layers.dense import DenseConvNormReLU, MapConv2d, map_of_rows
 from src.models.layers.norm import MapNorm
 
 MIN_CHANNELS = 16
@@ -101,7 +101,7 @@ class GatedFuser(nn.Module):
         super().__init__()
         self.camera = DenseConvNormReLU(camera_channels + 1, channels, 3)
         self.radar = DenseConvNormReLU(radar_channels, channels, 3)
-        self.gates = nn.Conv2d(channels, 2 * channels, 1)
+        self.gates = MapConv2d(channels, 2 * channels, 1)
 
     def forward(
         self,
@@ -132,14 +132,14 @@ class BEVDecoder(nn.Module):
         widths = [in_channels, *config.stage_channels]
         self.stages = nn.ModuleList(
             nn.Sequential(
-                BasicBlock(widths[stage], width, stride),
-                *(BasicBlock(width, width, 1) for _ in range(config.blocks_per_stage - 1)),
+                BasicBlock(widths[stage], width, stride, MapConv2d),
+                *(BasicBlock(width, width, 1, MapConv2d) for _ in range(config.blocks_per_stage - 1)),
             )
             for stage, (width, stride) in enumerate(zip(widths[1:], config.stage_strides, strict=True))
         )
         joined = widths[1] + (widths[-1] if len(config.stage_channels) > 1 else 0)
         self.join = nn.Sequential(DenseConvNormReLU(joined, channels, 1), DenseConvNormReLU(channels, channels, 3))
-        self.lateral = nn.Conv2d(in_channels, channels, 1)
+        self.lateral = MapConv2d(in_channels, channels, 1)
         self.output = DenseConvNormReLU(channels, channels, 3)
         for module in self.modules():
             if isinstance(module, nn.Conv2d):

@@ -14,13 +14,13 @@ class BasicBlock(nn.Module):
     expansion = 1
     norm_pairs = (("conv1", "bn1"), ("conv2", "bn2"))
 
-    def __init__(self, in_channels: int, width: int, stride: int) -> None:
+    def __init__(self, in_channels: int, width: int, stride: int, conv: type[nn.Conv2d] = nn.Conv2d) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(in_channels, width, 3, stride, 1, bias=False)
+        self.conv1 = conv(in_channels, width, 3, stride, 1, bias=False)
         self.bn1 = MapNorm(width)
-        self.conv2 = nn.Conv2d(width, width, 3, 1, 1, bias=False)
+        self.conv2 = conv(width, width, 3, 1, 1, bias=False)
         self.bn2 = MapNorm(width)
-        self.downsample = _projection(in_channels, width, stride)
+        self.downsample = _projection(in_channels, width, stride, conv)
 
     def forward(
         self,
@@ -58,11 +58,11 @@ class Bottleneck(nn.Module):
         return F.relu(y + self.downsample(x))
 
 
-def _projection(in_channels: int, out_channels: int, stride: int) -> nn.Module:
+def _projection(in_channels: int, out_channels: int, stride: int, conv: type[nn.Conv2d] = nn.Conv2d) -> nn.Module:
     if stride == 1 and in_channels == out_channels:
         return nn.Identity()
     return nn.Sequential(
-        nn.Conv2d(in_channels, out_channels, 1, stride, bias=False),
+        conv(in_channels, out_channels, 1, stride, bias=False),
         MapNorm(out_channels),
     )
 

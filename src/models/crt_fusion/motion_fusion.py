@@ -13,7 +13,7 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
 from src.models.crt_fusion.motion_estimator import CellMotion
-from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
+from src.models.layers.dense import DenseConvNormReLU, MapConv2d, map_of_rows, rows_of_map
 from src.models.layers.norm import MapNorm
 from src.models.memory import FrameMemory, RememberedFrame, StoredRows, TemporalConfig, moving
 from src.ops.bilinear_scatter import bilinear_scatter
@@ -98,9 +98,9 @@ class MotionGuidedFusion(nn.Module):
         super().__init__()
         self.config, self.channels, self.grid = config, channels, grid
         slots = config.num_frames + 1
-        self.gates = nn.Conv2d(slots * channels, slots * channels, 1)
+        self.gates = MapConv2d(slots * channels, slots * channels, 1)
         self.reduce = DenseConvNormReLU(slots * (channels + 1), channels, 1)  # a map and its age each
-        self.refine = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.refine = MapConv2d(channels, channels, 3, padding=1, bias=False)
         self.norm = MapNorm(channels)
         nn.init.zeros_(self.norm.weight)  # untrained, the memory adds exactly zero
 

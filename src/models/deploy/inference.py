@@ -71,7 +71,7 @@ def fold_norm(layer: Linear, norm: _BatchNorm) -> None:
     shift = -norm.running_mean.double() * scale
     if norm.bias is not None:
         shift = shift + norm.bias.double()
-    axis = {nn.ConvTranspose2d: 1, nn.Conv2d: 0, nn.Linear: 0}.get(type(layer), 2)
+    axis = 1 if isinstance(layer, nn.ConvTranspose2d) else 2 if isinstance(layer, SparseKernel) else 0
     shape = [-1 if number == axis else 1 for number in range(layer.weight.dim())]
     weight = layer.weight.double() * scale.view(shape)
     if layer.bias is not None:

@@ -114,7 +114,7 @@ class CenterHead(nn.Module):
         in_channels: int | None = None,  # of a dense map that is wider than the head; None: C
     ) -> None:
         super().__init__()
-        self.config, self.grid = config, grid
+        self.config, self.grid, self.dense = config, grid, dense
         self.learned = config.attributes is AttributeSource.learned
         self.code_weights = (1.0,) * (CODE_SIZE - 2) + (velocity_code_weight,) * 2
         if dense:
@@ -175,10 +175,15 @@ class CenterHead(nn.Module):
     ) -> Tensor:  # [n, CODE_SIZE (+ 11)]
         features = output.bev.features
         step = max(1, len(features) // SAMPLED_CELLS)
-        sampled = features[::step] if self.training else features[:0]
+        if self.dense:  # one gradient of a whole map instead of one for each group
+            every = torch.arange(0, len(features) if self.training else 0, step, device=rows.device)
+            *chosen_by_group, sampled = features.index_select(0, torch.cat([rows, every])).split([*counts, len(every)])
+        else:
+            chosen_by_group = [features[own] for own in rows.split(counts)]
+            sampled = features[::step] if self.training else features[:0]
         codes = []
-        for branches, own in zip(self.regressions, rows.split(counts), strict=True):
-            chosen = torch.cat([features[own], sampled])
+        for branches, own in zip(self.regressions, chosen_by_group, strict=True):
+            chosen = torch.cat([own, sampled])
             if not torch.is_autocast_enabled(chosen.device.type):
                 chosen = chosen.to(branches.hidden.weight.dtype)
             if len(chosen) or self.training or len(rows) == 0:  # otherwise a group without cells costs nothing

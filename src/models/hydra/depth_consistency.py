@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
-from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
+from src.models.layers.dense import DenseConvNormReLU, MapConv2d, map_of_rows, rows_of_map
 from src.models.layers.full_precision import FullPrecisionConv2d
 from src.models.layers.image_attention import ImageCrossAttention, attention_linear, feed_forward
 from src.models.layers.query_attention import PlaceEmbedding
@@ -69,7 +69,7 @@ class DepthConsistency(nn.Module):
         self.offset = attention_linear(channels, 3 * config.num_points, zero=True)
         self.radar = nn.Linear(channels, 1)
         nn.init.constant_(self.radar.bias, RADAR_BIAS)
-        self.value = nn.Conv2d(context_channels, channels, 1)
+        self.value = MapConv2d(context_channels, channels, 1)
         self.attention = ImageCrossAttention(channels, config.num_points, len(CAMERAS), num_levels=1)
         self.norm = nn.LayerNorm(channels)
         self.mlp = feed_forward(channels, FFN_RATIO)

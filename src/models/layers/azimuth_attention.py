@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import invert_projection, pixel_centres
-from src.models.layers.dense import rows_of_map
+from src.models.layers.dense import MapConv2d, rows_of_map
 from src.models.layers.sparse import LinearNormReLU
 from src.ops.linear import linear
 from src.ops.segment_reduce import segment_sum
@@ -44,7 +44,7 @@ class AzimuthAttention(nn.Module):
             LinearNormReLU(hidden_channels, channels),
         )
         self.score = nn.Linear(channels, 1)
-        self.gates = nn.Conv2d(channels, 2 * channels, 3, padding=1)
+        self.gates = MapConv2d(channels, 2 * channels, 3, padding=1)
 
     def forward(
         self,

@@ -7,8 +7,19 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.models.layers.norm import MapNorm
+from src.ops.map_conv import map_conv2d
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV
+
+
+class MapConv2d(nn.Conv2d):
+    """A convolution padded by half its kernel, so that it keeps or divides the size, by `map_conv2d`."""
+
+    def forward(
+        self,
+        x: Tensor,  # [B, C, H, W]
+    ) -> Tensor:  # [B, C', H / stride, W / stride]
+        return map_conv2d(x, self.weight, self.bias, self.stride[0])
 
 
 class DenseConvNormReLU(nn.Module):
@@ -20,7 +31,7 @@ class DenseConvNormReLU(nn.Module):
         self, in_channels: int, out_channels: int, kernel_size: int, stride: int = 1, bias: bool = False
     ) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(in_channels, out_channels, kernel_size, stride, kernel_size // 2, bias=bias)
+        self.conv = MapConv2d(in_channels, out_channels, kernel_size, stride, kernel_size // 2, bias=bias)
         self.norm = MapNorm(out_channels)
 
     def forward(

@@ -11,7 +11,7 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import invert_projection, pixel_centres
 from src.models.backbones.resnet import BasicBlock
-from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
+from src.models.layers.dense import DenseConvNormReLU, MapConv2d, map_of_rows, rows_of_map
 from src.ops.segment_reduce import inverse_rows, weighted_segment_sum
 from src.structures.batch import FrameBatch
 from src.targets.depth import lid_centres, paint_depth
@@ -69,9 +69,9 @@ class LiftSplat(nn.Module):
         super().__init__()
         self.config, self.grid = config, grid
         hidden = config.hidden_channels
-        self.trunk = nn.Sequential(DenseConvNormReLU(in_channels, hidden, 3), BasicBlock(hidden, hidden, 1))
-        self.depth = nn.Conv2d(hidden, config.num_depth_bins, 1)
-        self.context = nn.Conv2d(hidden, config.context_channels, 1)
+        self.trunk = nn.Sequential(DenseConvNormReLU(in_channels, hidden, 3), BasicBlock(hidden, hidden, 1, MapConv2d))
+        self.depth = MapConv2d(hidden, config.num_depth_bins, 1)
+        self.context = MapConv2d(hidden, config.context_channels, 1)
         centres = lid_centres(config.depth_range, config.num_depth_bins)
         self.register_buffer("depth_centres_m", centres, persistent=False)
 

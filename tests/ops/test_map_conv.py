@@ -1,0 +1,65 @@
+"""Convolutions of whole maps against torch's own: values and all gradients."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch.autograd import gradcheck
+
+from src.ops import map_conv
+from src.ops.map_conv import map_conv2d, weight_gradient
+
+
+@pytest.fixture(params=[False, True], ids=["oneDNN", "products"])
+def gradients(request, monkeypatch):
+    monkeypatch.setattr(map_conv, "slow_weight_gradients", lambda: request.param)
+
+
+@pytest.mark.parametrize("bias", [True, False])
+@pytest.mark.parametrize("size", [(8, 12), (70, 66), (5, 7)])
+@pytest.mark.parametrize(("kernel_size", "stride"), [(1, 1), (1, 2), (3, 1), (3, 2), (5, 2), (3, 4)])
+def test_agrees_with_torch(kernel_size, stride, size, bias, gradients):
+    torch.manual_seed(0)
+    x = torch.randn(2, 16, *size).contiguous(memory_format=torch.channels_last).requires_grad_()
+    weight = torch.randn(24, 16, kernel_size, kernel_size, requires_grad=True)
+    offset = torch.randn(24, requires_grad=True) if bias else None
+    leaves = [x, weight, *([offset] if bias else [])]
+    out = map_conv2d(x, weight, offset, stride)
+    exact = [leaf.detach().double().requires_grad_() for leaf in leaves]
+    expected = F.conv2d(*exact, stride=stride, padding=kernel_size // 2)
+    pull = torch.randn_like(out)
+    results = [(out, *torch.autograd.grad(out, leaves, pull))]
+    results.append((expected, *torch.autograd.grad(expected, exact, pull.double())))
+    for own, other in zip(*results, strict=True):
+        scale = other.abs().max().item()
+        torch.testing.assert_close(own.double(), other, rtol=0, atol=1e-5 * scale)
+
+
+def test_gradients_of_the_weights_are_exact():
+    """In float64, where rounding hides nothing; more cells than one product takes."""
+    torch.manual_seed(0)
+    for kernel_size, stride, size in ((3, 1, (70, 66)), (3, 2, (9, 10)), (1, 2, (8, 8)), (5, 1, (6, 7))):
+        x = torch.randn(2, 3, *size, dtype=torch.float64)
+        weight = torch.randn(4, 3, kernel_size, kernel_size, dtype=torch.float64, requires_grad=True)
+        out = F.conv2d(x, weight, None, stride, kernel_size // 2)
+        pull = torch.randn_like(out)
+        (expected,) = torch.autograd.grad(out, weight, pull)
+        torch.testing.assert_close(weight_gradient(x, pull, kernel_size, stride), expected)
+
+
+def test_gradcheck(gradients):
+    """The function itself; only its entry asks for float32."""
+    leaves = [torch.randn(*shape, dtype=torch.float64, requires_grad=True) for shape in ((2, 3, 4, 6), (2, 3, 3, 3))]
+    assert gradcheck(lambda x, weight: map_conv._MapConv.apply(x, weight, None, 2), leaves)
+
+
+def test_a_map_that_needs_no_gradient_gets_none(gradients):
+    x, weight = torch.randn(1, 16, 8, 8), torch.randn(16, 16, 3, 3, requires_grad=True)
+    (grad,) = torch.autograd.grad(map_conv2d(x, weight).sum(), weight)
+    assert grad.shape == weight.shape
+    assert not map_conv2d(x, weight.detach()).requires_grad
+
+
+def test_autocast_convolves_in_its_type(gradients):
+    with torch.autocast("cpu", torch.bfloat16):
+        out = map_conv2d(torch.randn(1, 16, 8, 8), torch.randn(16, 16, 1, 1))
+    assert out.dtype == torch.bfloat16
