@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from src.errors import ConfigError, require_least
-from src.geometry.tensor_transforms import invert_rigid
+from src.geometry.constants import constant, where_else
+from src.geometry.tensor_transforms import IDENTITY, invert_rigid
 from src.structures.batch import MAX_EGO_SPEED_MPS, FrameBatch
 from src.structures.tensor_fields import TensorFields
 
@@ -67,8 +68,8 @@ class RememberedFrame(TensorFields):
     def _usable_motion(batch: FrameBatch, ego_from_past: Tensor, elapsed: Tensor, usable: Tensor) -> Motion:
         matrix = batch.aug_from_ego.double() @ ego_from_past
         # What is not usable must not carry NaN or huge numbers into arithmetic that is masked afterwards.
-        matrix = torch.where(usable[..., None, None], matrix, torch.eye(4, dtype=matrix.dtype, device=matrix.device))
-        return Motion(matrix.float(), torch.where(usable, elapsed, 0.0).float(), usable)
+        matrix = torch.where(usable[..., None, None], matrix, constant(IDENTITY, matrix.dtype, matrix.device))
+        return Motion(matrix.float(), where_else(usable, elapsed, 0.0).float(), usable)
 
     def jumped(self, batch: FrameBatch) -> Tensor:  # [B] bool
         """Streams whose pose jumped between this frame and the batch's, which is later."""

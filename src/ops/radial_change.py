@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import counting
 from src.ops.backend import implementation
 from src.ops.sites import rows_of_keys
 
@@ -38,7 +39,7 @@ def radial_change_reference(velocities: Tensor, cells: Tensor, keys: Tensor, mea
     """Plain torch form."""
     row, col = torch.div(cells, grid.cols, rounding_mode="floor") % grid.rows, cells % grid.cols
     sight = F.normalize(grid.centre_of(torch.stack([row, col], dim=1)), dim=1)
-    near = torch.arange(-NEAR_BINS, NEAR_BINS + 1, device=cells.device)
+    near = counting(2 * NEAR_BINS + 1, torch.int64, cells.device) - NEAR_BINS
     bins = radial_bin((velocities * sight).sum(dim=1))[:, None] + near
     rows = rows_of_keys(keys, cells[:, None] * NUM_BINS + bins.clamp(0, NUM_BINS - 1))  # [n, 5]
     found = F.embedding(rows.where(rows >= 0, len(keys)), F.pad(measured, (0, 0, 0, 1)))

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import counting, where_else
 from src.geometry.tensor_transforms import rotate, unit_vectors
 from src.models.horizon3d.cross_attention import RadarCrossAttention
 from src.models.horizon3d.temporal_attention import TemporalSelfAttention
@@ -206,8 +207,8 @@ class SelfEncoding(nn.Module):
     def _of_all(self, features: Tensor, gaussians: GaussianSet) -> Tensor:
         """In fixed shapes: padding as Gaussians of a sample that does not exist."""
         valid, (b, g) = gaussians.valid[..., None], gaussians.valid.shape
-        sample = torch.arange(b, device=valid.device).view(b, 1, 1)
-        indices = torch.cat([torch.where(valid, sample, b), self.grid.cell_of(gaussians.means)], dim=2)
+        sample = counting(b, torch.int64, valid.device).view(b, 1, 1)
+        indices = torch.cat([where_else(valid, sample, b), self.grid.cell_of(gaussians.means)], dim=2)
         indices = F.pad(indices.flatten(0, 1), (0, 0, 0, 1), value=b)  # one more, which is padding in any case
         sites, rows = Sites.unique(indices, (b, *self.grid.cells))
         return self._exchange(features.flatten(0, 1), sites, rows[:-1]).unflatten(0, (b, g)) * valid
@@ -371,7 +372,7 @@ def _measured(gaussians: GaussianSet, doppler: Doppler | None) -> GaussianSet:
     if doppler is None:
         return gaussians
     row, col = doppler.grid.cell_of(gaussians.means.detach()).unbind(-1)  # [B, G]
-    sample = torch.arange(len(row), device=row.device)[:, None]
+    sample = counting(len(row), torch.int64, row.device)[:, None]
     cells = (sample * doppler.grid.rows + row) * doppler.grid.cols + col
     velocities = doppler.impose(gaussians.velocities.flatten(0, 1), cells.flatten())
     return replace(gaussians, velocities=velocities.unflatten(0, row.shape))

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant
+from src.geometry.constants import constant, where_else
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.moved_keys import NONE
 from src.ops.radial_change import NUM_BINS, radial_bin, radial_change
@@ -82,7 +82,7 @@ class Doppler:
         values = F.pad(velocities, (1, 0), value=1.0)  # [P, 3]
         weighted = (values[:, None] * falloff[:, None]).flatten(0, 1)
         if fixed is not None:
-            given = torch.where((within & grid.contains(xy)[:, None, None]).flatten(), given, NONE)
+            given = where_else((within & grid.contains(xy)[:, None, None]).flatten(), given, NONE)
             keys = fixed.distinct(given, NONE, len(given))
             sums = segment_sum(weighted, torch.searchsorted(keys, given), len(keys))
             return cls(grid, keys, sums[:, 1:] / sums[:, :1].clamp(min=1.0), in_losses, along_heading)
