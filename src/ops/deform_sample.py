@@ -126,9 +126,18 @@ def _attend_images(
     if pixels.device.type == "cpu":
         out = _sum_by_image(images, places, weights, seen)
     else:
-        attend = attend_views_reference if torch.is_grad_enabled() else implementation(attend_views_reference)
-        out = attend(images, places, weights)
+        out = attend_views(images, places, weights)
     return out.to(values[0].dtype)
+
+
+def attend_views(
+    images: list[Tensor],  # per level [B * N, heads * c, H_l, W_l]
+    places: Tensor,  # [B * N, Q, P, 2] in -1..1 of the image
+    weights: Tensor,  # [B, Q, heads, N, L, P]
+) -> Tensor:  # [B, Q, heads * c]
+    """Sums of samples, on a GPU; without gradient by the backend's kernel."""
+    attend = attend_views_reference if torch.is_grad_enabled() else implementation(attend_views_reference)
+    return attend(images, places, weights)
 
 
 def attend_views_reference(

@@ -72,7 +72,7 @@ def window_map(inputs: Sites, outputs: Sites, kernel_size: Size) -> KernelMap:
         raise ValueError(f"a window joins sites of one grid, but got shapes {inputs.shape} and {outputs.shape}")
     kernel = _odd_kernel(outputs, kernel_size)
     if makes_tables(outputs):
-        table, bits = neighbour_table(inputs.keys, _corners(outputs, kernel), _taps(outputs, kernel))
+        table, bits = neighbour_table(inputs.keys, outputs.keys, _taps(outputs, kernel, centred=True))
         return TableMap(table, len(inputs), bits=bits)
     found, where = _search(
         inputs.keys, _corners(outputs, kernel), outputs.strides[1:], kernel, torch.Size(kernel).numel()
@@ -165,7 +165,12 @@ def _odd_kernel(sites: Sites, kernel_size: Size) -> tuple[int, ...]:
 
 def _corners(sites: Sites, kernel: tuple[int, ...]) -> Tensor:  # [n] int64
     """Key of the first cell of the odd kernel around each site."""
-    return sites.keys - sum(size // 2 * step for size, step in zip(kernel, sites.strides[1:], strict=True))
+    return sites.keys - _reach(sites, kernel)
+
+
+def _reach(sites: Sites, kernel: tuple[int, ...]) -> int:
+    """From the key under the first tap of an odd kernel to that under its centre."""
+    return sum(size // 2 * step for size, step in zip(kernel, sites.strides[1:], strict=True))
 
 
 def _stacked_table(
@@ -182,10 +187,11 @@ def _stacked_table(
     return torch.cat(tables), first
 
 
-def _taps(sites: Sites, kernel: tuple[int, ...]) -> Tensor:  # [K] int64
-    """What each kernel tap adds to the key of the first."""
+def _taps(sites: Sites, kernel: tuple[int, ...], centred: bool = False) -> Tensor:  # [K] int64
+    """What each kernel tap adds to the key of the first, or to that of the centre."""
+    first = -_reach(sites, kernel) if centred else 0
     cells = itertools.product(*(range(size) for size in kernel))
-    steps = tuple(sum(i * step for i, step in zip(cell, sites.strides[1:], strict=True)) for cell in cells)
+    steps = tuple(first + sum(i * step for i, step in zip(cell, sites.strides[1:], strict=True)) for cell in cells)
     return constant(steps, torch.int64, sites.device)
 
 
@@ -194,7 +200,7 @@ def _build_submanifold(sites: Sites, kernel: tuple[int, ...]) -> KernelMap:
     num, device = len(sites), sites.device
     half = torch.Size(kernel).numel() // 2
     if half and makes_tables(sites):
-        table, bits = neighbour_table(sites.keys, _corners(sites, kernel), _taps(sites, kernel))
+        table, bits = neighbour_table(sites.keys, sites.keys, _taps(sites, kernel, centred=True))
         return TableMap(table, num, mirrored=True, bits=bits)
     rows = counting(num, torch.int32, device)
     if half == 0:

@@ -10,11 +10,9 @@ from torch import Tensor
 
 from src.geometry.constants import where_else
 from src.geometry.tensor_transforms import invert_projection, pixel_centres
+from src.ops.view_samples import MIN_DEPTH_M
 from src.structures.batch import FrameBatch
 from src.structures.taxonomy import CAMERAS
-
-MIN_DEPTH_M = 0.5
-"""Points nearer to the image plane count as invisible (method 5.3)."""
 
 
 @dataclass
