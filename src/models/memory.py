@@ -174,10 +174,10 @@ class FrameMemory(TensorFields, Generic[Frame]):
         if not self.frames:
             return self
         steady = ~self.frames[0].jumped(batch)
-        return self._shared(
-            replace(frame, present=frame.present & steady & (frame.timestamps_s < batch.timestamps_s))
-            for frame in self.frames
-        )
+        stamps = torch.stack([frame.timestamps_s for frame in self.frames])  # [T, B]
+        present = self.present & steady & (stamps < batch.timestamps_s)
+        frames = zip(self.frames, present.unbind(0), strict=True)
+        return self._shared(replace(frame, present=row) for frame, row in frames)
 
     def select(
         self,
@@ -197,5 +197,5 @@ class FrameMemory(TensorFields, Generic[Frame]):
         frames = tuple(frames)
         if not frames:
             return cls(())
-        kept = torch.stack([frame.present.any() for frame in frames]).tolist()  # one transfer, which synchronises
+        kept = torch.stack([frame.present for frame in frames]).any(1).tolist()  # one transfer, which synchronises
         return cls(tuple(frame for frame, wanted in zip(frames, kept, strict=True) if wanted))
