@@ -20,13 +20,15 @@ from torch import Tensor
 
 from src.benchmark.simulated_device import SimTensor, count_launch, host_values
 from src.geometry.bev_grid import BEVGrid
-from src.ops import backend
+from src.ops import backend, conv_relu
 from src.ops.deform_sample import attend_cells_reference, attend_views_reference
 from src.ops.farthest_point import farthest_points_reference
+from src.ops.gaussian_shapes import AttributeLimits, refined_attributes_reference, sampling_points_reference
 from src.ops.moved_keys import moved_keys_reference
 from src.ops.neighbour_table import neighbour_table_reference, turned_table_reference
 from src.ops.radial_change import radial_change_reference
 from src.ops.splat import log1mexp
+from src.ops.view_samples import view_places_reference, view_weights_reference
 
 
 @contextmanager
@@ -44,6 +46,9 @@ def simulated_kernels() -> Iterator[None]:
             for name, function in KERNELS.items():
                 if hasattr(module, name):
                     stack.enter_context(patch.object(module, name, _Launcher(name, function)))
+        stack.enter_context(patch.object(F, "scaled_dot_product_attention", _attention))
+        stack.enter_context(patch.object(conv_relu, "_fuses", lambda x: isinstance(x, SimTensor)))
+        stack.enter_context(patch.object(conv_relu, "_fused", _fused_convolution))
         yield
 
 
@@ -95,7 +100,7 @@ def _move(keys: Tensor, plan: Tensor, taps: Tensor, out: Tensor, num: int, old_s
 def _nearest_radial(
     velocities: Tensor, cells: Tensor, keys: Tensor, measured: Tensor, out: Tensor, *rest: float
 ) -> None:
-    out.copy_(radial_change_reference(velocities, cells, keys, measured, _grid(*rest[3:8])))
+    out.copy_(radial_change_reference(velocities, cells, keys, measured, _grid(*rest[3:8]), rest[-1]))
 
 
 def _attend_cells(
@@ -107,7 +112,36 @@ def _attend_cells(
 def _attend_level(
     image: Tensor, places: Tensor, weights: Tensor, out: Tensor, level: int, levels: int, *sizes: int
 ) -> None:
+    if level == 0:
+        out.zero_()
     out += attend_views_reference([image], places, weights[:, :, :, :, level : level + 1])
+
+
+def _place(
+    points: Tensor, heights: Tensor, matrices: Tensor, valid: Tensor, places: Tensor, visible: Tensor, *rest: float
+) -> None:
+    low, span, height, width = rest[4:8]
+    found = view_places_reference(points, heights, (low, low + span), matrices, valid > 0, (height, width))
+    for out, values in zip((places, visible), found, strict=True):
+        out.copy_(values)
+
+
+def _weigh(logits: Tensor, camera: Tensor, visible: Tensor, out: Tensor, *sizes: int) -> None:
+    out.copy_(view_weights_reference(logits, camera, visible > 0, sizes[2]))
+
+
+def _spread(
+    offsets: Tensor, fixed: Tensor, means: Tensor, scales: Tensor, directions: Tensor, out: Tensor, *rest: float
+) -> None:
+    out.copy_(sampling_points_reference(offsets, fixed, means, scales, directions))
+
+
+def _refine(
+    raw: Tensor, means: Tensor, lower: Tensor, upper: Tensor, out: Tensor, num: int, low: float, span: float,
+    max_shift: float, max_speed: float, unit: float, least: float,
+) -> None:  # fmt: skip
+    limits = AttributeLimits((low, low + span), max_shift, max_speed, unit * max_speed)
+    out.copy_(torch.stack(refined_attributes_reference(raw, means, lower, upper, limits)))
 
 
 def _grid(rows: int, cols: int, x_min: float, y_min: float, cell_m: float) -> BEVGrid:
@@ -165,6 +199,10 @@ def _segment_sum(values: Tensor, starts: Tensor) -> Tensor:
 KERNELS: dict[str, Callable[..., None] | None] = {
     "_attend_cells": _attend_cells,
     "_attend_level": _attend_level,
+    "_spread": _spread,
+    "_refine": _refine,
+    "_place": _place,
+    "_weigh": _weigh,
     "_sample": _sample,
     "_move": _move,
     "_nearest_radial": _nearest_radial,
@@ -178,3 +216,33 @@ KERNELS: dict[str, Callable[..., None] | None] = {
     "_turn": _turn,
 }
 """The plain form of every kernel, None where its values are a gradient."""
+
+
+_plain_attention = F.scaled_dot_product_attention
+
+
+def _attention(query: Tensor, key: Tensor, value: Tensor, attn_mask: Tensor) -> Tensor:
+    return _Attention.apply(query, key, value, attn_mask)
+
+
+def _fused_convolution(x: Tensor, weight: Tensor, bias: Tensor, *sizes: Any) -> Tensor:
+    count_launch("cudnn_convolution_relu", x, weight)
+    with torch.no_grad(), torch.utils._python_dispatch._disable_current_modes():
+        return SimTensor(conv_relu.conv_relu(*host_values((x, weight, bias, *sizes))))
+
+
+class _Attention(torch.autograd.Function):
+    """Fused attention, as torch runs it on a GPU: a launch forward, and two backward."""
+
+    @staticmethod
+    def forward(ctx: Any, query: Tensor, key: Tensor, value: Tensor, mask: Tensor) -> Tensor:
+        ctx.save_for_backward(query, key, value)
+        count_launch("attention", query, key, value, mask)
+        with torch.utils._python_dispatch._disable_current_modes():
+            return SimTensor(_plain_attention(*host_values((query, key, value)), attn_mask=host_values(mask)))
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        for name in ("attention_delta", "attention_backward"):
+            count_launch(name, grad)
+        return *(torch.empty_like(value) for value in ctx.saved_tensors), None

@@ -19,6 +19,30 @@ def constant(values: Values, dtype: torch.dtype, device: torch.device) -> Tensor
         return on_device(values, dtype, device)
 
 
+def counting(
+    count: int,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Tensor:  # [count]
+    """0, 1, 2, ...: the head of a sequence that is kept, so a launch less than `arange`; nobody may write into it."""
+    return _sequence(max(count - 1, 0).bit_length(), dtype, device)[:count]
+
+
+@cache  # as above; of each power of two one
+def _sequence(bits: int, dtype: torch.dtype, device: torch.device) -> Tensor:  # [2 ** bits]
+    with torch.inference_mode(False):
+        return torch.arange(2**bits, dtype=dtype, device=device)
+
+
+def where_else(
+    kept: Tensor,  # [...] bool
+    values: Tensor,  # [...]
+    other: float | int,
+) -> Tensor:  # [...]
+    """`torch.where` with a number for what is not kept, which is made once and not in every call."""
+    return torch.where(kept, values, constant((other,), values.dtype, values.device))
+
+
 def on_device(
     values: Sequence[Any],  # numbers, or rows of numbers
     dtype: torch.dtype,

@@ -6,9 +6,15 @@ and with them positions of 150 m.
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
+
+from src.geometry.constants import constant
+
+IDENTITY = tuple(tuple(float(row == column) for column in range(4)) for row in range(4))
 
 
 def invert_rigid(
@@ -84,6 +90,7 @@ def transform_points_xy(
     return transform_vectors_xy(dst_from_src, points) + dst_from_src[..., :2, 3]
 
 
+@cache  # as `constant`
 def pixel_centres(
     image_size_px: tuple[int, int],  # (H, W) of the network input
     level_size: tuple[int, int],  # (h, w) of a feature level
@@ -91,10 +98,11 @@ def pixel_centres(
 ) -> Tensor:  # [h, w, 3] (u, v, 1), pixels of the input
     """Where the cells of a feature level have their centres in the image."""
     (height, width), (h, w) = image_size_px, level_size
-    v = (torch.arange(h, device=device) + 0.5) * (height / h)
-    u = (torch.arange(w, device=device) + 0.5) * (width / w)
-    v, u = torch.meshgrid(v, u, indexing="ij")
-    return torch.stack([u, v, torch.ones_like(u)], -1)
+    with torch.inference_mode(False):
+        v = (torch.arange(h, device=device) + 0.5) * (height / h)
+        u = (torch.arange(w, device=device) + 0.5) * (width / w)
+        v, u = torch.meshgrid(v, u, indexing="ij")
+        return torch.stack([u, v, torch.ones_like(u)], -1)
 
 
 def invert_projection(
@@ -105,7 +113,8 @@ def invert_projection(
 
     A missing camera may carry any matrix: its points are never used, but must not stop the inversion.
     """
-    matrix = torch.where(valid[..., None, None], pix_from_src, torch.eye(4, device=pix_from_src.device))
+    identity = constant(IDENTITY, pix_from_src.dtype, pix_from_src.device)
+    matrix = torch.where(valid[..., None, None], pix_from_src, identity)
     return torch.linalg.inv_ex(matrix.double())[0].float()
 
 

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from src.errors import ConfigError, require_least
-from src.geometry.tensor_transforms import invert_rigid
+from src.geometry.constants import constant, where_else
+from src.geometry.tensor_transforms import IDENTITY, invert_rigid
 from src.structures.batch import MAX_EGO_SPEED_MPS, FrameBatch
 from src.structures.tensor_fields import TensorFields
 
@@ -67,8 +68,8 @@ class RememberedFrame(TensorFields):
     def _usable_motion(batch: FrameBatch, ego_from_past: Tensor, elapsed: Tensor, usable: Tensor) -> Motion:
         matrix = batch.aug_from_ego.double() @ ego_from_past
         # What is not usable must not carry NaN or huge numbers into arithmetic that is masked afterwards.
-        matrix = torch.where(usable[..., None, None], matrix, torch.eye(4, dtype=matrix.dtype, device=matrix.device))
-        return Motion(matrix.float(), torch.where(usable, elapsed, 0.0).float(), usable)
+        matrix = torch.where(usable[..., None, None], matrix, constant(IDENTITY, matrix.dtype, matrix.device))
+        return Motion(matrix.float(), where_else(usable, elapsed, 0.0).float(), usable)
 
     def jumped(self, batch: FrameBatch) -> Tensor:  # [B] bool
         """Streams whose pose jumped between this frame and the batch's, which is later."""
@@ -173,10 +174,10 @@ class FrameMemory(TensorFields, Generic[Frame]):
         if not self.frames:
             return self
         steady = ~self.frames[0].jumped(batch)
-        return self._shared(
-            replace(frame, present=frame.present & steady & (frame.timestamps_s < batch.timestamps_s))
-            for frame in self.frames
-        )
+        stamps = torch.stack([frame.timestamps_s for frame in self.frames])  # [T, B]
+        present = self.present & steady & (stamps < batch.timestamps_s)
+        frames = zip(self.frames, present.unbind(0), strict=True)
+        return self._shared(replace(frame, present=row) for frame, row in frames)
 
     def select(
         self,
@@ -196,5 +197,5 @@ class FrameMemory(TensorFields, Generic[Frame]):
         frames = tuple(frames)
         if not frames:
             return cls(())
-        kept = torch.stack([frame.present.any() for frame in frames]).tolist()  # one transfer, which synchronises
+        kept = torch.stack([frame.present for frame in frames]).any(1).tolist()  # one transfer, which synchronises
         return cls(tuple(frame for frame, wanted in zip(frames, kept, strict=True) if wanted))

@@ -23,12 +23,16 @@ KERNELS = {
     "attend_cells": "src.ops.kernels.attend_cells_triton",
     "attend_views": "src.ops.kernels.attend_views_triton",
     "farthest_points": "src.ops.kernels.farthest_point_triton",
+    "refined_attributes": "src.ops.kernels.gaussian_shapes_triton",
+    "sampling_points": "src.ops.kernels.gaussian_shapes_triton",
     "moved_keys": "src.ops.kernels.moved_keys_triton",
     "neighbour_table": "src.ops.kernels.neighbour_table_triton",
     "radial_change": "src.ops.kernels.radial_change_triton",
     "sparse_conv": "src.ops.kernels.sparse_conv_triton",
     "sparse_conv_relu": "src.ops.kernels.sparse_conv_triton",
     "splat": "src.ops.kernels.splat_triton",
+    "view_places": "src.ops.kernels.view_samples_triton",
+    "view_weights": "src.ops.kernels.view_samples_triton",
     "turned_table": "src.ops.kernels.neighbour_table_triton",
 }
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import window_cells, window_corners
+from src.geometry.constants import counting, where_else
 from src.geometry.ragged import enumerate_some_windows
 from src.geometry.tensor_transforms import rotate_back
 from src.ops.fixed_shapes import fixed_shapes
@@ -82,14 +83,14 @@ def gaussian_cells(
     num_cells = batch_size * grid.rows * grid.cols
     linear, order = torch.sort(linear.to(torch.int32 if num_cells < 2**31 else torch.int64), stable=True)
     support, cell, sizes = torch.unique_consecutive(linear, return_inverse=True, return_counts=True)
-    owners = torch.arange(len(means) + 1, device=gaussian.device)
+    owners = counting(len(means) + 1, torch.int64, gaussian.device)
     near = near.index_select(0, order)
     pairs = GaussianCellPairs(
         gaussian=gaussian.index_select(0, order),
         cell=cell,
         delta=torch.stack([delta_x.index_select(0, near), delta_y.index_select(0, near)], 1),
         q=q.index_select(0, near),
-        in_turn=torch.arange(len(order), device=order.device),
+        in_turn=counting(len(order), torch.int64, order.device),
         cell_starts=F.pad(sizes.cumsum(0), (1, 0)),
         by_gaussian=inverse_rows(order, len(order)),
         gaussian_starts=torch.searchsorted(gaussian, owners),
@@ -108,18 +109,18 @@ def _padded_pairs(
 ) -> tuple[GaussianCellPairs, Tensor]:
     """The pairs in fixed shapes; the support are all cells, and the one beyond them."""
     small = torch.int32 if num_cells < 2**31 - 1 else torch.int64
-    linear, order = torch.sort(torch.where(near, linear, num_cells).to(small), stable=True)
-    support = torch.arange(num_cells + 1, device=linear.device)
+    linear, order = torch.sort(where_else(near, linear, num_cells).to(small), stable=True)
     # Padding belongs to no cell: the last one ends where it begins.
-    starts = torch.searchsorted(linear, F.pad(support, (0, 1), value=num_cells).to(small))
+    edges = counting(num_cells + 2, small, linear.device).clamp(max=num_cells)
+    support, starts = counting(num_cells + 1, torch.int64, linear.device), torch.searchsorted(linear, edges)
     pairs = GaussianCellPairs(
         gaussian=owner.index_select(0, order),
         cell=linear.long(),
         delta=None,
-        q=torch.where(near, q, math.inf).index_select(0, order),
-        in_turn=torch.arange(len(order), device=order.device),
+        q=where_else(near, q, math.inf).index_select(0, order),
+        in_turn=counting(len(order), torch.int64, order.device),
         cell_starts=starts,
         by_gaussian=inverse_rows(order, len(order)),
-        gaussian_starts=torch.searchsorted(gaussian, torch.arange(num + 1, device=gaussian.device)),
+        gaussian_starts=torch.searchsorted(gaussian, counting(num + 1, torch.int64, gaussian.device)),
     )
     return pairs, support

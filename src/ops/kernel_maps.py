@@ -7,7 +7,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from src.geometry.constants import constant
+from src.geometry.constants import constant, counting, where_else
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.kernel_map import KernelMap, TableMap, counts_kept
 from src.ops.moved_keys import NONE, moved_keys
@@ -72,7 +72,7 @@ def window_map(inputs: Sites, outputs: Sites, kernel_size: Size) -> KernelMap:
         raise ValueError(f"a window joins sites of one grid, but got shapes {inputs.shape} and {outputs.shape}")
     kernel = _odd_kernel(outputs, kernel_size)
     if makes_tables(outputs):
-        table, bits = neighbour_table(inputs.keys, _corners(outputs, kernel), _taps(outputs, kernel))
+        table, bits = neighbour_table(inputs.keys, outputs.keys, _taps(outputs, kernel, centred=True))
         return TableMap(table, len(inputs), bits=bits)
     found, where = _search(
         inputs.keys, _corners(outputs, kernel), outputs.strides[1:], kernel, torch.Size(kernel).numel()
@@ -98,7 +98,7 @@ def stacked_map(
     inputs, outputs, counts, first = [], [], [], 0
     for rows in parts:
         place = torch.full((len(sites),), -1, dtype=torch.int32, device=sites.device)
-        place[rows] = torch.arange(first, first + len(rows), dtype=torch.int32, device=sites.device)
+        place[rows] = counting(first + len(rows), torch.int32, sites.device)[first:]
         seen = place.index_select(0, base.inputs)
         kept = (seen >= 0).nonzero().squeeze(1)
         inputs.append(seen.index_select(0, kept))
@@ -149,7 +149,7 @@ def pruned_map(
     tap_steps = [torch.Size(kernel[axis + 1 :]).numel() for axis in range(sites.ndim)]
     steps, first, per_tap = constant((strides, pads, tuple(tap_steps)), torch.int64, sites.device)
     own = ((first + sites.indices()[:, 1:] % steps) * per_tap).sum(1)  # [n] the tap between a site and its own output
-    taps = torch.arange(torch.Size(kernel).numel(), device=sites.device)[:, None]
+    taps = counting(torch.Size(kernel).numel(), torch.int64, sites.device)[:, None]
     out = _reached(
         sites, _output_shape(sites.shape, kernel, strides, pads), kernel, strides, pads, wide | (taps == own)
     )
@@ -165,7 +165,12 @@ def _odd_kernel(sites: Sites, kernel_size: Size) -> tuple[int, ...]:
 
 def _corners(sites: Sites, kernel: tuple[int, ...]) -> Tensor:  # [n] int64
     """Key of the first cell of the odd kernel around each site."""
-    return sites.keys - sum(size // 2 * step for size, step in zip(kernel, sites.strides[1:], strict=True))
+    return sites.keys - _reach(sites, kernel)
+
+
+def _reach(sites: Sites, kernel: tuple[int, ...]) -> int:
+    """From the key under the first tap of an odd kernel to that under its centre."""
+    return sum(size // 2 * step for size, step in zip(kernel, sites.strides[1:], strict=True))
 
 
 def _stacked_table(
@@ -176,16 +181,17 @@ def _stacked_table(
     tables, first = [], 0
     for rows in parts:
         place = table.new_full((table.shape[1] + 1,), -1)  # the last is the place of none
-        place[rows] = torch.arange(first, first + len(rows), dtype=table.dtype, device=table.device)
+        place[rows] = counting(first + len(rows), table.dtype, table.device)[first:]
         tables.append(place[table.long()])
         first += len(rows)
     return torch.cat(tables), first
 
 
-def _taps(sites: Sites, kernel: tuple[int, ...]) -> Tensor:  # [K] int64
-    """What each kernel tap adds to the key of the first."""
+def _taps(sites: Sites, kernel: tuple[int, ...], centred: bool = False) -> Tensor:  # [K] int64
+    """What each kernel tap adds to the key of the first, or to that of the centre."""
+    first = -_reach(sites, kernel) if centred else 0
     cells = itertools.product(*(range(size) for size in kernel))
-    steps = tuple(sum(i * step for i, step in zip(cell, sites.strides[1:], strict=True)) for cell in cells)
+    steps = tuple(first + sum(i * step for i, step in zip(cell, sites.strides[1:], strict=True)) for cell in cells)
     return constant(steps, torch.int64, sites.device)
 
 
@@ -194,9 +200,9 @@ def _build_submanifold(sites: Sites, kernel: tuple[int, ...]) -> KernelMap:
     num, device = len(sites), sites.device
     half = torch.Size(kernel).numel() // 2
     if half and makes_tables(sites):
-        table, bits = neighbour_table(sites.keys, _corners(sites, kernel), _taps(sites, kernel))
+        table, bits = neighbour_table(sites.keys, sites.keys, _taps(sites, kernel, centred=True))
         return TableMap(table, num, mirrored=True, bits=bits)
-    rows = torch.arange(num, dtype=torch.int32, device=device)
+    rows = counting(num, torch.int32, device)
     if half == 0:
         return KernelMap(rows, rows, (num,), num, num, mirrored=True, identity=True)
     found, where = _search(sites.keys, _corners(sites, kernel), sites.strides[1:], kernel, half)
@@ -225,7 +231,7 @@ def _build_strided(
     targets, valid = cells[:, 0] * out.strides[0], torch.ones_like(cells[:, 0], dtype=torch.bool)
     for axis in range(sites.ndim):
         # One more leading axis per kernel axis: [k0, ..., n] output keys and whether the tap meets the output lattice.
-        taps = torch.arange(kernel[axis], device=sites.device)[:, None]
+        taps = counting(kernel[axis], torch.int64, sites.device)[:, None]
         moved = cells[:, axis + 1] + padding[axis] - taps  # [k, n]
         coarse = torch.div(moved, stride[axis], rounding_mode="floor")
         fits = (coarse * stride[axis] == moved) & (coarse >= 0) & (coarse < shape[axis + 1])
@@ -266,7 +272,7 @@ def _reached(
     coarse = Sites(shape, sites.keys)
     ones, zeros = (1,) * sites.ndim, (0,) * sites.ndim
     candidates = _moved(sites, coarse, ones, stride, (zeros, shape[1:]), shifts)
-    candidates = (candidates if kept is None else torch.where(kept, candidates, NONE)).flatten()
+    candidates = (candidates if kept is None else where_else(kept, candidates, NONE)).flatten()
     if fixed_shapes() is not None:
         return padded_sites(candidates, shape)
     # What fits nowhere is the largest key, which is there at least once and cut off.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
@@ -22,6 +23,20 @@ def linear(
     if plain or len(x) < LEAST_ROWS:
         return x @ weight if bias is None else torch.addmm(bias, x, weight)
     return _Linear.apply(x.contiguous(), weight, bias, product_type(x, weight.shape[1]))
+
+
+def linear_relu(
+    x: Tensor,  # [..., C]
+    weight: Tensor,  # [O, C] as a layer has it
+    bias: Tensor,  # [O]
+) -> Tensor:  # [..., O]
+    """relu(x W^T + b), without gradient; on a GPU in one launch. Under autocast the operands are cast by hand."""
+    device = x.device.type
+    if device == "cpu":
+        return F.linear(x, weight, bias).relu_()
+    if torch.is_autocast_enabled(device):
+        x, weight, bias = (value.to(torch.get_autocast_dtype(device)) for value in (x, weight, bias))
+    return torch._addmm_activation(bias, x.reshape(-1, x.shape[-1]), weight.t()).unflatten(0, x.shape[:-1])
 
 
 class _Linear(torch.autograd.Function):

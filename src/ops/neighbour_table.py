@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from src.geometry.constants import counting, where_else
 from src.ops.backend import implementation
 
 ORDERING_TAPS = 62
@@ -27,7 +28,7 @@ def neighbour_table_reference(keys: Tensor, corners: Tensor, taps: Tensor) -> tu
         table = torch.full_like(wanted, -1, dtype=torch.int32)
     else:
         rows = torch.searchsorted(keys, wanted, out_int32=True).clamp_(max=len(keys) - 1)
-        table = torch.where(keys.index_select(0, rows.flatten()).view_as(wanted) == wanted, rows, -1)
+        table = where_else(keys.index_select(0, rows.flatten()).view_as(wanted) == wanted, rows, -1)
     return table, tap_bits(table)
 
 
@@ -35,7 +36,7 @@ def tap_bits(
     table: Tensor,  # [K, m] int32, -1 for none
 ) -> Tensor:  # [m] int64
     """The taps of the table that meet a site as bits of a number, of the first ORDERING_TAPS."""
-    shifts = torch.arange(min(len(table), ORDERING_TAPS), device=table.device)[:, None]
+    shifts = counting(min(len(table), ORDERING_TAPS), torch.int64, table.device)[:, None]
     return ((table[:ORDERING_TAPS] >= 0).long() << shifts).sum(0)
 
 
@@ -50,7 +51,7 @@ def turned_table(
 def turned_table_reference(table: Tensor, num: int) -> tuple[Tensor, Tensor]:
     """Plain torch form."""
     back = table.new_full((len(table), num + 1), -1)  # one more column, which takes what there is not
-    cells = torch.arange(table.shape[1], dtype=table.dtype, device=table.device).expand_as(table)
+    cells = counting(table.shape[1], table.dtype, table.device).expand_as(table)
     back.scatter_(1, torch.where(table < 0, num, table).long(), cells)
     back = back[:, :num].contiguous()
     return back, tap_bits(back)

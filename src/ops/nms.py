@@ -102,8 +102,8 @@ def maxpool_peaks(
     maps = submanifold_map(sites, 3)
     if fixed_shapes() is not None:
         table = maps.table.t()  # [M, 9]
-        around = torch.where(table < 0, len(scores), table)
-        return scores == F.embedding_bag(around, F.pad(scores, (0, 0, 0, 1), value=-torch.inf), mode="max")
+        padded = F.pad(scores, (0, 0, 1, 0), value=-torch.inf)  # -1 takes the row before them
+        return scores == F.embedding_bag(table + 1, padded, mode="max")
     order, starts = maps.by_output
     picks = maps.inputs.index_select(0, order)
     scores = scores.detach()

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import counting
 from src.ops.backend import implementation
 from src.ops.sites import rows_of_keys
 
@@ -21,24 +22,31 @@ MIN_SPEED_MPS = 0.5
 
 def radial_change(
     velocities: Tensor,  # [n, 2] m/s over ground, augmented axes
-    cells: Tensor,  # [n] int64 linear keys (b * rows + row) * cols + col
+    cells: Tensor,  # [n] int64 linear keys (b * rows + row) * cols + col, or [B, n / B, 2] positions in metres
     keys: Tensor,  # [m] int64 linear key * NUM_BINS + bin, sorted, unique
     measured: Tensor,  # [m, 2] m/s
     grid: BEVGrid,
+    added: bool = False,
 ) -> Tensor:  # [n, 2] m/s
     """From each velocity to that with the measured radial part that is nearest to its own; zero where none is near.
 
-    Near is within NEAR_BINS of the own bin of radial speed. Without gradient.
+    Near is within NEAR_BINS of the own bin of radial speed. `added` gives the new velocity itself. Without gradient.
     """
     with torch.no_grad():
-        return implementation(radial_change_reference)(velocities, cells, keys, measured, grid)
+        return implementation(radial_change_reference)(velocities, cells, keys, measured, grid, added)
 
 
-def radial_change_reference(velocities: Tensor, cells: Tensor, keys: Tensor, measured: Tensor, grid: BEVGrid) -> Tensor:
+def radial_change_reference(
+    velocities: Tensor, cells: Tensor, keys: Tensor, measured: Tensor, grid: BEVGrid, added: bool = False
+) -> Tensor:
     """Plain torch form."""
+    if cells.dim() == 3:
+        row, col = grid.cell_of(cells).unbind(-1)  # [B, n / B]
+        sample = counting(len(row), torch.int64, row.device)[:, None]
+        cells = ((sample * grid.rows + row) * grid.cols + col).flatten()
     row, col = torch.div(cells, grid.cols, rounding_mode="floor") % grid.rows, cells % grid.cols
     sight = F.normalize(grid.centre_of(torch.stack([row, col], dim=1)), dim=1)
-    near = torch.arange(-NEAR_BINS, NEAR_BINS + 1, device=cells.device)
+    near = counting(2 * NEAR_BINS + 1, torch.int64, cells.device) - NEAR_BINS
     bins = radial_bin((velocities * sight).sum(dim=1))[:, None] + near
     rows = rows_of_keys(keys, cells[:, None] * NUM_BINS + bins.clamp(0, NUM_BINS - 1))  # [n, 5]
     found = F.embedding(rows.where(rows >= 0, len(keys)), F.pad(measured, (0, 0, 0, 1)))
@@ -48,7 +56,8 @@ def radial_change_reference(velocities: Tensor, cells: Tensor, keys: Tensor, mea
     moving = found.norm(dim=1, keepdim=True) > MIN_SPEED_MPS
     direction = F.normalize(torch.where(moving, found, sight), dim=1)
     change = ((found - velocities) * direction).sum(dim=1, keepdim=True) * direction
-    return change * (rows.gather(1, best) >= 0)
+    change = change * (rows.gather(1, best) >= 0)
+    return velocities + change if added else change
 
 
 def radial_bin(

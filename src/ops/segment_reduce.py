@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from src.geometry.constants import constant
+from src.geometry.constants import constant, counting
 from src.ops.fixed_shapes import fixed_shapes
 
 # Pairs multiplied at a time in `paired_dot`: cache-sized on a CPU, few launches on a GPU.
@@ -24,7 +24,7 @@ def segments(
 ) -> tuple[Tensor, Tensor]:
     """Stable order of the pairs by row [pairs], and the start of each row's segment [num_rows + 1], int32."""
     ordered, order = torch.sort(rows, stable=True)
-    edges = torch.arange(num_rows + 1, dtype=rows.dtype, device=rows.device)
+    edges = counting(num_rows + 1, rows.dtype, rows.device)
     return order.to(torch.int32), torch.searchsorted(ordered, edges, out_int32=True)
 
 
@@ -67,7 +67,7 @@ def segment_mean(
     """Scatter mean: values that share a row; absent rows are 0. Differentiable."""
     if fixed_shapes() is not None:
         ordered, order = torch.sort(rows, stable=True)
-        starts = torch.searchsorted(ordered, torch.arange(num_rows + 1, device=rows.device))
+        starts = torch.searchsorted(ordered, counting(num_rows + 1, torch.int64, rows.device))
         return F.embedding_bag(order, values, starts, mode="mean", include_last_offset=True)
     counts = segment_count(rows, num_rows)
     return segment_sum(values, rows, num_rows) / counts.clamp(min=1)[:, None].to(values.dtype)
@@ -130,8 +130,8 @@ class _PermuteRows(torch.autograd.Function):
 
 
 def _take(values: Tensor, rows: Tensor) -> Tensor:
-    padded = F.pad(values, (0, 0, 0, 1))  # -1 takes the row of zeros behind them: a mask over rows takes twice as long
-    return padded.index_select(0, torch.where(rows < 0, len(values), rows))
+    padded = F.pad(values, (0, 0, 1, 0))  # -1 takes the row of zeros before them: a mask over rows takes twice as long
+    return padded.index_select(0, rows + 1)
 
 
 def topk_per_sample(
@@ -155,7 +155,7 @@ def rank_per_sample(
     order = scores.argsort(descending=True, stable=True)
     order = order[sample[order].argsort(stable=True)]
     owner = sample[order]
-    return order, torch.arange(len(order), device=order.device) - torch.searchsorted(owner, owner)
+    return order, counting(len(order), torch.int64, order.device) - torch.searchsorted(owner, owner)
 
 
 def inverse_rows(
@@ -164,7 +164,7 @@ def inverse_rows(
 ) -> Tensor:  # [num] int64
     """Place of each of `num` rows among the given ones, -1 where it is absent: the inverse permutation of all rows."""
     places = rows.new_full((num,), -1)
-    places[rows] = torch.arange(len(rows), device=rows.device)
+    places[rows] = counting(len(rows), torch.int64, rows.device)
     return places
 
 

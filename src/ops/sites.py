@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.geometry.constants import constant
+from src.geometry.constants import constant, counting, where_else
 from src.ops.fixed_shapes import fixed_shapes
 
 # Empty cells kept behind the last cell of every spatial axis. A key moved by up to HALO cells along any axis, in either
@@ -136,7 +136,7 @@ class Sites:
         """Row of each cell among the sites, -1 where it is absent or outside the grid."""
         upper = constant(self.shape, torch.int64, indices.device)
         inside = ((indices >= 0) & (indices < upper)).all(1)
-        return torch.where(inside, rows_of_keys(self.keys, self.keys_of(indices)), -1)
+        return where_else(inside, rows_of_keys(self.keys, self.keys_of(indices)), -1)
 
     def nearest_rows(
         self,
@@ -182,7 +182,7 @@ def rows_of_keys(
     if len(keys) == 0:
         return torch.full_like(wanted, -1)
     rows = torch.searchsorted(keys, wanted).clamp_(max=len(keys) - 1)
-    return torch.where(keys[rows] == wanted, rows, -1)
+    return where_else(keys[rows] == wanted, rows, -1)
 
 
 def padded_sites(
@@ -203,7 +203,7 @@ def union(a: Sites, b: Sites) -> tuple[Sites, Tensor, Tensor]:
     if a.shape != b.shape:
         raise ValueError(f"union of sites on different grids: shapes {a.shape} and {b.shape} must be equal")
     if a is b:
-        rows = torch.arange(len(a), device=a.device)
+        rows = counting(len(a), torch.int64, a.device)
         return a, rows, rows
     keys = torch.cat([a.keys, b.keys])
     if fixed_shapes() is not None:

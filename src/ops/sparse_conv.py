@@ -71,8 +71,7 @@ def neighbour_sum(
     """Sum of the input rows that each output sees: the convolution whose weights are all one. Without gradient."""
     if features.device.type != "cpu":  # whose maps are tables
         table = kernel_map.table.t()  # [M_out, K]
-        picks = torch.where(table < 0, len(features), table)
-        return F.embedding_bag(picks, F.pad(features, (0, 0, 0, 1)), mode="sum")
+        return F.embedding_bag(table + 1, F.pad(features, (0, 0, 1, 0)), mode="sum")
     order, starts = kernel_map.by_output
     return gather_segment_sum(features, kernel_map.inputs.index_select(0, order), starts)
 

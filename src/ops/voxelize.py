@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from src.geometry.constants import constant
+from src.geometry.constants import constant, counting, where_else
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.segment_reduce import inverse_rows, rank_per_sample, segment_count, segment_mean
 from src.ops.sites import Sites
@@ -73,9 +73,9 @@ def voxel_rows(
     limit = constant(tuple(shape), torch.int64, cells.device)
     inside = ((cells >= 0) & (cells < limit)).all(1)
     if fixed_shapes() is not None:
-        samples, cells = torch.where(inside, batch, batch_size), torch.where(inside[:, None], cells, 0.0)
+        samples, cells = where_else(inside, batch, batch_size), where_else(inside[:, None], cells, 0.0)
         sites, rows = Sites.unique(torch.cat([samples[:, None], cells.long()], 1), (batch_size, *shape))
-        return sites, rows, torch.arange(len(batch), device=batch.device)
+        return sites, rows, counting(len(batch), torch.int64, batch.device)
     inside = inside.nonzero().squeeze(1)
     indices = torch.cat([batch[:, None].index_select(0, inside), cells.index_select(0, inside).long()], 1)
     sites, rows = Sites.unique(indices, (batch_size, *shape))

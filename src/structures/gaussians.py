@@ -59,6 +59,10 @@ class GaussianSet(TensorFields):
     def __len__(self) -> int:
         return self.valid.shape[1]
 
+    def valid_rows(self) -> Tensor:  # [V] int64
+        """Rows in B * G of what is no padding, ascending. Waits for a GPU."""
+        return self.valid.flatten().nonzero().squeeze(1)
+
     def transform(
         self,
         dst_from_src: Tensor,  # [B, 4, 4] rotation, reflection and uniform scale, with translation

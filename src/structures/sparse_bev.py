@@ -67,8 +67,7 @@ class SparseMap:
     ) -> Tensor:  # [q, C]
         """Features at the given cells, zero where no site is active."""
         rows = self.sites.rows_of(indices)
-        padded = torch.cat([self.features, self.features.new_zeros(1, self.channels)])
-        return F.embedding(torch.where(rows < 0, len(self), rows), padded)
+        return F.embedding(rows + 1, F.pad(self.features, (0, 0, 1, 0)))
 
     def union(self, other: Self) -> tuple[Self, Self]:
         """Both maps on the sites of either, with zeros where a map has no site; they share one `Sites` object.

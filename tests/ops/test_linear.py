@@ -2,10 +2,14 @@
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from src.ops import products
-from src.ops.linear import linear
+from src.ops.linear import linear, linear_relu
 from src.ops.products import bfloat16_products
+
+NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, NO_GPU])]
 
 
 def values_and_gradients(layer, rows, bias=True, widths=(64, 48), dtype=torch.float32):
@@ -60,3 +64,11 @@ def test_other_types_and_autocast_are_torchs():
             assert torch.equal(linear(x, weight), x @ weight)
     with torch.autocast("cpu", torch.bfloat16):
         assert linear(torch.rand(3000, 64), torch.rand(64, 64)).dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_linear_layer_with_its_relu(device):
+    draw = torch.Generator().manual_seed(0)
+    x, weight, bias = (torch.randn(*shape, generator=draw) for shape in ((2, 3, 4), (5, 4), (5,)))
+    found = linear_relu(x.to(device), weight.to(device), bias.to(device))
+    torch.testing.assert_close(found.cpu(), F.relu(F.linear(x, weight, bias)), rtol=1e-3, atol=1e-3)  # TF32

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from src.models.layers.merging import with_relu
 from src.models.layers.norm import MapNorm
 
 
@@ -21,11 +22,18 @@ class BasicBlock(nn.Module):
         self.conv2 = conv(width, width, 3, 1, 1, bias=False)
         self.bn2 = MapNorm(width)
         self.downsample = _projection(in_channels, width, stride, conv)
+        self.merged = False
+
+    def merge_for_inference(self) -> None:
+        """The convolutions apply the ReLUs and add the identity."""
+        self.conv1, self.conv2, self.merged = with_relu(self.conv1), with_relu(self.conv2), True
 
     def forward(
         self,
         x: Tensor,  # [M, C, H, W]
     ) -> Tensor:  # [M, width, H / stride, W / stride]
+        if self.merged:
+            return self.conv2(self.conv1(x), self.downsample(x))
         y = F.relu(self.bn1(self.conv1(x)))
         y = self.bn2(self.conv2(y))
         return F.relu(y + self.downsample(x))
@@ -47,11 +55,20 @@ class Bottleneck(nn.Module):
         self.conv3 = nn.Conv2d(width, out_channels, 1, bias=False)
         self.bn3 = MapNorm(out_channels)
         self.downsample = _projection(in_channels, out_channels, stride)
+        self.merged = False
+
+    def merge_for_inference(self) -> None:
+        """The convolutions apply the ReLUs and add the identity."""
+        for name in ("conv1", "conv2", "conv3"):
+            setattr(self, name, with_relu(getattr(self, name)))
+        self.merged = True
 
     def forward(
         self,
         x: Tensor,  # [M, C, H, W]
     ) -> Tensor:  # [M, 4 * width, H / stride, W / stride]
+        if self.merged:
+            return self.conv3(self.conv2(self.conv1(x)), self.downsample(x))
         y = F.relu(self.bn1(self.conv1(x)))
         y = F.relu(self.bn2(self.conv2(y)))
         y = self.bn3(self.conv3(y))

@@ -21,7 +21,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from src.models.detector import Detector
 from src.models.heads.branches import Branches
 from src.models.heads.center_head import CenterHead
-from src.models.layers.merging import block_diagonal, joined_linear
+from src.models.layers.merging import LinearReLU, block_diagonal, joined_linear, with_relu
 from src.models.layers.sparse import SparseKernel
 from src.ops.precision import Precision
 
@@ -51,6 +51,7 @@ def prepare_for_inference(model: Detector, precision: str = Precision.FULL) -> D
                 _merge_head(module)
             elif hasattr(module, "merge_for_inference"):
                 module.merge_for_inference()
+        _merge_relus(model)
         if precision == Precision.MIXED:
             _round_weights(model)
         for value in model.parameters():
@@ -87,7 +88,8 @@ class MergedBranches(nn.Module):
         super().__init__()
         hidden = [part.hidden for part in branches]
         outputs = [output for part in branches for output in part.outputs]
-        self.hidden = joined_linear(torch.cat([x.weight for x in hidden]), torch.cat([x.bias for x in hidden]))
+        weight, bias = (torch.cat([getattr(x, name) for x in hidden]) for name in ("weight", "bias"))
+        self.hidden = joined_linear(weight, bias, LinearReLU)
         self.outputs = block_diagonal(outputs)
 
     def forward(
@@ -96,7 +98,8 @@ class MergedBranches(nn.Module):
     ) -> Tensor:  # [n, sum of widths] float32
         """Outputs of all branches side by side."""
         parts = [x] if x.device.type != "cpu" else x.split(CPU_CHUNK)
-        return torch.cat([self.outputs(self.hidden(part).relu_()) for part in parts])
+        found = [self.outputs(self.hidden(part)) for part in parts]
+        return found[0] if len(found) == 1 else torch.cat(found)
 
 
 def _fold_norms(model: nn.Module) -> None:
@@ -109,6 +112,15 @@ def _fold_norms(model: nn.Module) -> None:
                 if isinstance(layer, Linear) and isinstance(norm, _BatchNorm):
                     fold_norm(layer, norm)
                     module[number + 1] = nn.Identity()
+
+
+def _merge_relus(model: nn.Module) -> None:
+    """A linear layer of a sequence applies the ReLU behind it."""
+    for module in model.modules():
+        if isinstance(module, nn.Sequential):
+            for number, (layer, behind) in enumerate(zip(module[:-1], module[1:], strict=True)):
+                if type(layer) is nn.Linear and layer.bias is not None and isinstance(behind, nn.ReLU):
+                    module[number], module[number + 1] = with_relu(layer), nn.Identity()
 
 
 def _merge_head(head: CenterHead) -> None:

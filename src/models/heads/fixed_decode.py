@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.geometry.constants import constant
+from src.geometry.constants import constant, counting, where_else
 from src.models.heads.center_head import CenterHead, HeadOutput, decoded_codes
 from src.models.heads.decode import (
     MAX_BOXES_PER_GROUP,
@@ -56,7 +56,7 @@ class FixedDecode(nn.Module):
         sites, scores = output.bev.sites, output.logits.sigmoid()
         if self.peaks:
             scores = scores * maxpool_peaks(scores, sites)
-        scores = torch.where((sites.keys < sites.end)[:, None], scores, 0.0)  # padding may hold what is not finite
+        scores = where_else((sites.keys < sites.end)[:, None], scores, 0.0)  # padding may hold what is not finite
         best, rows, labels = best_candidates(scores, min(self.count, MOST_CLASSES * len(scores)))  # [groups, n] each
         codes = self._regress(output.bev.features.index_select(0, rows.flatten()).unflatten(0, rows.shape))
         rows, labels, best = rows.flatten(), labels.flatten(), best.flatten()
@@ -109,10 +109,10 @@ def best_candidates(
     table = constant(CLASS_TABLE, torch.int64, scores.device)
     by_group = F.pad(scores.float(), (0, 1)).index_select(1, table.flatten())  # [M, groups * MOST_CLASSES]
     by_group = by_group.unflatten(1, table.shape).transpose(0, 1).flatten(1)  # [groups, M * MOST_CLASSES]
-    # Scores are not negative, so their bits are in their order; behind them stands the place, the first being largest.
-    behind = torch.arange(by_group.shape[1] - 1, -1, -1, device=scores.device)
-    ranks = (by_group.contiguous().view(torch.int32).long() << RANK_BITS) + behind
-    places = by_group.shape[1] - 1 - (ranks.topk(count, dim=1).values & (2**RANK_BITS - 1))
+    # Scores are not negative, so their bits are in their order; less the place, so that the first comes first.
+    place = counting(by_group.shape[1], torch.int64, scores.device)
+    ranks = (by_group.contiguous().view(torch.int32).long() << RANK_BITS) - place
+    places = -ranks.topk(count, dim=1).values & (2**RANK_BITS - 1)
     rows = torch.div(places, MOST_CLASSES, rounding_mode="floor")
     labels = table.gather(1, places - rows * MOST_CLASSES).clamp(max=scores.shape[1] - 1)
     return by_group.gather(1, places), rows, labels

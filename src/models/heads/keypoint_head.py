@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import constant
 from src.losses.classification import depth_cross_entropy, penalty_reduced_focal
 from src.losses.normalizers import mean_over_ranks
 from src.models.layers.full_precision import FullPrecisionConv2d
@@ -117,7 +118,7 @@ def most_likely_depth(
     """Mean depth over the most likely bin and its two neighbours, and the probability of the three (method 4.2)."""
     probabilities = logits.float().softmax(2)
     last = len(centres_m) - 1
-    window = probabilities.argmax(2, keepdim=True) + torch.arange(-1, 2, device=logits.device).view(3, 1, 1)
+    window = probabilities.argmax(2, keepdim=True) + constant((-1, 0, 1), torch.int64, logits.device).view(3, 1, 1)
     inside = (window >= 0) & (window <= last)  # [B, N, 3, h, w]
     window = window.clamp(0, last)
     chosen = probabilities.gather(2, window) * inside

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from src.geometry.constants import constant
+from src.geometry.constants import constant, where_else
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
 from src.models.horizon3d.bev_path import BEVPath, CellPrediction, WarpedCells
 from src.models.horizon3d.dptf import DPTF, WarpedMemory
@@ -114,7 +114,7 @@ class FixedMemory:
         usable = motion.usable[:num] & (self.frames[:num, 18:19] > 0)  # [T, 1]
         found = (valid > 0) & (usable & path.grid.contains(xy))[..., None]  # [T, K, 1]
         slots = path.config.num_frames - kept[:num].cumsum(0)  # [T, 1], a frame for each that is kept
-        cells = torch.where(found, path.grid.cell_of(xy), 0)
+        cells = where_else(found, path.grid.cell_of(xy), 0)
         indices = torch.cat([(~found).long(), slots[:, :, None].expand_as(found), cells], dim=2)
         columns = (indices, xy, transform_vectors_xy(matrix, velocities), elapsed.expand(found.shape[:2]), features)
         return WarpedCells(*(column.flatten(0, 1) for column in columns))
@@ -163,7 +163,7 @@ def _best_cells(
     """As `BEVPath.store`, of a frame that is not augmented."""
     score = cells.occupancy_logits.sigmoid()
     chosen = (score > path.config.memory_threshold) & (fused.sites.keys < fused.sites.end)
-    best = torch.where(chosen, score, -1.0).argsort(descending=True, stable=True)[:count]
+    best = where_else(chosen, score, -1.0).argsort(descending=True, stable=True)[:count]
     features = fused.features
     if torch.is_autocast_enabled(features.device.type):
         features = features.to(torch.get_autocast_dtype(features.device.type))

@@ -11,16 +11,17 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.tensor_transforms import rotate, unit_vectors
+from src.geometry.constants import counting, where_else
 from src.models.horizon3d.cross_attention import RadarCrossAttention
-from src.models.horizon3d.temporal_attention import TemporalSelfAttention
+from src.models.horizon3d.temporal_attention import TemporalSelfAttention, attention_mask
 from src.models.layers.doppler import Doppler
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.image_attention import ImageCrossAttention, attention_linear, linear_relu_norm
-from src.models.layers.merging import block_diagonal, joined_linear
+from src.models.layers.merging import LinearReLU, block_diagonal, joined_linear, with_relu
 from src.models.layers.sparse import SubmanifoldConv
 from src.models.layers.views import CameraViews
 from src.ops.fixed_shapes import fixed_shapes
+from src.ops.gaussian_shapes import AttributeLimits, activated_attributes, refined_attributes, sampling_points
 from src.ops.segment_reduce import segment_mean
 from src.ops.sites import Sites
 from src.structures.gaussians import GaussianSet
@@ -30,8 +31,6 @@ FFN_RATIO = 4
 DROPOUT = 0.1
 SELF_ENCODING_KERNEL = 5
 FIXED_POINTS = ((0.0, 0.0), (0.45, 0.0), (-0.45, 0.0), (0.0, 0.45), (0.0, -0.45))
-LEARNABLE_REACH = 6.0
-"""Learnable points lie within half of this many standard deviations (method 5.2)."""
 INITIAL_OPACITY = 0.25
 RAW_ATTRIBUTES = (0.0, 0.0, 1.0, 0.0, math.log(INITIAL_OPACITY / (1.0 - INITIAL_OPACITY)), 0.0, 0.0)
 """Raw scale 2, rotation 2, opacity 1, velocity 2 of an untrained Gaussian (method 4.4)."""
@@ -39,27 +38,18 @@ REFINEMENT_STD = 0.01
 
 
 @dataclass(frozen=True)
-class GaussianBounds:
+class GaussianBounds(AttributeLimits):
     """Ranges of the attributes; the activations keep to them (method 5.4)."""
-
-    scale_range_m: tuple[float, float]
-    max_mean_shift_m: float
-    max_speed_mps: float
-    velocity_unit_mps: float  # of the raw velocity
 
     def activate(
         self,
         raw: Tensor,  # [..., 7] scale 2, rotation 2, opacity 1, velocity 2
     ) -> dict[str, Tensor]:
         """Physical attributes by their GaussianSet name, float32; opacity stays a logit."""
-        scale, rotation, opacity, velocity = raw.float().split([2, 2, 1, 2], dim=-1)
-        low, high = self.scale_range_m
-        return {
-            "scales": low + (high - low) * scale.sigmoid(),
-            "directions": unit_vectors(rotation, eps=1e-6),
-            "opacity_logits": opacity.squeeze(-1),
-            "velocities": self.max_speed_mps * torch.tanh(velocity * (self.velocity_unit_mps / self.max_speed_mps)),
-        }
+        raw = raw.float()
+        scales, directions, velocities = activated_attributes(raw, self)
+        named = {"scales": scales, "directions": directions, "velocities": velocities}
+        return {**named, "opacity_logits": raw[..., 4]}
 
 
 class AnchorEncoder(nn.Module):
@@ -83,7 +73,7 @@ class AnchorEncoder(nn.Module):
     def merge_for_inference(self) -> None:
         """All attributes are embedded by the same products."""
         self.merged = MergedEmbeddings(list(self.embed.values()), self.output[0])
-        self.embed, self.output = None, self.output[1:]
+        self.embed, self.output = None, self.output[2:]
 
     def joined(self) -> JoinedEmbeddings | None:
         """What `forward` may take to embed all attributes at once, with gradients; once for several sets."""
@@ -149,18 +139,18 @@ class JoinedEmbeddings:
 
 
 class MergedEmbeddings(nn.Module):
-    """The sum of several `linear_relu_norm` of inputs side by side, through the linear layer behind it."""
+    """The sum of several `linear_relu_norm` of inputs side by side, through the linear layer and the ReLU behind it."""
 
     def __init__(self, parts: Sequence[nn.Sequential], behind: nn.Linear) -> None:
         super().__init__()
         self.eps = parts[0][2].eps
-        self.first = block_diagonal([part[0] for part in parts])
+        self.first = with_relu(block_diagonal([part[0] for part in parts]))
         # A norm's scale and shift go into the layer behind it.
         weights = torch.stack([(part[3].weight * part[2].weight).t() for part in parts])  # [K, C, C]
         biases = torch.stack([part[3].bias + part[3].weight @ part[2].bias for part in parts])
         self.weights, self.biases = (nn.Parameter(x, requires_grad=False) for x in (weights, biases[:, None]))
         bias = behind.bias + sum(behind.weight @ part[5].bias for part in parts)
-        self.behind = joined_linear(torch.cat([behind.weight * part[5].weight for part in parts], 1), bias)
+        self.behind = joined_linear(torch.cat([behind.weight * part[5].weight for part in parts], 1), bias, LinearReLU)
 
     def forward(
         self,
@@ -168,7 +158,7 @@ class MergedEmbeddings(nn.Module):
     ) -> Tensor:  # [B, G, C]
         """Products over all parts at once."""
         parts, channels = self.weights.shape[:2]
-        hidden = F.layer_norm(self.first(x).relu_().view(-1, parts, channels), (channels,), eps=self.eps)
+        hidden = F.layer_norm(self.first(x).view(-1, parts, channels), (channels,), eps=self.eps)
         hidden = torch.baddbmm(self.biases, hidden.transpose(0, 1), self.weights).relu_()  # [K, B * G, C]
         hidden = F.layer_norm(hidden, (channels,), eps=self.eps)
         return self.behind(hidden.transpose(0, 1).reshape(*x.shape[:2], parts * channels))
@@ -190,12 +180,13 @@ class SelfEncoding(nn.Module):
         self,
         features: Tensor,  # [B, G, C]
         gaussians: GaussianSet,
+        picks: Tensor | None = None,  # [V] int64, `valid_rows` of the Gaussians, where the caller has them
     ) -> Tensor:  # [B, G, C]; zero for padding
         """No gradient reaches the means, which only choose cells."""
         b, g, c = features.shape
         if fixed_shapes() is not None:
             return self._of_all(features, gaussians)
-        picks = gaussians.valid.flatten().nonzero().squeeze(1)  # [V]
+        picks = gaussians.valid_rows() if picks is None else picks
         cells = self.grid.cell_of(gaussians.means.detach().flatten(0, 1).index_select(0, picks))
         sample = torch.div(picks, g, rounding_mode="floor")
         sites, rows = Sites.unique(torch.cat([sample[:, None], cells], dim=1), (b, *self.grid.cells))
@@ -206,8 +197,8 @@ class SelfEncoding(nn.Module):
     def _of_all(self, features: Tensor, gaussians: GaussianSet) -> Tensor:
         """In fixed shapes: padding as Gaussians of a sample that does not exist."""
         valid, (b, g) = gaussians.valid[..., None], gaussians.valid.shape
-        sample = torch.arange(b, device=valid.device).view(b, 1, 1)
-        indices = torch.cat([torch.where(valid, sample, b), self.grid.cell_of(gaussians.means)], dim=2)
+        sample = counting(b, torch.int64, valid.device).view(b, 1, 1)
+        indices = torch.cat([where_else(valid, sample, b), self.grid.cell_of(gaussians.means)], dim=2)
         indices = F.pad(indices.flatten(0, 1), (0, 0, 0, 1), value=b)  # one more, which is padding in any case
         sites, rows = Sites.unique(indices, (b, *self.grid.cells))
         return self._exchange(features.flatten(0, 1), sites, rows[:-1]).unflatten(0, (b, g)) * valid
@@ -245,16 +236,23 @@ class Refinement(nn.Module):
         self.register_buffer("lower_m", centre - half, persistent=False)
         self.register_buffer("upper_m", centre + half, persistent=False)
 
+    def merge_for_inference(self) -> None:
+        """The scale goes into the layer before it."""
+        scale, self.output_scale = self.output_scale, None
+        self.output.weight.mul_(scale[:, None])
+        self.output.bias.mul_(scale)
+
     def forward(
         self,
         x: Tensor,  # [B, G, C] features + anchor embedding
         gaussians: GaussianSet,
     ) -> GaussianSet:
         """Attributes are float32 also under autocast."""
-        raw = self.output(self.trunk(x)) * self.output_scale  # [B, G, 9]
-        shift = self.bounds.max_mean_shift_m * (2.0 * raw[..., :2].sigmoid() - 1.0)
-        means = (gaussians.means + shift).clamp(self.lower_m, self.upper_m)
-        return replace(gaussians, means=means, **self.bounds.activate(raw[..., 2:]))
+        raw = self.output(self.trunk(x))
+        raw = raw if self.output_scale is None else raw * self.output_scale  # [B, G, 9]
+        found = refined_attributes(raw, gaussians.means, self.lower_m, self.upper_m, self.bounds)
+        named = dict(zip(("means", "scales", "directions", "velocities"), found, strict=True))
+        return replace(gaussians, **named, opacity_logits=raw[..., 6])
 
 
 class EncoderLayer(nn.Module):
@@ -294,13 +292,10 @@ class EncoderLayer(nn.Module):
         gaussians: GaussianSet,
     ) -> Tensor:  # [B, G, P, 2] aug metres
         """q_k = m + R(theta) (s * phi_k): fixed and learnable points that follow the Gaussian's shape."""
-        phi = self.fixed_points.expand(*query.shape[:2], -1, -1)
-        if self.offsets is not None:
-            learnt = LEARNABLE_REACH * (self.offsets(query).float().sigmoid() - 0.5)
-            phi = torch.cat([phi, learnt.unflatten(-1, (-1, 2))], dim=2)
-        local = gaussians.scales[:, :, None] * phi  # [B, G, P, 2] along and across the direction
-        cos, sin = gaussians.directions[:, :, None].unbind(-1)  # [B, G, 1]
-        return gaussians.means[:, :, None] + torch.stack(rotate(cos, sin, *local.unbind(-1)), dim=-1)
+        offsets = (
+            gaussians.means.new_zeros(*query.shape[:2], 0) if self.offsets is None else self.offsets(query).float()
+        )
+        return sampling_points(offsets, self.fixed_points, gaussians.means, gaussians.scales, gaussians.directions)
 
     def forward(
         self,
@@ -309,11 +304,13 @@ class EncoderLayer(nn.Module):
         radar_bev: SparseBEV,
         views: CameraViews,
         values: list[Tensor],  # L x [B, N, C, h, w]
+        mask: Tensor | None = None,  # `attention_mask` of the Gaussians, made once for all layers
+        picks: Tensor | None = None,  # [V] int64, their `valid_rows`, alike
     ) -> GaussianSet:
         """Features and attributes after this layer."""
         f = gaussians.features
         if self.temporal_attention is not None:
-            f = f + self.temporal_attention(f, embedding, gaussians)
+            f = f + self.temporal_attention(f, embedding, gaussians, mask)
         query = f + embedding
         points = self.sampling_points(query, gaussians)
         x = f + self.radar_attention(query, points, radar_bev)
@@ -323,7 +320,7 @@ class EncoderLayer(nn.Module):
             x = x + self.image_attention(f, query, points, views, values)
         x = self.norms[0](x)
         x = attended = self.norms[1](x + self.feed_forward[0](x))
-        x = self.norms[2](x + self.self_encoding(x, gaussians))
+        x = self.norms[2](x + self.self_encoding(x, gaussians, picks))
         x = self.norms[3](x + self.feed_forward[1](x))
         refined = self.refinement((attended if self.refine_before_self_encoding else x) + embedding, gaussians)
         return replace(refined, features=x)
@@ -347,7 +344,12 @@ class GaussianEncoder(nn.Module):
         self.layers = nn.ModuleList(make_layer() for _ in range(num_layers))
 
     def forward(
-        self, gaussians: GaussianSet, radar_bev: SparseBEV, views: CameraViews, doppler: Doppler | None = None
+        self,
+        gaussians: GaussianSet,
+        radar_bev: SparseBEV,
+        views: CameraViews,
+        doppler: Doppler | None = None,
+        picks: Tensor | None = None,  # [V] int64, `valid_rows` of the Gaussians, where the caller has them
     ) -> tuple[GaussianSet, Tensor]:
         """G_0 -> G_L; with `doppler` the radial part of their velocities is always the measured one.
 
@@ -357,10 +359,12 @@ class GaussianEncoder(nn.Module):
             self.image_value(level.flatten(0, 1)).unflatten(0, level.shape[:2]) for level in views.levels
         ]  # L x [B, N, C, h, w]
         gaussians = _measured(gaussians, doppler)
+        temporal = any(layer.temporal_attention is not None for layer in self.layers)
+        mask = attention_mask(gaussians.valid, gaussians.features.dtype) if temporal else None
         joined = self.anchor.joined() if torch.is_grad_enabled() else None
         for layer in self.layers:
             embedding = self.anchor(gaussians) if joined is None else self.anchor(gaussians, joined)
-            regressed = layer(gaussians, embedding, radar_bev, views, values)
+            regressed = layer(gaussians, embedding, radar_bev, views, values, mask, picks)
             gaussians = _measured(regressed, doppler)
         in_losses = doppler is None or doppler.in_losses
         return gaussians, (gaussians if in_losses else regressed).velocities
@@ -370,11 +374,8 @@ def _measured(gaussians: GaussianSet, doppler: Doppler | None) -> GaussianSet:
     """With what the radar measures of their velocities."""
     if doppler is None:
         return gaussians
-    row, col = doppler.grid.cell_of(gaussians.means.detach()).unbind(-1)  # [B, G]
-    sample = torch.arange(len(row), device=row.device)[:, None]
-    cells = (sample * doppler.grid.rows + row) * doppler.grid.cols + col
-    velocities = doppler.impose(gaussians.velocities.flatten(0, 1), cells.flatten())
-    return replace(gaussians, velocities=velocities.unflatten(0, row.shape))
+    velocities = doppler.impose(gaussians.velocities.flatten(0, 1), gaussians.means.detach())
+    return replace(gaussians, velocities=velocities.unflatten(0, gaussians.valid.shape))
 
 
 def _feed_forward(channels: int) -> nn.Sequential:

@@ -167,9 +167,9 @@ class KGGI(nn.Module):
     ) -> GaussianSet:
         rows = topk_per_sample(scores, radar_bev.indices[:, 0], radar_bev.batch_size, self.config.num_radar_keypoints)
         valid = rows >= 0
-        cells = F.pad(radar_bev.indices, (0, 0, 0, 1))  # one more row, which padding reads
-        features = F.pad(radar_bev.features, (0, 0, 0, 1))
-        picks = torch.where(valid, rows, len(radar_bev))  # [B, K]
+        cells = F.pad(radar_bev.indices, (0, 0, 1, 0))  # a row before them, which padding reads
+        features = F.pad(radar_bev.features, (0, 0, 1, 0))
+        picks = rows + 1  # [B, K]
         means = self.grid.centre_of(cells[picks][..., 1:])  # [B, K, 2]
         return self._gaussians(Source.RADAR, means, valid, F.embedding(picks, features))
 

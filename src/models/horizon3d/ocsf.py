@@ -15,6 +15,7 @@ from src.models.horizon3d.sparse_fusion import SparseFusion
 from src.models.horizon3d.splatting import GaussianSplat, splat_set
 from src.models.layers.doppler import Doppler
 from src.models.layers.views import CameraViews
+from src.ops.fixed_shapes import fixed_shapes
 from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV
 
@@ -129,8 +130,8 @@ class OCSF(nn.Module):
     ) -> OCSFOutput:
         """G_0 to F_fuse."""
         config = self.config
-        gaussians, supervised = self.encoder(gaussians, radar_bev, views, doppler)
-        splat = splat_set(
-            gaussians, self.grid, config.occupancy_threshold, config.max_occupied_cells, config.support_sigmas
-        )
+        picks = gaussians.valid_rows() if fixed_shapes() is None else None  # once, since a GPU has to wait
+        gaussians, supervised = self.encoder(gaussians, radar_bev, views, doppler, picks)
+        limits = (config.occupancy_threshold, config.max_occupied_cells, config.support_sigmas)
+        splat = splat_set(gaussians, self.grid, *limits, picks)
         return OCSFOutput(gaussians, splat, self.fusion(splat.bev, radar_bev), supervised)

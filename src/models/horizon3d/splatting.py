@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import counting, where_else
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.splat import Splat, splat_gaussians
 from src.structures.gaussians import GaussianSet
@@ -37,16 +38,17 @@ def splat_set(
     occupancy_threshold: float,
     max_occupied_cells: int,
     support_sigmas: float,
+    picks: Tensor | None = None,  # [V] int64, `valid_rows` of the Gaussians, where the caller has them
 ) -> GaussianSplat:
     """Splat the valid Gaussians of every sample."""
     b, g = gaussians.valid.shape
-    picks = None
     if fixed_shapes() is None:
-        picks = gaussians.valid.flatten().nonzero().squeeze(1)  # [V]
+        picks = gaussians.valid_rows() if picks is None else picks
         batch = torch.div(picks, g, rounding_mode="floor")
-    else:  # all of them: padding reaches no cell from where it is
-        gaussians = replace(gaussians, means=torch.where(gaussians.valid[..., None], gaussians.means, FAR_M))
-        batch = torch.arange(b, device=gaussians.means.device).repeat_interleave(g, output_size=b * g)
+    else:
+        picks = None  # all of them: padding reaches no cell from where it is
+        gaussians = replace(gaussians, means=where_else(gaussians.valid[..., None], gaussians.means, FAR_M))
+        batch = counting(b, torch.int64, gaussians.means.device)[:, None].expand(b, g).flatten()
     names = ("means", "scales", "directions", "opacity_logits", "features")
     flat = {name: getattr(gaussians, name).flatten(0, 1) for name in names}
     if picks is not None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.structures.gaussians import GaussianSet
+
+MASK_ALIGNMENT = 16
+"""Values, of torch's memory-efficient attention."""
 
 
 class TemporalSelfAttention(nn.Module):
@@ -33,6 +37,7 @@ class TemporalSelfAttention(nn.Module):
         features: Tensor,  # [B, G, C]
         embedding: Tensor,  # [B, G, C] from the anchor encoder
         gaussians: GaussianSet,
+        mask: Tensor | None = None,  # `attention_mask` of them, where the caller has it
     ) -> Tensor:  # [B, G, C], to be added to the features
         """q = k = f + e + time(dt), v = f; the time of the current frame counts as zero, not as an embedded zero."""
         x = self.norm(features)
@@ -41,7 +46,21 @@ class TemporalSelfAttention(nn.Module):
         query, key = self.query_key(position).chunk(2, dim=-1)
         split = (self.num_heads, -1)
         heads = [part.unflatten(-1, split).transpose(1, 2) for part in (query, key, self.value(x))]  # [B, H, G, C/H]
-        # A sample without valid Gaussians attends to padding, whose result is unused: a softmax over nothing is NaN.
-        keys = gaussians.valid | ~gaussians.valid.any(dim=1, keepdim=True)
-        attended = F.scaled_dot_product_attention(*heads, attn_mask=keys[:, None, None, :])
+        mask = attention_mask(gaussians.valid, x.dtype) if mask is None else mask
+        attended = F.scaled_dot_product_attention(*heads, attn_mask=mask)
         return self.output(attended.transpose(1, 2).flatten(2))
+
+
+def attention_mask(
+    valid: Tensor,  # [B, G] bool
+    dtype: torch.dtype,
+) -> Tensor:  # [B, 1, 1, G]
+    """What is added to the logits of all queries: -inf for keys that are padding.
+
+    A sample without valid Gaussians attends to padding, whose result is unused: a softmax over nothing is NaN. Rows
+    begin where a GPU's fused attention wants them, which would otherwise copy them.
+    """
+    keys = valid | ~valid.any(dim=1, keepdim=True)
+    missing = -keys.shape[1] % MASK_ALIGNMENT
+    mask = F.pad(keys.to(dtype).log_(), (0, missing))
+    return mask[:, None, None, : keys.shape[1]]

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant
+from src.geometry.constants import constant, where_else
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.moved_keys import NONE
 from src.ops.radial_change import NUM_BINS, radial_bin, radial_change
@@ -66,9 +66,6 @@ class Doppler:
     ) -> Self:
         """Of all points inside the grid."""
         fixed = fixed_shapes()
-        if fixed is None:
-            inside = grid.contains(radar_points[:, :2]).nonzero().squeeze(1)
-            radar_points, radar_batch = radar_points[inside], radar_batch[inside]
         xy, velocities = radar_points[:, :2].float(), radar_points[:, 4:6].float()
         approach = (velocities * xy).sum(dim=1).sign()
         bins = radial_bin(approach * velocities.norm(dim=1))
@@ -76,13 +73,13 @@ class Doppler:
         falloff = constant(tuple(float(a * b) for a in FALLOFF for b in FALLOFF), xy.dtype, xy.device)  # [25]
         row, col = (places[:, None] + reach for places in grid.cell_of(xy).unbind(1))  # [P, 5] each
         in_row, in_col = row == row.clamp(0, grid.rows - 1), col == col.clamp(0, grid.cols - 1)
-        within = in_row[:, :, None] & in_col[:, None]  # [P, 5, 5]
+        within = in_row[:, :, None] & in_col[:, None] & grid.contains(xy)[:, None, None]  # [P, 5, 5]
         linear = ((radar_batch[:, None] * grid.rows + row) * grid.cols)[:, :, None] + col[:, None]
         given = (linear * NUM_BINS + bins[:, None, None]).flatten()  # [25 P]
         values = F.pad(velocities, (1, 0), value=1.0)  # [P, 3]
         weighted = (values[:, None] * falloff[:, None]).flatten(0, 1)
         if fixed is not None:
-            given = torch.where((within & grid.contains(xy)[:, None, None]).flatten(), given, NONE)
+            given = where_else(within.flatten(), given, NONE)
             keys = fixed.distinct(given, NONE, len(given))
             sums = segment_sum(weighted, torch.searchsorted(keys, given), len(keys))
             return cls(grid, keys, sums[:, 1:] / sums[:, :1].clamp(min=1.0), in_losses, along_heading)
@@ -95,14 +92,15 @@ class Doppler:
     def impose(
         self,
         velocities: Tensor,  # [n, 2] m/s over ground, augmented axes
-        cells: Tensor,  # [n] int64 linear keys (b * rows + row) * cols + col
+        cells: Tensor,  # [n] int64 linear keys (b * rows + row) * cols + col, or [B, n / B, 2] positions in metres
     ) -> Tensor:  # [n, 2]
         """The velocities with the measured radial part that is nearest to theirs; as they are where none is near.
 
         The gradient passes as if nothing had been replaced, so that the radial part is learnt as far as it leads to a
         wrong measurement or to none; whole, where losses see the velocities of before (`in_losses` false).
         """
-        return velocities + radial_change(velocities, cells, self.keys, self.velocities, self.grid)
+        given = (velocities, cells, self.keys, self.velocities, self.grid)
+        return velocities + radial_change(*given) if torch.is_grad_enabled() else radial_change(*given, added=True)
 
 
 def along_heading(

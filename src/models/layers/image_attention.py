@@ -10,7 +10,8 @@ from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
 from src.models.layers.views import CameraViews
-from src.ops.deform_sample import deform_attend_images
+from src.ops.deform_sample import attend_views, deform_attend_images
+from src.ops.view_samples import view_places, view_weights
 
 NUM_HEADS = 4
 INITIAL_HEIGHT_M = 1.0
@@ -73,6 +74,8 @@ class ImageCrossAttention(nn.Module):
         shares: Tensor | None = None,  # [B, G, N, P], what counts of each sample beside its weight; None: all
     ) -> Tensor:  # [B, G, C]
         """Samples of every visible point on every level."""
+        if not torch.is_grad_enabled() and points.device.type != "cpu" and self.height is not None and shares is None:
+            return self.output(self._gather(features, query, points, views, values).to(values[0].dtype))
         if self.height is not None:
             low, high = self.z_range_m
             z = low + (high - low) * self.height(features).float().sigmoid()  # [B, G, P]
@@ -87,18 +90,34 @@ class ImageCrossAttention(nn.Module):
             gathered = gathered + 0.0 * (weights.sum() + pixels.sum() + sum(level.float().sum() for level in values))
         return self.output(gathered.to(values[0].dtype))
 
+    def _gather(
+        self, features: Tensor, query: Tensor, points: Tensor, views: CameraViews, values: list[Tensor]
+    ) -> Tensor:  # [B, G, C]
+        """The same without gradient, in few launches."""
+        heights, logits = self.height(features).float(), self.logits(query).float()
+        matrix = views.pix_from_aug.float()
+        places, visible = view_places(points, heights, self.z_range_m, matrix, views.valid, views.image_size_px)
+        weights = view_weights(logits, self._of_cameras(matrix).float(), visible, NUM_HEADS)
+        return attend_views([level.float().flatten(0, 1) for level in values], places, weights)
+
+    def _of_cameras(
+        self,
+        pix_from_aug: Tensor,  # [B, N, 4, 4]
+    ) -> Tensor:  # [B, N, heads * L * P]
+        """Every view has its own rows of one linear layer on (f + e + cam_n); this is the camera's share."""
+        rows = F.normalize(pix_from_aug[:, :, :3].float(), dim=-1)  # pixel-scaled rows would drown the metric one
+        camera = self.camera(rows.flatten(2))  # [B, N, C]
+        weight = self.logits.weight.unflatten(0, (self.num_views, -1))  # [N, heads*L*P, C]
+        return torch.einsum("bnc,nkc->bnk", camera.to(weight.dtype), weight)
+
     def _weights(
         self,
         query: Tensor,  # [B, G, C]
         pix_from_aug: Tensor,  # [B, N, 4, 4]
         visible: Tensor,  # [B, G, N, P] bool
     ) -> Tensor:  # [B, G, heads, N, L, P], zero where invisible
-        rows = F.normalize(pix_from_aug[:, :, :3].float(), dim=-1)  # pixel-scaled rows would drown the metric one
-        camera = self.camera(rows.flatten(2))  # [B, N, C]
-        # Every view has its own rows of one linear layer on (f + e + cam_n); the camera's share is added separately.
-        weight = self.logits.weight.unflatten(0, (self.num_views, -1))  # [N, heads*L*P, C]
         logits = self.logits(query).unflatten(-1, (self.num_views, -1))  # [B, G, N, heads*L*P]
-        logits = logits + torch.einsum("bnc,nkc->bnk", camera.to(weight.dtype), weight)[:, None]
+        logits = logits + self._of_cameras(pix_from_aug)[:, None]
         logits = logits.float().unflatten(-1, self.per_view).transpose(2, 3)  # [B, G, heads, N, L, P]
         seen = visible[:, :, None, :, None].expand_as(logits)
         logits = logits.masked_fill(~seen, torch.finfo(logits.dtype).min)

@@ -8,6 +8,39 @@ import torch
 from torch import Tensor, nn
 
 from src.models.layers.sparse import SubmanifoldConv
+from src.ops.conv_relu import conv_relu
+from src.ops.linear import linear_relu
+
+
+class LinearReLU(nn.Linear):
+    """A linear layer and the ReLU behind it, without gradient."""
+
+    def forward(
+        self,
+        x: Tensor,  # [..., C]
+    ) -> Tensor:  # [..., C']
+        return linear_relu(x, self.weight, self.bias)
+
+
+class ConvReLU(nn.Conv2d):
+    """A convolution, what is added to it and the ReLU behind both, without gradient."""
+
+    def forward(
+        self,
+        x: Tensor,  # [M, C, H, W]
+        residual: Tensor | None = None,  # [M, C', H', W']
+    ) -> Tensor:  # [M, C', H', W']
+        return conv_relu(x, self.weight, self.bias, self.stride, self.padding, residual)
+
+
+def with_relu(layer: nn.Linear | nn.Conv2d) -> LinearReLU | ConvReLU:
+    """The layer with a ReLU behind it, of the same weights. Convolutions are neither dilated nor grouped."""
+    if isinstance(layer, nn.Linear):
+        return joined_linear(layer.weight, layer.bias, LinearReLU)
+    sizes = (layer.in_channels, layer.out_channels, layer.kernel_size, layer.stride, layer.padding)
+    merged = ConvReLU(*sizes, device="meta")
+    merged.weight, merged.bias = layer.weight, layer.bias
+    return merged
 
 
 def joined_convs(convs: Sequence[SubmanifoldConv]) -> SubmanifoldConv:

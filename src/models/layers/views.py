@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from src.geometry.constants import where_else
 from src.geometry.tensor_transforms import invert_projection, pixel_centres
+from src.ops.view_samples import MIN_DEPTH_M
 from src.structures.batch import FrameBatch
 from src.structures.taxonomy import CAMERAS
-
-MIN_DEPTH_M = 0.5
-"""Points nearer to the image plane count as invisible (method 5.3)."""
 
 
 @dataclass
@@ -61,7 +60,7 @@ class CameraViews:
             height, width = self.image_size_px
             inside = (pixels >= 0).all(-1) & (pixels[..., 0] < width) & (pixels[..., 1] < height)
             visible = inside & (depth > MIN_DEPTH_M) & self.valid[:, None, :, None]
-            return torch.where(visible[..., None], pixels, 0.0), visible
+            return where_else(visible[..., None], pixels, 0.0), visible
 
     def lift(
         self,

@@ -28,7 +28,7 @@ def attend_cells_triton(
     if out.numel() > 0:
         with torch.cuda.device_of(out):
             _attend_cells[(len(points),)](
-                *(values.contiguous(), table, points.contiguous(), batch, weights.contiguous(), out),
+                *(values.contiguous(), table, points.contiguous(), batch.contiguous(), weights.contiguous(), out),
                 *(points.shape[1], heads, channels, grid.rows, grid.cols, grid.x_min_m, grid.y_min_m, grid.cell_m),
                 BLOCK=triton.next_power_of_2(channels),
                 num_warps=1,

@@ -21,7 +21,7 @@ def attend_views_triton(
         return attend_views_reference(images, places, weights)
     batch_size, queries, heads, views, levels, points = weights.shape
     channels = images[0].shape[1]
-    out = places.new_zeros(batch_size, queries, channels)
+    out = places.new_empty(batch_size, queries, channels)
     if out.numel() > 0:
         places, weights = places.contiguous(), weights.contiguous()
         with torch.cuda.device_of(out):
@@ -48,7 +48,7 @@ def _attend_level(  # noqa: ANN202
     channel = tl.arange(0, BLOCK)
     wide = channel < channels
     head = channel // (channels // heads)
-    total = tl.load(out + query * channels + channel, mask=wide, other=0.0)
+    total = tl.load(out + query * channels + channel, mask=wide & (level > 0), other=0.0)
     for view in range(0, views):
         picture = image + (sample * views + view) * stride_image + channel * stride_channel
         corner = places + ((sample * views + view) * queries + own) * points * 2

@@ -16,10 +16,13 @@ VELOCITIES = 128
 """Velocities of a program, one lane each."""
 
 
-def radial_change_triton(velocities: Tensor, cells: Tensor, keys: Tensor, measured: Tensor, grid: BEVGrid) -> Tensor:
+def radial_change_triton(
+    velocities: Tensor, cells: Tensor, keys: Tensor, measured: Tensor, grid: BEVGrid, added: bool = False
+) -> Tensor:
     """The reference's change up to rounding."""
-    if velocities.dtype != torch.float32 or not runs_kernels(velocities):
-        return radial_change_reference(velocities, cells, keys, measured, grid)
+    placed = cells.dim() == 3
+    if velocities.dtype != torch.float32 or (placed and cells.dtype != torch.float32) or not runs_kernels(velocities):
+        return radial_change_reference(velocities, cells, keys, measured, grid, added)
     velocities, out = velocities.contiguous(), velocities.new_empty(velocities.shape)
     if len(out) > 0:
         with torch.cuda.device_of(out):
@@ -27,6 +30,7 @@ def radial_change_triton(velocities: Tensor, cells: Tensor, keys: Tensor, measur
                 *(velocities, cells.contiguous(), keys.contiguous(), measured.contiguous(), out),
                 *(len(out), len(keys), len(keys).bit_length(), grid.rows, grid.cols),
                 *(grid.x_min_m, grid.y_min_m, grid.cell_m, BIN_MPS, MIN_SPEED_MPS),
+                *(cells.shape[1] if placed else 1, placed, added),
                 BINS=NUM_BINS,
                 NEAR=NEAR_BINS,
                 BLOCK=VELOCITIES,
@@ -35,16 +39,22 @@ def radial_change_triton(velocities: Tensor, cells: Tensor, keys: Tensor, measur
     return out
 
 
-@triton.jit(do_not_specialize=["num", "keys_num", "steps", "rows", "cols"])
+@triton.jit(do_not_specialize=["num", "keys_num", "steps", "rows", "cols", "per_sample"])
 def _nearest_radial(  # noqa: ANN202
     velocities, cells, keys, measured, out, num, keys_num, steps, rows, cols,  # noqa: ANN001
-    x_min, y_min, cell_m, bin_mps, min_speed,  # noqa: ANN001
+    x_min, y_min, cell_m, bin_mps, min_speed, per_sample,  # noqa: ANN001
+    PLACED: tl.constexpr, ADDED: tl.constexpr,
     BINS: tl.constexpr, NEAR: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """All near bins of a block of velocities; the first of equally near ones counts."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = place < num
-    cell = tl.load(cells + place, mask=live, other=0)
+    if PLACED:
+        col = tl.floor((tl.load(cells + 2 * place, mask=live, other=0.0) - x_min) / cell_m).to(tl.int64)
+        row = tl.floor((tl.load(cells + 2 * place + 1, mask=live, other=0.0) - y_min) / cell_m).to(tl.int64)
+        cell = (place // per_sample * rows + row) * cols + col
+    else:
+        cell = tl.load(cells + place, mask=live, other=0)
     x = x_min + ((cell % cols).to(tl.float32) + 0.5) * cell_m
     y = y_min + ((cell // cols % rows).to(tl.float32) + 0.5) * cell_m
     length = tl.maximum(tl.sqrt(x * x + y * y), 1e-12)
@@ -77,5 +87,8 @@ def _nearest_radial(  # noqa: ANN202
     safe = tl.maximum(speed, 1e-12)
     x, y = tl.where(moving, found_x / safe, x), tl.where(moving, found_y / safe, y)
     change = tl.where(least < float("inf"), (found_x - own_x) * x + (found_y - own_y) * y, 0.0)
-    tl.store(out + 2 * place, change * x, mask=live)
-    tl.store(out + 2 * place + 1, change * y, mask=live)
+    new_x, new_y = change * x, change * y
+    if ADDED:
+        new_x, new_y = own_x + new_x, own_y + new_y
+    tl.store(out + 2 * place, new_x, mask=live)
+    tl.store(out + 2 * place + 1, new_y, mask=live)

@@ -12,16 +12,19 @@ from triton.runtime.jit import JITFunction
 
 from src.geometry.bev_grid import BEVGrid
 from src.ops.gaussian_cells import gaussian_cells
+from src.ops.gaussian_shapes import AttributeLimits
 from src.ops.kernel_maps import submanifold_map
 from src.ops.kernels import (
     attend_cells_triton,
     attend_views_triton,
     farthest_point_triton,
+    gaussian_shapes_triton,
     moved_keys_triton,
     neighbour_table_triton,
     radial_change_triton,
     sparse_conv_triton,
     splat_triton,
+    view_samples_triton,
 )
 from src.ops.sites import Sites
 
@@ -52,8 +55,8 @@ def main():
     driver.set_active(Target())
     JITFunction.run = compile_only(JITFunction.run)
     kernels = (
-        *(attend_cells_triton, attend_views_triton, farthest_point_triton, moved_keys_triton),
-        *(neighbour_table_triton, radial_change_triton, sparse_conv_triton, splat_triton),
+        *(attend_cells_triton, attend_views_triton, farthest_point_triton, gaussian_shapes_triton, moved_keys_triton),
+        *(neighbour_table_triton, radial_change_triton, sparse_conv_triton, splat_triton, view_samples_triton),
     )
     for module in kernels:
         module.runs_kernels = lambda tensor: True
@@ -83,6 +86,20 @@ def main():
         attend_cells_triton.attend_cells_triton(values, table, points, torch.zeros(7).long(), shares, grid)
     attend_views_triton.attend_views_triton(
         [torch.zeros(2, 128, 8, 9)], torch.zeros(2, 7, 3, 2), torch.zeros(1, 7, 4, 2, 1, 3)
+    )
+    radial_change_triton.radial_change_triton(
+        torch.zeros(9, 2), torch.zeros(1, 9, 2), torch.arange(9), torch.zeros(9, 2), grid, True
+    )
+    matrices, valid = torch.zeros(1, 2, 4, 4), torch.ones(1, 2, dtype=torch.bool)
+    places = (torch.zeros(1, 7, 3, 2), torch.zeros(1, 7, 3), (-3.0, 5.0), matrices, valid, (32, 64))
+    view_samples_triton.view_places_triton(*places)
+    seen = torch.ones(1, 7, 2, 3, dtype=torch.bool)
+    view_samples_triton.view_weights_triton(torch.zeros(1, 7, 48), torch.zeros(1, 2, 24), seen, 4)
+    pairs = [torch.zeros(1, 7, 2)] * 3
+    gaussian_shapes_triton.sampling_points_triton(torch.zeros(1, 7, 6), torch.zeros(5, 2), *pairs)
+    limits = AttributeLimits((0.2, 3.0), 4.0, 30.0, 10.0)
+    gaussian_shapes_triton.refined_attributes_triton(
+        torch.zeros(1, 7, 9), pairs[0], torch.zeros(2), torch.ones(2), limits
     )
     direction = torch.tensor([[1.0, 0.0]])
     gaussian = (torch.zeros(1, 2), torch.ones(1, 2), direction, torch.zeros(1), torch.zeros(1, 128))

@@ -23,6 +23,21 @@ def test_changes(device, points, count):
     assert count < 700 or (found != 0).any(1).float().mean() > 0.2
 
 
+@pytest.mark.parametrize("added", [False, True])
+def test_changes_at_positions(device, added):
+    draw = torch.Generator().manual_seed(2)
+    rows = torch.rand(60, 7, generator=draw) * torch.tensor([12.8, 9.6, 1, 1, 80, 80, 1])
+    rows -= torch.tensor([-1.6, 4.8, 0, 0, 40, 40, 0])
+    doppler = Doppler.measure(rows, torch.arange(60) % 2, GRID)
+    positions = torch.rand(2, 150, 2, generator=draw) * torch.tensor([12.8, 9.6]) - torch.tensor([-1.6, 4.8])
+    inputs = (15 * torch.randn(300, 2, generator=draw), positions, doppler.keys, doppler.velocities)
+    found = radial_change(*(x.to(device) for x in inputs), GRID, added).cpu()
+    row, col = GRID.cell_of(positions).unbind(-1)
+    cells = ((torch.arange(2)[:, None] * 12 + row) * 16 + col).flatten()
+    expected = radial_change_reference(inputs[0], cells, *inputs[2:], GRID) + added * inputs[0]
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
+
+
 def test_halves_go_to_the_even_bin(device):
     """Of radial speeds between two bins, whose nearest measurements differ."""
     grid = BEVGrid(cells=(13, 16), cell_m=0.8, centre_m=(8.0, 0.0), z_range_m=(-3.0, 5.0))
