@@ -60,7 +60,7 @@ def multiply(
     Operands must not be expanded ones: oneDNN takes a thousand times as long for a value that stands for many.
     """
     full, half = a.dtype == torch.float32, a.dtype == torch.bfloat16 and relu
-    if a.device.type == "cpu" and ((full and prefers_onednn()) or (half and multiplies_bfloat16())):
+    if a.device.type == "cpu" and ((full and prefers_onednn()) or (half and fuses_bfloat16())):
         return torch.ops.mkldnn._linear_pointwise(a, b.t(), bias, "relu" if relu else "none", [], "")
     with torch.autocast(a.device.type, enabled=False):
         out = torch.mm(a, b) if bias is None else torch.addmm(bias, a, b)
@@ -98,6 +98,12 @@ def multiplies_bfloat16() -> bool:
     """Whether this processor multiplies bfloat16."""
     found = torch.cpu.get_capabilities()
     return torch.backends.mkldnn.is_available() and bool(found.get("avx512_bf16") or found.get("amx_bf16"))
+
+
+@cache
+def fuses_bfloat16() -> bool:
+    """Whether oneDNN has products of bfloat16 here, if slow ones, which take the ReLU along."""
+    return torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
 
 
 @cache

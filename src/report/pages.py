@@ -97,14 +97,14 @@ def runs_on_page(
     shown = []
     for result in results:
         overrides = without_defaults(result.overrides, defaults.get(result.phase, {}))
-        overrides += changed_since(result, defaults.get(result.phase, {}))
-        run = replace(result, overrides=overrides)
+        older = changed_since(result, defaults.get(result.phase, {}))
+        run = replace(result, overrides=overrides + older)
         if phase in PHASES_OF:
             belongs = run.phase == phase or (run.phase in PHASES_OF[phase] and (not run.settings or _is_continued(run)))
         else:
             belongs = run.phase == phase and not _is_continued(run)
         belongs = belongs and run.epochs > 0
-        known = (run.phase, *_settings_without_dropout(run)) in names or _is_continued(run)
+        known = (run.phase, *_settings_without_dropout(run)) in names or (_is_continued(run) and not older)
         if belongs and (known or run.run_id not in in_sweeps):
             shown.append(run)
     return shown if any(run.phase == phase for run in shown) else []

@@ -207,7 +207,8 @@ def test_the_command_shows_three_passes_with_full_memory(tmp_path, monkeypatch, 
     assert len(set(remembered[1:])) == 1  # full after two frames, over the joints too
     # Clip by clip it holds the frame alone where the second clip starts, at frame 10: one of two.
     anew = [row["remembered MiB"] for row in result[CLIPS]]
-    assert anew[4] == pytest.approx(remembered[-1] / 2) and anew[3] == anew[5] == remembered[-1]
+    # Flags of both frames lie in one storage, of a byte each.
+    assert anew[4] == pytest.approx(remembered[-1] / 2, rel=1e-3) and anew[3] == anew[5] == remembered[-1]
     assert all(row["remembered MiB"] > 0 and row["tensors"] > 0 for row in result[TRAINING])
     assert f"![soak]({page.stem}.png)" in capsys.readouterr().out
     assert not list((tmp_path / "outputs").glob("soak*"))  # the training's folder lay elsewhere and is gone

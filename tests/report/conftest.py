@@ -53,7 +53,10 @@ def write_run(tmp_path: Path) -> Callable[..., Path]:
             part = {"mAP_present": value, "mAVE_present": 2 - value, "classes": classes | {
                 "car": {"AP": value, "AVE": 2 - value, "num_gt": 3}}}  # fmt: skip
             metrics["speeds"] = {s: part for s in SPEEDS}
-        config = {"model": {"name": "horizon3d", "ocsf": {"margin_m": 4.8}}, "phase": {"name": phase}, "seed": seed,
+        model = {
+            "name": "horizon3d", "ocsf": {"margin_m": 4.8}, "doppler": {"in_losses": False, "along_heading": True}
+        }  # fmt: skip
+        config = {"model": model, "phase": {"name": phase}, "seed": seed,
                   "data": {"root": str(tmp_path), "version": "v1.2-trainval"},
                   "backbone": {"file": f"{tmp_path}/r50.pth"},
                   "paths": {"outputs": str(tmp_path)}, "out": None}  # fmt: skip
