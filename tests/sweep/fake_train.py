@@ -81,6 +81,7 @@ def main(overrides):
     record = {"run_id": run_id, "seconds": {"fit": 1.0, "all": 2.0}}
     if keys.get("phase.task", "detection") != "detection":
         metrics, record["headline"] = {"IoU": metrics["mAP"]}, "IoU"
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a result and its note belong together
     (folder / "metrics.json").write_text(json.dumps(metrics))
     (folder / "run.json").write_text(json.dumps(record))
     note("end")
