@@ -22,6 +22,7 @@ from src.models.horizon3d.ocsf import OCSF
 from src.models.horizon3d.output import Horizon3DOutput
 from src.models.layers.doppler import Doppler
 from src.models.layers.views import CameraViews
+from src.ops.branches import beside
 from src.ops.fixed_shapes import Capacities
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
@@ -97,11 +98,14 @@ class Horizon3D(Detector):
 
     def detect(self, batch: FrameBatch, warped_memory: WarpedMemory | None) -> Horizon3DOutput:
         """What `forward` makes of a batch and of the memory brought to its time; None for single frames."""
-        radar_bev = fused = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
         views = kggi = ocsf = None
+        with beside(batch.device) as join_images:
+            if self.image_encoder is not None:
+                views = CameraViews.encode(self.image_encoder, batch)
+        radar_bev = fused = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
         doppler = self._measure_doppler(batch)
-        if self.image_encoder is not None:
-            views = CameraViews.encode(self.image_encoder, batch)
+        join_images()
+        if views is not None:
             kggi = self.kggi(radar_bev, views, warped_memory.history if warped_memory is not None else None)
             ocsf = self.ocsf(kggi.gaussians, radar_bev, views, doppler["gaussians"])
             fused = ocsf.fused_bev

@@ -16,9 +16,10 @@ DTYPES = (torch.float32, torch.float16, torch.bfloat16)
 # Output rows a program computes, and rows it multiplies at a time for the gradient of the weights.
 ROWS = 64
 PAIRS = 64
-# Tile edges: powers of two from 16, the least a tensor core takes, to what three stages keep in shared memory.
+# Tile edges: powers of two from 16, the least a tensor core takes, to what three stages keep in shared memory, and a
+# program in registers without spilling one (sm_80, sm_86).
 LEAST_TILE = 16
-MOST_OUT = 128
+MOST_OUT = {torch.float32: 64, torch.float16: 128, torch.bfloat16: 128}
 MOST_DEPTH = {torch.float32: 32, torch.float16: 64, torch.bfloat16: 64}
 MOST_SQUARE = 64
 # The table is cut into about this many spans of a tap's rows, each with a partial gradient of the weights, but into
@@ -80,7 +81,7 @@ def _product(
     out = rows.new_empty(num, c_out)
     if out.numel() == 0:
         return out
-    depth, width = _tile(c_in, MOST_DEPTH[rows.dtype]), _tile(c_out, MOST_OUT)
+    depth, width = _tile(c_in, MOST_DEPTH[rows.dtype]), _tile(c_out, MOST_OUT[rows.dtype])
     with torch.cuda.device_of(rows):
         _gather_product[(triton.cdiv(num, ROWS), triton.cdiv(c_out, width))](
             rows,
@@ -237,5 +238,5 @@ def _upcast(rows: Tensor) -> bool:
 
 
 def _precision() -> str:
-    """Precision of float32 products, as set by `torch.set_float32_matmul_precision`."""
-    return "ieee" if torch.get_float32_matmul_precision() == "highest" else "tf32"
+    """Precision of float32 products: that of torch's convolutions, TF32 unless it is switched off."""
+    return "tf32" if torch.backends.cudnn.conv.fp32_precision == "tf32" else "ieee"

@@ -1,5 +1,6 @@
 """The whole single-frame model: one forward and backward, empty inputs, sample isolation, sizes."""
 
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 
@@ -38,6 +39,22 @@ def test_named_terms_add_up_and_decode_gives_one_entry_per_sample(make_model, ma
 def test_every_parameter_learns_within_two_steps(make_model, make_batch, changes):
     model, batch = make_model(**changes), make_batch(boxes=(12, 12))  # every class, hence every branch of the head
     assert parameters_that_stay(model, batch, lr=1e-2) == []
+
+
+def test_images_are_joined_before_gaussians_look_at_them(make_model, make_batch, monkeypatch):
+    model, batch, order = make_model(), make_batch(), []
+
+    @contextmanager
+    def noted(device):
+        order.append("branch")
+        yield lambda: order.append("join")
+        order.append("main")
+
+    monkeypatch.setattr("src.models.horizon3d.model.beside", noted)
+    for name in ("image_encoder", "radar_encoder", "kggi"):
+        getattr(model, name).register_forward_pre_hook(lambda *_, name=name: order.append(name))
+    model(batch)
+    assert order == ["branch", "image_encoder", "main", "radar_encoder", "join", "kggi"]
 
 
 @pytest.mark.slow

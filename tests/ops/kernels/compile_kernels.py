@@ -1,8 +1,11 @@
-"""Compile every kernel for a GPU that need not be there, and print their names; run by test_without_a_gpu.py.
+"""Compile every kernel for a GPU that need not be there; run by test_without_a_gpu.py.
+
+Prints a line of JSON for each: its name, bytes of shared memory, and whether it multiplies on tensor cores.
 
 The operations run up to their launches on tensors of the CPU, which fill nothing: only shapes and types matter.
 """
 
+import json
 import sys
 
 import torch
@@ -46,7 +49,8 @@ def compile_only(launch):
     def run(self, *arguments, grid, warmup, **options):
         kernel = launch(self, *arguments, grid=grid, warmup=True, **options)
         assert kernel.asm["cubin"]
-        print(self.__name__)
+        products = "mma" in kernel.asm["ptx"]
+        print(json.dumps({"kernel": self.__name__, "shared": kernel.metadata.shared, "tensor_cores": products}))
 
     return run
 
@@ -66,7 +70,7 @@ def main():
     neighbour_table_triton.neighbour_table_triton(*(torch.arange(size) for size in (80, 80, 9)))
     neighbour_table_triton.turned_table_triton(torch.zeros(9, 80, dtype=torch.int32), 80)
     kernel_map = submanifold_map(Sites.from_linear(torch.arange(80), (1, 8, 10)), 3)
-    for dtype, c_in, c_out in ((torch.float32, 5, 16), (torch.bfloat16, 96, 128)):
+    for dtype, c_in, c_out in ((torch.float32, 5, 16), (torch.float32, 96, 128), (torch.bfloat16, 96, 128)):
         features, weight = torch.zeros(80, c_in, dtype=dtype), torch.zeros(9, c_in, c_out, dtype=dtype)
         inputs = [features.requires_grad_(), weight.requires_grad_()]
         out = sparse_conv_triton.sparse_conv_triton(*inputs, kernel_map, torch.zeros(c_out, dtype=dtype))

@@ -21,6 +21,7 @@ def device(request, monkeypatch):
     if find_spec("triton") is None:
         pytest.skip("Triton is not installed")
     monkeypatch.setattr(backend, "_chosen", "triton")
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
     for operation, name in backend.KERNELS.items():
         module, fallback = importlib.import_module(name), f"{operation}_reference"
         assert backend.implementation(getattr(module, fallback)) is getattr(module, f"{operation}_triton")

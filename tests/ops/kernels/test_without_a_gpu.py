@@ -1,5 +1,6 @@
 """The kernels where there is no GPU: their tests through Triton's interpreter, and their machine code for GPUs."""
 
+import json
 import os
 import re
 import subprocess
@@ -44,11 +45,22 @@ def test_the_interpreter_passes_the_tests_of_the_kernels():
 
 
 @pytest.mark.slow
-def test_the_compiler_takes_the_kernels(tmp_path):
+@pytest.mark.parametrize(("capability", "shared_bytes"), [("80", 163 * 1024), ("86", 99 * 1024), ("90", 227 * 1024)])
+def test_the_compiler_takes_the_kernels(capability, shared_bytes, tmp_path):
     """The interpreter forgives what the compiler does not; Triton compiles for a GPU without having one."""
-    done = python("tests/ops/kernels/compile_kernels.py", "90", TRITON_CACHE_DIR=str(tmp_path))
+    done = python(
+        *("tests/ops/kernels/compile_kernels.py", capability),
+        TRITON_CACHE_DIR=str(tmp_path),
+        TRITON_DUMP_PTXAS_LOG="1",
+    )
     assert done.returncode == 0, done.stderr
-    assert len(set(done.stdout.split())) == 17, done.stdout
+    kernels = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    assert len({kernel["kernel"] for kernel in kernels}) == 17, done.stdout
+    assert max(kernel["shared"] for kernel in kernels) <= shared_bytes
+    multiply = {kernel["kernel"] for kernel in kernels if kernel["tensor_cores"]}
+    assert multiply == {"_gather_product", "_span_product"}
+    spilled = re.findall(r"(\d+) bytes spill stores", done.stdout)
+    assert len(spilled) >= 17 and set(spilled) == {"0"}, done.stdout
 
 
 @pytest.mark.slow
