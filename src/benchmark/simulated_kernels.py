@@ -141,7 +141,8 @@ def _move_gaussians(
     means: Tensor, scales: Tensor, turns: Tensor, speeds: Tensor, valid: Tensor, matrices: Tensor, elapsed: Tensor,
     usable: Tensor, out: Tensor, moved: Tensor, *rest: float, DRIVEN: bool,
 ) -> None:  # fmt: skip
-    shapes, least = (means, scales, turns, speeds), rest[-1] if DRIVEN else None
+    shapes = tuple(x.view(*valid.shape, 2) for x in (means, scales, turns, speeds))
+    least = rest[-1] if DRIVEN else None
     found = moved_gaussians_reference(shapes, valid > 0, matrices, elapsed, usable > 0, least, _grid(*rest[6:11]))
     out.copy_(torch.stack(found[0]))
     moved.copy_(found[1])

@@ -58,7 +58,7 @@ def moved_gaussians_triton(
         with torch.cuda.device_of(valid):
             _move_gaussians[(triton.cdiv(total, GAUSSIANS),)](
                 *(*rows, valid.contiguous().view(torch.uint8), aug_from_past.contiguous(), elapsed_s.contiguous()),
-                *(usable.contiguous().view(torch.uint8), out, moved, total, num, *(x.stride(1) for x in rows)),
+                *(usable.contiguous().view(torch.uint8), out, moved, total, num, *(x.stride(0) for x in rows)),
                 *(grid.rows, grid.cols, grid.x_min_m, grid.y_min_m, grid.cell_m, *grid.centre_m),
                 0.0 if min_speed_mps is None else min_speed_mps,
                 DRIVEN=min_speed_mps is not None,
@@ -70,10 +70,10 @@ def moved_gaussians_triton(
 
 def _rows(
     pairs: Tensor,  # [N, n, 2]
-) -> Tensor:  # [N, n, 2]
-    """The same with all rows one step apart: columns of one tensor are, and are not copied."""
-    step = pairs.stride(1)
-    return pairs if pairs.stride() == (pairs.shape[1] * step, step, 1) else pairs.contiguous()
+) -> Tensor:  # [N * n, 2], the pair of each row side by side
+    """Columns of one tensor are not copied."""
+    rows = pairs.flatten(0, 1)
+    return rows if rows.stride(1) == 1 else rows.contiguous()
 
 
 @triton.jit
