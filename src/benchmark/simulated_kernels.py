@@ -10,6 +10,7 @@ import importlib
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from inspect import signature
 from types import ModuleType
 from typing import Any
 from unittest.mock import patch
@@ -21,13 +22,17 @@ from torch import Tensor
 from src.benchmark.simulated_device import SimTensor, count_launch, host_values
 from src.geometry.bev_grid import BEVGrid
 from src.ops import backend, conv_relu
+from src.ops.box_codes import decoded_boxes_reference
+from src.ops.candidate_ranks import ranked_candidates_reference, ranks_of_scores
 from src.ops.deform_sample import attend_cells_reference, attend_views_reference
 from src.ops.farthest_point import farthest_points_reference
+from src.ops.frame_motion import moved_gaussians_reference, relative_motion_reference
 from src.ops.gaussian_shapes import AttributeLimits, refined_attributes_reference, sampling_points_reference
 from src.ops.moved_keys import moved_keys_reference
 from src.ops.neighbour_table import neighbour_table_reference, turned_table_reference
-from src.ops.radial_change import radial_change_reference
+from src.ops.radial_change import radial_change_reference, radial_votes_reference
 from src.ops.splat import log1mexp
+from src.ops.summed_norm import relu_norm_columns_reference, summed_norm_reference
 from src.ops.view_samples import view_places_reference, view_weights_reference
 
 
@@ -67,13 +72,15 @@ class _Launcher:
 
     def __init__(self, name: str, function: Callable[..., None] | None) -> None:
         self.name, self.function = name, function
+        parameters = signature(function).parameters.values() if function is not None else ()
+        self.asked = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY]
 
     def __getitem__(self, grid: tuple[int, ...]) -> Callable[..., None]:
         def launch(*args: Any, **options: Any) -> None:
             count_launch(self.name, grid, *args)
             if self.function is not None:
                 with torch.no_grad(), torch.utils._python_dispatch._disable_current_modes():
-                    self.function(*host_values(args))
+                    self.function(*host_values(args), **{name: options[name] for name in self.asked})
 
         return launch
 
@@ -97,10 +104,83 @@ def _move(keys: Tensor, plan: Tensor, taps: Tensor, out: Tensor, num: int, old_s
     out.copy_(moved_keys_reference(keys, (old_step, new_step), axes, shifts))
 
 
+def _vote(points: Tensor, batch: Tensor, keys: Tensor, weighted: Tensor, num: int, width: int, *rest: float) -> None:
+    for out, values in zip((keys, weighted), radial_votes_reference(points, batch, _grid(*rest[:5])), strict=True):
+        out.copy_(values)
+
+
 def _nearest_radial(
     velocities: Tensor, cells: Tensor, keys: Tensor, measured: Tensor, out: Tensor, *rest: float
 ) -> None:
     out.copy_(radial_change_reference(velocities, cells, keys, measured, _grid(*rest[3:8]), rest[-1]))
+
+
+def _decode(
+    codes: Tensor, rows: Tensor, indices: Tensor, labels: Tensor, scores: Tensor, rules: Tensor, keys: Tensor,
+    measured: Tensor, out: Tensor, num: int, width: int, classes: int, keys_num: int, steps: int, *rest: float,
+    MEASURED: bool, TURNED: bool,
+) -> None:  # fmt: skip
+    radar = (keys, measured) if MEASURED else None
+    table = tuple(map(tuple, rules.tolist()))
+    out.copy_(
+        decoded_boxes_reference(codes, rows, indices, labels, scores, rest[5], _grid(*rest[:5]), table, radar, TURNED)
+    )
+
+
+def _relate(
+    now: Tensor, now_s: Tensor, aug: Tensor, poses: Tensor, times: Tensor, present: Tensor, matrix: Tensor,
+    elapsed: Tensor, flags: Tensor, *sizes: int, NEWEST: bool, MAX_AGE: float, MAX_SPEED: float,
+) -> None:  # fmt: skip
+    there = present.view(times.shape) > 0
+    found = relative_motion_reference((now, now_s), aug, (poses, times), there, MAX_AGE, MAX_SPEED, NEWEST)
+    for out, values in zip((flags[0], matrix, elapsed, flags[1]), found, strict=True):
+        out.copy_(values.view(out.shape))
+
+
+def _move_gaussians(
+    means: Tensor, scales: Tensor, turns: Tensor, speeds: Tensor, valid: Tensor, matrices: Tensor, elapsed: Tensor,
+    usable: Tensor, out: Tensor, moved: Tensor, *rest: float, DRIVEN: bool,
+) -> None:  # fmt: skip
+    shapes = tuple(x.view(*valid.shape, 2) for x in (means, scales, turns, speeds))
+    least = rest[-1] if DRIVEN else None
+    found = moved_gaussians_reference(shapes, valid > 0, matrices, elapsed, usable > 0, least, _grid(*rest[6:11]))
+    out.copy_(torch.stack(found[0]))
+    moved.copy_(found[1])
+
+
+def _sum_norm(
+    x: Tensor, added: Tensor, scale: Tensor, shift: Tensor, then: Tensor, embedded: Tensor, ages: Tensor, out: Tensor,
+    behind: Tensor, num: int, channels: int, own: int, columns: int, eps: float, *, ADDED: bool, RELU_FIRST: bool,
+    RELU_LAST: bool, THEN: bool, AGED: bool,
+) -> None:  # fmt: skip
+    if RELU_FIRST:
+        out.copy_(relu_norm_columns_reference(x.clone(), eps))
+        return
+    rest = (added if ADDED else None, RELU_LAST, then if THEN else None, (embedded, ages) if AGED else None)
+    normed, more = summed_norm_reference(x, (scale, shift), eps, *rest)
+    out.copy_(normed)
+    if more is not None:
+        behind.copy_(more)
+
+
+def _rank(
+    logits: Tensor, keys: Tensor, neighbours: Tensor, table: Tensor, ranks: Tensor, num: int, classes: int, end: int,
+    *, PEAKS: bool,
+) -> None:  # fmt: skip
+    scores = logits.sigmoid()
+    if PEAKS:
+        others = F.pad(scores, (0, 0, 1, 0), value=-torch.inf)[neighbours.long() + 1]  # [9, M, classes]
+        scores = scores * (scores == others.amax(0))
+    scores = scores.where((keys < end)[:, None], 0.0)
+    ranks.copy_(ranks_of_scores(scores, tuple(map(tuple, table.tolist()))))
+
+
+def _read_ranks(
+    ranks: Tensor, table: Tensor, scores: Tensor, rows: Tensor, labels: Tensor, num: int, of_group: int, classes: int
+) -> None:
+    found = ranked_candidates_reference(ranks, tuple(map(tuple, table.tolist())), classes)
+    for out, values in zip((scores, rows, labels), found, strict=True):
+        out.copy_(values)
 
 
 def _attend_cells(
@@ -199,12 +279,19 @@ def _segment_sum(values: Tensor, starts: Tensor) -> Tensor:
 KERNELS: dict[str, Callable[..., None] | None] = {
     "_attend_cells": _attend_cells,
     "_attend_level": _attend_level,
+    "_decode": _decode,
+    "_rank": _rank,
+    "_read_ranks": _read_ranks,
+    "_sum_norm": _sum_norm,
+    "_relate": _relate,
+    "_move_gaussians": _move_gaussians,
     "_spread": _spread,
     "_refine": _refine,
     "_place": _place,
     "_weigh": _weigh,
     "_sample": _sample,
     "_move": _move,
+    "_vote": _vote,
     "_nearest_radial": _nearest_radial,
     "_search": _search,
     "_gather_product": _gather_product,

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from src.errors import ConfigError, require_least
-from src.geometry.constants import constant, where_else
-from src.geometry.tensor_transforms import IDENTITY, invert_rigid
+from src.ops.frame_motion import relative_motion, relative_pose
 from src.structures.batch import MAX_EGO_SPEED_MPS, FrameBatch
 from src.structures.tensor_fields import TensorFields
 
@@ -51,37 +50,25 @@ class RememberedFrame(TensorFields):
 
         Not usable: an absent stream, a frame that is not in the past or older than `max_age_s`, a pose that jumped.
         """
-        ego_from_past, elapsed, driven = self._relative_pose(batch)
-        return self._usable_motion(batch, ego_from_past, elapsed, self.present & driven & (elapsed <= max_age_s))
+        return self._motion(batch, max_age_s, newest=False)[1]
 
     def stacked_motion(self, batch: FrameBatch, max_age_s: float) -> tuple[Tensor, Motion]:
         """Of T frames in one, newest first, each tensor with a leading axis [T]: which of them `FrameMemory.before`
         keeps for a stream [T, B] bool, and the `motion` of those.
         """
-        ego_from_past, elapsed, driven = self._relative_pose(batch)
-        past = self.present & (elapsed > 0)
-        kept = past & ~(past & ~driven)[:1]  # the newest tells whether the pose jumped
-        usable = kept & driven & (elapsed <= max_age_s)
-        return kept, self._usable_motion(batch, ego_from_past, elapsed, usable)
+        return self._motion(batch, max_age_s, newest=True)
 
-    @staticmethod
-    def _usable_motion(batch: FrameBatch, ego_from_past: Tensor, elapsed: Tensor, usable: Tensor) -> Motion:
-        matrix = batch.aug_from_ego.double() @ ego_from_past
-        # What is not usable must not carry NaN or huge numbers into arithmetic that is masked afterwards.
-        matrix = torch.where(usable[..., None, None], matrix, constant(IDENTITY, matrix.dtype, matrix.device))
-        return Motion(matrix.float(), where_else(usable, elapsed, 0.0).float(), usable)
+    def _motion(self, batch: FrameBatch, max_age_s: float, newest: bool) -> tuple[Tensor, Motion]:
+        now, past = (batch.global_from_ego, batch.timestamps_s), (self.global_from_ego, self.timestamps_s)
+        limits = (max_age_s, MAX_EGO_SPEED_MPS, newest)
+        kept, *motion = relative_motion(now, batch.aug_from_ego, past, self.present, *limits)
+        return kept, Motion(*motion)
 
     def jumped(self, batch: FrameBatch) -> Tensor:  # [B] bool
         """Streams whose pose jumped between this frame and the batch's, which is later."""
-        _, elapsed, driven = self._relative_pose(batch)
+        now, past = (batch.global_from_ego, batch.timestamps_s), (self.global_from_ego, self.timestamps_s)
+        _, elapsed, driven = relative_pose(now, past, MAX_EGO_SPEED_MPS)
         return self.present & (elapsed > 0) & ~driven
-
-    def _relative_pose(self, batch: FrameBatch) -> tuple[Tensor, Tensor, Tensor]:
-        """[B, 4, 4] and [B] s from here to the batch, float64, and whether a vehicle can drive it in that time [B]."""
-        ego_from_past = invert_rigid(batch.global_from_ego) @ self.global_from_ego
-        elapsed = batch.timestamps_s - self.timestamps_s
-        distance = ego_from_past[..., :3, 3].norm(dim=-1)
-        return ego_from_past, elapsed, (elapsed > 0) & (distance <= MAX_EGO_SPEED_MPS * elapsed)
 
     def select(
         self,
@@ -136,16 +123,6 @@ def motions(frames: Sequence[RememberedFrame], batch: FrameBatch, max_age_s: flo
     names = ("timestamps_s", "global_from_ego", "present")
     stacked = RememberedFrame(*(torch.stack([getattr(frame, name) for frame in frames]) for name in names))
     return stacked.motion(batch, max_age_s)
-
-
-def moving(
-    velocities: Tensor,  # [..., 2] m/s
-    min_speed_mps: float,
-) -> Tensor:  # [..., 2]
-    """The velocities, zero where they are slower: what stands must not drift on the error of its speed."""
-    if min_speed_mps == 0:
-        return velocities
-    return velocities * (velocities.norm(dim=-1, keepdim=True) >= min_speed_mps)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from src.errors import require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points, transform_vectors_xy
 from src.models.heads.query_head import QueryPrediction
-from src.models.memory import FrameMemory, RememberedFrame, TemporalConfig, motions, moving
+from src.models.memory import FrameMemory, RememberedFrame, TemporalConfig, motions
+from src.ops.frame_motion import moving
 from src.structures.batch import FrameBatch
 from src.structures.evidence import Evidence, WarpedPoints
 from src.structures.queries import SPEED_UNIT_MPS, UNKNOWN_LOGIT, Queries

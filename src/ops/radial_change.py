@@ -1,4 +1,4 @@
-"""What velocities change by when their radial part becomes the nearest measured one (method 1.4)."""
+"""Radial velocities that points measure around cells, and what they make of given ones (method 1.4)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import counting
+from src.geometry.constants import constant, counting, where_else
 from src.ops.backend import implementation
+from src.ops.moved_keys import NONE
 from src.ops.sites import rows_of_keys
 
 BIN_MPS = 6.0
@@ -16,8 +17,40 @@ NUM_BINS = 31
 """Bins of radial speed, which keep a mover, what stands beside it and an aliased value apart."""
 NEAR_BINS = 2
 """How far a prediction may be from the measured value it takes: 12 to 18 m/s, less than an aliased value is off."""
+WINDOW_CELLS = 2
+"""A cell knows the points of its 5x5 neighbourhood; their weight falls off linearly along both axes."""
+REACH = tuple(range(-WINDOW_CELLS, WINDOW_CELLS + 1))
+FALLOFF = tuple(WINDOW_CELLS + 1 - abs(offset) for offset in REACH)
 MIN_SPEED_MPS = 0.5
 """Below it a velocity is noise whose direction says nothing; the line of sight is then that from the ego's origin."""
+
+
+def radial_votes(
+    points: Tensor,  # [P, 7] x, y, z (m, aug frame), rcs (dB), vx, vy (m/s), dt (s)
+    batch: Tensor,  # [P] int64
+    grid: BEVGrid,
+) -> tuple[Tensor, Tensor]:  # [25 P] int64, [25 P, 3]
+    """What each point says of the cells around it: linear key * NUM_BINS + bin, and (1, vx, vy) times its weight.
+
+    The key is NONE outside the grid, and everywhere for a point outside. Without gradient.
+    """
+    return implementation(radial_votes_reference)(points, batch, grid)
+
+
+def radial_votes_reference(points: Tensor, batch: Tensor, grid: BEVGrid) -> tuple[Tensor, Tensor]:
+    """Plain torch form."""
+    xy, velocities = points[:, :2].float(), points[:, 4:6].float()
+    approach = (velocities * xy).sum(dim=1).sign()
+    bins = radial_bin(approach * velocities.norm(dim=1))
+    reach = constant(REACH, torch.int64, xy.device)
+    falloff = constant(tuple(float(a * b) for a in FALLOFF for b in FALLOFF), xy.dtype, xy.device)  # [25]
+    row, col = (places[:, None] + reach for places in grid.cell_of(xy).unbind(1))  # [P, 5] each
+    in_row, in_col = row == row.clamp(0, grid.rows - 1), col == col.clamp(0, grid.cols - 1)
+    within = in_row[:, :, None] & in_col[:, None] & grid.contains(xy)[:, None, None]  # [P, 5, 5]
+    linear = ((batch[:, None] * grid.rows + row) * grid.cols)[:, :, None] + col[:, None]
+    keys = where_else(within, linear * NUM_BINS + bins[:, None, None], NONE).flatten()
+    values = F.pad(velocities, (1, 0), value=1.0)  # [P, 3]
+    return keys, (values[:, None] * falloff[:, None]).flatten(0, 1)
 
 
 def radial_change(

@@ -15,9 +15,10 @@ from src.geometry.tensor_transforms import transform_points_xy, transform_vector
 from src.models.crt_fusion.motion_estimator import CellMotion
 from src.models.layers.dense import DenseConvNormReLU, MapConv2d, map_of_rows, rows_of_map
 from src.models.layers.norm import MapNorm
-from src.models.memory import FrameMemory, RememberedFrame, StoredRows, TemporalConfig, moving
+from src.models.memory import FrameMemory, RememberedFrame, StoredRows, TemporalConfig
 from src.ops.bilinear_scatter import bilinear_scatter
 from src.ops.concat_conv import concat_conv2d
+from src.ops.frame_motion import moving
 from src.ops.segment_reduce import topk_per_sample
 from src.structures.batch import FrameBatch
 

@@ -18,18 +18,19 @@ from src.losses.regression import masked_l1
 from src.models.detector import Objective
 from src.models.heads.branches import Branches, checkpointed_branches
 from src.models.heads.decode import (
+    ATTRIBUTE_RULES,
     AttributeSource,
     Suppression,
     allowed_attributes,
-    boxes_from_codes,
+    boxes_of_columns,
     learned_attributes,
-    rule_attributes,
     suppress,
     top_candidates,
 )
 from src.models.layers.dense import AllCells, DenseConvNormReLU
-from src.models.layers.doppler import Doppler, along_heading
+from src.models.layers.doppler import Doppler
 from src.models.layers.sparse import ConvNormReLU, SubmanifoldConv
+from src.ops.box_codes import ATTRIBUTE, decoded_boxes
 from src.ops.nms import maxpool_peaks
 from src.ops.segment_reduce import segment_count
 from src.structures.boxes import Boxes3D
@@ -255,13 +256,29 @@ class CenterHead(nn.Module):
         else:
             groups = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts)).to(best.rows.device)
             codes = output.codes[best.rows, groups]
-        codes = decoded_codes(output, codes, best.rows)
-        boxes = boxes_from_codes(cells[best.rows, 1:], codes[:, :CODE_SIZE], best.labels, best.scores, self.grid)
-        if self.learned:
-            boxes.attributes = learned_attributes(codes[:, CODE_SIZE:], best.labels)
-        else:
-            boxes.attributes = rule_attributes(boxes)
+        boxes = boxes_of_columns(self.columns(output, codes, best.rows, best.labels, best.scores))
         return suppress(boxes, best.counts, self.config.nms, self.config.max_boxes)
+
+    def columns(
+        self,
+        output: HeadOutput,
+        codes: Tensor,  # [n, CODE_SIZE (+ 11)]
+        rows: Tensor,  # [n] int64, cells
+        labels: Tensor,  # [n] int64
+        scores: Tensor,  # [n]
+    ) -> Tensor:  # [n, sum of WIDTHS]
+        """Boxes as `decoded_boxes`, of learned attributes where the head has them.
+
+        With measured velocities, along the heading if the radar's reader wants it.
+        """
+        doppler, threshold = output.doppler, self.config.score_threshold
+        radar = None if doppler is None else (doppler.keys, doppler.velocities)
+        turned = doppler is not None and doppler.along_heading
+        cells = (rows, output.bev.indices, labels, scores)
+        found = decoded_boxes(codes, *cells, threshold, self.grid, ATTRIBUTE_RULES, radar, turned)
+        if self.learned:
+            found[:, ATTRIBUTE] = learned_attributes(codes[:, CODE_SIZE:], labels).to(found.dtype)
+        return found
 
 
 def measured_codes(
@@ -274,20 +291,6 @@ def measured_codes(
         return codes
     before, velocities, after = codes.split([CODE_SIZE - 2, 2, codes.shape[1] - CODE_SIZE], dim=1)
     return torch.cat([before, output.doppler.impose(velocities, output.bev.sites.linear()[rows]), after], dim=1)
-
-
-def decoded_codes(
-    output: HeadOutput,
-    codes: Tensor,  # [n, CODE_SIZE (+ 11)]
-    rows: Tensor,  # [n] int64, cells
-) -> Tensor:  # [n, CODE_SIZE (+ 11)]
-    """Codes as boxes are read from them: with measured velocities, along the heading if the radar's reader wants it."""
-    codes, doppler = measured_codes(output, codes, rows), output.doppler
-    if doppler is None or not doppler.along_heading:
-        return codes
-    before, heading, velocities, after = codes.split([CODE_SIZE - 4, 2, 2, codes.shape[1] - CODE_SIZE], dim=1)
-    positions = doppler.grid.centre_of(output.bev.indices[rows, 1:])
-    return torch.cat([before, heading, along_heading(velocities, heading, positions), after], dim=1)
 
 
 def _attribute_loss(logits: Tensor, targets: HeadTargets) -> Tensor:

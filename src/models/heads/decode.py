@@ -11,6 +11,7 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant, on_device
+from src.ops.box_codes import WIDTHS, attributes_by_rule, box_geometry
 from src.ops.nms import conflicting_pairs, greedy_survivors
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import ATTRIBUTES, CLASS_ATTRIBUTE_PREFIX, CLASS_RANGE_M, CLASSES
@@ -19,10 +20,7 @@ from src.targets.heatmap import GROUP_OF_CLASS, HEAD_GROUPS
 MAX_CANDIDATES_PER_GROUP = 500
 """Best (cell, class) scores of a group; the public limit of 1000 before NMS lies above it and never binds."""
 MAX_BOXES_PER_GROUP = 83
-LOG_SIZE_LIMIT = 5.0
 ROTATED_IOU = 0.2
-MOVING_MPS = 0.2
-OVERHEAD_M = 3.5
 
 GROUP_COLUMNS = tuple(CLASSES.index(name) for group in HEAD_GROUPS for name in group)
 """Classes in the order of the groups."""
@@ -51,8 +49,20 @@ def _attribute_of_classes(pedestrian: str, cycle: str, **vehicles: str) -> tuple
     return tuple(table)
 
 
-MOVING_ATTRIBUTES = _attribute_of_classes("moving", "with_rider", vehicle="moving")
 STILL_ATTRIBUTES = _attribute_of_classes("standing", "without_rider", vehicle="parked", bus="stopped")
+MOVING_ATTRIBUTES = _attribute_of_classes("moving", "with_rider", vehicle="moving")
+OVERHANGING = tuple(
+    ATTRIBUTES.index("traffic_sign.overhanging") if name == "traffic_sign" else None for name in CLASSES
+)
+ATTRIBUTE_RULES = (
+    STILL_ATTRIBUTES,
+    MOVING_ATTRIBUTES,
+    *(
+        tuple(own if high is None else high for own, high in zip(low, OVERHANGING, strict=True))
+        for low in (STILL_ATTRIBUTES, MOVING_ATTRIBUTES)
+    ),
+)
+"""Rules of `attributes_by_rule`: signs are overhanging where their lower edge is above 3.5 m."""
 
 
 class Suppression(Enum):
@@ -123,17 +133,32 @@ def boxes_from_codes(
     scores: Tensor,  # [n]
     grid: BEVGrid,
 ) -> Boxes3D:
-    """Invert the box code: x = (col + dx) * cell + x_min, sizes = exp(clamp(., -5, 5)), yaw = atan2(sin, cos)."""
-    lower = constant((grid.x_min_m, grid.y_min_m), codes.dtype, codes.device)
-    xy = (cells.flip(1).to(codes.dtype) + codes[:, :2]) * grid.cell_m + lower
+    """Boxes by `box_geometry`; attributes are not set."""
+    centers, sizes, yaws = box_geometry(cells, codes, grid)
     return Boxes3D(
-        centers=torch.cat([xy, codes[:, 2:3]], dim=1),
-        sizes=codes[:, 3:6].clamp(-LOG_SIZE_LIMIT, LOG_SIZE_LIMIT).exp(),
-        yaws=torch.atan2(codes[:, 7], codes[:, 6]),
+        centers=centers,
+        sizes=sizes,
+        yaws=yaws,
         velocities=codes[:, 8:10],
         labels=labels,
         attributes=torch.full_like(labels, -1),
         scores=scores,
+    )
+
+
+def boxes_of_columns(
+    columns: Tensor,  # [n, sum of WIDTHS]
+) -> Boxes3D:
+    """What `decoded_boxes` gives."""
+    centers, sizes, yaws, velocities, scores, labels, attributes, _ = columns.split(WIDTHS, dim=1)
+    return Boxes3D(
+        centers=centers,
+        sizes=sizes,
+        yaws=yaws.squeeze(1),
+        velocities=velocities,
+        labels=labels.squeeze(1).long(),
+        attributes=attributes.squeeze(1).long(),
+        scores=scores.squeeze(1),
     )
 
 
@@ -178,12 +203,8 @@ def suppress(
 def rule_attributes(
     boxes: Boxes3D,
 ) -> Tensor:  # [K] int64, -1 for none
-    """Attributes from the speed (table of method 7); signs are overhanging where their lower edge is above 3.5 m."""
-    labels = boxes.labels
-    moving, still = constant((MOVING_ATTRIBUTES, STILL_ATTRIBUTES), labels.dtype, labels.device)
-    chosen = torch.where(boxes.velocities.norm(dim=1) > MOVING_MPS, moving[labels], still[labels])
-    overhead = (labels == CLASSES.index("traffic_sign")) & (boxes.centers[:, 2] - 0.5 * boxes.sizes[:, 2] > OVERHEAD_M)
-    return torch.where(overhead, ATTRIBUTES.index("traffic_sign.overhanging"), chosen)
+    """Attributes from the speed (table of method 7)."""
+    return attributes_by_rule(boxes.velocities, boxes.centers, boxes.sizes, boxes.labels, ATTRIBUTE_RULES)
 
 
 def allowed_attributes(device: torch.device) -> Tensor:  # [12, 11] bool

@@ -5,24 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.geometry.constants import constant, counting, where_else
-from src.models.heads.center_head import CenterHead, HeadOutput, decoded_codes
+from src.models.heads.center_head import CenterHead, HeadOutput
 from src.models.heads.decode import (
     MAX_BOXES_PER_GROUP,
     MAX_CANDIDATES_PER_GROUP,
     Suppression,
-    boxes_from_codes,
-    learned_attributes,
-    rule_attributes,
+    boxes_of_columns,
     suppress,
 )
-from src.ops.nms import maxpool_peaks
+from src.ops.candidate_ranks import candidate_ranks, ranked_candidates
+from src.ops.sites import Sites
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CLASSES
-from src.targets.heatmap import CODE_SIZE, HEAD_GROUPS
+from src.targets.heatmap import HEAD_GROUPS
 
 MOST_CLASSES = max(len(group) for group in HEAD_GROUPS)
 CLASS_TABLE = tuple(
@@ -30,9 +27,6 @@ CLASS_TABLE = tuple(
     for group in HEAD_GROUPS
 )
 """Classes of every group; where there is none, a column behind the last."""
-RANK_BITS = 31
-WIDTHS = (3, 3, 1, 2, 1, 1, 1, 1)
-"""Centre, size, yaw, velocity, score, label, attribute, and whether there is such a box."""
 
 
 class FixedDecode(nn.Module):
@@ -53,23 +47,12 @@ class FixedDecode(nn.Module):
     @torch.no_grad()
     def forward(self, output: HeadOutput) -> Tensor:  # [groups, n, sum of WIDTHS] float32
         """Candidates of every group, best first; those with score 0 at the end are none."""
-        sites, scores = output.bev.sites, output.logits.sigmoid()
-        if self.peaks:
-            scores = scores * maxpool_peaks(scores, sites)
-        scores = where_else((sites.keys < sites.end)[:, None], scores, 0.0)  # padding may hold what is not finite
-        best, rows, labels = best_candidates(scores, min(self.count, MOST_CLASSES * len(scores)))  # [groups, n] each
+        count = min(self.count, MOST_CLASSES * len(output.logits))
+        best, rows, labels = best_candidates(output.logits, output.bev.sites, count, self.peaks)  # [groups, n] each
         codes = self._regress(output.bev.features.index_select(0, rows.flatten()).unflatten(0, rows.shape))
         rows, labels, best = rows.flatten(), labels.flatten(), best.flatten()
-        codes = decoded_codes(output, codes.flatten(0, 1), rows)
-        cells = output.bev.indices.index_select(0, rows)[:, 1:]
-        boxes = boxes_from_codes(cells, codes[:, :CODE_SIZE], labels, best, self.head.grid)
-        if self.head.learned:
-            attributes = learned_attributes(codes[:, CODE_SIZE:], labels)
-        else:
-            attributes = rule_attributes(boxes)
-        single = (boxes.scores, labels, attributes, boxes.scores > self.head.config.score_threshold)
-        columns = (boxes.centers, boxes.sizes, boxes.yaws[:, None], boxes.velocities, *(x[:, None] for x in single))
-        return torch.cat([column.float() for column in columns], dim=1).unflatten(0, (len(HEAD_GROUPS), -1))
+        found = self.head.columns(output, codes.flatten(0, 1), rows, labels, best)
+        return found.float().unflatten(0, (len(HEAD_GROUPS), -1))
 
     def _regress(
         self,
@@ -87,32 +70,16 @@ class FixedDecode(nn.Module):
         """What is left of them, best first."""
         counts = [[count] for count in (candidates[..., -1] > 0).sum(1).tolist()]
         found = candidates[candidates[..., -1] > 0]
-        centers, sizes, yaws, velocities, scores, labels, attributes, _ = found.split(WIDTHS, dim=1)
-        boxes = Boxes3D(
-            centers=centers,
-            sizes=sizes,
-            yaws=yaws.squeeze(1),
-            velocities=velocities,
-            labels=labels.squeeze(1).long(),
-            attributes=attributes.squeeze(1).long(),
-            scores=scores.squeeze(1),
-        )
-        (kept,) = suppress(boxes, counts, self.head.config.nms, self.head.config.max_boxes)
+        (kept,) = suppress(boxes_of_columns(found), counts, self.head.config.nms, self.head.config.max_boxes)
         return kept
 
 
 def best_candidates(
-    scores: Tensor,  # [M, classes]
+    logits: Tensor,  # [M, classes]
+    sites: Sites,
     count: int,
+    peaks: bool = False,
 ) -> Sequence[Tensor]:  # [groups, count] each: float32; int64, row; int64, index into CLASSES
     """The best (cell, class) pairs of every group in descending order, ties by cell and class."""
-    table = constant(CLASS_TABLE, torch.int64, scores.device)
-    by_group = F.pad(scores.float(), (0, 1)).index_select(1, table.flatten())  # [M, groups * MOST_CLASSES]
-    by_group = by_group.unflatten(1, table.shape).transpose(0, 1).flatten(1)  # [groups, M * MOST_CLASSES]
-    # Scores are not negative, so their bits are in their order; less the place, so that the first comes first.
-    place = counting(by_group.shape[1], torch.int64, scores.device)
-    ranks = (by_group.contiguous().view(torch.int32).long() << RANK_BITS) - place
-    places = -ranks.topk(count, dim=1).values & (2**RANK_BITS - 1)
-    rows = torch.div(places, MOST_CLASSES, rounding_mode="floor")
-    labels = table.gather(1, places - rows * MOST_CLASSES).clamp(max=scores.shape[1] - 1)
-    return by_group.gather(1, places), rows, labels
+    ranks = candidate_ranks(logits, sites, CLASS_TABLE, peaks).topk(count, dim=1).values
+    return ranked_candidates(ranks, CLASS_TABLE, logits.shape[1])

@@ -17,8 +17,9 @@ from src.models.layers.doppler import Doppler
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.merging import block_diagonal, joined_convs
 from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv, TemporalConv
-from src.models.memory import motions, moving
+from src.models.memory import motions
 from src.ops.fixed_shapes import fixed_shapes
+from src.ops.frame_motion import moving
 from src.ops.segment_reduce import segment_mean, topk_per_sample
 from src.ops.sites import Sites
 from src.structures.batch import FrameBatch

@@ -8,11 +8,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.models.heads.fixed_decode import WIDTHS, FixedDecode
+from src.models.heads.fixed_decode import FixedDecode
 from src.models.horizon3d.dptf_memory import Memory
 from src.models.horizon3d.fixed_memory import FixedMemory
 from src.models.horizon3d.gaussian_path import Sampling
 from src.models.horizon3d.splatting import FAR_M
+from src.ops.box_codes import WIDTHS
 from src.ops.fixed_shapes import Capacities, FixedShapes, in_fixed_shapes
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D

@@ -15,7 +15,8 @@ from src.models.horizon3d.dptf import DPTF, WarpedMemory
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
 from src.models.horizon3d.gaussian_path import GaussianPath
 from src.models.horizon3d.output import Horizon3DOutput
-from src.models.memory import Motion, RememberedFrame, moving
+from src.models.memory import Motion, RememberedFrame
+from src.ops.frame_motion import moving
 from src.structures.batch import FrameBatch
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV

@@ -18,12 +18,14 @@ from src.models.layers.doppler import Doppler
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.image_attention import ImageCrossAttention, attention_linear, linear_relu_norm
 from src.models.layers.merging import LinearReLU, block_diagonal, joined_linear, with_relu
+from src.models.layers.norm import layer_norm
 from src.models.layers.sparse import SubmanifoldConv
 from src.models.layers.views import CameraViews
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.gaussian_shapes import AttributeLimits, activated_attributes, refined_attributes, sampling_points
 from src.ops.segment_reduce import segment_mean
 from src.ops.sites import Sites
+from src.ops.summed_norm import relu_norm_columns, summed_norm
 from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV
 
@@ -159,9 +161,8 @@ class MergedEmbeddings(nn.Module):
         """Products over all parts at once."""
         parts, channels = self.weights.shape[:2]
         hidden = F.layer_norm(self.first(x).view(-1, parts, channels), (channels,), eps=self.eps)
-        hidden = torch.baddbmm(self.biases, hidden.transpose(0, 1), self.weights).relu_()  # [K, B * G, C]
-        hidden = F.layer_norm(hidden, (channels,), eps=self.eps)
-        return self.behind(hidden.transpose(0, 1).reshape(*x.shape[:2], parts * channels))
+        hidden = torch.baddbmm(self.biases, hidden.transpose(0, 1), self.weights)  # [K, B * G, C]
+        return self.behind(relu_norm_columns(hidden, self.eps).unflatten(0, x.shape[:2]))
 
 
 class SelfEncoding(nn.Module):
@@ -212,7 +213,7 @@ class SelfEncoding(nn.Module):
         x = SparseBEV(sites, segment_mean(features, rows, len(sites)))
         for conv, norm in zip(self.convs, self.norms, strict=True):
             x = conv(x)
-            x = x.with_features(norm(x.features).relu())
+            x = x.with_features(layer_norm(norm, x.features, relu=True))
         return self.output(x.features).index_select(0, rows)
 
 
@@ -315,14 +316,16 @@ class EncoderLayer(nn.Module):
         points = self.sampling_points(query, gaussians)
         x = f + self.radar_attention(query, points, radar_bev)
         if self.chained_attention:
-            x = x + self.image_attention(x, x + embedding, points, views, values)
+            seen = self.image_attention(x, x + embedding, points, views, values)
         else:
-            x = x + self.image_attention(f, query, points, views, values)
-        x = self.norms[0](x)
-        x = attended = self.norms[1](x + self.feed_forward[0](x))
-        x = self.norms[2](x + self.self_encoding(x, gaussians, picks))
-        x = self.norms[3](x + self.feed_forward[1](x))
-        refined = self.refinement((attended if self.refine_before_self_encoding else x) + embedding, gaussians)
+            seen = self.image_attention(f, query, points, views, values)
+        x = layer_norm(self.norms[0], x, seen)
+        x = attended = layer_norm(self.norms[1], x, self.feed_forward[0](x))
+        x = layer_norm(self.norms[2], x, self.self_encoding(x, gaussians, picks))
+        last = self.norms[3]
+        affine, shaped = (last.weight, last.bias), None if self.refine_before_self_encoding else embedding
+        x, query = summed_norm(x, affine, last.eps, self.feed_forward[1](x), then=shaped)
+        refined = self.refinement(attended + embedding if query is None else query, gaussians)
         return replace(refined, features=x)
 
 

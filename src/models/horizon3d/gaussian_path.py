@@ -12,11 +12,12 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import where_else
+from src.geometry.constants import constant, where_else
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.time_embedding import TimeEmbedding
-from src.models.memory import Motion, motions, moving
+from src.models.memory import Motion, motions
 from src.ops.farthest_point import farthest_points
+from src.ops.frame_motion import moved_gaussians
 from src.structures.batch import FrameBatch
 from src.structures.gaussians import GaussianSet, Source
 
@@ -121,16 +122,22 @@ class GaussianPath(nn.Module):
         min_speed_mps: float,
     ) -> GaussianSet:  # [B, T * n]
         """Remembered Gaussians of T frames as history."""
-        elapsed = motion.elapsed_s.flatten()[:, None].expand_as(past.valid)
-        if self.config.velocity_compensation:
-            past = replace(past, means=past.means + moving(past.velocities, min_speed_mps) * elapsed[..., None])
-        moved = past.transform(motion.aug_from_past.flatten(0, 1))
-        valid = moved.valid & motion.usable.flatten()[:, None] & self.grid.contains(moved.means)
+        elapsed, speed = motion.elapsed_s.flatten(), min_speed_mps if self.config.velocity_compensation else None
+        shapes, valid = moved_gaussians(
+            (past.means, past.scales, past.directions, past.velocities),
+            past.valid,
+            *(motion.aug_from_past.flatten(0, 1), elapsed, motion.usable.flatten(), speed, self.grid),
+        )
+        means, scales, directions, velocities = shapes
+        elapsed = elapsed[:, None].expand_as(valid)
         moved = replace(
-            moved,
-            means=torch.where(valid[..., None], moved.means, self.centre_m),
+            past,
+            means=means,
+            scales=scales,
+            directions=directions,
+            velocities=velocities,
             features=past.features + self.time(elapsed),
-            sources=torch.full_like(past.sources, int(Source.HISTORY)),
+            sources=constant((int(Source.HISTORY),), past.sources.dtype, past.sources.device).expand_as(past.sources),
             elapsed_s=elapsed,
             valid=valid,
         )

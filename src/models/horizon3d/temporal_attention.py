@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.models.horizon3d.time_embedding import TimeEmbedding
+from src.ops.summed_norm import summed_norm
 from src.structures.gaussians import GaussianSet
 
 MASK_ALIGNMENT = 16
@@ -40,9 +41,9 @@ class TemporalSelfAttention(nn.Module):
         mask: Tensor | None = None,  # `attention_mask` of them, where the caller has it
     ) -> Tensor:  # [B, G, C], to be added to the features
         """q = k = f + e + time(dt), v = f; the time of the current frame counts as zero, not as an embedded zero."""
-        x = self.norm(features)
-        past = (gaussians.elapsed_s > 0)[..., None]
-        position = x + embedding + self.time(gaussians.elapsed_s) * past
+        norm, ages = self.norm, gaussians.elapsed_s
+        affine, past = (norm.weight, norm.bias), (self.time(ages), ages)
+        x, position = summed_norm(features, affine, norm.eps, then=embedding, aged=past)
         query, key = self.query_key(position).chunk(2, dim=-1)
         split = (self.num_heads, -1)
         heads = [part.unflatten(-1, split).transpose(1, 2) for part in (query, key, self.value(x))]  # [B, H, G, C/H]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Self
 
@@ -11,20 +10,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant, where_else
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.moved_keys import NONE
-from src.ops.radial_change import NUM_BINS, radial_bin, radial_change
+from src.ops.radial_change import radial_change, radial_votes
 from src.ops.segment_reduce import gather_segment_sum, segment_sum
-
-WINDOW_CELLS = 2
-"""A cell knows the points of its 5x5 neighbourhood; their weight falls off linearly along both axes."""
-MOVING_MPS = 1.0
-"""What is slower does not drive (CRT-Fusion's least speed)."""
-LEAST_COSINE = 0.3
-"""Between heading and line of sight; at a wider angle the radial part says too little of the speed."""
-REACH = tuple(range(-WINDOW_CELLS, WINDOW_CELLS + 1))
-FALLOFF = tuple(WINDOW_CELLS + 1 - abs(offset) for offset in REACH)
 
 
 @dataclass(kw_only=True)
@@ -65,25 +54,12 @@ class Doppler:
         along_heading: bool = False,
     ) -> Self:
         """Of all points inside the grid."""
-        fixed = fixed_shapes()
-        xy, velocities = radar_points[:, :2].float(), radar_points[:, 4:6].float()
-        approach = (velocities * xy).sum(dim=1).sign()
-        bins = radial_bin(approach * velocities.norm(dim=1))
-        reach = constant(REACH, torch.int64, xy.device)
-        falloff = constant(tuple(float(a * b) for a in FALLOFF for b in FALLOFF), xy.dtype, xy.device)  # [25]
-        row, col = (places[:, None] + reach for places in grid.cell_of(xy).unbind(1))  # [P, 5] each
-        in_row, in_col = row == row.clamp(0, grid.rows - 1), col == col.clamp(0, grid.cols - 1)
-        within = in_row[:, :, None] & in_col[:, None] & grid.contains(xy)[:, None, None]  # [P, 5, 5]
-        linear = ((radar_batch[:, None] * grid.rows + row) * grid.cols)[:, :, None] + col[:, None]
-        given = (linear * NUM_BINS + bins[:, None, None]).flatten()  # [25 P]
-        values = F.pad(velocities, (1, 0), value=1.0)  # [P, 3]
-        weighted = (values[:, None] * falloff[:, None]).flatten(0, 1)
-        if fixed is not None:
-            given = where_else(within.flatten(), given, NONE)
+        given, weighted = radial_votes(radar_points, radar_batch, grid)
+        if (fixed := fixed_shapes()) is not None:
             keys = fixed.distinct(given, NONE, len(given))
             sums = segment_sum(weighted, torch.searchsorted(keys, given), len(keys))
             return cls(grid, keys, sums[:, 1:] / sums[:, :1].clamp(min=1.0), in_losses, along_heading)
-        chosen = within.flatten().nonzero().squeeze(1)
+        chosen = (given < NONE).nonzero().squeeze(1)
         keys, order = torch.sort(given.index_select(0, chosen), stable=True)
         keys, counts = torch.unique_consecutive(keys, return_counts=True)
         sums = gather_segment_sum(weighted, chosen.index_select(0, order), F.pad(counts.cumsum(0), (1, 0)))
@@ -101,21 +77,3 @@ class Doppler:
         """
         given = (velocities, cells, self.keys, self.velocities, self.grid)
         return velocities + radial_change(*given) if torch.is_grad_enabled() else radial_change(*given, added=True)
-
-
-def along_heading(
-    velocities: Tensor,  # [n, 2] m/s over ground
-    headings: Tensor,  # [n, 2] cosine and sine of the yaw, of any length
-    positions: Tensor,  # [n, 2] m from the ego's origin, same axes
-) -> Tensor:  # [n, 2] m/s
-    """Velocities of what drives, turned into its heading: they keep their radial part, or the part along the heading.
-
-    The latter where heading and line of sight are nearly at right angles. What is slow stays as it is, and what moves
-    more than 45 degrees away from its heading, where one of both is wrong.
-    """
-    heading, sight = F.normalize(headings, dim=1), F.normalize(positions, dim=1)
-    along, radial, cosine = ((a * b).sum(1) for a, b in ((velocities, heading), (velocities, sight), (heading, sight)))
-    speed = torch.where(cosine.abs() > LEAST_COSINE, radial / cosine, along)
-    stated = velocities.norm(dim=1)
-    drives = (stated > MOVING_MPS) & (along.abs() > math.sqrt(0.5) * stated)
-    return torch.where(drives[:, None], speed[:, None] * heading, velocities)

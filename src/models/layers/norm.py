@@ -1,9 +1,11 @@
-"""Batch norms that do not count their batches."""
+"""Batch norms that do not count their batches; layer norms with what stands around them."""
 
 from __future__ import annotations
 
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from src.ops.summed_norm import summed_norm
 
 
 class MapNorm(nn.BatchNorm2d):
@@ -26,3 +28,13 @@ def normalize(
     """
     statistics = (norm.running_mean, norm.running_var)
     return F.batch_norm(x, *statistics, norm.weight, norm.bias, norm.training, norm.momentum, norm.eps)
+
+
+def layer_norm(
+    norm: nn.LayerNorm,
+    x: Tensor,  # [..., C]
+    added: Tensor | None = None,  # [..., C]
+    relu: bool = False,
+) -> Tensor:  # [..., C]
+    """What the norm gives of x, or of its sum with `added`, and a ReLU if asked for: without gradient one launch."""
+    return summed_norm(x, (norm.weight, norm.bias), norm.eps, added, relu)[0]

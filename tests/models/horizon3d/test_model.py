@@ -12,12 +12,14 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models import FAMILIES, build_model
 from src.models.backbones.image import ImageEncoderConfig
-from src.models.heads.center_head import BoxOptions, decoded_codes
+from src.models.heads.center_head import BoxOptions
+from src.models.heads.decode import boxes_of_columns
 from src.models.horizon3d.kggi import Initialization
 from src.models.horizon3d.model import Horizon3D
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import CrossAttention, RefineFrom
-from src.models.layers.doppler import Doppler, along_heading
+from src.models.layers.doppler import Doppler
+from src.ops.box_codes import along_heading
 from src.structures.boxes import Boxes3D
 from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
 
@@ -179,6 +181,12 @@ def test_gaussian_velocity_is_supervised_in_phase_1_where_asked_for(make_model, 
     assert float(train_step(model, batch)[1]["gaussian_velocity"].detach()) == 0.0
 
 
+def boxes_of(model, output, codes):
+    """Of the same class and score in every cell."""
+    every = torch.arange(len(codes))
+    return boxes_of_columns(model.head.columns(output, codes, every, 0 * every, torch.ones(len(codes))))
+
+
 def test_velocities_are_those_that_the_radar_measures_along_the_line_of_sight(make_model, make_batch):
     """Of Gaussians and boxes of an untrained model, which says that all stands: wherever something is seen to stand."""
     model, batch = make_model(doppler=("gaussians", "boxes")), make_batch(boxes=(12, 12))
@@ -186,14 +194,14 @@ def test_velocities_are_those_that_the_radar_measures_along_the_line_of_sight(ma
     with torch.no_grad():
         output, _ = model.eval()(batch)
         every = torch.arange(len(output.head.bev))
-        codes = decoded_codes(output.head, model.head.regress(output.head, every, 0 * every), every)
+        boxes = boxes_of(model, output.head, model.head.regress(output.head, every, 0 * every))
     doppler = Doppler.measure(batch.radar_points, batch.radar_batch, model.grid)
     gaussians = output.ocsf.gaussians
     sample, _ = gaussians.valid.nonzero().unbind(1)
     row, col = model.grid.cell_of(gaussians.means[gaussians.valid]).unbind(1)
     for cells, velocities in (
         ((sample * model.grid.rows + row) * model.grid.cols + col, gaussians.velocities[gaussians.valid]),
-        (output.head.bev.sites.linear(), codes[:, 8:]),
+        (output.head.bev.sites.linear(), boxes.velocities),
     ):
         torch.testing.assert_close(doppler.impose(velocities, cells), velocities, atol=1e-4, rtol=0)
         assert (doppler.impose(0 * velocities, cells).norm(dim=1) > 0.3).sum() > 10
@@ -224,13 +232,13 @@ def test_boxes_may_move_along_their_heading(make_model, make_batch):
         every = torch.arange(len(output.head.bev))
         codes = model.head.regress(output.head, every, 0 * every)
         codes[:, 6:8], codes[:, 8:10] = torch.tensor([0.0, 2.0]), torch.tensor([3.0, 20.0])
-        kept = decoded_codes(output.head, codes, every)
+        kept = boxes_of(model, output.head, codes).velocities
         output.head.doppler.along_heading = True
-        turned = decoded_codes(output.head, codes, every)
-    assert torch.equal(turned[:, :8], kept[:, :8]) and (kept[:, 8] != 0).all()
+        turned = boxes_of(model, output.head, codes).velocities
+    assert (kept[:, 0] != 0).all()
     positions = model.grid.centre_of(output.head.bev.indices[:, 1:])
-    torch.testing.assert_close(turned[:, 8:], along_heading(kept[:, 8:10], codes[:, 6:8], positions))
-    assert ((turned[:, 8] == 0) & (turned[:, 9] > 0)).float().mean() > 0.5
+    torch.testing.assert_close(turned, along_heading(kept, codes[:, 6:8], positions))
+    assert ((turned[:, 0] == 0) & (turned[:, 1] > 0)).float().mean() > 0.5
 
 
 @pytest.mark.slow

@@ -20,13 +20,17 @@ from src.ops.kernel_maps import submanifold_map
 from src.ops.kernels import (
     attend_cells_triton,
     attend_views_triton,
+    box_codes_triton,
+    candidate_ranks_triton,
     farthest_point_triton,
+    frame_motion_triton,
     gaussian_shapes_triton,
     moved_keys_triton,
     neighbour_table_triton,
     radial_change_triton,
     sparse_conv_triton,
     splat_triton,
+    summed_norm_triton,
     view_samples_triton,
 )
 from src.ops.sites import Sites
@@ -59,8 +63,9 @@ def main():
     driver.set_active(Target())
     JITFunction.run = compile_only(JITFunction.run)
     kernels = (
-        *(attend_cells_triton, attend_views_triton, farthest_point_triton, gaussian_shapes_triton, moved_keys_triton),
-        *(neighbour_table_triton, radial_change_triton, sparse_conv_triton, splat_triton, view_samples_triton),
+        *(attend_cells_triton, attend_views_triton, box_codes_triton, candidate_ranks_triton, farthest_point_triton),
+        *(frame_motion_triton, gaussian_shapes_triton, moved_keys_triton, neighbour_table_triton, radial_change_triton),
+        *(sparse_conv_triton, splat_triton, summed_norm_triton, view_samples_triton),
     )
     for module in kernels:
         module.runs_kernels = lambda tensor: True
@@ -83,6 +88,7 @@ def main():
     # Nothing fills log_free, so the occupied cells are given.
     splat_triton.occupied_cells = lambda log_free, support, *choice: (torch.arange(len(support)), 0)
     grid = BEVGrid(cells=(8, 10), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
+    radial_change_triton.radial_votes_triton(torch.zeros(9, 7), torch.zeros(9).long(), grid)
     radial_change_triton.radial_change_triton(torch.zeros(9, 2), *[torch.arange(9)] * 2, torch.zeros(9, 2), grid)
     table, points, shares = torch.arange(80), torch.zeros(7, 3, 2), torch.zeros(7, 4, 3)
     for dtype in (torch.float32, torch.bfloat16):
@@ -105,6 +111,24 @@ def main():
     gaussian_shapes_triton.refined_attributes_triton(
         torch.zeros(1, 7, 9), pairs[0], torch.zeros(2), torch.ones(2), limits
     )
+    cells = (torch.zeros(9).long(), torch.zeros(80, 3).long(), torch.zeros(9).long(), torch.zeros(9))
+    radar = (torch.arange(9), torch.zeros(9, 2))
+    box_codes_triton.decoded_boxes_triton(torch.zeros(9, 10), *cells, 0.1, grid, ((0,) * 12,) * 4, radar, True)
+    now = (torch.zeros(1, 4, 4).double(), torch.zeros(1).double())
+    present = torch.ones(2, 1, dtype=torch.bool)
+    frame_motion_triton.relative_motion_triton(
+        now, torch.zeros(1, 4, 4), tuple(torch.stack([x, x]) for x in now), present, 4.0, 100.0, True
+    )
+    rest = (present.expand(2, 7), torch.zeros(2, 4, 4), torch.zeros(2), present[:, 0], 0.3, grid)
+    frame_motion_triton.moved_gaussians_triton((torch.zeros(2, 7, 2),) * 4, *rest)
+    for dtype in (torch.float32, torch.bfloat16):
+        rows, affine = torch.zeros(1, 7, 128, dtype=dtype), (torch.ones(128), torch.zeros(128))
+        aged = (rows, torch.zeros(1, 7))
+        summed_norm_triton.summed_norm_triton(rows, affine, 1e-5, rows, True, rows, aged)
+        summed_norm_triton.relu_norm_columns_triton(rows, 1e-5)
+    sites, classes = Sites.from_linear(torch.arange(80), (1, 8, 10)), ((0, 1), (2, 3))
+    candidate_ranks_triton.candidate_ranks_triton(torch.zeros(80, 3), sites, classes, True)
+    candidate_ranks_triton.ranked_candidates_triton(torch.zeros(2, 5).long(), classes, 3)
     direction = torch.tensor([[1.0, 0.0]])
     gaussian = (torch.zeros(1, 2), torch.ones(1, 2), direction, torch.zeros(1), torch.zeros(1, 128))
     inputs = [x.requires_grad_() for x in gaussian]

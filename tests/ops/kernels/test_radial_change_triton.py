@@ -3,9 +3,28 @@ import torch
 
 from src.geometry.bev_grid import BEVGrid
 from src.models.layers.doppler import Doppler
-from src.ops.radial_change import BIN_MPS, radial_change, radial_change_reference
+from src.ops.radial_change import (
+    BIN_MPS,
+    radial_change,
+    radial_change_reference,
+    radial_votes,
+    radial_votes_reference,
+)
 
 GRID = BEVGrid(cells=(12, 16), cell_m=0.8, centre_m=(8.0, 0.0), z_range_m=(-3.0, 5.0))
+
+
+@pytest.mark.parametrize("count", [0, 200])
+def test_votes(device, count):
+    """Of points in and around the grid, some not finite, of speeds beyond all bins, and of none."""
+    draw = torch.Generator().manual_seed(count)
+    rows = torch.rand(count, 7, generator=draw) * torch.tensor([16.0, 14, 1, 1, 300, 300, 1])
+    rows -= torch.tensor([0.0, 7, 0, 0, 150, 150, 0])
+    rows[::9, 4:6], rows[3::40, 0], rows[5::40, 1] = 0.0, torch.nan, torch.inf
+    batch = torch.randint(0, 3, (count,), generator=draw)
+    wanted = radial_votes_reference(rows, batch, GRID)
+    for value, expected in zip(radial_votes(rows.to(device), batch.to(device), GRID), wanted, strict=True):
+        assert torch.equal(value.cpu(), expected)
 
 
 @pytest.mark.parametrize(("points", "count"), [(0, 5), (60, 0), (60, 1), (60, 700)])

@@ -1,0 +1,68 @@
+"""Ranks of (cell, class) pairs, group by group, and the pairs of chosen ranks: numbers that sort as candidates do."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from src.geometry.constants import constant, counting, where_else
+from src.ops.backend import implementation
+from src.ops.nms import maxpool_peaks
+from src.ops.sites import Sites
+
+RANK_BITS = 31
+Groups = tuple[tuple[int, ...], ...]
+"""Classes of every group, as many of each; where it has less, the number of all classes."""
+
+
+def candidate_ranks(
+    logits: Tensor,  # [M, classes]
+    sites: Sites,  # M sites in 2D, in fixed shapes
+    groups: Groups,
+    peaks: bool,  # only local maxima have a score, see `maxpool_peaks`
+) -> Tensor:  # [groups, M * classes of a group] int64
+    """The bits of each score, which are in their order as none is negative, less the place, so that the first leads.
+
+    Padding and what no class is have score 0. Without gradient.
+    """
+    return implementation(candidate_ranks_reference)(logits, sites, groups, peaks)
+
+
+def candidate_ranks_reference(logits: Tensor, sites: Sites, groups: Groups, peaks: bool) -> Tensor:
+    """Plain torch form."""
+    scores = logits.sigmoid()
+    if peaks:
+        scores = scores * maxpool_peaks(scores, sites)
+    scores = where_else((sites.keys < sites.end)[:, None], scores, 0.0)  # padding may hold what is not finite
+    return ranks_of_scores(scores, groups)
+
+
+def ranks_of_scores(
+    scores: Tensor,  # [M, classes]
+    groups: Groups,
+) -> Tensor:  # [groups, M * classes of a group] int64
+    """See `candidate_ranks`."""
+    table = constant(groups, torch.int64, scores.device)
+    by_group = F.pad(scores.float(), (0, 1)).index_select(1, table.flatten())  # [M, groups * classes of a group]
+    by_group = by_group.unflatten(1, table.shape).transpose(0, 1).flatten(1)
+    place = counting(by_group.shape[1], torch.int64, scores.device)
+    return (by_group.contiguous().view(torch.int32).long() << RANK_BITS) - place
+
+
+def ranked_candidates(
+    ranks: Tensor,  # [groups, n] int64
+    groups: Groups,
+    num_classes: int,
+) -> tuple[Tensor, Tensor, Tensor]:  # [groups, n] each: float32; int64, row; int64, class
+    """Score, row and class of each rank."""
+    return implementation(ranked_candidates_reference)(ranks, groups, num_classes)
+
+
+def ranked_candidates_reference(ranks: Tensor, groups: Groups, num_classes: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Plain torch form."""
+    table = constant(groups, torch.int64, ranks.device)
+    places = -ranks & (2**RANK_BITS - 1)
+    scores = ((ranks + places) >> RANK_BITS).int().view(torch.float32)
+    rows = torch.div(places, table.shape[1], rounding_mode="floor")
+    return scores, rows, table.gather(1, places - rows * table.shape[1]).clamp(max=num_classes - 1)

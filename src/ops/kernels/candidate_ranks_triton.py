@@ -1,0 +1,106 @@
+"""Ranks of candidates, and candidates of ranks, by a Triton launch each."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from src.geometry.constants import constant
+from src.ops.backend import runs_kernels
+from src.ops.candidate_ranks import RANK_BITS, Groups, candidate_ranks_reference, ranked_candidates_reference
+from src.ops.kernel_maps import submanifold_map
+from src.ops.sites import Sites
+
+PAIRS = 256
+"""Pairs of a program, one lane each."""
+
+
+def candidate_ranks_triton(logits: Tensor, sites: Sites, groups: Groups, peaks: bool) -> Tensor:
+    """The reference's ranks, of scores up to rounding."""
+    if logits.dtype != torch.float32 or not runs_kernels(logits):
+        return candidate_ranks_reference(logits, sites, groups, peaks)
+    (num, classes), width = logits.shape, len(groups[0])
+    ranks = sites.keys.new_empty(len(groups), num * width)
+    if ranks.numel() > 0:
+        neighbours = submanifold_map(sites, 3).table if peaks else sites.keys
+        table = constant(groups, torch.int64, logits.device)
+        with torch.cuda.device_of(logits):
+            _rank[(triton.cdiv(num * width, PAIRS), len(groups))](
+                *(logits.contiguous(), sites.keys.contiguous(), neighbours.contiguous(), table, ranks),
+                *(num, classes, sites.end),
+                PEAKS=peaks,
+                TAPS=9,
+                WIDTH=width,
+                BITS=RANK_BITS,
+                BLOCK=PAIRS,
+                num_warps=4,
+            )
+    return ranks
+
+
+def ranked_candidates_triton(ranks: Tensor, groups: Groups, num_classes: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The reference's candidates."""
+    if ranks.dtype != torch.int64 or not runs_kernels(ranks):
+        return ranked_candidates_reference(ranks, groups, num_classes)
+    scores = ranks.new_empty(ranks.shape, dtype=torch.float32)
+    rows, labels = torch.empty_like(ranks), torch.empty_like(ranks)
+    if ranks.numel() > 0:
+        table = constant(groups, torch.int64, ranks.device)
+        with torch.cuda.device_of(ranks):
+            _read_ranks[(triton.cdiv(ranks.numel(), PAIRS),)](
+                *(ranks.contiguous(), table, scores, rows, labels, ranks.numel(), ranks.shape[1], num_classes),
+                WIDTH=len(groups[0]),
+                BITS=RANK_BITS,
+                BLOCK=PAIRS,
+                num_warps=4,
+            )
+    return scores, rows, labels
+
+
+@triton.jit
+def _score(logits, seen):  # noqa: ANN001, ANN202
+    """Scores of logits; 0 of those that are not to be seen."""
+    return tl.where(seen, 1.0 / (1.0 + tl.exp(-tl.load(logits, mask=seen, other=0.0))), 0.0)
+
+
+@triton.jit(do_not_specialize=["num", "classes", "end"])
+def _rank(  # noqa: ANN202
+    logits, keys, neighbours, table, ranks, num, classes, end,  # noqa: ANN001
+    PEAKS: tl.constexpr, TAPS: tl.constexpr, WIDTH: tl.constexpr, BITS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """A block of pairs of one group."""
+    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    group = tl.program_id(1)
+    live = place < num * WIDTH
+    row = place // WIDTH
+    label = tl.load(table + group * WIDTH + place % WIDTH)
+    seen = live & (label < classes)
+    seen = seen & (tl.load(keys + row, mask=seen, other=0) < end)
+    own = _score(logits + row * classes + label, seen)
+    if PEAKS:
+        peak = seen
+        for tap in range(0, TAPS):
+            other = tl.load(neighbours + tap * num + row, mask=seen, other=-1).to(tl.int64)
+            peak = peak & (own >= _score(logits + other * classes + label, seen & (other >= 0)))
+        own = tl.where(peak, own, 0.0)
+    bits = own.to(tl.int32, bitcast=True).to(tl.int64)
+    tl.store(ranks + group.to(tl.int64) * num * WIDTH + place, (bits << BITS) - place, mask=live)
+
+
+@triton.jit(do_not_specialize=["num", "of_group", "classes"])
+def _read_ranks(  # noqa: ANN202
+    ranks, table, scores, rows, labels, num, of_group, classes,  # noqa: ANN001
+    WIDTH: tl.constexpr, BITS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """A block of ranks."""
+    own = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = own < num
+    rank = tl.load(ranks + own, mask=live, other=0)
+    place = -rank & ((1 << BITS) - 1)
+    score = ((rank + place) >> BITS).to(tl.int32).to(tl.float32, bitcast=True)
+    tl.store(scores + own, score, mask=live)
+    tl.store(rows + own, place // WIDTH, mask=live)
+    label = tl.load(table + (own // of_group) * WIDTH + place % WIDTH, mask=live, other=0)
+    tl.store(labels + own, tl.minimum(label, classes - 1), mask=live)
