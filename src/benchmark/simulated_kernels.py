@@ -21,12 +21,15 @@ from torch import Tensor
 from src.benchmark.simulated_device import SimTensor, count_launch, host_values
 from src.geometry.bev_grid import BEVGrid
 from src.ops import backend, conv_relu
+from src.ops.cell_keys import cell_keys_reference
 from src.ops.deform_sample import attend_cells_reference, attend_views_reference
+from src.ops.distinct_keys import Groups, distinct_keys_reference, grouped_keys_reference
 from src.ops.farthest_point import farthest_points_reference
 from src.ops.gaussian_shapes import AttributeLimits, refined_attributes_reference, sampling_points_reference
 from src.ops.moved_keys import moved_keys_reference
 from src.ops.neighbour_table import neighbour_table_reference, turned_table_reference
 from src.ops.radial_change import radial_change_reference
+from src.ops.segment_reduce import group_sum_reference
 from src.ops.splat import log1mexp
 from src.ops.view_samples import view_places_reference, view_weights_reference
 
@@ -90,6 +93,37 @@ def _search(keys: Tensor, corners: Tensor, taps: Tensor, table: Tensor, bits: Te
 def _turn(table: Tensor, back: Tensor, bits: Tensor, num: int, cells: int) -> None:
     for out, found in zip((back, bits), turned_table_reference(table, num), strict=True):
         out.copy_(found)
+
+
+def _locate(
+    points: Tensor, samples: Tensor, valid: Tensor, frame: Tensor, limits: Tensor, out: Tensor, *rest: int
+) -> None:
+    num, total, _, _, step, end = rest
+    checked = None if valid is points else valid > 0
+    lower, size = (tuple(row) for row in frame.tolist())
+    shape = (end // step, *limits[:, 0].flip(0).tolist())
+    out.copy_(cell_keys_reference(points, samples, checked, lower, size, shape, frame.dtype, total - num))
+
+
+def _count_firsts(ordered: Tensor, counts: Tensor, num: int, end: int, blocks: int) -> None:
+    counts.zero_()
+
+
+def _write_groups(
+    ordered: Tensor, order: Tensor, counts: Tensor, found: Tensor, rows: Tensor, starts: Tensor, num: int, size: int,
+    end: int, blocks: int,
+) -> None:  # fmt: skip
+    if starts is found:
+        found.copy_(distinct_keys_reference(ordered, end, size))
+        return
+    keys, own, groups = grouped_keys_reference(ordered, end, size)
+    found.copy_(keys)
+    starts.copy_(groups.starts)
+    rows[order] = own
+
+
+def _sum_groups(values: Tensor, order: Tensor, starts: Tensor, out: Tensor, channels: int, mean: bool) -> None:
+    out.copy_(group_sum_reference(values, Groups(order, starts), mean))
 
 
 def _move(keys: Tensor, plan: Tensor, taps: Tensor, out: Tensor, num: int, old_step: int, new_step: int) -> None:
@@ -204,6 +238,10 @@ KERNELS: dict[str, Callable[..., None] | None] = {
     "_place": _place,
     "_weigh": _weigh,
     "_sample": _sample,
+    "_locate": _locate,
+    "_count_firsts": _count_firsts,
+    "_write_groups": _write_groups,
+    "_sum_groups": _sum_groups,
     "_move": _move,
     "_nearest_radial": _nearest_radial,
     "_search": _search,

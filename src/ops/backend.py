@@ -22,7 +22,11 @@ INTERPRETER = "TRITON_INTERPRET"
 KERNELS = {
     "attend_cells": "src.ops.kernels.attend_cells_triton",
     "attend_views": "src.ops.kernels.attend_views_triton",
+    "cell_keys": "src.ops.kernels.cell_keys_triton",
+    "distinct_keys": "src.ops.kernels.distinct_keys_triton",
     "farthest_points": "src.ops.kernels.farthest_point_triton",
+    "group_sum": "src.ops.kernels.group_sum_triton",
+    "grouped_keys": "src.ops.kernels.distinct_keys_triton",
     "refined_attributes": "src.ops.kernels.gaussian_shapes_triton",
     "sampling_points": "src.ops.kernels.gaussian_shapes_triton",
     "moved_keys": "src.ops.kernels.moved_keys_triton",

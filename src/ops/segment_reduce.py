@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
 from src.geometry.constants import constant, counting
-from src.ops.fixed_shapes import fixed_shapes
+from src.ops.backend import implementation
+from src.ops.distinct_keys import Groups
 
 # Pairs multiplied at a time in `paired_dot`: cache-sized on a CPU, few launches on a GPU.
 CPU_CHUNK = 2048
@@ -43,8 +44,11 @@ def gather_segment_sum(
 def segment_count(
     rows: Tensor,  # [n] int64
     num_rows: int,
+    groups: Groups | None = None,  # of the rows, where the caller knows them
 ) -> Tensor:  # [num_rows] int64
     """How many values share each row. Does not wait for a GPU, as bincount does."""
+    if groups is not None:
+        return groups.starts.diff()
     if rows.device.type == "cpu":  # where it is faster
         return torch.bincount(rows, minlength=num_rows)
     return rows.new_zeros(num_rows).index_add_(0, rows, constant((1,), rows.dtype, rows.device).expand_as(rows))
@@ -54,8 +58,12 @@ def segment_sum(
     values: Tensor,  # [n, C]
     rows: Tensor,  # [n] int64
     num_rows: int,
+    groups: Groups | None = None,  # of the rows, where the caller knows them
 ) -> Tensor:  # [num_rows, C]
-    """Scatter sum: values that share a row, added in their order of appearance; absent rows are 0. Differentiable."""
+    """Scatter sum: values that share a row, added in their order of appearance; absent rows are 0. Differentiable,
+    unless groups are given."""
+    if groups is not None:
+        return group_sum(values, groups)
     return _SegmentSum.apply(values, rows, num_rows)
 
 
@@ -63,14 +71,31 @@ def segment_mean(
     values: Tensor,  # [n, C]
     rows: Tensor,  # [n] int64
     num_rows: int,
+    groups: Groups | None = None,  # of the rows, where the caller knows them
 ) -> Tensor:  # [num_rows, C]
-    """Scatter mean: values that share a row; absent rows are 0. Differentiable."""
-    if fixed_shapes() is not None:
-        ordered, order = torch.sort(rows, stable=True)
-        starts = torch.searchsorted(ordered, counting(num_rows + 1, torch.int64, rows.device))
-        return F.embedding_bag(order, values, starts, mode="mean", include_last_offset=True)
+    """Scatter mean: values that share a row; absent rows are 0. Differentiable, unless groups are given."""
+    if groups is not None:
+        return group_sum(values, groups, mean=True)
     counts = segment_count(rows, num_rows)
     return segment_sum(values, rows, num_rows) / counts.clamp(min=1)[:, None].to(values.dtype)
+
+
+@torch.no_grad()
+def group_sum(
+    values: Tensor,  # [n, C]
+    groups: Groups,  # of rows of `values`; it may name others that are in no group
+    mean: bool = False,
+) -> Tensor:  # [groups, C]
+    """Sum or mean of the rows of each group in their order; 0 for an empty one."""
+    return implementation(group_sum_reference)(values, groups, mean)
+
+
+def group_sum_reference(values: Tensor, groups: Groups, mean: bool) -> Tensor:
+    """Plain torch form. Waits for a GPU."""
+    members, mode = groups.order[: int(groups.starts[-1])], "mean" if mean else "sum"
+    if len(members) == 0:
+        return values.new_zeros(len(groups.starts) - 1, values.shape[1])
+    return F.embedding_bag(members, values, groups.starts, mode=mode, include_last_offset=True)
 
 
 def segment_max(

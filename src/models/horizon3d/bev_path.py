@@ -190,7 +190,7 @@ class BEVPath(nn.Module):
         sites, owners = Sites.unique(indices, shape)
         times = F.embedding(indices[:, 0] * self.num_slots + indices[:, 1], self.time(ages))
         features = torch.cat([features, times.to(features.dtype)], dim=1)
-        x = SparseMap(sites, segment_mean(features, owners, len(sites)))
+        x = SparseMap(sites, segment_mean(features, owners, len(sites), sites.groups))
         for number, (conv, norm) in enumerate(zip(self.convs, self.norms, strict=True)):
             x = conv(x)
             y = norm(x.features)

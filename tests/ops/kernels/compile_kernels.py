@@ -11,14 +11,18 @@ from triton.runtime import driver
 from triton.runtime.jit import JITFunction
 
 from src.geometry.bev_grid import BEVGrid
+from src.ops.distinct_keys import Groups
 from src.ops.gaussian_cells import gaussian_cells
 from src.ops.gaussian_shapes import AttributeLimits
 from src.ops.kernel_maps import submanifold_map
 from src.ops.kernels import (
     attend_cells_triton,
     attend_views_triton,
+    cell_keys_triton,
+    distinct_keys_triton,
     farthest_point_triton,
     gaussian_shapes_triton,
+    group_sum_triton,
     moved_keys_triton,
     neighbour_table_triton,
     radial_change_triton,
@@ -55,14 +59,18 @@ def main():
     driver.set_active(Target())
     JITFunction.run = compile_only(JITFunction.run)
     kernels = (
-        *(attend_cells_triton, attend_views_triton, farthest_point_triton, gaussian_shapes_triton, moved_keys_triton),
-        *(neighbour_table_triton, radial_change_triton, sparse_conv_triton, splat_triton, view_samples_triton),
+        *(attend_cells_triton, attend_views_triton, cell_keys_triton, distinct_keys_triton, farthest_point_triton),
+        *(gaussian_shapes_triton, group_sum_triton, moved_keys_triton, neighbour_table_triton, radial_change_triton),
+        *(sparse_conv_triton, splat_triton, view_samples_triton),
     )
     for module in kernels:
         module.runs_kernels = lambda tensor: True
     valid = torch.ones(2, 700, dtype=torch.bool)
     farthest_point_triton.farthest_points_triton(torch.zeros(2, 700, 2), valid, torch.zeros(2).long(), 20)
 
+    for count in (80, 8000):
+        distinct_keys_triton.distinct_keys_triton(torch.arange(count), 2**62, 50)
+        distinct_keys_triton.grouped_keys_triton(torch.arange(count), 70, 50)
     neighbour_table_triton.neighbour_table_triton(*(torch.arange(size) for size in (80, 80, 9)))
     neighbour_table_triton.turned_table_triton(torch.zeros(9, 80, dtype=torch.int32), 80)
     kernel_map = submanifold_map(Sites.from_linear(torch.arange(80), (1, 8, 10)), 3)
@@ -74,6 +82,16 @@ def main():
         operands = (features.detach(), weight.detach(), kernel_map, None, out.detach())
         sparse_conv_triton.sparse_conv_relu_triton(*operands)
 
+    for dtype, channels in ((torch.float32, 7), (torch.bfloat16, 128)):
+        groups = Groups(torch.arange(80), torch.arange(9))
+        group_sum_triton.group_sum_triton(torch.zeros(80, channels, dtype=dtype), groups, channels == 7)
+    places, samples = torch.zeros(80, 5), torch.zeros(8).long()
+    for points, dtype in ((places[:, :2], torch.float32), (places[:, :3], torch.float64)):
+        frame = (0.0, 1.0, 2.0)[: points.shape[1]]
+        cell_keys_triton.cell_keys_triton(points, samples, None, frame, frame, (1, 5, 6, 7)[: len(frame) + 1], dtype)
+    cell_keys_triton.cell_keys_triton(
+        places[:, :2], samples, places[:, 0] > 0, (0.0, 1.0), (1.0, 1.0), (1, 5, 6), torch.float32, 1
+    )
     moved_keys_triton.moved_keys_triton(torch.arange(80), (120, 35), ((12, 10, 1, 2, 0, 5, 7),) * 2, ((1, 0),))
 
     # Nothing fills log_free, so the occupied cells are given.
