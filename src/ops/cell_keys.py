@@ -1,4 +1,4 @@
-"""Keys of the cells that points lie in, for sets of sites in fixed shapes."""
+"""Keys of the cells that points lie in, and centres of the cells of keys, for sets of sites in fixed shapes."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
 from src.ops.backend import implementation
 from src.ops.sites import Sites
@@ -46,3 +47,17 @@ def cell_keys_reference(
     sample = samples.repeat_interleave(len(points) // max(len(samples), 1), output_size=len(points))
     keys = sites.keys_of(torch.cat([sample[:, None], cells.long()], dim=1))
     return F.pad(torch.where(inside, keys, sites.end).clamp_(max=sites.end), (0, behind), value=sites.end)
+
+
+@torch.no_grad()
+def cell_centres(
+    keys: Tensor,  # [n] int64 of sites on (B, rows, cols)
+    grid: BEVGrid,
+) -> Tensor:  # [n, 2] float32 (x, y) metres
+    """Centre of each cell."""
+    return implementation(cell_centres_reference)(keys, grid)
+
+
+def cell_centres_reference(keys: Tensor, grid: BEVGrid) -> Tensor:
+    """Plain torch form."""
+    return grid.centre_of(Sites((1, *grid.cells), keys).indices()[:, 1:])

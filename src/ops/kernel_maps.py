@@ -11,7 +11,7 @@ from src.geometry.constants import constant, counting, where_else
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.kernel_map import KernelMap, TableMap, counts_kept
 from src.ops.moved_keys import NONE, moved_keys
-from src.ops.neighbour_table import neighbour_table
+from src.ops.neighbour_table import neighbour_table, stacked_table
 from src.ops.sites import HALO, Sites, padded_sites
 
 Size = int | tuple[int, ...]
@@ -85,6 +85,7 @@ def stacked_map(
     sites: Sites,
     kernel_size: Size,
     parts: list[Tensor],  # [n_p] int64 each: rows of `sites` that a subset has features for, ascending
+    places: tuple[Tensor, Tensor] | None = None,  # [n] each, the inverse, where the caller has it of two
 ) -> KernelMap:
     """Map from several subsets of the sites, whose features are stacked row below row, to all of the sites.
 
@@ -94,7 +95,10 @@ def stacked_map(
     """
     base = submanifold_map(sites, kernel_size)
     if makes_tables(sites):
-        return TableMap(*_stacked_table(base.table, parts))
+        if places is None:
+            return TableMap(*_stacked_table(base.table, parts))
+        table, bits = stacked_table(base.table, places, len(parts[0]))
+        return TableMap(table, sum(map(len, parts)), bits=bits)
     inputs, outputs, counts, first = [], [], [], 0
     for rows in parts:
         place = torch.full((len(sites),), -1, dtype=torch.int32, device=sites.device)

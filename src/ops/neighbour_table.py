@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.constants import counting, where_else
@@ -30,6 +31,26 @@ def neighbour_table_reference(keys: Tensor, corners: Tensor, taps: Tensor) -> tu
         rows = torch.searchsorted(keys, wanted, out_int32=True).clamp_(max=len(keys) - 1)
         table = where_else(keys.index_select(0, rows.flatten()).view_as(wanted) == wanted, rows, -1)
     return table, tap_bits(table)
+
+
+def stacked_table(
+    table: Tensor,  # [K, m] int32 of rows below `m`, -1 for none
+    places: tuple[Tensor, Tensor],  # [m] integer each, what row of either part each of these rows is, -1 for none
+    first: int,  # rows of the first part, behind which those of the second stand
+) -> tuple[Tensor, Tensor]:  # [2 K, m] int32, [m] int64
+    """The table with the rows of either part in turn, and its tap bits."""
+    return implementation(stacked_table_reference)(table, places, first)
+
+
+def stacked_table_reference(table: Tensor, places: tuple[Tensor, Tensor], first: int) -> tuple[Tensor, Tensor]:
+    """Plain torch form."""
+    tables = []
+    for place, before in zip(places, (0, first), strict=True):
+        # One more, which is the place of none.
+        shifted = F.pad(where_else(place >= 0, place + before, -1).to(table.dtype), (0, 1), value=-1)
+        tables.append(shifted[table.long()])
+    joined = torch.cat(tables)
+    return joined, tap_bits(joined)
 
 
 def tap_bits(

@@ -10,9 +10,10 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from src.geometry.constants import constant, counting
+from src.geometry.constants import constant, counting, where_else
 from src.ops.backend import implementation
 from src.ops.distinct_keys import Groups
+from src.ops.fixed_shapes import fixed_shapes
 
 # Pairs multiplied at a time in `paired_dot`: cache-sized on a CPU, few launches on a GPU.
 CPU_CHUNK = 2048
@@ -135,8 +136,8 @@ class _SegmentSum(torch.autograd.Function):
 
 def permute_rows(
     values: Tensor,  # [n, C]
-    there: Tensor,  # [m] int64, the row of `values` that each result takes, -1 for zeros; none twice
-    back: Tensor,  # [n] int64, the inverse: the result that takes each row, -1 for none
+    there: Tensor,  # [m] integer, the row of `values` that each result takes, -1 for zeros; none twice
+    back: Tensor,  # [n] integer, the inverse: the result that takes each row, -1 for none
 ) -> Tensor:  # [m, C]
     """Permute, insert and drop rows. Differentiable; the backward pass is a gather as well, so nothing is summed."""
     return _PermuteRows.apply(values, there, back)
@@ -146,15 +147,24 @@ class _PermuteRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: FunctionCtx, values: Tensor, there: Tensor, back: Tensor) -> Tensor:
         ctx.save_for_backward(back)
-        return _take(values, there)
+        return taken_rows(values, there)
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None, None]:
         (back,) = ctx.saved_tensors
-        return _take(grad, back), None, None
+        return taken_rows(grad, back), None, None
 
 
-def _take(values: Tensor, rows: Tensor) -> Tensor:
+def taken_rows(
+    values: Tensor,  # [n, C]
+    rows: Tensor,  # [m] integer, -1 for zeros
+) -> Tensor:  # [m, C]
+    """Gather rows, without gradient."""
+    return implementation(taken_rows_reference)(values, rows)
+
+
+def taken_rows_reference(values: Tensor, rows: Tensor) -> Tensor:
+    """Plain torch form."""
     padded = F.pad(values, (0, 0, 1, 0))  # -1 takes the row of zeros before them: a mask over rows takes twice as long
     return padded.index_select(0, rows + 1)
 
@@ -166,6 +176,10 @@ def topk_per_sample(
     count: int,
 ) -> Tensor:  # [B, count] int64
     """Rows of the highest scores of each sample, best first, ties by row; -1 where a sample has fewer."""
+    if fixed_shapes() is not None and batch_size == 1:
+        best, order = where_else(sample < 1, scores, -torch.inf).sort(descending=True, stable=True)
+        found = where_else(best[:count] > -torch.inf, order[:count], -1)
+        return F.pad(found, (0, count - len(found)), value=-1)[None] if len(found) < count else found[None]
     order, rank = rank_per_sample(scores, sample)
     rows = order.new_full((batch_size + 1, count + 1), -1)
     rows[sample[order], rank.clamp(max=count)] = order  # all beyond the last place meet in one column that is dropped

@@ -13,6 +13,7 @@ from src.geometry.constants import constant, counting, where_else
 from src.ops.distinct_keys import Groups
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.moved_keys import moved_keys
+from src.ops.neighbour_table import neighbour_table
 
 # Empty cells kept behind the last cell of every spatial axis. A key moved by up to HALO cells along any axis, in either
 # direction, lands in such a gap and never on a cell of the next row, so look-ups need no bounds test.
@@ -150,11 +151,13 @@ class Sites:
     def positions(
         self,
         steps: tuple[int, ...],  # per axis of `shape`
+        first: int = 0,
     ) -> Tensor:  # [n] int64
-        """(batch, *cell) of every site times the steps, summed: a key of another grid, a linear position."""
+        """(batch, *cell) of every site times the steps, summed on `first`: keys of another grid, linear positions."""
         if self.device.type == "cpu":
-            return (self.indices() * constant(steps, torch.int64, self.device)).sum(1)
-        return _counted_anew(self.keys, self.strides, tuple(size + HALO for size in self.shape[1:]), steps)
+            found = (self.indices() * constant(steps, torch.int64, self.device)).sum(1)
+            return found + first if first else found
+        return _counted_anew(self.keys, self.strides, tuple(size + HALO for size in self.shape[1:]), steps, first)
 
     @property
     def groups(self) -> Groups | None:
@@ -195,12 +198,13 @@ def _counted_anew(
     strides: tuple[int, ...],
     sizes: tuple[int, ...],  # of each axis but the first, as the strides count them
     steps: tuple[int, ...],
+    first: int = 0,
 ) -> Tensor:  # [n] int64
-    """The positions with other strides, in one launch."""
-    limits = ((1, 1, 0, size) for size in sizes)
-    columns = zip(strides[1:], sizes, limits, steps[1:], strict=True)
-    axes = tuple((stride, size, *limit, step) for stride, size, limit, step in columns)
-    return moved_keys(positions, (strides[0], steps[0]), axes, ((0,) * len(sizes),))[0]
+    """The positions with other strides, counted from `first`, in one launch."""
+    columns = zip(strides[1:], sizes, steps[1:], strict=True)
+    axes = tuple((stride, size, 1, 1, 0, size, step) for stride, size, step in columns)
+    shift = (1, 1, 1, 1, 0, first + 1, 1)  # an axis with the cell 0 alone, moved by `first`
+    return moved_keys(positions, (strides[0], steps[0]), (*axes, shift), ((0,) * len(sizes) + (first,),))[0]
 
 
 def _unravelled(
@@ -228,6 +232,14 @@ def rows_of_keys(
         return torch.full_like(wanted, -1)
     rows = torch.searchsorted(keys, wanted).clamp_(max=len(keys) - 1)
     return where_else(keys[rows] == wanted, rows, -1)
+
+
+def places_among(
+    part: Sites,
+    joint: Sites,
+) -> Tensor:  # [n of joint] int32
+    """Row that each site of `joint` has in `part`, -1 for none. In fixed shapes padding has some of padding, or -1."""
+    return neighbour_table(part.keys, joint.keys, constant((0,), torch.int64, joint.device))[0][0]
 
 
 def padded_sites(

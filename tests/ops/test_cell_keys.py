@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from src.ops.cell_keys import cell_keys
+from src.geometry.bev_grid import BEVGrid
+from src.ops.cell_keys import cell_centres, cell_keys
 from src.ops.sites import Sites
 
 INF, NAN = float("inf"), float("nan")
@@ -25,3 +26,9 @@ def test_a_sample_of_each_point_and_three_axes():
     found = cell_keys(points, samples, None, (0.0,) * 3, (1.0,) * 3, (2, 3, 4, 5), torch.float64)
     sites = Sites((2, 3, 4, 5), found)
     assert found.tolist() == [*sites.keys_of(torch.tensor([[1, 2, 0, 1]])).tolist(), sites.end]
+
+
+def test_centres_by_hand():
+    grid = BEVGrid(cells=(3, 4), cell_m=2.0, centre_m=(4.0, 3.0), z_range_m=(0.0, 1.0))
+    cells = torch.tensor([[0, 0, 0], [1, 2, 1]])
+    assert cell_centres(Sites((2, 3, 4), cells).keys_of(cells), grid).tolist() == [[1.0, 1.0], [3.0, 5.0]]

@@ -15,7 +15,7 @@ from src.geometry.constants import constant, where_else
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.moved_keys import NONE
 from src.ops.radial_change import NUM_BINS, radial_bin, radial_change
-from src.ops.segment_reduce import gather_segment_sum, segment_sum
+from src.ops.segment_reduce import gather_segment_sum, group_sum
 
 WINDOW_CELLS = 2
 """A cell knows the points of its 5x5 neighbourhood; their weight falls off linearly along both axes."""
@@ -80,8 +80,8 @@ class Doppler:
         weighted = (values[:, None] * falloff[:, None]).flatten(0, 1)
         if fixed is not None:
             given = where_else(within.flatten(), given, NONE)
-            keys = fixed.distinct(given, NONE, len(given))
-            sums = segment_sum(weighted, torch.searchsorted(keys, given), len(keys))
+            keys, _, groups = fixed.grouped(given, NONE, len(given))
+            sums = group_sum(weighted, groups)
             return cls(grid, keys, sums[:, 1:] / sums[:, :1].clamp(min=1.0), in_losses, along_heading)
         chosen = within.flatten().nonzero().squeeze(1)
         keys, order = torch.sort(given.index_select(0, chosen), stable=True)

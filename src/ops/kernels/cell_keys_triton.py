@@ -1,4 +1,4 @@
-"""Keys of the cells that points lie in by one Triton launch."""
+"""Keys of the cells that points lie in by one Triton launch, and centres of the cells of keys by another."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
 from src.ops.backend import runs_kernels
-from src.ops.cell_keys import cell_keys_reference
+from src.ops.cell_keys import cell_centres_reference, cell_keys_reference
 from src.ops.sites import Sites
 
 POINTS = 256
@@ -49,6 +50,32 @@ def cell_keys_triton(
                 num_warps=4,
             )
     return out
+
+
+def cell_centres_triton(keys: Tensor, grid: BEVGrid) -> Tensor:
+    """The reference's centres up to rounding."""
+    if not runs_kernels(keys):
+        return cell_centres_reference(keys, grid)
+    out = keys.new_empty((len(keys), 2), dtype=torch.float32)
+    if len(keys) > 0:
+        sample, row, _ = Sites((1, *grid.cells), keys).strides
+        with torch.cuda.device_of(keys):
+            _centre[(triton.cdiv(len(keys), POINTS),)](
+                *(keys, out, len(keys), sample, row, grid.x_min_m, grid.y_min_m, grid.cell_m),
+                BLOCK=POINTS,
+                num_warps=4,
+            )
+    return out
+
+
+@triton.jit(do_not_specialize=["num", "sample_step", "row_step"])
+def _centre(keys, out, num, sample_step, row_step, x_min, y_min, cell_m, BLOCK: tl.constexpr):  # noqa: ANN001, ANN202
+    """A block of keys."""
+    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    live = place < num
+    key = tl.load(keys + place, mask=live, other=0) % sample_step
+    tl.store(out + 2 * place, x_min + ((key % row_step).to(tl.float32) + 0.5) * cell_m, mask=live)
+    tl.store(out + 2 * place + 1, y_min + ((key // row_step).to(tl.float32) + 0.5) * cell_m, mask=live)
 
 
 @triton.jit(do_not_specialize=["num", "total", "width", "per_sample", "sample_step", "end"])

@@ -1,4 +1,5 @@
-"""A neighbour table by one Triton launch: a binary search for every tap and cell. Reading it backwards is another."""
+"""A neighbour table by one Triton launch: a binary search for every tap and cell. Reading it backwards is another,
+and so is taking the rows of two parts."""
 
 from __future__ import annotations
 
@@ -9,7 +10,12 @@ from torch import Tensor
 
 from src.ops.backend import runs_kernels
 from src.ops.kernels.sorted_search_triton import lower_bound
-from src.ops.neighbour_table import ORDERING_TAPS, neighbour_table_reference, turned_table_reference
+from src.ops.neighbour_table import (
+    ORDERING_TAPS,
+    neighbour_table_reference,
+    stacked_table_reference,
+    turned_table_reference,
+)
 
 CELLS = 256
 """Cells a program looks around, one lane each."""
@@ -35,6 +41,27 @@ def neighbour_table_triton(
                 num_warps=4,
             )
     return table, bits
+
+
+def stacked_table_triton(
+    table: Tensor,  # [K, m] int32
+    places: tuple[Tensor, Tensor],  # [m] integer each
+    first: int,
+) -> tuple[Tensor, Tensor]:  # [2 K, m] int32, [m] int64
+    """The reference's table and bits."""
+    if not runs_kernels(table):
+        return stacked_table_reference(table, places, first)
+    taps, cells = table.shape
+    out, bits = table.new_empty(2 * taps, cells), table.new_empty(cells, dtype=torch.int64)
+    if cells > 0:
+        with torch.cuda.device_of(table):
+            _stack[(triton.cdiv(cells, CELLS),)](
+                *(table.contiguous(), *(place.contiguous() for place in places), out, bits, first, cells, taps),
+                BITS=ORDERING_TAPS,
+                BLOCK=CELLS,
+                num_warps=4,
+            )
+    return out, bits
 
 
 def turned_table_triton(
@@ -75,6 +102,27 @@ def _search(  # noqa: ANN202
         tl.store(table + tap * cells + place, tl.where(found, low, -1), mask=live)
         if tap < BITS:
             seen += found.to(tl.int64) << tap
+    tl.store(bits + place, seen, mask=live)
+
+
+@triton.jit(do_not_specialize=["first", "cells", "taps"])
+def _stack(  # noqa: ANN202
+    table, own, other, out, bits, first, cells, taps,  # noqa: ANN001
+    BITS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """All taps of a block of cells in either part."""
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    live = place < cells
+    seen = tl.zeros((BLOCK,), tl.int64)
+    for tap in range(0, 2 * taps):
+        row = tl.load(table + tap % taps * cells + place, mask=live, other=-1)
+        known = row >= 0
+        mine = tl.load(own + row, mask=known & (tap < taps), other=-1)
+        theirs = tl.load(other + row, mask=known & (tap >= taps), other=-1)
+        found = tl.where(mine >= 0, mine, tl.where(theirs >= 0, theirs + first, -1))
+        tl.store(out + tap * cells + place, found, mask=live)
+        if tap < BITS:
+            seen += (found >= 0).to(tl.int64) << tap
     tl.store(bits + place, seen, mask=live)
 
 

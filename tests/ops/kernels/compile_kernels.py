@@ -22,10 +22,10 @@ from src.ops.kernels import (
     distinct_keys_triton,
     farthest_point_triton,
     gaussian_shapes_triton,
-    group_sum_triton,
     moved_keys_triton,
     neighbour_table_triton,
     radial_change_triton,
+    segment_reduce_triton,
     sparse_conv_triton,
     splat_triton,
     view_samples_triton,
@@ -60,7 +60,13 @@ def main():
     JITFunction.run = compile_only(JITFunction.run)
     kernels = (
         *(attend_cells_triton, attend_views_triton, cell_keys_triton, distinct_keys_triton, farthest_point_triton),
-        *(gaussian_shapes_triton, group_sum_triton, moved_keys_triton, neighbour_table_triton, radial_change_triton),
+        *(
+            gaussian_shapes_triton,
+            segment_reduce_triton,
+            moved_keys_triton,
+            neighbour_table_triton,
+            radial_change_triton,
+        ),
         *(sparse_conv_triton, splat_triton, view_samples_triton),
     )
     for module in kernels:
@@ -73,6 +79,9 @@ def main():
         distinct_keys_triton.grouped_keys_triton(torch.arange(count), 70, 50)
     neighbour_table_triton.neighbour_table_triton(*(torch.arange(size) for size in (80, 80, 9)))
     neighbour_table_triton.turned_table_triton(torch.zeros(9, 80, dtype=torch.int32), 80)
+    for dtype in (torch.int32, torch.int64):
+        places = (torch.zeros(80, dtype=torch.int32), torch.zeros(80, dtype=dtype))
+        neighbour_table_triton.stacked_table_triton(torch.zeros(9, 80, dtype=torch.int32), places, 40)
     kernel_map = submanifold_map(Sites.from_linear(torch.arange(80), (1, 8, 10)), 3)
     for dtype, c_in, c_out in ((torch.float32, 5, 16), (torch.bfloat16, 96, 128)):
         features, weight = torch.zeros(80, c_in, dtype=dtype), torch.zeros(9, c_in, c_out, dtype=dtype)
@@ -84,7 +93,10 @@ def main():
 
     for dtype, channels in ((torch.float32, 7), (torch.bfloat16, 128)):
         groups = Groups(torch.arange(80), torch.arange(9))
-        group_sum_triton.group_sum_triton(torch.zeros(80, channels, dtype=dtype), groups, channels == 7)
+        values = torch.zeros(80, channels, dtype=dtype)
+        segment_reduce_triton.group_sum_triton(values, groups, channels == 7)
+        segment_reduce_triton.taken_rows_triton(values, torch.arange(40, dtype=torch.int32))
+        segment_reduce_triton.taken_rows_triton(values, torch.arange(40))
     places, samples = torch.zeros(80, 5), torch.zeros(8).long()
     for points, dtype in ((places[:, :2], torch.float32), (places[:, :3], torch.float64)):
         frame = (0.0, 1.0, 2.0)[: points.shape[1]]
@@ -98,6 +110,7 @@ def main():
     splat_triton.occupied_cells = lambda log_free, support, *choice: (torch.arange(len(support)), 0)
     grid = BEVGrid(cells=(8, 10), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
     radial_change_triton.radial_change_triton(torch.zeros(9, 2), *[torch.arange(9)] * 2, torch.zeros(9, 2), grid)
+    cell_keys_triton.cell_centres_triton(torch.arange(80), grid)
     table, points, shares = torch.arange(80), torch.zeros(7, 3, 2), torch.zeros(7, 4, 3)
     for dtype in (torch.float32, torch.bfloat16):
         values = torch.zeros(80, 4, 32, dtype=dtype)

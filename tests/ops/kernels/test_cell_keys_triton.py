@@ -1,7 +1,9 @@
 import pytest
 import torch
 
-from src.ops.cell_keys import cell_keys, cell_keys_reference
+from src.geometry.bev_grid import BEVGrid
+from src.ops.cell_keys import cell_centres, cell_centres_reference, cell_keys, cell_keys_reference
+from src.ops.sites import Sites
 
 
 @pytest.mark.parametrize(("count", "samples"), [(0, 0), (1, 1), (600, 3), (300, 300)])
@@ -22,3 +24,13 @@ def test_keys_of_points(device, dtype, ndim, count, samples):
             known_there = None if known is None else known.to(device)
             found = cell_keys(rows.to(device)[:, :ndim], owners.to(device), known_there, *given)
             assert torch.equal(found.cpu(), wanted)
+
+
+@pytest.mark.parametrize("count", [0, 3, 700])
+def test_centres_of_keys(device, count):
+    grid = BEVGrid(cells=(20, 14), cell_m=0.8, centre_m=(1.0, -2.0), z_range_m=(-3.0, 5.0))
+    cells = torch.stack([torch.arange(count) % size for size in (2, 20, 14)], 1)
+    keys = Sites((2, 20, 14), cells[:, 0]).keys_of(cells)
+    found = cell_centres(keys.to(device), grid)
+    torch.testing.assert_close(found.cpu(), cell_centres_reference(keys, grid))
+    torch.testing.assert_close(found.cpu(), grid.centre_of(cells[:, 1:]))
