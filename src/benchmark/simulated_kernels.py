@@ -86,7 +86,12 @@ def _sample(points: Tensor, valid: Tensor, start: Tensor, picks: Tensor, num: in
     picks.copy_(farthest_points_reference(points, valid.bool(), start, count))
 
 
-def _search(keys: Tensor, corners: Tensor, taps: Tensor, table: Tensor, bits: Tensor, *sizes: int) -> None:
+def _search(
+    keys: Tensor, corners: Tensor, taps: Tensor, table: Tensor, bits: Tensor, plan: Tensor, shifts: Tensor, *sizes: int
+) -> None:
+    if plan is not keys:
+        axes = tuple(map(tuple, plan.tolist()))
+        corners = moved_keys_reference(corners, sizes[-2:], axes, (tuple(shifts.tolist()),))[0]
     for out, found in zip((table, bits), neighbour_table_reference(keys, corners, taps), strict=True):
         out.copy_(found)
 

@@ -31,6 +31,7 @@ KERNELS = {
     "refined_attributes": "src.ops.kernels.gaussian_shapes_triton",
     "sampling_points": "src.ops.kernels.gaussian_shapes_triton",
     "moved_keys": "src.ops.kernels.moved_keys_triton",
+    "moved_table": "src.ops.kernels.neighbour_table_triton",
     "neighbour_table": "src.ops.kernels.neighbour_table_triton",
     "radial_change": "src.ops.kernels.radial_change_triton",
     "sparse_conv": "src.ops.kernels.sparse_conv_triton",

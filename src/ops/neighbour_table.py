@@ -8,6 +8,7 @@ from torch import Tensor
 
 from src.geometry.constants import counting, where_else
 from src.ops.backend import implementation
+from src.ops.moved_keys import Axis, moved_keys_reference
 
 ORDERING_TAPS = 62
 """Taps that take part in the order of the rows: more bits fit no int64, and the order never changes a result."""
@@ -59,6 +60,25 @@ def tap_bits(
     """The taps of the table that meet a site as bits of a number, of the first ORDERING_TAPS."""
     shifts = counting(min(len(table), ORDERING_TAPS), torch.int64, table.device)[:, None]
     return ((table[:ORDERING_TAPS] >= 0).long() << shifts).sum(0)
+
+
+def moved_table(
+    keys: Tensor,  # [n] int64, sorted, unique
+    cells: Tensor,  # [m] int64, keys on another grid
+    samples: tuple[int, int],
+    axes: tuple[Axis, ...],
+    shift: tuple[int, ...],
+    taps: Tensor,  # [K] int64
+) -> tuple[Tensor, Tensor]:  # [K, m] int32, [m] int64
+    """`neighbour_table` of the corners that `moved_keys` makes of the cells with one shift."""
+    return implementation(moved_table_reference)(keys, cells, samples, axes, shift, taps)
+
+
+def moved_table_reference(
+    keys: Tensor, cells: Tensor, samples: tuple[int, int], axes: tuple[Axis, ...], shift: tuple[int, ...], taps: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Plain torch form."""
+    return neighbour_table_reference(keys, moved_keys_reference(cells, samples, axes, (shift,))[0], taps)
 
 
 def turned_table(

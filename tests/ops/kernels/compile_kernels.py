@@ -79,6 +79,9 @@ def main():
         distinct_keys_triton.grouped_keys_triton(torch.arange(count), 70, 50)
     neighbour_table_triton.neighbour_table_triton(*(torch.arange(size) for size in (80, 80, 9)))
     neighbour_table_triton.turned_table_triton(torch.zeros(9, 80, dtype=torch.int32), 80)
+    neighbour_table_triton.moved_table_triton(
+        *(torch.arange(80), torch.arange(40), (120, 35), ((12, 10, 1, 2, 0, 5, 7),) * 2, (1, 0), torch.arange(9))
+    )
     for dtype in (torch.int32, torch.int64):
         places = (torch.zeros(80, dtype=torch.int32), torch.zeros(80, dtype=dtype))
         neighbour_table_triton.stacked_table_triton(torch.zeros(9, 80, dtype=torch.int32), places, 40)

@@ -1,7 +1,14 @@
 import pytest
 import torch
 
-from src.ops.neighbour_table import neighbour_table, stacked_table, tap_bits, turned_table
+from src.ops.neighbour_table import (
+    moved_table,
+    moved_table_reference,
+    neighbour_table,
+    stacked_table,
+    tap_bits,
+    turned_table,
+)
 
 
 @pytest.mark.parametrize(("count", "cells", "taps"), [(0, 5, 9), (1, 3, 1), (300, 700, 27), (64, 64, 125)])
@@ -41,3 +48,14 @@ def test_the_rows_of_two_parts(device, cells, taps):
         for line in table.tolist()
     ]
     assert found.tolist() == lines and torch.equal(bits.cpu(), tap_bits(found.cpu()))
+
+
+@pytest.mark.parametrize(("count", "cells"), [(0, 5), (200, 0), (300, 700)])
+def test_a_table_of_moved_cells(device, count, cells):
+    draw = torch.Generator().manual_seed(count)
+    keys = torch.randperm(900, generator=draw)[:count].sort().values.to(device)
+    coarse = torch.randint(0, 2800, (cells,), generator=draw).to(device)
+    axes = ((100, 28, 2, 1, -2, 32, 30), (1, 100, 1, 4, 0, 24, 1))
+    given = (keys, coarse, (2800, 900), axes, (-1, 3), torch.arange(9).to(device))
+    for found, wanted in zip(moved_table(*given), moved_table_reference(*given), strict=True):
+        assert torch.equal(found, wanted)
