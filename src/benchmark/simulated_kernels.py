@@ -24,13 +24,17 @@ from src.geometry.bev_grid import BEVGrid
 from src.ops import backend, conv_relu
 from src.ops.box_codes import decoded_boxes_reference
 from src.ops.candidate_ranks import ranked_candidates_reference, ranks_of_scores
+from src.ops.cell_keys import cell_centres_reference, cell_keys_reference
 from src.ops.deform_sample import attend_cells_reference, attend_views_reference
+from src.ops.distinct_keys import Groups, distinct_keys_reference, grouped_keys_reference
 from src.ops.farthest_point import farthest_points_reference
 from src.ops.frame_motion import moved_gaussians_reference, relative_motion_reference
 from src.ops.gaussian_shapes import AttributeLimits, refined_attributes_reference, sampling_points_reference
 from src.ops.moved_keys import moved_keys_reference
-from src.ops.neighbour_table import neighbour_table_reference, turned_table_reference
+from src.ops.neighbour_table import neighbour_table_reference, stacked_table_reference, turned_table_reference
 from src.ops.radial_change import radial_change_reference, radial_votes_reference
+from src.ops.segment_reduce import group_sum_reference, taken_rows_reference
+from src.ops.sites import HALO
 from src.ops.splat import log1mexp
 from src.ops.summed_norm import relu_norm_columns_reference, summed_norm_reference
 from src.ops.view_samples import view_places_reference, view_weights_reference
@@ -89,14 +93,66 @@ def _sample(points: Tensor, valid: Tensor, start: Tensor, picks: Tensor, num: in
     picks.copy_(farthest_points_reference(points, valid.bool(), start, count))
 
 
-def _search(keys: Tensor, corners: Tensor, taps: Tensor, table: Tensor, bits: Tensor, *sizes: int) -> None:
+def _search(
+    keys: Tensor, corners: Tensor, taps: Tensor, table: Tensor, bits: Tensor, plan: Tensor, shifts: Tensor, *sizes: int
+) -> None:
+    if plan is not keys:
+        axes = tuple(map(tuple, plan.tolist()))
+        corners = moved_keys_reference(corners, sizes[-2:], axes, (tuple(shifts.tolist()),))[0]
     for out, found in zip((table, bits), neighbour_table_reference(keys, corners, taps), strict=True):
         out.copy_(found)
+
+
+def _stack(table: Tensor, own: Tensor, other: Tensor, out: Tensor, bits: Tensor, first: int, *sizes: int) -> None:
+    for filled, found in zip((out, bits), stacked_table_reference(table, (own, other), first), strict=True):
+        filled.copy_(found)
 
 
 def _turn(table: Tensor, back: Tensor, bits: Tensor, num: int, cells: int) -> None:
     for out, found in zip((back, bits), turned_table_reference(table, num), strict=True):
         out.copy_(found)
+
+
+def _locate(
+    points: Tensor, samples: Tensor, valid: Tensor, frame: Tensor, limits: Tensor, out: Tensor, *rest: int
+) -> None:
+    num, total, _, _, step, end = rest
+    checked = None if valid is points else valid > 0
+    lower, size = (tuple(row) for row in frame.tolist())
+    shape = (end // step, *limits[:, 0].flip(0).tolist())
+    out.copy_(cell_keys_reference(points, samples, checked, lower, size, shape, frame.dtype, total - num))
+
+
+def _centre(
+    keys: Tensor, out: Tensor, num: int, sample_step: int, row_step: int, x_min: float, y_min: float, cell_m: float
+) -> None:
+    grid = _grid(sample_step // row_step - HALO, row_step - HALO, x_min, y_min, cell_m)
+    out.copy_(cell_centres_reference(keys, grid))
+
+
+def _count_firsts(ordered: Tensor, counts: Tensor, num: int, end: int, blocks: int) -> None:
+    counts.zero_()
+
+
+def _write_groups(
+    ordered: Tensor, order: Tensor, counts: Tensor, found: Tensor, rows: Tensor, starts: Tensor, num: int, size: int,
+    end: int, blocks: int,
+) -> None:  # fmt: skip
+    if starts is found:
+        found.copy_(distinct_keys_reference(ordered, end, size))
+        return
+    keys, own, groups = grouped_keys_reference(ordered, end, size)
+    found.copy_(keys)
+    starts.copy_(groups.starts)
+    rows[order] = own
+
+
+def _sum_groups(values: Tensor, order: Tensor, starts: Tensor, out: Tensor, channels: int, mean: bool) -> None:
+    out.copy_(group_sum_reference(values, Groups(order, starts), mean))
+
+
+def _take(values: Tensor, rows: Tensor, out: Tensor, *sizes: int) -> None:
+    out.copy_(taken_rows_reference(values, rows))
 
 
 def _move(keys: Tensor, plan: Tensor, taps: Tensor, out: Tensor, num: int, old_step: int, new_step: int) -> None:
@@ -290,6 +346,12 @@ KERNELS: dict[str, Callable[..., None] | None] = {
     "_place": _place,
     "_weigh": _weigh,
     "_sample": _sample,
+    "_locate": _locate,
+    "_centre": _centre,
+    "_count_firsts": _count_firsts,
+    "_write_groups": _write_groups,
+    "_sum_groups": _sum_groups,
+    "_take": _take,
     "_move": _move,
     "_vote": _vote,
     "_nearest_radial": _nearest_radial,
@@ -300,6 +362,7 @@ KERNELS: dict[str, Callable[..., None] | None] = {
     "_cell_features": _cell_features,
     "_nearest_cell": _nearest_cell,
     "_gaussian_gradient": None,
+    "_stack": _stack,
     "_turn": _turn,
 }
 """The plain form of every kernel, None where its values are a gradient."""

@@ -90,5 +90,8 @@ class BEVGrid:
         dtype: torch.dtype = torch.float32,
     ) -> Tensor:  # [..., 2] (x, y) metres
         """Centre of each cell."""
+        if cells.device.type != "cpu":  # where a launch costs more than another rounding
+            first = (self.x_min_m + 0.5 * self.cell_m, self.y_min_m + 0.5 * self.cell_m)
+            return torch.add(constant(first, dtype, cells.device), cells.flip(-1), alpha=self.cell_m)
         lower = constant((self.x_min_m, self.y_min_m), dtype, cells.device)
         return lower + (cells.flip(-1).to(dtype) + 0.5) * self.cell_m

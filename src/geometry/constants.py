@@ -34,6 +34,16 @@ def _sequence(bits: int, dtype: torch.dtype, device: torch.device) -> Tensor:  #
         return torch.arange(2**bits, dtype=dtype, device=device)
 
 
+@cache  # as above
+def repeated(
+    counts: tuple[int, ...],
+    device: torch.device,
+) -> Tensor:  # [sum of the counts] int64
+    """0 as often as the first count says, 1 as often as the second, ...; nobody may write into it."""
+    with torch.inference_mode(False):
+        return upload([torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))], device)[0]
+
+
 def where_else(
     kept: Tensor,  # [...] bool
     values: Tensor,  # [...]

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.constants import constant
+from src.ops.distinct_keys import Groups, distinct_keys, grouped_keys
 
 
 @dataclass(frozen=True)
@@ -58,11 +59,20 @@ class FixedShapes:
         most: int,
     ) -> Tensor:  # [min(n, most + 1)] int64
         """The distinct keys in ascending order, `end` behind them."""
-        ordered = keys.sort().values
-        last = self.places(ordered[:-1] != ordered[1:], min(most + 1, len(keys)))  # the last of equal ones
-        found = ordered.index_select(0, last).clamp_(max=end)
+        found = distinct_keys(keys, end, min(most + 1, len(keys)))
         self.expect(found[-1:], end)
         return found
+
+    def grouped(
+        self,
+        keys: Tensor,  # [n] int64, as above
+        end: int,
+        most: int,
+    ) -> tuple[Tensor, Tensor, Groups]:  # [min(n, most + 1)], [n] int64
+        """The same, which of them each of the keys is, padding for padding, and which keys each of them is."""
+        found, rows, groups = grouped_keys(keys, end, min(most + 1, len(keys)))
+        self.expect(found[-1:], end)
+        return found, rows, groups
 
     def places(
         self,

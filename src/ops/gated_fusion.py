@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from src.ops.kernel_maps import stacked_map, submanifold_map
+from src.ops.kernel_maps import makes_tables, stacked_map, submanifold_map
 from src.ops.linear import linear
 from src.ops.segment_reduce import inverse_rows, permute_rows
-from src.ops.sites import Sites, union
+from src.ops.sites import Sites, places_among, union
 from src.ops.sparse_conv import sparse_conv
 
 
@@ -30,9 +30,13 @@ def gated_fusion_conv(
     side, and a gate of kernel size 1 is computed where its branch has a site.
     """
     joint, *rows = union(*sites)
-    places = [inverse_rows(own, len(joint)) for own in rows]  # row of a branch in each cell of the union, -1 for none
+    # Row of a branch in each cell of the union, -1 for none.
+    if makes_tables(joint):
+        places = tuple(places_among(own, joint) for own in sites)
+    else:
+        places = tuple(inverse_rows(own, len(joint)) for own in rows)
     gated = [x * gate.sigmoid() for x, gate in zip(features, _gates(features, joint, rows, places, gates), strict=True)]
-    kernel_map = stacked_map(joint, math.isqrt(len(weight)), rows)
+    kernel_map = stacked_map(joint, math.isqrt(len(weight)), rows, places)
     convolved = sparse_conv(torch.cat(gated), torch.cat(weight.chunk(2, dim=1)), kernel_map, bias)
     addends = tuple(
         permute_rows(linear(x, matrix), place, own)
@@ -45,7 +49,7 @@ def _gates(
     features: tuple[Tensor, Tensor],
     joint: Sites,
     rows: list[Tensor],  # [n_p] int64, row of each branch's cells in the union
-    places: list[Tensor],  # [M] int64, their inverse
+    places: tuple[Tensor, Tensor],  # [M], their inverse
     gates: Sequence[tuple[Tensor, Tensor]],
 ) -> list[Tensor]:  # [n_p, C]
     """Logits of each branch's gate on its own cells."""

@@ -10,8 +10,8 @@ from torch import Tensor
 from src.geometry.constants import constant, counting, where_else
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.kernel_map import KernelMap, TableMap, counts_kept
-from src.ops.moved_keys import NONE, moved_keys
-from src.ops.neighbour_table import neighbour_table
+from src.ops.moved_keys import NONE, Axis, moved_keys
+from src.ops.neighbour_table import moved_table, neighbour_table, stacked_table
 from src.ops.sites import HALO, Sites, padded_sites
 
 Size = int | tuple[int, ...]
@@ -85,6 +85,7 @@ def stacked_map(
     sites: Sites,
     kernel_size: Size,
     parts: list[Tensor],  # [n_p] int64 each: rows of `sites` that a subset has features for, ascending
+    places: tuple[Tensor, Tensor] | None = None,  # [n] each, the inverse, where the caller has it of two
 ) -> KernelMap:
     """Map from several subsets of the sites, whose features are stacked row below row, to all of the sites.
 
@@ -94,7 +95,10 @@ def stacked_map(
     """
     base = submanifold_map(sites, kernel_size)
     if makes_tables(sites):
-        return TableMap(*_stacked_table(base.table, parts))
+        if places is None:
+            return TableMap(*_stacked_table(base.table, parts))
+        table, bits = stacked_table(base.table, places, len(parts[0]))
+        return TableMap(table, sum(map(len, parts)), bits=bits)
     inputs, outputs, counts, first = [], [], [], 0
     for rows in parts:
         place = torch.full((len(sites),), -1, dtype=torch.int32, device=sites.device)
@@ -271,19 +275,12 @@ def _reached(
     shifts = tuple(tuple(pad - k for pad, k in zip(padding, tap, strict=True)) for tap in taps)
     coarse = Sites(shape, sites.keys)
     ones, zeros = (1,) * sites.ndim, (0,) * sites.ndim
-    candidates = _moved(sites, coarse, ones, stride, (zeros, shape[1:]), shifts)
+    candidates = moved_keys(sites.keys, *_moved(sites, coarse, ones, stride, (zeros, shape[1:])), shifts)
     candidates = (candidates if kept is None else where_else(kept, candidates, NONE)).flatten()
     if fixed_shapes() is not None:
         return padded_sites(candidates, shape)
     # What fits nowhere is the largest key, which is there at least once and cut off.
     return Sites(shape, torch.unique(torch.cat([candidates, constant((NONE,), torch.int64, sites.device)]))[:-1])
-
-
-def _strided_corners(sites: Sites, out: Sites, stride: tuple[int, ...], padding: tuple[int, ...]) -> Tensor:  # [m]
-    """Key among `sites` of the first cell of each output's window."""
-    low, high = (-HALO,) * sites.ndim, tuple(size + HALO for size in sites.shape[1:])
-    shifts = (tuple(-pad for pad in padding),)
-    return _moved(out, sites, stride, (1,) * sites.ndim, (low, high), shifts)[0]
 
 
 def _moved(
@@ -292,23 +289,25 @@ def _moved(
     factors: tuple[int, ...],
     divisors: tuple[int, ...],
     limits: tuple[tuple[int, ...], tuple[int, ...]],  # low and high of the cells there
-    shifts: tuple[tuple[int, ...], ...],
-) -> Tensor:  # [K, n] int64
-    """Keys of the sites on another grid, tap by tap."""
+) -> tuple[tuple[int, int], tuple[Axis, ...]]:
+    """How `moved_keys` takes the sites to another grid."""
     sizes = tuple(size + HALO for size in sites.shape[1:])
     columns = (sites.strides[1:], sizes, factors, divisors, *limits, target.strides[1:])
-    axes = tuple(zip(*columns, strict=True))
-    return moved_keys(sites.keys, (sites.strides[0], target.strides[0]), axes, shifts)
+    return (sites.strides[0], target.strides[0]), tuple(zip(*columns, strict=True))
 
 
 def _map_between(
     sites: Sites, out: Sites, kernel: tuple[int, ...], stride: tuple[int, ...], padding: tuple[int, ...]
 ) -> KernelMap:
     """The map between two sets that are known."""
-    corners = _strided_corners(sites, out, stride, padding)
+    # From each output to the first cell of its window.
+    low, high = (-HALO,) * sites.ndim, tuple(size + HALO for size in sites.shape[1:])
+    plan = _moved(out, sites, stride, (1,) * sites.ndim, (low, high))
+    shift = tuple(-pad for pad in padding)
     if makes_tables(sites):
-        table, bits = neighbour_table(sites.keys, corners, _taps(sites, kernel))
+        table, bits = moved_table(sites.keys, out.keys, *plan, shift, _taps(sites, kernel))
         return TableMap(table, len(sites), bits=bits)
+    corners = moved_keys(out.keys, *plan, (shift,))[0]
     found, where = _search(sites.keys, corners, sites.strides[1:], kernel, torch.Size(kernel).numel())
     hits, outputs, counts = _hits(found)
     inputs = where.reshape(-1).index_select(0, hits).to(torch.int32)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.constants import counting, where_else
 from src.ops.backend import implementation
+from src.ops.moved_keys import Axis, moved_keys_reference
 
 ORDERING_TAPS = 62
 """Taps that take part in the order of the rows: more bits fit no int64, and the order never changes a result."""
@@ -32,12 +34,51 @@ def neighbour_table_reference(keys: Tensor, corners: Tensor, taps: Tensor) -> tu
     return table, tap_bits(table)
 
 
+def stacked_table(
+    table: Tensor,  # [K, m] int32 of rows below `m`, -1 for none
+    places: tuple[Tensor, Tensor],  # [m] integer each, what row of either part each of these rows is, -1 for none
+    first: int,  # rows of the first part, behind which those of the second stand
+) -> tuple[Tensor, Tensor]:  # [2 K, m] int32, [m] int64
+    """The table with the rows of either part in turn, and its tap bits."""
+    return implementation(stacked_table_reference)(table, places, first)
+
+
+def stacked_table_reference(table: Tensor, places: tuple[Tensor, Tensor], first: int) -> tuple[Tensor, Tensor]:
+    """Plain torch form."""
+    tables = []
+    for place, before in zip(places, (0, first), strict=True):
+        # One more, which is the place of none.
+        shifted = F.pad(where_else(place >= 0, place + before, -1).to(table.dtype), (0, 1), value=-1)
+        tables.append(shifted[table.long()])
+    joined = torch.cat(tables)
+    return joined, tap_bits(joined)
+
+
 def tap_bits(
     table: Tensor,  # [K, m] int32, -1 for none
 ) -> Tensor:  # [m] int64
     """The taps of the table that meet a site as bits of a number, of the first ORDERING_TAPS."""
     shifts = counting(min(len(table), ORDERING_TAPS), torch.int64, table.device)[:, None]
     return ((table[:ORDERING_TAPS] >= 0).long() << shifts).sum(0)
+
+
+def moved_table(
+    keys: Tensor,  # [n] int64, sorted, unique
+    cells: Tensor,  # [m] int64, keys on another grid
+    samples: tuple[int, int],
+    axes: tuple[Axis, ...],
+    shift: tuple[int, ...],
+    taps: Tensor,  # [K] int64
+) -> tuple[Tensor, Tensor]:  # [K, m] int32, [m] int64
+    """`neighbour_table` of the corners that `moved_keys` makes of the cells with one shift."""
+    return implementation(moved_table_reference)(keys, cells, samples, axes, shift, taps)
+
+
+def moved_table_reference(
+    keys: Tensor, cells: Tensor, samples: tuple[int, int], axes: tuple[Axis, ...], shift: tuple[int, ...], taps: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Plain torch form."""
+    return neighbour_table_reference(keys, moved_keys_reference(cells, samples, axes, (shift,))[0], taps)
 
 
 def turned_table(

@@ -10,7 +10,9 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from src.geometry.constants import constant, counting
+from src.geometry.constants import constant, counting, where_else
+from src.ops.backend import implementation
+from src.ops.distinct_keys import Groups
 from src.ops.fixed_shapes import fixed_shapes
 
 # Pairs multiplied at a time in `paired_dot`: cache-sized on a CPU, few launches on a GPU.
@@ -43,8 +45,11 @@ def gather_segment_sum(
 def segment_count(
     rows: Tensor,  # [n] int64
     num_rows: int,
+    groups: Groups | None = None,  # of the rows, where the caller knows them
 ) -> Tensor:  # [num_rows] int64
     """How many values share each row. Does not wait for a GPU, as bincount does."""
+    if groups is not None:
+        return groups.starts.diff()
     if rows.device.type == "cpu":  # where it is faster
         return torch.bincount(rows, minlength=num_rows)
     return rows.new_zeros(num_rows).index_add_(0, rows, constant((1,), rows.dtype, rows.device).expand_as(rows))
@@ -54,8 +59,12 @@ def segment_sum(
     values: Tensor,  # [n, C]
     rows: Tensor,  # [n] int64
     num_rows: int,
+    groups: Groups | None = None,  # of the rows, where the caller knows them
 ) -> Tensor:  # [num_rows, C]
-    """Scatter sum: values that share a row, added in their order of appearance; absent rows are 0. Differentiable."""
+    """Scatter sum: values that share a row, added in their order of appearance; absent rows are 0. Differentiable,
+    unless groups are given."""
+    if groups is not None:
+        return group_sum(values, groups)
     return _SegmentSum.apply(values, rows, num_rows)
 
 
@@ -63,14 +72,31 @@ def segment_mean(
     values: Tensor,  # [n, C]
     rows: Tensor,  # [n] int64
     num_rows: int,
+    groups: Groups | None = None,  # of the rows, where the caller knows them
 ) -> Tensor:  # [num_rows, C]
-    """Scatter mean: values that share a row; absent rows are 0. Differentiable."""
-    if fixed_shapes() is not None:
-        ordered, order = torch.sort(rows, stable=True)
-        starts = torch.searchsorted(ordered, counting(num_rows + 1, torch.int64, rows.device))
-        return F.embedding_bag(order, values, starts, mode="mean", include_last_offset=True)
+    """Scatter mean: values that share a row; absent rows are 0. Differentiable, unless groups are given."""
+    if groups is not None:
+        return group_sum(values, groups, mean=True)
     counts = segment_count(rows, num_rows)
     return segment_sum(values, rows, num_rows) / counts.clamp(min=1)[:, None].to(values.dtype)
+
+
+@torch.no_grad()
+def group_sum(
+    values: Tensor,  # [n, C]
+    groups: Groups,  # of rows of `values`; it may name others that are in no group
+    mean: bool = False,
+) -> Tensor:  # [groups, C]
+    """Sum or mean of the rows of each group in their order; 0 for an empty one."""
+    return implementation(group_sum_reference)(values, groups, mean)
+
+
+def group_sum_reference(values: Tensor, groups: Groups, mean: bool) -> Tensor:
+    """Plain torch form. Waits for a GPU."""
+    members, mode = groups.order[: int(groups.starts[-1])], "mean" if mean else "sum"
+    if len(members) == 0:
+        return values.new_zeros(len(groups.starts) - 1, values.shape[1])
+    return F.embedding_bag(members, values, groups.starts, mode=mode, include_last_offset=True)
 
 
 def segment_max(
@@ -110,8 +136,8 @@ class _SegmentSum(torch.autograd.Function):
 
 def permute_rows(
     values: Tensor,  # [n, C]
-    there: Tensor,  # [m] int64, the row of `values` that each result takes, -1 for zeros; none twice
-    back: Tensor,  # [n] int64, the inverse: the result that takes each row, -1 for none
+    there: Tensor,  # [m] integer, the row of `values` that each result takes, -1 for zeros; none twice
+    back: Tensor,  # [n] integer, the inverse: the result that takes each row, -1 for none
 ) -> Tensor:  # [m, C]
     """Permute, insert and drop rows. Differentiable; the backward pass is a gather as well, so nothing is summed."""
     return _PermuteRows.apply(values, there, back)
@@ -121,15 +147,24 @@ class _PermuteRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: FunctionCtx, values: Tensor, there: Tensor, back: Tensor) -> Tensor:
         ctx.save_for_backward(back)
-        return _take(values, there)
+        return taken_rows(values, there)
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None, None]:
         (back,) = ctx.saved_tensors
-        return _take(grad, back), None, None
+        return taken_rows(grad, back), None, None
 
 
-def _take(values: Tensor, rows: Tensor) -> Tensor:
+def taken_rows(
+    values: Tensor,  # [n, C]
+    rows: Tensor,  # [m] integer, -1 for zeros
+) -> Tensor:  # [m, C]
+    """Gather rows, without gradient."""
+    return implementation(taken_rows_reference)(values, rows)
+
+
+def taken_rows_reference(values: Tensor, rows: Tensor) -> Tensor:
+    """Plain torch form."""
     padded = F.pad(values, (0, 0, 1, 0))  # -1 takes the row of zeros before them: a mask over rows takes twice as long
     return padded.index_select(0, rows + 1)
 
@@ -141,6 +176,10 @@ def topk_per_sample(
     count: int,
 ) -> Tensor:  # [B, count] int64
     """Rows of the highest scores of each sample, best first, ties by row; -1 where a sample has fewer."""
+    if fixed_shapes() is not None and batch_size == 1:
+        best, order = where_else(sample < 1, scores, -torch.inf).sort(descending=True, stable=True)
+        found = where_else(best[:count] > -torch.inf, order[:count], -1)
+        return F.pad(found, (0, count - len(found)), value=-1)[None] if len(found) < count else found[None]
     order, rank = rank_per_sample(scores, sample)
     rows = order.new_full((batch_size + 1, count + 1), -1)
     rows[sample[order], rank.clamp(max=count)] = order  # all beyond the last place meet in one column that is dropped

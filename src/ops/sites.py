@@ -10,7 +10,10 @@ import torch
 from torch import Tensor
 
 from src.geometry.constants import constant, counting, where_else
+from src.ops.distinct_keys import Groups
 from src.ops.fixed_shapes import fixed_shapes
+from src.ops.moved_keys import moved_keys
+from src.ops.neighbour_table import neighbour_table
 
 # Empty cells kept behind the last cell of every spatial axis. A key moved by up to HALO cells along any axis, in either
 # direction, lands in such a gap and never on a cell of the next row, so look-ups need no bounds test.
@@ -62,12 +65,22 @@ class Sites:
         Raises ValueError for a cell outside `shape`, which a CPU looks for: a GPU would have to wait.
         """
         empty = _checked_empty(indices, shape)
-        keys = empty.keys_of(indices)
-        if fixed_shapes() is not None:
-            sites = padded_sites(keys, empty.shape)
-            return sites, sites.nearest_rows(keys)
-        keys, rows = torch.unique(keys, return_inverse=True)
-        return cls(empty.shape, keys), rows
+        return cls.unique_keys(empty.keys_of(indices), empty.shape)
+
+    @classmethod
+    def unique_keys(
+        cls,
+        keys: Tensor,  # [n] int64, any order, repeats allowed; in fixed shapes those from `end` on are padding
+        shape: tuple[int, ...],
+    ) -> tuple[Sites, Tensor]:
+        """The same of keys, which are trusted."""
+        sites, fixed = cls(tuple(shape), keys), fixed_shapes()
+        if fixed is None:
+            sites.keys, rows = torch.unique(keys, return_inverse=True)
+        else:
+            most = fixed.most_sites(sites.shape)
+            sites.keys, rows, sites.cache["groups"] = fixed.grouped(keys, sites.end, most)
+        return sites, rows
 
     @classmethod
     def from_linear(
@@ -77,9 +90,12 @@ class Sites:
     ) -> Sites:
         """Sites from plain row-major positions, which have the same order as the keys. Trusts its arguments."""
         sites = cls(tuple(shape), linear)
-        cells = _unravelled(linear, _row_major(sites.shape), (2**62, *sites.shape[1:]))
-        sites.keys = sites.keys_of(cells)
-        sites.cache["indices"] = cells
+        sites.cache["linear"] = linear
+        if linear.device.type == "cpu":
+            cells = _unravelled(linear, _row_major(sites.shape), (2**62, *sites.shape[1:]))
+            sites.keys, sites.cache["indices"] = sites.keys_of(cells), cells
+        else:
+            sites.keys = _counted_anew(linear, _row_major(sites.shape), sites.shape[1:], sites.strides)
         return sites
 
     def on_grid(self, shape: tuple[int, ...], axes: tuple[int, ...] | None = None) -> Sites:
@@ -87,9 +103,10 @@ class Sites:
 
         Trusts that they lie in it and are as many; they keep their order.
         """
-        cells = self.indices() if axes is None else torch.stack([self.indices()[:, axis] for axis in axes], 1)
-        sites = Sites(tuple(shape), self.keys)
-        sites.keys = sites.keys_of(cells)
+        sites, steps = Sites(tuple(shape), self.keys), [0] * len(self.shape)
+        for axis, step in zip(axes or range(len(shape)), sites.strides, strict=True):
+            steps[axis] = step
+        sites.keys = self.positions(tuple(steps))
         return sites
 
     @property
@@ -127,7 +144,25 @@ class Sites:
 
     def linear(self) -> Tensor:  # [n] int64
         """Row-major position of every site, (batch * rows + row) * cols + col in 2D; sorted."""
-        return (self.indices() * constant(_row_major(self.shape), torch.int64, self.device)).sum(1)
+        if "linear" not in self.cache:
+            self.cache["linear"] = self.positions(_row_major(self.shape))
+        return self.cache["linear"]
+
+    def positions(
+        self,
+        steps: tuple[int, ...],  # per axis of `shape`
+        first: int = 0,
+    ) -> Tensor:  # [n] int64
+        """(batch, *cell) of every site times the steps, summed on `first`: keys of another grid, linear positions."""
+        if self.device.type == "cpu":
+            found = (self.indices() * constant(steps, torch.int64, self.device)).sum(1)
+            return found + first if first else found
+        return _counted_anew(self.keys, self.strides, tuple(size + HALO for size in self.shape[1:]), steps, first)
+
+    @property
+    def groups(self) -> Groups | None:
+        """Which of the given cells each site of `unique` is, known in fixed shapes."""
+        return self.cache.get("groups")
 
     def rows_of(
         self,
@@ -158,6 +193,20 @@ def _row_major(shape: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(math.prod(shape[axis + 1 :]) for axis in range(len(shape)))
 
 
+def _counted_anew(
+    positions: Tensor,  # [n] int64
+    strides: tuple[int, ...],
+    sizes: tuple[int, ...],  # of each axis but the first, as the strides count them
+    steps: tuple[int, ...],
+    first: int = 0,
+) -> Tensor:  # [n] int64
+    """The positions with other strides, counted from `first`, in one launch."""
+    columns = zip(strides[1:], sizes, steps[1:], strict=True)
+    axes = tuple((stride, size, 1, 1, 0, size, step) for stride, size, step in columns)
+    shift = (1, 1, 1, 1, 0, first + 1, 1)  # an axis with the cell 0 alone, moved by `first`
+    return moved_keys(positions, (strides[0], steps[0]), (*axes, shift), ((0,) * len(sizes) + (first,),))[0]
+
+
 def _unravelled(
     positions: Tensor,  # [n] int64
     strides: tuple[int, ...],
@@ -185,6 +234,14 @@ def rows_of_keys(
     return where_else(keys[rows] == wanted, rows, -1)
 
 
+def places_among(
+    part: Sites,
+    joint: Sites,
+) -> Tensor:  # [n of joint] int32
+    """Row that each site of `joint` has in `part`, -1 for none. In fixed shapes padding has some of padding, or -1."""
+    return neighbour_table(part.keys, joint.keys, constant((0,), torch.int64, joint.device))[0][0]
+
+
 def padded_sites(
     keys: Tensor,  # [n] int64, any order, repeats allowed; those from `end` on, of which there are some, are padding
     shape: tuple[int, ...],
@@ -207,8 +264,8 @@ def union(a: Sites, b: Sites) -> tuple[Sites, Tensor, Tensor]:
         return a, rows, rows
     keys = torch.cat([a.keys, b.keys])
     if fixed_shapes() is not None:
-        joint = padded_sites(keys, a.shape)
-        return joint, joint.nearest_rows(a.keys), joint.nearest_rows(b.keys)
+        joint, rows = Sites.unique_keys(keys, a.shape)
+        return joint, *rows.split([len(a), len(b)])
     keys = torch.unique(keys)
     return Sites(a.shape, keys), torch.searchsorted(keys, a.keys), torch.searchsorted(keys, b.keys)
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from src.geometry.constants import constant, counting, where_else
+from src.geometry.constants import constant
+from src.ops.cell_keys import cell_keys
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.segment_reduce import inverse_rows, rank_per_sample, segment_count, segment_mean
 from src.ops.sites import Sites
@@ -32,8 +33,8 @@ def voxelize(
     if len(points) != len(batch):
         raise ValueError(f"expected one row of points for each entry of batch [{len(batch)}], got {len(points)}")
     sites, rows, inside = voxel_rows(coordinates, batch, lower_m, voxel_size_m, shape, batch_size)
-    values = points.index_select(0, inside)
     limited, fixed = max_voxels is not None and len(sites) > max_voxels, fixed_shapes()
+    values = points if inside is None else points.index_select(0, inside)
     if limited and fixed is not None:  # of one sample: padding follows the voxels
         fixed.expect(sites.keys[max_voxels : max_voxels + 1], sites.end)
     elif limited:
@@ -42,7 +43,8 @@ def voxelize(
         values, rows = values[rows >= 0], rows[rows >= 0]
         sites = Sites(sites.shape, sites.keys.index_select(0, kept))
     values = values.to(torch.promote_types(values.dtype, torch.float32))
-    return sites, segment_mean(values, rows, len(sites)), segment_count(rows, len(sites))
+    of_all = (rows, len(sites), sites.groups)
+    return sites, segment_mean(values, *of_all), segment_count(*of_all)
 
 
 def voxel_rows(
@@ -52,11 +54,11 @@ def voxel_rows(
     voxel_size_m: tuple[float, ...],  # (x, y[, z])
     shape: tuple[int, ...],  # (y, x) or (z, y, x) voxels
     batch_size: int,
-) -> tuple[Sites, Tensor, Tensor]:
+) -> tuple[Sites, Tensor, Tensor | None]:
     """Sites [V] of the voxels that hold points; of the n points inside, the voxel and which they are, both [n] int64.
 
-    What is inside, and what raises ValueError, is as for `voxelize`. In fixed shapes n is P, and points outside have
-    padding for their voxel.
+    What is inside, and what raises ValueError, is as for `voxelize`. In fixed shapes n is P, None says that they are
+    all, and points outside have padding for their voxel.
     """
     ndim = len(shape)
     if coordinates.shape != (len(batch), ndim):
@@ -66,16 +68,15 @@ def voxel_rows(
         )
     if len(lower_m) != ndim or len(voxel_size_m) != ndim:
         raise ValueError(f"lower_m={lower_m}, voxel_size_m={voxel_size_m}: expected {ndim} values each, as in {shape}")
+    if fixed_shapes() is not None:
+        grid = (tuple(lower_m), tuple(voxel_size_m), (batch_size, *shape))
+        return *Sites.unique_keys(cell_keys(coordinates, batch, None, *grid, torch.float64), grid[2]), None
     place = coordinates.double() - constant(tuple(lower_m), torch.float64, coordinates.device)
     cells = (
         (place / constant(tuple(voxel_size_m), torch.float64, coordinates.device)).floor().flip(1)
     )  # [P, d] (z, y, x)
     limit = constant(tuple(shape), torch.int64, cells.device)
     inside = ((cells >= 0) & (cells < limit)).all(1)
-    if fixed_shapes() is not None:
-        samples, cells = where_else(inside, batch, batch_size), where_else(inside[:, None], cells, 0.0)
-        sites, rows = Sites.unique(torch.cat([samples[:, None], cells.long()], 1), (batch_size, *shape))
-        return sites, rows, counting(len(batch), torch.int64, batch.device)
     inside = inside.nonzero().squeeze(1)
     indices = torch.cat([batch[:, None].index_select(0, inside), cells.index_select(0, inside).long()], 1)
     sites, rows = Sites.unique(indices, (batch_size, *shape))

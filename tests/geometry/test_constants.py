@@ -2,7 +2,7 @@
 
 import torch
 
-from src.geometry.constants import constant, counting, where_else
+from src.geometry.constants import constant, counting, repeated, where_else
 
 
 def test_the_same_tensor_every_time_and_one_for_each_type():
@@ -26,6 +26,7 @@ def test_counting_is_the_head_of_one_sequence_for_every_count_up_to_a_power_of_t
     for count in (0, 1, 5, 8, 9):
         assert counting(count, torch.int32, device).tolist() == list(range(count))
     assert counting(5, torch.int64, device).data_ptr() == counting(8, torch.int64, device).data_ptr()
+    assert repeated((2, 0, 3), device).tolist() == [0, 0, 2, 2, 2]
 
 
 def test_a_number_stands_where_a_value_is_not_kept():

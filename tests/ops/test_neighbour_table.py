@@ -5,7 +5,7 @@ import torch
 
 from src.ops import kernel_maps
 from src.ops.kernel_maps import pruned_map, stacked_map, strided_map, submanifold_map, temporal_map, window_map
-from src.ops.neighbour_table import neighbour_table, tap_bits
+from src.ops.neighbour_table import neighbour_table, stacked_table, tap_bits
 from tests.ops.maps import random_sites
 
 BUILDERS = {
@@ -47,3 +47,10 @@ def test_a_search_by_hand():
     table, bits = neighbour_table(torch.tensor([2, 3, 9]), torch.tensor([1, 8]), torch.tensor([0, 1, 2]))
     assert table.tolist() == [[-1, -1], [0, 2], [1, -1]] and table.dtype == torch.int32
     assert bits.tolist() == [0b110, 0b010] and torch.equal(tap_bits(table), bits)
+
+
+def test_the_rows_of_two_parts_are_those_of_their_maps():
+    table = torch.tensor([[0, -1, 2], [1, 2, -1]], dtype=torch.int32)
+    places = (torch.tensor([0, -1, 1]), torch.tensor([-1, 0, 1]))
+    found, bits = stacked_table(table, places, 2)
+    assert found.tolist() == [[0, -1, 1], [-1, 1, -1], [-1, -1, 3], [2, 3, -1]] and bits.tolist() == [9, 10, 5]

@@ -1,5 +1,6 @@
 import torch
 
+from src.ops.fixed_shapes import Capacities, FixedShapes, in_fixed_shapes
 from src.ops.segment_reduce import (
     gather_segment_sum,
     inverse_rows,
@@ -63,6 +64,9 @@ def test_topk_per_sample_by_hand():
     scores, sample = torch.tensor([0.1, 0.9, 0.5, 0.5, 0.7]), torch.tensor([0, 0, 0, 2, 2])
     assert topk_per_sample(scores, sample, 3, 2).tolist() == [[1, 2], [-1, -1], [4, 3]]
     assert topk_per_sample(scores[:0], sample[:0], 2, 2).tolist() == [[-1, -1], [-1, -1]]
+    with in_fixed_shapes(FixedShapes(Capacities(9, 9, 9, 9), (3, 3))):  # what is of sample 1 is padding
+        assert topk_per_sample(scores, sample.clamp(max=1), 1, 2).tolist() == [[1, 2]]
+        assert topk_per_sample(scores, sample.clamp(max=1), 1, 7).tolist() == [[1, 2, 0, -1, -1, -1, -1]]
     order, rank = rank_per_sample(scores, sample)
     assert order.tolist() == [1, 2, 0, 4, 3] and rank.tolist() == [0, 1, 2, 0, 1]
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from src.ops.sites import Sites, rows_of_keys, union
+from src.ops.sites import HALO, Sites, _counted_anew, places_among, rows_of_keys, union
 
 SHAPE = (2, 4, 5)
 
@@ -72,3 +72,19 @@ def test_union_needs_one_grid():
     b, _ = Sites.from_indices(torch.zeros(1, 3, dtype=torch.int64), (2, 4, 6))
     with pytest.raises(ValueError, match="different grids"):
         union(a, b)
+
+
+@pytest.mark.parametrize("first", [0, 70])
+def test_positions_of_a_gpu_are_those_of_a_cpu(first):
+    shape, steps = (2, 5, 6, 7), (1000, 0, 14, 2)
+    keys = torch.tensor([[0, 0, 0, 0], [0, 4, 5, 6], [1, 2, 0, 3], [2, 0, 0, 0]])  # the last is padding
+    sites = Sites(shape, Sites(shape, keys).keys_of(keys))
+    sizes = tuple(size + HALO for size in shape[1:])
+    wanted = (keys * torch.tensor(steps)).sum(1) + first
+    assert torch.equal(sites.positions(steps, first), wanted)
+    assert torch.equal(_counted_anew(sites.keys, sites.strides, sizes, steps, first), wanted)
+
+
+def test_places_among_by_hand():
+    part, joint = (Sites((1, 4, 4), torch.tensor(keys)) for keys in ([3, 8], [1, 3, 7, 8]))
+    assert places_among(part, joint).tolist() == [-1, 0, -1, 1]

@@ -172,17 +172,16 @@ class VoxelEncoder(nn.Module):
     ) -> SparseBEV:
         """Sum over height and over strides: a coarse site lands on the lowest row and column of its block."""
         shape = (stages[0].batch_size, *stages[0].sites.shape[-2:])
-        cells = torch.cat(
-            [
-                torch.cat([stage.indices[:, :1], stage.indices[:, -2:] * 2**depth], dim=1)  # (b, row, col)
-                for depth, stage in enumerate(stages)
-            ]
-        )
+        sample, row, col = Sites(shape, stages[0].sites.keys).strides
+        keys = []
+        for depth, stage in enumerate(stages):
+            above = (0,) * (stage.sites.ndim - 2)
+            keys.append(stage.sites.positions((sample, *above, row * 2**depth, col * 2**depth)))
         features = torch.cat([stage.features for stage in stages])
         features = features.to(torch.promote_types(features.dtype, torch.float32))  # many terms: not in half precision
-        sites, rows = Sites.unique(cells, shape)
+        sites, rows = Sites.unique_keys(torch.cat(keys), shape)
         if len(sites) > 0:  # without sites the (empty) features stay as they are, in the graph of their parameters
-            features = segment_sum(features, rows, len(sites))
+            features = segment_sum(features, rows, len(sites), sites.groups)
         return SparseBEV(sites, features)
 
 

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import repeated
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
 from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
@@ -20,8 +21,8 @@ from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv, Tem
 from src.models.memory import motions
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.frame_motion import moving
-from src.ops.segment_reduce import segment_mean, topk_per_sample
-from src.ops.sites import Sites
+from src.ops.segment_reduce import segment_mean, taken_rows, topk_per_sample
+from src.ops.sites import Sites, places_among
 from src.structures.batch import FrameBatch
 from src.structures.sparse_bev import SparseBEV, SparseMap
 
@@ -71,6 +72,15 @@ class WarpedCells:
     velocities: Tensor  # [n, 2] m/s over ground, augmented axes
     elapsed_s: Tensor  # [n]
     features: Tensor  # [n, C]
+
+
+@dataclass
+class PaddedCells:
+    """Remembered cells of one stream in fixed shapes; those that are nowhere are padding."""
+
+    keys: Tensor  # [T * K] int64 among sites on `BEVPath.shape`, frame after frame
+    elapsed_s: Tensor  # [T]
+    features: Tensor  # [T * K, C]
 
 
 class BEVPath(nn.Module):
@@ -174,34 +184,56 @@ class BEVPath(nn.Module):
         values = (indices, xy, transform_vectors_xy(matrix, velocities), elapsed, features)
         return WarpedCells(*(value[kept] for value in values))
 
-    def aggregate(self, fused: SparseBEV, warped: WarpedCells | None) -> SparseBEV:
+    def shape(self, batch_size: int) -> tuple[int, int, int, int]:
+        """Of the grid over time: (B, slots, rows, cols)."""
+        return batch_size, self.num_slots, *self.grid.cells
+
+    def aggregate(self, fused: SparseBEV, warped: WarpedCells | PaddedCells | None) -> SparseBEV:
         """F_out = F_fuse + what sparse convolutions over time make of both, on the sites of either."""
-        b = fused.batch_size
-        shape = (b, self.num_slots, *self.grid.cells)
-        cell = fused.indices
-        now = torch.full_like(cell[:, :1], self.config.num_frames)
-        indices = torch.cat([cell[:, :1], now, cell[:, 1:]], dim=1)
-        # All cells of a slot have one age: embed it once per (sample, slot) and look it up; unused slots hold 0.
-        samples = b if fixed_shapes() is None else b + 1  # padding has one of its own
-        ages, features = self.time.mlp[0].bias.new_zeros(samples * self.num_slots), fused.features
-        if warped is not None:
-            ages[warped.indices[:, 0] * self.num_slots + warped.indices[:, 1]] = warped.elapsed_s
-            indices = torch.cat([warped.indices, indices])
-            features = torch.cat([warped.features.to(features.dtype), features])
-        sites, owners = Sites.unique(indices, shape)
-        times = F.embedding(indices[:, 0] * self.num_slots + indices[:, 1], self.time(ages))
-        features = torch.cat([features, times.to(features.dtype)], dim=1)
-        x = SparseMap(sites, segment_mean(features, owners, len(sites)))
+        x = self._over_time_padded(fused, warped) if isinstance(warped, PaddedCells) else self._over_time(fused, warped)
         for number, (conv, norm) in enumerate(zip(self.convs, self.norms, strict=True)):
             x = conv(x)
             y = norm(x.features)
             x = x.with_features(y if number == len(self.convs) - 1 else F.relu(y))
         if len(x.sites) == len(fused.sites) and fixed_shapes() is None:  # only the current cells: keep their maps
             return fused.with_features(fused.features + x.features)
-        sites = Sites.from_linear(x.sites.linear(), (b, *self.grid.cells))
-        rows = sites.nearest_rows(fused.sites.keys)
-        spread = fused.features.new_zeros(x.features.shape).index_copy(0, rows, fused.features)
+        sites = Sites.from_linear(x.sites.linear(), (fused.batch_size, *self.grid.cells))
+        if fixed_shapes() is not None:
+            spread = taken_rows(fused.features, places_among(fused.sites, sites))
+        else:
+            rows = sites.nearest_rows(fused.sites.keys)
+            spread = fused.features.new_zeros(x.features.shape).index_copy(0, rows, fused.features)
         return SparseBEV(sites, spread + x.features)
+
+    def _over_time(self, fused: SparseBEV, warped: WarpedCells | None) -> SparseMap:
+        """The current and the remembered cells with an embedding of their age."""
+        b, cell = fused.batch_size, fused.indices
+        now = torch.full_like(cell[:, :1], self.config.num_frames)
+        indices = torch.cat([cell[:, :1], now, cell[:, 1:]], dim=1)
+        # All cells of a slot have one age: embed it once per (sample, slot) and look it up; unused slots hold 0.
+        ages, features = self.time.mlp[0].bias.new_zeros(b * self.num_slots), fused.features
+        if warped is not None:
+            ages[warped.indices[:, 0] * self.num_slots + warped.indices[:, 1]] = warped.elapsed_s
+            indices = torch.cat([warped.indices, indices])
+            features = torch.cat([warped.features.to(features.dtype), features])
+        sites, owners = Sites.unique(indices, self.shape(b))
+        times = F.embedding(indices[:, 0] * self.num_slots + indices[:, 1], self.time(ages))
+        features = torch.cat([features, times.to(features.dtype)], dim=1)
+        return SparseMap(sites, segment_mean(features, owners, len(sites)))
+
+    def _over_time_padded(self, fused: SparseBEV, warped: PaddedCells) -> SparseMap:
+        """The same in fixed shapes."""
+        shape = self.shape(fused.batch_size)
+        sample, slot, row, col = Sites(shape, warped.keys).strides
+        now = fused.sites.positions((sample, row, col), self.config.num_frames * slot)
+        sites, owners = Sites.unique_keys(torch.cat([warped.keys, now]), shape)
+        num = len(warped.elapsed_s)
+        counts = (*[len(warped.keys) // num] * num, len(fused))
+        ages = F.pad(warped.elapsed_s, (0, 1))  # the last is that of the current cells
+        times = F.embedding(repeated(counts, ages.device), self.time(ages))
+        features = torch.cat([warped.features.to(fused.features.dtype), fused.features])
+        features = torch.cat([features, times.to(features.dtype)], dim=1)
+        return SparseMap(sites, segment_mean(features, owners, len(sites), sites.groups))
 
 
 def _cell_head(channels: int, outputs: int) -> nn.ModuleList:

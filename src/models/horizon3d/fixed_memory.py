@@ -9,14 +9,16 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.constants import constant, where_else
-from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
-from src.models.horizon3d.bev_path import BEVPath, CellPrediction, WarpedCells
+from src.geometry.tensor_transforms import transform_points_xy
+from src.models.horizon3d.bev_path import BEVPath, CellPrediction, PaddedCells
 from src.models.horizon3d.dptf import DPTF, WarpedMemory
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
 from src.models.horizon3d.gaussian_path import GaussianPath
 from src.models.horizon3d.output import Horizon3DOutput
 from src.models.memory import Motion, RememberedFrame
+from src.ops.cell_keys import cell_centres, cell_keys
 from src.ops.frame_motion import moving
+from src.ops.sites import HALO
 from src.structures.batch import FrameBatch
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV
@@ -90,35 +92,38 @@ class FixedMemory:
 
     def recall(self, dptf: DPTF, batch: FrameBatch) -> tuple[WarpedMemory, Tensor]:  # and [T] bool
         """As `DPTF.recall`, less the memory itself: instead, which frames stay in it (`Memory.before`)."""
-        stored = RememberedFrame(self.frames[:, :1], self.frames[:, 1:17].view(-1, 1, 4, 4), self.frames[:, 17:18] > 0)
+        held = self.frames[:, 17:] > 0  # [T, 3]
+        stored = RememberedFrame(self.frames[:, :1], self.frames[:, 1:17].view(-1, 1, 4, 4), held[:, :1])
         kept, motion = stored.stacked_motion(batch, dptf.config.max_age_s)
         history = warped = None
         if dptf.gaussian_path is not None:
-            history = self._history(dptf.gaussian_path, motion, dptf.config.min_speed_mps)
+            history = self._history(dptf.gaussian_path, held[:, 2:], motion, dptf.config.min_speed_mps)
         if dptf.bev_path is not None:
-            warped = self._warped(dptf.bev_path, kept, motion, dptf.config.min_speed_mps)
+            warped = self._warped(dptf.bev_path, kept, held[:, 1:2], motion, dptf.config.min_speed_mps)
         return WarpedMemory(Memory(()), history, warped), kept.squeeze(1)
 
-    def _history(self, path: GaussianPath, motion: Motion, min_speed_mps: float) -> GaussianSet:
+    def _history(self, path: GaussianPath, held: Tensor, motion: Motion, min_speed_mps: float) -> GaussianSet:
         num, past = len(self.gaussians), _gaussians_of(self.gaussians)
-        usable = motion.usable[:num] & (self.frames[:num, 19:] > 0)
+        usable = motion.usable[:num] & held[:num]
         return path.move(past, Motion(motion.aug_from_past[:num], motion.elapsed_s[:num], usable), min_speed_mps)
 
-    def _warped(self, path: BEVPath, kept: Tensor, motion: Motion, min_speed_mps: float) -> WarpedCells:
-        """As `BEVPath.recall`; cells that are not there lie in a sample that does not exist."""
-        num, width = len(self.cells), self.cells.shape[2]
+    def _warped(
+        self, path: BEVPath, kept: Tensor, held: Tensor, motion: Motion, min_speed_mps: float
+    ) -> PaddedCells:  # kept, held: [T, 1] bool
+        """As `BEVPath.recall`; cells that are not there are padding."""
+        num, width, grid = len(self.cells), self.cells.shape[2], path.grid
         xy, velocities, features, valid = self.cells.split([2, 2, width - CELL_WIDTH, 1], dim=2)  # [T, K, ...] each
-        matrix, elapsed = motion.aug_from_past[:num], motion.elapsed_s[:num]  # [T, 1, 4, 4], [T, 1]
+        elapsed = motion.elapsed_s[:num]  # [T, 1]
         if path.config.velocity_compensation:
             xy = xy + moving(velocities, min_speed_mps) * elapsed[:, :, None]
-        xy = transform_points_xy(matrix, xy)
-        usable = motion.usable[:num] & (self.frames[:num, 18:19] > 0)  # [T, 1]
-        found = (valid > 0) & (usable & path.grid.contains(xy))[..., None]  # [T, K, 1]
+        xy = transform_points_xy(motion.aug_from_past[:num], xy)
+        found = (valid > 0) & (motion.usable[:num] & held[:num])[:, :, None]  # [T, K, 1]
         slots = path.config.num_frames - kept[:num].cumsum(0)  # [T, 1], a frame for each that is kept
-        cells = where_else(found, path.grid.cell_of(xy), 0)
-        indices = torch.cat([(~found).long(), slots[:, :, None].expand_as(found), cells], dim=2)
-        columns = (indices, xy, transform_vectors_xy(matrix, velocities), elapsed.expand(found.shape[:2]), features)
-        return WarpedCells(*(column.flatten(0, 1) for column in columns))
+        # Slots stand for samples, as many as make the key of padding that of padding among sites on `path.shape`.
+        shape = (path.shape(1)[1] + HALO, *grid.cells)
+        corner, size = (grid.x_min_m, grid.y_min_m), (grid.cell_m, grid.cell_m)
+        keys = cell_keys(xy.flatten(0, 1), slots.flatten(), found.flatten(), corner, size, shape, xy.dtype)
+        return PaddedCells(keys, elapsed.flatten(), features.flatten(0, 1))
 
     def pushed(
         self,
@@ -131,14 +136,16 @@ class FixedMemory:
         """The memory with the current frame added; as it was where that has overflowed."""
         num = len(self.frames)
         # Of the new frame (0), the old ones and one that is none: which comes first, second, ...
-        old = torch.nonzero_static(kept, size=num - 1, fill_value=num).flatten() + 1
-        same, first = (constant(values, torch.int64, old.device) for values in (tuple(range(1, num + 1)), (0,)))
-        order = torch.where(overflow, same, torch.cat([first, old]))
-        row = torch.cat([batch.timestamps_s, batch.global_from_ego.flatten()])
-        frames = torch.cat([F.pad(row, (0, 3), value=1.0)[None], self.frames, torch.zeros_like(self.frames[:1])])
+        stay = F.pad(kept, (1, 0), value=True)
+        same = constant(tuple(range(1, num + 1)), torch.int64, stay.device)
+        order = torch.where(overflow, same, torch.nonzero_static(stay, size=num, fill_value=num + 1).flatten())
+        there = constant((1.0,) * 3, torch.float64, order.device)
+        none = constant(((0.0,) * FRAME_WIDTH,), torch.float64, order.device)
+        row = torch.cat([batch.timestamps_s, batch.global_from_ego.flatten(), there])
+        frames = torch.cat([row[None], self.frames, none])
         paths = (num, len(self.cells), len(self.gaussians))
         held = tuple((1,) * 17 + tuple(int(age < count) for count in paths) for age in range(num))
-        frames = frames.index_select(0, order) * constant(held, torch.float64, old.device)
+        frames = frames.index_select(0, order) * constant(held, torch.float64, order.device)
         cells, gaussians = self.cells, self.gaussians
         if dptf.bev_path is not None:
             best = _best_cells(dptf.bev_path, output.fused_bev, output.dptf.cells, cells.shape[1])
@@ -168,7 +175,7 @@ def _best_cells(
     features = fused.features
     if torch.is_autocast_enabled(features.device.type):
         features = features.to(torch.get_autocast_dtype(features.device.type))
-    columns = (path.grid.centre_of(fused.indices[:, 1:]), cells.velocities, features.float(), chosen[:, None].float())
+    columns = (cell_centres(fused.sites.keys, path.grid), cells.velocities, features.float(), chosen[:, None].float())
     rows = torch.cat(columns, dim=1).index_select(0, best)
     return F.pad(rows, (0, 0, 0, count - len(rows)))[None] if len(rows) < count else rows[None]
 

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import counting, where_else
+from src.geometry.constants import counting
 from src.models.horizon3d.cross_attention import RadarCrossAttention
 from src.models.horizon3d.temporal_attention import TemporalSelfAttention, attention_mask
 from src.models.layers.doppler import Doppler
@@ -21,6 +21,7 @@ from src.models.layers.merging import LinearReLU, block_diagonal, joined_linear,
 from src.models.layers.norm import layer_norm
 from src.models.layers.sparse import SubmanifoldConv
 from src.models.layers.views import CameraViews
+from src.ops.cell_keys import cell_keys
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.gaussian_shapes import AttributeLimits, activated_attributes, refined_attributes, sampling_points
 from src.ops.segment_reduce import segment_mean
@@ -197,12 +198,13 @@ class SelfEncoding(nn.Module):
 
     def _of_all(self, features: Tensor, gaussians: GaussianSet) -> Tensor:
         """In fixed shapes: padding as Gaussians of a sample that does not exist."""
-        valid, (b, g) = gaussians.valid[..., None], gaussians.valid.shape
-        sample = counting(b, torch.int64, valid.device).view(b, 1, 1)
-        indices = torch.cat([where_else(valid, sample, b), self.grid.cell_of(gaussians.means)], dim=2)
-        indices = F.pad(indices.flatten(0, 1), (0, 0, 0, 1), value=b)  # one more, which is padding in any case
-        sites, rows = Sites.unique(indices, (b, *self.grid.cells))
-        return self._exchange(features.flatten(0, 1), sites, rows[:-1]).unflatten(0, (b, g)) * valid
+        valid, (b, g), grid = gaussians.valid, gaussians.valid.shape, self.grid
+        lower, size, shape = (grid.x_min_m, grid.y_min_m), (grid.cell_m,) * 2, (b, *grid.cells)
+        means, sample = gaussians.means.flatten(0, 1), counting(b, torch.int64, valid.device)
+        # One more, which is padding in any case.
+        keys = cell_keys(means, sample, valid.flatten(), lower, size, shape, means.dtype, behind=1)
+        sites, rows = Sites.unique_keys(keys, shape)
+        return self._exchange(features.flatten(0, 1), sites, rows[:-1]).unflatten(0, (b, g)) * valid[..., None]
 
     def _exchange(
         self,
@@ -210,7 +212,7 @@ class SelfEncoding(nn.Module):
         sites: Sites,
         rows: Tensor,  # [V] int64, site of each
     ) -> Tensor:  # [V, C]
-        x = SparseBEV(sites, segment_mean(features, rows, len(sites)))
+        x = SparseBEV(sites, segment_mean(features, rows, len(sites), sites.groups))
         for conv, norm in zip(self.convs, self.norms, strict=True):
             x = conv(x)
             x = x.with_features(layer_norm(norm, x.features, relu=True))

@@ -13,7 +13,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.moved_keys import NONE
 from src.ops.radial_change import radial_change, radial_votes
-from src.ops.segment_reduce import gather_segment_sum, segment_sum
+from src.ops.segment_reduce import gather_segment_sum, group_sum
 
 
 @dataclass(kw_only=True)
@@ -56,8 +56,8 @@ class Doppler:
         """Of all points inside the grid."""
         given, weighted = radial_votes(radar_points, radar_batch, grid)
         if (fixed := fixed_shapes()) is not None:
-            keys = fixed.distinct(given, NONE, len(given))
-            sums = segment_sum(weighted, torch.searchsorted(keys, given), len(keys))
+            keys, _, groups = fixed.grouped(given, NONE, len(given))
+            sums = group_sum(weighted, groups)
             return cls(grid, keys, sums[:, 1:] / sums[:, :1].clamp(min=1.0), in_losses, along_heading)
         chosen = (given < NONE).nonzero().squeeze(1)
         keys, order = torch.sort(given.index_select(0, chosen), stable=True)

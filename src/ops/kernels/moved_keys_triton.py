@@ -38,6 +38,23 @@ def moved_keys_triton(
     return out
 
 
+@triton.jit
+def moved_key(key, plan, shifts, old_step, new_step, AXES: tl.constexpr, NONE: tl.constexpr):  # noqa: ANN001, ANN201
+    """The keys moved by one tap's shifts."""
+    total = key // old_step * new_step
+    fits = key == key
+    for axis in tl.static_range(AXES):
+        row = plan + 7 * axis
+        divisor = tl.load(row + 3)
+        cell = key // tl.load(row) % tl.load(row + 1)
+        # Eight divisors more, so that the division of integers, which cuts towards zero, meets nothing negative.
+        moved = cell * tl.load(row + 2) + tl.load(shifts + axis) + 8 * divisor
+        target = moved // divisor - 8
+        fits = fits & (moved % divisor == 0) & (target >= tl.load(row + 4)) & (target < tl.load(row + 5))
+        total += target * tl.load(row + 6)
+    return tl.where(fits, total, NONE)
+
+
 @triton.jit(do_not_specialize=["num", "old_step", "new_step"])
 def _move(  # noqa: ANN202
     keys, plan, taps, out, num, old_step, new_step,  # noqa: ANN001
@@ -46,17 +63,6 @@ def _move(  # noqa: ANN202
     """One tap of a block of sites."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     tap = tl.program_id(1)
-    live = place < num
-    key = tl.load(keys + place, mask=live, other=0)
-    total = key // old_step * new_step
-    fits = live
-    for axis in tl.static_range(AXES):
-        row = plan + 7 * axis
-        divisor = tl.load(row + 3)
-        cell = key // tl.load(row) % tl.load(row + 1)
-        # Eight divisors more, so that the division of integers, which cuts towards zero, meets nothing negative.
-        moved = cell * tl.load(row + 2) + tl.load(taps + tap * AXES + axis) + 8 * divisor
-        target = moved // divisor - 8
-        fits = fits & (moved % divisor == 0) & (target >= tl.load(row + 4)) & (target < tl.load(row + 5))
-        total += target * tl.load(row + 6)
-    tl.store(out + tap * num + place, tl.where(fits, total, NONE), mask=live)
+    key = tl.load(keys + place, mask=place < num, other=0)
+    found = moved_key(key, plan, taps + tap * AXES, old_step, new_step, AXES, NONE)
+    tl.store(out + tap * num + place, found, mask=place < num)

@@ -14,6 +14,7 @@ from triton.runtime import driver
 from triton.runtime.jit import JITFunction
 
 from src.geometry.bev_grid import BEVGrid
+from src.ops.distinct_keys import Groups
 from src.ops.gaussian_cells import gaussian_cells
 from src.ops.gaussian_shapes import AttributeLimits
 from src.ops.kernel_maps import submanifold_map
@@ -22,12 +23,15 @@ from src.ops.kernels import (
     attend_views_triton,
     box_codes_triton,
     candidate_ranks_triton,
+    cell_keys_triton,
+    distinct_keys_triton,
     farthest_point_triton,
     frame_motion_triton,
     gaussian_shapes_triton,
     moved_keys_triton,
     neighbour_table_triton,
     radial_change_triton,
+    segment_reduce_triton,
     sparse_conv_triton,
     splat_triton,
     summed_norm_triton,
@@ -63,17 +67,28 @@ def main():
     driver.set_active(Target())
     JITFunction.run = compile_only(JITFunction.run)
     kernels = (
-        *(attend_cells_triton, attend_views_triton, box_codes_triton, candidate_ranks_triton, farthest_point_triton),
-        *(frame_motion_triton, gaussian_shapes_triton, moved_keys_triton, neighbour_table_triton, radial_change_triton),
-        *(sparse_conv_triton, splat_triton, summed_norm_triton, view_samples_triton),
+        *(attend_cells_triton, attend_views_triton, box_codes_triton, candidate_ranks_triton),
+        *(cell_keys_triton, distinct_keys_triton, farthest_point_triton, frame_motion_triton),
+        *(gaussian_shapes_triton, moved_keys_triton, neighbour_table_triton, radial_change_triton),
+        *(segment_reduce_triton, sparse_conv_triton, splat_triton, summed_norm_triton),
+        view_samples_triton,
     )
     for module in kernels:
         module.runs_kernels = lambda tensor: True
     valid = torch.ones(2, 700, dtype=torch.bool)
     farthest_point_triton.farthest_points_triton(torch.zeros(2, 700, 2), valid, torch.zeros(2).long(), 20)
 
+    for count in (80, 8000):
+        distinct_keys_triton.distinct_keys_triton(torch.arange(count), 2**62, 50)
+        distinct_keys_triton.grouped_keys_triton(torch.arange(count), 70, 50)
     neighbour_table_triton.neighbour_table_triton(*(torch.arange(size) for size in (80, 80, 9)))
     neighbour_table_triton.turned_table_triton(torch.zeros(9, 80, dtype=torch.int32), 80)
+    neighbour_table_triton.moved_table_triton(
+        *(torch.arange(80), torch.arange(40), (120, 35), ((12, 10, 1, 2, 0, 5, 7),) * 2, (1, 0), torch.arange(9))
+    )
+    for dtype in (torch.int32, torch.int64):
+        places = (torch.zeros(80, dtype=torch.int32), torch.zeros(80, dtype=dtype))
+        neighbour_table_triton.stacked_table_triton(torch.zeros(9, 80, dtype=torch.int32), places, 40)
     kernel_map = submanifold_map(Sites.from_linear(torch.arange(80), (1, 8, 10)), 3)
     for dtype, c_in, c_out in ((torch.float32, 5, 16), (torch.float32, 96, 128), (torch.bfloat16, 96, 128)):
         features, weight = torch.zeros(80, c_in, dtype=dtype), torch.zeros(9, c_in, c_out, dtype=dtype)
@@ -83,6 +98,19 @@ def main():
         operands = (features.detach(), weight.detach(), kernel_map, None, out.detach())
         sparse_conv_triton.sparse_conv_relu_triton(*operands)
 
+    for dtype, channels in ((torch.float32, 7), (torch.bfloat16, 128)):
+        groups = Groups(torch.arange(80), torch.arange(9))
+        values = torch.zeros(80, channels, dtype=dtype)
+        segment_reduce_triton.group_sum_triton(values, groups, channels == 7)
+        segment_reduce_triton.taken_rows_triton(values, torch.arange(40, dtype=torch.int32))
+        segment_reduce_triton.taken_rows_triton(values, torch.arange(40))
+    places, samples = torch.zeros(80, 5), torch.zeros(8).long()
+    for points, dtype in ((places[:, :2], torch.float32), (places[:, :3], torch.float64)):
+        frame = (0.0, 1.0, 2.0)[: points.shape[1]]
+        cell_keys_triton.cell_keys_triton(points, samples, None, frame, frame, (1, 5, 6, 7)[: len(frame) + 1], dtype)
+    cell_keys_triton.cell_keys_triton(
+        places[:, :2], samples, places[:, 0] > 0, (0.0, 1.0), (1.0, 1.0), (1, 5, 6), torch.float32, 1
+    )
     moved_keys_triton.moved_keys_triton(torch.arange(80), (120, 35), ((12, 10, 1, 2, 0, 5, 7),) * 2, ((1, 0),))
 
     # Nothing fills log_free, so the occupied cells are given.
@@ -90,6 +118,7 @@ def main():
     grid = BEVGrid(cells=(8, 10), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
     radial_change_triton.radial_votes_triton(torch.zeros(9, 7), torch.zeros(9).long(), grid)
     radial_change_triton.radial_change_triton(torch.zeros(9, 2), *[torch.arange(9)] * 2, torch.zeros(9, 2), grid)
+    cell_keys_triton.cell_centres_triton(torch.arange(80), grid)
     table, points, shares = torch.arange(80), torch.zeros(7, 3, 2), torch.zeros(7, 4, 3)
     for dtype in (torch.float32, torch.bfloat16):
         values = torch.zeros(80, 4, 32, dtype=dtype)

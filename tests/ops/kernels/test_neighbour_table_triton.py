@@ -1,7 +1,14 @@
 import pytest
 import torch
 
-from src.ops.neighbour_table import neighbour_table, tap_bits, turned_table
+from src.ops.neighbour_table import (
+    moved_table,
+    moved_table_reference,
+    neighbour_table,
+    stacked_table,
+    tap_bits,
+    turned_table,
+)
 
 
 @pytest.mark.parametrize(("count", "cells", "taps"), [(0, 5, 9), (1, 3, 1), (300, 700, 27), (64, 64, 125)])
@@ -27,3 +34,28 @@ def test_a_table_read_backwards(device, num, cells, taps):
     for tap, cell in (table >= 0).nonzero().tolist():
         expected[tap, table[tap, cell]] = cell
     assert torch.equal(back.cpu(), expected) and torch.equal(bits.cpu(), tap_bits(expected))
+
+
+@pytest.mark.parametrize(("cells", "taps"), [(0, 9), (1, 1), (700, 27), (64, 40)])
+def test_the_rows_of_two_parts(device, cells, taps):
+    draw = torch.Generator().manual_seed(cells)
+    table = torch.randint(-1, max(cells, 1), (taps, cells), generator=draw).clamp(max=cells - 1).to(torch.int32)
+    places = [torch.randint(-1, 20, (cells,), generator=draw) for _ in range(2)]
+    found, bits = stacked_table(table.to(device), (places[0].to(device, torch.int32), places[1].to(device)), 30)
+    lines = [
+        [place[row] + shift * (place[row] >= 0) if row >= 0 else -1 for row in line]
+        for place, shift in zip((x.tolist() for x in places), (0, 30), strict=True)
+        for line in table.tolist()
+    ]
+    assert found.tolist() == lines and torch.equal(bits.cpu(), tap_bits(found.cpu()))
+
+
+@pytest.mark.parametrize(("count", "cells"), [(0, 5), (200, 0), (300, 700)])
+def test_a_table_of_moved_cells(device, count, cells):
+    draw = torch.Generator().manual_seed(count)
+    keys = torch.randperm(900, generator=draw)[:count].sort().values.to(device)
+    coarse = torch.randint(0, 2800, (cells,), generator=draw).to(device)
+    axes = ((100, 28, 2, 1, -2, 32, 30), (1, 100, 1, 4, 0, 24, 1))
+    given = (keys, coarse, (2800, 900), axes, (-1, 3), torch.arange(9).to(device))
+    for found, wanted in zip(moved_table(*given), moved_table_reference(*given), strict=True):
+        assert torch.equal(found, wanted)

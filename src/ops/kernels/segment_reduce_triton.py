@@ -1,0 +1,74 @@
+"""Sums or means of groups of rows by one Triton launch, and rows gathered by another."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from src.ops.backend import runs_kernels
+from src.ops.distinct_keys import Groups
+from src.ops.segment_reduce import group_sum_reference, taken_rows_reference
+
+ROWS = 16
+"""Gathered rows of a program."""
+
+
+def group_sum_triton(values: Tensor, groups: Groups, mean: bool) -> Tensor:
+    """The reference's sums; those of float16 and bfloat16 are added in float32."""
+    if values.dtype == torch.float64 or not runs_kernels(values):
+        return group_sum_reference(values, groups, mean)
+    num, channels = len(groups.starts) - 1, values.shape[1]
+    out = values.new_empty(num, channels)
+    if out.numel() > 0:
+        with torch.cuda.device_of(values):
+            _sum_groups[(num,)](
+                *(values.contiguous(), *groups, out, channels, mean),
+                BLOCK=triton.next_power_of_2(channels),
+                num_warps=1,
+            )
+    return out
+
+
+def taken_rows_triton(values: Tensor, rows: Tensor) -> Tensor:
+    """The reference's rows."""
+    if not runs_kernels(values):
+        return taken_rows_reference(values, rows)
+    num, channels = len(rows), values.shape[1]
+    out = values.new_empty(num, channels)
+    if out.numel() > 0:
+        with torch.cuda.device_of(values):
+            _take[(triton.cdiv(num, ROWS),)](
+                *(values.contiguous(), rows.contiguous(), out, num, channels),
+                ROWS=ROWS,
+                BLOCK=triton.next_power_of_2(channels),
+                num_warps=4,
+            )
+    return out
+
+
+@triton.jit(do_not_specialize=["num"])
+def _take(values, rows, out, num, channels, ROWS: tl.constexpr, BLOCK: tl.constexpr):  # noqa: ANN001, ANN202
+    """A block of rows."""
+    place = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
+    lane = tl.arange(0, BLOCK)[None]
+    row = tl.load(rows + place, mask=place < num, other=-1).to(tl.int64)[:, None]
+    found = tl.load(values + row * channels + lane, mask=(row >= 0) & (lane < channels), other=0)
+    place = place[:, None]
+    tl.store(out + place * channels + lane, found, mask=(place < num) & (lane < channels))
+
+
+@triton.jit(do_not_specialize=["channels"])
+def _sum_groups(values, order, starts, out, channels, MEAN: tl.constexpr, BLOCK: tl.constexpr):  # noqa: ANN001, ANN202
+    """One group."""
+    group = tl.program_id(0).to(tl.int64)
+    lane = tl.arange(0, BLOCK)
+    live = lane < channels
+    first, last = tl.load(starts + group), tl.load(starts + group + 1)
+    total = tl.zeros((BLOCK,), tl.float32)
+    for place in range(first, last):
+        total += tl.load(values + tl.load(order + place) * channels + lane, mask=live, other=0.0).to(tl.float32)
+    if MEAN:
+        total = total / tl.maximum(last - first, 1).to(tl.float32)
+    tl.store(out + group * channels + lane, total, mask=live)
