@@ -20,9 +20,11 @@ from torch import Tensor
 
 from src.benchmark.simulated_device import SimTensor, count_launch, host_values
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.box_cells import window_corners
 from src.ops import backend, conv_relu
 from src.ops.deform_sample import attend_cells_reference, attend_views_reference
 from src.ops.farthest_point import farthest_points_reference
+from src.ops.gaussian_cells import cell_distances, gaussian_windows
 from src.ops.gaussian_shapes import AttributeLimits, refined_attributes_reference, sampling_points_reference
 from src.ops.moved_keys import moved_keys_reference
 from src.ops.neighbour_table import neighbour_table_reference, turned_table_reference
@@ -144,6 +146,52 @@ def _refine(
     out.copy_(torch.stack(refined_attributes_reference(raw, means, lower, upper, limits)))
 
 
+def _window(
+    means: Tensor, scales: Tensor, directions: Tensor, exact: Tensor, corners: Tensor, bases: Tensor, counts: Tensor,
+    num: int, *rest: float,
+) -> None:  # fmt: skip
+    grid = _grid(*rest[:5])
+    centres, reach, table = gaussian_windows(means, scales, directions, grid, rest[5])
+    low, high = window_corners(centres, reach, grid)
+    sizes = (high - low + 1).clamp(min=0)
+    corners.copy_(torch.cat([low, sizes[:, :1]], 1))
+    bases.copy_(table[:, :4])
+    counts.copy_(sizes.prod(1))
+
+
+def _pair(
+    corners: Tensor, bases: Tensor, ends: Tensor, scales: Tensor, directions: Tensor, batch: Tensor, owners: Tensor,
+    keys: Tensor, q: Tensor, delta: Tensor, missing: Tensor, size: int, num: int, steps: int, rows: int, cols: int,
+    num_cells: int, step: int, cell_m: float, limit: float,
+) -> None:  # fmt: skip
+    place = torch.arange(size)
+    owner = torch.searchsorted(ends, place, right=True)
+    inside, owner = owner < num, owner.clamp(max=num - 1)
+    low_col, low_row, width = corners.long()[owner].unbind(1)
+    own = place - F.pad(ends, (1, 0))[owner]
+    row, col = low_row + own // width.clamp(min=1), low_col + own % width.clamp(min=1)
+    table = torch.cat([bases, directions, scales], 1)[owner]
+    distance, *offsets = cell_distances(table, row, col, _grid(rows, cols, 0.0, 0.0, cell_m))
+    near = inside & (distance <= limit)
+    owners.copy_(owner)
+    keys.copy_(torch.where(near, (batch[owner] * rows + row) * cols + col, num_cells))
+    q.copy_(torch.where(near, distance, torch.inf))
+    missing.copy_(-ends[-1:])
+    if delta.numel() > 0:
+        delta.copy_(torch.stack(offsets))
+
+
+def _arrange(
+    owners: Tensor, q: Tensor, keys: Tensor, order: Tensor, ends: Tensor, gaussian: Tensor, ordered_q: Tensor,
+    by_gaussian: Tensor, cell_starts: Tensor, gaussian_starts: Tensor, size: int, num_cells: int, num: int, steps: int,
+) -> None:  # fmt: skip
+    gaussian.copy_(owners[order])
+    ordered_q.copy_(q[order])
+    by_gaussian[order] = torch.arange(size, dtype=by_gaussian.dtype)
+    cell_starts.copy_(torch.searchsorted(keys, torch.arange(num_cells + 2, dtype=keys.dtype).clamp(max=num_cells)))
+    gaussian_starts.copy_(F.pad(ends, (1, 0)).clamp(max=size))
+
+
 def _grid(rows: int, cols: int, x_min: float, y_min: float, cell_m: float) -> BEVGrid:
     centre = (x_min + 0.5 * cols * cell_m, y_min + 0.5 * rows * cell_m)
     return BEVGrid(cells=(rows, cols), cell_m=cell_m, centre_m=centre, z_range_m=(0.0, 1.0))
@@ -164,10 +212,12 @@ def _gather_product(
 
 
 def _log_free(
-    q: Tensor, gaussian: Tensor, surprise: Tensor, starts: Tensor, out: Tensor, num: int, extra: float, least: float
-) -> None:
-    own = (surprise[gaussian] + 0.5 * q + extra).clamp(min=least)
+    q: Tensor, gaussian: Tensor, logits: Tensor, starts: Tensor, out: Tensor, occupied: Tensor, num: int, step: int,
+    extra: float, least: float, threshold: float,
+) -> None:  # fmt: skip
+    own = (F.softplus(-logits)[gaussian] + 0.5 * q + extra).clamp(min=least)
     out.copy_(_segment_sum(log1mexp(own)[:, None], starts)[:, 0])
+    occupied.copy_(-torch.expm1(out) > threshold)
 
 
 def _cell_features(
@@ -177,16 +227,18 @@ def _cell_features(
 
 
 def _nearest_cell(
-    q: Tensor, cell: Tensor, by_gaussian: Tensor, starts: Tensor, place: Tensor, support: Tensor, peak: Tensor,
-    peak_q: Tensor,
+    q: Tensor, cell: Tensor, by_gaussian: Tensor, starts: Tensor, occupied: Tensor, support: Tensor, logits: Tensor,
+    peak: Tensor, contribution: Tensor, step: int,
 ) -> None:  # fmt: skip
+    peak.fill_(-1)
+    contribution.zero_()
     for gaussian, (first, last) in enumerate(zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True)):
         pairs = by_gaussian[first:last]
-        pairs = pairs[place[cell[pairs].long()] >= 0]
+        pairs = pairs[occupied[cell[pairs].long()] > 0]
         if len(pairs):
             least = q[pairs].min()
             peak[gaussian] = support[cell[pairs[q[pairs] == least]].long().min()]
-            peak_q[gaussian] = least
+            contribution[gaussian] = logits[gaussian].sigmoid() * torch.exp(-0.5 * least)
 
 
 def _segment_sum(values: Tensor, starts: Tensor) -> Tensor:
@@ -209,6 +261,9 @@ KERNELS: dict[str, Callable[..., None] | None] = {
     "_search": _search,
     "_gather_product": _gather_product,
     "_span_product": None,
+    "_window": _window,
+    "_pair": _pair,
+    "_arrange": _arrange,
     "_log_free": _log_free,
     "_cell_features": _cell_features,
     "_nearest_cell": _nearest_cell,

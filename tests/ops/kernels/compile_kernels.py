@@ -18,6 +18,7 @@ from src.ops.kernels import (
     attend_cells_triton,
     attend_views_triton,
     farthest_point_triton,
+    gaussian_cells_triton,
     gaussian_shapes_triton,
     moved_keys_triton,
     neighbour_table_triton,
@@ -55,8 +56,9 @@ def main():
     driver.set_active(Target())
     JITFunction.run = compile_only(JITFunction.run)
     kernels = (
-        *(attend_cells_triton, attend_views_triton, farthest_point_triton, gaussian_shapes_triton, moved_keys_triton),
-        *(neighbour_table_triton, radial_change_triton, sparse_conv_triton, splat_triton, view_samples_triton),
+        *(attend_cells_triton, attend_views_triton, farthest_point_triton, gaussian_cells_triton),
+        *(gaussian_shapes_triton, moved_keys_triton, neighbour_table_triton, radial_change_triton),
+        *(sparse_conv_triton, splat_triton, view_samples_triton),
     )
     for module in kernels:
         module.runs_kernels = lambda tensor: True
@@ -76,8 +78,8 @@ def main():
 
     moved_keys_triton.moved_keys_triton(torch.arange(80), (120, 35), ((12, 10, 1, 2, 0, 5, 7),) * 2, ((1, 0),))
 
-    # Nothing fills log_free, so the occupied cells are given.
-    splat_triton.occupied_cells = lambda log_free, support, *choice: (torch.arange(len(support)), 0)
+    # Nothing fills what kernels make, so pairs and occupied cells are given.
+    splat_triton.occupied_cells = lambda occupied, log_free, support, *limits: (torch.arange(len(support)), 0)
     grid = BEVGrid(cells=(8, 10), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
     radial_change_triton.radial_change_triton(torch.zeros(9, 2), *[torch.arange(9)] * 2, torch.zeros(9, 2), grid)
     table, points, shares = torch.arange(80), torch.zeros(7, 3, 2), torch.zeros(7, 4, 3)
@@ -105,6 +107,10 @@ def main():
     gaussian = (torch.zeros(1, 2), torch.ones(1, 2), direction, torch.zeros(1), torch.zeros(1, 128))
     inputs = [x.requires_grad_() for x in gaussian]
     pairs, support = gaussian_cells(*inputs[:3], torch.zeros(1).long(), grid, 1, 3.0)
+    shapes, batch, choice = [x.detach() for x in inputs[:3]], torch.zeros(1).long(), (grid, 80, 3.0)
+    gaussian_cells_triton.padded_pairs_triton(*shapes, batch, *choice, 9)
+    windows = gaussian_cells_triton.all_windows(*shapes, grid, 3.0)
+    gaussian_cells_triton.all_candidates(windows, *shapes[1:], batch, *choice, 9, True)
     log_free, features, *_ = splat_triton.splat_triton(*inputs, pairs, (support, 0.1, 99, 80), False)
     torch.autograd.grad(log_free.sum() + features.sum(), inputs)
 
