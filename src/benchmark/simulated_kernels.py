@@ -26,6 +26,7 @@ from src.ops.deform_sample import attend_cells_reference, attend_views_reference
 from src.ops.farthest_point import farthest_points_reference
 from src.ops.gaussian_cells import cell_distances, gaussian_windows
 from src.ops.gaussian_shapes import AttributeLimits, refined_attributes_reference, sampling_points_reference
+from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians_reference
 from src.ops.moved_keys import moved_keys_reference
 from src.ops.neighbour_table import neighbour_table_reference, turned_table_reference
 from src.ops.radial_change import radial_change_reference
@@ -146,6 +147,26 @@ def _refine(
     out.copy_(torch.stack(refined_attributes_reference(raw, means, lower, upper, limits)))
 
 
+def _initialise(
+    values: Tensor, sources: Tensor, learnt: Tensor, shift: Tensor, centre: Tensor, first: Tensor, first_step: int,
+    first_valid: Tensor, second: Tensor, second_step: int, second_valid: Tensor, first_change: Tensor,
+    second_change: Tensor, *rest: Any,
+) -> None:  # fmt: skip
+    *past, past_valid = rest[:9]
+    all_rows, num, kept, num_first, _, _, low, span, max_speed, unit, _ = rest[14:]
+    found = [(first, first_valid, first_change), (second, second_valid, second_change)] if num_first > 0 else []
+    keypoints = [Keypoints(x, valid > 0, change if change.dim() == 3 else None) for x, valid, change in found]
+    limits = AttributeLimits((low, low + span), 0.0, max_speed, unit * max_speed)
+    wanted = initial_gaussians_reference(
+        Slots(values, sources, learnt, shift), keypoints, (*past, past_valid > 0) if kept > 0 else None, centre,
+        limits, all_rows // (num + kept),
+    )  # fmt: skip
+    means, scales, directions, logits, velocities, features, sources, ages, valid = wanted
+    made = (torch.stack([means, scales, directions, velocities]), features, torch.stack([logits, ages]), sources, valid)
+    for out, own in zip(rest[9:14], made, strict=True):
+        out.copy_(own)
+
+
 def _window(
     means: Tensor, scales: Tensor, directions: Tensor, exact: Tensor, corners: Tensor, bases: Tensor, counts: Tensor,
     num: int, *rest: float,
@@ -261,6 +282,7 @@ KERNELS: dict[str, Callable[..., None] | None] = {
     "_search": _search,
     "_gather_product": _gather_product,
     "_span_product": None,
+    "_initialise": _initialise,
     "_window": _window,
     "_pair": _pair,
     "_arrange": _arrange,

@@ -25,6 +25,7 @@ KERNELS = {
     "farthest_points": "src.ops.kernels.farthest_point_triton",
     "refined_attributes": "src.ops.kernels.gaussian_shapes_triton",
     "sampling_points": "src.ops.kernels.gaussian_shapes_triton",
+    "initial_gaussians": "src.ops.kernels.initial_gaussians_triton",
     "moved_keys": "src.ops.kernels.moved_keys_triton",
     "near_pairs": "src.ops.kernels.gaussian_cells_triton",
     "neighbour_table": "src.ops.kernels.neighbour_table_triton",

@@ -188,6 +188,23 @@ def test_initialisation_modes(make_config, grid, mode, counts, make_views):
     assert hasattr(kggi, "camera_head") == hasattr(kggi, "objectness") == has_keypoints
 
 
+@pytest.mark.parametrize("mode", list(Initialization))
+@pytest.mark.parametrize("property_head", [True, False])
+def test_merged_slots_give_the_same_gaussians(make_config, grid, make_views, mode, property_head):
+    kggi = make_kggi(make_config, grid, initialization=mode, property_head=property_head)
+    for value in kggi.parameters():
+        torch.nn.init.normal_(value)
+    radar, views = make_radar(grid, b=2), make_views(2)
+    with torch.no_grad():
+        past = kggi(radar, views).gaussians
+        wanted = [kggi(radar, views, history).gaussians for history in (None, past)]
+        kggi.merge_for_inference()
+        found = [kggi(radar, views, history).gaussians for history in (None, past)]
+    for one, other in zip(found, wanted, strict=True):
+        for name in one.__dataclass_fields__:
+            assert torch.equal(getattr(one, name), getattr(other, name)), name
+
+
 def test_random_means_stay_in_the_grid_and_are_trainable(make_config, grid, make_views):
     kggi = make_kggi(make_config, grid, initialization=Initialization.random)
     with torch.no_grad():

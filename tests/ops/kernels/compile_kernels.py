@@ -13,6 +13,7 @@ from triton.runtime.jit import JITFunction
 from src.geometry.bev_grid import BEVGrid
 from src.ops.gaussian_cells import gaussian_cells
 from src.ops.gaussian_shapes import AttributeLimits
+from src.ops.initial_gaussians import Keypoints, Slots
 from src.ops.kernel_maps import submanifold_map
 from src.ops.kernels import (
     attend_cells_triton,
@@ -20,6 +21,7 @@ from src.ops.kernels import (
     farthest_point_triton,
     gaussian_cells_triton,
     gaussian_shapes_triton,
+    initial_gaussians_triton,
     moved_keys_triton,
     neighbour_table_triton,
     radial_change_triton,
@@ -57,8 +59,8 @@ def main():
     JITFunction.run = compile_only(JITFunction.run)
     kernels = (
         *(attend_cells_triton, attend_views_triton, farthest_point_triton, gaussian_cells_triton),
-        *(gaussian_shapes_triton, moved_keys_triton, neighbour_table_triton, radial_change_triton),
-        *(sparse_conv_triton, splat_triton, view_samples_triton),
+        *(gaussian_shapes_triton, initial_gaussians_triton, moved_keys_triton, neighbour_table_triton),
+        *(radial_change_triton, sparse_conv_triton, splat_triton, view_samples_triton),
     )
     for module in kernels:
         module.runs_kernels = lambda tensor: True
@@ -103,6 +105,12 @@ def main():
     gaussian_shapes_triton.refined_attributes_triton(
         torch.zeros(1, 7, 9), pairs[0], torch.zeros(2), torch.ones(2), limits
     )
+    slots = Slots(torch.zeros(9, 135), torch.zeros(9).long(), torch.zeros(2, 2), torch.zeros(128))
+    found = [Keypoints(torch.zeros(1, n, 2), torch.ones(1, n) > 0, torch.zeros(1, n, 135)) for n in (4, 3)]
+    past = (*pairs, torch.zeros(1, 7), pairs[0], torch.zeros(1, 7, 128), torch.zeros(1, 7).long())
+    past = (*past, torch.zeros(1, 7), torch.ones(1, 7) > 0)
+    for keypoints, history in ((found, past), ([], None)):
+        initial_gaussians_triton.initial_gaussians_triton(slots, keypoints, history, torch.zeros(2), limits, 1)
     direction = torch.tensor([[1.0, 0.0]])
     gaussian = (torch.zeros(1, 2), torch.ones(1, 2), direction, torch.zeros(1), torch.zeros(1, 128))
     inputs = [x.requires_grad_() for x in gaussian]
