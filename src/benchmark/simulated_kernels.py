@@ -30,6 +30,7 @@ from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians_refere
 from src.ops.moved_keys import moved_keys_reference
 from src.ops.neighbour_table import neighbour_table_reference, turned_table_reference
 from src.ops.radial_change import radial_change_reference
+from src.ops.scored_pixels import scored_pixels_reference
 from src.ops.splat import log1mexp
 from src.ops.view_samples import view_places_reference, view_weights_reference
 
@@ -167,6 +168,18 @@ def _initialise(
         out.copy_(own)
 
 
+def _score(
+    keypoints: Tensor, depths: Tensor, centres: Tensor, matrices: Tensor, valid: Tensor, scores: Tensor,
+    points: Tensor, *rest: float,
+) -> None:  # fmt: skip
+    (b, n, h, w), (height, width, x_min, y_min, cell_m, rows, cols) = scores.shape, rest[9:]
+    depths, matrices = depths.unflatten(0, (b, n)).unflatten(3, (h, w)), matrices.unflatten(0, (b, n))
+    chosen = ((h * height, w * width), _grid(rows, cols, x_min, y_min, cell_m), None)
+    wanted = scored_pixels_reference(keypoints, depths, centres, matrices, valid > 0, *chosen)
+    for out, own in zip((scores, points), wanted, strict=True):
+        out.copy_(own)
+
+
 def _window(
     means: Tensor, scales: Tensor, directions: Tensor, exact: Tensor, corners: Tensor, bases: Tensor, counts: Tensor,
     num: int, *rest: float,
@@ -283,6 +296,7 @@ KERNELS: dict[str, Callable[..., None] | None] = {
     "_gather_product": _gather_product,
     "_span_product": None,
     "_initialise": _initialise,
+    "_score": _score,
     "_window": _window,
     "_pair": _pair,
     "_arrange": _arrange,

@@ -31,6 +31,7 @@ KERNELS = {
     "neighbour_table": "src.ops.kernels.neighbour_table_triton",
     "padded_pairs": "src.ops.kernels.gaussian_cells_triton",
     "radial_change": "src.ops.kernels.radial_change_triton",
+    "scored_pixels": "src.ops.kernels.scored_pixels_triton",
     "sparse_conv": "src.ops.kernels.sparse_conv_triton",
     "sparse_conv_relu": "src.ops.kernels.sparse_conv_triton",
     "splat": "src.ops.kernels.splat_triton",

@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from src.errors import ConfigError
-from src.models.heads.keypoint_head import CameraMaps, keypoint_scores, most_likely_depth
+from src.models.heads.keypoint_head import CameraMaps
 from src.models.horizon3d.gaussian_encoder import GaussianBounds
 from src.models.horizon3d.kggi import KGGI, Initialization
+from src.ops.scored_pixels import most_likely_depth, peak_scores
 from src.ops.sites import Sites
 from src.structures.gaussians import Source
 from src.structures.sparse_bev import SparseBEV
@@ -143,8 +144,8 @@ def test_depth_is_the_mean_over_the_best_bin_and_its_neighbours():
 def test_keypoint_window_keeps_local_maxima_only():
     maps = flat_maps()
     maps.keypoint_logits[0, 0, 2, 2:5] = torch.tensor([1.0, 2.0, 1.5])
-    assert (keypoint_scores(maps, None)[0, 0, 2, 2:5] > 0.5).all()
-    thinned = keypoint_scores(maps, 3)[0, 0, 2, 2:5]
+    assert (peak_scores(maps.keypoint_logits, None)[0, 0, 2, 2:5] > 0.5).all()
+    thinned = peak_scores(maps.keypoint_logits, 3)[0, 0, 2, 2:5]
     assert (thinned > 0).tolist() == [False, True, False]
 
 

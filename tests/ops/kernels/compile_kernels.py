@@ -25,6 +25,7 @@ from src.ops.kernels import (
     moved_keys_triton,
     neighbour_table_triton,
     radial_change_triton,
+    scored_pixels_triton,
     sparse_conv_triton,
     splat_triton,
     view_samples_triton,
@@ -60,7 +61,7 @@ def main():
     kernels = (
         *(attend_cells_triton, attend_views_triton, farthest_point_triton, gaussian_cells_triton),
         *(gaussian_shapes_triton, initial_gaussians_triton, moved_keys_triton, neighbour_table_triton),
-        *(radial_change_triton, sparse_conv_triton, splat_triton, view_samples_triton),
+        *(radial_change_triton, scored_pixels_triton, sparse_conv_triton, splat_triton, view_samples_triton),
     )
     for module in kernels:
         module.runs_kernels = lambda tensor: True
@@ -104,6 +105,9 @@ def main():
     limits = AttributeLimits((0.2, 3.0), 4.0, 30.0, 10.0)
     gaussian_shapes_triton.refined_attributes_triton(
         torch.zeros(1, 7, 9), pairs[0], torch.zeros(2), torch.ones(2), limits
+    )
+    scored_pixels_triton.scored_pixels_triton(
+        *(torch.zeros(1, 2, 4, 5), torch.zeros(1, 2, 7, 4, 5), torch.zeros(7), matrices, valid, (32, 40), grid, None)
     )
     slots = Slots(torch.zeros(9, 135), torch.zeros(9).long(), torch.zeros(2, 2), torch.zeros(128))
     found = [Keypoints(torch.zeros(1, n, 2), torch.ones(1, n) > 0, torch.zeros(1, n, 135)) for n in (4, 3)]
