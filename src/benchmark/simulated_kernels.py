@@ -32,6 +32,7 @@ from src.ops.neighbour_table import neighbour_table_reference, turned_table_refe
 from src.ops.radial_change import radial_change_reference
 from src.ops.scored_pixels import scored_pixels_reference
 from src.ops.splat import log1mexp
+from src.ops.taken_cells import taken_cells_reference
 from src.ops.view_samples import view_places_reference, view_weights_reference
 
 
@@ -180,6 +181,15 @@ def _score(
         out.copy_(own)
 
 
+def _take(
+    features: Tensor, indices: Tensor, rows: Tensor, means: Tensor, valid: Tensor, out: Tensor, *rest: float
+) -> None:
+    x_min, y_min, cell_m = rest[6:]
+    wanted = taken_cells_reference(features, indices, rows, _grid(2, 2, x_min, y_min, cell_m))
+    for made, own in zip((means, valid, out), wanted, strict=True):
+        made.copy_(own)
+
+
 def _window(
     means: Tensor, scales: Tensor, directions: Tensor, exact: Tensor, corners: Tensor, bases: Tensor, counts: Tensor,
     num: int, *rest: float,
@@ -297,6 +307,7 @@ KERNELS: dict[str, Callable[..., None] | None] = {
     "_span_product": None,
     "_initialise": _initialise,
     "_score": _score,
+    "_take": _take,
     "_window": _window,
     "_pair": _pair,
     "_arrange": _arrange,

@@ -35,6 +35,7 @@ KERNELS = {
     "sparse_conv": "src.ops.kernels.sparse_conv_triton",
     "sparse_conv_relu": "src.ops.kernels.sparse_conv_triton",
     "splat": "src.ops.kernels.splat_triton",
+    "taken_cells": "src.ops.kernels.taken_cells_triton",
     "view_places": "src.ops.kernels.view_samples_triton",
     "view_weights": "src.ops.kernels.view_samples_triton",
     "turned_table": "src.ops.kernels.neighbour_table_triton",

@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields, replace
 from enum import Enum
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
@@ -17,6 +16,7 @@ from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.views import CameraViews
 from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians
 from src.ops.segment_reduce import topk_per_sample
+from src.ops.taken_cells import taken_cells
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV
 from src.targets.depth import DepthTarget, lid_centres
@@ -187,12 +187,7 @@ class KGGI(nn.Module):
         radar_bev: SparseBEV,
     ) -> tuple[Tensor, Tensor, Tensor]:  # [B, K, 2] m, [B, K] bool, [B, K, C]
         rows = topk_per_sample(scores, radar_bev.indices[:, 0], radar_bev.batch_size, self.config.num_radar_keypoints)
-        valid = rows >= 0
-        cells = F.pad(radar_bev.indices, (0, 0, 1, 0))  # a row before them, which padding reads
-        features = F.pad(radar_bev.features, (0, 0, 1, 0))
-        picks = rows + 1  # [B, K]
-        means = self.grid.centre_of(cells[picks][..., 1:])  # [B, K, 2]
-        return means, valid, F.embedding(picks, features)
+        return taken_cells(radar_bev.features, radar_bev.indices, rows, self.grid)
 
     def _camera_keypoints(
         self, camera: CameraMaps, views: CameraViews

@@ -28,6 +28,7 @@ from src.ops.kernels import (
     scored_pixels_triton,
     sparse_conv_triton,
     splat_triton,
+    taken_cells_triton,
     view_samples_triton,
 )
 from src.ops.sites import Sites
@@ -61,7 +62,8 @@ def main():
     kernels = (
         *(attend_cells_triton, attend_views_triton, farthest_point_triton, gaussian_cells_triton),
         *(gaussian_shapes_triton, initial_gaussians_triton, moved_keys_triton, neighbour_table_triton),
-        *(radial_change_triton, scored_pixels_triton, sparse_conv_triton, splat_triton, view_samples_triton),
+        *(radial_change_triton, scored_pixels_triton, sparse_conv_triton, splat_triton),
+        *(taken_cells_triton, view_samples_triton),
     )
     for module in kernels:
         module.runs_kernels = lambda tensor: True
@@ -109,6 +111,7 @@ def main():
     scored_pixels_triton.scored_pixels_triton(
         *(torch.zeros(1, 2, 4, 5), torch.zeros(1, 2, 7, 4, 5), torch.zeros(7), matrices, valid, (32, 40), grid, None)
     )
+    taken_cells_triton.taken_cells_triton(torch.zeros(9, 128), torch.zeros(9, 3).long(), torch.zeros(1, 4).long(), grid)
     slots = Slots(torch.zeros(9, 135), torch.zeros(9).long(), torch.zeros(2, 2), torch.zeros(128))
     found = [Keypoints(torch.zeros(1, n, 2), torch.ones(1, n) > 0, torch.zeros(1, n, 135)) for n in (4, 3)]
     past = (*pairs, torch.zeros(1, 7), pairs[0], torch.zeros(1, 7, 128), torch.zeros(1, 7).long())
