@@ -21,6 +21,7 @@ from torch import Tensor
 
 from src.benchmark.simulated_device import SimTensor, count_launch, host_values
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.box_cells import window_corners
 from src.ops import backend, conv_relu
 from src.ops.box_codes import decoded_boxes_reference
 from src.ops.candidate_ranks import ranked_candidates_reference, ranks_of_scores
@@ -29,14 +30,18 @@ from src.ops.deform_sample import attend_cells_reference, attend_views_reference
 from src.ops.distinct_keys import Groups, distinct_keys_reference, grouped_keys_reference
 from src.ops.farthest_point import farthest_points_reference
 from src.ops.frame_motion import moved_gaussians_reference, relative_motion_reference
+from src.ops.gaussian_cells import cell_distances, gaussian_windows
 from src.ops.gaussian_shapes import AttributeLimits, refined_attributes_reference, sampling_points_reference
+from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians_reference
 from src.ops.moved_keys import moved_keys_reference
 from src.ops.neighbour_table import neighbour_table_reference, stacked_table_reference, turned_table_reference
 from src.ops.radial_change import radial_change_reference, radial_votes_reference
+from src.ops.scored_pixels import scored_pixels_reference
 from src.ops.segment_reduce import group_sum_reference, taken_rows_reference
 from src.ops.sites import HALO
 from src.ops.splat import log1mexp
 from src.ops.summed_norm import relu_norm_columns_reference, summed_norm_reference
+from src.ops.taken_cells import taken_cells_reference
 from src.ops.view_samples import view_places_reference, view_weights_reference
 
 
@@ -280,6 +285,93 @@ def _refine(
     out.copy_(torch.stack(refined_attributes_reference(raw, means, lower, upper, limits)))
 
 
+def _initialise(
+    values: Tensor, sources: Tensor, learnt: Tensor, shift: Tensor, centre: Tensor, first: Tensor, first_step: int,
+    first_valid: Tensor, second: Tensor, second_step: int, second_valid: Tensor, first_change: Tensor,
+    second_change: Tensor, *rest: Any,
+) -> None:  # fmt: skip
+    *past, past_valid = rest[:9]
+    all_rows, num, kept, num_first, _, _, low, span, max_speed, unit, _ = rest[14:]
+    found = [(first, first_valid, first_change), (second, second_valid, second_change)] if num_first > 0 else []
+    keypoints = [Keypoints(x, valid > 0, change if change.dim() == 3 else None) for x, valid, change in found]
+    limits = AttributeLimits((low, low + span), 0.0, max_speed, unit * max_speed)
+    wanted = initial_gaussians_reference(
+        Slots(values, sources, learnt, shift), keypoints, (*past, past_valid > 0) if kept > 0 else None, centre,
+        limits, all_rows // (num + kept),
+    )  # fmt: skip
+    means, scales, directions, logits, velocities, features, sources, ages, valid = wanted
+    made = (torch.stack([means, scales, directions, velocities]), features, torch.stack([logits, ages]), sources, valid)
+    for out, own in zip(rest[9:14], made, strict=True):
+        out.copy_(own)
+
+
+def _score(
+    keypoints: Tensor, depths: Tensor, centres: Tensor, matrices: Tensor, valid: Tensor, scores: Tensor,
+    points: Tensor, *rest: float,
+) -> None:  # fmt: skip
+    (b, n, h, w), (height, width, x_min, y_min, cell_m, rows, cols) = scores.shape, rest[9:]
+    depths, matrices = depths.unflatten(0, (b, n)).unflatten(3, (h, w)), matrices.unflatten(0, (b, n))
+    chosen = ((h * height, w * width), _grid(rows, cols, x_min, y_min, cell_m), None)
+    wanted = scored_pixels_reference(keypoints, depths, centres, matrices, valid > 0, *chosen)
+    for out, own in zip((scores, points), wanted, strict=True):
+        out.copy_(own)
+
+
+def _take_cells(
+    features: Tensor, indices: Tensor, rows: Tensor, means: Tensor, valid: Tensor, out: Tensor, *rest: float
+) -> None:
+    x_min, y_min, cell_m = rest[6:]
+    wanted = taken_cells_reference(features, indices, rows, _grid(2, 2, x_min, y_min, cell_m))
+    for made, own in zip((means, valid, out), wanted, strict=True):
+        made.copy_(own)
+
+
+def _window(
+    means: Tensor, scales: Tensor, directions: Tensor, exact: Tensor, corners: Tensor, bases: Tensor, counts: Tensor,
+    num: int, *rest: float,
+) -> None:  # fmt: skip
+    grid = _grid(*rest[:5])
+    centres, reach, table = gaussian_windows(means, scales, directions, grid, rest[5])
+    low, high = window_corners(centres, reach, grid)
+    sizes = (high - low + 1).clamp(min=0)
+    corners.copy_(torch.cat([low, sizes[:, :1]], 1))
+    bases.copy_(table[:, :4])
+    counts.copy_(sizes.prod(1))
+
+
+def _pair(
+    corners: Tensor, bases: Tensor, ends: Tensor, scales: Tensor, directions: Tensor, batch: Tensor, owners: Tensor,
+    keys: Tensor, q: Tensor, delta: Tensor, missing: Tensor, size: int, num: int, steps: int, rows: int, cols: int,
+    num_cells: int, step: int, cell_m: float, limit: float,
+) -> None:  # fmt: skip
+    place = torch.arange(size)
+    owner = torch.searchsorted(ends, place, right=True)
+    inside, owner = owner < num, owner.clamp(max=num - 1)
+    low_col, low_row, width = corners.long()[owner].unbind(1)
+    own = place - F.pad(ends, (1, 0))[owner]
+    row, col = low_row + own // width.clamp(min=1), low_col + own % width.clamp(min=1)
+    table = torch.cat([bases, directions, scales], 1)[owner]
+    distance, *offsets = cell_distances(table, row, col, _grid(rows, cols, 0.0, 0.0, cell_m))
+    near = inside & (distance <= limit)
+    owners.copy_(owner)
+    keys.copy_(torch.where(near, (batch[owner] * rows + row) * cols + col, num_cells))
+    q.copy_(torch.where(near, distance, torch.inf))
+    missing.copy_(-ends[-1:])
+    if delta.numel() > 0:
+        delta.copy_(torch.stack(offsets))
+
+
+def _arrange(
+    owners: Tensor, q: Tensor, keys: Tensor, order: Tensor, ends: Tensor, gaussian: Tensor, ordered_q: Tensor,
+    by_gaussian: Tensor, cell_starts: Tensor, gaussian_starts: Tensor, size: int, num_cells: int, num: int, steps: int,
+) -> None:  # fmt: skip
+    gaussian.copy_(owners[order])
+    ordered_q.copy_(q[order])
+    by_gaussian[order] = torch.arange(size, dtype=by_gaussian.dtype)
+    cell_starts.copy_(torch.searchsorted(keys, torch.arange(num_cells + 2, dtype=keys.dtype).clamp(max=num_cells)))
+    gaussian_starts.copy_(F.pad(ends, (1, 0)).clamp(max=size))
+
+
 def _grid(rows: int, cols: int, x_min: float, y_min: float, cell_m: float) -> BEVGrid:
     centre = (x_min + 0.5 * cols * cell_m, y_min + 0.5 * rows * cell_m)
     return BEVGrid(cells=(rows, cols), cell_m=cell_m, centre_m=centre, z_range_m=(0.0, 1.0))
@@ -300,10 +392,12 @@ def _gather_product(
 
 
 def _log_free(
-    q: Tensor, gaussian: Tensor, surprise: Tensor, starts: Tensor, out: Tensor, num: int, extra: float, least: float
-) -> None:
-    own = (surprise[gaussian] + 0.5 * q + extra).clamp(min=least)
+    q: Tensor, gaussian: Tensor, logits: Tensor, starts: Tensor, out: Tensor, occupied: Tensor, num: int, step: int,
+    extra: float, least: float, threshold: float,
+) -> None:  # fmt: skip
+    own = (F.softplus(-logits)[gaussian] + 0.5 * q + extra).clamp(min=least)
     out.copy_(_segment_sum(log1mexp(own)[:, None], starts)[:, 0])
+    occupied.copy_(-torch.expm1(out) > threshold)
 
 
 def _cell_features(
@@ -313,16 +407,18 @@ def _cell_features(
 
 
 def _nearest_cell(
-    q: Tensor, cell: Tensor, by_gaussian: Tensor, starts: Tensor, place: Tensor, support: Tensor, peak: Tensor,
-    peak_q: Tensor,
+    q: Tensor, cell: Tensor, by_gaussian: Tensor, starts: Tensor, occupied: Tensor, support: Tensor, logits: Tensor,
+    peak: Tensor, contribution: Tensor, step: int,
 ) -> None:  # fmt: skip
+    peak.fill_(-1)
+    contribution.zero_()
     for gaussian, (first, last) in enumerate(zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True)):
         pairs = by_gaussian[first:last]
-        pairs = pairs[place[cell[pairs].long()] >= 0]
+        pairs = pairs[occupied[cell[pairs].long()] > 0]
         if len(pairs):
             least = q[pairs].min()
             peak[gaussian] = support[cell[pairs[q[pairs] == least]].long().min()]
-            peak_q[gaussian] = least
+            contribution[gaussian] = logits[gaussian].sigmoid() * torch.exp(-0.5 * least)
 
 
 def _segment_sum(values: Tensor, starts: Tensor) -> Tensor:
@@ -358,6 +454,12 @@ KERNELS: dict[str, Callable[..., None] | None] = {
     "_search": _search,
     "_gather_product": _gather_product,
     "_span_product": None,
+    "_initialise": _initialise,
+    "_score": _score,
+    "_take_cells": _take_cells,
+    "_window": _window,
+    "_pair": _pair,
+    "_arrange": _arrange,
     "_log_free": _log_free,
     "_cell_features": _cell_features,
     "_nearest_cell": _nearest_cell,

@@ -105,15 +105,15 @@ def splat_gaussians(
         gaussians = [x.to(dtype) for x in (means, scales, directions, opacity_logits, features)]
         pairs, support = gaussian_cells(*gaussians[:3], batch, grid, batch_size, support_sigmas)
         choice = (support, threshold, max_cells, grid.rows * grid.cols)
-        log_free, out, occupied_rows, peak_cell, peak_q, num_cut = implementation(splat_reference)(
+        log_free, out, occupied_rows, peak_cell, peak_contribution, num_cut = implementation(splat_reference)(
             *gaussians, pairs, choice, smooth_cap
         )
-        with torch.no_grad():
-            peak_contribution = gaussians[3].sigmoid() * torch.exp(-0.5 * peak_q)
+    # In fixed shapes the rows of the support are its keys.
+    keys = support.index_select(0, occupied_rows) if fixed_shapes() is None else occupied_rows
     return Splat(
         support=support,
         log_free=log_free,
-        occupied=Sites.from_linear(support.index_select(0, occupied_rows), (batch_size, grid.rows, grid.cols)),
+        occupied=Sites.from_linear(keys, (batch_size, grid.rows, grid.cols)),
         features=out,
         occupied_rows=occupied_rows,
         peak_cell=peak_cell,
@@ -205,11 +205,12 @@ def splat_reference(
     choice: Choice,
     smooth_cap: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, int]:
-    """Plain torch form: `log_free`, `features`, `occupied_rows`, `peak_cell`, its q (inf for none) and `num_cut`."""
-    support = choice[0]
+    """Plain torch form: `log_free`, `features`, `occupied_rows`, `peak_cell`, `peak_contribution` and `num_cut`."""
+    support, threshold, *limits = choice
     q = _Distance.apply(means, scales, directions, pairs)
     log_free = _LogFree.apply(q, opacity_logits, pairs, smooth_cap)
-    occupied_rows, num_cut = occupied_cells(log_free.detach(), *choice)
+    occupied = -torch.expm1(log_free.detach()) > threshold
+    occupied_rows, num_cut = occupied_cells(occupied, log_free.detach(), support, *limits)
 
     # Pairs of the occupied cells, and their order by Gaussian.
     cell = occupied_places(occupied_rows, support).index_select(0, pairs.cell)
@@ -221,18 +222,19 @@ def splat_reference(
     distance = q.index_select(0, chosen)
     out = weighted_segment_sum(features, torch.exp(-0.5 * distance), gaussian, cell, len(occupied_rows), by_gaussian)
     keys = support.index_select(0, occupied_rows).index_select(0, cell)
-    return log_free, out, occupied_rows, *_nearest_cell(distance.detach(), gaussian, keys, len(means)), num_cut
+    peak_cell, peak_q = _nearest_cell(distance.detach(), gaussian, keys, len(means))
+    peak_contribution = opacity_logits.detach().sigmoid() * torch.exp(-0.5 * peak_q)
+    return log_free, out, occupied_rows, peak_cell, peak_contribution, num_cut
 
 
 def occupied_cells(
+    occupied: Tensor,  # [n] bool, above the threshold
     log_free: Tensor,  # [n]
     support: Tensor,  # [n]
-    threshold: float,
     max_cells: int,
     cells_per_sample: int,
 ) -> tuple[Tensor, int]:
-    """Rows of the support above the threshold, at most `max_cells` a sample, and how many were dropped for that."""
-    occupied = -torch.expm1(log_free) > threshold
+    """Occupied rows of the support, at most `max_cells` a sample, and how many were dropped for that."""
     if fixed_shapes() is not None:
         return _padded_occupied(occupied, max_cells), 0
     rows = occupied.nonzero().squeeze(1)
@@ -250,7 +252,7 @@ def _padded_occupied(
 ) -> Tensor:  # [at most max_cells + 1]
     """Rows of the occupied cells in fixed shapes; padding takes the last."""
     fixed, last = fixed_shapes(), len(occupied) - 1
-    rows = fixed.places(occupied, min(max_cells, fixed.capacities.cells, last) + 1).clamp_(max=last)
+    rows = fixed.places(occupied[:-1], min(max_cells, fixed.capacities.cells, last) + 1)
     fixed.expect(rows[-1:], last)
     return rows
 

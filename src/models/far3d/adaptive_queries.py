@@ -10,15 +10,10 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.heads.keypoint_head import (
-    CameraKeypointHead,
-    CameraMaps,
-    best_pixels,
-    keypoint_scores,
-    most_likely_depth,
-)
+from src.models.heads.keypoint_head import CameraKeypointHead, CameraMaps, best_pixels
 from src.models.heads.query_proposals import KeypointQueryConfig
 from src.models.layers.views import CameraViews
+from src.ops.scored_pixels import most_likely_depth, peak_scores
 from src.structures.queries import Queries
 from src.targets.depth import lid_centres
 
@@ -58,7 +53,7 @@ class AdaptiveQueries(nn.Module):
             depth, _ = most_likely_depth(maps.depth_logits, self.depth_centres_m)
             places = views.lift(depth)  # [B, N, h, w, 3]
             inside = self.grid.contains(places[..., :2]) & views.valid[:, :, None, None]
-            scores = keypoint_scores(maps, self.config.keypoint_nms_cells) * inside
+            scores = peak_scores(maps.keypoint_logits, self.config.keypoint_nms_cells) * inside
             best, picks = best_pixels(scores, self.config.num_proposals)
             valid = best > threshold
             centers, seen = (

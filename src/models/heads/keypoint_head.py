@@ -9,11 +9,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant
 from src.losses.classification import depth_cross_entropy, penalty_reduced_focal
 from src.losses.normalizers import mean_over_ranks
 from src.models.layers.full_precision import FullPrecisionConv2d
+from src.models.layers.merging import with_relu
 from src.models.layers.views import CameraViews
+from src.ops.scored_pixels import scored_pixels
 from src.targets.depth import paint_depth
 from src.targets.keypoints import keypoint_heatmap
 from src.targets.projection import BoxViews
@@ -54,6 +55,10 @@ class CameraKeypointHead(nn.Module):
         )
         nn.init.constant_(self.keypoint[-1].bias, KEYPOINT_BIAS)
 
+    def merge_for_inference(self) -> None:
+        """A convolution applies the ReLU behind it."""
+        self.keypoint[0], self.keypoint[1] = with_relu(self.keypoint[0]), nn.Identity()
+
     def forward(
         self,
         level: Tensor,  # [B, N, C_I, h, w] finest level of the image pyramid
@@ -68,18 +73,6 @@ class CameraKeypointHead(nn.Module):
         )
 
 
-def keypoint_scores(
-    maps: CameraMaps,
-    nms_cells: int | None,
-) -> Tensor:  # [B, N, h, w] in 0..1
-    """S, with everything but the maxima of an nms_cells x nms_cells window set to zero if a window is given."""
-    scores = maps.keypoint_logits.float().sigmoid()
-    if nms_cells is None:
-        return scores
-    peaks = F.max_pool2d(scores, nms_cells, stride=1, padding=nms_cells // 2)
-    return scores * (scores == peaks)
-
-
 def lift_keypoints(
     maps: CameraMaps,
     views: CameraViews,
@@ -91,10 +84,8 @@ def lift_keypoints(
     """The K best pixels of all views of a sample by S times confidence, lifted into the grid without gradient, whether
     there was another at all, and their features."""
     with torch.no_grad():
-        depth, confidence = most_likely_depth(maps.depth_logits, depth_centres_m)  # [B, N, h, w] each
-        points = views.lift(depth)
-        scores = keypoint_scores(maps, nms_cells) * confidence
-        scores = scores * (grid.contains(points[..., :2]) & views.valid[:, :, None, None])
+        inputs = (maps.keypoint_logits, maps.depth_logits, depth_centres_m, views.aug_from_pix, views.valid)
+        scores, points = scored_pixels(*inputs, views.image_size_px, grid, nms_cells)
         best, picks = best_pixels(scores, count)
         points = points.flatten(1, 3).gather(1, picks[..., None].expand(-1, -1, 3))
     local = maps.features.movedim(2, -1).flatten(1, 3)  # [B, N*h*w, C]
@@ -108,22 +99,7 @@ def best_pixels(
     """One ranking over the pixels of all views of a sample; where there are fewer, score and place are 0."""
     best, picks = scores.flatten(1).topk(min(count, scores[0].numel()), dim=1)
     missing = count - picks.shape[1]
-    return F.pad(best, (0, missing)), F.pad(picks, (0, missing))
-
-
-def most_likely_depth(
-    logits: Tensor,  # [B, N, D, h, w]
-    centres_m: Tensor,  # [D]
-) -> tuple[Tensor, Tensor]:  # [B, N, h, w] m, [B, N, h, w] in 0..1
-    """Mean depth over the most likely bin and its two neighbours, and the probability of the three (method 4.2)."""
-    probabilities = logits.float().softmax(2)
-    last = len(centres_m) - 1
-    window = probabilities.argmax(2, keepdim=True) + constant((-1, 0, 1), torch.int64, logits.device).view(3, 1, 1)
-    inside = (window >= 0) & (window <= last)  # [B, N, 3, h, w]
-    window = window.clamp(0, last)
-    chosen = probabilities.gather(2, window) * inside
-    confidence = chosen.sum(2)
-    return (chosen * centres_m[window]).sum(2) / confidence, confidence
+    return (F.pad(best, (0, missing)), F.pad(picks, (0, missing))) if missing > 0 else (best, picks)
 
 
 def camera_losses(

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import Enum
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
@@ -15,7 +14,9 @@ from src.models.heads.keypoint_head import KEYPOINT_BIAS, CameraKeypointHead, Ca
 from src.models.horizon3d.gaussian_encoder import RAW_ATTRIBUTES, GaussianBounds
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.views import CameraViews
+from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians
 from src.ops.segment_reduce import topk_per_sample
+from src.ops.taken_cells import taken_cells
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV
 from src.targets.depth import DepthTarget, lid_centres
@@ -143,40 +144,77 @@ class KGGI(nn.Module):
         self.register_buffer("centre_m", torch.tensor(grid.centre_m), persistent=False)
         self.register_buffer("half_extent_m", torch.tensor(grid.half_extent_m), persistent=False)
 
+    def merge_for_inference(self) -> None:
+        """What the Gaussians of all sources start with is computed once."""
+        counts, embedding = self.config.counts, self.source_embedding.weight
+        values = [
+            torch.cat([slots.features + embedding[source], slots.attributes], dim=1)
+            for source, slots in zip(counts, self.slots.values(), strict=True)
+        ]
+        sources = [torch.full((count,), int(source), device=embedding.device) for source, count in counts.items()]
+        means = self._learnt_means() if Source.RANDOM in counts else self.centre_m.new_zeros(0, 2)
+        self.register_buffer("slot_values", torch.cat(values), persistent=False)
+        self.register_buffer("slot_sources", torch.cat(sources), persistent=False)
+        self.register_buffer("slot_means", means, persistent=False)
+        self.slots = self.random_means = None
+
     def forward(self, radar_bev: SparseBEV, views: CameraViews, history: GaussianSet | None = None) -> KGGIOutput:
         """G_0: radar, camera, random, then history Gaussians with their own attributes and features (method 4.4)."""
-        parts: list[GaussianSet] = []
+        found: list[tuple[Source, Tensor, Tensor, Tensor]] = []
         logits = camera = None
         if self.config.uses_keypoints:
             logits = self.objectness(radar_bev.features).squeeze(-1)  # [M]
             camera = self.camera_head(views.levels[0])
-            parts += [self._radar_gaussians(logits.detach(), radar_bev), self._camera_gaussians(camera, views)]
+            found.append((Source.RADAR, *self._radar_keypoints(logits.detach(), radar_bev)))
+            found.append((Source.CAMERA, *self._camera_keypoints(camera, views)))
+        if self.slots is None:
+            return KGGIOutput(self._merged(found, history, radar_bev.batch_size), logits, camera)
+        parts = [self._gaussians(*one) for one in found]
         if Source.RANDOM in self.config.counts:
-            means = self.centre_m + self.half_extent_m * self.random_means.clamp(-INSIDE, INSIDE)
-            means = means.expand(radar_bev.batch_size, -1, -1)
+            means = self._learnt_means().expand(radar_bev.batch_size, -1, -1)
             valid = torch.ones(means.shape[:2], dtype=torch.bool, device=means.device)
             parts.append(self._gaussians(Source.RANDOM, means, valid, None))
         if history is not None:
             parts.append(replace(history, features=history.features + self.source_embedding.weight[Source.HISTORY]))
         return KGGIOutput(GaussianSet.concatenate(parts), logits, camera)
 
-    def _radar_gaussians(
+    def _learnt_means(self) -> Tensor:  # [K, 2] m
+        return self.centre_m + self.half_extent_m * self.random_means.clamp(-INSIDE, INSIDE)
+
+    def _radar_keypoints(
         self,
         scores: Tensor,  # [M]
         radar_bev: SparseBEV,
-    ) -> GaussianSet:
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [B, K, 2] m, [B, K] bool, [B, K, C]
         rows = topk_per_sample(scores, radar_bev.indices[:, 0], radar_bev.batch_size, self.config.num_radar_keypoints)
-        valid = rows >= 0
-        cells = F.pad(radar_bev.indices, (0, 0, 1, 0))  # a row before them, which padding reads
-        features = F.pad(radar_bev.features, (0, 0, 1, 0))
-        picks = rows + 1  # [B, K]
-        means = self.grid.centre_of(cells[picks][..., 1:])  # [B, K, 2]
-        return self._gaussians(Source.RADAR, means, valid, F.embedding(picks, features))
+        return taken_cells(radar_bev.features, radar_bev.indices, rows, self.grid)
 
-    def _camera_gaussians(self, camera: CameraMaps, views: CameraViews) -> GaussianSet:
+    def _camera_keypoints(
+        self, camera: CameraMaps, views: CameraViews
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [B, K, 2] m, [B, K] bool, [B, K, C]
         wanted, window = self.config.num_camera_keypoints, self.config.keypoint_nms_cells
         points, valid, local = lift_keypoints(camera, views, self.depth_centres_m, self.grid, wanted, window)
-        return self._gaussians(Source.CAMERA, points[..., :2], valid, local)
+        return points[..., :2], valid, local
+
+    def _merged(
+        self, found: list[tuple[Source, Tensor, Tensor, Tensor]], history: GaussianSet | None, batch_size: int
+    ) -> GaussianSet:
+        """All Gaussians at once."""
+        shift = self.source_embedding.weight[Source.HISTORY]
+        slots = Slots(self.slot_values, self.slot_sources, self.slot_means, shift)
+        keypoints = [
+            Keypoints(means, valid, self._change(source.name.lower(), local)) for source, means, valid, local in found
+        ]
+        past = None if history is None else tuple(getattr(history, field.name) for field in fields(history))
+        return GaussianSet(*initial_gaussians(slots, keypoints, past, self.centre_m, self.bounds, batch_size))
+
+    def _change(
+        self,
+        name: str,
+        local: Tensor | None,  # [B, K, C] features at the keypoints
+    ) -> Tensor | None:  # [B, K, C + 7]
+        """What the property head changes, where there is one."""
+        return None if local is None or not self.config.property_head else self.property_heads[name](local)
 
     def _gaussians(
         self,
@@ -189,8 +227,8 @@ class KGGI(nn.Module):
         name = source.name.lower()
         features = self.slots[name].features + self.source_embedding.weight[source]  # [K, C]
         features, raw = features.expand(*valid.shape, -1), self.slots[name].attributes.expand(*valid.shape, -1)
-        if local is not None and self.config.property_head:
-            change = self.property_heads[name](local)
+        change = self._change(name, local)
+        if change is not None:
             features, raw = features + change[..., : features.shape[-1]], raw + change[..., features.shape[-1] :]
         return GaussianSet(
             means=torch.where(valid[..., None], means.float(), self.centre_m),

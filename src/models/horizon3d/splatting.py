@@ -29,7 +29,7 @@ class GaussianSplat:
 
     def active(self, min_contribution: float = 0.0) -> Tensor:  # [B, G] bool
         """The Gaussian contributes that much to an occupied cell; 0: its support reaches one."""
-        return (self.peak_cells >= 0) & (self.peak_contributions >= min_contribution)
+        return self.peak_contributions >= min_contribution if min_contribution > 0 else self.peak_cells >= 0
 
 
 def splat_set(

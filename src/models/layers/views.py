@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from src.geometry.constants import where_else
-from src.geometry.tensor_transforms import invert_projection, pixel_centres
+from src.geometry.tensor_transforms import invert_projection
+from src.ops.scored_pixels import lifted_pixels
 from src.ops.view_samples import MIN_DEPTH_M
 from src.structures.batch import FrameBatch
 from src.structures.taxonomy import CAMERAS
@@ -46,6 +47,12 @@ class CameraViews:
         """Pixels of the input per cell of the finest level."""
         return self.image_size_px[0] // self.levels[0].shape[-2]
 
+    @property
+    def aug_from_pix(self) -> Tensor:  # [B, N, 4, 4]: (u*d, v*d, d, 1) -> (x, y, z, 1)
+        """The way back, the identity for a missing camera."""
+        with torch.autocast(self.pix_from_aug.device.type, enabled=False):
+            return invert_projection(self.pix_from_aug, self.valid)
+
     def project(
         self,
         points: Tensor,  # [B, Q, P, 3] aug metres
@@ -67,12 +74,8 @@ class CameraViews:
         depth: Tensor,  # [B, N, h, w] m along the optical axis, one per pixel of the finest level
     ) -> Tensor:  # [B, N, h, w, 3] aug metres
         """3D points at the pixel centres of the finest level, without gradient."""
-        with torch.no_grad(), torch.autocast(depth.device.type, enabled=False):
-            rays = pixel_centres(self.image_size_px, depth.shape[-2:], depth.device)  # [h, w, 3]
-            aug_from_pix = invert_projection(self.pix_from_aug, self.valid)[:, :, :3]  # [B, N, 3, 4]
-            points = rays * depth.float()[..., None]  # [B, N, h, w, 3] (u*d, v*d, d)
-            lifted = torch.einsum("bnij,bnhwj->bnhwi", aug_from_pix[..., :3], points)
-            return lifted + aug_from_pix[:, :, None, None, :, 3]
+        with torch.no_grad():
+            return lifted_pixels(depth, self.aug_from_pix, self.image_size_px)
 
     def lift_pixels(
         self,
@@ -80,5 +83,5 @@ class CameraViews:
     ) -> Tensor:  # [B, Q, N, 3] aug metres
         """3D points at any pixels, without gradient; those of a missing camera are finite."""
         with torch.no_grad(), torch.autocast(points.device.type, enabled=False):
-            aug_from_pix = invert_projection(self.pix_from_aug, self.valid)[:, None, :, :3]  # [B, 1, N, 3, 4]
+            aug_from_pix = self.aug_from_pix[:, None, :, :3]  # [B, 1, N, 3, 4]
             return (aug_from_pix[..., :3] @ points.float()[..., None]).squeeze(-1) + aug_from_pix[..., 3]

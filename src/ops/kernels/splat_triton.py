@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import torch
-import torch.nn.functional as F
 import triton
 import triton.language as tl
 from torch import Tensor
@@ -62,21 +61,21 @@ class _Splat(torch.autograd.Function):
         extra: float,
         least: float,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, int]:
-        support = choice[0]
-        features = features.contiguous()
-        surprise = F.softplus(-opacity_logits)  # [G] -log sigmoid(o)
+        support, threshold, *limits = choice
+        features, stride = features.contiguous(), opacity_logits.stride(0)
         with torch.cuda.device_of(means):
-            log_free = means.new_empty(len(support))
+            log_free, occupied = means.new_empty(len(support)), support.new_empty(len(support), dtype=torch.uint8)
             if len(support) > 0:
                 _log_free[(triton.cdiv(len(support), CELLS),)](
-                    *(pairs.q, pairs.gaussian, surprise, pairs.cell_starts, log_free),
-                    *(len(support), extra, least),
+                    *(pairs.q, pairs.gaussian, opacity_logits, pairs.cell_starts, log_free, occupied),
+                    *(len(support), stride, extra, least, threshold),
                     BLOCK=CELLS,
                     num_warps=4,
                     enable_fp_fusion=True,
                 )
-            occupied_rows, num_cut = occupied_cells(log_free, *choice)
-            place = occupied_places(occupied_rows, support)
+            occupied_rows, num_cut = occupied_cells(occupied.view(torch.bool), log_free, support, *limits)
+            if num_cut > 0:
+                occupied = torch.zeros_like(occupied).index_fill(0, occupied_rows, 1)
             out = features.new_empty(len(occupied_rows), features.shape[1])
             if out.numel() > 0:
                 width = min(triton.next_power_of_2(features.shape[1]), MOST_CHANNELS)
@@ -88,25 +87,25 @@ class _Splat(torch.autograd.Function):
                     num_warps=1,
                     enable_fp_fusion=True,
                 )
-            peak_cell = torch.full((len(means),), -1, dtype=torch.int64, device=means.device)
-            peak_q = means.new_full((len(means),), math.inf)
-            if len(support) > 0:
+            peak_cell, contribution = support.new_empty(len(means)), means.new_empty(len(means))
+            if len(means) > 0:
                 _nearest_cell[(len(means),)](
-                    *(pairs.q, pairs.cell, pairs.by_gaussian, pairs.gaussian_starts, place, support),
-                    *(peak_cell, peak_q),
+                    *(pairs.q, pairs.cell, pairs.by_gaussian, pairs.gaussian_starts, occupied, support),
+                    *(opacity_logits, peak_cell, contribution, stride),
                     BLOCK=PAIRS_OF_GAUSSIAN,
                     num_warps=1,
                     enable_fp_fusion=True,
                 )
-        ctx.save_for_backward(scales, directions, opacity_logits, surprise, features, place)
+        ctx.save_for_backward(scales, directions, opacity_logits, features, occupied_rows, support)
         ctx.pairs, ctx.extra, ctx.least = pairs, extra, least
-        ctx.mark_non_differentiable(occupied_rows, peak_cell, peak_q)
-        return log_free, out, occupied_rows, peak_cell, peak_q, num_cut
+        ctx.mark_non_differentiable(occupied_rows, peak_cell, contribution)
+        return log_free, out, occupied_rows, peak_cell, contribution, num_cut
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad_log_free: Tensor, grad_out: Tensor, *_: None) -> tuple[Tensor | None, ...]:
-        scales, directions, opacity_logits, surprise, features, place = ctx.saved_tensors
+        scales, directions, opacity_logits, features, occupied_rows, support = ctx.saved_tensors
         pairs: GaussianCellPairs = ctx.pairs
+        place = occupied_places(occupied_rows, support)
         shape_grad = features.new_zeros(len(features), 7)  # means, scales, directions, logits
         grad_features = torch.zeros_like(features)
         if len(pairs.q) > 0:
@@ -114,9 +113,9 @@ class _Splat(torch.autograd.Function):
             with torch.cuda.device_of(features):
                 _gaussian_gradient[(len(features),)](
                     *(pairs.q, pairs.delta, pairs.cell, pairs.by_gaussian, pairs.gaussian_starts, place),
-                    *(scales.contiguous(), directions.contiguous(), opacity_logits.contiguous(), surprise, features),
+                    *(scales.contiguous(), directions.contiguous(), opacity_logits, features),
                     *(grad_log_free.contiguous(), grad_out.contiguous(), shape_grad, grad_features),
-                    *(features.shape[1], ctx.extra, ctx.least),
+                    *(features.shape[1], opacity_logits.stride(0), ctx.extra, ctx.least),
                     BLOCK_PAIRS=min(max(TILE // width, 2), PAIRS_OF_GAUSSIAN),
                     BLOCK_CHANNELS=width,
                     num_warps=4,
@@ -146,18 +145,29 @@ def _log_of_free(surprise):  # noqa: ANN001, ANN202
     """log(1 - exp(-u)) without cancellation on either side."""
     # Where a is below 1/2: log(1 - a) = -2 artanh(a / (2 - a)), whose series needs no difference of near numbers.
     a = tl.minimum(tl.exp(-surprise), 0.5)
-    t = a / (2.0 - a)
+    return tl.where(surprise < LN2, tl.log(_free(surprise)), -_twice_artanh(a / (2.0 - a)))
+
+
+@triton.jit
+def _twice_artanh(t):  # noqa: ANN001, ANN202
+    """2 artanh(t) for t from 0 to 1/3."""
     s = t * t
-    series = 1.0 + s * (1.0 / 3 + s * (1.0 / 5 + s * (1.0 / 7 + s * (1.0 / 9 + s * (1.0 / 11 + s / 13)))))
-    return tl.where(surprise < LN2, tl.log(_free(surprise)), -2.0 * t * series)
+    return 2.0 * t * (1.0 + s * (1.0 / 3 + s * (1.0 / 5 + s * (1.0 / 7 + s * (1.0 / 9 + s * (1.0 / 11 + s / 13))))))
+
+
+@triton.jit
+def _surprise(logit):  # noqa: ANN001, ANN202
+    """-log sigmoid(o) = max(-o, 0) + log(1 + exp(-|o|)), to the last digit where it is small."""
+    e = tl.exp(-tl.abs(logit))
+    return tl.maximum(-logit, 0.0) + _twice_artanh(e / (2.0 + e))
 
 
 @triton.jit
 def _log_free(  # noqa: ANN202
-    q, gaussian, surprise, starts, out, num, extra, least,  # noqa: ANN001
+    q, gaussian, logits, starts, out, occupied, num, stride, extra, least, threshold,  # noqa: ANN001
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """S = sum of log(1 - a) per cell (Eq. 5): a lane a cell, pair after pair."""
+    """S = sum of log(1 - a) per cell (Eq. 5), and whether alpha is above the threshold: a lane a cell, pair by pair."""
     cell = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = cell < num
     first = tl.load(starts + cell, mask=live, other=0).to(tl.int32)
@@ -166,10 +176,11 @@ def _log_free(  # noqa: ANN202
     for step in range(0, tl.max(size, 0)):
         inside = step < size
         owner = tl.load(gaussian + first + step, mask=inside, other=0)
-        own = tl.load(surprise + owner, mask=inside, other=1.0)
+        own = _surprise(tl.load(logits + stride * owner, mask=inside, other=0.0))
         own += 0.5 * tl.load(q + first + step, mask=inside, other=0.0)
         total += tl.where(inside, _log_of_free(tl.maximum(own + extra, least)), 0.0)
     tl.store(out + cell, total, mask=live)
+    tl.store(occupied + cell, (_free(-total) > threshold).to(tl.uint8), mask=live)
 
 
 @triton.jit
@@ -186,7 +197,7 @@ def _cell_features(  # noqa: ANN202
     total = tl.zeros((BLOCK_CHANNELS,), tl.float32)
     for first in range(tl.load(starts + row).to(tl.int32), last, BLOCK_PAIRS):
         live = first + lane < last
-        owner = tl.load(gaussian + first + lane, mask=live, other=0)
+        owner = tl.load(gaussian + first + lane, mask=live, other=0).to(tl.int64)
         kernel = tl.exp(-0.5 * tl.load(q + first + lane, mask=live, other=0.0))
         values = tl.load(
             features + owner[:, None] * channels + channel[None, :],
@@ -199,10 +210,10 @@ def _cell_features(  # noqa: ANN202
 
 @triton.jit
 def _nearest_cell(  # noqa: ANN202
-    q, cell, by_gaussian, starts, place, support, peak, peak_q,  # noqa: ANN001
+    q, cell, by_gaussian, starts, occupied, support, logits, peak, contribution, stride,  # noqa: ANN001
     BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The occupied cell with the smallest q of one Gaussian, the first on ties, and q; left alone if there is none."""
+    """The occupied cell with the smallest q of one Gaussian, the first on ties, -1 for none, and a_i there."""
     gaussian = tl.program_id(0)
     lane = tl.arange(0, BLOCK)
     last = tl.load(starts + gaussian + 1).to(tl.int32)
@@ -212,23 +223,22 @@ def _nearest_cell(  # noqa: ANN202
         live = first + lane < last
         pair = tl.load(by_gaussian + first + lane, mask=live, other=0)
         row = tl.load(cell + pair, mask=live, other=0)
-        live = live & (tl.load(place + row, mask=live, other=-1) >= 0)
+        live = live & (tl.load(occupied + row, mask=live, other=0) > 0)
         distance = tl.load(q + pair, mask=live, other=float("inf"))
         nearest = tl.min(distance, 0)
         key = tl.min(tl.where(live & (distance == nearest), row, 2**31 - 1), 0)
         where = tl.where(nearest < least, key, where)
         least = tl.minimum(nearest, least)
-    if where >= 0:
-        tl.store(peak + gaussian, tl.load(support + where))
-        tl.store(peak_q + gaussian, least)
+    tl.store(peak + gaussian, tl.load(support + where, mask=where >= 0, other=-1))
+    tl.store(contribution + gaussian, tl.exp(-0.5 * least) / (1.0 + tl.exp(-tl.load(logits + stride * gaussian))))
 
 
 @triton.jit
 def _gaussian_gradient(  # noqa: ANN202
     q, delta, cell, by_gaussian, starts, place,  # noqa: ANN001
-    scales, directions, logits, surprise, features,  # noqa: ANN001
+    scales, directions, logits, features,  # noqa: ANN001
     grad_log_free, grad_out, shape_grad, grad_features,  # noqa: ANN001
-    channels, extra, least,  # noqa: ANN001
+    channels, stride, extra, least,  # noqa: ANN001
     BLOCK_PAIRS: tl.constexpr, BLOCK_CHANNELS: tl.constexpr,
 ):  # fmt: skip
     """All gradients of one Gaussian, in closed form (method 5.6)."""
@@ -238,7 +248,8 @@ def _gaussian_gradient(  # noqa: ANN202
     lane = tl.arange(0, BLOCK_PAIRS)
     size_x, size_y = tl.load(scales + gaussian * 2), tl.load(scales + gaussian * 2 + 1)
     cosine, sine = tl.load(directions + gaussian * 2), tl.load(directions + gaussian * 2 + 1)
-    base = tl.load(surprise + gaussian)
+    logit = tl.load(logits + stride * gaussian)
+    base = _surprise(logit)
     own = tl.load(features + gaussian * channels + channel, mask=wide, other=0.0)
 
     zero = tl.zeros((BLOCK_PAIRS,), tl.float32)
@@ -287,5 +298,5 @@ def _gaussian_gradient(  # noqa: ANN202
     tl.store(out + 3, -tl.sum(by_size_y, 0) / size_y)
     tl.store(out + 4, tl.sum(by_cosine, 0))
     tl.store(out + 5, tl.sum(by_sine, 0))
-    faint = 1.0 / (1.0 + tl.exp(tl.load(logits + gaussian)))  # sigmoid(-o)
+    faint = 1.0 / (1.0 + tl.exp(logit))  # sigmoid(-o)
     tl.store(out + 6, -tl.sum(by_logit, 0) * faint)

@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from src.errors import ConfigError
-from src.models.heads.keypoint_head import CameraMaps, keypoint_scores, most_likely_depth
+from src.models.heads.keypoint_head import CameraMaps
 from src.models.horizon3d.gaussian_encoder import GaussianBounds
 from src.models.horizon3d.kggi import KGGI, Initialization
+from src.ops.scored_pixels import most_likely_depth, peak_scores
 from src.ops.sites import Sites
 from src.structures.gaussians import Source
 from src.structures.sparse_bev import SparseBEV
@@ -143,8 +144,8 @@ def test_depth_is_the_mean_over_the_best_bin_and_its_neighbours():
 def test_keypoint_window_keeps_local_maxima_only():
     maps = flat_maps()
     maps.keypoint_logits[0, 0, 2, 2:5] = torch.tensor([1.0, 2.0, 1.5])
-    assert (keypoint_scores(maps, None)[0, 0, 2, 2:5] > 0.5).all()
-    thinned = keypoint_scores(maps, 3)[0, 0, 2, 2:5]
+    assert (peak_scores(maps.keypoint_logits, None)[0, 0, 2, 2:5] > 0.5).all()
+    thinned = peak_scores(maps.keypoint_logits, 3)[0, 0, 2, 2:5]
     assert (thinned > 0).tolist() == [False, True, False]
 
 
@@ -186,6 +187,23 @@ def test_initialisation_modes(make_config, grid, mode, counts, make_views):
     has_keypoints = mode is not Initialization.random
     assert (out.objectness_logits is not None) == (out.camera is not None) == has_keypoints
     assert hasattr(kggi, "camera_head") == hasattr(kggi, "objectness") == has_keypoints
+
+
+@pytest.mark.parametrize("mode", list(Initialization))
+@pytest.mark.parametrize("property_head", [True, False])
+def test_merged_slots_give_the_same_gaussians(make_config, grid, make_views, mode, property_head):
+    kggi = make_kggi(make_config, grid, initialization=mode, property_head=property_head)
+    for value in kggi.parameters():
+        torch.nn.init.normal_(value)
+    radar, views = make_radar(grid, b=2), make_views(2)
+    with torch.no_grad():
+        past = kggi(radar, views).gaussians
+        wanted = [kggi(radar, views, history).gaussians for history in (None, past)]
+        kggi.merge_for_inference()
+        found = [kggi(radar, views, history).gaussians for history in (None, past)]
+    for one, other in zip(found, wanted, strict=True):
+        for name in one.__dataclass_fields__:
+            assert torch.equal(getattr(one, name), getattr(other, name)), name
 
 
 def test_random_means_stay_in_the_grid_and_are_trainable(make_config, grid, make_views):

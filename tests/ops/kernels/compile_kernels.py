@@ -17,6 +17,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.ops.distinct_keys import Groups
 from src.ops.gaussian_cells import gaussian_cells
 from src.ops.gaussian_shapes import AttributeLimits
+from src.ops.initial_gaussians import Keypoints, Slots
 from src.ops.kernel_maps import submanifold_map
 from src.ops.kernels import (
     attend_cells_triton,
@@ -27,14 +28,18 @@ from src.ops.kernels import (
     distinct_keys_triton,
     farthest_point_triton,
     frame_motion_triton,
+    gaussian_cells_triton,
     gaussian_shapes_triton,
+    initial_gaussians_triton,
     moved_keys_triton,
     neighbour_table_triton,
     radial_change_triton,
+    scored_pixels_triton,
     segment_reduce_triton,
     sparse_conv_triton,
     splat_triton,
     summed_norm_triton,
+    taken_cells_triton,
     view_samples_triton,
 )
 from src.ops.sites import Sites
@@ -69,8 +74,9 @@ def main():
     kernels = (
         *(attend_cells_triton, attend_views_triton, box_codes_triton, candidate_ranks_triton),
         *(cell_keys_triton, distinct_keys_triton, farthest_point_triton, frame_motion_triton),
-        *(gaussian_shapes_triton, moved_keys_triton, neighbour_table_triton, radial_change_triton),
-        *(segment_reduce_triton, sparse_conv_triton, splat_triton, summed_norm_triton),
+        *(gaussian_cells_triton, gaussian_shapes_triton, initial_gaussians_triton, moved_keys_triton),
+        *(neighbour_table_triton, radial_change_triton, scored_pixels_triton, segment_reduce_triton),
+        *(sparse_conv_triton, splat_triton, summed_norm_triton, taken_cells_triton),
         view_samples_triton,
     )
     for module in kernels:
@@ -113,8 +119,8 @@ def main():
     )
     moved_keys_triton.moved_keys_triton(torch.arange(80), (120, 35), ((12, 10, 1, 2, 0, 5, 7),) * 2, ((1, 0),))
 
-    # Nothing fills log_free, so the occupied cells are given.
-    splat_triton.occupied_cells = lambda log_free, support, *choice: (torch.arange(len(support)), 0)
+    # Nothing fills what kernels make, so pairs and occupied cells are given.
+    splat_triton.occupied_cells = lambda occupied, log_free, support, *limits: (torch.arange(len(support)), 0)
     grid = BEVGrid(cells=(8, 10), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
     radial_change_triton.radial_votes_triton(torch.zeros(9, 7), torch.zeros(9).long(), grid)
     radial_change_triton.radial_change_triton(torch.zeros(9, 2), *[torch.arange(9)] * 2, torch.zeros(9, 2), grid)
@@ -158,10 +164,24 @@ def main():
     sites, classes = Sites.from_linear(torch.arange(80), (1, 8, 10)), ((0, 1), (2, 3))
     candidate_ranks_triton.candidate_ranks_triton(torch.zeros(80, 3), sites, classes, True)
     candidate_ranks_triton.ranked_candidates_triton(torch.zeros(2, 5).long(), classes, 3)
+    scored_pixels_triton.scored_pixels_triton(
+        *(torch.zeros(1, 2, 4, 5), torch.zeros(1, 2, 7, 4, 5), torch.zeros(7), matrices, valid, (32, 40), grid, None)
+    )
+    taken_cells_triton.taken_cells_triton(torch.zeros(9, 128), torch.zeros(9, 3).long(), torch.zeros(1, 4).long(), grid)
+    slots = Slots(torch.zeros(9, 135), torch.zeros(9).long(), torch.zeros(2, 2), torch.zeros(128))
+    found = [Keypoints(torch.zeros(1, n, 2), torch.ones(1, n) > 0, torch.zeros(1, n, 135)) for n in (4, 3)]
+    past = (*pairs, torch.zeros(1, 7), pairs[0], torch.zeros(1, 7, 128), torch.zeros(1, 7).long())
+    past = (*past, torch.zeros(1, 7), torch.ones(1, 7) > 0)
+    for keypoints, history in ((found, past), ([], None)):
+        initial_gaussians_triton.initial_gaussians_triton(slots, keypoints, history, torch.zeros(2), limits, 1)
     direction = torch.tensor([[1.0, 0.0]])
     gaussian = (torch.zeros(1, 2), torch.ones(1, 2), direction, torch.zeros(1), torch.zeros(1, 128))
     inputs = [x.requires_grad_() for x in gaussian]
     pairs, support = gaussian_cells(*inputs[:3], torch.zeros(1).long(), grid, 1, 3.0)
+    shapes, batch, choice = [x.detach() for x in inputs[:3]], torch.zeros(1).long(), (grid, 80, 3.0)
+    gaussian_cells_triton.padded_pairs_triton(*shapes, batch, *choice, 9)
+    windows = gaussian_cells_triton.all_windows(*shapes, grid, 3.0)
+    gaussian_cells_triton.all_candidates(windows, *shapes[1:], batch, *choice, 9, True)
     log_free, features, *_ = splat_triton.splat_triton(*inputs, pairs, (support, 0.1, 99, 80), False)
     torch.autograd.grad(log_free.sum() + features.sum(), inputs)
 

@@ -1,0 +1,87 @@
+"""The Gaussians that a frame starts from, those of all sources side by side, without gradient (method 4.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from src.ops.backend import implementation
+from src.ops.gaussian_shapes import AttributeLimits, activated_attributes
+
+NUM_RAW = 7
+"""Raw scale 2, rotation 2, opacity 1, velocity 2."""
+
+Attributes = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Means, scales, directions, opacity logits, velocities, features, sources, ages and valid, [B, G, ...] each."""
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """What one source found."""
+
+    means: Tensor  # [B, K, 2] m
+    valid: Tensor  # [B, K] bool
+    change: Tensor | None  # [B, K, C + 7] of features and raw attributes
+
+
+@dataclass(frozen=True, eq=False)
+class Slots:
+    """What Gaussians start with, by their rank: those of keypoints, source by source, then those with learnt means."""
+
+    values: Tensor  # [K, C + 7] features and raw attributes
+    sources: Tensor  # [K] int64
+    learnt_means: Tensor  # [K', 2] m, of the last ones
+    history_shift: Tensor  # [C], what features of history change by
+
+    @property
+    def channels(self) -> int:
+        """C."""
+        return self.values.shape[1] - NUM_RAW
+
+
+def initial_gaussians(
+    slots: Slots,
+    keypoints: Sequence[Keypoints],  # of two sources, or of none
+    history: Attributes | None,
+    centre_m: Tensor,  # [2], the mean of what is no keypoint
+    limits: AttributeLimits,
+    batch_size: int,
+) -> Attributes:
+    """Keypoints, those with learnt means, and history as it is."""
+    return implementation(initial_gaussians_reference)(slots, keypoints, history, centre_m, limits, batch_size)
+
+
+def initial_gaussians_reference(
+    slots: Slots,
+    keypoints: Sequence[Keypoints],
+    history: Attributes | None,
+    centre_m: Tensor,
+    limits: AttributeLimits,
+    batch_size: int,
+) -> Attributes:
+    """Plain torch form."""
+    learnt = slots.learnt_means.expand(batch_size, -1, -1)
+    valid = [*(one.valid for one in keypoints), learnt.new_ones(learnt.shape[:2], dtype=torch.bool)]
+    valid = torch.cat(valid, dim=1)
+    means = torch.cat([*(one.means.float() for one in keypoints), learnt], dim=1)
+    parts = slots.values.split([*(one.valid.shape[1] for one in keypoints), learnt.shape[1]])
+    changes = [*(one.change for one in keypoints), None]
+    parts = [
+        part.expand(batch_size, -1, -1) if change is None else part + change
+        for part, change in zip(parts, changes, strict=True)
+    ]
+    features = [part[..., :-NUM_RAW] for part in parts]
+    raw = torch.cat([part[..., -NUM_RAW:] for part in parts], dim=1)
+    scales, directions, velocities = activated_attributes(raw, limits)
+    sources, ages = slots.sources.expand_as(valid), torch.zeros_like(valid, dtype=torch.float32)
+    means = torch.where(valid[..., None], means, centre_m)
+    before = (means, scales, directions, raw[..., 4], velocities)
+    if history is None:
+        return *before, torch.cat(features, dim=1), sources, ages, valid
+    features = torch.cat([*features, history[5] + slots.history_shift], dim=1)
+    before = (torch.cat(pair, dim=1) for pair in zip(before, history[:5], strict=True))
+    behind = (torch.cat(pair, dim=1) for pair in zip((sources, ages, valid), history[6:], strict=True))
+    return *before, features, *behind
