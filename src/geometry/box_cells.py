@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant, counting
+from src.geometry.constants import arange, constant
 from src.geometry.ragged import enumerate_windows
 from src.geometry.tensor_transforms import rotate_back
 
@@ -69,7 +69,7 @@ def cells_in_boxes(
     # The cells of the last rule are candidates of every box, so that one look at all decides.
     home = grid.cell_of(boxes[:, :2])
     cell = torch.cat([row * grid.cols + col, home[:, 0] * grid.cols + home[:, 1]])
-    box = torch.cat([box, counting(len(boxes), torch.int64, box.device)])
+    box = torch.cat([box, arange(len(boxes), torch.int64, box.device)])
     kept = torch.cat([inside, fallback]).nonzero().squeeze(1)
     box, order = torch.sort(box[kept], stable=True)
     return box, cell[kept[order]], fallback

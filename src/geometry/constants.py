@@ -19,7 +19,7 @@ def constant(values: Values, dtype: torch.dtype, device: torch.device) -> Tensor
         return on_device(values, dtype, device)
 
 
-def counting(
+def arange(
     count: int,
     dtype: torch.dtype,
     device: torch.device,
@@ -44,7 +44,7 @@ def repeated(
         return upload([torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))], device)[0]
 
 
-def where_else(
+def where_scalar(
     kept: Tensor,  # [...] bool
     values: Tensor,  # [...]
     other: float | int,

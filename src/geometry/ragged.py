@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from src.geometry.constants import counting
+from src.geometry.constants import arange
 
 
 def enumerate_items(
@@ -15,7 +15,7 @@ def enumerate_items(
     """For every item its owner and its position 0, 1, ... within that owner, ascending in both."""
     owners = torch.repeat_interleave(counts)
     starts = counts.cumsum(0) - counts
-    return owners, counting(len(owners), torch.int64, counts.device) - starts.index_select(0, owners)
+    return owners, arange(len(owners), torch.int64, counts.device) - starts.index_select(0, owners)
 
 
 def enumerate_some(
@@ -24,7 +24,7 @@ def enumerate_some(
 ) -> tuple[Tensor, Tensor, Tensor]:  # [size], [size], [1] int64
     """The first `size` items as `enumerate_items` lists them, owner n behind the last, and how many there are."""
     ends = counts.cumsum(0)
-    item = counting(size, torch.int64, counts.device)
+    item = arange(size, torch.int64, counts.device)
     owners = torch.searchsorted(ends, item, right=True)
     starts = F.pad(ends - counts, (0, 1))
     return owners, item - starts.index_select(0, owners), ends[-1:]

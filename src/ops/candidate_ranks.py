@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from src.geometry.constants import constant, counting, where_else
+from src.geometry.constants import arange, constant, where_scalar
 from src.ops.backend import implementation
 from src.ops.nms import maxpool_peaks
 from src.ops.sites import Sites
@@ -34,7 +34,7 @@ def candidate_ranks_reference(logits: Tensor, sites: Sites, groups: Groups, peak
     scores = logits.sigmoid()
     if peaks:
         scores = scores * maxpool_peaks(scores, sites)
-    scores = where_else((sites.keys < sites.end)[:, None], scores, 0.0)  # padding may hold what is not finite
+    scores = where_scalar((sites.keys < sites.end)[:, None], scores, 0.0)  # padding may hold what is not finite
     return ranks_of_scores(scores, groups)
 
 
@@ -46,7 +46,7 @@ def ranks_of_scores(
     table = constant(groups, torch.int64, scores.device)
     by_group = F.pad(scores.float(), (0, 1)).index_select(1, table.flatten())  # [M, groups * classes of a group]
     by_group = by_group.unflatten(1, table.shape).transpose(0, 1).flatten(1)
-    place = counting(by_group.shape[1], torch.int64, scores.device)
+    place = arange(by_group.shape[1], torch.int64, scores.device)
     return (by_group.contiguous().view(torch.int32).long() << RANK_BITS) - place
 
 

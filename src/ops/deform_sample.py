@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant, counting, where_else
+from src.geometry.constants import arange, constant, where_scalar
 from src.ops.backend import implementation
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.segment_reduce import inverse_rows, weighted_segment_sum
@@ -81,7 +81,7 @@ def attend_cells_reference(
     if len(values) == 0:
         return weights.new_zeros(queries, values.shape[1] * values.shape[2])
     rows, shares = _corners(table, points.flatten(0, 1), batch.repeat_interleave(num_points), grid)
-    rows, shares = rows.clamp(min=0), where_else(rows >= 0, shares, 0.0)
+    rows, shares = rows.clamp(min=0), where_scalar(rows >= 0, shares, 0.0)
     sampled = F.embedding_bag(rows, values.flatten(1).to(shares.dtype), mode="sum", per_sample_weights=shares)
     by_head = sampled.view(queries, num_points, *values.shape[1:])
     return (by_head * weights.transpose(1, 2).unsqueeze(3)).sum(1).flatten(1)
@@ -120,7 +120,7 @@ def _attend_images(
     if visible is not None:
         seen = seen & visible
     # Elsewhere samples are zero already, except that a point behind a camera may lie anywhere, NaN included.
-    unit = where_else(seen.unsqueeze(4), unit, -1.0)
+    unit = where_scalar(seen.unsqueeze(4), unit, -1.0)
     places = (2 * unit - 1).transpose(1, 2).flatten(0, 1)  # [B * N, Q, P, 2]
     images = [level.to(dtype).flatten(0, 1) for level in values]
     if pixels.device.type == "cpu":
@@ -200,15 +200,15 @@ def _corners(
     down = torch.stack([1 - part[:, 1], part[:, 1]], 1)  # [n, 2] over rows
     weights = (down.unsqueeze(2) * across.unsqueeze(1)).flatten(1)
 
-    step = counting(2, torch.int64, points.device)
+    step = arange(2, torch.int64, points.device)
     # Clamping before the conversion to integers keeps NaN and far points out.
     low = low.nan_to_num(-2).clamp(-2, max(grid.cells)).long()
     col, row = low[:, :1] + step, low[:, 1:] + step
     inside = ((row >= 0) & (row < grid.rows)).unsqueeze(2) & ((col >= 0) & (col < grid.cols)).unsqueeze(1)
     linear = (batch[:, None] * grid.rows + row).unsqueeze(2) * grid.cols + col.unsqueeze(1)
     inside, linear = inside.flatten(1), linear.flatten(1)
-    rows = table.index_select(0, where_else(inside, linear, 0).flatten()).view_as(linear)
-    return where_else(inside, rows, -1), weights
+    rows = table.index_select(0, where_scalar(inside, linear, 0).flatten()).view_as(linear)
+    return where_scalar(inside, rows, -1), weights
 
 
 def _row_table(sites: Sites) -> Tensor:  # [B * rows * cols + 1] int64

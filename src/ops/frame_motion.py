@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant, where_else
+from src.geometry.constants import constant, where_scalar
 from src.geometry.tensor_transforms import IDENTITY, invert_rigid, transform_points_xy, transform_vectors_xy
 from src.ops.backend import implementation
 
@@ -48,7 +48,7 @@ def relative_motion_reference(
     matrix = aug_from_ego.double() @ ego_from_past
     # What is not usable must not carry NaN or huge numbers into arithmetic that is masked afterwards.
     matrix = torch.where(usable[..., None, None], matrix, constant(IDENTITY, matrix.dtype, matrix.device))
-    return kept, matrix.float(), where_else(usable, elapsed, 0.0).float(), usable
+    return kept, matrix.float(), where_scalar(usable, elapsed, 0.0).float(), usable
 
 
 def relative_pose(

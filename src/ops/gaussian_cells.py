@@ -11,7 +11,7 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import window_cells, window_corners
-from src.geometry.constants import counting, where_else
+from src.geometry.constants import arange, where_scalar
 from src.geometry.ragged import enumerate_some_windows
 from src.geometry.tensor_transforms import rotate_back
 from src.ops.backend import implementation
@@ -57,19 +57,19 @@ def gaussian_cells(
         size = fixed.capacities.pairs
         pairs, missing = implementation(padded_pairs_reference)(*inputs, grid, num_cells, support_sigmas, size)
         fixed.expect(missing, -size)
-        return pairs, counting(num_cells + 1, torch.int64, means.device)
+        return pairs, arange(num_cells + 1, torch.int64, means.device)
     found = implementation(near_pairs_reference)(*inputs, grid, num_cells, support_sigmas)
     gaussian, linear, near, q, delta_x, delta_y = found
     linear, order = torch.sort(linear.to(key_type(num_cells)), stable=True)
     support, cell, sizes = torch.unique_consecutive(linear, return_inverse=True, return_counts=True)
-    owners = counting(len(means) + 1, gaussian.dtype, gaussian.device)
+    owners = arange(len(means) + 1, gaussian.dtype, gaussian.device)
     near = near.index_select(0, order)
     pairs = GaussianCellPairs(
         gaussian=gaussian.index_select(0, order),
         cell=cell,
         delta=torch.stack([delta_x.index_select(0, near), delta_y.index_select(0, near)], 1),
         q=q.index_select(0, near),
-        in_turn=counting(len(order), torch.int64, order.device),
+        in_turn=arange(len(order), torch.int64, order.device),
         cell_starts=F.pad(sizes.cumsum(0), (1, 0)),
         by_gaussian=inverse_rows(order, len(order)),
         gaussian_starts=torch.searchsorted(gaussian, owners),
@@ -118,18 +118,18 @@ def padded_pairs_reference(
     near = (q <= support_sigmas**2) & (gaussian < num)
     linear = (batch.index_select(0, owner) * grid.rows + row) * grid.cols + col
     small = key_type(num_cells)
-    linear, order = torch.sort(where_else(near, linear, num_cells).to(small), stable=True)
+    linear, order = torch.sort(where_scalar(near, linear, num_cells).to(small), stable=True)
     # Padding belongs to no cell: the last one ends where it begins.
-    edges = counting(num_cells + 2, small, linear.device).clamp(max=num_cells)
+    edges = arange(num_cells + 2, small, linear.device).clamp(max=num_cells)
     pairs = GaussianCellPairs(
         gaussian=owner.index_select(0, order),
         cell=linear,
         delta=None,
-        q=where_else(near, q, math.inf).index_select(0, order),
-        in_turn=counting(size, torch.int64, order.device),
+        q=where_scalar(near, q, math.inf).index_select(0, order),
+        in_turn=arange(size, torch.int64, order.device),
         cell_starts=torch.searchsorted(linear, edges),
         by_gaussian=inverse_rows(order, size),
-        gaussian_starts=torch.searchsorted(gaussian, counting(num + 1, torch.int64, gaussian.device)),
+        gaussian_starts=torch.searchsorted(gaussian, arange(num + 1, torch.int64, gaussian.device)),
     )
     return pairs, -total
 

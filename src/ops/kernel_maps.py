@@ -7,7 +7,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from src.geometry.constants import constant, counting, where_else
+from src.geometry.constants import arange, constant, where_scalar
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.kernel_map import KernelMap, TableMap, counts_kept
 from src.ops.moved_keys import NONE, Axis, moved_keys
@@ -102,7 +102,7 @@ def stacked_map(
     inputs, outputs, counts, first = [], [], [], 0
     for rows in parts:
         place = torch.full((len(sites),), -1, dtype=torch.int32, device=sites.device)
-        place[rows] = counting(first + len(rows), torch.int32, sites.device)[first:]
+        place[rows] = arange(first + len(rows), torch.int32, sites.device)[first:]
         seen = place.index_select(0, base.inputs)
         kept = (seen >= 0).nonzero().squeeze(1)
         inputs.append(seen.index_select(0, kept))
@@ -153,7 +153,7 @@ def pruned_map(
     tap_steps = [torch.Size(kernel[axis + 1 :]).numel() for axis in range(sites.ndim)]
     steps, first, per_tap = constant((strides, pads, tuple(tap_steps)), torch.int64, sites.device)
     own = ((first + sites.indices()[:, 1:] % steps) * per_tap).sum(1)  # [n] the tap between a site and its own output
-    taps = counting(torch.Size(kernel).numel(), torch.int64, sites.device)[:, None]
+    taps = arange(torch.Size(kernel).numel(), torch.int64, sites.device)[:, None]
     out = _reached(
         sites, _output_shape(sites.shape, kernel, strides, pads), kernel, strides, pads, wide | (taps == own)
     )
@@ -185,7 +185,7 @@ def _stacked_table(
     tables, first = [], 0
     for rows in parts:
         place = table.new_full((table.shape[1] + 1,), -1)  # the last is the place of none
-        place[rows] = counting(first + len(rows), table.dtype, table.device)[first:]
+        place[rows] = arange(first + len(rows), table.dtype, table.device)[first:]
         tables.append(place[table.long()])
         first += len(rows)
     return torch.cat(tables), first
@@ -206,7 +206,7 @@ def _build_submanifold(sites: Sites, kernel: tuple[int, ...]) -> KernelMap:
     if half and makes_tables(sites):
         table, bits = neighbour_table(sites.keys, sites.keys, _taps(sites, kernel, centred=True))
         return TableMap(table, num, mirrored=True, bits=bits)
-    rows = counting(num, torch.int32, device)
+    rows = arange(num, torch.int32, device)
     if half == 0:
         return KernelMap(rows, rows, (num,), num, num, mirrored=True, identity=True)
     found, where = _search(sites.keys, _corners(sites, kernel), sites.strides[1:], kernel, half)
@@ -235,7 +235,7 @@ def _build_strided(
     targets, valid = cells[:, 0] * out.strides[0], torch.ones_like(cells[:, 0], dtype=torch.bool)
     for axis in range(sites.ndim):
         # One more leading axis per kernel axis: [k0, ..., n] output keys and whether the tap meets the output lattice.
-        taps = counting(kernel[axis], torch.int64, sites.device)[:, None]
+        taps = arange(kernel[axis], torch.int64, sites.device)[:, None]
         moved = cells[:, axis + 1] + padding[axis] - taps  # [k, n]
         coarse = torch.div(moved, stride[axis], rounding_mode="floor")
         fits = (coarse * stride[axis] == moved) & (coarse >= 0) & (coarse < shape[axis + 1])
@@ -276,7 +276,7 @@ def _reached(
     coarse = Sites(shape, sites.keys)
     ones, zeros = (1,) * sites.ndim, (0,) * sites.ndim
     candidates = moved_keys(sites.keys, *_moved(sites, coarse, ones, stride, (zeros, shape[1:])), shifts)
-    candidates = (candidates if kept is None else where_else(kept, candidates, NONE)).flatten()
+    candidates = (candidates if kept is None else where_scalar(kept, candidates, NONE)).flatten()
     if fixed_shapes() is not None:
         return padded_sites(candidates, shape)
     # What fits nowhere is the largest key, which is there at least once and cut off.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from src.geometry.constants import constant, where_else
+from src.geometry.constants import constant, where_scalar
 from src.ops.backend import implementation
 
 NONE = torch.iinfo(torch.int64).max
@@ -39,4 +39,4 @@ def moved_keys_reference(
     target = torch.div(moved, divisor, rounding_mode="floor")
     fits = ((target * divisor == moved) & (target >= low) & (target < high)).all(-1)
     found = (target * new_step).sum(-1) + torch.div(keys, samples[0], rounding_mode="floor") * samples[1]
-    return where_else(fits, found, NONE)
+    return where_scalar(fits, found, NONE)

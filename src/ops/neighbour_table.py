@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from src.geometry.constants import counting, where_else
+from src.geometry.constants import arange, where_scalar
 from src.ops.backend import implementation
 from src.ops.moved_keys import Axis, moved_keys_reference
 
@@ -30,7 +30,7 @@ def neighbour_table_reference(keys: Tensor, corners: Tensor, taps: Tensor) -> tu
         table = torch.full_like(wanted, -1, dtype=torch.int32)
     else:
         rows = torch.searchsorted(keys, wanted, out_int32=True).clamp_(max=len(keys) - 1)
-        table = where_else(keys.index_select(0, rows.flatten()).view_as(wanted) == wanted, rows, -1)
+        table = where_scalar(keys.index_select(0, rows.flatten()).view_as(wanted) == wanted, rows, -1)
     return table, tap_bits(table)
 
 
@@ -48,7 +48,7 @@ def stacked_table_reference(table: Tensor, places: tuple[Tensor, Tensor], first:
     tables = []
     for place, before in zip(places, (0, first), strict=True):
         # One more, which is the place of none.
-        shifted = F.pad(where_else(place >= 0, place + before, -1).to(table.dtype), (0, 1), value=-1)
+        shifted = F.pad(where_scalar(place >= 0, place + before, -1).to(table.dtype), (0, 1), value=-1)
         tables.append(shifted[table.long()])
     joined = torch.cat(tables)
     return joined, tap_bits(joined)
@@ -58,7 +58,7 @@ def tap_bits(
     table: Tensor,  # [K, m] int32, -1 for none
 ) -> Tensor:  # [m] int64
     """The taps of the table that meet a site as bits of a number, of the first ORDERING_TAPS."""
-    shifts = counting(min(len(table), ORDERING_TAPS), torch.int64, table.device)[:, None]
+    shifts = arange(min(len(table), ORDERING_TAPS), torch.int64, table.device)[:, None]
     return ((table[:ORDERING_TAPS] >= 0).long() << shifts).sum(0)
 
 
@@ -92,7 +92,7 @@ def turned_table(
 def turned_table_reference(table: Tensor, num: int) -> tuple[Tensor, Tensor]:
     """Plain torch form."""
     back = table.new_full((len(table), num + 1), -1)  # one more column, which takes what there is not
-    cells = counting(table.shape[1], table.dtype, table.device).expand_as(table)
+    cells = arange(table.shape[1], table.dtype, table.device).expand_as(table)
     back.scatter_(1, torch.where(table < 0, num, table).long(), cells)
     back = back[:, :num].contiguous()
     return back, tap_bits(back)

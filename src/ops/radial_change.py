@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant, counting, where_else
+from src.geometry.constants import arange, constant, where_scalar
 from src.ops.backend import implementation
 from src.ops.moved_keys import NONE
 from src.ops.sites import rows_of_keys
@@ -48,7 +48,7 @@ def radial_votes_reference(points: Tensor, batch: Tensor, grid: BEVGrid) -> tupl
     in_row, in_col = row == row.clamp(0, grid.rows - 1), col == col.clamp(0, grid.cols - 1)
     within = in_row[:, :, None] & in_col[:, None] & grid.contains(xy)[:, None, None]  # [P, 5, 5]
     linear = ((batch[:, None] * grid.rows + row) * grid.cols)[:, :, None] + col[:, None]
-    keys = where_else(within, linear * NUM_BINS + bins[:, None, None], NONE).flatten()
+    keys = where_scalar(within, linear * NUM_BINS + bins[:, None, None], NONE).flatten()
     values = F.pad(velocities, (1, 0), value=1.0)  # [P, 3]
     return keys, (values[:, None] * falloff[:, None]).flatten(0, 1)
 
@@ -75,11 +75,11 @@ def radial_change_reference(
     """Plain torch form."""
     if cells.dim() == 3:
         row, col = grid.cell_of(cells).unbind(-1)  # [B, n / B]
-        sample = counting(len(row), torch.int64, row.device)[:, None]
+        sample = arange(len(row), torch.int64, row.device)[:, None]
         cells = ((sample * grid.rows + row) * grid.cols + col).flatten()
     row, col = torch.div(cells, grid.cols, rounding_mode="floor") % grid.rows, cells % grid.cols
     sight = F.normalize(grid.centre_of(torch.stack([row, col], dim=1)), dim=1)
-    near = counting(2 * NEAR_BINS + 1, torch.int64, cells.device) - NEAR_BINS
+    near = arange(2 * NEAR_BINS + 1, torch.int64, cells.device) - NEAR_BINS
     bins = radial_bin((velocities * sight).sum(dim=1))[:, None] + near
     rows = rows_of_keys(keys, cells[:, None] * NUM_BINS + bins.clamp(0, NUM_BINS - 1))  # [n, 5]
     found = F.embedding(rows.where(rows >= 0, len(keys)), F.pad(measured, (0, 0, 0, 1)))

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from src.geometry.constants import constant, counting, where_else
+from src.geometry.constants import arange, constant, where_scalar
 from src.ops.backend import implementation
 from src.ops.distinct_keys import Groups
 from src.ops.fixed_shapes import fixed_shapes
@@ -26,7 +26,7 @@ def segments(
 ) -> tuple[Tensor, Tensor]:
     """Stable order of the pairs by row [pairs], and the start of each row's segment [num_rows + 1], int32."""
     ordered, order = torch.sort(rows, stable=True)
-    edges = counting(num_rows + 1, rows.dtype, rows.device)
+    edges = arange(num_rows + 1, rows.dtype, rows.device)
     return order.to(torch.int32), torch.searchsorted(ordered, edges, out_int32=True)
 
 
@@ -177,8 +177,8 @@ def topk_per_sample(
 ) -> Tensor:  # [B, count] int64
     """Rows of the highest scores of each sample, best first, ties by row; -1 where a sample has fewer."""
     if fixed_shapes() is not None and batch_size == 1:
-        best, order = where_else(sample < 1, scores, -torch.inf).sort(descending=True, stable=True)
-        found = where_else(best[:count] > -torch.inf, order[:count], -1)
+        best, order = where_scalar(sample < 1, scores, -torch.inf).sort(descending=True, stable=True)
+        found = where_scalar(best[:count] > -torch.inf, order[:count], -1)
         return F.pad(found, (0, count - len(found)), value=-1)[None] if len(found) < count else found[None]
     order, rank = rank_per_sample(scores, sample)
     rows = order.new_full((batch_size + 1, count + 1), -1)
@@ -194,7 +194,7 @@ def rank_per_sample(
     order = scores.argsort(descending=True, stable=True)
     order = order[sample[order].argsort(stable=True)]
     owner = sample[order]
-    return order, counting(len(order), torch.int64, order.device) - torch.searchsorted(owner, owner)
+    return order, arange(len(order), torch.int64, order.device) - torch.searchsorted(owner, owner)
 
 
 def inverse_rows(
@@ -203,7 +203,7 @@ def inverse_rows(
 ) -> Tensor:  # [num] int64
     """Place of each of `num` rows among the given ones, -1 where it is absent: the inverse permutation of all rows."""
     places = rows.new_full((num,), -1)
-    places[rows] = counting(len(rows), torch.int64, rows.device)
+    places[rows] = arange(len(rows), torch.int64, rows.device)
     return places
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.geometry.constants import constant, counting, where_else
+from src.geometry.constants import arange, constant, where_scalar
 from src.ops.distinct_keys import Groups
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.moved_keys import moved_keys
@@ -171,7 +171,7 @@ class Sites:
         """Row of each cell among the sites, -1 where it is absent or outside the grid."""
         upper = constant(self.shape, torch.int64, indices.device)
         inside = ((indices >= 0) & (indices < upper)).all(1)
-        return where_else(inside, rows_of_keys(self.keys, self.keys_of(indices)), -1)
+        return where_scalar(inside, rows_of_keys(self.keys, self.keys_of(indices)), -1)
 
     def nearest_rows(
         self,
@@ -231,7 +231,7 @@ def rows_of_keys(
     if len(keys) == 0:
         return torch.full_like(wanted, -1)
     rows = torch.searchsorted(keys, wanted).clamp_(max=len(keys) - 1)
-    return where_else(keys[rows] == wanted, rows, -1)
+    return where_scalar(keys[rows] == wanted, rows, -1)
 
 
 def places_among(
@@ -260,7 +260,7 @@ def union(a: Sites, b: Sites) -> tuple[Sites, Tensor, Tensor]:
     if a.shape != b.shape:
         raise ValueError(f"union of sites on different grids: shapes {a.shape} and {b.shape} must be equal")
     if a is b:
-        rows = counting(len(a), torch.int64, a.device)
+        rows = arange(len(a), torch.int64, a.device)
         return a, rows, rows
     keys = torch.cat([a.keys, b.keys])
     if fixed_shapes() is not None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import where_else
+from src.geometry.constants import where_scalar
 from src.geometry.tensor_transforms import rotate_back
 from src.ops.backend import implementation
 from src.ops.fixed_shapes import fixed_shapes
@@ -148,7 +148,7 @@ class _LogFree(torch.autograd.Function):
         pairs: GaussianCellPairs = ctx.pairs
         slope = grad.index_select(0, pairs.cell) / torch.expm1(surprise)  # d log(1 - a) / d(-log a) = a / (1 - a)
         if not ctx.smooth_cap:
-            slope = where_else(surprise > -math.log1p(-CAP), slope, 0.0)
+            slope = where_scalar(surprise > -math.log1p(-CAP), slope, 0.0)
         grad_logits = _gaussian_sum(slope[:, None], pairs).squeeze(1) * -torch.sigmoid(-opacity_logits)
         return 0.5 * slope, grad_logits, None, None
 
@@ -277,7 +277,7 @@ def _nearest_cell(
     """Key of the cell with the smallest q per Gaussian (the largest contribution), lowest on ties, -1 if none; q."""
     least = q.new_full((num,), math.inf).scatter_reduce_(0, gaussian, q, "amin")
     none = torch.iinfo(torch.int64).max
-    candidates = where_else(q == least.index_select(0, gaussian), key, none)
+    candidates = where_scalar(q == least.index_select(0, gaussian), key, none)
     peak = key.new_full((num,), none).scatter_reduce_(0, gaussian, candidates, "amin")
     return torch.where(peak == none, -1, peak), least
 

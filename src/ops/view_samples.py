@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from src.geometry.constants import where_else
+from src.geometry.constants import where_scalar
 from src.ops.backend import implementation
 
 MIN_DEPTH_M = 0.5
@@ -46,7 +46,7 @@ def view_places_reference(
     u, v = x / safe, y / safe
     visible = (u >= 0) & (v >= 0) & (u < width) & (v < height) & (depth > MIN_DEPTH_M) & valid[:, None, :, None]
     places = torch.stack([2 * (u / width) - 1, 2 * (v / height) - 1], dim=-1)
-    return where_else(visible[..., None], places, BEYOND).transpose(1, 2).flatten(0, 1), visible
+    return where_scalar(visible[..., None], places, BEYOND).transpose(1, 2).flatten(0, 1), visible
 
 
 @torch.no_grad()

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant, counting
+from src.geometry.constants import arange, constant
 from src.geometry.ragged import enumerate_items
 from src.ops.sites import Sites
 from src.structures.boxes import Boxes3D
@@ -126,7 +126,7 @@ def _first_of_each_group(boxes: Boxes3D, batch: Tensor) -> tuple[Boxes3D, Tensor
         return boxes, batch
     owner = batch * len(HEAD_GROUPS) + constant(GROUP_OF_CLASS, torch.int64, batch.device)[boxes.labels]
     owner, order = owner.sort(stable=True)
-    place = counting(len(owner), torch.int64, owner.device) - torch.searchsorted(owner, owner)
+    place = arange(len(owner), torch.int64, owner.device) - torch.searchsorted(owner, owner)
     kept = order[place < MAX_OBJECTS_PER_GROUP].sort().values
     return boxes[kept], batch[kept]
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from src.geometry.constants import constant, counting, repeated, where_else
+from src.geometry.constants import arange, constant, repeated, where_scalar
 
 
 def test_the_same_tensor_every_time_and_one_for_each_type():
@@ -24,15 +24,15 @@ def test_what_inference_made_takes_part_in_training():
 def test_counting_is_the_head_of_one_sequence_for_every_count_up_to_a_power_of_two():
     device = torch.device("cpu")
     for count in (0, 1, 5, 8, 9):
-        assert counting(count, torch.int32, device).tolist() == list(range(count))
-    assert counting(5, torch.int64, device).data_ptr() == counting(8, torch.int64, device).data_ptr()
+        assert arange(count, torch.int32, device).tolist() == list(range(count))
+    assert arange(5, torch.int64, device).data_ptr() == arange(8, torch.int64, device).data_ptr()
     assert repeated((2, 0, 3), device).tolist() == [0, 0, 2, 2, 2]
 
 
 def test_a_number_stands_where_a_value_is_not_kept():
     values = torch.tensor([[1.0, 2.0], [3.0, 4.0]], requires_grad=True)
     kept = torch.tensor([[True], [False]])
-    found = where_else(kept, values, -torch.inf)
+    found = where_scalar(kept, values, -torch.inf)
     assert found.tolist() == [[1.0, 2.0], [-torch.inf, -torch.inf]]
     found[0].sum().backward()
     assert values.grad.tolist() == [[1.0, 1.0], [0.0, 0.0]]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import counting
+from src.geometry.constants import arange
 from src.models.layers.image_attention import NUM_HEADS, attention_linear
 from src.ops.deform_sample import deform_attend_bev
 from src.ops.linear import linear
@@ -35,7 +35,7 @@ class RadarCrossAttention(nn.Module):
         values = linear(radar_bev.features, self.value.weight.t(), self.value.bias)
         values = values.unflatten(-1, (NUM_HEADS, -1))  # [M, heads, C / heads]
         weights = self.logits(query).float().unflatten(-1, (NUM_HEADS, self.num_points)).softmax(-1)
-        sample = counting(b, torch.int64, query.device)[:, None].expand(b, g).flatten()
+        sample = arange(b, torch.int64, query.device)[:, None].expand(b, g).flatten()
         gathered = deform_attend_bev(
             values, radar_bev.sites, points.flatten(0, 1), sample, weights.flatten(0, 1), self.grid
         )

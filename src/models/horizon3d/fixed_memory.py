@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from src.geometry.constants import constant, where_else
+from src.geometry.constants import constant, where_scalar
 from src.geometry.tensor_transforms import transform_points_xy
 from src.models.horizon3d.bev_path import BEVPath, CellPrediction, PaddedCells
 from src.models.horizon3d.dptf import DPTF, WarpedMemory
@@ -171,7 +171,7 @@ def _best_cells(
     """As `BEVPath.store`, of a frame that is not augmented."""
     score = cells.occupancy_logits.sigmoid()
     chosen = (score > path.config.memory_threshold) & (fused.sites.keys < fused.sites.end)
-    best = where_else(chosen, score, -1.0).argsort(descending=True, stable=True)[:count]
+    best = where_scalar(chosen, score, -1.0).argsort(descending=True, stable=True)[:count]
     features = fused.features
     if torch.is_autocast_enabled(features.device.type):
         features = features.to(torch.get_autocast_dtype(features.device.type))

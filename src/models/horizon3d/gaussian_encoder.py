@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import counting
+from src.geometry.constants import arange
 from src.models.horizon3d.cross_attention import RadarCrossAttention
 from src.models.horizon3d.temporal_attention import TemporalSelfAttention, attention_mask
 from src.models.layers.doppler import Doppler
@@ -200,7 +200,7 @@ class SelfEncoding(nn.Module):
         """In fixed shapes: padding as Gaussians of a sample that does not exist."""
         valid, (b, g), grid = gaussians.valid, gaussians.valid.shape, self.grid
         lower, size, shape = (grid.x_min_m, grid.y_min_m), (grid.cell_m,) * 2, (b, *grid.cells)
-        means, sample = gaussians.means.flatten(0, 1), counting(b, torch.int64, valid.device)
+        means, sample = gaussians.means.flatten(0, 1), arange(b, torch.int64, valid.device)
         # One more, which is padding in any case.
         keys = cell_keys(means, sample, valid.flatten(), lower, size, shape, means.dtype, behind=1)
         sites, rows = Sites.unique_keys(keys, shape)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant, where_else
+from src.geometry.constants import constant, where_scalar
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.memory import Motion, motions
@@ -203,11 +203,11 @@ class GaussianPath(nn.Module):
         count, active = self.config.gaussians_per_frame, active & gaussians.valid
         opacity = gaussians.opacity_logits.detach()
         if self.config.sampling is Sampling.farthest_point:
-            start = where_else(active, opacity, -torch.inf).argmax(dim=1)
+            start = where_scalar(active, opacity, -torch.inf).argmax(dim=1)
             return farthest_points(gaussians.means.detach(), active, start, count)
         score = opacity if self.config.sampling is Sampling.top_opacity else _random_scores(batch, active)
-        score, picks = where_else(active, score, -torch.inf).topk(min(count, active.shape[1]), dim=1)
-        picks = where_else(score > -torch.inf, picks, -1)
+        score, picks = where_scalar(active, score, -torch.inf).topk(min(count, active.shape[1]), dim=1)
+        picks = where_scalar(score > -torch.inf, picks, -1)
         return F.pad(picks, (0, count - picks.shape[1]), value=-1)
 
 

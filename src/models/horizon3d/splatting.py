@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import counting, where_else
+from src.geometry.constants import arange, where_scalar
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.splat import Splat, splat_gaussians
 from src.structures.gaussians import GaussianSet
@@ -47,8 +47,8 @@ def splat_set(
         batch = torch.div(picks, g, rounding_mode="floor")
     else:
         picks = None  # all of them: padding reaches no cell from where it is
-        gaussians = replace(gaussians, means=where_else(gaussians.valid[..., None], gaussians.means, FAR_M))
-        batch = counting(b, torch.int64, gaussians.means.device)[:, None].expand(b, g).flatten()
+        gaussians = replace(gaussians, means=where_scalar(gaussians.valid[..., None], gaussians.means, FAR_M))
+        batch = arange(b, torch.int64, gaussians.means.device)[:, None].expand(b, g).flatten()
     names = ("means", "scales", "directions", "opacity_logits", "features")
     flat = {name: getattr(gaussians, name).flatten(0, 1) for name in names}
     if picks is not None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from src.geometry.constants import where_else
+from src.geometry.constants import where_scalar
 from src.geometry.tensor_transforms import invert_projection
 from src.ops.scored_pixels import lifted_pixels
 from src.ops.view_samples import MIN_DEPTH_M
@@ -67,7 +67,7 @@ class CameraViews:
             height, width = self.image_size_px
             inside = (pixels >= 0).all(-1) & (pixels[..., 0] < width) & (pixels[..., 1] < height)
             visible = inside & (depth > MIN_DEPTH_M) & self.valid[:, None, :, None]
-            return where_else(visible[..., None], pixels, 0.0), visible
+            return where_scalar(visible[..., None], pixels, 0.0), visible
 
     def lift(
         self,

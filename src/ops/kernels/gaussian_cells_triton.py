@@ -8,7 +8,7 @@ import triton.language as tl
 from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import constant, counting
+from src.geometry.constants import arange, constant
 from src.ops.backend import runs_kernels
 from src.ops.gaussian_cells import (
     WINDOW_SLACK_CELLS,
@@ -74,7 +74,7 @@ def padded_pairs_triton(
             BLOCK=LANES,
             num_warps=4,
         )
-    in_turn = counting(size, torch.int64, means.device)
+    in_turn = arange(size, torch.int64, means.device)
     own = (gaussian, key, None, ordered_q, in_turn, cell_starts, by_gaussian, gaussian_starts)
     return GaussianCellPairs(*own), missing
 

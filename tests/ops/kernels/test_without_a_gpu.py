@@ -27,7 +27,7 @@ def python(*arguments, **variables):
         env=environment | {"OMP_NUM_THREADS": "1"} | variables,
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=600,
     )
 
 
