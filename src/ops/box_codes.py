@@ -61,7 +61,7 @@ def decoded_boxes_reference(
     attributes = attributes_by_rule(velocities, centers, sizes, labels, rules)
     single = (scores, labels, attributes, scores > threshold)
     columns = (centers, sizes, yaws[:, None], velocities, *(column[:, None] for column in single))
-    return torch.cat([column.to(codes.dtype) for column in columns], dim=1)
+    return torch.cat([column.to(torch.promote_types(codes.dtype, torch.float32)) for column in columns], dim=1)
 
 
 def box_geometry(

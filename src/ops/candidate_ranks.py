@@ -12,14 +12,15 @@ from src.ops.nms import maxpool_peaks
 from src.ops.sites import Sites
 
 RANK_BITS = 31
-Groups = tuple[tuple[int, ...], ...]
+ClassGroups = tuple[tuple[int, ...], ...]
 """Classes of every group, as many of each; where it has less, the number of all classes."""
 
 
+@torch.no_grad()
 def candidate_ranks(
     logits: Tensor,  # [M, classes]
     sites: Sites,  # M sites in 2D, in fixed shapes
-    groups: Groups,
+    groups: ClassGroups,
     peaks: bool,  # only local maxima have a score, see `maxpool_peaks`
 ) -> Tensor:  # [groups, M * classes of a group] int64
     """The bits of each score, which are in their order as none is negative, less the place, so that the first leads.
@@ -29,7 +30,7 @@ def candidate_ranks(
     return implementation(candidate_ranks_reference)(logits, sites, groups, peaks)
 
 
-def candidate_ranks_reference(logits: Tensor, sites: Sites, groups: Groups, peaks: bool) -> Tensor:
+def candidate_ranks_reference(logits: Tensor, sites: Sites, groups: ClassGroups, peaks: bool) -> Tensor:
     """Plain torch form."""
     scores = logits.sigmoid()
     if peaks:
@@ -40,7 +41,7 @@ def candidate_ranks_reference(logits: Tensor, sites: Sites, groups: Groups, peak
 
 def ranks_of_scores(
     scores: Tensor,  # [M, classes]
-    groups: Groups,
+    groups: ClassGroups,
 ) -> Tensor:  # [groups, M * classes of a group] int64
     """See `candidate_ranks`."""
     table = constant(groups, torch.int64, scores.device)
@@ -50,16 +51,17 @@ def ranks_of_scores(
     return (by_group.contiguous().view(torch.int32).long() << RANK_BITS) - place
 
 
+@torch.no_grad()
 def ranked_candidates(
     ranks: Tensor,  # [groups, n] int64
-    groups: Groups,
+    groups: ClassGroups,
     num_classes: int,
 ) -> tuple[Tensor, Tensor, Tensor]:  # [groups, n] each: float32; int64, row; int64, class
     """Score, row and class of each rank."""
     return implementation(ranked_candidates_reference)(ranks, groups, num_classes)
 
 
-def ranked_candidates_reference(ranks: Tensor, groups: Groups, num_classes: int) -> tuple[Tensor, Tensor, Tensor]:
+def ranked_candidates_reference(ranks: Tensor, groups: ClassGroups, num_classes: int) -> tuple[Tensor, Tensor, Tensor]:
     """Plain torch form."""
     table = constant(groups, torch.int64, ranks.device)
     places = -ranks & (2**RANK_BITS - 1)

@@ -17,6 +17,7 @@ Shapes = tuple[Tensor, Tensor, Tensor, Tensor]
 """Means, scales, directions and velocities of Gaussians, [N, n, 2] each."""
 
 
+@torch.no_grad()
 def relative_motion(
     now: Pose,  # of B streams
     aug_from_ego: Tensor,  # [B, 4, 4] float32
@@ -63,6 +64,7 @@ def relative_pose(
     return ego_from_past, elapsed, (elapsed > 0) & (distance <= max_speed_mps * elapsed)
 
 
+@torch.no_grad()
 def moved_gaussians(
     shapes: Shapes,
     valid: Tensor,  # [N, n] bool

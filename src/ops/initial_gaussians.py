@@ -42,6 +42,7 @@ class Slots:
         return self.values.shape[1] - NUM_RAW
 
 
+@torch.no_grad()
 def initial_gaussians(
     slots: Slots,
     keypoints: Sequence[Keypoints],  # of two sources, or of none

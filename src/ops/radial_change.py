@@ -25,6 +25,7 @@ MIN_SPEED_MPS = 0.5
 """Below it a velocity is noise whose direction says nothing; the line of sight is then that from the ego's origin."""
 
 
+@torch.no_grad()
 def radial_votes(
     points: Tensor,  # [P, 7] x, y, z (m, aug frame), rcs (dB), vx, vy (m/s), dt (s)
     batch: Tensor,  # [P] int64

@@ -155,6 +155,7 @@ class _PermuteRows(torch.autograd.Function):
         return taken_rows(grad, back), None, None
 
 
+@torch.no_grad()
 def taken_rows(
     values: Tensor,  # [n, C]
     rows: Tensor,  # [m] integer, -1 for zeros

@@ -26,7 +26,8 @@ class Sites:
 
     `shape` is (batch, *spatial), for example (B, rows, cols) or (B, z, y, x); `keys` [n] int64 are sorted and unique.
     `cache` holds what was derived from this set (kernel maps), so every layer that works on the same `Sites` object
-    shares them. Build with `from_indices`, `unique` or `from_linear`; the constructor trusts its arguments.
+    shares them. Build with `from_indices`, `unique`, `unique_keys` or `from_linear`; the constructor trusts what it is
+    given.
     In fixed shapes (`ops/fixed_shapes.py`) padding stands behind the sites, its key `end` in every row.
     """
 

@@ -22,7 +22,8 @@ def summed_norm(
     aged: tuple[Tensor, Tensor] | None = None,  # [..., C], ages [...]: added too where the age is above 0
 ) -> tuple[Tensor, Tensor | None]:  # [..., C] each
     """Norm of x, or of its sum with `added`, with a ReLU if asked for; and that plus `then`, None without it."""
-    form = summed_norm_reference if torch.is_grad_enabled() else implementation(summed_norm_reference)
+    fused_elsewhere = torch.is_grad_enabled() or torch.compiler.is_compiling()
+    form = summed_norm_reference if fused_elsewhere else implementation(summed_norm_reference)
     return form(x, affine, eps, added, relu, then, aged)
 
 
@@ -42,11 +43,14 @@ def summed_norm_reference(
     return normed, behind
 
 
+@torch.no_grad()
 def relu_norm_columns(
-    hidden: Tensor,  # [K, n, C], overwritten
+    hidden: Tensor,  # [K, n, C], may be overwritten
     eps: float,
 ) -> Tensor:  # [n, K * C]
     """Norm, without scale and shift, of the positive part of each row; the K rows side by side. Without gradient."""
+    if torch.compiler.is_compiling():
+        return relu_norm_columns_reference(hidden, eps)
     return implementation(relu_norm_columns_reference)(hidden, eps)
 
 

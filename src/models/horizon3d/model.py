@@ -22,8 +22,8 @@ from src.models.horizon3d.ocsf import OCSF
 from src.models.horizon3d.output import Horizon3DOutput
 from src.models.layers.doppler import Doppler
 from src.models.layers.views import CameraViews
-from src.ops.branches import beside
 from src.ops.fixed_shapes import Capacities
+from src.ops.side_stream import beside
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence

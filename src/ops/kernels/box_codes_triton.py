@@ -25,7 +25,7 @@ from src.ops.box_codes import (
 from src.ops.kernels.radial_change_triton import nearest_radial
 from src.ops.radial_change import BIN_MPS, MIN_SPEED_MPS, NEAR_BINS, NUM_BINS
 
-BOXES = 128
+BOXES = 32
 """Boxes of a program, one lane each."""
 
 
@@ -52,7 +52,7 @@ def decoded_boxes_triton(
                 NEAR=NEAR_BINS,
                 WIDTH=sum(WIDTHS),
                 BLOCK=BOXES,
-                num_warps=4,
+                num_warps=1,
             )
         torch.atan2(codes[:, 7], codes[:, 6], out=out[:, YAW])
     return out
@@ -110,7 +110,8 @@ def _decode(  # noqa: ANN202
     height = tl.zeros((BLOCK,), tl.float32)
     for axis in tl.static_range(3):  # the last is the height
         size = tl.load(code + 3 + axis, mask=live, other=0.0)
-        height = tl.exp(tl.minimum(tl.maximum(size, -size_limit), size_limit))
+        size = tl.maximum(size, -size_limit, propagate_nan=tl.PropagateNan.ALL)
+        height = tl.exp(tl.minimum(size, size_limit, propagate_nan=tl.PropagateNan.ALL))
         tl.store(box + 3 + axis, height, mask=live)
     tl.store(box + 7, speed_x, mask=live)
     tl.store(box + 8, speed_y, mask=live)

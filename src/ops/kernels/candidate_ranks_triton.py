@@ -9,7 +9,7 @@ from torch import Tensor
 
 from src.geometry.constants import constant
 from src.ops.backend import runs_kernels
-from src.ops.candidate_ranks import RANK_BITS, Groups, candidate_ranks_reference, ranked_candidates_reference
+from src.ops.candidate_ranks import RANK_BITS, ClassGroups, candidate_ranks_reference, ranked_candidates_reference
 from src.ops.kernel_maps import submanifold_map
 from src.ops.sites import Sites
 
@@ -17,7 +17,7 @@ PAIRS = 256
 """Pairs of a program, one lane each."""
 
 
-def candidate_ranks_triton(logits: Tensor, sites: Sites, groups: Groups, peaks: bool) -> Tensor:
+def candidate_ranks_triton(logits: Tensor, sites: Sites, groups: ClassGroups, peaks: bool) -> Tensor:
     """The reference's ranks, of scores up to rounding."""
     if logits.dtype != torch.float32 or not runs_kernels(logits):
         return candidate_ranks_reference(logits, sites, groups, peaks)
@@ -40,7 +40,7 @@ def candidate_ranks_triton(logits: Tensor, sites: Sites, groups: Groups, peaks: 
     return ranks
 
 
-def ranked_candidates_triton(ranks: Tensor, groups: Groups, num_classes: int) -> tuple[Tensor, Tensor, Tensor]:
+def ranked_candidates_triton(ranks: Tensor, groups: ClassGroups, num_classes: int) -> tuple[Tensor, Tensor, Tensor]:
     """The reference's candidates."""
     if ranks.dtype != torch.int64 or not runs_kernels(ranks):
         return ranked_candidates_reference(ranks, groups, num_classes)

@@ -151,7 +151,7 @@ def _move_gaussians(  # noqa: ANN202
         x, y = x + speed_x * age, y + speed_y * age
     new_x = xx * x + xy * y + tl.load(matrix + 3, mask=live, other=0.0)
     new_y = yx * x + yy * y + tl.load(matrix + 7, mask=live, other=0.0)
-    col, line = (new_x - x_min) / cell_m, (new_y - y_min) / cell_m
+    col, line = tl.div_rn(new_x - x_min, cell_m), tl.div_rn(new_y - y_min, cell_m)
     here = live & (tl.load(valid + place, mask=live, other=0) > 0) & (tl.load(usable + frame, mask=live, other=0) > 0)
     here = here & (col >= 0.0) & (col < grid_cols) & (line >= 0.0) & (line < grid_rows)
     tl.store(moved + place, here.to(tl.uint8), mask=live)

@@ -95,7 +95,7 @@ def _vote(  # noqa: ANN202
     away = speed_x * x + speed_y * y
     speed = tl.sqrt(speed_x * speed_x + speed_y * speed_y)
     bin_ = _radial_bin(tl.where(away > 0.0, speed, tl.where(away < 0.0, -speed, 0.0)) / bin_mps, BINS)
-    col, row = tl.floor((x - x_min) / cell_m), tl.floor((y - y_min) / cell_m)
+    col, row = tl.floor(tl.div_rn(x - x_min, cell_m)), tl.floor(tl.div_rn(y - y_min, cell_m))
     within = (col >= 0.0) & (col < cols) & (row >= 0.0) & (row < rows)  # a point that is not finite is nowhere
     col = tl.where(within, col, 0.0).to(tl.int64) + right
     row = tl.where(within, row, 0.0).to(tl.int64) + down
@@ -149,13 +149,14 @@ def _nearest_radial(  # noqa: ANN202
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = place < num
     if PLACED:
-        col = tl.floor((tl.load(cells + 2 * place, mask=live, other=0.0) - x_min) / cell_m).to(tl.int64)
-        row = tl.floor((tl.load(cells + 2 * place + 1, mask=live, other=0.0) - y_min) / cell_m).to(tl.int64)
+        col = tl.floor(tl.div_rn(tl.load(cells + 2 * place, mask=live, other=0.0) - x_min, cell_m)).to(tl.int64)
+        row = tl.floor(tl.div_rn(tl.load(cells + 2 * place + 1, mask=live, other=0.0) - y_min, cell_m)).to(tl.int64)
         cell = (place // per_sample * rows + row) * cols + col
     else:
         cell = tl.load(cells + place, mask=live, other=0)
-    x = x_min + ((cell % cols).to(tl.float32) + 0.5) * cell_m
-    y = y_min + ((cell // cols % rows).to(tl.float32) + 0.5) * cell_m
+        col, row = cell % cols, cell // cols % rows
+    x = x_min + (col.to(tl.float32) + 0.5) * cell_m
+    y = y_min + (row.to(tl.float32) + 0.5) * cell_m
     length = tl.maximum(tl.sqrt(x * x + y * y), 1e-12)
     x, y = x / length, y / length
     own_x = tl.load(velocities + 2 * place, mask=live, other=0.0)

@@ -86,9 +86,9 @@ def _score(  # noqa: ANN202
         place += tl.load(row + 2 * col_step) * depth + tl.load(row + 3 * col_step)
         tl.store(points + 3 * (view * num + pixel) + axis, place, mask=live)
         if axis == 0:
-            cell = (place - x_min) / cell_m
+            cell = tl.div_rn(place - x_min, cell_m)
             there = there & (cell >= 0.0) & (cell < cols)
         if axis == 1:
-            cell = (place - y_min) / cell_m
+            cell = tl.div_rn(place - y_min, cell_m)
             there = there & (cell >= 0.0) & (cell < rows)
     tl.store(scores + view * num + pixel, tl.where(there, score, 0.0), mask=live)

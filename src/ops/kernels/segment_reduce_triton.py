@@ -59,7 +59,7 @@ def _take(values, rows, out, num, channels, ROWS: tl.constexpr, BLOCK: tl.conste
     tl.store(out + place * channels + lane, found, mask=(place < num) & (lane < channels))
 
 
-@triton.jit(do_not_specialize=["channels"])
+@triton.jit
 def _sum_groups(values, order, starts, out, channels, MEAN: tl.constexpr, BLOCK: tl.constexpr):  # noqa: ANN001, ANN202
     """One group."""
     group = tl.program_id(0).to(tl.int64)

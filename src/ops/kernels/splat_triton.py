@@ -118,7 +118,7 @@ class _Splat(torch.autograd.Function):
                     *(features.shape[1], opacity_logits.stride(0), ctx.extra, ctx.least),
                     BLOCK_PAIRS=min(max(TILE // width, 2), PAIRS_OF_GAUSSIAN),
                     BLOCK_CHANNELS=width,
-                    num_warps=4,
+                    num_warps=8,
                     enable_fp_fusion=True,
                 )
         means_grad, scales_grad, directions_grad, logits_grad = shape_grad.split((2, 2, 2, 1), 1)

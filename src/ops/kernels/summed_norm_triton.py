@@ -22,11 +22,13 @@ def summed_norm_triton(
     aged: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor | None]:  # fmt: skip
     """The reference's sums up to rounding, in float32; its results are float32 under autocast, as torch's norm's."""
-    inputs = [value for value in (x, *affine, added, then, *(aged or ())) if value is not None]
-    if any(value.dtype not in DTYPES for value in inputs) or x.shape[-1] > MOST_CHANNELS or not runs_kernels(x):
+    rows = [value for value in (added, then, aged and aged[0]) if value is not None]
+    fits = all(value is not None and value.dtype in DTYPES for value in (x, *affine, *rows, *(aged or ())))
+    fits = fits and all(value.shape == x.shape for value in rows) and x.shape[-1] <= MOST_CHANNELS
+    if not (fits and runs_kernels(x)):
         return summed_norm_reference(x, affine, eps, added, relu, then, aged)
-    out = x.new_empty(x.shape, dtype=_result_type(x))
-    behind = None if then is None else torch.empty_like(out)
+    out = x.new_empty(x.shape, dtype=_result_type(x, added))
+    behind = None if then is None else torch.empty_like(out, dtype=_result_type(out, then))
     _launch(x, out, eps, (False, relu), 1, affine, added, then, aged, behind)
     return out, behind
 
@@ -41,8 +43,10 @@ def relu_norm_columns_triton(hidden: Tensor, eps: float) -> Tensor:
     return out
 
 
-def _result_type(x: Tensor) -> torch.dtype:
-    return torch.float32 if torch.is_autocast_enabled(x.device.type) else x.dtype
+def _result_type(x: Tensor, other: Tensor | None = None) -> torch.dtype:
+    if torch.is_autocast_enabled(x.device.type):
+        return torch.float32
+    return x.dtype if other is None else torch.promote_types(x.dtype, other.dtype)
 
 
 def _launch(
@@ -95,7 +99,7 @@ def _sum_norm(  # noqa: ANN202
     if ADDED:
         total += tl.load(added + place, mask=live, other=0.0).to(tl.float32)
     if RELU_FIRST:
-        total = tl.maximum(total, 0.0)
+        total = tl.maximum(total, 0.0, propagate_nan=tl.PropagateNan.ALL)
     mean = tl.sum(total, 1) / channels
     total = tl.where(live, total - mean[:, None], 0.0)
     variance = tl.sum(total * total, 1) / channels
@@ -104,7 +108,7 @@ def _sum_norm(  # noqa: ANN202
         total = total * tl.load(scale + lane, mask=inside, other=0.0).to(tl.float32)[None, :]
         total += tl.load(shift + lane, mask=inside, other=0.0).to(tl.float32)[None, :]
     if RELU_LAST:
-        total = tl.maximum(total, 0.0)
+        total = tl.maximum(total, 0.0, propagate_nan=tl.PropagateNan.ALL)
     target = ((row % own) * columns + row // own)[:, None] * channels + lane[None, :]
     tl.store(out + target, total.to(out.dtype.element_ty), mask=live)
     if THEN:

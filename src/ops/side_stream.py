@@ -13,9 +13,10 @@ import torch
 def beside(device: torch.device) -> Iterator[Callable[[], None]]:
     """On a GPU the context's work goes on beside what follows it, in a CUDA graph as a branch of its own.
 
-    Yields what to call before anything reads its results. On a CPU one comes after the other.
+    Yields what to call before anything reads its results. On a CPU one comes after the other, and in training, whose
+    memory two streams would split. No constant that is kept (`geometry/constants.py`) may be made inside.
     """
-    if device.type != "cuda":
+    if device.type != "cuda" or torch.is_grad_enabled():
         yield lambda: None
         return
     stream = torch.cuda.current_stream(device)

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from src.ops import branches
-from src.ops.branches import beside
+from src.ops import side_stream
+from src.ops.side_stream import beside
 
 
 class Stream:
@@ -37,9 +37,10 @@ def cuda(monkeypatch):
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: streams.main)
     monkeypatch.setattr(torch.cuda, "Stream", made)
     monkeypatch.setattr(torch.cuda, "stream", lambda stream: stream)
-    branches._branch_of.cache_clear()
-    yield streams, notes
-    branches._branch_of.cache_clear()
+    side_stream._branch_of.cache_clear()
+    with torch.no_grad():
+        yield streams, notes
+    side_stream._branch_of.cache_clear()
 
 
 def test_a_branch_begins_behind_and_is_joined_by_its_stream(cuda):
@@ -63,14 +64,17 @@ def test_a_stream_keeps_its_branch_and_shares_it_with_none(cuda):
     assert len(streams.made) == 2
 
 
-def test_a_cpu_has_no_branches():
-    with beside(torch.device("cpu")) as join:
-        found = torch.ones(1)
-    join()
-    assert found == 1
+def test_neither_a_cpu_nor_training_has_branches(cuda):
+    _, notes = cuda
+    for device, training in (("cpu", False), ("cuda", True)):
+        with torch.set_grad_enabled(training), beside(torch.device(device)) as join:
+            notes.append("works")
+        join()
+    assert notes == ["works"] * 2
 
 
 @pytest.mark.gpu
+@torch.no_grad()
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 def test_results_of_a_branch_are_there_once_it_is_joined():
     values = torch.randn(2000, 2000, device="cuda")
