@@ -57,8 +57,11 @@ def multiply(
     """a @ b + bias, or its positive part, without gradient, in their own type whatever autocast says.
 
     In float32 by oneDNN where MKL leaves half of a processor unused, in bfloat16 where that spares a pass for the ReLU.
-    Operands must not be expanded ones: oneDNN takes a thousand times as long for a value that stands for many.
+    Operands must not be expanded ones: oneDNN takes a thousand times as long for a value that stands for many, and for a
+    part of a wider matrix, of which b is copied.
     """
+    if not (b.is_contiguous() or b.t().is_contiguous()):
+        b = b.contiguous()
     full, half = a.dtype == torch.float32, a.dtype == torch.bfloat16 and relu
     if a.device.type == "cpu" and ((full and prefers_onednn()) or (half and fuses_bfloat16())):
         return torch.ops.mkldnn._linear_pointwise(a, b.t(), bias, "relu" if relu else "none", [], "")

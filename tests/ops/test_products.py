@@ -24,6 +24,20 @@ def test_float32_has_all_its_digits(shape, library):
         torch.testing.assert_close(multiply(left, right).double(), expected, rtol=1e-5, atol=0)
 
 
+@pytest.mark.skipif(not torch.backends.mkldnn.is_available(), reason="this torch has no oneDNN")
+def test_onednn_is_given_no_part_of_a_wider_matrix(monkeypatch):
+    """It multiplies one as well, but by its reference code: seen to take 300 times as long."""
+    given, found = torch.ops.mkldnn._linear_pointwise, []
+    monkeypatch.setattr(products, "prefers_onednn", lambda: True)
+    monkeypatch.setattr(
+        torch.ops.mkldnn, "_linear_pointwise", lambda a, b, *rest: found.append(b.stride()) or given(a, b, *rest)
+    )
+    a, wide = torch.rand(64, 16), torch.rand(16, 48)
+    for part in (wide[:, 16:32], wide.t()[16:32].t()):
+        torch.testing.assert_close(multiply(a, part), a @ part)
+    assert all(sorted(stride) == [1, 16] for stride in found) and len(found) == 2
+
+
 def test_other_types_are_multiplied_as_they_are(library):
     a, b = torch.randn(256, 64), torch.randn(64, 64)
     for dtype in (torch.float64, torch.bfloat16):
