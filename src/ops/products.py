@@ -57,8 +57,8 @@ def multiply(
     """a @ b + bias, or its positive part, without gradient, in their own type whatever autocast says.
 
     In float32 by oneDNN where MKL leaves half of a processor unused, in bfloat16 where that spares a pass for the ReLU.
-    Operands must not be expanded ones: oneDNN takes a thousand times as long for a value that stands for many, and some
-    hundred times for a part of a wider matrix, so of b such a part is copied.
+    Operands must not be expanded ones: oneDNN takes a thousand times as long for a value that stands for many. It also
+    has no fast code for a part of a wider matrix, so of b such a part is copied.
     """
     if not (b.is_contiguous() or b.t().is_contiguous()):
         b = b.contiguous()

@@ -26,7 +26,7 @@ def test_float32_has_all_its_digits(shape, library):
 
 @pytest.mark.skipif(not torch.backends.mkldnn.is_available(), reason="this torch has no oneDNN")
 def test_onednn_is_given_no_part_of_a_wider_matrix(monkeypatch):
-    """It multiplies one as well, but by its reference code: seen to take 300 times as long."""
+    """It multiplies one as well, but by its slow reference code."""
     given, found = torch.ops.mkldnn._linear_pointwise, []
     monkeypatch.setattr(products, "prefers_onednn", lambda: True)
     monkeypatch.setattr(
