@@ -23,6 +23,7 @@ from src.benchmark.simulated_device import SimTensor, count_launch, host_values
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import window_corners
 from src.ops import backend, conv_relu
+from src.ops.add_layer_norm import add_layer_norm_reference, relu_norm_columns_reference
 from src.ops.box_codes import decoded_boxes_reference
 from src.ops.candidate_ranks import ranked_candidates_reference, ranks_of_scores
 from src.ops.cell_keys import cell_centres_reference, cell_keys_reference
@@ -30,6 +31,7 @@ from src.ops.deform_sample import attend_cells_reference, attend_views_reference
 from src.ops.distinct_keys import Groups, distinct_keys_reference, grouped_keys_reference
 from src.ops.farthest_point import farthest_points_reference
 from src.ops.frame_motion import moved_gaussians_reference, relative_motion_reference
+from src.ops.gather_cells import gather_cells_reference
 from src.ops.gaussian_cells import cell_distances, gaussian_windows
 from src.ops.gaussian_shapes import AttributeLimits, refined_attributes_reference, sampling_points_reference
 from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians_reference
@@ -37,11 +39,9 @@ from src.ops.moved_keys import moved_keys_reference
 from src.ops.neighbour_table import neighbour_table_reference, stacked_table_reference, turned_table_reference
 from src.ops.radial_change import radial_change_reference, radial_votes_reference
 from src.ops.scored_pixels import scored_pixels_reference
-from src.ops.segment_reduce import group_sum_reference, taken_rows_reference
+from src.ops.segment_reduce import gather_rows_reference, group_sum_reference
 from src.ops.sites import HALO
 from src.ops.splat import log1mexp
-from src.ops.summed_norm import relu_norm_columns_reference, summed_norm_reference
-from src.ops.taken_cells import taken_cells_reference
 from src.ops.view_samples import view_places_reference, view_weights_reference
 
 
@@ -157,7 +157,7 @@ def _sum_groups(values: Tensor, order: Tensor, starts: Tensor, out: Tensor, chan
 
 
 def _take(values: Tensor, rows: Tensor, out: Tensor, *sizes: int) -> None:
-    out.copy_(taken_rows_reference(values, rows))
+    out.copy_(gather_rows_reference(values, rows))
 
 
 def _move(keys: Tensor, plan: Tensor, taps: Tensor, out: Tensor, num: int, old_step: int, new_step: int) -> None:
@@ -218,7 +218,7 @@ def _sum_norm(
         out.copy_(relu_norm_columns_reference(x.clone(), eps))
         return
     rest = (added if ADDED else None, RELU_LAST, then if THEN else None, (embedded, ages) if AGED else None)
-    normed, more = summed_norm_reference(x, (scale, shift), eps, *rest)
+    normed, more = add_layer_norm_reference(x, (scale, shift), eps, *rest)
     out.copy_(normed)
     if more is not None:
         behind.copy_(more)
@@ -321,7 +321,7 @@ def _take_cells(
     features: Tensor, indices: Tensor, rows: Tensor, means: Tensor, valid: Tensor, out: Tensor, *rest: float
 ) -> None:
     x_min, y_min, cell_m = rest[6:]
-    wanted = taken_cells_reference(features, indices, rows, _grid(2, 2, x_min, y_min, cell_m))
+    wanted = gather_cells_reference(features, indices, rows, _grid(2, 2, x_min, y_min, cell_m))
     for made, own in zip((means, valid, out), wanted, strict=True):
         made.copy_(own)
 

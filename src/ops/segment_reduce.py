@@ -147,24 +147,24 @@ class _PermuteRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: FunctionCtx, values: Tensor, there: Tensor, back: Tensor) -> Tensor:
         ctx.save_for_backward(back)
-        return taken_rows(values, there)
+        return gather_rows(values, there)
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, None, None]:
         (back,) = ctx.saved_tensors
-        return taken_rows(grad, back), None, None
+        return gather_rows(grad, back), None, None
 
 
 @torch.no_grad()
-def taken_rows(
+def gather_rows(
     values: Tensor,  # [n, C]
     rows: Tensor,  # [m] integer, -1 for zeros
 ) -> Tensor:  # [m, C]
     """Gather rows, without gradient."""
-    return implementation(taken_rows_reference)(values, rows)
+    return implementation(gather_rows_reference)(values, rows)
 
 
-def taken_rows_reference(values: Tensor, rows: Tensor) -> Tensor:
+def gather_rows_reference(values: Tensor, rows: Tensor) -> Tensor:
     """Plain torch form."""
     padded = F.pad(values, (0, 0, 1, 0))  # -1 takes the row of zeros before them: a mask over rows takes twice as long
     return padded.index_select(0, rows + 1)

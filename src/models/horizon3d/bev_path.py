@@ -21,7 +21,7 @@ from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv, Tem
 from src.models.memory import motions
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.frame_motion import moving
-from src.ops.segment_reduce import segment_mean, taken_rows, topk_per_sample
+from src.ops.segment_reduce import gather_rows, segment_mean, topk_per_sample
 from src.ops.sites import Sites, places_among
 from src.structures.batch import FrameBatch
 from src.structures.sparse_bev import SparseBEV, SparseMap
@@ -199,7 +199,7 @@ class BEVPath(nn.Module):
             return fused.with_features(fused.features + x.features)
         sites = Sites.from_linear(x.sites.linear(), (fused.batch_size, *self.grid.cells))
         if fixed_shapes() is not None:
-            spread = taken_rows(fused.features, places_among(fused.sites, sites))
+            spread = gather_rows(fused.features, places_among(fused.sites, sites))
         else:
             rows = sites.nearest_rows(fused.sites.keys)
             spread = fused.features.new_zeros(x.features.shape).index_copy(0, rows, fused.features)

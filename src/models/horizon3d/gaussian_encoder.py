@@ -21,12 +21,12 @@ from src.models.layers.merging import LinearReLU, block_diagonal, joined_linear,
 from src.models.layers.norm import layer_norm
 from src.models.layers.sparse import SubmanifoldConv
 from src.models.layers.views import CameraViews
+from src.ops.add_layer_norm import add_layer_norm, relu_norm_columns
 from src.ops.cell_keys import cell_keys
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.gaussian_shapes import AttributeLimits, activated_attributes, refined_attributes, sampling_points
 from src.ops.segment_reduce import segment_mean
 from src.ops.sites import Sites
-from src.ops.summed_norm import relu_norm_columns, summed_norm
 from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV
 
@@ -326,7 +326,7 @@ class EncoderLayer(nn.Module):
         x = layer_norm(self.norms[2], x, self.self_encoding(x, gaussians, picks))
         last = self.norms[3]
         affine, shaped = (last.weight, last.bias), None if self.refine_before_self_encoding else embedding
-        x, query = summed_norm(x, affine, last.eps, self.feed_forward[1](x), then=shaped)
+        x, query = add_layer_norm(x, affine, last.eps, self.feed_forward[1](x), then=shaped)
         refined = self.refinement(attended + embedding if query is None else query, gaussians)
         return replace(refined, features=x)
 

@@ -14,9 +14,9 @@ from src.models.heads.keypoint_head import KEYPOINT_BIAS, CameraKeypointHead, Ca
 from src.models.horizon3d.gaussian_encoder import RAW_ATTRIBUTES, GaussianBounds
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.views import CameraViews
+from src.ops.gather_cells import gather_cells
 from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians
 from src.ops.segment_reduce import topk_per_sample
-from src.ops.taken_cells import taken_cells
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV
 from src.targets.depth import DepthTarget, lid_centres
@@ -187,7 +187,7 @@ class KGGI(nn.Module):
         radar_bev: SparseBEV,
     ) -> tuple[Tensor, Tensor, Tensor]:  # [B, K, 2] m, [B, K] bool, [B, K, C]
         rows = topk_per_sample(scores, radar_bev.indices[:, 0], radar_bev.batch_size, self.config.num_radar_keypoints)
-        return taken_cells(radar_bev.features, radar_bev.indices, rows, self.grid)
+        return gather_cells(radar_bev.features, radar_bev.indices, rows, self.grid)
 
     def _camera_keypoints(
         self, camera: CameraMaps, views: CameraViews

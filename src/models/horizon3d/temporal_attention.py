@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.models.horizon3d.time_embedding import TimeEmbedding
-from src.ops.summed_norm import summed_norm
+from src.ops.add_layer_norm import add_layer_norm
 from src.structures.gaussians import GaussianSet
 
 MASK_ALIGNMENT = 16
@@ -43,7 +43,7 @@ class TemporalSelfAttention(nn.Module):
         """q = k = f + e + time(dt), v = f; the time of the current frame counts as zero, not as an embedded zero."""
         norm, ages = self.norm, gaussians.elapsed_s
         affine, past = (norm.weight, norm.bias), (self.time(ages), ages)
-        x, position = summed_norm(features, affine, norm.eps, then=embedding, aged=past)
+        x, position = add_layer_norm(features, affine, norm.eps, then=embedding, aged=past)
         query, key = self.query_key(position).chunk(2, dim=-1)
         split = (self.num_heads, -1)
         heads = [part.unflatten(-1, split).transpose(1, 2) for part in (query, key, self.value(x))]  # [B, H, G, C/H]

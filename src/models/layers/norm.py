@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.ops.summed_norm import summed_norm
+from src.ops.add_layer_norm import add_layer_norm
 
 
 class MapNorm(nn.BatchNorm2d):
@@ -37,4 +37,4 @@ def layer_norm(
     relu: bool = False,
 ) -> Tensor:  # [..., C]
     """What the norm gives of x, or of its sum with `added`, and a ReLU if asked for: without gradient one launch."""
-    return summed_norm(x, (norm.weight, norm.bias), norm.eps, added, relu)[0]
+    return add_layer_norm(x, (norm.weight, norm.bias), norm.eps, added, relu)[0]

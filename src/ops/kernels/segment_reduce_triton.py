@@ -9,7 +9,7 @@ from torch import Tensor
 
 from src.ops.backend import runs_kernels
 from src.ops.distinct_keys import Groups
-from src.ops.segment_reduce import group_sum_reference, taken_rows_reference
+from src.ops.segment_reduce import gather_rows_reference, group_sum_reference
 
 ROWS = 16
 """Gathered rows of a program."""
@@ -31,10 +31,10 @@ def group_sum_triton(values: Tensor, groups: Groups, mean: bool) -> Tensor:
     return out
 
 
-def taken_rows_triton(values: Tensor, rows: Tensor) -> Tensor:
+def gather_rows_triton(values: Tensor, rows: Tensor) -> Tensor:
     """The reference's rows."""
     if not runs_kernels(values):
-        return taken_rows_reference(values, rows)
+        return gather_rows_reference(values, rows)
     num, channels = len(rows), values.shape[1]
     out = values.new_empty(num, channels)
     if out.numel() > 0:

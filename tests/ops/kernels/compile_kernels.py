@@ -20,6 +20,7 @@ from src.ops.gaussian_shapes import AttributeLimits
 from src.ops.initial_gaussians import Keypoints, Slots
 from src.ops.kernel_maps import submanifold_map
 from src.ops.kernels import (
+    add_layer_norm_triton,
     attend_cells_triton,
     attend_views_triton,
     box_codes_triton,
@@ -28,6 +29,7 @@ from src.ops.kernels import (
     distinct_keys_triton,
     farthest_point_triton,
     frame_motion_triton,
+    gather_cells_triton,
     gaussian_cells_triton,
     gaussian_shapes_triton,
     initial_gaussians_triton,
@@ -38,8 +40,6 @@ from src.ops.kernels import (
     segment_reduce_triton,
     sparse_conv_triton,
     splat_triton,
-    summed_norm_triton,
-    taken_cells_triton,
     view_samples_triton,
 )
 from src.ops.sites import Sites
@@ -76,7 +76,7 @@ def main():
         *(cell_keys_triton, distinct_keys_triton, farthest_point_triton, frame_motion_triton),
         *(gaussian_cells_triton, gaussian_shapes_triton, initial_gaussians_triton, moved_keys_triton),
         *(neighbour_table_triton, radial_change_triton, scored_pixels_triton, segment_reduce_triton),
-        *(sparse_conv_triton, splat_triton, summed_norm_triton, taken_cells_triton),
+        *(sparse_conv_triton, splat_triton, add_layer_norm_triton, gather_cells_triton),
         view_samples_triton,
     )
     for module in kernels:
@@ -108,8 +108,8 @@ def main():
         groups = Groups(torch.arange(80), torch.arange(9))
         values = torch.zeros(80, channels, dtype=dtype)
         segment_reduce_triton.group_sum_triton(values, groups, channels == 7)
-        segment_reduce_triton.taken_rows_triton(values, torch.arange(40, dtype=torch.int32))
-        segment_reduce_triton.taken_rows_triton(values, torch.arange(40))
+        segment_reduce_triton.gather_rows_triton(values, torch.arange(40, dtype=torch.int32))
+        segment_reduce_triton.gather_rows_triton(values, torch.arange(40))
     places, samples = torch.zeros(80, 5), torch.zeros(8).long()
     for points, dtype in ((places[:, :2], torch.float32), (places[:, :3], torch.float64)):
         frame = (0.0, 1.0, 2.0)[: points.shape[1]]
@@ -159,15 +159,17 @@ def main():
     for dtype in (torch.float32, torch.bfloat16):
         rows, affine = torch.zeros(1, 7, 128, dtype=dtype), (torch.ones(128), torch.zeros(128))
         aged = (rows, torch.zeros(1, 7))
-        summed_norm_triton.summed_norm_triton(rows, affine, 1e-5, rows, True, rows, aged)
-        summed_norm_triton.relu_norm_columns_triton(rows, 1e-5)
+        add_layer_norm_triton.add_layer_norm_triton(rows, affine, 1e-5, rows, True, rows, aged)
+        add_layer_norm_triton.relu_norm_columns_triton(rows, 1e-5)
     sites, classes = Sites.from_linear(torch.arange(80), (1, 8, 10)), ((0, 1), (2, 3))
     candidate_ranks_triton.candidate_ranks_triton(torch.zeros(80, 3), sites, classes, True)
     candidate_ranks_triton.ranked_candidates_triton(torch.zeros(2, 5).long(), classes, 3)
     scored_pixels_triton.scored_pixels_triton(
         *(torch.zeros(1, 2, 4, 5), torch.zeros(1, 2, 7, 4, 5), torch.zeros(7), matrices, valid, (32, 40), grid, None)
     )
-    taken_cells_triton.taken_cells_triton(torch.zeros(9, 128), torch.zeros(9, 3).long(), torch.zeros(1, 4).long(), grid)
+    gather_cells_triton.gather_cells_triton(
+        torch.zeros(9, 128), torch.zeros(9, 3).long(), torch.zeros(1, 4).long(), grid
+    )
     slots = Slots(torch.zeros(9, 135), torch.zeros(9).long(), torch.zeros(2, 2), torch.zeros(128))
     found = [Keypoints(torch.zeros(1, n, 2), torch.ones(1, n) > 0, torch.zeros(1, n, 135)) for n in (4, 3)]
     past = (*pairs, torch.zeros(1, 7), pairs[0], torch.zeros(1, 7, 128), torch.zeros(1, 7).long())

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from src.ops.distinct_keys import grouped_keys
-from src.ops.segment_reduce import group_sum, group_sum_reference, taken_rows, taken_rows_reference
+from src.ops.segment_reduce import gather_rows, gather_rows_reference, group_sum, group_sum_reference
 
 
 @pytest.mark.parametrize("mean", [False, True])
@@ -31,5 +31,5 @@ def test_rows_are_taken(device, count, num, channels, dtype):
     values = torch.randn(count, channels, generator=draw).to(dtype)
     rows = torch.randint(-1, max(count, 1), (num,), generator=draw).clamp(max=count - 1)
     for kind in (torch.int32, torch.int64):
-        found = taken_rows(values.to(device), rows.to(device, kind))
-        assert torch.equal(found.cpu(), taken_rows_reference(values, rows))
+        found = gather_rows(values.to(device), rows.to(device, kind))
+        assert torch.equal(found.cpu(), gather_rows_reference(values, rows))

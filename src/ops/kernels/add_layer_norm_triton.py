@@ -7,8 +7,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from src.ops.add_layer_norm import Affine, add_layer_norm_reference, relu_norm_columns_reference
 from src.ops.backend import runs_kernels
-from src.ops.summed_norm import Affine, relu_norm_columns_reference, summed_norm_reference
 
 DTYPES = (torch.float32, torch.float16, torch.bfloat16)
 ROWS = 8
@@ -17,7 +17,7 @@ MOST_CHANNELS = 1024
 """A program holds its rows at once."""
 
 
-def summed_norm_triton(
+def add_layer_norm_triton(
     x: Tensor, affine: Affine, eps: float, added: Tensor | None = None, relu: bool = False, then: Tensor | None = None,
     aged: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor | None]:  # fmt: skip
@@ -26,7 +26,7 @@ def summed_norm_triton(
     fits = all(value is not None and value.dtype in DTYPES for value in (x, *affine, *rows, *(aged or ())))
     fits = fits and all(value.shape == x.shape for value in rows) and x.shape[-1] <= MOST_CHANNELS
     if not (fits and runs_kernels(x)):
-        return summed_norm_reference(x, affine, eps, added, relu, then, aged)
+        return add_layer_norm_reference(x, affine, eps, added, relu, then, aged)
     out = x.new_empty(x.shape, dtype=_result_type(x, added))
     behind = None if then is None else torch.empty_like(out, dtype=_result_type(out, then))
     _launch(x, out, eps, (False, relu), 1, affine, added, then, aged, behind)

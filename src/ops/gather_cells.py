@@ -10,18 +10,18 @@ from src.geometry.bev_grid import BEVGrid
 from src.ops.backend import implementation
 
 
-def taken_cells(
+def gather_cells(
     features: Tensor,  # [M, C]
     indices: Tensor,  # [M, 3] int64 (sample, row, col)
     rows: Tensor,  # [B, K] int64, -1 for none
     grid: BEVGrid,
 ) -> tuple[Tensor, Tensor, Tensor]:  # [B, K, 2] m, [B, K] bool, [B, K, C]
     """Centres, whether there is a cell, and its features, zero for none; with a gradient where one is wanted."""
-    form = taken_cells_reference if torch.is_grad_enabled() else implementation(taken_cells_reference)
+    form = gather_cells_reference if torch.is_grad_enabled() else implementation(gather_cells_reference)
     return form(features, indices, rows, grid)
 
 
-def taken_cells_reference(
+def gather_cells_reference(
     features: Tensor, indices: Tensor, rows: Tensor, grid: BEVGrid
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Plain torch form."""

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from src.geometry.bev_grid import BEVGrid
-from src.ops.taken_cells import taken_cells, taken_cells_reference
+from src.ops.gather_cells import gather_cells, gather_cells_reference
 
 GRID = BEVGrid(cells=(24, 20), cell_m=0.8, centre_m=(1.0, -2.0), z_range_m=(-3.0, 5.0))
 
@@ -18,7 +18,7 @@ def test_cells(device, num, channels, count, dtype):
         rows = rows.clamp(max=-1)
     inputs = (features, indices, rows)
     with torch.no_grad():
-        found = taken_cells(*(x.to(device) for x in inputs), GRID)
-    for value, expected in zip(found, taken_cells_reference(*inputs, GRID), strict=True):
+        found = gather_cells(*(x.to(device) for x in inputs), GRID)
+    for value, expected in zip(found, gather_cells_reference(*inputs, GRID), strict=True):
         assert value.dtype == expected.dtype
         torch.testing.assert_close(value.cpu(), expected, rtol=0, atol=1e-5 if expected.shape[-1:] == (2,) else 0)

@@ -1,11 +1,11 @@
 import pytest
 import torch
 
-from src.ops.summed_norm import (
+from src.ops.add_layer_norm import (
+    add_layer_norm,
+    add_layer_norm_reference,
     relu_norm_columns,
     relu_norm_columns_reference,
-    summed_norm,
-    summed_norm_reference,
 )
 
 
@@ -18,13 +18,13 @@ def test_sums(device, shape, relu, asked):
     ages = torch.randint(0, 3, shape[:-1], generator=draw) / 2
     given = {"added": added, "then": then, "aged": (embedded, ages)}
     given = {name: given[name] for name in asked}
-    wanted = summed_norm_reference(x, affine, 1e-5, relu=relu, **given)
+    wanted = add_layer_norm_reference(x, affine, 1e-5, relu=relu, **given)
     moved = {
         name: tuple(y.to(device) for y in value) if name == "aged" else value.to(device)
         for name, value in given.items()
     }
     with torch.no_grad():
-        found = summed_norm(x.to(device), tuple(y.to(device) for y in affine), 1e-5, relu=relu, **moved)
+        found = add_layer_norm(x.to(device), tuple(y.to(device) for y in affine), 1e-5, relu=relu, **moved)
     assert (found[1] is None) == ("then" not in asked)
     for value, expected in zip(found, wanted, strict=True):
         if expected is not None:

@@ -12,7 +12,7 @@ Affine = tuple[Tensor, Tensor]
 """Scale and shift [C] of a norm."""
 
 
-def summed_norm(
+def add_layer_norm(
     x: Tensor,  # [..., C]
     affine: Affine,
     eps: float,
@@ -23,11 +23,11 @@ def summed_norm(
 ) -> tuple[Tensor, Tensor | None]:  # [..., C] each
     """Norm of x, or of its sum with `added`, with a ReLU if asked for; and that plus `then`, None without it."""
     fused_elsewhere = torch.is_grad_enabled() or torch.compiler.is_compiling()
-    form = summed_norm_reference if fused_elsewhere else implementation(summed_norm_reference)
+    form = add_layer_norm_reference if fused_elsewhere else implementation(add_layer_norm_reference)
     return form(x, affine, eps, added, relu, then, aged)
 
 
-def summed_norm_reference(
+def add_layer_norm_reference(
     x: Tensor, affine: Affine, eps: float, added: Tensor | None = None, relu: bool = False, then: Tensor | None = None,
     aged: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor | None]:  # fmt: skip

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.ops.backend import runs_kernels
-from src.ops.taken_cells import taken_cells_reference
+from src.ops.gather_cells import gather_cells_reference
 
 
-def taken_cells_triton(
+def gather_cells_triton(
     features: Tensor,  # [M, C]
     indices: Tensor,  # [M, 3] int64
     rows: Tensor,  # [B, K] int64
@@ -20,7 +20,7 @@ def taken_cells_triton(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The reference's cells, centres up to rounding."""
     if features.dtype == torch.float64 or not runs_kernels(features):
-        return taken_cells_reference(features, indices, rows, grid)
+        return gather_cells_reference(features, indices, rows, grid)
     means = features.new_empty((*rows.shape, 2), dtype=torch.float32)
     valid, out = rows.new_empty(rows.shape, dtype=torch.uint8), features.new_empty(*rows.shape, features.shape[1])
     if rows.numel() > 0:
