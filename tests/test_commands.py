@@ -67,7 +67,8 @@ def test_evaluate_agrees_with_training_from_checkpoint_and_from_file(trained, ou
     )  # fmt: skip
     from_file = json.loads((tmp_path / "b" / "metrics.json").read_text())
     measures = from_file.pop("measures")  # a file of boxes does not tell what they were made of
-    assert set(measures) == {"moving_AP", "moving_boxes"} and measures.items() <= expected.pop("measures").items()
+    assert {name.partition("_")[0] for name in measures} == {"moving"}
+    assert measures.items() <= expected.pop("measures").items()
     assert from_file == expected
 
 

@@ -46,7 +46,7 @@ class MatchedParts:
     ranges: dict[str, Part]
     speeds: dict[str, Part]
     moving: Part | None  # None where speeds are not asked for
-    sums: dict[str, Array]  # [S, 2] see `sums_by_sample`
+    sums: dict[str, Array]  # [S, 2] see `_motion_sums` and `sums_by_sample`
     truth_kept: Array  # [k] bool, ground truth that survives the official filters
     predictions_kept: Array  # [n] bool
 
@@ -146,7 +146,8 @@ def match_parts(
         ranges=ranges,
         speeds=speeds,
         moving=moving,
-        sums=sums_by_sample(diagnoses, evaluation_set, truth_kept, found),
+        sums=(_motion_sums(ranking, matching) if by_speed else {})
+        | sums_by_sample(diagnoses, evaluation_set, truth_kept, found),
         truth_kept=truth_kept,
         predictions_kept=kept,
     )
@@ -156,7 +157,7 @@ def measure_parts(parts: MatchedParts) -> dict[str, float | None]:
     """What sees the claim of a memory, beside the official scores; each with the number of boxes it stands on.
 
     `moving_AP`: AP of MOVING above FAST_MPS as one class, so that every box weighs the same; each is matched within its
-    own, and predictions follow the rule of `_speed_parts`. The others: see `sums_by_sample`.
+    own, and predictions follow the rule of `_speed_parts`. The others: see `_motion_sums` and `sums_by_sample`.
     """
     measures: dict[str, float | None] = {}
     if parts.moving is not None:
@@ -232,3 +233,25 @@ def _speed_parts(ranking: Ranking, matching: Matching) -> tuple[dict[str, Part],
     labels = ranking.predictions.labels[ranking.rows]
     moving = (followed >= fast) & np.isin(labels, MOVING), (truth >= fast) & np.isin(ranking.truth.labels, MOVING)
     return speeds, Part(ranking, matching, *moving)
+
+
+def _motion_sums(ranking: Ranking, matching: Matching) -> dict[str, Array]:  # [S, 2] each
+    """Total and count in each sample of how wrongly matched moving vehicles move, as far as both velocities are known.
+
+    `moving_velocity_error`: m/s; `moving_radial_error`: m/s, what of it lies along the ray from the vehicle, which a
+    radar measures; `moving_heading_error`: degrees, from which follows what lies across.
+    """
+    at_errors = ranking.protocol.thresholds_m.index(ranking.protocol.error_threshold_m)
+    truth = ranking.truth[matching.ground_truth[at_errors]]
+    wrong = ranking.predictions.velocities[ranking.rows[matching.places[at_errors]]] - truth.velocities
+    _, _, turns, speeds, _ = matching.errors.T
+    rays = truth.centers[:, :2] - ranking.evaluation_set.ego_centers[truth.samples, :2]
+    radial = np.abs(np.vecdot(wrong, rays)) / np.linalg.norm(rays, axis=1)
+    counted = np.isin(truth.labels, MOVING) & (np.linalg.norm(truth.velocities, axis=1) >= FAST_MPS) & ~np.isnan(speeds)
+    samples, num_samples = truth.samples[counted], len(ranking.evaluation_set.tokens)
+    count = np.bincount(samples, minlength=num_samples)
+    values = {"velocity": speeds, "radial": radial, "heading": np.degrees(turns)}
+    return {
+        f"moving_{name}_error": np.stack([np.bincount(samples, value[counted], num_samples), count], axis=1)
+        for name, value in values.items()
+    }

@@ -30,7 +30,7 @@ IN_WORDS = {
 
 def format_scores(metrics: Mapping[str, Any]) -> str:
     """Tables of the content of metrics.json: a summary by distance bin, every class by distance bin, the summary by a
-    second protocol, speed classes, measures.
+    second protocol, speed classes, measures, how wrongly vehicles move.
 
     `metrics` is `DetectionScores.as_dict()`, fresh or read back; a file written before there were speed classes or
     measures has no table of them. mAP, NDS and AP in percent, errors in their own units (m, 1 - IoU, rad, m/s,
@@ -51,7 +51,7 @@ def format_scores(metrics: Mapping[str, Any]) -> str:
         tables.append(_measures(measures))
     if measures.get("radar_gaussians") is not None:
         tables.append(_gaussians(measures))
-    return "\n\n".join([*map(align, tables), *_intervals(metrics.get("intervals", {"bounds": {}}))])
+    return "\n\n".join([*map(align, tables), *_motion(measures), *_intervals(metrics.get("intervals", {"bounds": {}}))])
 
 
 def _summary(corner: str, scores: Mapping[str, Any]) -> list[list[str]]:
@@ -87,6 +87,15 @@ def _measures(measures: Mapping[str, float | None]) -> list[list[str]]:
             boxes = measures.get(f"{name.rpartition('_')[0]}_boxes")
             rows.append([words, _percent(measures[name]), "" if boxes is None else str(boxes)])
     return rows
+
+
+def _motion(measures: Mapping[str, float | None]) -> list[str]:
+    """How moving vehicles move, in a line; none where none is matched."""
+    speed, radial, heading = (measures.get(f"moving_{name}_error") for name in ("velocity", "radial", "heading"))
+    if speed is None or radial is None or heading is None:
+        return []
+    along = f"velocity off by {speed:.2f} m/s, {radial:.2f} along the ray, heading by {heading:.1f} deg"
+    return [f"matched moving vehicles: {along}"]
 
 
 def _gaussians(measures: Mapping[str, float | None]) -> list[list[str]]:
