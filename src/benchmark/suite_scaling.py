@@ -1,4 +1,4 @@
-"""suite=scaling: cost of a frame as range, traffic, radar, Gaussians and memory grow, model beside model."""
+"""suite=scaling: cost of a frame as range, traffic, radar, Gaussians and memory grow, beside the dense baseline."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import copy
 import logging
 import statistics
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,14 +30,13 @@ from src.benchmark.plots import draw_scaling, held_mib
 from src.benchmark.scenes import ROADS, Highway, highway_frame, highway_points, lidar_frame
 from src.benchmark.timing import added_mib, clock, interleaved, milliseconds, timed_parts
 from src.config import Config, compose_config
-from src.errors import ConfigError
-from src.models import FAMILIES
 from src.models.detector import ModelConfig
 from src.structures.batch import FrameBatch
 from src.training.phases import EVALUATORS
 
 logger = logging.getLogger(__name__)
 
+BASELINE = "dense_bev"
 ROUNDS, BUDGET_S = 5, 8.0  # of each model at each point; whole maps of 600 m are measured once
 NOMINAL_M = 150.0  # the range of the paper: `grid.cells` cover it
 EGO_STEP_M = 12.0  # between remembered frames: 24 m/s
@@ -136,16 +134,15 @@ def points_of(batch: FrameBatch) -> dict[str, Tensor]:
 
 
 def configs_of(config: Config) -> dict[str, Config]:
-    """By name the configured model with fresh weights, then all others of this phase that need no LiDAR, at the same
-    scale, grid and backbone."""
+    """By name the configured model with fresh weights, then the dense baseline at the same scale, grid and backbone.
+
+    All methods side by side, at one range: `suite=latency`, and sweeps/comparison.yaml.
+    """
     configs = {config.model.name: replace(config, checkpoint=None)}
-    if reads_lidar(config):
-        return configs
-    same = {name: getattr(config, name) for name in ("grid", "backbone", "precision", "seed")}
-    for name in [name for name in FAMILIES if name not in configs]:
-        overrides = [f"model={name}", f"scale={config.scale}", f"phase={config.phase.name}", "data=synthetic"]
-        with suppress(ConfigError):  # of a model without this phase, or one that reads what this world lacks
-            configs[name] = replace(compose_config(overrides)[0], **same)
+    if not reads_lidar(config) and BASELINE not in configs:
+        same = {name: getattr(config, name) for name in ("grid", "backbone", "precision", "seed")}
+        overrides = [f"model={BASELINE}", f"scale={config.scale}", f"phase={config.phase.name}", "data=synthetic"]
+        configs[BASELINE] = replace(compose_config(overrides)[0], **same)
     return configs
 
 

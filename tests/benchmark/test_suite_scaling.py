@@ -121,7 +121,7 @@ def test_a_point_changes_what_it_names():
     assert settings.radar_encoder == config.model.radar_encoder
 
     configs = configs_of(config)
-    assert [*configs] == ["horizon3d", "dense_bev", "crt_fusion", "hydra", "sparc", "petr", "far3d", "rctrans"]
+    assert [*configs] == ["horizon3d", "dense_bev"]
     assert configs["horizon3d"].model == config.model
     dense = configs["dense_bev"]
     assert settings_at(dense, point).temporal.num_frames == 5 and dense.grid == config.grid
