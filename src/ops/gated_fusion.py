@@ -36,7 +36,7 @@ def gated_fusion_conv(
     else:
         places = tuple(inverse_rows(own, len(joint)) for own in rows)
     gated = [x * gate.sigmoid() for x, gate in zip(features, _gates(features, joint, rows, places, gates), strict=True)]
-    kernel_map = stacked_map(joint, math.isqrt(len(weight)), rows, places)
+    kernel_map = stacked_map(joint, math.isqrt(len(weight)), places, (len(rows[0]), len(rows[1])))
     convolved = sparse_conv(torch.cat(gated), torch.cat(weight.chunk(2, dim=1)), kernel_map, bias)
     addends = tuple(
         permute_rows(linear(x, matrix), place, own)

@@ -84,32 +84,27 @@ def window_map(inputs: Sites, outputs: Sites, kernel_size: Size) -> KernelMap:
 def stacked_map(
     sites: Sites,
     kernel_size: Size,
-    parts: list[Tensor],  # [n_p] int64 each: rows of `sites` that a subset has features for, ascending
-    places: tuple[Tensor, Tensor] | None = None,  # [n] each, the inverse, where the caller has it of two
+    places: tuple[Tensor, Tensor],  # [n] each, row of either subset at each of the sites, -1 for none
+    counts: tuple[int, int],  # rows of either
 ) -> KernelMap:
-    """Map from several subsets of the sites, whose features are stacked row below row, to all of the sites.
+    """Map from two subsets of the sites, whose features are stacked row below row, to all of the sites.
 
-    Kernel offsets run through the subsets one after the other: convolving the stack with the stacked weights equals a
+    Kernel offsets run through the one and then the other: convolving the stack with the stacked weights equals a
     submanifold convolution of the subsets concatenated as channels, zero-filled where a subset lacks a site, without
     computing with the zeros.
     """
     base = submanifold_map(sites, kernel_size)
     if makes_tables(sites):
-        if places is None:
-            return TableMap(*_stacked_table(base.table, parts))
-        table, bits = stacked_table(base.table, places, len(parts[0]))
-        return TableMap(table, sum(map(len, parts)), bits=bits)
-    inputs, outputs, counts, first = [], [], [], 0
-    for rows in parts:
-        place = torch.full((len(sites),), -1, dtype=torch.int32, device=sites.device)
-        place[rows] = arange(first + len(rows), torch.int32, sites.device)[first:]
-        seen = place.index_select(0, base.inputs)
+        table, bits = stacked_table(base.table, places, counts[0])
+        return TableMap(table, sum(counts), bits=bits)
+    inputs, outputs, pairs = [], [], []
+    for place, before in zip(places, (0, counts[0]), strict=True):
+        seen = place.to(torch.int32).index_select(0, base.inputs)
         kept = (seen >= 0).nonzero().squeeze(1)
-        inputs.append(seen.index_select(0, kept))
+        inputs.append(seen.index_select(0, kept) + before)
         outputs.append(base.outputs.index_select(0, kept))
-        counts.append(counts_kept(kept, base))
-        first += len(rows)
-    return KernelMap(torch.cat(inputs), torch.cat(outputs), tuple(torch.cat(counts).tolist()), first, len(sites))
+        pairs.append(counts_kept(kept, base))
+    return KernelMap(torch.cat(inputs), torch.cat(outputs), tuple(torch.cat(pairs).tolist()), sum(counts), len(sites))
 
 
 def temporal_map(sites: Sites, kernel_size: Size, stride: Size, padding: Size) -> tuple[KernelMap, Sites]:
@@ -175,20 +170,6 @@ def _corners(sites: Sites, kernel: tuple[int, ...]) -> Tensor:  # [n] int64
 def _reach(sites: Sites, kernel: tuple[int, ...]) -> int:
     """From the key under the first tap of an odd kernel to that under its centre."""
     return sum(size // 2 * step for size, step in zip(kernel, sites.strides[1:], strict=True))
-
-
-def _stacked_table(
-    table: Tensor,  # [K, M] int32
-    parts: list[Tensor],
-) -> tuple[Tensor, int]:  # [P * K, M] int32, number of rows of the stack
-    """The table with the rows of each subset in turn."""
-    tables, first = [], 0
-    for rows in parts:
-        place = table.new_full((table.shape[1] + 1,), -1)  # the last is the place of none
-        place[rows] = arange(first + len(rows), table.dtype, table.device)[first:]
-        tables.append(place[table.long()])
-        first += len(rows)
-    return torch.cat(tables), first
 
 
 def _taps(sites: Sites, kernel: tuple[int, ...], centred: bool = False) -> Tensor:  # [K] int64

@@ -2,7 +2,8 @@
 
 import torch
 
-from src.ops.kernel_maps import strided_map, submanifold_map, temporal_map
+from src.ops.kernel_maps import stacked_map, strided_map, submanifold_map, temporal_map
+from src.ops.segment_reduce import inverse_rows
 from src.ops.sites import Sites
 
 
@@ -19,3 +20,8 @@ def map_of(mode, sites):
         return strided_map(sites, 3, 2, 1)[0].transposed
     build = strided_map if mode == "strided" else temporal_map
     return build(sites, 3, (2, 1, 1), 1)[0]
+
+
+def stack_of(sites, kernel, parts):
+    """`stacked_map` of two subsets, given as the rows that each has of the sites."""
+    return stacked_map(sites, kernel, tuple(inverse_rows(rows, len(sites)) for rows in parts), tuple(map(len, parts)))

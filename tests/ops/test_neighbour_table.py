@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from src.ops import kernel_maps
-from src.ops.kernel_maps import pruned_map, stacked_map, strided_map, submanifold_map, temporal_map, window_map
+from src.ops.kernel_maps import pruned_map, strided_map, submanifold_map, temporal_map, window_map
 from src.ops.neighbour_table import neighbour_table, stacked_table, tap_bits
-from tests.ops.maps import random_sites
+from tests.ops.maps import random_sites, stack_of
 
 BUILDERS = {
     "submanifold": lambda sites: submanifold_map(sites, (3, 1, 5)),
@@ -16,7 +16,7 @@ BUILDERS = {
     "pruned": lambda sites: pruned_map(sites, torch.arange(len(sites)) % 2 == 0, 3, 2, 1)[0],
     "temporal": lambda sites: temporal_map(sites, 3, (2, 1, 1), 1)[0],
     "window": lambda sites: window_map(random_sites((2, 4, 5, 6), 50, seed=1), sites, 3),
-    "stacked": lambda sites: stacked_map(sites, 3, [torch.arange(0, len(sites), 2), torch.arange(len(sites) // 2)]),
+    "stacked": lambda sites: stack_of(sites, 3, [torch.arange(0, len(sites), 2), torch.arange(len(sites) // 2)]),
     "kept": lambda sites: submanifold_map(sites, 3).keep_outputs(torch.arange(0, len(sites), 3)),
 }
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from src.ops.kernel_maps import inverse_map, stacked_map, strided_map, submanifold_map, temporal_map
+from src.ops.kernel_maps import inverse_map, strided_map, submanifold_map, temporal_map
 from src.ops.sites import Sites
 from src.ops.sparse_conv import neighbour_sum, plain_sparse_conv, sparse_conv
-from tests.ops.maps import map_of, random_sites
+from tests.ops.maps import map_of, random_sites, stack_of
 
 GOLDEN = np.load(Path(__file__).parents[1] / "golden" / "sparse_conv" / "cases.npz")
 CASES = json.loads(str(GOLDEN["meta_json"]))
@@ -169,18 +169,19 @@ def test_neighbour_sum_is_the_convolution_with_unit_weights(mode):
     assert torch.allclose(neighbour_sum(features, kernel_map), sparse_conv(features, unit, kernel_map), atol=1e-12)
 
 
+@pytest.mark.parametrize("counts", [(25, 18), (0, 18), (40, 0)])
 @pytest.mark.parametrize("kernel", [1, 3])
-def test_stacked_parts_equal_the_parts_side_by_side(kernel):
+def test_stacked_parts_equal_the_parts_side_by_side(kernel, counts):
     sites = random_sites((2, 6, 7), 40)
     generator = torch.Generator().manual_seed(2)
-    parts = [torch.randperm(40, generator=generator)[:count].sort().values for count in (25, 0, 18)]
+    parts = [torch.randperm(40, generator=generator)[:count].sort().values for count in counts]
     features = [torch.randn(len(rows), 4, dtype=torch.float64, generator=generator) for rows in parts]
     weights = [torch.randn(kernel**2, 4, 5, dtype=torch.float64, generator=generator) for _ in parts]
     wide = torch.cat(
         [torch.zeros(40, 4).double().index_copy(0, r, x) for r, x in zip(parts, features, strict=True)], dim=1
     )
     expected = sparse_conv(wide, torch.cat(weights, dim=1), submanifold_map(sites, kernel))
-    found = sparse_conv(torch.cat(features), torch.cat(weights), stacked_map(sites, kernel, parts))
+    found = sparse_conv(torch.cat(features), torch.cat(weights), stack_of(sites, kernel, parts))
     torch.testing.assert_close(found, expected)
 
 

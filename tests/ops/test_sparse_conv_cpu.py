@@ -5,12 +5,12 @@ import threading
 import pytest
 import torch
 
-from src.ops.kernel_maps import stacked_map, submanifold_map
+from src.ops.kernel_maps import submanifold_map
 from src.ops.products import bfloat16_products
 from src.ops.sites import Sites
 from src.ops.sparse_conv import plain_sparse_conv, sparse_conv
 from src.ops.sparse_conv_cpu import blocks, scratch
-from tests.ops.maps import map_of, random_sites
+from tests.ops.maps import map_of, random_sites, stack_of
 
 
 def values_and_gradients(convolve, kernel_map, width=3, dtype=torch.float64):
@@ -50,7 +50,7 @@ def test_blocks_hold_every_pair_once():
     sites = random_sites((2, 40, 50), 900)
     parts = [torch.arange(0, 900, 2), torch.arange(0, 900, 3)]
     strided = map_of("strided", random_sites((2, 9, 16, 17), 1200))
-    for kernel_map in (submanifold_map(sites, 5), stacked_map(sites, 3, parts), strided):
+    for kernel_map in (submanifold_map(sites, 5), stack_of(sites, 3, parts), strided):
         for backward in (False, True):
             ends = (kernel_map.outputs, kernel_map.inputs) if backward else (kernel_map.inputs, kernel_map.outputs)
             offsets = torch.repeat_interleave(torch.tensor(kernel_map.counts))
