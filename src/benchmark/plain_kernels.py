@@ -109,7 +109,9 @@ def _write_groups(
 
 
 @_of_kernel
-def _sum_groups(values: Tensor, order: Tensor, starts: Tensor, out: Tensor, channels: int, mean: bool) -> None:
+def _sum_groups(
+    values: Tensor, order: Tensor, starts: Tensor, out: Tensor, num: int, channels: int, mean: bool
+) -> None:
     out.copy_(group_sum_reference(values, Groups(order, starts), mean))
 
 

@@ -13,6 +13,8 @@ from src.ops.segment_reduce import gather_rows_reference, group_sum_reference
 
 ROWS = 16
 """Gathered rows of a program."""
+VALUES = 256
+"""Sums of a program, of as many groups as have them: most groups are of few rows, or padding."""
 
 
 def group_sum_triton(values: Tensor, groups: Groups, mean: bool) -> Tensor:
@@ -23,9 +25,12 @@ def group_sum_triton(values: Tensor, groups: Groups, mean: bool) -> Tensor:
     out = values.new_empty(num, channels)
     if out.numel() > 0:
         with torch.cuda.device_of(values):
-            _sum_groups[(num,)](
-                *(values.contiguous(), *groups, out, channels, mean),
-                BLOCK=triton.next_power_of_2(channels),
+            block = triton.next_power_of_2(channels)
+            together = max(1, VALUES // block)
+            _sum_groups[(triton.cdiv(num, together),)](
+                *(values.contiguous(), *groups, out, num, channels, mean),
+                GROUPS=together,
+                BLOCK=block,
                 num_warps=1,
             )
     return out
@@ -59,16 +64,21 @@ def _take(values, rows, out, num, channels, ROWS: tl.constexpr, BLOCK: tl.conste
     tl.store(out + place * channels + lane, found, mask=(place < num) & (lane < channels))
 
 
-@triton.jit
-def _sum_groups(values, order, starts, out, channels, MEAN: tl.constexpr, BLOCK: tl.constexpr):  # noqa: ANN001, ANN202
-    """One group."""
-    group = tl.program_id(0).to(tl.int64)
-    lane = tl.arange(0, BLOCK)
-    live = lane < channels
-    first, last = tl.load(starts + group), tl.load(starts + group + 1)
-    total = tl.zeros((BLOCK,), tl.float32)
-    for place in range(first, last):
-        total += tl.load(values + tl.load(order + place) * channels + lane, mask=live, other=0.0).to(tl.float32)
+@triton.jit(do_not_specialize=["num"])
+def _sum_groups(  # noqa: ANN202
+    values, order, starts, out, num, channels, MEAN: tl.constexpr, GROUPS: tl.constexpr, BLOCK: tl.constexpr  # noqa: ANN001
+):  # fmt: skip
+    """Some groups side by side, each row by row."""
+    group = tl.program_id(0).to(tl.int64) * GROUPS + tl.arange(0, GROUPS)
+    lane = tl.arange(0, BLOCK)[None]
+    first = tl.load(starts + group, mask=group < num, other=0)
+    count = tl.load(starts + group + 1, mask=group < num, other=0) - first
+    total = tl.zeros((GROUPS, BLOCK), tl.float32)
+    for place in range(0, tl.max(count, 0)):
+        row = tl.load(order + first + place, mask=place < count, other=0)[:, None]
+        live = (place < count)[:, None] & (lane < channels)
+        total += tl.load(values + row * channels + lane, mask=live, other=0.0).to(tl.float32)
     if MEAN:
-        total = total / tl.maximum(last - first, 1).to(tl.float32)
-    tl.store(out + group * channels + lane, total, mask=live)
+        total = total / tl.maximum(count, 1).to(tl.float32)[:, None]
+    group = group[:, None]
+    tl.store(out + group * channels + lane, total, mask=(group < num) & (lane < channels))
