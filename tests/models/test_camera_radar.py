@@ -10,10 +10,9 @@ from src.errors import ConfigError
 from src.models import build_model
 from src.models.crt_fusion.model import CRTFusionLossConfig
 from src.models.hydra.model import HyDRaLossConfig
-from tests.models.crt_fusion import crt_frames
+from tests.models.camera_radar_frames import settings, small_model
 from tests.models.crt_fusion.test_crt_model import TERMS as CRT_TERMS
 from tests.models.dense_bev.dense_frames import GRID, make_batch
-from tests.models.hydra import hydra_frames
 from tests.models.hydra.test_hydra_model import TERMS as HYDRA_TERMS
 from tests.models.learning import (
     gradients_are_finite,
@@ -26,10 +25,10 @@ from tests.models.learning import (
 )
 
 FAMILIES = {
-    "crt_fusion": (crt_frames.crt_model, crt_frames.SMALL, CRTFusionLossConfig, CRT_TERMS),
-    "hydra": (hydra_frames.hydra_model, hydra_frames.SMALL, HyDRaLossConfig, HYDRA_TERMS),
+    "crt_fusion": (CRTFusionLossConfig, CRT_TERMS),
+    "hydra": (HyDRaLossConfig, HYDRA_TERMS),
 }
-WEIGHTS = [(name, field.name) for name, (_, _, loss, _) in FAMILIES.items() for field in fields(loss)]
+WEIGHTS = [(name, field.name) for name, (loss, _) in FAMILIES.items() for field in fields(loss)]
 
 
 @pytest.fixture(params=FAMILIES)
@@ -39,7 +38,7 @@ def family(request):
 
 @pytest.fixture
 def model(family):
-    return FAMILIES[family][0]()
+    return small_model(family)
 
 
 def test_every_parameter_learns(model):
@@ -62,8 +61,7 @@ def test_two_samples_do_not_mix(model):
 
 @pytest.mark.parametrize(("name", "weight"), WEIGHTS)
 def test_weights_multiply_and_null_switches_a_term_off(name, weight):
-    make, _, _, terms = FAMILIES[name]
-    weight_multiplies_or_switches_off(make().eval(), make_batch(), weight, terms)
+    weight_multiplies_or_switches_off(small_model(name).eval(), make_batch(), weight, FAMILIES[name][1])
 
 
 def test_images_and_annotations_are_needed_where_they_are(model):
@@ -71,7 +69,7 @@ def test_images_and_annotations_are_needed_where_they_are(model):
 
 
 def test_it_needs_a_backbone(family):
-    config, _ = compose_config([*FAMILIES[family][1], "phase=phase1"])
+    config, _ = compose_config([*settings(family), "phase=phase1"])
     with pytest.raises(ConfigError, match=f"backbone=null: model={family}"):
         build_model(config.model, GRID, None, config.phase.options)
 

@@ -1,9 +1,6 @@
-"""Memory of maps: alignment under ego motion and augmentation, what is usable, streams, storage, the first step."""
+"""Memory of maps: alignment under ego motion and augmentation, what is usable, streams, storage."""
 
 import io
-import re
-from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,13 +8,9 @@ from torch import nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.dense_bev.model import DenseBEVConfig
 from src.models.map_memory import MapMemory, TemporalFusion
-from src.reliability.checkpoints import load_model_weights
-from tests.models.dense_bev.dense_frames import GRID, dense_model, drive, fill, memory_config, pose
+from tests.models.dense_bev.dense_frames import memory_config, pose
 from tests.models.moving import bare_frame, bda
-
-ADDED = re.compile(DenseBEVConfig.new_in_temporal_phase)
 
 WIDE = BEVGrid(cells=(96, 96), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
 
@@ -148,92 +141,3 @@ def test_mistakes_are_named():
         memory_config(num_frames=0)
     with pytest.raises(ConfigError, match="max_age_s=0"):
         memory_config(max_age_s=0)
-
-
-# ---------------------------------------------------------------- in the model
-
-
-@pytest.fixture
-def pair():
-    """A phase-1 model whose every tensor is random, and the phase-2 model that took its weights."""
-    first = dense_model(seed=1)
-    generator = torch.Generator().manual_seed(2)
-    with torch.no_grad():
-        for value in first.state_dict().values():
-            if value.is_floating_point():
-                value.add_(0.05 * torch.rand(value.shape, generator=generator))
-    second = dense_model(seed=3, temporal=memory_config())
-    state = {f"model.{key}": value.clone() for key, value in first.state_dict().items()}
-    new = load_model_weights(second, {"state_dict": state}, Path("phase1.ckpt"), ADDED)
-    assert set(new) == second.state_dict().keys() - first.state_dict().keys() and new
-    assert not [key for key in first.state_dict() if ADDED.match(key)]  # none of phase 1 may be missing
-    return first, second
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("training", [False, True])
-@pytest.mark.parametrize("steps", [0, 2, 4])
-def test_untrained_memory_leaves_phase_1_to_the_last_bit(pair, training, steps):
-    """Empty, partly full and full; also in its losses."""
-    first, second = (model.train(training) for model in pair)
-    memory, batch = fill(second, steps), drive(steps)
-    assert (len(memory.frames) if memory else 0) == min(steps, 3)
-    second.load_state_dict({key: value for key, value in first.state_dict().items()}, strict=False)  # batch statistics
-    one, two = first(batch)[0], second(batch, memory)[0]
-    assert torch.equal(one.fused_bev, two.fused_bev) and torch.equal(one.head.logits, two.head.logits)
-    if not training:
-        terms, more = first.loss(one, batch).terms, second.loss(two, batch).terms
-        assert all(torch.equal(terms[name], more[name]) for name in terms)
-    assert first(batch)[1] is None
-
-
-def test_trained_memory_changes_the_output_and_streams_do_not_mix(pair):
-    _, model = pair
-    model.eval()
-    torch.nn.init.normal_(model.temporal.norm.weight)
-    memory, batch = fill(model, 3), drive(3)
-    with torch.no_grad():
-        both = model(batch, memory)[0].head.logits.view(2, -1, 12)
-        nothing = model(batch, None)[0].head.logits.view(2, -1, 12)
-        half = model(batch, memory.select(torch.tensor([0, 1]), torch.tensor([True, False])))[0]
-    half = half.head.logits.view(2, -1, 12)
-    assert not torch.allclose(both[0], nothing[0]) and not torch.allclose(both[1], nothing[1])
-    torch.testing.assert_close(half[0], both[0], rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(half[1], nothing[1], rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("steps", [0, 3])
-def test_every_parameter_of_the_memory_learns(pair, steps):
-    model = pair[1].train()
-    memory, batch = fill(model, steps), drive(steps, boxes=(12, 12))
-    optimizer = torch.optim.SGD(model.parameters(), lr=1e-2)
-    moved = set()
-    for _ in range(2):
-        model.zero_grad()
-        output, new = model(batch, memory)
-        model.loss(output, batch).terms["total"].backward()
-        assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
-        moved |= {name for name, p in model.temporal.named_parameters() if p.grad.any()}
-        optimizer.step()
-    assert moved == {name for name, _ in model.temporal.named_parameters()}
-    assert len(new.frames) == min(steps + 1, 3) and not any(f.cells.requires_grad for f in new.frames)
-
-
-def test_a_memory_of_other_streams_is_refused(pair):
-    model = pair[1].eval()
-    memory = fill(model, 1)
-    with pytest.raises(ValueError, match="2 streams, but the batch 1 frames"):
-        model(drive(1, points=(10,), boxes=(1,)), memory)
-
-
-def test_a_jump_of_the_clock_or_the_pose_empties_the_memory(pair):
-    model = pair[1].eval()
-    memory = fill(model, 2)
-    batch = drive(2)
-    late = replace(batch, timestamps_s=batch.timestamps_s + 100.0)
-    with torch.no_grad():
-        assert not model(late, memory)[0].warped_maps.usable.any()
-        far = replace(batch, global_from_ego=torch.stack([pose(1000.0), pose(2000.0)]))
-        assert not model(far, memory)[0].warped_maps.usable.any()
-        assert model(batch, memory)[0].warped_maps.usable[:2].all()
-    assert GRID.rows == 48  # the small grid of the model, not the wide one above

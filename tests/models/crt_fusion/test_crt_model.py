@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from src.errors import ConfigError
-from tests.models.crt_fusion.crt_frames import crt_model
+from tests.models.camera_radar_frames import crt_model
 from tests.models.dense_bev.dense_frames import GRID, make_batch
 from tests.models.learning import (
     gradients_are_finite,

@@ -1,8 +1,6 @@
-"""Motion-guided fusion: warps by velocity, ego motion and augmentation, recurrence, what is usable, the first step."""
+"""Motion-guided fusion: warps by velocity, ego motion and augmentation, recurrence, what is usable."""
 
 import io
-import re
-from dataclasses import replace
 
 import pytest
 import torch
@@ -10,16 +8,12 @@ from torch import nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.crt_fusion.model import CRTFusionConfig
 from src.models.crt_fusion.motion_estimator import CellMotion
 from src.models.crt_fusion.motion_fusion import MotionFusionConfig, MotionGuidedFusion, StackMemory
-from tests.models.crt_fusion.crt_frames import crt_model
-from tests.models.dense_bev.dense_frames import drive, fill, pose
-from tests.models.learning import gradients_are_finite
+from tests.models.dense_bev.dense_frames import pose
 from tests.models.moving import bare_frame, bda
 
 WIDE = BEVGrid(cells=(40, 60), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
-ADDED = re.compile(CRTFusionConfig.new_in_temporal_phase)
 
 
 def make_fusion(num_frames=3, min_speed_mps=1.0, threshold=0.5, max_cells=1000, max_age_s=6.0):
@@ -191,82 +185,3 @@ def test_mistakes_are_named():
         make_fusion(threshold=1.0)
     with pytest.raises(ConfigError, match="min_speed_mps=-1"):
         make_fusion(min_speed_mps=-1.0)
-
-
-# ---------------------------------------------------------------- in the model
-
-
-@pytest.fixture
-def pair():
-    """A phase-1 model and the phase-2 model that took its weights; half of all cells are occupied."""
-    first, second = crt_model(seed=1), crt_model(phase="phase2", seed=3)
-    with torch.no_grad():
-        first.estimator.output.bias[0] = 0.0
-    new = second.load_state_dict(first.state_dict(), strict=False)
-    assert new.missing_keys and all(ADDED.match(key) for key in new.missing_keys) and not new.unexpected_keys
-    return first, second
-
-
-@pytest.mark.parametrize("training", [False, True])
-@pytest.mark.parametrize("steps", [0, 1, 3])
-def test_untrained_memory_leaves_phase_1_to_the_last_bit(pair, training, steps):
-    first, second = (model.train(training) for model in pair)
-    memory, batch = fill(second, steps), drive(steps)
-    second.load_state_dict(first.state_dict(), strict=False)  # batch statistics
-    one, two = first(batch)[0], second(batch, memory)[0]
-    assert torch.equal(one.head.logits, two.head.logits) and first(batch)[1] is None
-    assert second.diagnostics(two)["remembered_frames"] == min(steps, 2)
-
-
-def test_trained_memory_changes_the_output_and_streams_do_not_mix(pair):
-    model = pair[1].eval()
-    nn.init.normal_(model.temporal.norm.weight)
-    memory, batch = fill(model, 3), drive(3)
-    with torch.no_grad():
-        both, nothing, half = (
-            model(batch, past)[0].head.logits.view(2, -1, 12)
-            for past in (memory, None, memory.select(torch.tensor([0, 1]), torch.tensor([True, False])))
-        )
-    assert not torch.allclose(both[0], nothing[0]) and not torch.allclose(both[1], nothing[1])
-    torch.testing.assert_close(half[0], both[0], rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(half[1], nothing[1], rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("steps", [0, 2])
-def test_every_parameter_of_the_memory_learns(pair, steps):
-    model = pair[1].train()
-    memory, batch = fill(model, steps), drive(steps, boxes=(12, 12))
-    optimizer, moved = torch.optim.SGD(model.parameters(), lr=1e-2), set()
-    for _ in range(2):
-        model.zero_grad()
-        output, _ = model(batch, memory)
-        model.loss(output, batch).terms["total"].backward()
-        assert gradients_are_finite(model)
-        moved |= {name for name, p in model.temporal.named_parameters() if p.grad.any()}
-        optimizer.step()
-    assert moved == {name for name, _ in model.temporal.named_parameters()}
-
-
-@pytest.mark.parametrize("shape", [{"points": (0, 0)}, {"boxes": (0, 0)}])
-def test_empty_frames_pass_through_the_memory(pair, shape):
-    model = pair[1].train()
-    batch = drive(1, **shape)
-    batch.image_valid[:] = False
-    output, memory = model(batch, fill(model, 1))
-    assert model.loss(output, batch).terms["total"].isfinite() and memory.batch_size == 2
-
-
-def test_a_memory_of_other_streams_is_refused(pair):
-    model = pair[1].eval()
-    with pytest.raises(ValueError, match="2 streams, but the batch 1 frames"):
-        model(drive(1, points=(10,), boxes=(1,)), fill(model, 1))
-
-
-def test_a_jump_of_the_clock_or_the_pose_empties_the_memory(pair):
-    model = pair[1].eval()
-    memory, batch = fill(model, 2), drive(2)
-    late = replace(batch, timestamps_s=batch.timestamps_s + 100.0)
-    far = replace(batch, global_from_ego=torch.stack([pose(1000.0), pose(2000.0)]))
-    with torch.no_grad():
-        assert not model(late, memory)[0].moved.usable.any() and not model(far, memory)[0].moved.usable.any()
-        assert model(batch, memory)[0].moved.usable.all()

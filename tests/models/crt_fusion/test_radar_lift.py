@@ -7,7 +7,7 @@ import torch
 
 from src.models.backbones.bev_decoder import GatedFuser
 from src.models.layers.azimuth_attention import AzimuthAttention
-from tests.models.crt_fusion.crt_frames import crt_model
+from tests.models.camera_radar_frames import crt_model
 from tests.models.dense_bev.dense_frames import GRID, SIZE, make_batch
 from tests.models.surroundings import AXES, camera_matrices
 

@@ -8,8 +8,8 @@ import torch
 from src.models.hydra.height_association import HeightAssociation
 from src.models.layers.views import CameraViews
 from src.targets.depth import lid_edges
+from tests.models.camera_radar_frames import hydra_model
 from tests.models.dense_bev.dense_frames import GRID, SIZE, make_batch
-from tests.models.hydra.hydra_frames import hydra_model
 from tests.models.surroundings import AXES, camera_matrices
 
 LEVEL = (4, 6)  # h, w

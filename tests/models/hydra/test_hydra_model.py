@@ -1,17 +1,12 @@
 """What is HyDRa's own: its terms, cameras that are not there, types, bad settings, fusion, memory."""
 
-import re
-from dataclasses import replace
-
 import pytest
 import torch
-from torch import nn
 
 from src.errors import ConfigError
 from src.models.backbones.bev_decoder import SqueezeFuser
-from src.models.hydra.model import HyDRaConfig
-from tests.models.dense_bev.dense_frames import GRID, drive, fill, make_batch, pose
-from tests.models.hydra.hydra_frames import hydra_model
+from tests.models.camera_radar_frames import hydra_model
+from tests.models.dense_bev.dense_frames import GRID, drive, make_batch
 from tests.models.learning import (
     gradients_are_finite,
     missing_cameras_do_not_matter,
@@ -20,7 +15,6 @@ from tests.models.learning import (
 
 TERMS = {"heatmap", "box", "depth", "foreground", "total"}
 EVERY = [(b, n) for b in range(2) for n in range(4)]
-ADDED = re.compile(HyDRaConfig.new_in_temporal_phase)
 
 
 def test_named_terms_and_one_entry_per_sample():
@@ -81,50 +75,8 @@ def test_channels_are_weighted_by_the_means_of_all():
         torch.testing.assert_close(fuser(camera, radar), fuser.norm(wanted).clamp(min=0))
 
 
-# ---------------------------------------------------------------- memory
-
-
-@pytest.fixture
-def pair():
-    """A phase-1 model and the phase-2 model that took its weights."""
-    first, second = hydra_model(seed=1), hydra_model(phase="phase2", seed=3)
-    new = second.load_state_dict(first.state_dict(), strict=False)
-    assert new.missing_keys and all(ADDED.match(key) for key in new.missing_keys) and not new.unexpected_keys
-    return first, second
-
-
-@pytest.mark.parametrize("training", [False, True])
-@pytest.mark.parametrize("steps", [0, 1, 3])
-def test_untrained_memory_leaves_phase_1_to_the_last_bit(pair, training, steps):
-    first, second = (model.train(training) for model in pair)
-    memory, batch = fill(second, steps), drive(steps)
-    second.load_state_dict(first.state_dict(), strict=False)  # batch statistics
-    one, two = first(batch)[0], second(batch, memory)[0]
-    assert torch.equal(one.head.logits, two.head.logits) and first(batch)[1] is None
-    assert second.diagnostics(two)["remembered_frames"] == min(steps, 2)
-
-
-def test_a_clip_that_starts_forgets_and_so_does_a_jump(pair):
-    """The stream that starts anew detects as without a past, the other with it."""
-    model = pair[1].eval()
-    nn.init.normal_(model.temporal.norm.weight)
-    memory, batch = fill(model, 3), drive(3)
-    late = replace(batch, timestamps_s=batch.timestamps_s + 100.0)
-    far = replace(batch, global_from_ego=torch.stack([pose(1000.0), pose(2000.0)]))
-    with torch.no_grad():
-        both, nothing, half = (
-            model(batch, past)[0].head.logits.view(2, -1, 12)
-            for past in (memory, None, memory.select(torch.tensor([0, 1]), torch.tensor([True, False])))
-        )
-        assert not model(late, memory)[0].warped_maps.usable.any()
-        assert not model(far, memory)[0].warped_maps.usable.any()
-    assert not torch.allclose(both[0], nothing[0]) and not torch.allclose(both[1], nothing[1])
-    torch.testing.assert_close(half[0], both[0], rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(half[1], nothing[1], rtol=1e-4, atol=1e-4)
-
-
-def test_what_is_remembered_is_the_refined_map_without_its_graph(pair):
-    output, memory = pair[1].train()(drive(0))
+def test_what_is_remembered_is_the_refined_map_without_its_graph():
+    output, memory = hydra_model(phase="phase2").train()(drive(0))
     (frame,) = memory.frames
     assert not frame.cells.requires_grad and output.fused_bev.requires_grad
     assert torch.equal(frame.cells, output.fused_bev.detach().permute(0, 2, 3, 1).to(torch.bfloat16))
