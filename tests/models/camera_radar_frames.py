@@ -26,3 +26,12 @@ def small_model(family, *overrides, phase="phase1", seed=0):
 
 
 crt_model, hydra_model = (partial(small_model, family) for family in ("crt_fusion", "hydra"))
+
+
+def radar_map(cells):
+    """[2, 4, rows, cols] with random features at (sample, row, col)."""
+    torch.manual_seed(1)
+    bev = torch.zeros(2, 4, *GRID.cells)
+    for sample, row, col in cells:
+        bev[sample, :, row, col] = torch.rand(4) + 0.1
+    return bev

@@ -7,7 +7,7 @@ import torch
 
 from src.models.backbones.bev_decoder import GatedFuser
 from src.models.layers.azimuth_attention import AzimuthAttention
-from tests.models.camera_radar_frames import crt_model
+from tests.models.camera_radar_frames import crt_model, radar_map
 from tests.models.dense_bev.dense_frames import GRID, SIZE, make_batch
 from tests.models.surroundings import AXES, camera_matrices
 
@@ -15,15 +15,6 @@ from tests.models.surroundings import AXES, camera_matrices
 def make_attention(count=3):
     torch.manual_seed(0)
     return AzimuthAttention(6, 4, 8, count, GRID).eval()
-
-
-def radar_map(cells):
-    """[2, 4, rows, cols] with random features at (sample, row, col)."""
-    torch.manual_seed(1)
-    bev = torch.zeros(2, 4, *GRID.cells)
-    for sample, row, col in cells:
-        bev[sample, :, row, col] = torch.rand(4) + 0.1
-    return bev
 
 
 CELLS = [(0, 24, 60), (0, 30, 55), (0, 10, 40), (0, 40, 3), (0, 20, 2), (1, 33, 33), (1, 2, 60)]

@@ -8,7 +8,7 @@ import torch
 from src.models.hydra.height_association import HeightAssociation
 from src.models.layers.views import CameraViews
 from src.targets.depth import lid_edges
-from tests.models.camera_radar_frames import hydra_model
+from tests.models.camera_radar_frames import hydra_model, radar_map
 from tests.models.dense_bev.dense_frames import GRID, SIZE, make_batch
 from tests.models.surroundings import AXES, camera_matrices
 
@@ -20,15 +20,6 @@ def make_association():
     torch.manual_seed(0)
     config = hydra_model().config.view_transform
     return HeightAssociation(config, 6, 4, LEVEL[0], GRID).eval()
-
-
-def radar_map(cells):
-    """[2, 4, rows, cols] with random features at (sample, row, col)."""
-    torch.manual_seed(1)
-    bev = torch.zeros(2, 4, *GRID.cells)
-    for sample, row, col in cells:
-        bev[sample, :, row, col] = torch.rand(4) + 0.1
-    return bev
 
 
 def turned_cameras():
