@@ -13,24 +13,24 @@ from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import window_corners
 from src.ops.add_layer_norm import add_layer_norm_reference, relu_norm_columns_reference
 from src.ops.box_codes import decoded_boxes_reference
-from src.ops.candidate_ranks import ranked_candidates_reference, ranks_of_scores
+from src.ops.candidate_sort_keys import sort_keys_of_scores, unpack_candidates_reference
 from src.ops.cell_keys import cell_centres_reference, cell_keys_reference
 from src.ops.deform_sample import attend_cells_reference, attend_views_reference
 from src.ops.distinct_keys import Groups, distinct_keys_reference, grouped_keys_reference
 from src.ops.farthest_point import farthest_points_reference
-from src.ops.frame_motion import moved_gaussians_reference, relative_motion_reference
+from src.ops.frame_motion import relative_motion_reference, warp_gaussians_reference
 from src.ops.gather_cells import gather_cells_reference
 from src.ops.gaussian_cells import cell_distances, gaussian_windows
 from src.ops.gaussian_shapes import AttributeLimits, refined_attributes_reference, sampling_points_reference
 from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians_reference
 from src.ops.moved_keys import moved_keys_reference
-from src.ops.neighbour_table import neighbour_table_reference, stacked_table_reference, turned_table_reference
-from src.ops.radial_change import radial_change_reference, radial_votes_reference
-from src.ops.scored_pixels import scored_pixels_reference
+from src.ops.neighbour_table import neighbour_table_reference, stacked_table_reference, transposed_table_reference
+from src.ops.radial_correction import radial_correction_reference, radial_votes_reference
+from src.ops.score_and_lift_pixels import score_and_lift_pixels_reference
 from src.ops.segment_reduce import gather_rows_reference, group_sum_reference
 from src.ops.sites import HALO
 from src.ops.splat import log1mexp
-from src.ops.view_samples import view_places_reference, view_weights_reference
+from src.ops.view_samples import view_attention_weights_reference, view_sampling_locations_reference
 
 KERNELS: dict[str, Callable[..., None] | None] = {"_span_product": None, "_gaussian_gradient": None}
 """By name; None where a kernel's values are a gradient."""
@@ -66,7 +66,7 @@ def _stack(table: Tensor, own: Tensor, other: Tensor, out: Tensor, bits: Tensor,
 
 @_of_kernel
 def _turn(table: Tensor, back: Tensor, bits: Tensor, num: int, cells: int) -> None:
-    for out, found in zip((back, bits), turned_table_reference(table, num), strict=True):
+    for out, found in zip((back, bits), transposed_table_reference(table, num), strict=True):
         out.copy_(found)
 
 
@@ -136,7 +136,7 @@ def _vote(points: Tensor, batch: Tensor, keys: Tensor, weighted: Tensor, num: in
 def _nearest_radial(
     velocities: Tensor, cells: Tensor, keys: Tensor, measured: Tensor, out: Tensor, *rest: float
 ) -> None:
-    out.copy_(radial_change_reference(velocities, cells, keys, measured, _grid(*rest[3:8]), rest[-1]))
+    out.copy_(radial_correction_reference(velocities, cells, keys, measured, _grid(*rest[3:8]), rest[-1]))
 
 
 @_of_kernel
@@ -170,7 +170,7 @@ def _move_gaussians(
 ) -> None:  # fmt: skip
     shapes = tuple(x.view(*valid.shape, 2) for x in (means, scales, turns, speeds))
     least = rest[-1] if DRIVEN else None
-    found = moved_gaussians_reference(shapes, valid > 0, matrices, elapsed, usable > 0, least, _grid(*rest[6:11]))
+    found = warp_gaussians_reference(shapes, valid > 0, matrices, elapsed, usable > 0, least, _grid(*rest[6:11]))
     out.copy_(torch.stack(found[0]))
     moved.copy_(found[1])
 
@@ -201,14 +201,14 @@ def _rank(
         others = F.pad(scores, (0, 0, 1, 0), value=-torch.inf)[neighbours.long() + 1]  # [9, M, classes]
         scores = scores * (scores == others.amax(0))
     scores = scores.where((keys < end)[:, None], 0.0)
-    ranks.copy_(ranks_of_scores(scores, tuple(map(tuple, table.tolist()))))
+    ranks.copy_(sort_keys_of_scores(scores, tuple(map(tuple, table.tolist()))))
 
 
 @_of_kernel
 def _read_ranks(
     ranks: Tensor, table: Tensor, scores: Tensor, rows: Tensor, labels: Tensor, num: int, of_group: int, classes: int
 ) -> None:
-    found = ranked_candidates_reference(ranks, tuple(map(tuple, table.tolist())), classes)
+    found = unpack_candidates_reference(ranks, tuple(map(tuple, table.tolist())), classes)
     for out, values in zip((scores, rows, labels), found, strict=True):
         out.copy_(values)
 
@@ -234,14 +234,14 @@ def _place(
     points: Tensor, heights: Tensor, matrices: Tensor, valid: Tensor, places: Tensor, visible: Tensor, *rest: float
 ) -> None:
     low, span, height, width = rest[4:8]
-    found = view_places_reference(points, heights, (low, low + span), matrices, valid > 0, (height, width))
+    found = view_sampling_locations_reference(points, heights, (low, low + span), matrices, valid > 0, (height, width))
     for out, values in zip((places, visible), found, strict=True):
         out.copy_(values)
 
 
 @_of_kernel
 def _weigh(logits: Tensor, camera: Tensor, visible: Tensor, out: Tensor, *sizes: int) -> None:
-    out.copy_(view_weights_reference(logits, camera, visible > 0, sizes[2]))
+    out.copy_(view_attention_weights_reference(logits, camera, visible > 0, sizes[2]))
 
 
 @_of_kernel
@@ -289,7 +289,7 @@ def _score(
     (b, n, h, w), (height, width, x_min, y_min, cell_m, rows, cols) = scores.shape, rest[9:]
     depths, matrices = depths.unflatten(0, (b, n)).unflatten(3, (h, w)), matrices.unflatten(0, (b, n))
     chosen = ((h * height, w * width), _grid(rows, cols, x_min, y_min, cell_m), None)
-    wanted = scored_pixels_reference(keypoints, depths, centres, matrices, valid > 0, *chosen)
+    wanted = score_and_lift_pixels_reference(keypoints, depths, centres, matrices, valid > 0, *chosen)
     for out, own in zip((scores, points), wanted, strict=True):
         out.copy_(own)
 

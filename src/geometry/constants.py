@@ -35,7 +35,7 @@ def _sequence(bits: int, dtype: torch.dtype, device: torch.device) -> Tensor:  #
 
 
 @cache  # as above
-def repeated(
+def repeat_interleave(
     counts: tuple[int, ...],
     device: torch.device,
 ) -> Tensor:  # [sum of the counts] int64

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy
 from src.models.layers.dense import DenseConvNormReLU, MapConv2d
-from src.models.layers.norm import MapNorm
+from src.models.layers.norm import MapBatchNorm
 from src.models.memory import FrameMemory, Motion, RememberedFrame, TemporalConfig
 from src.ops.concat_conv import concat_conv2d
 from src.structures.batch import FrameBatch
@@ -81,7 +81,7 @@ class TemporalFusion(nn.Module):
         self.config, self.grid = config, grid
         self.reduce = DenseConvNormReLU((config.num_frames + 1) * channels, channels, 1)
         self.refine = MapConv2d(channels, channels, 3, padding=1, bias=False)
-        self.norm = MapNorm(channels)
+        self.norm = MapBatchNorm(channels)
         nn.init.zeros_(self.norm.weight)  # untrained, the memory adds exactly zero
         row, col = torch.meshgrid(torch.arange(grid.rows), torch.arange(grid.cols), indexing="ij")
         self.register_buffer("centres_m", grid.centre_of(torch.stack([row, col], -1)), persistent=False)

@@ -80,7 +80,7 @@ class QueryOutput:
     recalled: RecalledQueries | None  # None in phase 1
 
 
-class Answers(NamedTuple):
+class DecoderOutput(NamedTuple):
     """The fields of `QueryOutput`, in their order."""
 
     layers: list[QueryPrediction]
@@ -140,31 +140,31 @@ class QueryDetector(Detector):
         return self.image_encoder.backbone
 
     @property
-    def answering_layer(self) -> int:
+    def output_layer(self) -> int:
         """The decoder's layer whose boxes count and whose queries are remembered."""
         return -1
 
-    def ask(
+    def run_decoder(
         self,
         batch: FrameBatch,
         memory: QueryMemory | None,
         queries: Queries,  # of this frame
         *seen: Any,  # as the decoder takes it
-    ) -> tuple[Answers, QueryMemory | None]:
+    ) -> tuple[DecoderOutput, QueryMemory | None]:
         """What the decoder says to these queries and those of the last frame, and the memory with this frame, detached.
 
         Raises ValueError for a memory of another number of streams.
         """
         if self.temporal is None:
             layers, _ = self.decoder(queries, None, *seen, self.head)
-            return Answers(layers, layers[self.answering_layer], None), None
+            return DecoderOutput(layers, layers[self.output_layer], None), None
         if memory is not None and memory.frames and memory.batch_size != len(batch):
             raise ValueError(f"the memory holds {memory.batch_size} streams, but the batch {len(batch)} frames")
         recalled = self.temporal.recall(memory, batch)
         queries = Queries.concatenate([queries, recalled.newest])
         layers, features = self.decoder(queries, recalled.older, *seen, self.head)
-        head, own = layers[self.answering_layer], features[self.answering_layer]
-        return Answers(layers, head, recalled), self.temporal.remember(memory, batch, own, head)
+        head, own = layers[self.output_layer], features[self.output_layer]
+        return DecoderOutput(layers, head, recalled), self.temporal.remember(memory, batch, own, head)
 
     def restore_memory(self, state: list[dict[str, Any]]) -> QueryMemory:
         """The memory that `QueryMemory.state` described."""

@@ -15,7 +15,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points, transform_vectors_xy
 from src.models.heads.query_head import QueryPrediction
 from src.models.memory import FrameMemory, RememberedFrame, TemporalConfig, motions
-from src.ops.frame_motion import moving
+from src.ops.frame_motion import zero_slow_velocities
 from src.structures.batch import FrameBatch
 from src.structures.evidence import Evidence, WarpedPoints
 from src.structures.queries import SPEED_UNIT_MPS, UNKNOWN_LOGIT, Queries
@@ -161,7 +161,7 @@ class QueryPropagation(nn.Module):
         with torch.autocast(batch.device.type, enabled=False):
             elapsed = motion.elapsed_s[..., None].expand_as(valid)
             driven = motion.aug_from_past[:, :, None]  # [T, B, 1, 4, 4]
-            shift = moving(velocities, self.config.min_speed_mps) * elapsed[..., None]
+            shift = zero_slow_velocities(velocities, self.config.min_speed_mps) * elapsed[..., None]
             centers = transform_points(driven, centers + F.pad(shift, (0, 1)))
             velocities = transform_vectors_xy(driven, velocities)
             valid = valid & motion.usable[..., None] & self.grid.contains(centers[..., :2])

@@ -11,7 +11,7 @@ from torch import Tensor
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import Values, constant
 from src.ops.backend import implementation
-from src.ops.radial_change import radial_change_reference
+from src.ops.radial_correction import radial_correction_reference
 
 WIDTHS = (3, 3, 1, 2, 1, 1, 1, 1)
 """Centre, size, yaw, velocity, score, label, attribute, and whether the score is above the threshold."""
@@ -35,7 +35,7 @@ def decoded_boxes(
     threshold: float,
     grid: BEVGrid,
     rules: Values,  # see `attributes_by_rule`
-    radar: tuple[Tensor, Tensor] | None,  # `keys` and `measured` of `radial_change`
+    radar: tuple[Tensor, Tensor] | None,  # `keys` and `measured` of `radial_correction`
     turned: bool,  # then `along_heading`
 ) -> Tensor:  # [n, sum of WIDTHS]
     """Boxes side by side with scores, labels and attributes by rule. Without gradient."""
@@ -54,7 +54,7 @@ def decoded_boxes_reference(
     velocities = codes[:, 8:10]
     if radar is not None:
         steps = constant((grid.rows * grid.cols, grid.cols, 1), torch.int64, cells.device)
-        velocities = radial_change_reference(velocities, (cells * steps).sum(1), *radar, grid, added=True)
+        velocities = radial_correction_reference(velocities, (cells * steps).sum(1), *radar, grid, added=True)
         if turned:
             velocities = along_heading(velocities, codes[:, 6:8], grid.centre_of(cells[:, 1:]))
     centers, sizes, yaws = box_geometry(cells[:, 1:], codes, grid)

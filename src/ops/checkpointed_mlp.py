@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from src.ops.products import multiply, multiply_rows, product_type, row_spans, whole_steps
+from src.ops.products import matmul, matmul_tn, product_type, row_spans, whole_steps
 
 CPU_ROWS = 1024
 GPU_VALUES = 1 << 28
@@ -63,8 +63,8 @@ class _CheckpointedMLP(torch.autograd.Function):
         first = hidden_weight.to(dtype), hidden_bias.to(dtype)
         out = weight.new_empty(len(x), weight.shape[1])
         for span in _spans(x, hidden_weight.shape[1]):
-            hidden = multiply(whole_steps(x[span]).to(dtype), *first, relu=True)
-            out[span] = multiply(hidden.to(weight.dtype), weight, bias)[: len(out[span])]
+            hidden = matmul(whole_steps(x[span]).to(dtype), *first, relu=True)
+            out[span] = matmul(hidden.to(weight.dtype), weight, bias)[: len(out[span])]
         return out
 
     @staticmethod
@@ -76,12 +76,12 @@ class _CheckpointedMLP(torch.autograd.Function):
         sums = [torch.zeros_like(value, dtype=full) for value in (hidden_weight, hidden_bias, weight)]
         for span in _spans(x, hidden_weight.shape[1]):
             rows, pull = whole_steps(x[span]).to(dtype), whole_steps(grad[span]).to(dtype).contiguous()
-            hidden = multiply(rows, *first, relu=True)
-            sums[2].add_(multiply_rows(hidden, pull))
-            back = torch.ops.aten.threshold_backward(multiply(pull, second.t()), hidden, 0)
-            sums[0].add_(multiply_rows(rows, back))
+            hidden = matmul(rows, *first, relu=True)
+            sums[2].add_(matmul_tn(hidden, pull))
+            back = torch.ops.aten.threshold_backward(matmul(pull, second.t()), hidden, 0)
+            sums[0].add_(matmul_tn(rows, back))
             sums[1].add_(back.sum(0))
-            grad_x[span] = multiply(back, first[0].t())[: len(x[span])]
+            grad_x[span] = matmul(back, first[0].t())[: len(x[span])]
         return grad_x, sums[0].to(x.dtype), sums[1].to(x.dtype), sums[2], grad.sum(0), None
 
 

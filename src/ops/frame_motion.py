@@ -65,7 +65,7 @@ def relative_pose(
 
 
 @torch.no_grad()
-def moved_gaussians(
+def warp_gaussians(
     shapes: Shapes,
     valid: Tensor,  # [N, n] bool
     aug_from_past: Tensor,  # [N, 4, 4]
@@ -78,19 +78,19 @@ def moved_gaussians(
 
     Valid is what was and lies in the grid, of usable frames; the means of the rest are the grid's centre.
     """
-    return implementation(moved_gaussians_reference)(
+    return implementation(warp_gaussians_reference)(
         shapes, valid, aug_from_past, elapsed_s, usable, min_speed_mps, grid
     )
 
 
-def moved_gaussians_reference(
+def warp_gaussians_reference(
     shapes: Shapes, valid: Tensor, aug_from_past: Tensor, elapsed_s: Tensor, usable: Tensor,
     min_speed_mps: float | None, grid: BEVGrid,
 ) -> tuple[Shapes, Tensor]:  # fmt: skip
     """Plain torch form."""
     means, scales, directions, velocities = shapes
     if min_speed_mps is not None:
-        means = means + moving(velocities, min_speed_mps) * elapsed_s[:, None, None]
+        means = means + zero_slow_velocities(velocities, min_speed_mps) * elapsed_s[:, None, None]
     matrix = aug_from_past[:, None].to(means.dtype)  # [N, 1, 4, 4]
     means = transform_points_xy(matrix, means)
     valid = valid & usable[:, None] & grid.contains(means)
@@ -102,7 +102,7 @@ def moved_gaussians_reference(
     ), valid
 
 
-def moving(
+def zero_slow_velocities(
     velocities: Tensor,  # [..., 2] m/s
     min_speed_mps: float,
 ) -> Tensor:  # [..., 2]

@@ -34,7 +34,7 @@ class GaussianCellPairs:
     cell: Tensor  # [pairs] integer, row in the support, ascending
     delta: Tensor | None  # [pairs, 2] cell centre - mean, metres; None without gradient
     q: Tensor  # [pairs] squared Mahalanobis distance
-    in_turn: Tensor  # [pairs] int64, 0, 1, 2, ...
+    pair_index: Tensor  # [pairs] int64, 0, 1, 2, ...
     cell_starts: Tensor  # [n + 1] integer, first pair of each support cell
     by_gaussian: Tensor  # [pairs] integer, pairs in the order of the Gaussians
     gaussian_starts: Tensor  # [G + 1] integer, first place of each Gaussian in by_gaussian
@@ -69,7 +69,7 @@ def gaussian_cells(
         cell=cell,
         delta=torch.stack([delta_x.index_select(0, near), delta_y.index_select(0, near)], 1),
         q=q.index_select(0, near),
-        in_turn=arange(len(order), torch.int64, order.device),
+        pair_index=arange(len(order), torch.int64, order.device),
         cell_starts=F.pad(sizes.cumsum(0), (1, 0)),
         by_gaussian=inverse_rows(order, len(order)),
         gaussian_starts=torch.searchsorted(gaussian, owners),
@@ -126,7 +126,7 @@ def padded_pairs_reference(
         cell=linear,
         delta=None,
         q=where_scalar(near, q, math.inf).index_select(0, order),
-        in_turn=arange(size, torch.int64, order.device),
+        pair_index=arange(size, torch.int64, order.device),
         cell_starts=torch.searchsorted(linear, edges),
         by_gaussian=inverse_rows(order, size),
         gaussian_starts=torch.searchsorted(gaussian, arange(num + 1, torch.int64, gaussian.device)),

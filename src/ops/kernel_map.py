@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from src.geometry.constants import on_device
-from src.ops.neighbour_table import pairs_of_table, table_of_pairs, tap_bits, turned_table
+from src.ops.neighbour_table import pairs_of_table, table_of_pairs, tap_bits, transposed_table
 from src.ops.segment_reduce import inverse_rows, segments
 
 
@@ -119,7 +119,7 @@ class TableMap(KernelMap):
 
     @cached_property
     def transposed(self) -> KernelMap:
-        table, bits = turned_table(self.table, self.num_inputs)
+        table, bits = transposed_table(self.table, self.num_inputs)
         return TableMap(table, self.num_outputs, bits=bits)
 
     def keep_outputs(self, rows: Tensor) -> KernelMap:

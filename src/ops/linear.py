@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from src.ops.products import MOST_ROWS, multiply, multiply_rows, product_type, row_spans, whole_steps
+from src.ops.products import MOST_ROWS, matmul, matmul_tn, product_type, row_spans, whole_steps
 
 LEAST_ROWS = 2048
 """Below, torch's own layer is as fast."""
@@ -18,7 +18,7 @@ def linear(
     weight: Tensor,  # [C, O]
     bias: Tensor | None = None,  # [O]
 ) -> Tensor:  # [n, O]
-    """x W + b; many rows in float32 on a CPU by `multiply`, in the type that `product_type` chooses."""
+    """x W + b; many rows in float32 on a CPU by `matmul`, in the type that `product_type` chooses."""
     plain = x.device.type != "cpu" or x.dtype != torch.float32 or torch.is_autocast_enabled("cpu")
     if plain or len(x) < LEAST_ROWS:
         return x @ weight if bias is None else torch.addmm(bias, x, weight)
@@ -56,12 +56,12 @@ class _Linear(torch.autograd.Function):
         if ctx.needs_input_grad[1]:
             grad_weight = torch.zeros_like(weight)
             for span in row_spans(len(x), MOST_ROWS):
-                grad_weight += multiply_rows(whole_steps(x[span]).to(dtype), whole_steps(grad[span]).to(dtype))
+                grad_weight += matmul_tn(whole_steps(x[span]).to(dtype), whole_steps(grad[span]).to(dtype))
         return grad_x, grad_weight, grad.sum(0) if ctx.needs_input_grad[2] else None, None
 
 
 def _times(x: Tensor, weight: Tensor, dtype: torch.dtype) -> Tensor:
     out, weight = x.new_empty(len(x), weight.shape[1]), weight.to(dtype)
     for span in row_spans(len(x), MOST_ROWS):
-        out[span] = multiply(whole_steps(x[span]).to(dtype), weight)[: len(x[span])]
+        out[span] = matmul(whole_steps(x[span]).to(dtype), weight)[: len(x[span])]
     return out

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 from src.ops.linear import linear
-from src.ops.products import MOST_ROWS, multiply_rows, row_spans, slow_weight_gradients
+from src.ops.products import MOST_ROWS, matmul_tn, row_spans, slow_weight_gradients
 
 
 def map_conv2d(
@@ -79,7 +79,7 @@ def weight_gradient(
     for span in row_spans(len(pulls) - 2 * edge, MOST_ROWS):
         pull = pulls[edge:][span]
         for total, ((down, row), (right, col)) in zip(sums, product(shifts, repeat=2), strict=True):
-            total += multiply_rows(planes[row, col][edge + down * width + right :][span], pull)
+            total += matmul_tn(planes[row, col][edge + down * width + right :][span], pull)
     return sums.permute(2, 1, 0).unflatten(2, (kernel_size, kernel_size))
 
 

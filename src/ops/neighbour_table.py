@@ -81,15 +81,15 @@ def moved_table_reference(
     return neighbour_table_reference(keys, moved_keys_reference(cells, samples, axes, (shift,))[0], taps)
 
 
-def turned_table(
+def transposed_table(
     table: Tensor,  # [K, m] int32 of rows below `num`, none twice in a row of the table, -1 for none
     num: int,
 ) -> tuple[Tensor, Tensor]:  # [K, num] int32, [num] int64
     """The table read backwards: the cell that sees each site through each tap, -1 where there is none; its tap bits."""
-    return implementation(turned_table_reference)(table, num)
+    return implementation(transposed_table_reference)(table, num)
 
 
-def turned_table_reference(table: Tensor, num: int) -> tuple[Tensor, Tensor]:
+def transposed_table_reference(table: Tensor, num: int) -> tuple[Tensor, Tensor]:
     """Plain torch form."""
     back = table.new_full((len(table), num + 1), -1)  # one more column, which takes what there is not
     cells = arange(table.shape[1], table.dtype, table.device).expand_as(table)

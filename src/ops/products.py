@@ -48,7 +48,7 @@ def product_type(
     return x.dtype
 
 
-def multiply(
+def matmul(
     a: Tensor,  # [n, k]
     b: Tensor,  # [k, m]
     bias: Tensor | None = None,  # [m]
@@ -70,12 +70,12 @@ def multiply(
     return out.relu_() if relu else out
 
 
-def multiply_rows(
+def matmul_tn(
     a: Tensor,  # [n, k]
     b: Tensor,  # [n, m]
 ) -> Tensor:  # [k, m]
-    """a^T @ b as by `multiply`, with the narrower operand on the left: oneDNN takes up to five times as long else."""
-    return multiply(a.t(), b) if a.shape[1] <= b.shape[1] else multiply(b.t(), a).t()
+    """a^T @ b as by `matmul`, with the narrower operand on the left: oneDNN takes up to five times as long else."""
+    return matmul(a.t(), b) if a.shape[1] <= b.shape[1] else matmul(b.t(), a).t()
 
 
 def row_spans(rows: int, most: int) -> Iterator[slice]:

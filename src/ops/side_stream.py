@@ -10,7 +10,7 @@ import torch
 
 
 @contextmanager
-def beside(device: torch.device) -> Iterator[Callable[[], None]]:
+def on_side_stream(device: torch.device) -> Iterator[Callable[[], None]]:
     """On a GPU the context's work goes on beside what follows it, in a CUDA graph as a branch of its own.
 
     Yields what to call before anything reads its results. On a CPU one comes after the other, and in training, whose

@@ -98,7 +98,7 @@ def plain_sparse_conv(
     kernel_map: KernelMap,
     bias: Tensor | None,  # [Cout]
 ) -> Tensor:  # [M_out, Cout]
-    """The formula offset by offset: gather, multiply, scatter; keeps a row per pair for the backward pass.
+    """The formula offset by offset: gather, matmul, scatter; keeps a row per pair for the backward pass.
 
     An output meets each offset at most once, so no sum depends on the order in which a GPU adds.
     """

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.ops.kernel_maps import KernelMap
-from src.ops.products import MOST_ROWS, ROW_STEP, multiply, product_type, row_spans, row_steps
+from src.ops.products import MOST_ROWS, ROW_STEP, matmul, product_type, row_spans, row_steps
 from src.ops.sparse_conv_function import SparseConvFunction
 
 GATHERED_BYTES = 5 << 19
@@ -88,7 +88,7 @@ def _convolve(
         matrix = weight[part.offsets].reshape(-1, c_out)  # [T * Ca, Cb]
         for span in _spans(len(part.table), len(matrix), dtype):
             gathered = _gather("gathered", rows, part.table[span]).view(-1, len(matrix))
-            product = multiply(gathered, matrix)
+            product = matmul(gathered, matrix)
             if part.rows is None:
                 out[span] += product
             else:
@@ -99,7 +99,7 @@ def _convolve(
                     partners = others[span]
                 else:
                     partners = _gather("partners", others, _filled(into, len(gathered), num))
-                products = multiply(partners.t(), gathered).view(c_out, -1, c_in)  # [Cb, T, Ca]
+                products = matmul(partners.t(), gathered).view(c_out, -1, c_in)  # [Cb, T, Ca]
                 grad[part.offsets] += products.transpose(0, 1)
     return out[:num], grad
 

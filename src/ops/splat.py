@@ -140,7 +140,7 @@ class _LogFree(torch.autograd.Function):
             surprise = surprise.clamp(min=-math.log1p(-CAP))
         ctx.save_for_backward(surprise, opacity_logits)
         ctx.pairs, ctx.smooth_cap = pairs, smooth_cap
-        return gather_segment_sum(log1mexp(surprise)[:, None], pairs.in_turn, pairs.cell_starts).squeeze(1)
+        return gather_segment_sum(log1mexp(surprise)[:, None], pairs.pair_index, pairs.cell_starts).squeeze(1)
 
     @staticmethod
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:

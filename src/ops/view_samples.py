@@ -15,7 +15,7 @@ BEYOND = -3.0
 
 
 @torch.no_grad()
-def view_places(
+def view_sampling_locations(
     points: Tensor,  # [B, Q, P, 2] aug metres
     heights: Tensor,  # [B, Q, P] logits of the height within the band
     band_m: tuple[float, float],  # low and high
@@ -24,10 +24,12 @@ def view_places(
     image_size_px: tuple[int, int],  # (H, W)
 ) -> tuple[Tensor, Tensor]:  # [B * N, Q, P, 2] in -1..1 of the image, [B, Q, N, P] bool
     """Places of the points in every view as `grid_sample` has them, and whether they are visible there."""
-    return implementation(view_places_reference)(points, heights, band_m, pix_from_aug, valid, image_size_px)
+    return implementation(view_sampling_locations_reference)(
+        points, heights, band_m, pix_from_aug, valid, image_size_px
+    )
 
 
-def view_places_reference(
+def view_sampling_locations_reference(
     points: Tensor,
     heights: Tensor,
     band_m: tuple[float, float],
@@ -50,17 +52,17 @@ def view_places_reference(
 
 
 @torch.no_grad()
-def view_weights(
+def view_attention_weights(
     logits: Tensor,  # [B, Q, N * heads * L * P] of the queries
     camera: Tensor,  # [B, N, heads * L * P] of the cameras, added to them
     visible: Tensor,  # [B, Q, N, P] bool
     heads: int,
 ) -> Tensor:  # [B, Q, heads, N, L, P]
     """Softmax over the visible (view, level, point) triples of every query and head; zero where invisible."""
-    return implementation(view_weights_reference)(logits, camera, visible, heads)
+    return implementation(view_attention_weights_reference)(logits, camera, visible, heads)
 
 
-def view_weights_reference(logits: Tensor, camera: Tensor, visible: Tensor, heads: int) -> Tensor:
+def view_attention_weights_reference(logits: Tensor, camera: Tensor, visible: Tensor, heads: int) -> Tensor:
     """Plain torch form."""
     summed = logits.unflatten(-1, camera.shape[1:]) + camera[:, None]  # [B, Q, N, heads * L * P]
     summed = summed.unflatten(-1, (heads, -1, visible.shape[3])).transpose(2, 3)  # [B, Q, heads, N, L, P]

@@ -41,7 +41,7 @@ class TemporalModule(TrainingModule):
 
         Raises ValueError for a batch without either.
         """
-        past = self._used = self.remember(batch.past) if batch.past else self.recall(batch)
+        past = self._used = self.remember(batch.past) if batch.past else self.select_memory(batch)
         if batch.past:
             return self.model(batch, past)[0]
         if self.oracle is not None and past is not None:
@@ -67,7 +67,7 @@ class TemporalModule(TrainingModule):
         self.model.train(training)
         return self.model.transition(frames[-1], memory) if learns else memory
 
-    def recall(self, batch: FrameBatch) -> TemporalMemory | None:
+    def select_memory(self, batch: FrameBatch) -> TemporalMemory | None:
         """Memory of the batch's streams, row by row, or None where none of them has any."""
         if batch.streams is None:
             raise ValueError(

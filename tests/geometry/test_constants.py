@@ -2,7 +2,7 @@
 
 import torch
 
-from src.geometry.constants import arange, constant, repeated, where_scalar
+from src.geometry.constants import arange, constant, repeat_interleave, where_scalar
 
 
 def test_the_same_tensor_every_time_and_one_for_each_type():
@@ -26,7 +26,7 @@ def test_counting_is_the_head_of_one_sequence_for_every_count_up_to_a_power_of_t
     for count in (0, 1, 5, 8, 9):
         assert arange(count, torch.int32, device).tolist() == list(range(count))
     assert arange(5, torch.int64, device).data_ptr() == arange(8, torch.int64, device).data_ptr()
-    assert repeated((2, 0, 3), device).tolist() == [0, 0, 2, 2, 2]
+    assert repeat_interleave((2, 0, 3), device).tolist() == [0, 0, 2, 2, 2]
 
 
 def test_a_number_stands_where_a_value_is_not_kept():

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from src.ops import products
-from src.ops.products import bfloat16_products, multiplies_bfloat16, multiply, multiply_rows, product_type, row_steps
+from src.ops.products import bfloat16_products, matmul, matmul_tn, multiplies_bfloat16, product_type, row_steps
 
 
 @pytest.fixture(params=[False, True], ids=["torch", "oneDNN"])
@@ -21,7 +21,7 @@ def test_float32_has_all_its_digits(shape, library):
     a, b = torch.rand(n, k), torch.rand(k, m)  # no cancellation: errors are relative to the result
     for left, right in ((a, b), (torch.rand(k, n).t(), b), (a, torch.rand(m, k).t())):
         expected = left.double() @ right.double()
-        torch.testing.assert_close(multiply(left, right).double(), expected, rtol=1e-5, atol=0)
+        torch.testing.assert_close(matmul(left, right).double(), expected, rtol=1e-5, atol=0)
 
 
 @pytest.mark.skipif(not torch.backends.mkldnn.is_available(), reason="this torch has no oneDNN")
@@ -34,32 +34,32 @@ def test_onednn_is_given_no_part_of_a_wider_matrix(monkeypatch):
     )
     a, wide = torch.rand(64, 16), torch.rand(16, 48)
     for part in (wide[:, 16:32], wide.t()[16:32].t()):
-        torch.testing.assert_close(multiply(a, part), a @ part)
+        torch.testing.assert_close(matmul(a, part), a @ part)
     assert all(sorted(stride) == [1, 16] for stride in found) and len(found) == 2
 
 
 def test_other_types_are_multiplied_as_they_are(library):
     a, b = torch.randn(256, 64), torch.randn(64, 64)
     for dtype in (torch.float64, torch.bfloat16):
-        assert torch.equal(multiply(a.to(dtype), b.to(dtype)), a.to(dtype) @ b.to(dtype))
+        assert torch.equal(matmul(a.to(dtype), b.to(dtype)), a.to(dtype) @ b.to(dtype))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float64])
 def test_the_positive_part_of_a_product(dtype, library):
     a, b, bias = (torch.randn(*shape).to(dtype) for shape in ((300, 64), (64, 96), (96,)))
-    torch.testing.assert_close(multiply(a, b, bias, relu=True), torch.addmm(bias, a, b).clamp(min=0))
+    torch.testing.assert_close(matmul(a, b, bias, relu=True), torch.addmm(bias, a, b).clamp(min=0))
 
 
 @pytest.mark.parametrize("widths", [(12, 64), (64, 12)])
 def test_products_over_rows_whichever_operand_is_the_wider(widths, library):
     a, b = torch.rand(300, widths[0]), torch.rand(300, widths[1])
-    torch.testing.assert_close(multiply_rows(a, b).double(), a.double().t() @ b.double(), rtol=1e-5, atol=0)
+    torch.testing.assert_close(matmul_tn(a, b).double(), a.double().t() @ b.double(), rtol=1e-5, atol=0)
 
 
 def test_autocast_does_not_round_what_its_caller_keeps_in_float32(library):
     a, b, bias = torch.rand(256, 64), torch.rand(64, 64), torch.rand(64)
     with torch.autocast("cpu", torch.bfloat16):
-        plain, with_bias = multiply(a, b), multiply(a, b, bias)
+        plain, with_bias = matmul(a, b), matmul(a, b, bias)
     torch.testing.assert_close(plain.double(), a.double() @ b.double(), rtol=1e-5, atol=0)
     torch.testing.assert_close(with_bias.double(), a.double() @ b.double() + bias.double(), rtol=1e-5, atol=0)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from src.ops import side_stream
-from src.ops.side_stream import beside
+from src.ops.side_stream import on_side_stream
 
 
 class Stream:
@@ -45,7 +45,7 @@ def cuda(monkeypatch):
 
 def test_a_branch_begins_behind_and_is_joined_by_its_stream(cuda):
     streams, notes = cuda
-    with beside(torch.device("cuda", 0)) as join:
+    with on_side_stream(torch.device("cuda", 0)) as join:
         notes.append("branch works")
     notes.append("main works")
     join()
@@ -59,7 +59,7 @@ def test_a_stream_keeps_its_branch_and_shares_it_with_none(cuda):
     streams, notes = cuda
     for name in ("main", "main", "other"):
         streams.main = Stream(name, notes)
-        with beside(torch.device("cuda", 0)):
+        with on_side_stream(torch.device("cuda", 0)):
             pass
     assert len(streams.made) == 2
 
@@ -67,7 +67,7 @@ def test_a_stream_keeps_its_branch_and_shares_it_with_none(cuda):
 def test_neither_a_cpu_nor_training_has_branches(cuda):
     _, notes = cuda
     for device, training in (("cpu", False), ("cuda", True)):
-        with torch.set_grad_enabled(training), beside(torch.device(device)) as join:
+        with torch.set_grad_enabled(training), on_side_stream(torch.device(device)) as join:
             notes.append("works")
         join()
     assert notes == ["works"] * 2
@@ -80,7 +80,7 @@ def test_results_of_a_branch_are_there_once_it_is_joined():
     values = torch.randn(2000, 2000, device="cuda")
     expected = values @ values
     for _ in range(20):
-        with beside(values.device) as join:
+        with on_side_stream(values.device) as join:
             product = values @ values
         other = values.sin()
         join()

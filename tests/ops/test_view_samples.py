@@ -4,13 +4,13 @@ import torch
 
 from src.models.layers.image_attention import ImageCrossAttention
 from src.models.layers.views import CameraViews
-from src.ops.view_samples import BEYOND, view_places_reference, view_weights_reference
+from src.ops.view_samples import BEYOND, view_attention_weights_reference, view_sampling_locations_reference
 from tests.ops.view_cases import BAND_M, HEADS, SIZE_PX, make_case
 
 
 def test_places_are_the_pixels_of_the_views():
     points, heights, matrices, valid, *_ = make_case()
-    places, visible = view_places_reference(points, heights, BAND_M, matrices, valid, SIZE_PX)
+    places, visible = view_sampling_locations_reference(points, heights, BAND_M, matrices, valid, SIZE_PX)
     low, high = BAND_M
     lifted = torch.cat([points, (low + (high - low) * heights.sigmoid())[..., None]], -1)
     pixels, expected = CameraViews([], matrices, valid, SIZE_PX).project(lifted)
@@ -27,9 +27,11 @@ def test_weights_are_those_of_the_layer():
     layer.logits = torch.nn.Identity()
     layer.logits.weight = torch.zeros(n * camera.shape[2], 8)
     weights = layer._weights(logits, torch.eye(4).expand(b, n, 4, 4), visible)
-    torch.testing.assert_close(view_weights_reference(logits, torch.zeros_like(camera), visible, HEADS), weights)
+    torch.testing.assert_close(
+        view_attention_weights_reference(logits, torch.zeros_like(camera), visible, HEADS), weights
+    )
     shifted = logits + camera.flatten(1)[:, None]
     torch.testing.assert_close(
-        view_weights_reference(logits, camera, visible, HEADS),
-        view_weights_reference(shifted, torch.zeros_like(camera), visible, HEADS),
+        view_attention_weights_reference(logits, camera, visible, HEADS),
+        view_attention_weights_reference(shifted, torch.zeros_like(camera), visible, HEADS),
     )

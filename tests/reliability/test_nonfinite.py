@@ -185,8 +185,8 @@ def test_streams_begin_anew_after_a_skipped_step():
     module.run(toy_batch([5, 3], [True] * 2))
     module.run(toy_batch([1, 2], [True] * 2))
     module.forget_step(toy_batch([5, 3], [False] * 2))
-    assert module.recall(toy_batch([5, 3], [False] * 2)) is None
-    assert module.recall(toy_batch([1, 2], [False] * 2)) is not None
+    assert module.select_memory(toy_batch([5, 3], [False] * 2)) is None
+    assert module.select_memory(toy_batch([1, 2], [False] * 2)) is not None
 
 
 def test_training_gives_up_after_too_many_in_a_row(tmp_path, monkeypatch):

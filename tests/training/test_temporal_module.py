@@ -13,7 +13,7 @@ from tests.training.toys import ToyMemory, toy_batch, toy_module
 
 def past(module, batch):
     """What the model is given for each row: NaN-free numbers, 0 for nothing."""
-    memory = module.recall(batch)
+    memory = module.select_memory(batch)
     return None if memory is None else memory.values.tolist()
 
 
@@ -31,7 +31,7 @@ def module():
 def test_the_first_batch_has_no_memory():
     module = toy_module().eval()
     batch = toy_batch([0, 1], [False, False])
-    assert module.recall(batch) is None
+    assert module.select_memory(batch) is None
     output = module.run(batch)
     ((streams, memory),) = module.memories
     assert streams.tolist() == [0, 1] and torch.equal(memory.values, output) and not memory.values.requires_grad

@@ -13,7 +13,7 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.resnet import BasicBlock
 from src.models.layers.dense import DenseConvNormReLU, MapConv2d, map_of_rows
-from src.models.layers.norm import MapNorm
+from src.models.layers.norm import MapBatchNorm
 
 MIN_CHANNELS = 16
 """Least width of what a strided stage reads: below it the backward pass of a strided 1x1 convolution with channels last
@@ -73,7 +73,7 @@ class SqueezeFuser(nn.Module):
         squeezed = in_channels // SQUEEZE_RATIO
         self.excitation = nn.Sequential(nn.Linear(in_channels, squeezed), nn.ReLU(), nn.Linear(squeezed, in_channels))
         self.conv = nn.Linear(in_channels, channels, bias=False)
-        self.norm = MapNorm(channels)
+        self.norm = MapBatchNorm(channels)
 
     def forward(
         self,

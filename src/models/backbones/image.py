@@ -13,7 +13,7 @@ from src.errors import ConfigError
 from src.models.backbones.resnet import BasicBlock, Bottleneck, ResNet
 from src.models.backbones.vovnet import VoVNet99
 from src.models.backbones.weights import BackboneName, load_backbone_weights
-from src.models.layers.norm import MapNorm
+from src.models.layers.norm import MapBatchNorm
 
 COARSEST_STRIDE = 32
 RESNET50_WIDTHS, RESNET50_BLOCKS = [64, 128, 256, 512], [3, 4, 6, 3]
@@ -118,7 +118,7 @@ class SecondFPN16(nn.Module):
             nn.ConvTranspose2d(at_32, part, 2, 2, bias=False),
         )
         self.branches = nn.ModuleList(
-            nn.Sequential(conv, MapNorm(part, eps=1e-3, momentum=0.01), nn.ReLU(inplace=True)) for conv in resample
+            nn.Sequential(conv, MapBatchNorm(part, eps=1e-3, momentum=0.01), nn.ReLU(inplace=True)) for conv in resample
         )
 
     def forward(

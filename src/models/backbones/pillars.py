@@ -12,7 +12,7 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.sparse_voxel import POINT_SCALES
 from src.models.layers.dense import map_of_rows
-from src.models.layers.sparse import RowNorm
+from src.models.layers.sparse import RowBatchNorm
 from src.ops.segment_reduce import segment_max, segment_mean
 
 EXTRA_FEATURES = 6
@@ -49,7 +49,7 @@ class PillarEncoder(nn.Module):
         for number in range(config.num_layers):
             width = config.channels if number == config.num_layers - 1 else config.channels // 2
             self.layers.append(nn.Linear(inputs, width, bias=False))
-            self.norms.append(RowNorm(width))
+            self.norms.append(RowBatchNorm(width))
             inputs = config.channels
 
     @property

@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.models.layers.merging import with_relu
-from src.models.layers.norm import MapNorm
+from src.models.layers.norm import MapBatchNorm
 
 
 class BasicBlock(nn.Module):
@@ -18,9 +18,9 @@ class BasicBlock(nn.Module):
     def __init__(self, in_channels: int, width: int, stride: int, conv: type[nn.Conv2d] = nn.Conv2d) -> None:
         super().__init__()
         self.conv1 = conv(in_channels, width, 3, stride, 1, bias=False)
-        self.bn1 = MapNorm(width)
+        self.bn1 = MapBatchNorm(width)
         self.conv2 = conv(width, width, 3, 1, 1, bias=False)
-        self.bn2 = MapNorm(width)
+        self.bn2 = MapBatchNorm(width)
         self.downsample = _projection(in_channels, width, stride, conv)
         self.merged = False
 
@@ -49,11 +49,11 @@ class Bottleneck(nn.Module):
         super().__init__()
         out_channels = width * self.expansion
         self.conv1 = nn.Conv2d(in_channels, width, 1, bias=False)
-        self.bn1 = MapNorm(width)
+        self.bn1 = MapBatchNorm(width)
         self.conv2 = nn.Conv2d(width, width, 3, stride, 1, bias=False)
-        self.bn2 = MapNorm(width)
+        self.bn2 = MapBatchNorm(width)
         self.conv3 = nn.Conv2d(width, out_channels, 1, bias=False)
-        self.bn3 = MapNorm(out_channels)
+        self.bn3 = MapBatchNorm(out_channels)
         self.downsample = _projection(in_channels, out_channels, stride)
         self.merged = False
 
@@ -80,7 +80,7 @@ def _projection(in_channels: int, out_channels: int, stride: int, conv: type[nn.
         return nn.Identity()
     return nn.Sequential(
         conv(in_channels, out_channels, 1, stride, bias=False),
-        MapNorm(out_channels),
+        MapBatchNorm(out_channels),
     )
 
 
@@ -96,7 +96,7 @@ class ResNet(nn.Module):
     def __init__(self, block: type[BasicBlock] | type[Bottleneck], widths: list[int], blocks: list[int]) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(3, widths[0], 7, 2, 3, bias=False)
-        self.bn1 = MapNorm(widths[0])
+        self.bn1 = MapBatchNorm(widths[0])
         self.maxpool = nn.MaxPool2d(3, 2, 1)
         channels = widths[0]
         for stage, (width, count) in enumerate(zip(widths, blocks, strict=True)):

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.models.layers.norm import MapNorm
+from src.models.layers.norm import MapBatchNorm
 
 STEM_CHANNELS = (64, 64, 128)
 MID_CHANNELS = (128, 160, 192, 224)
@@ -23,7 +23,7 @@ class ConvNorm(nn.Module):
     def __init__(self, in_channels: int, out_channels: int, kernel_size: int, stride: int = 1) -> None:
         super().__init__()
         self.conv = nn.Conv2d(in_channels, out_channels, kernel_size, stride, kernel_size // 2, bias=False)
-        self.bn = MapNorm(out_channels)
+        self.bn = MapBatchNorm(out_channels)
 
     def forward(
         self,
@@ -119,7 +119,7 @@ class VoVNet99(nn.Module):
         """As for any module, except that batch norm stays in evaluation mode."""
         super().train(mode)
         for module in self.modules():
-            if isinstance(module, MapNorm):
+            if isinstance(module, MapBatchNorm):
                 module.eval()
         return self
 

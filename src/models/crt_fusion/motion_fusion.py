@@ -14,11 +14,11 @@ from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
 from src.models.crt_fusion.motion_estimator import CellMotion
 from src.models.layers.dense import DenseConvNormReLU, MapConv2d, map_of_rows, rows_of_map
-from src.models.layers.norm import MapNorm
+from src.models.layers.norm import MapBatchNorm
 from src.models.memory import FrameMemory, RememberedFrame, StoredRows, TemporalConfig
 from src.ops.bilinear_scatter import bilinear_scatter
 from src.ops.concat_conv import concat_conv2d
-from src.ops.frame_motion import moving
+from src.ops.frame_motion import zero_slow_velocities
 from src.ops.segment_reduce import topk_per_sample
 from src.structures.batch import FrameBatch
 
@@ -102,7 +102,7 @@ class MotionGuidedFusion(nn.Module):
         self.gates = MapConv2d(slots * channels, slots * channels, 1)
         self.reduce = DenseConvNormReLU(slots * (channels + 1), channels, 1)  # a map and its age each
         self.refine = MapConv2d(channels, channels, 3, padding=1, bias=False)
-        self.norm = MapNorm(channels)
+        self.norm = MapBatchNorm(channels)
         nn.init.zeros_(self.norm.weight)  # untrained, the memory adds exactly zero
 
     @torch.no_grad()
@@ -122,7 +122,8 @@ class MotionGuidedFusion(nn.Module):
             motion, cells = frame.motion(batch, self.config.max_age_s), frame.cells
             ages = torch.where(motion.usable[:, None], frame.ages_s + motion.elapsed_s[:, None], ages)
             ages = torch.where(ages <= self.config.max_age_s, ages, torch.inf)
-            xy = cells.xy + moving(cells.velocities, self.config.min_speed_mps) * motion.elapsed_s[cells.rows, None]
+            moving = zero_slow_velocities(cells.velocities, self.config.min_speed_mps)
+            xy = cells.xy + moving * motion.elapsed_s[cells.rows, None]
             xy = transform_points_xy(motion.aug_from_past[cells.rows], xy)
             known = ages.isfinite()[cells.rows].repeat_interleave(self.channels, dim=1)  # [n, T * C]
             features = torch.where(known, cells.features.float(), 0.0)

@@ -13,7 +13,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.heads.keypoint_head import CameraKeypointHead, CameraMaps, best_pixels
 from src.models.heads.query_proposals import KeypointQueryConfig
 from src.models.layers.views import CameraViews
-from src.ops.scored_pixels import most_likely_depth, peak_scores
+from src.ops.score_and_lift_pixels import most_likely_depth, peak_scores
 from src.structures.queries import Queries
 from src.targets.depth import lid_centres
 

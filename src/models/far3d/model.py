@@ -72,7 +72,7 @@ class Far3D(QueryDetector):
         views = CameraViews.encode(self.image_encoder, batch)
         adaptive, camera = self.proposals(views)
         queries = Queries.concatenate([self.anchor_queries(len(batch)), adaptive])
-        answers, memory = self.ask(batch, memory, queries, views)
+        answers, memory = self.run_decoder(batch, memory, queries, views)
         return Far3DOutput(*answers, views, camera, adaptive), memory
 
     def loss_terms(self, output: Far3DOutput, batch: FrameBatch) -> Objective:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from src.geometry.constants import constant
 from src.losses.normalizers import full_precision
 from src.models.layers.full_precision import FullPrecisionLinear
-from src.models.layers.sparse import RowNorm
+from src.models.layers.sparse import RowBatchNorm
 from src.ops.checkpointed_mlp import checkpointed_mlp, projected_statistics
 
 
@@ -25,7 +25,7 @@ class Branches(nn.Module):
     def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
         super().__init__()
         self.hidden = nn.Linear(channels, len(widths) * channels, bias=False)
-        self.norm = RowNorm(len(widths) * channels)
+        self.norm = RowBatchNorm(len(widths) * channels)
         self.outputs = nn.ModuleList(FullPrecisionLinear(channels, width) for width in widths)
 
     def forward(

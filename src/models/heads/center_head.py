@@ -27,7 +27,7 @@ from src.models.heads.decode import (
     suppress,
     top_candidates,
 )
-from src.models.layers.dense import AllCells, DenseConvNormReLU
+from src.models.layers.dense import DenseConvNormReLU, DenseToSparse
 from src.models.layers.doppler import Doppler
 from src.models.layers.sparse import ConvNormReLU, SubmanifoldConv
 from src.ops.box_codes import ATTRIBUTE, decoded_boxes
@@ -119,7 +119,9 @@ class CenterHead(nn.Module):
         self.learned = config.attributes is AttributeSource.learned
         self.code_weights = (1.0,) * (CODE_SIZE - 2) + (velocity_code_weight,) * 2
         if dense:
-            self.shared = nn.Sequential(DenseConvNormReLU(in_channels or channels, channels, 3, bias=True), AllCells())
+            self.shared = nn.Sequential(
+                DenseConvNormReLU(in_channels or channels, channels, 3, bias=True), DenseToSparse()
+            )
         else:
             self.shared = ConvNormReLU(SubmanifoldConv(channels, channels, 3, 2, bias=True), eps=1e-5, momentum=0.1)
         self.heatmaps = nn.ModuleList(Branches(channels, (len(group),)) for group in HEAD_GROUPS)
@@ -290,7 +292,7 @@ def measured_codes(
     if output.doppler is None:
         return codes
     before, velocities, after = codes.split([CODE_SIZE - 2, 2, codes.shape[1] - CODE_SIZE], dim=1)
-    return torch.cat([before, output.doppler.impose(velocities, output.bev.sites.linear()[rows]), after], dim=1)
+    return torch.cat([before, output.doppler.correct(velocities, output.bev.sites.linear()[rows]), after], dim=1)
 
 
 def _attribute_loss(logits: Tensor, targets: HeadTargets) -> Tensor:

@@ -15,7 +15,7 @@ from src.models.heads.decode import (
     boxes_of_columns,
     suppress,
 )
-from src.ops.candidate_ranks import candidate_ranks, ranked_candidates
+from src.ops.candidate_sort_keys import candidate_sort_keys, unpack_candidates
 from src.ops.sites import Sites
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CLASSES
@@ -81,5 +81,5 @@ def best_candidates(
     peaks: bool = False,
 ) -> Sequence[Tensor]:  # [groups, count] each: float32; int64, row; int64, index into CLASSES
     """The best (cell, class) pairs of every group in descending order, ties by cell and class."""
-    ranks = candidate_ranks(logits, sites, CLASS_TABLE, peaks).topk(count, dim=1).values
-    return ranked_candidates(ranks, CLASS_TABLE, logits.shape[1])
+    ranks = candidate_sort_keys(logits, sites, CLASS_TABLE, peaks).topk(count, dim=1).values
+    return unpack_candidates(ranks, CLASS_TABLE, logits.shape[1])

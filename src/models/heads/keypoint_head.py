@@ -14,7 +14,7 @@ from src.losses.normalizers import mean_over_ranks
 from src.models.layers.full_precision import FullPrecisionConv2d
 from src.models.layers.merging import with_relu
 from src.models.layers.views import CameraViews
-from src.ops.scored_pixels import scored_pixels
+from src.ops.score_and_lift_pixels import score_and_lift_pixels
 from src.targets.depth import paint_depth
 from src.targets.keypoints import keypoint_heatmap
 from src.targets.projection import BoxViews
@@ -85,7 +85,7 @@ def lift_keypoints(
     there was another at all, and their features."""
     with torch.no_grad():
         inputs = (maps.keypoint_logits, maps.depth_logits, depth_centres_m, views.aug_from_pix, views.valid)
-        scores, points = scored_pixels(*inputs, views.image_size_px, grid, nms_cells)
+        scores, points = score_and_lift_pixels(*inputs, views.image_size_px, grid, nms_cells)
         best, picks = best_pixels(scores, count)
         points = points.flatten(1, 3).gather(1, picks[..., None].expand(-1, -1, 3))
     local = maps.features.movedim(2, -1).flatten(1, 3)  # [B, N*h*w, C]

@@ -10,17 +10,17 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.constants import repeated
+from src.geometry.constants import repeat_interleave
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
 from src.models.horizon3d.dptf_memory import Memory, StoredCells
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.layers.doppler import Doppler
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.merging import block_diagonal, joined_convs
-from src.models.layers.sparse import ConvNormReLU, RowNorm, SubmanifoldConv, TemporalConv
+from src.models.layers.sparse import ConvNormReLU, RowBatchNorm, SubmanifoldConv, TemporalConv
 from src.models.memory import motions
 from src.ops.fixed_shapes import fixed_shapes
-from src.ops.frame_motion import moving
+from src.ops.frame_motion import zero_slow_velocities
 from src.ops.segment_reduce import gather_rows, segment_mean, topk_per_sample
 from src.ops.sites import Sites, places_among
 from src.structures.batch import FrameBatch
@@ -75,7 +75,7 @@ class WarpedCells:
 
 
 @dataclass
-class PaddedCells:
+class PaddedWarpedCells:
     """Remembered cells of one stream in fixed shapes; those that are nowhere are padding."""
 
     keys: Tensor  # [T * K] int64 among sites on `BEVPath.shape`, frame after frame
@@ -98,7 +98,7 @@ class BEVPath(nn.Module):
         slots, width = self.num_slots, channels + TIME_CHANNELS
         while slots > 1:
             self.convs.append(TemporalConv(width, channels, config.spatial_dilation))
-            self.norms.append(RowNorm(channels, **NORM))
+            self.norms.append(RowBatchNorm(channels, **NORM))
             slots, width = (slots + 1) // 2, channels
         # Untrained, the path adds exactly zero. A ReLU after this norm would sit at 0 and never pass a gradient.
         nn.init.zeros_(self.norms[-1].weight)
@@ -129,7 +129,7 @@ class BEVPath(nn.Module):
         if self.velocity is None:
             values = list(values[0].split([1, 2], dim=1))
         regressed = VELOCITY_UNIT_MPS * values[1]
-        velocities = regressed if doppler is None else doppler.impose(regressed, fused.sites.linear())
+        velocities = regressed if doppler is None else doppler.correct(regressed, fused.sites.linear())
         in_losses = doppler is None or doppler.in_losses
         return CellPrediction(values[0].squeeze(1), velocities, velocities if in_losses else regressed)
 
@@ -177,7 +177,7 @@ class BEVPath(nn.Module):
             torch.cat([getattr(past, name) for past in cells]) for name in ("xy", "velocities", "features", "rows")
         )
         if self.config.velocity_compensation:
-            xy = xy + moving(velocities, min_speed_mps) * elapsed[:, None]
+            xy = xy + zero_slow_velocities(velocities, min_speed_mps) * elapsed[:, None]
         xy = transform_points_xy(matrix, xy)
         kept = (motion.usable.flatten()[frame] & self.grid.contains(xy)).nonzero().squeeze(1)
         indices = torch.cat([rows[:, None], torch.cat(slots)[:, None], self.grid.cell_of(xy)], dim=1)
@@ -188,9 +188,10 @@ class BEVPath(nn.Module):
         """Of the grid over time: (B, slots, rows, cols)."""
         return batch_size, self.num_slots, *self.grid.cells
 
-    def aggregate(self, fused: SparseBEV, warped: WarpedCells | PaddedCells | None) -> SparseBEV:
+    def aggregate(self, fused: SparseBEV, warped: WarpedCells | PaddedWarpedCells | None) -> SparseBEV:
         """F_out = F_fuse + what sparse convolutions over time make of both, on the sites of either."""
-        x = self._over_time_padded(fused, warped) if isinstance(warped, PaddedCells) else self._over_time(fused, warped)
+        over_time = self._over_time_padded if isinstance(warped, PaddedWarpedCells) else self._over_time
+        x = over_time(fused, warped)
         for number, (conv, norm) in enumerate(zip(self.convs, self.norms, strict=True)):
             x = conv(x)
             y = norm(x.features)
@@ -221,7 +222,7 @@ class BEVPath(nn.Module):
         features = torch.cat([features, times.to(features.dtype)], dim=1)
         return SparseMap(sites, segment_mean(features, owners, len(sites)))
 
-    def _over_time_padded(self, fused: SparseBEV, warped: PaddedCells) -> SparseMap:
+    def _over_time_padded(self, fused: SparseBEV, warped: PaddedWarpedCells) -> SparseMap:
         """The same in fixed shapes."""
         shape = self.shape(fused.batch_size)
         sample, slot, row, col = Sites(shape, warped.keys).strides
@@ -230,7 +231,7 @@ class BEVPath(nn.Module):
         num = len(warped.elapsed_s)
         counts = (*[len(warped.keys) // num] * num, len(fused))
         ages = F.pad(warped.elapsed_s, (0, 1))  # the last is that of the current cells
-        times = F.embedding(repeated(counts, ages.device), self.time(ages))
+        times = F.embedding(repeat_interleave(counts, ages.device), self.time(ages))
         features = torch.cat([warped.features.to(fused.features.dtype), fused.features])
         features = torch.cat([features, times.to(features.dtype)], dim=1)
         return SparseMap(sites, segment_mean(features, owners, len(sites), sites.groups))

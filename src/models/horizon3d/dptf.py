@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
-from src.models.horizon3d.bev_path import BEVPath, BEVPathConfig, CellPrediction, PaddedCells, WarpedCells
+from src.models.horizon3d.bev_path import BEVPath, BEVPathConfig, CellPrediction, PaddedWarpedCells, WarpedCells
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.gaussian_path import GaussianPath, GaussianPathConfig, VelocityFrom
 from src.models.horizon3d.ocsf import OCSFOutput
@@ -57,7 +57,7 @@ class WarpedMemory:
 
     past: Memory  # less what is not in the frame's past (`Memory.before`)
     history: GaussianSet | None  # None: nothing remembered, or the path is off
-    warped: WarpedCells | PaddedCells | None
+    warped: WarpedCells | PaddedWarpedCells | None
 
 
 @dataclass
@@ -65,7 +65,7 @@ class DPTFOutput:
     """What the losses, the head and pictures read."""
 
     history: GaussianSet | None
-    warped: WarpedCells | PaddedCells | None
+    warped: WarpedCells | PaddedWarpedCells | None
     cells: CellPrediction | None  # on the cells of F_fuse; None without the BEV path
     bev: SparseBEV  # F_out
 

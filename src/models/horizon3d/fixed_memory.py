@@ -10,14 +10,14 @@ from torch import Tensor
 
 from src.geometry.constants import constant, where_scalar
 from src.geometry.tensor_transforms import transform_points_xy
-from src.models.horizon3d.bev_path import BEVPath, CellPrediction, PaddedCells
+from src.models.horizon3d.bev_path import BEVPath, CellPrediction, PaddedWarpedCells
 from src.models.horizon3d.dptf import DPTF, WarpedMemory
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
 from src.models.horizon3d.gaussian_path import GaussianPath
 from src.models.horizon3d.output import Horizon3DOutput
 from src.models.memory import Motion, RememberedFrame
 from src.ops.cell_keys import cell_centres, cell_keys
-from src.ops.frame_motion import moving
+from src.ops.frame_motion import zero_slow_velocities
 from src.ops.sites import HALO
 from src.structures.batch import FrameBatch
 from src.structures.gaussians import GaussianSet, Source
@@ -109,13 +109,13 @@ class FixedMemory:
 
     def _warped(
         self, path: BEVPath, kept: Tensor, held: Tensor, motion: Motion, min_speed_mps: float
-    ) -> PaddedCells:  # kept, held: [T, 1] bool
+    ) -> PaddedWarpedCells:  # kept, held: [T, 1] bool
         """As `BEVPath.recall`; cells that are not there are padding."""
         num, width, grid = len(self.cells), self.cells.shape[2], path.grid
         xy, velocities, features, valid = self.cells.split([2, 2, width - CELL_WIDTH, 1], dim=2)  # [T, K, ...] each
         elapsed = motion.elapsed_s[:num]  # [T, 1]
         if path.config.velocity_compensation:
-            xy = xy + moving(velocities, min_speed_mps) * elapsed[:, :, None]
+            xy = xy + zero_slow_velocities(velocities, min_speed_mps) * elapsed[:, :, None]
         xy = transform_points_xy(motion.aug_from_past[:num], xy)
         found = (valid > 0) & (motion.usable[:num] & held[:num])[:, :, None]  # [T, K, 1]
         slots = path.config.num_frames - kept[:num].cumsum(0)  # [T, 1], a frame for each that is kept
@@ -123,7 +123,7 @@ class FixedMemory:
         shape = (path.shape(1)[1] + HALO, *grid.cells)
         corner, size = (grid.x_min_m, grid.y_min_m), (grid.cell_m, grid.cell_m)
         keys = cell_keys(xy.flatten(0, 1), slots.flatten(), found.flatten(), corner, size, shape, xy.dtype)
-        return PaddedCells(keys, elapsed.flatten(), features.flatten(0, 1))
+        return PaddedWarpedCells(keys, elapsed.flatten(), features.flatten(0, 1))
 
     def pushed(
         self,

@@ -379,7 +379,7 @@ def _measured(gaussians: GaussianSet, doppler: Doppler | None) -> GaussianSet:
     """With what the radar measures of their velocities."""
     if doppler is None:
         return gaussians
-    velocities = doppler.impose(gaussians.velocities.flatten(0, 1), gaussians.means.detach())
+    velocities = doppler.correct(gaussians.velocities.flatten(0, 1), gaussians.means.detach())
     return replace(gaussians, velocities=velocities.unflatten(0, gaussians.valid.shape))
 
 

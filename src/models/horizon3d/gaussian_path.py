@@ -17,7 +17,7 @@ from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.memory import Motion, motions
 from src.ops.farthest_point import farthest_points
-from src.ops.frame_motion import moved_gaussians
+from src.ops.frame_motion import warp_gaussians
 from src.structures.batch import FrameBatch
 from src.structures.gaussians import GaussianSet, Source
 
@@ -123,7 +123,7 @@ class GaussianPath(nn.Module):
     ) -> GaussianSet:  # [B, T * n]
         """Remembered Gaussians of T frames as history."""
         elapsed, speed = motion.elapsed_s.flatten(), min_speed_mps if self.config.velocity_compensation else None
-        shapes, valid = moved_gaussians(
+        shapes, valid = warp_gaussians(
             (past.means, past.scales, past.directions, past.velocities),
             past.valid,
             *(motion.aug_from_past.flatten(0, 1), elapsed, motion.usable.flatten(), speed, self.grid),

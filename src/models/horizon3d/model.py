@@ -23,7 +23,7 @@ from src.models.horizon3d.output import Horizon3DOutput
 from src.models.layers.doppler import Doppler
 from src.models.layers.views import CameraViews
 from src.ops.fixed_shapes import Capacities
-from src.ops.side_stream import beside
+from src.ops.side_stream import on_side_stream
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
@@ -99,7 +99,7 @@ class Horizon3D(Detector):
     def detect(self, batch: FrameBatch, warped_memory: WarpedMemory | None) -> Horizon3DOutput:
         """What `forward` makes of a batch and of the memory brought to its time; None for single frames."""
         views = kggi = ocsf = None
-        with beside(batch.device) as join_images:
+        with on_side_stream(batch.device) as join_images:
             if self.image_encoder is not None:
                 views = CameraViews.encode(self.image_encoder, batch)
         radar_bev = fused = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from src.models.layers.sparse import RowNorm, SubmanifoldConv
+from src.models.layers.sparse import RowBatchNorm, SubmanifoldConv
 from src.ops.gated_fusion import gated_fusion_conv
 from src.structures.sparse_bev import SparseBEV
 
@@ -27,13 +27,13 @@ class SparseFusion(nn.Module):
     def __init__(self, channels: int, gate_kernel_size: int, identity_start: bool = False) -> None:
         super().__init__()
         both = 2 * channels
-        self.norm_gaussian, self.norm_radar = RowNorm(channels), RowNorm(channels)
+        self.norm_gaussian, self.norm_radar = RowBatchNorm(channels), RowBatchNorm(channels)
         self.gate_gaussian = SubmanifoldConv(both, channels, gate_kernel_size, 2, bias=True)
         self.gate_radar = SubmanifoldConv(both, channels, gate_kernel_size, 2, bias=True)
         self.conv1 = SubmanifoldConv(both, channels, 3, 2, bias=False)
-        self.norm1 = RowNorm(channels)
+        self.norm1 = RowBatchNorm(channels)
         self.conv2 = SubmanifoldConv(channels, channels, 3, 2, bias=False)
-        self.norm2 = RowNorm(channels)
+        self.norm2 = RowBatchNorm(channels)
         self.shortcut = SubmanifoldConv(both, channels, 1, 2, bias=False)
         if identity_start:
             for part in (self.gate_gaussian, self.gate_radar):  # open by half

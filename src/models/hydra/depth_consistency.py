@@ -13,7 +13,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.layers.dense import DenseConvNormReLU, MapConv2d, map_of_rows, rows_of_map
 from src.models.layers.full_precision import FullPrecisionConv2d
 from src.models.layers.image_attention import ImageCrossAttention, attention_linear, feed_forward
-from src.models.layers.query_attention import PlaceEmbedding
+from src.models.layers.query_attention import SinePositionEmbedding
 from src.models.layers.views import CameraViews
 from src.structures.taxonomy import CAMERAS
 from src.targets.depth import lid_index
@@ -65,7 +65,7 @@ class DepthConsistency(nn.Module):
             DenseConvNormReLU(channels, channels // 2, 3, FOREGROUND_STRIDE), FullPrecisionConv2d(channels // 2, 1, 1)
         )
         nn.init.constant_(self.foreground[1].bias, FOREGROUND_BIAS)
-        self.place = PlaceEmbedding(channels, grid, coordinates=2)
+        self.place = SinePositionEmbedding(channels, grid, coordinates=2)
         self.offset = attention_linear(channels, 3 * config.num_points, zero=True)
         self.radar = nn.Linear(channels, 1)
         nn.init.constant_(self.radar.bias, RADAR_BIAS)
@@ -93,7 +93,7 @@ class DepthConsistency(nn.Module):
         x = F.embedding(keys, rows)
         query = x + self.place(centres).to(x.dtype)
         points = self.points(query, centres)
-        trust = self.trust(x, rows_of_map(radar_bev)[keys].any(-1))
+        trust = self.radar_weight(x, rows_of_map(radar_bev)[keys].any(-1))
         weights = self.consistency(points, trust, views, depth_logits)
         values = self.value(context.flatten(0, 1)).unflatten(0, context.shape[:2])
         x = self.norm(x + self.attention(x, query, points, views, [values], weights))
@@ -113,7 +113,7 @@ class DepthConsistency(nn.Module):
         offsets = self.offset(query).float().unflatten(-1, (-1, 3))
         return torch.cat([xy, z[..., None]], dim=-1) + self.grid.cell_m * offsets
 
-    def trust(
+    def radar_weight(
         self,
         x: Tensor,  # [B, Q, C]
         returned: Tensor,  # [B, Q] bool, whether the radar returned anything from the cell

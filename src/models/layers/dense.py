@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.models.layers.norm import MapNorm
+from src.models.layers.norm import MapBatchNorm
 from src.ops.map_conv import map_conv2d
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV
@@ -32,7 +32,7 @@ class DenseConvNormReLU(nn.Module):
     ) -> None:
         super().__init__()
         self.conv = MapConv2d(in_channels, out_channels, kernel_size, stride, kernel_size // 2, bias=bias)
-        self.norm = MapNorm(out_channels)
+        self.norm = MapBatchNorm(out_channels)
 
     def forward(
         self,
@@ -41,7 +41,7 @@ class DenseConvNormReLU(nn.Module):
         return F.relu(self.norm(self.conv(x)), inplace=True)
 
 
-class AllCells(nn.Module):
+class DenseToSparse(nn.Module):
     """A whole map as a sparse one whose sites are all cells, for what works on sites; no copy where channels are last.
 
     The sites of the last batch size are kept, since they never change.

@@ -12,7 +12,7 @@ from torch import Tensor
 from src.geometry.bev_grid import BEVGrid
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.moved_keys import NONE
-from src.ops.radial_change import radial_change, radial_votes
+from src.ops.radial_correction import radial_correction, radial_votes
 from src.ops.segment_reduce import gather_segment_sum, group_sum
 
 
@@ -65,7 +65,7 @@ class Doppler:
         sums = gather_segment_sum(weighted, chosen.index_select(0, order), F.pad(counts.cumsum(0), (1, 0)))
         return cls(grid, keys, sums[:, 1:] / sums[:, :1], in_losses, along_heading)
 
-    def impose(
+    def correct(
         self,
         velocities: Tensor,  # [n, 2] m/s over ground, augmented axes
         cells: Tensor,  # [n] int64 linear keys (b * rows + row) * cols + col, or [B, n / B, 2] positions in metres
@@ -76,4 +76,6 @@ class Doppler:
         wrong measurement or to none; whole, where losses see the velocities of before (`in_losses` false).
         """
         given = (velocities, cells, self.keys, self.velocities, self.grid)
-        return velocities + radial_change(*given) if torch.is_grad_enabled() else radial_change(*given, added=True)
+        if torch.is_grad_enabled():
+            return velocities + radial_correction(*given)
+        return radial_correction(*given, added=True)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from src.geometry.bev_grid import BEVGrid
 from src.models.layers.views import CameraViews
 from src.ops.deform_sample import attend_views, deform_attend_images
-from src.ops.view_samples import view_places, view_weights
+from src.ops.view_samples import view_attention_weights, view_sampling_locations
 
 NUM_HEADS = 4
 INITIAL_HEIGHT_M = 1.0
@@ -96,8 +96,10 @@ class ImageCrossAttention(nn.Module):
         """The same without gradient, in few launches."""
         heights, logits = self.height(features).float(), self.logits(query).float()
         matrix = views.pix_from_aug.float()
-        places, visible = view_places(points, heights, self.z_range_m, matrix, views.valid, views.image_size_px)
-        weights = view_weights(logits, self._of_cameras(matrix).float(), visible, NUM_HEADS)
+        places, visible = view_sampling_locations(
+            points, heights, self.z_range_m, matrix, views.valid, views.image_size_px
+        )
+        weights = view_attention_weights(logits, self._of_cameras(matrix).float(), visible, NUM_HEADS)
         return attend_views([level.float().flatten(0, 1) for level in values], places, weights)
 
     def _of_cameras(

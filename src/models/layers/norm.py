@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from src.ops.add_layer_norm import add_layer_norm
 
 
-class MapNorm(nn.BatchNorm2d):
+class MapBatchNorm(nn.BatchNorm2d):
     """Batch norm over maps, as torch's but for its counter; see `normalize`."""
 
     def forward(

@@ -20,7 +20,7 @@ PENALTY_RANGE = (-2.0, 1.0)
 """Heads start with penalties of softplus(-2) = 0.13 to softplus(1) = 1.3 per metre."""
 
 
-class PlaceEmbedding(nn.Module):
+class SinePositionEmbedding(nn.Module):
     """Sines of places, and what else is told of each, by an MLP; in float32, since autocast would round 150 m."""
 
     full_precision_parts = ("",)
@@ -46,7 +46,7 @@ class PlaceEmbedding(nn.Module):
             return self.mlp(torch.cat([phase.sin(), phase.cos(), *(value.float() for value in extra)], dim=-1))
 
 
-class QueryEmbedding(PlaceEmbedding):
+class QueryEmbedding(SinePositionEmbedding):
     """Sines of a query's place, and its velocity."""
 
     def __init__(self, channels: int, grid: BEVGrid) -> None:

@@ -135,7 +135,7 @@ class TemporalConv(SparseKernel):
         return build(sites, self.kernel_size, self.stride, self.padding)
 
 
-class RowNorm(nn.BatchNorm1d):
+class RowBatchNorm(nn.BatchNorm1d):
     """Batch norm over the rows of all samples; fewer than two rows carry no statistics, so running ones serve them."""
 
     def forward(
@@ -157,7 +157,7 @@ class LinearNormReLU(nn.Module):
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
         self.linear = nn.Linear(in_channels, out_channels, bias=False)
-        self.norm = RowNorm(out_channels)
+        self.norm = RowBatchNorm(out_channels)
 
     def forward(
         self,
@@ -174,7 +174,7 @@ class ConvNormReLU(nn.Module):
     def __init__(self, conv: SparseKernel, eps: float, momentum: float, negative_slope: float = 0.0) -> None:
         super().__init__()
         self.conv, self.negative_slope = conv, negative_slope
-        self.norm = RowNorm(conv.out_channels, eps=eps, momentum=momentum)
+        self.norm = RowBatchNorm(conv.out_channels, eps=eps, momentum=momentum)
 
     def forward(
         self,
@@ -204,9 +204,9 @@ class ResidualBlock(nn.Module):
     def __init__(self, channels: int, ndim: int, eps: float, momentum: float) -> None:
         super().__init__()
         self.conv1 = SubmanifoldConv(channels, channels, 3, ndim, bias=True)
-        self.bn1 = RowNorm(channels, eps=eps, momentum=momentum)
+        self.bn1 = RowBatchNorm(channels, eps=eps, momentum=momentum)
         self.conv2 = SubmanifoldConv(channels, channels, 3, ndim, bias=True)
-        self.bn2 = RowNorm(channels, eps=eps, momentum=momentum)
+        self.bn2 = RowBatchNorm(channels, eps=eps, momentum=momentum)
 
     def merge_for_inference(self) -> None:
         """The convolutions apply the ReLUs and add the identity."""

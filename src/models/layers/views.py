@@ -10,7 +10,7 @@ from torch import Tensor
 
 from src.geometry.constants import where_scalar
 from src.geometry.tensor_transforms import invert_projection
-from src.ops.scored_pixels import lifted_pixels
+from src.ops.score_and_lift_pixels import lift_pixel_centres
 from src.ops.view_samples import MIN_DEPTH_M
 from src.structures.batch import FrameBatch
 from src.structures.taxonomy import CAMERAS
@@ -75,7 +75,7 @@ class CameraViews:
     ) -> Tensor:  # [B, N, h, w, 3] aug metres
         """3D points at the pixel centres of the finest level, without gradient."""
         with torch.no_grad():
-            return lifted_pixels(depth, self.aug_from_pix, self.image_size_px)
+            return lift_pixel_centres(depth, self.aug_from_pix, self.image_size_px)
 
     def lift_pixels(
         self,

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.models.layers.dense import DenseConvNormReLU
-from src.models.layers.norm import MapNorm
+from src.models.layers.norm import MapBatchNorm
 from src.ops.segment_reduce import segment_max
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV, SparseMap
@@ -68,7 +68,7 @@ class UpConvNormReLU(nn.Module):
     def __init__(self, in_channels: int, out_channels: int, stride: int) -> None:
         super().__init__()
         self.conv = nn.ConvTranspose2d(in_channels, out_channels, stride, stride, bias=False)
-        self.norm = MapNorm(out_channels)
+        self.norm = MapBatchNorm(out_channels)
 
     def forward(
         self,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch.nn.functional as F
 from torch import nn
 
-from src.models.layers.sparse import ConvNormReLU, RowNorm, SparseConv, SubmanifoldConv
+from src.models.layers.sparse import ConvNormReLU, RowBatchNorm, SparseConv, SubmanifoldConv
 from src.ops.site_limit import limit_sites
 from src.structures.sparse_bev import SparseMap
 
@@ -85,7 +85,7 @@ class SparseConvNorm(nn.Module):
     def __init__(self, conv: SubmanifoldConv, norm: Norm) -> None:
         super().__init__()
         self.conv = conv
-        self.norm = RowNorm(conv.out_channels, **norm)
+        self.norm = RowBatchNorm(conv.out_channels, **norm)
 
     def forward(self, x: SparseMap) -> SparseMap:
         y = self.conv(x)

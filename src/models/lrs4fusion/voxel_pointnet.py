@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from src.geometry.constants import constant
 from src.geometry.voxel_grid import VoxelGrid
-from src.models.layers.sparse import RowNorm
+from src.models.layers.sparse import RowBatchNorm
 from src.ops.segment_reduce import segment_max, segment_mean
 from src.ops.voxelize import voxel_rows
 from src.structures.sparse_bev import SparseMap
@@ -34,7 +34,7 @@ class VoxelPointNet(nn.Module):
         super().__init__()
         self.grid = grid
         self.linear = nn.Linear(POINT_FEATURES, channels, bias=False)
-        self.norm = RowNorm(channels, eps=eps, momentum=momentum)
+        self.norm = RowBatchNorm(channels, eps=eps, momentum=momentum)
 
     def forward(
         self,

@@ -23,7 +23,7 @@ from src.models.heads.center_head import BoxOptions
 from src.models.heads.decode import Suppression
 from src.models.heads.query_head import INITIAL_SIZE_M, QueryHeadConfig, box_codes, decode_codes
 from src.models.layers.full_precision import FullPrecisionLinear
-from src.models.layers.sparse import RowNorm
+from src.models.layers.sparse import RowBatchNorm
 from src.models.radargnn.graph import GraphConfig, PointGraph, build_graph
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
@@ -108,7 +108,7 @@ class MessagePassing(nn.Module):
         self.sizes = (channels, channels, edge_channels)
         self.message = nn.Linear(sum(self.sizes), sum(self.sizes))
         self.update = nn.Linear(channels + sum(self.sizes), out_channels, bias=False)
-        self.norm = RowNorm(out_channels)
+        self.norm = RowBatchNorm(out_channels)
 
     def forward(
         self,

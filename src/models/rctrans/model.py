@@ -67,7 +67,7 @@ class RCTrans(QueryDetector):
         self.decoder = SequentialDecoder(config.decoder, config.position, *widths, grid)
 
     @property
-    def answering_layer(self) -> int:
+    def output_layer(self) -> int:
         """The last one that is left in inference."""
         return self.config.decoder.num_inference_layers - 1
 
@@ -79,7 +79,7 @@ class RCTrans(QueryDetector):
         views = CameraViews.encode(self.image_encoder, batch)
         pillars = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
         radar = self.densifier(pillars)
-        answers, memory = self.ask(batch, memory, self.anchor_queries(len(batch)), radar, views)
+        answers, memory = self.run_decoder(batch, memory, self.anchor_queries(len(batch)), radar, views)
         return RCTransOutput(*answers, pillars), memory
 
     def diagnostics(self, output: RCTransOutput) -> dict[str, Tensor | float]:

@@ -12,7 +12,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
 from src.models.layers.global_attention import GlobalAttention
 from src.models.layers.image_attention import feed_forward
-from src.models.layers.query_attention import PlaceEmbedding
+from src.models.layers.query_attention import SinePositionEmbedding
 
 DOWNS = 3
 """Halvings of the map, each with twice the channels (public code: 64 to 512)."""
@@ -42,7 +42,7 @@ class CellAttention(nn.Module):
 
     def __init__(self, channels: int, num_heads: int, grid: BEVGrid) -> None:
         super().__init__()
-        self.embedding = PlaceEmbedding(channels, grid, coordinates=2)
+        self.embedding = SinePositionEmbedding(channels, grid, coordinates=2)
         self.attention = GlobalAttention(channels, num_heads)
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(2))
         self.mlp = feed_forward(channels, FFN_RATIO)

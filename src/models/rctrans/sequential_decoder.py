@@ -12,7 +12,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.heads.query_head import QueryPrediction, SetPredictionHead
 from src.models.layers.global_attention import GlobalDecoderLayer
 from src.models.layers.position_embedding import PositionEmbedding, PositionEmbeddingConfig
-from src.models.layers.query_attention import PlaceEmbedding
+from src.models.layers.query_attention import SinePositionEmbedding
 from src.models.layers.views import CameraViews
 from src.structures.queries import Queries
 
@@ -69,7 +69,7 @@ class SequentialDecoder(nn.Module):
             token_layers(radar_channels, channels),
             token_layers(image_channels, channels),
         )
-        self.plane = PlaceEmbedding(channels, grid, coordinates=2)
+        self.plane = SinePositionEmbedding(channels, grid, coordinates=2)
         self.perspective = PositionEmbedding(position, channels, grid)
         places = torch.cartesian_prod(torch.arange(grid.rows), torch.arange(grid.cols))
         self.register_buffer("places_m", grid.centre_of(places), persistent=False)

@@ -22,8 +22,8 @@ from src.ops.box_codes import (
     YAW,
     decoded_boxes_reference,
 )
-from src.ops.kernels.radial_change_triton import nearest_radial
-from src.ops.radial_change import BIN_MPS, MIN_SPEED_MPS, NEAR_BINS, NUM_BINS
+from src.ops.kernels.radial_correction_triton import nearest_radial
+from src.ops.radial_correction import BIN_MPS, MIN_SPEED_MPS, NEAR_BINS, NUM_BINS
 
 BOXES = 32
 """Boxes of a program, one lane each."""

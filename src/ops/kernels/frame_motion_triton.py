@@ -9,7 +9,7 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.ops.backend import runs_kernels
-from src.ops.frame_motion import Pose, Shapes, moved_gaussians_reference, relative_motion_reference
+from src.ops.frame_motion import Pose, Shapes, relative_motion_reference, warp_gaussians_reference
 
 GAUSSIANS = 128
 """Gaussians of a program, one lane each."""
@@ -42,14 +42,14 @@ def relative_motion_triton(
     return kept, matrix, elapsed, usable
 
 
-def moved_gaussians_triton(
+def warp_gaussians_triton(
     shapes: Shapes, valid: Tensor, aug_from_past: Tensor, elapsed_s: Tensor, usable: Tensor,
     min_speed_mps: float | None, grid: BEVGrid,
 ) -> tuple[Shapes, Tensor]:  # fmt: skip
     """The reference's Gaussians up to rounding."""
     inputs = (*shapes, aug_from_past, elapsed_s)
     if any(x.dtype != torch.float32 for x in inputs) or not runs_kernels(valid):
-        return moved_gaussians_reference(shapes, valid, aug_from_past, elapsed_s, usable, min_speed_mps, grid)
+        return warp_gaussians_reference(shapes, valid, aug_from_past, elapsed_s, usable, min_speed_mps, grid)
     (frames, num), total = valid.shape, valid.numel()
     out = aug_from_past.new_empty(4, frames, num, 2)
     moved = valid.new_empty((frames, num), dtype=torch.uint8)

@@ -74,8 +74,8 @@ def padded_pairs_triton(
             BLOCK=LANES,
             num_warps=4,
         )
-    in_turn = arange(size, torch.int64, means.device)
-    own = (gaussian, key, None, ordered_q, in_turn, cell_starts, by_gaussian, gaussian_starts)
+    pair_index = arange(size, torch.int64, means.device)
+    own = (gaussian, key, None, ordered_q, pair_index, cell_starts, by_gaussian, gaussian_starts)
     return GaussianCellPairs(*own), missing
 
 

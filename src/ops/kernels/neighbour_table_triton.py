@@ -21,7 +21,7 @@ from src.ops.neighbour_table import (
     moved_table_reference,
     neighbour_table_reference,
     stacked_table_reference,
-    turned_table_reference,
+    transposed_table_reference,
 )
 
 CELLS = 256
@@ -100,13 +100,13 @@ def stacked_table_triton(
     return out, bits
 
 
-def turned_table_triton(
+def transposed_table_triton(
     table: Tensor,  # [K, m] int32
     num: int,
 ) -> tuple[Tensor, Tensor]:  # [K, num] int32, [num] int64
     """The reference's table and bits."""
     if not runs_kernels(table):
-        return turned_table_reference(table, num)
+        return transposed_table_reference(table, num)
     back, bits = table.new_full((len(table), num), -1), table.new_zeros(num, dtype=torch.int64)
     cells = table.shape[1]
     if cells > 0 and num > 0:

@@ -8,13 +8,18 @@ import triton.language as tl
 from torch import Tensor
 
 from src.ops.backend import runs_kernels
-from src.ops.view_samples import BEYOND, MIN_DEPTH_M, view_places_reference, view_weights_reference
+from src.ops.view_samples import (
+    BEYOND,
+    MIN_DEPTH_M,
+    view_attention_weights_reference,
+    view_sampling_locations_reference,
+)
 
 POINTS = 256
 """Points of a program, one lane each."""
 
 
-def view_places_triton(
+def view_sampling_locations_triton(
     points: Tensor,  # [B, Q, P, 2]
     heights: Tensor,  # [B, Q, P]
     band_m: tuple[float, float],
@@ -25,7 +30,7 @@ def view_places_triton(
     """The reference's places up to rounding."""
     inputs = (points, heights, pix_from_aug)
     if any(x.dtype != torch.float32 for x in inputs) or not runs_kernels(points):
-        return view_places_reference(points, heights, band_m, pix_from_aug, valid, image_size_px)
+        return view_sampling_locations_reference(points, heights, band_m, pix_from_aug, valid, image_size_px)
     (b, q, p), n = heights.shape, valid.shape[1]
     places = points.new_empty(b * n, q, p, 2)
     visible = points.new_empty((b, q, n, p), dtype=torch.uint8)
@@ -41,7 +46,7 @@ def view_places_triton(
     return places, visible.view(torch.bool)
 
 
-def view_weights_triton(
+def view_attention_weights_triton(
     logits: Tensor,  # [B, Q, N * heads * L * P]
     camera: Tensor,  # [B, N, heads * L * P]
     visible: Tensor,  # [B, Q, N, P] bool
@@ -49,7 +54,7 @@ def view_weights_triton(
 ) -> Tensor:  # [B, Q, heads, N, L, P]
     """The reference's weights up to rounding."""
     if logits.dtype != torch.float32 or camera.dtype != torch.float32 or not runs_kernels(logits):
-        return view_weights_reference(logits, camera, visible, heads)
+        return view_attention_weights_reference(logits, camera, visible, heads)
     b, q, n, p = visible.shape
     levels = camera.shape[2] // (heads * p)
     out = logits.new_empty(b, q, heads, n, levels, p)

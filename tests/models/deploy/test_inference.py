@@ -15,7 +15,7 @@ from src.models.deploy.static_parts import GraphReplay, ImageNetwork
 from src.models.heads.branches import Branches
 from src.models.horizon3d.gaussian_encoder import AnchorEncoder, GaussianBounds
 from src.models.horizon3d.sparse_fusion import SparseFusion
-from src.models.layers.sparse import RowNorm, SparseConv, SubmanifoldConv
+from src.models.layers.sparse import RowBatchNorm, SparseConv, SubmanifoldConv
 from src.ops.precision import computing
 from src.ops.sites import Sites
 from src.streaming import StreamingDetector
@@ -89,7 +89,7 @@ def test_a_folded_norm_is_the_layer_and_the_norm(name, bias):
     torch.manual_seed(0)
     layer = LAYERS[name](bias)
     dense = isinstance(layer, nn.Conv2d | nn.ConvTranspose2d)
-    norm = stir(nn.BatchNorm2d(5) if dense else RowNorm(5, eps=1e-3)).eval()
+    norm = stir(nn.BatchNorm2d(5) if dense else RowBatchNorm(5, eps=1e-3)).eval()
     sites, _ = Sites.unique(torch.randint(0, 8, (40, 3)) % torch.tensor([2, 8, 8]), (2, 8, 8))
     x = torch.randn(2, 6, 8, 8) if dense else torch.randn(len(sites), 6)
     if name in ("submanifold", "strided"):

@@ -8,7 +8,7 @@ import torch
 from src.geometry.bev_grid import BEVGrid
 from src.models.heads.center_head import CenterHead, HeadConfig, TrainRegression
 from src.models.heads.decode import AttributeSource, Suppression
-from src.models.layers.dense import AllCells, map_of_rows, rows_of_map
+from src.models.layers.dense import DenseToSparse, map_of_rows, rows_of_map
 from src.structures.boxes import Boxes3D
 
 GRID = BEVGrid(cells=(24, 32), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
@@ -62,11 +62,11 @@ def test_outputs_losses_gradients_and_boxes_are_the_sparse_heads(train_regressio
     boxes = [boxes_of(12, 2), boxes_of(5, 3)]
     found = []
     for head, bev in ((dense, x.clone().requires_grad_()), (sparse, x.clone().requires_grad_())):
-        output = head(bev if head is dense else AllCells()(bev))
+        output = head(bev if head is dense else DenseToSparse()(bev))
         terms = head.loss(output, boxes, 1.0, 0.25).terms
         sum(terms.values()).backward()
         found.append(
-            (output.logits, terms, bev.grad, head.eval().decode(head(bev if head is dense else AllCells()(bev))))
+            (output.logits, terms, bev.grad, head.eval().decode(head(bev if head is dense else DenseToSparse()(bev))))
         )
     (logits, terms, grad, decoded), (logits2, terms2, grad2, decoded2) = found
     torch.testing.assert_close(logits, logits2, rtol=1e-4, atol=1e-5)
@@ -117,7 +117,7 @@ def test_maps_and_rows_are_views_of_each_other():
 
 
 def test_sites_are_made_once_per_size():
-    cells = AllCells()
+    cells = DenseToSparse()
     first, again = cells(torch.zeros(2, 3, 4, 5)), cells(torch.ones(2, 3, 4, 5))
     assert first.sites is again.sites and first.indices[-1].tolist() == [1, 3, 4] and len(first) == 40
     assert cells(torch.zeros(1, 3, 4, 5)).sites is not first.sites

@@ -7,7 +7,7 @@ from src.errors import ConfigError
 from src.models.heads.keypoint_head import CameraMaps
 from src.models.horizon3d.gaussian_encoder import GaussianBounds
 from src.models.horizon3d.kggi import KGGI, Initialization
-from src.ops.scored_pixels import most_likely_depth, peak_scores
+from src.ops.score_and_lift_pixels import most_likely_depth, peak_scores
 from src.ops.sites import Sites
 from src.structures.gaussians import Source
 from src.structures.sparse_bev import SparseBEV

@@ -203,8 +203,8 @@ def test_velocities_are_those_that_the_radar_measures_along_the_line_of_sight(ma
         ((sample * model.grid.rows + row) * model.grid.cols + col, gaussians.velocities[gaussians.valid]),
         (output.head.bev.sites.linear(), boxes.velocities),
     ):
-        torch.testing.assert_close(doppler.impose(velocities, cells), velocities, atol=1e-4, rtol=0)
-        assert (doppler.impose(0 * velocities, cells).norm(dim=1) > 0.3).sum() > 10
+        torch.testing.assert_close(doppler.correct(velocities, cells), velocities, atol=1e-4, rtol=0)
+        assert (doppler.correct(0 * velocities, cells).norm(dim=1) > 0.3).sum() > 10
     assert parameters_that_stay(make_model(doppler=("gaussians", "boxes")), batch, lr=1e-2) == []
 
 

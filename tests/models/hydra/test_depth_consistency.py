@@ -72,10 +72,12 @@ def test_depth_agrees_where_the_pixel_puts_the_point():
 
 def test_radar_vouches_only_where_it_returned_something():
     module, x = make_refinement(), torch.randn(1, 2, 8)
-    trust = module.trust(x, torch.tensor([[False, True]]))
+    trust = module.radar_weight(x, torch.tensor([[False, True]]))
     assert trust[0, 0] == 0.0
     torch.testing.assert_close(trust[0, 1], module.radar(x[0, 1]).sigmoid().squeeze())
-    untrained = DepthConsistency(module.config, 8, 5, RANGE_M, GRID).trust(torch.zeros(1, 1, 8), torch.ones(1, 1))
+    untrained = DepthConsistency(module.config, 8, 5, RANGE_M, GRID).radar_weight(
+        torch.zeros(1, 1, 8), torch.ones(1, 1)
+    )
     assert 0.05 < untrained.item() < 0.2
 
 

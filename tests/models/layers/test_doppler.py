@@ -6,7 +6,7 @@ import torch.nn.functional as F
 
 from src.geometry.bev_grid import BEVGrid
 from src.models.layers.doppler import Doppler
-from src.ops.radial_change import NUM_BINS
+from src.ops.radial_correction import NUM_BINS
 from tests.models.moving import bda
 
 GRID = BEVGrid(cells=(12, 16), cell_m=0.8, centre_m=(8.0, 0.0), z_range_m=(-3.0, 5.0))
@@ -44,7 +44,7 @@ def test_only_the_radial_part_is_imposed_and_only_what_is_near() -> None:
     doppler = Doppler.measure(points, torch.zeros(4).long(), GRID)
     here, there, nowhere = cell(0, 2, 2), cell(0, 9, 14), cell(0, 5, 8)
     said = torch.tensor([[19.0, -17.0], [2.0, -1.0], [-20.0, 19.0], [3.0, -5.0], [4.0, 4.0]], requires_grad=True)
-    found = doppler.impose(said, torch.tensor([here, here, here, there, nowhere]))
+    found = doppler.correct(said, torch.tensor([here, here, here, there, nowhere]))
     torch.testing.assert_close(found[0], torch.tensor([21.0, -19.0]))  # (1, 1) across (20, -20) stays
     for row, place, measured in ((1, (2, 2), [1e-3, 1e-3]), (3, (9, 14), [0.2, 0.1])):
         sight = F.normalize(GRID.centre_of(torch.tensor(place)), dim=0)
@@ -61,13 +61,13 @@ def test_only_the_radial_part_is_imposed_and_only_what_is_near() -> None:
 def test_without_points_nothing_changes(points: torch.Tensor) -> None:
     doppler = Doppler.measure(points, torch.zeros(len(points)).long(), GRID)
     said = torch.randn(9, 2)
-    assert torch.equal(doppler.impose(said, torch.arange(9)), said) and len(doppler.keys) == 0
-    assert doppler.impose(said[:0], torch.arange(0)).shape == (0, 2)
+    assert torch.equal(doppler.correct(said, torch.arange(9)), said) and len(doppler.keys) == 0
+    assert doppler.correct(said[:0], torch.arange(0)).shape == (0, 2)
 
 
 def test_speeds_beyond_the_bins_are_taken_together() -> None:
     doppler = Doppler.measure(points_at((5, 9, 300.0, 0.0)), torch.zeros(1).long(), GRID)
-    assert doppler.impose(torch.tensor([[110.0, 0.0]]), torch.tensor([cell(0, 5, 9)])).tolist() == [[300.0, 0.0]]
+    assert doppler.correct(torch.tensor([[110.0, 0.0]]), torch.tensor([cell(0, 5, 9)])).tolist() == [[300.0, 0.0]]
 
 
 def test_it_turns_with_the_augmentation() -> None:
@@ -80,7 +80,7 @@ def test_it_turns_with_the_augmentation() -> None:
     turned = torch.cat([points[:, :2] @ linear.T, points[:, 2:4], points[:, 4:6] @ linear.T, points[:, 6:]], dim=1)
     row, col = torch.arange(144) // 12, torch.arange(144) % 12
     said = 20 * torch.randn(144, 2, generator=generator)
-    before = Doppler.measure(points, torch.zeros(40).long(), grid).impose(said, torch.arange(144))
-    after = Doppler.measure(turned, torch.zeros(40).long(), grid).impose(said @ linear.T, col * 12 + 11 - row)
+    before = Doppler.measure(points, torch.zeros(40).long(), grid).correct(said, torch.arange(144))
+    after = Doppler.measure(turned, torch.zeros(40).long(), grid).correct(said @ linear.T, col * 12 + 11 - row)
     torch.testing.assert_close(after, before @ linear.T, atol=1e-3, rtol=1e-4)
     assert (before != said).any(dim=1).float().mean() > 0.5

@@ -7,7 +7,7 @@ from src.models.layers.sparse import (
     ConvNormReLU,
     PrunedSparseConv,
     ResidualBlock,
-    RowNorm,
+    RowBatchNorm,
     SparseConv,
     SparseInverseConv,
     SparseKernel,
@@ -67,7 +67,7 @@ def test_weights_start_like_those_of_a_dense_convolution() -> None:
 
 
 def test_row_norm_is_batch_norm_over_rows() -> None:
-    ours, reference = RowNorm(4, eps=1e-3, momentum=0.01), nn.BatchNorm1d(4, eps=1e-3, momentum=0.01)
+    ours, reference = RowBatchNorm(4, eps=1e-3, momentum=0.01), nn.BatchNorm1d(4, eps=1e-3, momentum=0.01)
     x = torch.randn(20, 4) * 3 + 1
     torch.testing.assert_close(ours(x), reference(x))
     torch.testing.assert_close(ours.running_var, reference.running_var)
@@ -75,7 +75,7 @@ def test_row_norm_is_batch_norm_over_rows() -> None:
 
 @pytest.mark.parametrize("rows", [0, 1])
 def test_row_norm_without_statistics_uses_the_running_ones(rows: int) -> None:
-    norm = RowNorm(4, eps=1e-3, momentum=0.01).train()
+    norm = RowBatchNorm(4, eps=1e-3, momentum=0.01).train()
     norm(torch.randn(20, 4) * 3 + 1)
     before = {name: value.clone() for name, value in norm.named_buffers()}
     x = torch.randn(rows, 4)

@@ -24,7 +24,7 @@ from src.ops.kernels import (
     attend_cells_triton,
     attend_views_triton,
     box_codes_triton,
-    candidate_ranks_triton,
+    candidate_sort_keys_triton,
     cell_keys_triton,
     distinct_keys_triton,
     farthest_point_triton,
@@ -35,8 +35,8 @@ from src.ops.kernels import (
     initial_gaussians_triton,
     moved_keys_triton,
     neighbour_table_triton,
-    radial_change_triton,
-    scored_pixels_triton,
+    radial_correction_triton,
+    score_and_lift_pixels_triton,
     segment_reduce_triton,
     sparse_conv_triton,
     splat_triton,
@@ -72,10 +72,10 @@ def main():
     driver.set_active(Target())
     JITFunction.run = compile_only(JITFunction.run)
     kernels = (
-        *(attend_cells_triton, attend_views_triton, box_codes_triton, candidate_ranks_triton),
+        *(attend_cells_triton, attend_views_triton, box_codes_triton, candidate_sort_keys_triton),
         *(cell_keys_triton, distinct_keys_triton, farthest_point_triton, frame_motion_triton),
         *(gaussian_cells_triton, gaussian_shapes_triton, initial_gaussians_triton, moved_keys_triton),
-        *(neighbour_table_triton, radial_change_triton, scored_pixels_triton, segment_reduce_triton),
+        *(neighbour_table_triton, radial_correction_triton, score_and_lift_pixels_triton, segment_reduce_triton),
         *(sparse_conv_triton, splat_triton, add_layer_norm_triton, gather_cells_triton),
         view_samples_triton,
     )
@@ -88,7 +88,7 @@ def main():
         distinct_keys_triton.distinct_keys_triton(torch.arange(count), 2**62, 50)
         distinct_keys_triton.grouped_keys_triton(torch.arange(count), 70, 50)
     neighbour_table_triton.neighbour_table_triton(*(torch.arange(size) for size in (80, 80, 9)))
-    neighbour_table_triton.turned_table_triton(torch.zeros(9, 80, dtype=torch.int32), 80)
+    neighbour_table_triton.transposed_table_triton(torch.zeros(9, 80, dtype=torch.int32), 80)
     neighbour_table_triton.moved_table_triton(
         *(torch.arange(80), torch.arange(40), (120, 35), ((12, 10, 1, 2, 0, 5, 7),) * 2, (1, 0), torch.arange(9))
     )
@@ -122,8 +122,10 @@ def main():
     # Nothing fills what kernels make, so pairs and occupied cells are given.
     splat_triton.occupied_cells = lambda occupied, log_free, support, *limits: (torch.arange(len(support)), 0)
     grid = BEVGrid(cells=(8, 10), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
-    radial_change_triton.radial_votes_triton(torch.zeros(9, 7), torch.zeros(9).long(), grid)
-    radial_change_triton.radial_change_triton(torch.zeros(9, 2), *[torch.arange(9)] * 2, torch.zeros(9, 2), grid)
+    radial_correction_triton.radial_votes_triton(torch.zeros(9, 7), torch.zeros(9).long(), grid)
+    radial_correction_triton.radial_correction_triton(
+        torch.zeros(9, 2), *[torch.arange(9)] * 2, torch.zeros(9, 2), grid
+    )
     cell_keys_triton.cell_centres_triton(torch.arange(80), grid)
     table, points, shares = torch.arange(80), torch.zeros(7, 3, 2), torch.zeros(7, 4, 3)
     for dtype in (torch.float32, torch.bfloat16):
@@ -132,14 +134,14 @@ def main():
     attend_views_triton.attend_views_triton(
         [torch.zeros(2, 128, 8, 9)], torch.zeros(2, 7, 3, 2), torch.zeros(1, 7, 4, 2, 1, 3)
     )
-    radial_change_triton.radial_change_triton(
+    radial_correction_triton.radial_correction_triton(
         torch.zeros(9, 2), torch.zeros(1, 9, 2), torch.arange(9), torch.zeros(9, 2), grid, True
     )
     matrices, valid = torch.zeros(1, 2, 4, 4), torch.ones(1, 2, dtype=torch.bool)
     places = (torch.zeros(1, 7, 3, 2), torch.zeros(1, 7, 3), (-3.0, 5.0), matrices, valid, (32, 64))
-    view_samples_triton.view_places_triton(*places)
+    view_samples_triton.view_sampling_locations_triton(*places)
     seen = torch.ones(1, 7, 2, 3, dtype=torch.bool)
-    view_samples_triton.view_weights_triton(torch.zeros(1, 7, 48), torch.zeros(1, 2, 24), seen, 4)
+    view_samples_triton.view_attention_weights_triton(torch.zeros(1, 7, 48), torch.zeros(1, 2, 24), seen, 4)
     pairs = [torch.zeros(1, 7, 2)] * 3
     gaussian_shapes_triton.sampling_points_triton(torch.zeros(1, 7, 6), torch.zeros(5, 2), *pairs)
     limits = AttributeLimits((0.2, 3.0), 4.0, 30.0, 10.0)
@@ -155,16 +157,16 @@ def main():
         now, torch.zeros(1, 4, 4), tuple(torch.stack([x, x]) for x in now), present, 4.0, 100.0, True
     )
     rest = (present.expand(2, 7), torch.zeros(2, 4, 4), torch.zeros(2), present[:, 0], 0.3, grid)
-    frame_motion_triton.moved_gaussians_triton((torch.zeros(2, 7, 2),) * 4, *rest)
+    frame_motion_triton.warp_gaussians_triton((torch.zeros(2, 7, 2),) * 4, *rest)
     for dtype in (torch.float32, torch.bfloat16):
         rows, affine = torch.zeros(1, 7, 128, dtype=dtype), (torch.ones(128), torch.zeros(128))
         aged = (rows, torch.zeros(1, 7))
         add_layer_norm_triton.add_layer_norm_triton(rows, affine, 1e-5, rows, True, rows, aged)
         add_layer_norm_triton.relu_norm_columns_triton(rows, 1e-5)
     sites, classes = Sites.from_linear(torch.arange(80), (1, 8, 10)), ((0, 1), (2, 3))
-    candidate_ranks_triton.candidate_ranks_triton(torch.zeros(80, 3), sites, classes, True)
-    candidate_ranks_triton.ranked_candidates_triton(torch.zeros(2, 5).long(), classes, 3)
-    scored_pixels_triton.scored_pixels_triton(
+    candidate_sort_keys_triton.candidate_sort_keys_triton(torch.zeros(80, 3), sites, classes, True)
+    candidate_sort_keys_triton.unpack_candidates_triton(torch.zeros(2, 5).long(), classes, 3)
+    score_and_lift_pixels_triton.score_and_lift_pixels_triton(
         *(torch.zeros(1, 2, 4, 5), torch.zeros(1, 2, 7, 4, 5), torch.zeros(7), matrices, valid, (32, 40), grid, None)
     )
     gather_cells_triton.gather_cells_triton(

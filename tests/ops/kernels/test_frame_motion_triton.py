@@ -3,10 +3,10 @@ import torch
 
 from src.geometry.bev_grid import BEVGrid
 from src.ops.frame_motion import (
-    moved_gaussians,
-    moved_gaussians_reference,
     relative_motion,
     relative_motion_reference,
+    warp_gaussians,
+    warp_gaussians_reference,
 )
 from tests.models.moving import UTM, bda, pose
 
@@ -46,9 +46,9 @@ def test_gaussians(device, count, min_speed_mps):
     aug_from_past[2, :3, :3] *= 1.1
     rest = (valid, aug_from_past, torch.tensor([0.5, 1.0, 1.5]), usable)
     shapes = rows.split([2, 2, 2, 2, 3], dim=2)[:4]  # columns of one tensor
-    wanted, there = moved_gaussians_reference(shapes, *rest, min_speed_mps, GRID)
+    wanted, there = warp_gaussians_reference(shapes, *rest, min_speed_mps, GRID)
     shapes = rows.to(device).split([2, 2, 2, 2, 3], dim=2)[:4]
-    found, here = moved_gaussians(shapes, *(x.to(device) for x in rest), min_speed_mps, GRID)
+    found, here = warp_gaussians(shapes, *(x.to(device) for x in rest), min_speed_mps, GRID)
     assert torch.equal(here.cpu(), there) and (not count or 0 < there.sum() < valid[usable].sum())
     for value, expected in zip(found, wanted, strict=True):
         torch.testing.assert_close(value.cpu(), expected, rtol=1e-5, atol=1e-5)

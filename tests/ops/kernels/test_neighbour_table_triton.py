@@ -7,7 +7,7 @@ from src.ops.neighbour_table import (
     neighbour_table,
     stacked_table,
     tap_bits,
-    turned_table,
+    transposed_table,
 )
 
 
@@ -29,7 +29,7 @@ def test_a_table_read_backwards(device, num, cells, taps):
     draw = torch.Generator().manual_seed(num)
     lines = [torch.randperm(max(num, cells), generator=draw)[:cells] for _ in range(taps)]
     table = torch.stack([torch.where(line < num, line, -1) for line in lines]).to(torch.int32)
-    back, bits = turned_table(table.to(device), num)
+    back, bits = transposed_table(table.to(device), num)
     expected = torch.full((taps, num), -1, dtype=torch.int32)
     for tap, cell in (table >= 0).nonzero().tolist():
         expected[tap, table[tap, cell]] = cell

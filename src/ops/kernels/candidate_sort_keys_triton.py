@@ -1,4 +1,4 @@
-"""Ranks of candidates, and candidates of ranks, by a Triton launch each."""
+"""Sort keys of candidates, and candidates of sort keys, by a Triton launch each."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ from torch import Tensor
 
 from src.geometry.constants import constant
 from src.ops.backend import runs_kernels
-from src.ops.candidate_ranks import RANK_BITS, ClassGroups, candidate_ranks_reference, ranked_candidates_reference
+from src.ops.candidate_sort_keys import (
+    PLACE_BITS,
+    ClassGroups,
+    candidate_sort_keys_reference,
+    unpack_candidates_reference,
+)
 from src.ops.kernel_maps import submanifold_map
 from src.ops.sites import Sites
 
@@ -17,42 +22,51 @@ PAIRS = 256
 """Pairs of a program, one lane each."""
 
 
-def candidate_ranks_triton(logits: Tensor, sites: Sites, groups: ClassGroups, peaks: bool) -> Tensor:
-    """The reference's ranks, of scores up to rounding."""
+def candidate_sort_keys_triton(logits: Tensor, sites: Sites, groups: ClassGroups, peaks: bool) -> Tensor:
+    """The reference's sort keys, of scores up to rounding."""
     if logits.dtype != torch.float32 or not runs_kernels(logits):
-        return candidate_ranks_reference(logits, sites, groups, peaks)
+        return candidate_sort_keys_reference(logits, sites, groups, peaks)
     (num, classes), width = logits.shape, len(groups[0])
-    ranks = sites.keys.new_empty(len(groups), num * width)
-    if ranks.numel() > 0:
+    sort_keys = sites.keys.new_empty(len(groups), num * width)
+    if sort_keys.numel() > 0:
         neighbours = submanifold_map(sites, 3).table if peaks else sites.keys
         table = constant(groups, torch.int64, logits.device)
         with torch.cuda.device_of(logits):
             _rank[(triton.cdiv(num * width, PAIRS), len(groups))](
-                *(logits.contiguous(), sites.keys.contiguous(), neighbours.contiguous(), table, ranks),
+                *(logits.contiguous(), sites.keys.contiguous(), neighbours.contiguous(), table, sort_keys),
                 *(num, classes, sites.end),
                 PEAKS=peaks,
                 TAPS=9,
                 WIDTH=width,
-                BITS=RANK_BITS,
+                BITS=PLACE_BITS,
                 BLOCK=PAIRS,
                 num_warps=4,
             )
-    return ranks
+    return sort_keys
 
 
-def ranked_candidates_triton(ranks: Tensor, groups: ClassGroups, num_classes: int) -> tuple[Tensor, Tensor, Tensor]:
+def unpack_candidates_triton(sort_keys: Tensor, groups: ClassGroups, num_classes: int) -> tuple[Tensor, Tensor, Tensor]:
     """The reference's candidates."""
-    if ranks.dtype != torch.int64 or not runs_kernels(ranks):
-        return ranked_candidates_reference(ranks, groups, num_classes)
-    scores = ranks.new_empty(ranks.shape, dtype=torch.float32)
-    rows, labels = torch.empty_like(ranks), torch.empty_like(ranks)
-    if ranks.numel() > 0:
-        table = constant(groups, torch.int64, ranks.device)
-        with torch.cuda.device_of(ranks):
-            _read_ranks[(triton.cdiv(ranks.numel(), PAIRS),)](
-                *(ranks.contiguous(), table, scores, rows, labels, ranks.numel(), ranks.shape[1], num_classes),
+    if sort_keys.dtype != torch.int64 or not runs_kernels(sort_keys):
+        return unpack_candidates_reference(sort_keys, groups, num_classes)
+    scores = sort_keys.new_empty(sort_keys.shape, dtype=torch.float32)
+    rows, labels = torch.empty_like(sort_keys), torch.empty_like(sort_keys)
+    if sort_keys.numel() > 0:
+        table = constant(groups, torch.int64, sort_keys.device)
+        with torch.cuda.device_of(sort_keys):
+            _read_ranks[(triton.cdiv(sort_keys.numel(), PAIRS),)](
+                *(
+                    sort_keys.contiguous(),
+                    table,
+                    scores,
+                    rows,
+                    labels,
+                    sort_keys.numel(),
+                    sort_keys.shape[1],
+                    num_classes,
+                ),
                 WIDTH=len(groups[0]),
-                BITS=RANK_BITS,
+                BITS=PLACE_BITS,
                 BLOCK=PAIRS,
                 num_warps=4,
             )
@@ -67,7 +81,7 @@ def _score(logits, seen):  # noqa: ANN001, ANN202
 
 @triton.jit(do_not_specialize=["num", "classes", "end"])
 def _rank(  # noqa: ANN202
-    logits, keys, neighbours, table, ranks, num, classes, end,  # noqa: ANN001
+    logits, keys, neighbours, table, sort_keys, num, classes, end,  # noqa: ANN001
     PEAKS: tl.constexpr, TAPS: tl.constexpr, WIDTH: tl.constexpr, BITS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """A block of pairs of one group."""
@@ -86,18 +100,18 @@ def _rank(  # noqa: ANN202
             peak = peak & (own >= _score(logits + other * classes + label, seen & (other >= 0)))
         own = tl.where(peak, own, 0.0)
     bits = own.to(tl.int32, bitcast=True).to(tl.int64)
-    tl.store(ranks + group.to(tl.int64) * num * WIDTH + place, (bits << BITS) - place, mask=live)
+    tl.store(sort_keys + group.to(tl.int64) * num * WIDTH + place, (bits << BITS) - place, mask=live)
 
 
 @triton.jit(do_not_specialize=["num", "of_group", "classes"])
 def _read_ranks(  # noqa: ANN202
-    ranks, table, scores, rows, labels, num, of_group, classes,  # noqa: ANN001
+    sort_keys, table, scores, rows, labels, num, of_group, classes,  # noqa: ANN001
     WIDTH: tl.constexpr, BITS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """A block of ranks."""
+    """A block of sort keys."""
     own = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = own < num
-    rank = tl.load(ranks + own, mask=live, other=0)
+    rank = tl.load(sort_keys + own, mask=live, other=0)
     place = -rank & ((1 << BITS) - 1)
     score = ((rank + place) >> BITS).to(tl.int32).to(tl.float32, bitcast=True)
     tl.store(scores + own, score, mask=live)

@@ -2,11 +2,11 @@ import pytest
 import torch
 
 from src.models.heads.fixed_decode import CLASS_TABLE
-from src.ops.candidate_ranks import (
-    candidate_ranks,
-    candidate_ranks_reference,
-    ranked_candidates,
-    ranked_candidates_reference,
+from src.ops.candidate_sort_keys import (
+    candidate_sort_keys,
+    candidate_sort_keys_reference,
+    unpack_candidates,
+    unpack_candidates_reference,
 )
 from src.ops.fixed_shapes import Capacities, FixedShapes, in_fixed_shapes
 from src.ops.sites import Sites, padded_sites
@@ -24,10 +24,10 @@ def test_ranks(device, peaks):
         sites = padded_sites(keys, SHAPE)
         logits = torch.randint(-6, 6, (len(sites), 12), generator=draw).float()
         logits[len(some) :] = torch.nan
-        wanted = candidate_ranks_reference(logits, sites, CLASS_TABLE, peaks)
-        found = candidate_ranks(logits.to(device), Sites(SHAPE, sites.keys.to(device)), CLASS_TABLE, peaks).cpu()
+        wanted = candidate_sort_keys_reference(logits, sites, CLASS_TABLE, peaks)
+        found = candidate_sort_keys(logits.to(device), Sites(SHAPE, sites.keys.to(device)), CLASS_TABLE, peaks).cpu()
     assert 0 < (wanted > 0).sum() < 12 * len(some) + 1 and len(sites) > len(some)
-    (a, *own), (b, *others) = (ranked_candidates_reference(x, CLASS_TABLE, 12) for x in (found, wanted))
+    (a, *own), (b, *others) = (unpack_candidates_reference(x, CLASS_TABLE, 12) for x in (found, wanted))
     torch.testing.assert_close(a, b)
     assert all(torch.equal(x, y) for x, y in zip(own, others, strict=True))
 
@@ -36,6 +36,6 @@ def test_ranks(device, peaks):
 def test_candidates(device, count):
     scores = torch.rand(7, 90, generator=torch.Generator().manual_seed(1)) * (torch.arange(90) % 3 > 0)
     ranks = ((scores.view(torch.int32).long() << 31) - torch.arange(90)).topk(count, dim=1).values
-    wanted = ranked_candidates_reference(ranks, CLASS_TABLE, 12)
-    for value, expected in zip(ranked_candidates(ranks.to(device), CLASS_TABLE, 12), wanted, strict=True):
+    wanted = unpack_candidates_reference(ranks, CLASS_TABLE, 12)
+    for value, expected in zip(unpack_candidates(ranks.to(device), CLASS_TABLE, 12), wanted, strict=True):
         assert torch.equal(value.cpu(), expected)

@@ -9,13 +9,13 @@ from torch import Tensor
 
 from src.geometry.bev_grid import BEVGrid
 from src.ops.backend import runs_kernels
-from src.ops.scored_pixels import scored_pixels_reference
+from src.ops.score_and_lift_pixels import score_and_lift_pixels_reference
 
 PIXELS = 128
 """Pixels of a program, one lane each."""
 
 
-def scored_pixels_triton(
+def score_and_lift_pixels_triton(
     keypoint_logits: Tensor,  # [B, N, h, w]
     depth_logits: Tensor,  # [B, N, D, h, w]
     centres_m: Tensor,  # [D]
@@ -28,7 +28,7 @@ def scored_pixels_triton(
     """The reference's scores and points up to rounding; its own where a window thins them."""
     inputs = (keypoint_logits, depth_logits, centres_m, aug_from_pix)
     if nms_cells is not None or any(x.dtype != torch.float32 for x in inputs) or not runs_kernels(depth_logits):
-        return scored_pixels_reference(*inputs, valid, image_size_px, grid, nms_cells)
+        return score_and_lift_pixels_reference(*inputs, valid, image_size_px, grid, nms_cells)
     b, n, bins, h, w = depth_logits.shape
     scores, points = depth_logits.new_empty(b, n, h, w), depth_logits.new_empty(b, n, h, w, 3)
     if scores.numel() > 0:

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from src.geometry.bev_grid import BEVGrid
-from src.ops.scored_pixels import scored_pixels, scored_pixels_reference
+from src.ops.score_and_lift_pixels import score_and_lift_pixels, score_and_lift_pixels_reference
 
 GRID = BEVGrid(cells=(24, 20), cell_m=0.8, centre_m=(1.0, -2.0), z_range_m=(-3.0, 5.0))
 
@@ -21,8 +21,8 @@ def test_scores_and_points(device, bins, size, channels_last):
     matrices = matrices.mT.contiguous().mT  # as an inverse lies in memory
     valid = torch.tensor([[True, True, False], [True, False, True]])
     inputs = (keypoints, depths.unflatten(0, (2, 3)), torch.linspace(2.0, 9.0, bins), matrices, valid)
-    wanted = scored_pixels_reference(*inputs, (8 * size[0], 8 * size[1]), GRID, None)
-    found = scored_pixels(*(x.to(device) for x in inputs), (8 * size[0], 8 * size[1]), GRID, None)
+    wanted = score_and_lift_pixels_reference(*inputs, (8 * size[0], 8 * size[1]), GRID, None)
+    found = score_and_lift_pixels(*(x.to(device) for x in inputs), (8 * size[0], 8 * size[1]), GRID, None)
     for value, expected in zip(found, wanted, strict=True):
         torch.testing.assert_close(value.cpu(), expected, rtol=1e-5, atol=1e-4)
     assert 0 < (wanted[0] > 0).sum() < wanted[0][valid].numel()

@@ -54,7 +54,7 @@ def radial_votes_reference(points: Tensor, batch: Tensor, grid: BEVGrid) -> tupl
     return keys, (values[:, None] * falloff[:, None]).flatten(0, 1)
 
 
-def radial_change(
+def radial_correction(
     velocities: Tensor,  # [n, 2] m/s over ground, augmented axes
     cells: Tensor,  # [n] int64 linear keys (b * rows + row) * cols + col, or [B, n / B, 2] positions in metres
     keys: Tensor,  # [m] int64 linear key * NUM_BINS + bin, sorted, unique
@@ -67,10 +67,10 @@ def radial_change(
     Near is within NEAR_BINS of the own bin of radial speed. `added` gives the new velocity itself. Without gradient.
     """
     with torch.no_grad():
-        return implementation(radial_change_reference)(velocities, cells, keys, measured, grid, added)
+        return implementation(radial_correction_reference)(velocities, cells, keys, measured, grid, added)
 
 
-def radial_change_reference(
+def radial_correction_reference(
     velocities: Tensor, cells: Tensor, keys: Tensor, measured: Tensor, grid: BEVGrid, added: bool = False
 ) -> Tensor:
     """Plain torch form."""

@@ -11,13 +11,13 @@ from src.geometry.bev_grid import BEVGrid
 from src.ops.backend import runs_kernels
 from src.ops.kernels.sorted_search_triton import lower_bound
 from src.ops.moved_keys import NONE
-from src.ops.radial_change import (
+from src.ops.radial_correction import (
     BIN_MPS,
     MIN_SPEED_MPS,
     NEAR_BINS,
     NUM_BINS,
     WINDOW_CELLS,
-    radial_change_reference,
+    radial_correction_reference,
     radial_votes_reference,
 )
 
@@ -45,13 +45,13 @@ def radial_votes_triton(points: Tensor, batch: Tensor, grid: BEVGrid) -> tuple[T
     return keys, weighted
 
 
-def radial_change_triton(
+def radial_correction_triton(
     velocities: Tensor, cells: Tensor, keys: Tensor, measured: Tensor, grid: BEVGrid, added: bool = False
 ) -> Tensor:
     """The reference's change up to rounding."""
     placed = cells.dim() == 3
     if velocities.dtype != torch.float32 or (placed and cells.dtype != torch.float32) or not runs_kernels(velocities):
-        return radial_change_reference(velocities, cells, keys, measured, grid, added)
+        return radial_correction_reference(velocities, cells, keys, measured, grid, added)
     velocities, out = velocities.contiguous(), velocities.new_empty(velocities.shape)
     if len(out) > 0:
         with torch.cuda.device_of(out):

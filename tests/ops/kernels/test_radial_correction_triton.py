@@ -3,10 +3,10 @@ import torch
 
 from src.geometry.bev_grid import BEVGrid
 from src.models.layers.doppler import Doppler
-from src.ops.radial_change import (
+from src.ops.radial_correction import (
     BIN_MPS,
-    radial_change,
-    radial_change_reference,
+    radial_correction,
+    radial_correction_reference,
     radial_votes,
     radial_votes_reference,
 )
@@ -37,8 +37,8 @@ def test_changes(device, points, count):
     velocities = 15 * torch.randn(count, 2, generator=draw)
     cells = torch.randint(0, 2 * 12 * 16, (count,), generator=draw)
     inputs = (velocities, cells, doppler.keys, doppler.velocities)
-    found = radial_change(*(x.to(device) for x in inputs), GRID).cpu()
-    torch.testing.assert_close(found, radial_change_reference(*inputs, GRID), rtol=1e-4, atol=1e-4)
+    found = radial_correction(*(x.to(device) for x in inputs), GRID).cpu()
+    torch.testing.assert_close(found, radial_correction_reference(*inputs, GRID), rtol=1e-4, atol=1e-4)
     assert count < 700 or (found != 0).any(1).float().mean() > 0.2
 
 
@@ -50,10 +50,10 @@ def test_changes_at_positions(device, added):
     doppler = Doppler.measure(rows, torch.arange(60) % 2, GRID)
     positions = torch.rand(2, 150, 2, generator=draw) * torch.tensor([12.8, 9.6]) - torch.tensor([-1.6, 4.8])
     inputs = (15 * torch.randn(300, 2, generator=draw), positions, doppler.keys, doppler.velocities)
-    found = radial_change(*(x.to(device) for x in inputs), GRID, added).cpu()
+    found = radial_correction(*(x.to(device) for x in inputs), GRID, added).cpu()
     row, col = GRID.cell_of(positions).unbind(-1)
     cells = ((torch.arange(2)[:, None] * 12 + row) * 16 + col).flatten()
-    expected = radial_change_reference(inputs[0], cells, *inputs[2:], GRID) + added * inputs[0]
+    expected = radial_correction_reference(inputs[0], cells, *inputs[2:], GRID) + added * inputs[0]
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
 
 
@@ -64,5 +64,5 @@ def test_halves_go_to_the_even_bin(device):
     bins = torch.arange(0, 31, 3)
     velocities = (torch.arange(-6, 6)[:, None] + 0.5) * BIN_MPS * sight
     inputs = (velocities, cell.expand(12), cell * 31 + bins, (bins[:, None] - 15) * BIN_MPS * sight)
-    found = radial_change(*(x.to(device) for x in inputs), grid).cpu()
-    torch.testing.assert_close(found, radial_change_reference(*inputs, grid))
+    found = radial_correction(*(x.to(device) for x in inputs), grid).cpu()
+    torch.testing.assert_close(found, radial_correction_reference(*inputs, grid))

@@ -13,7 +13,7 @@ from src.ops.backend import implementation
 
 
 @torch.no_grad()
-def scored_pixels(
+def score_and_lift_pixels(
     keypoint_logits: Tensor,  # [B, N, h, w]
     depth_logits: Tensor,  # [B, N, D, h, w]
     centres_m: Tensor,  # [D] of the depth bins
@@ -26,10 +26,10 @@ def scored_pixels(
     """Probability of a keypoint times confidence in its depth, 0 for what lies outside the grid or in a missing view;
     and the point."""
     inputs = (keypoint_logits, depth_logits, centres_m, aug_from_pix, valid)
-    return implementation(scored_pixels_reference)(*inputs, image_size_px, grid, nms_cells)
+    return implementation(score_and_lift_pixels_reference)(*inputs, image_size_px, grid, nms_cells)
 
 
-def scored_pixels_reference(
+def score_and_lift_pixels_reference(
     keypoint_logits: Tensor,
     depth_logits: Tensor,
     centres_m: Tensor,
@@ -41,7 +41,7 @@ def scored_pixels_reference(
 ) -> tuple[Tensor, Tensor]:
     """Plain torch form."""
     depth, confidence = most_likely_depth(depth_logits, centres_m)  # [B, N, h, w] each
-    points = lifted_pixels(depth, aug_from_pix, image_size_px)
+    points = lift_pixel_centres(depth, aug_from_pix, image_size_px)
     scores = peak_scores(keypoint_logits, nms_cells) * confidence
     return scores * (grid.contains(points[..., :2]) & valid[:, :, None, None]), points
 
@@ -73,7 +73,7 @@ def most_likely_depth(
     return (chosen * centres_m[window]).sum(2) / confidence, confidence
 
 
-def lifted_pixels(
+def lift_pixel_centres(
     depth: Tensor,  # [B, N, h, w] m along the optical axis
     aug_from_pix: Tensor,  # [B, N, 4, 4]
     image_size_px: tuple[int, int],
