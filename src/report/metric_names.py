@@ -71,7 +71,7 @@ for _key, _words, *_rest in (
     ("moving_radial_error", "radial velocity error of moving vehicles", "m/s", 1.0, 2, False),
     ("moving_heading_error", "heading error of moving vehicles", "deg", 1.0, 2, False),
     ("hidden_recall", "recall of hidden objects", "%", 100.0, 1, True),
-    ("unoccupied_recall", "recall without an occupied cell", "%", 100.0, 1, True),
+    ("unoccupied_recall", "recall of objects without an occupied cell", "%", 100.0, 1, True),
     ("radar_covers", "objects that radar Gaussians cover", "%", 100.0, 1, True),
     ("camera_covers", "objects that camera Gaussians cover", "%", 100.0, 1, True),
     ("random_covers", "objects that random Gaussians cover", "%", 100.0, 1, True),
@@ -90,7 +90,7 @@ for _part in PARTS + FURTHER_PARTS:
     METRICS[f"latency.{_part}"] = Metric(f"latency.{_part}", _part.replace("_", " "), "ms", 1.0, 1, False)
 METRICS["latency.fps"] = Metric("latency.fps", "frames per second", "1/s", 1.0, 2, True)
 METRICS["latency.memory_gb"] = Metric("latency.memory_gb", "memory", "GB", 1.0, 2, False)
-METRICS["latency.gflop"] = Metric("latency.gflop", "arithmetic of a frame", "GFLOP", 1.0, 1, False)
+METRICS["latency.gflop"] = Metric("latency.gflop", "compute per frame", "GFLOP", 1.0, 1, False)
 METRICS["cost.parameters"] = Metric("cost.parameters", "parameters", "M", 1e-6, 2, False)
 METRICS["cost.training"] = Metric("cost.training", "training with its validation", "min", 1 / 60, 1, False)
 
