@@ -5,6 +5,7 @@ The dataclasses are the schema that each file, and the record of its sweep, is c
 
 from __future__ import annotations
 
+import itertools
 import re
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -33,6 +34,7 @@ class RowConfig:
 
     label: str
     overrides: Many[str] = field(default_factory=list)  # as after `python -m src.train`
+    scale_overrides: dict[str, Many[str]] = field(default_factory=dict)  # at a scale, by its name; they come last
     paper: dict[str, float] = field(default_factory=dict)  # the paper's numbers by metric, in the paper's units
     x: float | None = None  # place on the plot's horizontal axis
     baseline: str | None = None  # label of the row this one is compared with, where it is not the file's
@@ -129,9 +131,9 @@ class SweepConfig:
             raise ConfigError(f"{where}: give tables with the columns of task {self.task}")
         elif self.space and self.objective is None:
             raise ConfigError(f"{where}: give the objective of task {self.task}")
-        given = [*self.overrides, *self.space]
-        for overrides in (*self.scale_overrides.values(), *(row.overrides for row in self.rows)):
-            given += overrides
+        given = [*self.space]
+        for part in (self, *self.rows):
+            given += itertools.chain(part.overrides, *part.scale_overrides.values())
         if any(key_of(override) == "seed" for override in given):
             raise ConfigError(f"{where}: seed=... is no part of a sweep; seed= and seeds= of its command say them")
         labels = [row.label for row in self.rows] + [row.label for row in self.paper_rows]
@@ -201,7 +203,11 @@ class SweepConfig:
 
     def at_scale(self, scale: str) -> SweepConfig:
         """The same question with the overrides of one scale; a row not for it becomes one that only the paper has."""
+
+        def own(part: Any) -> dict[str, Any]:
+            return {"overrides": [*part.overrides, *part.scale_overrides.get(scale, [])], "scale_overrides": {}}
+
         rows = [row for row in self.rows if row.scales is None or scale in row.scales]
         others = [PaperRowConfig(label=row.label, paper=row.paper) for row in self.rows if row not in rows]
-        overrides = [*self.overrides, *self.scale_overrides.get(scale, [])]
-        return replace(self, overrides=overrides, scale_overrides={}, rows=rows, paper_rows=others + self.paper_rows)
+        rows = [replace(row, **own(row)) for row in rows]
+        return replace(self, **own(self), rows=rows, paper_rows=others + self.paper_rows)
