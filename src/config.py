@@ -44,6 +44,16 @@ GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir())
 PHASES = sorted(path.stem for path in (CONF / "phase").glob("*.yaml"))
 SCALES = sorted(path.stem for path in (CONF / "scale").glob("*.yaml"))
 
+COMMANDS_OF_OPTIONS = {
+    "checkpoint": ("evaluate", "predict", "export", "replay", "benchmark"),
+    "predictions": ("evaluate",),
+    "scene": ("predict",),
+    "out": ("evaluate", "predict", "export", "world", "benchmark"),
+    "preview": ("world",),
+    "compare": ("world",),
+    "oracle": ("evaluate",),
+}
+"""Options of single commands, and the commands that read them."""
 FILES_AND_NAMES = (
     *("checkpoint", "predictions", "out", "scene", "data.root", "phase.init_from"),
     *("paths.outputs", "paths.reports"),
@@ -187,10 +197,13 @@ def _register() -> None:
         store.store(group="model", name=f"schema_{name}", node=schema)
 
 
-def refuse_oracle(config: Config) -> None:
-    """Raises ConfigError for an oracle, which an evaluation alone may ask."""
-    if config.oracle is not Oracle.none:
-        raise ConfigError(f"oracle={config.oracle.value}: an option of python -m src.evaluate; leave it out")
+def refuse_options_of_others(config: Config, command: str) -> None:
+    """Raises ConfigError for an option of single commands that this one, `train` for instance, would ignore."""
+    for option, users in COMMANDS_OF_OPTIONS.items():
+        if command not in users and (value := getattr(config, option)) not in (None, False, Oracle.none):
+            names = " or ".join(f"python -m src.{user}" for user in users)
+            said = "true" if value is True else getattr(value, "value", value)
+            raise ConfigError(f"{option}={said}: an option of {names}; leave it out")
 
 
 def compose_config(overrides: list[str]) -> tuple[Config, dict[str, Any]]:

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
-from src.config import compose_config, restore_config
+from src.config import compose_config, refuse_options_of_others, restore_config
 from src.errors import ConfigError, DataError
 from src.metrics.bootstrap import score_report
 from src.metrics.detection import score_detections
@@ -32,6 +32,7 @@ logger = logging.getLogger(__name__)
 def main(overrides: list[str]) -> None:
     """Score a checkpoint, or a submission file, and write metrics.json (and submission.json) into `out`."""
     config, _ = compose_config(overrides)
+    refuse_options_of_others(config, "evaluate")
     if (config.checkpoint is None) == (config.predictions is None):
         raise ConfigError("give either checkpoint=PATH or predictions=FILE.json")
     if config.oracle is not Oracle.none and config.predictions is not None:

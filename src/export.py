@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from src.assembly import restored_model
-from src.config import compose_config, restore_config
+from src.config import compose_config, refuse_options_of_others, restore_config
 from src.errors import ConfigError
 from src.models.backbones.image import ImageEncoder
 from src.models.deploy.inference import prepare_for_inference
@@ -30,6 +30,7 @@ def main(overrides: list[str]) -> None:
     Without `out` the file is named by the checkpoint and its run and lies in `paths.outputs`/exports.
     """
     command, _ = compose_config(overrides)
+    refuse_options_of_others(command, "export")
     if command.checkpoint is None:
         raise ConfigError("give checkpoint=PATH of the trained model whose image encoder is to be exported")
     path = Path(command.checkpoint)

@@ -10,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from src.assembly import build_datamodule, data_root, save_submission
-from src.config import Config, compose_config, refuse_oracle, restore_config
+from src.config import Config, compose_config, refuse_options_of_others, restore_config
 from src.data.splits import split_samples
 from src.errors import ConfigError
 from src.metrics.submission import to_global
@@ -40,7 +40,7 @@ def main(overrides: list[str]) -> None:
     command, _ = compose_config(overrides)
     if command.checkpoint is None or command.predictions is not None:
         raise ConfigError("give checkpoint=PATH (predictions=FILE.json is scored by python -m src.evaluate)")
-    refuse_oracle(command)
+    refuse_options_of_others(command, "predict")
     tune_cpu_allocator()
     path = Path(command.checkpoint)
     checkpoint = read_checkpoint(path)

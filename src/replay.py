@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from src.assembly import restored_model
-from src.config import Config, compose_config, restore_config
+from src.config import Config, compose_config, refuse_options_of_others, restore_config
 from src.errors import ConfigError, DivergedError
 from src.ops.precision import computing
 from src.reliability.command import run_command
@@ -41,6 +41,7 @@ MAX_SHOWN = 8
 def main(overrides: list[str]) -> None:
     """Run a dumped step again. Raises DivergedError at the first number that is not finite."""
     command, _ = compose_config(overrides)
+    refuse_options_of_others(command, "replay")
     if command.checkpoint is None:
         raise ConfigError("give checkpoint=PATH of a dump, nonfinite-step*.pt in the folder of a run")
     path = Path(command.checkpoint)

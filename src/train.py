@@ -13,7 +13,7 @@ from typing import Any
 import lightning as L
 
 from src.assembly import build_datamodule, build_module, data_root, save_submission
-from src.config import PHASES, Config, compose_config, refuse_oracle
+from src.config import PHASES, Config, compose_config, refuse_options_of_others
 from src.data.datamodule import DetectionDataModule
 from src.errors import DataError
 from src.pictures.learning_curves import draw_curves
@@ -47,7 +47,7 @@ def main(overrides: list[str]) -> None:
     """Train one run, or show it when it has finished; start its processes first when there are to be several."""
     started = time.monotonic()
     config, tree = compose_config(overrides)
-    refuse_oracle(config)
+    refuse_options_of_others(config, "train")
     check_devices(*config.trainer.processes)
     source = find_source(config, overrides, compose_config, PHASES)
     folder = RunFolder(Path(config.paths.outputs), run_identity(tree, source.identity if source is not None else None))

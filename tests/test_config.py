@@ -8,7 +8,7 @@ import signal
 
 import pytest
 
-from src.config import CONF, compose_config, restore_config
+from src.config import CONF, compose_config, refuse_options_of_others, restore_config
 from src.errors import CheckpointError, ConfigError
 from src.reliability.command import run_command
 from src.training.identity import YOUNGER_KEYS, run_identity, without_keys
@@ -432,3 +432,23 @@ def test_exit_code_of_a_configuration_error():
     result = command("train", "phase=phase3", expect=3)
     assert "phase3" in result.stderr and "phase1" in result.stderr and "phase2" in result.stderr
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "users"),
+    [
+        ("train", "checkpoint=a.ckpt", "evaluate or .*benchmark"),
+        ("train", "out=x", "evaluate or .*world"),
+        ("gallery", "out=x", "evaluate"),
+        ("report", "scene=x", "predict"),
+        ("evaluate", "preview=true", "world"),
+        ("predict", "oracle=velocity", "evaluate"),
+    ],
+)
+def test_an_option_that_a_command_would_ignore_is_refused(command, option, users):
+    config, _ = compose_config(["scale=debug", option])
+    with pytest.raises(
+        ConfigError, match=rf"{option}: an option of python -m src.{users}.*; leave it out".replace("true", "True")
+    ):
+        refuse_options_of_others(config, command)
+    refuse_options_of_others(compose_config(["scale=debug"])[0], command)

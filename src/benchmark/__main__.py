@@ -26,7 +26,7 @@ from pathlib import Path
 from src.benchmark.machine import busy_warning, describe_machine
 from src.benchmark.page import markdown, page_name, page_of, write_page
 from src.benchmark.suite_latency import latency_page, measure_latency
-from src.config import BenchmarkSuite, Config, compose_config
+from src.config import BenchmarkSuite, Config, compose_config, refuse_options_of_others
 from src.errors import DataError
 from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.command import run_command
@@ -36,6 +36,7 @@ from src.training.run_folder import make_writable, write_json
 def main(overrides: list[str]) -> None:
     """Measure one suite, print its page, and keep it as JSON and Markdown in `out` when given."""
     config, tree = compose_config(overrides)
+    refuse_options_of_others(config, "benchmark")
     of_one_frame = config.suite in (BenchmarkSuite.model, BenchmarkSuite.launches, BenchmarkSuite.gpu)
     if of_one_frame and not any(word.startswith("data.batch_size=") for word in overrides):
         config.data.batch_size = 1

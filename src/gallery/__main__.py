@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from src.assembly import build_datamodule, data_root
-from src.config import Config, compose_config
+from src.config import Config, compose_config, refuse_options_of_others
 from src.data.datamodule import DetectionDataModule
 from src.errors import ConfigError, DataError
 from src.files.atomic_write import write_whole
@@ -77,6 +77,7 @@ def main(overrides: list[str]) -> None:
     if not runs:
         raise ConfigError("give runs=A,B: ids of finished runs of paths.outputs, the one that is looked at last")
     config, _ = compose_config([override for override in overrides if key_of(override) != "runs"])
+    refuse_options_of_others(config, "gallery")
     reports = Path(config.paths.reports)
     make_writable(reports, "paths.reports")
     datamodule = build_datamodule(config, data_root(config, write=False))

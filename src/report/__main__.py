@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from src.config import PHASES, Config, compose_config
+from src.config import PHASES, Config, compose_config, refuse_options_of_others
 from src.errors import ConfigError, DataError
 from src.files.atomic_write import write_whole
 from src.pictures.comparison import BarPanel, draw_comparison
@@ -46,6 +46,7 @@ def main(overrides: list[str]) -> None:
     Raises DataError for run folders, results, records and claims that are broken, once the rest is done.
     """
     config, _ = compose_config(overrides)
+    refuse_options_of_others(config, "report")
     outputs, reports = Path(config.paths.outputs), Path(config.paths.reports)
     make_writable(reports, "paths.reports")
     faults: list[str] = []

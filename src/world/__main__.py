@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from src.assembly import data_root
-from src.config import Config, compose_config
+from src.config import Config, compose_config, refuse_options_of_others
 from src.data.cache import load_index
 from src.data.reader import FrameReader
 from src.errors import ConfigError
@@ -31,6 +31,7 @@ def main(overrides: list[str]) -> None:
     takes recorded data.
     """
     config, _ = compose_config(overrides)
+    refuse_options_of_others(config, "world")
     if config.data.world is None and not config.compare:
         raise ConfigError("data.world is null: this configuration reads recorded data, there is no world to write")
     root = data_root(config)
