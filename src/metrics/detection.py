@@ -246,7 +246,7 @@ def _motion_sums(ranking: Ranking, matching: Matching) -> dict[str, Array]:  # [
     wrong = ranking.predictions.velocities[ranking.rows[matching.places[at_errors]]] - truth.velocities
     _, _, turns, speeds, _ = matching.errors.T
     rays = truth.centers[:, :2] - ranking.evaluation_set.ego_centers[truth.samples, :2]
-    radial = np.abs(np.vecdot(wrong, rays)) / np.linalg.norm(rays, axis=1)
+    radial = np.abs(np.vecdot(wrong, rays)) / np.maximum(np.linalg.norm(rays, axis=1), 1e-9)
     counted = np.isin(truth.labels, MOVING) & (np.linalg.norm(truth.velocities, axis=1) >= FAST_MPS) & ~np.isnan(speeds)
     samples, num_samples = truth.samples[counted], len(ranking.evaluation_set.tokens)
     count = np.bincount(samples, minlength=num_samples)
