@@ -52,7 +52,7 @@ def test_images_are_joined_before_gaussians_look_at_them(make_model, make_batch,
         yield lambda: order.append("join")
         order.append("main")
 
-    monkeypatch.setattr("src.models.horizon3d.model.beside", noted)
+    monkeypatch.setattr("src.models.horizon3d.model.on_side_stream", noted)
     for name in ("image_encoder", "radar_encoder", "kggi"):
         getattr(model, name).register_forward_pre_hook(lambda *_, name=name: order.append(name))
     model(batch)
