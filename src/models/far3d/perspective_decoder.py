@@ -12,7 +12,7 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.heads.query_head import QueryPrediction, SetPredictionHead
 from src.models.layers.global_attention import FFN_RATIO, GlobalAttention
-from src.models.layers.image_attention import ImageCrossAttention, feed_forward
+from src.models.layers.image_attention import ImageCrossAttention, PointOffsets, feed_forward
 from src.models.layers.query_attention import QueryEmbedding
 from src.models.layers.views import CameraViews
 from src.structures.queries import Queries
@@ -67,9 +67,7 @@ class PerspectiveLayer(nn.Module):
         super().__init__()
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
         self.self_attention = GlobalAttention(channels, config.num_heads)
-        self.offsets = nn.Linear(channels, 3 * config.num_points)
-        nn.init.zeros_(self.offsets.weight)
-        nn.init.uniform_(self.offsets.bias, -INITIAL_REACH_M, INITIAL_REACH_M)
+        self.offsets = PointOffsets(channels, config.num_points, INITIAL_REACH_M)
         self.image_attention = ImageCrossAttention(channels, config.num_points, num_views, num_levels)
         self.mlp = feed_forward(channels, FFN_RATIO)
 
@@ -85,7 +83,7 @@ class PerspectiveLayer(nn.Module):
         x = queries.features
         x = self.norms[0](x + self.self_attention.among(x, embedding, queries.valid, past))
         query = x + embedding
-        points = queries.centers[:, :, None] + self.offsets(query).float().unflatten(-1, (-1, 3))
+        points = self.offsets(query, queries.centers)
         x = self.norms[1](x + self.image_attention(x, query, points, views, values))
         return self.norms[2](x + self.mlp(x))
 

@@ -41,6 +41,23 @@ def attention_linear(in_channels: int, out_channels: int, zero: bool = False) ->
     return layer
 
 
+class PointOffsets(nn.Linear):
+    """Sampling points in 3D: a query's place and what it learns to add; untrained, at most `reach_m` along each axis."""
+
+    def __init__(self, channels: int, num_points: int, reach_m: float) -> None:
+        super().__init__(channels, 3 * num_points)
+        nn.init.zeros_(self.weight)
+        nn.init.uniform_(self.bias, -reach_m, reach_m)
+
+    def forward(
+        self,
+        query: Tensor,  # [B, Q, C]
+        centers: Tensor,  # [B, Q, 3] aug metres
+    ) -> Tensor:  # [B, Q, P, 3]
+        """The points, in float32."""
+        return centers[:, :, None] + super().forward(query).float().unflatten(-1, (-1, 3))
+
+
 class ImageCrossAttention(nn.Module):
     """Deformable attention from queries to the image pyramids of all views (DCA_I of Eq. 2).
 

@@ -11,7 +11,7 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.point_transformer import PaddedPoints
 from src.models.heads.query_head import QueryPrediction, SetPredictionHead
-from src.models.layers.image_attention import ImageCrossAttention, feed_forward
+from src.models.layers.image_attention import ImageCrossAttention, PointOffsets, feed_forward
 from src.models.layers.query_attention import DistanceAttention, QueryEmbedding
 from src.models.layers.views import CameraViews
 from src.structures.queries import Queries
@@ -44,9 +44,7 @@ class QueryDecoderLayer(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(4))
         self.self_attention = DistanceAttention(channels, config.num_heads, config.num_neighbours)
         self.radar_attention = DistanceAttention(channels, config.num_heads, config.num_radar_points)
-        self.offsets = nn.Linear(channels, 3 * config.num_points)
-        nn.init.zeros_(self.offsets.weight)
-        nn.init.uniform_(self.offsets.bias, -INITIAL_REACH_M, INITIAL_REACH_M)
+        self.offsets = PointOffsets(channels, config.num_points, INITIAL_REACH_M)
         self.image_attention = ImageCrossAttention(channels, config.num_points, num_views, num_levels)
         self.mlp = feed_forward(channels, FFN_RATIO)
 
@@ -70,7 +68,7 @@ class QueryDecoderLayer(nn.Module):
         query = self.norms[1](x) + embedding
         x = x + self.radar_attention(query, centers, radar.features, radar.xyz, radar.valid)
         query = self.norms[2](x) + embedding
-        points = centers[:, :, None] + self.offsets(query).float().unflatten(-1, (-1, 3))
+        points = self.offsets(query, centers)
         x = x + self.image_attention(x, query, points, views, values)
         return x + self.mlp(self.norms[3](x))
 

@@ -32,7 +32,7 @@ def candidate_sort_keys_triton(logits: Tensor, sites: Sites, groups: ClassGroups
         neighbours = submanifold_map(sites, 3).table if peaks else sites.keys
         table = constant(groups, torch.int64, logits.device)
         with torch.cuda.device_of(logits):
-            _rank[(triton.cdiv(num * width, PAIRS), len(groups))](
+            _sort_keys_of_pairs[(triton.cdiv(num * width, PAIRS), len(groups))](
                 *(logits.contiguous(), sites.keys.contiguous(), neighbours.contiguous(), table, sort_keys),
                 *(num, classes, sites.end),
                 PEAKS=peaks,
@@ -54,7 +54,7 @@ def unpack_candidates_triton(sort_keys: Tensor, groups: ClassGroups, num_classes
     if sort_keys.numel() > 0:
         table = constant(groups, torch.int64, sort_keys.device)
         with torch.cuda.device_of(sort_keys):
-            _read_ranks[(triton.cdiv(sort_keys.numel(), PAIRS),)](
+            _candidates_of_sort_keys[(triton.cdiv(sort_keys.numel(), PAIRS),)](
                 *(
                     sort_keys.contiguous(),
                     table,
@@ -80,7 +80,7 @@ def _score(logits, seen):  # noqa: ANN001, ANN202
 
 
 @triton.jit(do_not_specialize=["num", "classes", "end"])
-def _rank(  # noqa: ANN202
+def _sort_keys_of_pairs(  # noqa: ANN202
     logits, keys, neighbours, table, sort_keys, num, classes, end,  # noqa: ANN001
     PEAKS: tl.constexpr, TAPS: tl.constexpr, WIDTH: tl.constexpr, BITS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -104,16 +104,16 @@ def _rank(  # noqa: ANN202
 
 
 @triton.jit(do_not_specialize=["num", "of_group", "classes"])
-def _read_ranks(  # noqa: ANN202
+def _candidates_of_sort_keys(  # noqa: ANN202
     sort_keys, table, scores, rows, labels, num, of_group, classes,  # noqa: ANN001
     WIDTH: tl.constexpr, BITS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """A block of sort keys."""
     own = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = own < num
-    rank = tl.load(sort_keys + own, mask=live, other=0)
-    place = -rank & ((1 << BITS) - 1)
-    score = ((rank + place) >> BITS).to(tl.int32).to(tl.float32, bitcast=True)
+    key = tl.load(sort_keys + own, mask=live, other=0)
+    place = -key & ((1 << BITS) - 1)
+    score = ((key + place) >> BITS).to(tl.int32).to(tl.float32, bitcast=True)
     tl.store(scores + own, score, mask=live)
     tl.store(rows + own, place // WIDTH, mask=live)
     label = tl.load(table + (own // of_group) * WIDTH + place % WIDTH, mask=live, other=0)
