@@ -42,7 +42,7 @@ def attention_linear(in_channels: int, out_channels: int, zero: bool = False) ->
 
 
 class PointOffsets(nn.Linear):
-    """Sampling points in 3D: a query's place and what it learns to add; untrained, at most `reach_m` along each axis."""
+    """Sampling points: a query's place and what it learns to add, untrained at most `reach_m` along each axis."""
 
     def __init__(self, channels: int, num_points: int, reach_m: float) -> None:
         super().__init__(channels, 3 * num_points)

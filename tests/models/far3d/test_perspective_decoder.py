@@ -40,7 +40,8 @@ def test_a_layer_samples_every_visible_point_of_every_view_and_level():
     x = queries.features
     x = layer.norms[0](x + layer.self_attention(x + embedding, x + embedding, x, queries.valid))
     query = x + embedding
-    points = queries.centers[:, :, None] + F.linear(query, layer.offsets.weight, layer.offsets.bias).view(2, 6, POINTS, 3)
+    added = F.linear(query, layer.offsets.weight, layer.offsets.bias)
+    points = queries.centers[:, :, None] + added.view(2, 6, POINTS, 3)
     attention = layer.image_attention
     rows = F.normalize(views.pix_from_aug[:, :, :3], dim=-1).flatten(2)
     gathered = torch.zeros(2, 6, C)
