@@ -22,6 +22,7 @@ from src.report.claims import Claim, Finding, judge, load_claims, verdict_of
 from src.report.claims_page import claims_page
 from src.report.metric_names import DETECTION, RANGES, SPEEDS, find_metric
 from src.report.pages import (
+    FURTHER,
     PHASES_OF,
     compared_experiments,
     comparison_page,
@@ -98,7 +99,7 @@ def write_pages(config: Config, results: dict[str, RunResult], in_sweeps: Collec
     models = {result.phase: result.model for result in results.values() if result.phase in PHASES}
     defaults = {phase: defaults_of(config.scale, phase, model) for phase, model in models.items()}
     detection = [run for run in results.values() if run.task == DETECTION]
-    groups = {phase: runs_on_page(detection, phase, in_sweeps, defaults) for phase in PHASES}
+    groups = {phase: runs_on_page(detection, phase, in_sweeps, defaults) for phase in PHASES if phase != FURTHER}
     for run in results.values():
         if run.task != DETECTION and run.phase in PHASES and run.run_id not in in_sweeps:
             groups.setdefault(f"{run.phase}_{run.task}", []).append(run)

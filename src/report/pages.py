@@ -34,11 +34,10 @@ from src.report.score_tables import (
 )
 from src.training.identity import OUTSIDE_IDENTITY, TEMPORAL_DATA_KEYS, YOUNGER_KEYS, is_of, key_of
 
-PHASES_OF = {"phase2": ("phase1", "phase2")}
+FURTHER = "phase1_further"
+"""What phase 2 is compared with; it stands on that page alone."""
+PHASES_OF = {"phase2": ("phase1", FURTHER, "phase2")}
 """Whose runs a phase's page reads; other phases' pages read their own."""
-
-INIT_FROM = "phase.init_from="
-CONTINUED = "phase 1, as many further epochs"
 
 NAMES = {
     ("phase1",): "KGGI + OCSF",
@@ -48,6 +47,7 @@ NAMES = {
 }
 NAMES_OF_COMPARISON = {
     ("phase1",): "phase 1",
+    (FURTHER,): "phase 1, as many further epochs",
     ("phase2",): "phase 2",
     (
         "phase2",
@@ -55,7 +55,7 @@ NAMES_OF_COMPARISON = {
         "model.dptf.gaussian_path.velocity_compensation=false",
     ): "phase 2, no velocity compensation",
 }
-"""By phase and sorted settings, in the order of the page; continued phase 1 comes after phase 1."""
+"""By phase and sorted settings, in the order of the page."""
 
 DROPOUT = "data.sensor_dropout="
 
@@ -87,11 +87,11 @@ def runs_on_page(
 ) -> list[RunResult]:
     """Those of `results` that the page of `phase` shows; none when there is none of the phase itself.
 
-    Phase 1 continued from phase 1 is what phase 2 is compared with, so it is on that page and not on its own; phase 1
-    is there without its ablations. Runs of sweeps (their ids are `in_sweeps`) have tables of their own: of them only
-    experiments that have a name here are shown. Weights that were scored once more with other settings are left to the
-    tables of their sweeps. `defaults` are the configurations of runs without settings, by phase:
-    a run is called by what differs from these, so an older default never passes for today's.
+    Phase 1, and its further epochs, stand on phase 2's page without their ablations. Runs of sweeps (their ids are
+    `in_sweeps`) have tables of their own: of them only experiments that have a name here are shown. Weights that were
+    scored once more with other settings are left to the tables of their sweeps. `defaults` are the configurations of
+    runs without settings, by phase: a run is called by what differs from these, so an older default never passes for
+    today's.
     """
     names = NAMES_OF_COMPARISON if phase in PHASES_OF else NAMES
     shown = []
@@ -99,12 +99,9 @@ def runs_on_page(
         overrides = without_defaults(result.overrides, defaults.get(result.phase, {}))
         older = changed_since(result, defaults.get(result.phase, {}))
         run = replace(result, overrides=overrides + older)
-        if phase in PHASES_OF:
-            belongs = run.phase == phase or (run.phase in PHASES_OF[phase] and (not run.settings or _is_continued(run)))
-        else:
-            belongs = run.phase == phase and not _is_continued(run)
+        belongs = run.phase == phase or (run.phase in PHASES_OF.get(phase, ()) and not run.settings)
         belongs = belongs and run.epochs > 0
-        known = (run.phase, *_settings_without_dropout(run)) in names or (_is_continued(run) and not older)
+        known = (run.phase, *_settings_without_dropout(run)) in names
         if belongs and (known or run.run_id not in in_sweeps):
             shown.append(run)
     return shown if any(run.phase == phase for run in shown) else []
@@ -199,12 +196,8 @@ def phase_page(runs: list[RunResult], scale: str) -> str:
 
 def compared_experiments(runs: list[RunResult]) -> list[Experiment]:
     """The experiments of phase 2's page, in its order. Raises ValueError when the runs are of different data."""
-    epochs = {run.epochs for run in runs if (run.phase, *run.settings) == ("phase2",)}
 
     def name(run: RunResult) -> str | None:
-        free = ("phase.epochs=", "phase.options.velocity_code_weight=")
-        if f"{INIT_FROM}phase1" in run.settings and all(s.startswith((INIT_FROM, *free)) for s in run.settings):
-            return CONTINUED if {run.epochs} == epochs else f"phase 1, {run.epochs} further epochs"
         dropout = [setting for setting in run.settings if setting.startswith(DROPOUT)]
         known = NAMES_OF_COMPARISON.get((run.phase, *_settings_without_dropout(run)))
         if known and dropout:
@@ -213,9 +206,7 @@ def compared_experiments(runs: list[RunResult]) -> list[Experiment]:
 
     def place(experiment: Experiment) -> float:
         known, key = list(NAMES_OF_COMPARISON), tuple(part for part in experiment.key if not part.startswith(DROPOUT))
-        if key in known:
-            return known.index(key)
-        return 0.5 if experiment.key[0] == "phase1" else len(known)
+        return known.index(key) if key in known else len(known)
 
     return sorted(group_runs(runs, name), key=place)
 
@@ -274,10 +265,6 @@ def _boxes_by_speed(runs: list[RunResult]) -> str:
 
 def _settings_without_dropout(run: RunResult) -> tuple[str, ...]:
     return tuple(setting for setting in run.settings if not setting.startswith(DROPOUT))
-
-
-def _is_continued(run: RunResult) -> bool:
-    return any(setting.startswith(INIT_FROM) for setting in run.settings)
 
 
 def _page(phase: str, scale: str, epochs: str, runs: list[RunResult]) -> str:

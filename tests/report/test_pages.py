@@ -14,7 +14,6 @@ NO_VELOCITY = [
     "model.dptf.gaussian_path.velocity_compensation=false",
     "model.dptf.bev_path.velocity_compensation=false",
 ]
-FURTHER = ["phase=phase1", "phase.init_from=phase1", "phase.options.velocity_code_weight=1.0"]
 
 
 @pytest.fixture
@@ -39,7 +38,7 @@ def report(tmp_path, capsys, exported):
 def both_phases(write_run):
     for seed in (0, 1):
         write_run(f"plain{seed}", [f"seed={seed}"], seed, 0.30 + 0.1 * seed)  # scored before there were speed classes
-        write_run(f"further{seed}", [*FURTHER, f"seed={seed}"], seed, 0.33 + 0.1 * seed, speeds=True)
+        write_run(f"further{seed}", [], seed, 0.33 + 0.1 * seed, phase="phase1_further", speeds=True)
         write_run(f"full{seed}", ["phase=phase2"], seed, 0.38 + 0.1 * seed, phase="phase2", speeds=True)
         write_run(f"still{seed}", NO_VELOCITY, seed, 0.35 + 0.1 * seed, phase="phase2", speeds=True)
     write_run("radar", ["model.kggi=null", "model.ocsf=null"], 0, 0.2)
@@ -67,8 +66,7 @@ def test_phase_2_is_held_against_phase_1(both_phases, report, tmp_path):
     assert "| 2 | +5.0 [+5.0, +5.0] |" in gain["phase 1, as many further epochs"]
     fast = rows(text, "| phase 2 over | seeds | mAVE 0-0.5 m/s, m/s |")["phase 2, no velocity compensation"]
     assert fast.endswith("| -0.03 [-0.03, -0.03] |")
-    for command in ("phase=phase1 scale=mini phase.init_from=phase1 phase.options.velocity_code_weight=1.0 seed=1",
-                    "phase=phase2 scale=mini seed=0"):  # fmt: skip
+    for command in ("phase=phase1_further scale=mini seed=1", "phase=phase2 scale=mini seed=0"):
         assert f"python -m src.train {command}\n" in text
     assert Image.open(tmp_path / "reports" / "pictures" / "phase2_mini.png").width == 1600
     assert "(pictures/phase2_mini.png)" in text
@@ -78,19 +76,7 @@ def test_phase_2_is_held_against_phase_1(both_phases, report, tmp_path):
 def test_phase_1_keeps_its_own_page(both_phases, report):
     text = report("phase1")
     assert list(rows(text, "| experiment | mAP, % | NDS, % | mAVE, m/s | car AP, % |")) == ["KGGI + OCSF", "radar only"]
-    assert "init_from" not in text and "phase2" not in text
-
-
-@pytest.mark.slow
-def test_further_epochs_must_be_as_many(both_phases, write_run, report):
-    write_run("longer", [*FURTHER, "phase.epochs=9"], 0, 0.2, epochs=9)
-    write_run("weight", ["phase.init_from=phase1"], 0, 0.3)
-    summary = rows(report("phase2"), "| experiment | mAP, % | NDS, % | mAVE, m/s |")
-    assert [name for name in summary if "further" in name] == [
-        "phase 1, as many further epochs (`phase.init_from=phase1 phase.options.velocity_code_weight=1.0`)",
-        "phase 1, as many further epochs (`phase.init_from=phase1`)",
-        "phase 1, 9 further epochs",
-    ]
+    assert "further" not in text and "phase2" not in text
 
 
 @pytest.mark.slow
@@ -130,7 +116,7 @@ def test_phase_2_without_its_plain_run_has_no_gains(write_run, report):
 
 @pytest.mark.slow
 def test_no_run_of_the_phase_itself(write_run, report):
-    write_run("further", FURTHER, 0, 0.3)
+    write_run("further", [], 0, 0.3, phase="phase1_further")
     for phase in ("phase1", "phase2"):
         with pytest.raises(DataError, match=f"no finished run of {phase} at scale=mini"):
             report(phase)

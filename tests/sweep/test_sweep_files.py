@@ -116,7 +116,7 @@ def test_paper_numbers_are_those_reported_for_the_rows_configuration(name):
         for row in sweep.rows:
             config = build_config(tree_of("paper", overrides_of(sweep, row)))
             if not row.paper:  # ours, beside the paper's
-                assert config.phase.init_from == "phase1" and config.phase.name == "phase1", row.label
+                assert config.phase.init_from == "phase1" and config.phase.name == "phase1_further", row.label
                 continue
             wanted = ROW_OF[key](config)
             (entry,) = [e for e in table["rows"] if wanted.items() <= e.items()]
@@ -270,8 +270,8 @@ def test_overrides_of_a_scale_hold_at_that_scale_alone():
     assert small.at_scale("mini") == small  # as a record keeps it
     cycles = load_sweep("cycles")
     small, full = ({row.label: row.overrides for row in cycles.at_scale(scale).rows} for scale in ("mini", "paper"))
-    assert small["no memory, one cycle"] == ["phase=phase1", "phase.epochs=10", "phase.validate_every=10"]
-    assert full["no memory, one cycle"] == ["phase=phase1", "phase.epochs=48"]
+    cycle = ["optim.lr=2.0e-4", "optim.rise_fraction=0.4", "optim.final_lr_ratio=1.0e-4"]
+    assert small["memory, two cycles"] == ["phase=phase2", *cycle] and full["memory, two cycles"] == ["phase=phase2"]
 
 
 @pytest.mark.parametrize("scale", SCALES)
