@@ -10,7 +10,7 @@ from typing import Any
 
 from src.config import Config
 from src.data.datamodule import DetectionDataModule
-from src.errors import ConfigError
+from src.errors import ConfigError, DataError
 from src.metrics.submission import write_submission
 from src.models import build_model as build_model_of
 from src.models.detector import Detector
@@ -43,6 +43,25 @@ def data_root(config: Config, write: bool = True) -> Path:
         raise ConfigError("data.root is null and there is no data.world to write; give data.root=FOLDER")
     root = Path(data.root) if data.root else Path(config.paths.outputs) / "worlds" / world_digest(data.world)
     return ensure_world(data.world, root)
+
+
+def samples_of(config: Config) -> dict[str, Any]:
+    """What `data.root` holds, as runs record it; nothing where it is away or an empty mount point."""
+    root = config.data.root
+    if root is None or not any(Path(root).glob("*")):
+        return {}  # without a root the world identifies the run
+    return build_datamodule(config, data_root(config)).state_dict()
+
+
+def check_data(config: Config, run: Path, recorded: dict[str, Any], found: dict[str, Any]) -> None:
+    """Raises DataError when `samples_of` found other samples than the run has recorded; older runs recorded none."""
+    samples = recorded.get("samples_digest")
+    if found and samples not in (None, found["samples_digest"]):
+        raise DataError(
+            f"{run} was trained on {recorded.get('data')} with the samples {samples}, but data.root="
+            f"{config.data.root} holds {found['data']} with the samples {found['samples_digest']}; give the data.root "
+            "of the run, or resume=restart to move it aside and train anew on these"
+        )
 
 
 def build_datamodule(config: Config, root: Path) -> DetectionDataModule:

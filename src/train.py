@@ -12,10 +12,9 @@ from typing import Any
 
 import lightning as L
 
-from src.assembly import build_datamodule, build_module, data_root, save_submission
+from src.assembly import build_datamodule, build_module, check_data, data_root, samples_of, save_submission
 from src.config import PHASES, Config, compose_config, refuse_options_of_others
 from src.data.datamodule import DetectionDataModule
-from src.errors import DataError
 from src.pictures.learning_curves import draw_curves
 from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.checkpoints import OpenCheckpoint, open_checkpoint
@@ -95,12 +94,13 @@ def prepare(
             weights = open_source(source)
         folder.open(config.resume)
         if folder.finished:
-            check_data(config, folder, folder.read_result()[0])
+            check_data(config, folder.path, folder.read_result()[0], samples_of(config))
             show_finished(folder)
             return None
         resume = folder.newest_checkpoint()
         if resume is not None:
-            check_data(config, folder, resume.content.get(DetectionDataModule.__qualname__, {}))
+            recorded = resume.content.get(DetectionDataModule.__qualname__, {})
+            check_data(config, folder.path, recorded, samples_of(config))
         folder.start_log(tree)
         return {"resume": resume and str(resume.path), "root": str(data_root(config))}
 
@@ -110,23 +110,6 @@ def prepare(
     if decided["resume"] is not None:
         return StartingPoint(Path(decided["root"]), resume=resume or open_checkpoint(Path(decided["resume"])))
     return StartingPoint(Path(decided["root"]), weights=weights or (source and open_source(source)))
-
-
-def check_data(config: Config, folder: RunFolder, recorded: dict[str, Any]) -> None:
-    """Raises DataError when `data.root` holds other samples than the run has recorded.
-
-    It may be away, or an empty mount point; older runs recorded none; without a root the world identifies the run.
-    """
-    root, samples = config.data.root, recorded.get("samples_digest")
-    if root is None or samples is None or not any(Path(root).glob("*")):
-        return
-    found = build_datamodule(config, data_root(config)).state_dict()
-    if found["samples_digest"] != samples:
-        raise DataError(
-            f"{folder.path} was trained on {recorded.get('data')} with the samples {samples}, but data.root={root} "
-            f"holds {found['data']} with the samples {found['samples_digest']}; give the data.root of the run, or "
-            "resume=restart to move it aside and train anew on these"
-        )
 
 
 def run(

@@ -7,7 +7,10 @@ from pathlib import Path
 import pytest
 
 from src.config import compose_config
+from src.errors import DataError
 from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
+from src.sweep import compose
+from src.sweep.__main__ import main as run_sweep
 from src.world.write import ensure_world
 from tests.running import call
 
@@ -72,6 +75,19 @@ def test_a_finished_run_is_not_shown_for_other_data(outputs, worlds, tmp_path):
     train(outputs, worlds / "there", "resume=restart")
     second = json.loads((run_of(outputs) / "run.json").read_text())
     assert second["samples_digest"] != first["samples_digest"] and second["data"]["root"] == "there"
+
+
+def test_a_sweep_does_not_count_a_run_on_other_data(outputs, worlds, tmp_path, monkeypatch):
+    sweep = """{title: One, question: "Which?", baseline: a, overrides: [phase=phase1, model=centerpoint],
+      rows: [{label: a}],
+      tables: [{name: one, title: One, columns: [mAP]}]}"""
+    (tmp_path / "one.yaml").write_text(sweep)
+    monkeypatch.setattr(compose, "SWEEPS", tmp_path)
+    command = ["+sweep=one", "scale=debug", "data.world=null", "trainer.num_pictures=0", "workers=0"]
+    command += [f"paths.outputs={outputs}", f"paths.reports={tmp_path / 'reports'}"]
+    run_sweep([*command, f"data.root={worlds / 'here'}"])
+    with pytest.raises(DataError, match=f"{run_of(outputs)} was trained on.*there holds"):
+        run_sweep([*command, f"data.root={worlds / 'there'}"])
 
 
 def test_a_killed_run_does_not_resume_on_other_data(outputs, worlds, tmp_path):

@@ -46,7 +46,7 @@ from src.sweep.search import Search
 from src.sweep.sweep_study import FORMAT, SweepStudy, default_storage
 from src.training.handoff import find_source
 from src.training.identity import key_of, run_identity
-from src.training.run_folder import make_writable
+from src.training.run_folder import RunFolder, make_writable
 
 logger = logging.getLogger(__name__)
 
@@ -94,6 +94,7 @@ def run_plan(
     """
     make_writable(outputs / "sweeps", "paths.outputs")
     make_writable(reports / "sweeps", "paths.reports")
+    check_data_of_finished(plan, identify, outputs)
     study = SweepStudy(outputs, plan.study, command.storage or default_storage(outputs), definition(plan, common))
     launcher = Launcher(
         [sys.executable, "-m", "src.train"],
@@ -115,6 +116,21 @@ def run_plan(
         measured = measure_latencies(record, outputs, partial(latency_command, outputs), runner)
         logger.info("latency measured of %d runs", measured)
     finish(record, runner, outputs, reports, again)
+
+
+def check_data_of_finished(plan: Plan, identify: Identifier, outputs: Path) -> None:
+    """Raises DataError where a finished run was trained on other data than `data.root` holds, as training it would."""
+    known: dict[str, dict[str, Any]] = {}
+    for spec in plan.specs.values():
+        config, _ = identify.compose(join_overrides(spec.overrides, spec.machine))
+        if config.data.root is None or spec.run_id in plan.published or not is_done(outputs / spec.run_id):
+            continue
+        from src.assembly import check_data, samples_of  # the reader is not needed before
+
+        key = repr((config.data, config.model.sensors))
+        if key not in known:
+            known[key] = samples_of(config)
+        check_data(config, outputs / spec.run_id, RunFolder(outputs, spec.run_id).read_result()[0], known[key])
 
 
 def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, again: str) -> None:
