@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -94,17 +94,29 @@ def runs_on_page(
     today's.
     """
     names = NAMES_OF_COMPARISON if phase in PHASES_OF else NAMES
-    shown = []
+    runs: dict[str, RunResult] = {}
     for result in results:
-        overrides = without_defaults(result.overrides, defaults.get(result.phase, {}))
-        older = changed_since(result, defaults.get(result.phase, {}))
-        run = replace(result, overrides=overrides + older)
+        own = defaults.get(result.phase, {})
+        changes = without_defaults(result.overrides, own) + changed_since(result, own)
+        runs[result.run_id] = replace(result, overrides=changes)
+    shown = []
+    for run in runs.values():
+        run = _as_by_phase(run, runs, defaults)
         belongs = run.phase == phase or (run.phase in PHASES_OF.get(phase, ()) and not run.settings)
         belongs = belongs and run.epochs > 0
         known = (run.phase, *_settings_without_dropout(run)) in names
         if belongs and (known or run.run_id not in in_sweeps):
             shown.append(run)
     return shown if any(run.phase == phase for run in shown) else []
+
+
+def _as_by_phase(run: RunResult, runs: Mapping[str, RunResult], defaults: dict[str, dict[str, Any]]) -> RunResult:
+    """Started from the id of the very run that its phase starts from, without that setting."""
+    source = runs.get(str(run.config["phase"].get("init_from")))
+    usual = defaults.get(run.phase, {}).get("phase", {}).get("init_from")
+    if source is None or (source.phase, source.seed) != (usual, run.seed) or source.settings:
+        return run
+    return replace(run, overrides=[change for change in run.overrides if key_of(change) != "phase.init_from"])
 
 
 def split_by_data(runs: list[RunResult], phase: str) -> tuple[list[RunResult], list[RunResult]]:

@@ -32,9 +32,12 @@ def write_run(tmp_path: Path) -> Callable[..., Path]:
         phase: str = "phase1",
         epochs: int = 6,
         speeds: bool = False,
+        source: str | None = None,  # id of the run that it was told to start from
     ) -> Path:
         folder = tmp_path / f"horizon3d-{phase}-{scale}-{name}"
         folder.mkdir(parents=True)
+        told = {"init_from": source} if source else {}
+        overrides = [*overrides, *(f"phase.{key}={value}" for key, value in told.items())]
         record = {
             "run_id": folder.name, "overrides": overrides, "scale": scale, "seed": seed, "commit": "0123456789abcdef",
             "data": {"name": "synthetic highway", "version": "v1.2-trainval", "train_split": "train", "split": "val",
@@ -56,7 +59,7 @@ def write_run(tmp_path: Path) -> Callable[..., Path]:
         model = {
             "name": "horizon3d", "ocsf": {"margin_m": 4.8}, "doppler": {"in_losses": False, "along_heading": True}
         }  # fmt: skip
-        config = {"model": model, "phase": {"name": phase}, "seed": seed,
+        config = {"model": model, "phase": {"name": phase} | told, "seed": seed,
                   "data": {"root": str(tmp_path), "version": "v1.2-trainval"},
                   "backbone": {"file": f"{tmp_path}/r50.pth"},
                   "paths": {"outputs": str(tmp_path)}, "out": None}  # fmt: skip

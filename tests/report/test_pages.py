@@ -89,6 +89,18 @@ def test_weights_scored_once_more_are_left_to_their_sweeps(both_phases, write_ru
 
 
 @pytest.mark.slow
+def test_a_start_from_the_id_of_the_usual_run_is_no_setting(write_run, report):
+    for seed, settings in ((0, []), (1, []), (2, ["model.channels=32"])):
+        write_run(f"0000000{seed}", settings, seed, 0.3)
+        source = f"horizon3d-phase1-mini-0000000{seed}"
+        write_run(f"full{seed}", ["phase=phase2"], seed, 0.4, phase="phase2", source=source)
+    write_run("other", ["phase=phase2"], 1, 0.4, phase="phase2", source="horizon3d-phase1-mini-00000000")
+    summary = rows(report("phase2"), "| experiment | mAP, % | NDS, % | mAVE, m/s |")
+    started = [f"phase 2, `phase.init_from=horizon3d-phase1-mini-0000000{other}`" for other in (0, 2)]
+    assert sorted(summary) == sorted(["phase 1", "phase 2", *started])
+
+
+@pytest.mark.slow
 def test_an_unnamed_setting_shows_itself_last(both_phases, write_run, report):
     write_run("a", ["model.dptf.gaussian_path.sampling=random"], 0, 0.9, phase="phase2")
     names = list(rows(report("phase2"), "| experiment | mAP, % | NDS, % | mAVE, m/s |"))
