@@ -154,7 +154,7 @@ def test_a_run_is_named_by_its_id(tmp_path):
 
 @pytest.mark.parametrize("name", ["nowhere.ckpt", "phase9", "."])
 def test_a_file_that_does_not_exist(name):
-    with pytest.raises(CheckpointError, match=rf"init_from={name}.*no such checkpoint.*phase1, phase2"):
+    with pytest.raises(CheckpointError, match=rf"init_from={name}.*no such checkpoint.*phase1, phase1_further, phase2"):
         source_of("phase=phase2", f"phase.init_from={name}")
 
 
