@@ -45,7 +45,6 @@ def test_phase_2_composes_at_every_scale(scale):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", SCALES)
 def test_both_phases_of_mini_lie_within_one_cycle_of_the_learning_rate():
     first, second, further = (compose_config([f"phase={name}"])[0] for name in ("phase1", "phase2", "phase1_further"))
     assert first.optim.lr * first.optim.final_lr_ratio == pytest.approx(second.optim.lr * second.optim.peak_lr_ratio)
@@ -54,6 +53,8 @@ def test_both_phases_of_mini_lie_within_one_cycle_of_the_learning_rate():
     assert further.phase.options == second.phase.options and not further.phase.temporal
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
 @pytest.mark.parametrize("name", ["dense_bev", "crt_fusion", "hydra", "sparc", "petr", "far3d", "rctrans"])
 def test_other_detectors_without_lidar_compose_at_every_scale(scale, phase, name):
