@@ -48,7 +48,7 @@ define TRAIN
 $(PYTHON) -m src.train $(MODEL_ARG) phase=$(1) $(INIT_ARG) $(SCALE_ARG) $(ARGS)
 
 endef
-train: $(STAMP) ## train PHASE=1|2 [MODEL=lrs4fusion: all its phases] [CHECKPOINT=PATH] [SCALE=debug|mini|paper] [ARGS="optim.lr=2e-4 ..."]
+train: $(STAMP) ## train PHASE=1|2 [MODEL=lrs4fusion: all its phases] [CHECKPOINT=PATH] [SCALE=debug|mini|paper] [ARGS="seed=1 ..."]
 	$(foreach phase,$(PHASES),$(call TRAIN,$(phase)))
 
 sweep: $(STAMP) ## train every row of SWEEP=epsilon and write its tables [ARGS="seeds=3 workers=2 dry_run=true"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,14 +54,17 @@ def samples_of(config: Config) -> dict[str, Any]:
     return build_datamodule(config, data_root(config)).state_dict()
 
 
-def check_data(config: Config, run: Path, recorded: dict[str, Any], found: dict[str, Any]) -> None:
-    """Raises DataError when `samples_of` found other samples than the run has recorded; older runs recorded none."""
+def check_data(
+    config: Config, run: Path, recorded: dict[str, Any], find: Callable[[Config], dict[str, Any]] = samples_of
+) -> None:
+    """Raises DataError when `find` finds other samples than the run has recorded; older runs recorded none."""
     samples = recorded.get("samples_digest")
-    if found and samples not in (None, found["samples_digest"]):
+    found = {} if samples is None else find(config)
+    if found and samples != found["samples_digest"]:
         raise DataError(
             f"{run} was trained on {recorded.get('data')} with the samples {samples}, but data.root="
             f"{config.data.root} holds {found['data']} with the samples {found['samples_digest']}; give the data.root "
-            "of the run, or resume=restart to move it aside and train anew on these"
+            "of the run, another paths.outputs, or train it with resume=restart, which moves it aside, anew on these"
         )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import lightning as L
 
-from src.assembly import build_datamodule, build_module, check_data, data_root, samples_of, save_submission
+from src.assembly import build_datamodule, build_module, check_data, data_root, save_submission
 from src.config import PHASES, Config, compose_config, refuse_options_of_others
 from src.data.datamodule import DetectionDataModule
 from src.pictures.learning_curves import draw_curves
@@ -94,13 +94,12 @@ def prepare(
             weights = open_source(source)
         folder.open(config.resume)
         if folder.finished:
-            check_data(config, folder.path, folder.read_result()[0], samples_of(config))
+            check_data(config, folder.path, folder.read_result()[0])
             show_finished(folder)
             return None
         resume = folder.newest_checkpoint()
         if resume is not None:
-            recorded = resume.content.get(DetectionDataModule.__qualname__, {})
-            check_data(config, folder.path, recorded, samples_of(config))
+            check_data(config, folder.path, resume.content.get(DetectionDataModule.__qualname__, {}))
         folder.start_log(tree)
         return {"resume": resume and str(resume.path), "root": str(data_root(config))}
 

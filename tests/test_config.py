@@ -12,6 +12,7 @@ from src.config import CONF, compose_config, refuse_options_of_others, restore_c
 from src.errors import CheckpointError, ConfigError
 from src.reliability.command import run_command
 from src.training.identity import YOUNGER_KEYS, run_identity, without_keys
+from src.training.optim import cycle_value
 from tests.running import command
 
 SCALES = sorted(p.stem for p in (CONF / "scale").glob("*.yaml"))
@@ -48,7 +49,8 @@ def test_phase_2_composes_at_every_scale(scale):
 def test_both_phases_of_mini_lie_within_one_cycle_of_the_learning_rate():
     first, second, further = (compose_config([f"phase={name}"])[0] for name in ("phase1", "phase2", "phase1_further"))
     assert first.optim.lr * first.optim.final_lr_ratio == pytest.approx(second.optim.lr * second.optim.peak_lr_ratio)
-    assert second.optim.rise_fraction == 0
+    assert second.optim.rise_fraction == 0 and first.optim.rise_fraction * first.phase.epochs == pytest.approx(4, 1e-3)
+    assert first.optim.final_lr_ratio == cycle_value(6, first.phase.epochs + second.phase.epochs, 0.4, 1.0, 10.0, 0.0)
     assert (further.optim, further.phase.epochs) == (second.optim, second.phase.epochs)
     assert further.phase.options == second.phase.options and not further.phase.temporal
 

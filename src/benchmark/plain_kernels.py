@@ -192,23 +192,30 @@ def _sum_norm(
 
 
 @_of_kernel
-def _rank(
-    logits: Tensor, keys: Tensor, neighbours: Tensor, table: Tensor, ranks: Tensor, num: int, classes: int, end: int,
-    *, PEAKS: bool,
+def _sort_keys_of_pairs(
+    logits: Tensor, keys: Tensor, neighbours: Tensor, table: Tensor, sort_keys: Tensor, num: int, classes: int,
+    end: int, *, PEAKS: bool,
 ) -> None:  # fmt: skip
     scores = logits.sigmoid()
     if PEAKS:
         others = F.pad(scores, (0, 0, 1, 0), value=-torch.inf)[neighbours.long() + 1]  # [9, M, classes]
         scores = scores * (scores == others.amax(0))
     scores = scores.where((keys < end)[:, None], 0.0)
-    ranks.copy_(sort_keys_of_scores(scores, tuple(map(tuple, table.tolist()))))
+    sort_keys.copy_(sort_keys_of_scores(scores, tuple(map(tuple, table.tolist()))))
 
 
 @_of_kernel
-def _read_ranks(
-    ranks: Tensor, table: Tensor, scores: Tensor, rows: Tensor, labels: Tensor, num: int, of_group: int, classes: int
+def _candidates_of_sort_keys(
+    sort_keys: Tensor,
+    table: Tensor,
+    scores: Tensor,
+    rows: Tensor,
+    labels: Tensor,
+    num: int,
+    of_group: int,
+    classes: int,
 ) -> None:
-    found = unpack_candidates_reference(ranks, tuple(map(tuple, table.tolist())), classes)
+    found = unpack_candidates_reference(sort_keys, tuple(map(tuple, table.tolist())), classes)
     for out, values in zip((scores, rows, labels), found, strict=True):
         out.copy_(values)
 

@@ -13,7 +13,7 @@ import yaml
 from src.report.escaping import as_code, escape_markdown
 from src.report.metric_names import DETECTION, SPEEDS, Metric
 from src.report.plain_yaml import load_plain_yaml
-from src.report.results import NOT_A_SETTING, RunResult
+from src.report.results import NOT_A_SETTING, RunResult, settings_of
 from src.report.score_tables import (
     BY_LONG_RANGE,
     BY_RANGE,
@@ -58,6 +58,7 @@ NAMES_OF_COMPARISON = {
 """By phase and sorted settings, in the order of the page."""
 
 DROPOUT = "data.sensor_dropout="
+OF_THE_PHASE = ("model.dptf", "data.sensor_dropout")
 
 SCORES = (
     "means over seeds, in brackets 95 % intervals over the validation scenes; bold is decided against every other row."
@@ -111,12 +112,17 @@ def runs_on_page(
 
 
 def _as_by_phase(run: RunResult, runs: Mapping[str, RunResult], defaults: dict[str, dict[str, Any]]) -> RunResult:
-    """Started from the id of the very run that its phase starts from, without that setting."""
+    """Started from the id of the very run that its phase starts from, without that setting.
+
+    What only the phase itself has, as its memory, is no setting of that run.
+    """
     source = runs.get(str(run.config["phase"].get("init_from")))
     usual = defaults.get(run.phase, {}).get("phase", {}).get("init_from")
     if source is None or (source.phase, source.seed) != (usual, run.seed) or source.settings:
         return run
-    return replace(run, overrides=[change for change in run.overrides if key_of(change) != "phase.init_from"])
+    others = [change for change in run.overrides if key_of(change) != "phase.init_from"]
+    shared = [change for change in settings_of(others) if not is_of(change, OF_THE_PHASE)]
+    return run if shared else replace(run, overrides=others)
 
 
 def split_by_data(runs: list[RunResult], phase: str) -> tuple[list[RunResult], list[RunResult]]:

@@ -122,15 +122,20 @@ def check_data_of_finished(plan: Plan, identify: Identifier, outputs: Path) -> N
     """Raises DataError where a finished run was trained on other data than `data.root` holds, as training it would."""
     known: dict[str, dict[str, Any]] = {}
     for spec in plan.specs.values():
-        config, _ = identify.compose(join_overrides(spec.overrides, spec.machine))
-        if config.data.root is None or spec.run_id in plan.published or not is_done(outputs / spec.run_id):
+        if not any(key_of(override) == "data.root" for override in spec.machine) or spec.run_id in plan.published:
+            continue
+        if not is_done(outputs / spec.run_id):
             continue
         from src.assembly import check_data, samples_of  # the reader is not needed before
 
-        key = repr((config.data, config.model.sensors))
-        if key not in known:
-            known[key] = samples_of(config)
-        check_data(config, outputs / spec.run_id, RunFolder(outputs, spec.run_id).read_result()[0], known[key])
+        def find(config: Config) -> dict[str, Any]:
+            key = repr((config.data, config.model.sensors))
+            if key not in known:
+                known[key] = samples_of(config)
+            return known[key]
+
+        config, _ = identify.compose(join_overrides(spec.overrides, spec.machine))
+        check_data(config, outputs / spec.run_id, RunFolder(outputs, spec.run_id).read_result()[0], find)
 
 
 def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, again: str) -> None:

@@ -95,9 +95,13 @@ def test_a_start_from_the_id_of_the_usual_run_is_no_setting(write_run, report):
         source = f"horizon3d-phase1-mini-0000000{seed}"
         write_run(f"full{seed}", ["phase=phase2"], seed, 0.4, phase="phase2", source=source)
     write_run("other", ["phase=phase2"], 1, 0.4, phase="phase2", source="horizon3d-phase1-mini-00000000")
+    for name, setting in (("alone", "model.dptf.gaussian_path=null"), ("narrow", "model.ocsf.margin_m=1.6")):
+        write_run(name, [setting], 0, 0.4, phase="phase2", source="horizon3d-phase1-mini-00000000")
     summary = rows(report("phase2"), "| experiment | mAP, % | NDS, % | mAVE, m/s |")
     started = [f"phase 2, `phase.init_from=horizon3d-phase1-mini-0000000{other}`" for other in (0, 2)]
-    assert sorted(summary) == sorted(["phase 1", "phase 2", *started])
+    narrow = "phase 2, `model.ocsf.margin_m=1.6 phase.init_from=horizon3d-phase1-mini-00000000`"  # of another phase 1
+    names = ["phase 1", "phase 2", "phase 2, `model.dptf.gaussian_path=null`", narrow, *started]
+    assert sorted(summary) == sorted(names)
 
 
 @pytest.mark.slow
