@@ -271,7 +271,8 @@ def test_overrides_of_a_scale_hold_at_that_scale_alone():
     cycles = load_sweep("cycles")
     small, full = ({row.label: row.overrides for row in cycles.at_scale(scale).rows} for scale in ("mini", "paper"))
     cycle = ["optim.lr=2.0e-4", "optim.rise_fraction=0.4", "optim.final_lr_ratio=1.0e-4"]
-    assert small["memory, two cycles"] == ["phase=phase2", *cycle] and full["memory, two cycles"] == ["phase=phase2"]
+    assert small["memory, two cycles"] == ["phase=phase2", *cycle] and "memory, two cycles" not in full
+    assert full["no memory, one cycle at once"] == ["phase=phase1", "phase.epochs=48"]
 
 
 @pytest.mark.parametrize("scale", SCALES)
