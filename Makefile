@@ -19,7 +19,7 @@ else
 PHASE ?= 1
 PHASES := phase$(PHASE)
 endif
-$(if $(filter phase1 phase2 lrs_occupancy lrs_forecast lrs_detection,$(PHASES)),,$(error PHASE=$(PHASE): must be 1 or 2, or with MODEL=lrs4fusion occupancy, forecast or detection))
+$(if $(filter phase1 phase1_further phase2 lrs_occupancy lrs_forecast lrs_detection,$(PHASES)),,$(error PHASE=$(PHASE): must be 1, 1_further or 2, or with MODEL=lrs4fusion occupancy, forecast or detection))
 MODEL_ARG := $(if $(MODEL),model=$(MODEL))
 
 .PHONY: help install world train sweep study report dashboard benchmark performance test test-all test-faults audit gpu check
@@ -48,7 +48,7 @@ define TRAIN
 $(PYTHON) -m src.train $(MODEL_ARG) phase=$(1) $(INIT_ARG) $(SCALE_ARG) $(ARGS)
 
 endef
-train: $(STAMP) ## train PHASE=1|2 [MODEL=lrs4fusion: all its phases] [CHECKPOINT=PATH] [SCALE=debug|mini|paper] [ARGS="seed=1 ..."]
+train: $(STAMP) ## train PHASE=1|1_further|2 [MODEL=lrs4fusion: all its phases] [CHECKPOINT=PATH] [SCALE=debug|mini|paper] [ARGS="seed=1 ..."]
 	$(foreach phase,$(PHASES),$(call TRAIN,$(phase)))
 
 sweep: $(STAMP) ## train every row of SWEEP=epsilon and write its tables [ARGS="seeds=3 workers=2 dry_run=true"]

@@ -1,12 +1,16 @@
 """What a frame and a step would launch and wait for on a GPU: the simulated device counts right, and budgets hold."""
 
 import json
+import re
+from pathlib import Path
 
 import pytest
 import torch
 
+from src.benchmark.plain_kernels import KERNELS
 from src.benchmark.simulated_device import DEVICE, SimulatedDevice
 from src.geometry.constants import upload
+from src.ops import backend
 from src.ops.segment_reduce import segment_sum
 from tests.running import command
 
@@ -66,6 +70,12 @@ def test_tensors_of_one_type_are_uploaded_together():
         assert tally.totals()["uploads"] == 3 and tally.totals()["waits"] == 0
         found = [tensor.cpu() for tensor in moved]
     assert all(torch.equal(one, other) for one, other in zip(found, [*host, torch.tensor([4])], strict=True))
+
+
+def test_every_kernel_that_is_launched_has_a_plain_form_of_its_name():
+    sources = [path.read_text() for path in Path(backend.__file__).parent.glob("kernels/*_triton.py")]
+    launched = {name for source in sources for name in re.findall(r"^ +(_\w+)\[", source, re.MULTILINE)}
+    assert launched == set(KERNELS)
 
 
 def test_a_frame_and_a_training_step_keep_their_budgets(tmp_path):

@@ -597,12 +597,12 @@ def test_make_hands_the_checkpoint_on():
     options = shown("PHASE=2", f"CHECKPOINT={path}")
     assert options[0] == "phase=phase2" and compose_config(options)[0].phase.init_from == path
     assert shown("PHASE=2", "SCALE=debug") == ["phase=phase2", "scale=debug"]
-    assert shown() == ["phase=phase1"]
+    assert shown() == ["phase=phase1"] and shown("PHASE=1_further") == ["phase=phase1_further"]
     for phase in ("", "3", "phase2"):
         wrong = subprocess.run(["make", "-n", "train", f"PHASE={phase}"], cwd=ROOT, capture_output=True, text=True)
-        assert wrong.returncode == 2 and f"PHASE={phase}: must be 1 or 2" in wrong.stderr
+        assert wrong.returncode == 2 and f"PHASE={phase}: must be 1, 1_further or 2" in wrong.stderr
     helped = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    assert "PHASE=1|2" in helped and "CHECKPOINT=PATH" in helped
+    assert "PHASE=1|1_further|2" in helped and "CHECKPOINT=PATH" in helped
 
 
 def test_norms_that_were_handed_over_may_keep_their_statistics():
