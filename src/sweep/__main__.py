@@ -120,20 +120,26 @@ def run_plan(
 
 def check_data_of_finished(plan: Plan, identify: Identifier, outputs: Path) -> None:
     """Raises DataError where a finished run was trained on other data than `data.root` holds, as training it would."""
+    finished = [
+        spec
+        for spec in plan.specs.values()
+        if any(key_of(override) == "data.root" for override in spec.machine)
+        and spec.run_id not in plan.published
+        and is_done(outputs / spec.run_id)
+    ]
+    if not finished:
+        return
+    from src.assembly import check_data, samples_of  # the reader is not needed before
+
     known: dict[str, dict[str, Any]] = {}
-    for spec in plan.specs.values():
-        if not any(key_of(override) == "data.root" for override in spec.machine) or spec.run_id in plan.published:
-            continue
-        if not is_done(outputs / spec.run_id):
-            continue
-        from src.assembly import check_data, samples_of  # the reader is not needed before
 
-        def find(config: Config) -> dict[str, Any]:
-            key = repr((config.data, config.model.sensors))
-            if key not in known:
-                known[key] = samples_of(config)
-            return known[key]
+    def find(config: Config) -> dict[str, Any]:
+        key = repr((config.data, config.model.sensors))
+        if key not in known:
+            known[key] = samples_of(config)
+        return known[key]
 
+    for spec in finished:
         config, _ = identify.compose(join_overrides(spec.overrides, spec.machine))
         check_data(config, outputs / spec.run_id, RunFolder(outputs, spec.run_id).read_result()[0], find)
 

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from src.geometry.bev_grid import BEVGrid
+from src.models.layers.image_attention import PointOffsets
 from src.models.layers.query_attention import DistanceAttention, QueryEmbedding
 from src.structures.queries import Queries
 
@@ -115,3 +116,16 @@ def test_places_are_told_apart(step):
         found = embedding(queries)
     assert found.dtype == torch.float32
     assert (found[0, 0] - found[0, 1]).norm() > 0.01 and (found[0, 0] - found[0, 2]).norm() > 0.01
+
+
+def test_untrained_sampling_points_lie_within_their_reach_and_are_what_the_layer_adds_to_a_querys_place():
+    torch.manual_seed(0)
+    layer = PointOffsets(C, 64, reach_m=2.0)
+    query, centers = torch.randn(2, 5, C), torch.randn(2, 5, 3) * 50
+    offsets = layer(query, centers) - centers[:, :, None]
+    assert 1.9 < offsets.abs().max() < 2.0001
+    torch.testing.assert_close(offsets[0, 0], offsets[1, 4], atol=1e-4, rtol=0)  # the same of every query
+    torch.nn.init.normal_(layer.weight)
+    added = (query[1, 3] @ layer.weight.T + layer.bias).view(64, 3)  # point by point, x, y, z
+    torch.testing.assert_close(layer(query, centers)[1, 3], centers[1, 3] + added)
+    assert layer.bfloat16()(query.bfloat16(), centers).dtype == torch.float32  # places keep their digits
