@@ -57,6 +57,14 @@ def test_both_phases_of_mini_lie_within_one_cycle_of_the_learning_rate():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
+def test_all_phases_of_lrs4fusion_give_the_network_the_same_speeds(scale):
+    own = ("model=lrs4fusion", f"scale={scale}", "data.root=x")
+    phases = ("lrs_occupancy", "lrs_forecast", "lrs_detection")
+    assert len({compose_config([*own, f"phase={name}"])[0].data.timeline.radial_speeds for name in phases}) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
 @pytest.mark.parametrize("name", ["dense_bev", "crt_fusion", "hydra", "sparc", "petr", "far3d", "rctrans"])
 def test_other_detectors_without_lidar_compose_at_every_scale(scale, phase, name):
@@ -378,7 +386,8 @@ def test_a_second_score_of_detections_composes_and_an_older_checkpoint_has_none(
 
 @pytest.mark.parametrize(("key", "before"), YOUNGER_KEYS.items())
 def test_what_was_made_before_there_was_a_key_is_what_it_was(key, before):
-    config, tree = compose_config(["scale=debug", "phase=phase2", f"{key}={json.dumps(before)}"])
+    own = ["model=lrs4fusion", "phase=lrs_forecast"] if "ray" in key else ["phase=phase2"]
+    config, tree = compose_config(["scale=debug", *own, f"{key}={json.dumps(before)}"])
     older = without_keys(tree, [key])
     assert older != tree and run_identity(older) == run_identity(tree)
     assert restore_config(older, []) == config

@@ -20,6 +20,12 @@ ROWS = {
     "l1_150-250m": "L1 150-250 m",
 }
 HORIZONS = ("1s", "3s")
+OCCUPANCY = {
+    "iou": "IoU along rays",
+    "slice_iou": "IoU above the ground",
+    "velocity_median_moving": "radial velocity of what moves: median error, m/s",
+    "velocity_error_moving": "mean error, m/s",
+}
 
 
 def format_forecast(metrics: Mapping[str, Any]) -> str:
@@ -38,15 +44,13 @@ def format_forecast(metrics: Mapping[str, Any]) -> str:
 
 
 def format_occupancy(metrics: Mapping[str, Any]) -> str:
-    """Intersection over union by time, along rays and one metre above the ground; radial velocities."""
+    """By time intersection over union, along rays and one metre above the ground, and errors of radial velocities."""
     times = sorted({name.partition("@")[2] for name in metrics if name.startswith("iou@")}, key=lambda t: float(t[:-1]))
-    rows = [["time", "IoU along rays", "IoU above the ground"]]
-    rows += [[time, *(_plain(metrics.get(f"{kind}@{time}")) for kind in ("iou", "slice_iou"))] for time in times]
-    rows.append(["all", _plain(metrics.get("iou")), ""])
-    names = {"velocity_error_moving": "mean", "velocity_median_moving": "median"}
-    speeds = [f"{words} {_plain(metrics[name])}" for name, words in names.items() if metrics.get(name) is not None]
-    text = f"radial velocity error of what moves, m/s: {', '.join(speeds)}"
-    return "\n\n".join([align(rows), *([text] if speeds else [])])
+    kinds = {kind: words for kind, words in OCCUPANCY.items() if kind.endswith("iou") or metrics.get(kind) is not None}
+    rows = [["time", *kinds.values()]]
+    rows += [[time, *(_plain(metrics.get(f"{kind}@{time}")) for kind in kinds)] for time in times]
+    rows.append(["all", *(_plain(metrics.get(kind)) for kind in kinds)])
+    return align(rows)
 
 
 def _gain(metrics: Mapping[str, Any], name: str) -> str:

@@ -112,6 +112,8 @@ for _step in range(4):
     for _key, _words in (("iou", "IoU along rays"), ("slice_iou", "IoU above the ground")):
         _name = f"{_key}@{_step}.0s"
         FORECASTS[_name] = Metric(_name, f"{_words} at {_step} s", "%", 100.0, 1)
+    _name, _words = f"velocity_median_moving@{_step}.0s", "median radial velocity error of what moves"
+    FORECASTS[_name] = Metric(_name, f"{_words} at {_step} s", "m/s", 1.0, 2, False)
 for _key, _words in (("velocity_error_moving", "mean"), ("velocity_median_moving", "median")):
     FORECASTS[_key] = Metric(_key, f"{_words} radial velocity error of what moves", "m/s", 1.0, 2, False)
 

@@ -168,12 +168,18 @@ def draw_rays(
     bounds: Bounds,
     count: int,
     generator: torch.Generator | None = None,  # on the rays' device
+    range_power: float = 0.0,
 ) -> RayBundle:
-    """Up to `count` rays of every sample and target time that end in the bounds, without replacement, in order."""
+    """Up to `count` rays of every sample and target time that end in the bounds, without replacement, in order.
+
+    Each has a chance in proportion to its range to `range_power`, one after the other among those that are left.
+    """
     low, high = torch.tensor(bounds, dtype=rays.origins.dtype, device=rays.origins.device).unbind(1)
     ends = rays.points
     rows = ((ends >= low) & (ends < high)).all(1).nonzero().squeeze(1)
-    rows = rows[torch.rand(len(rows), generator=generator, device=rows.device).argsort()]
+    # The first of exponential times at rates w is each with chance w / sum(w); then the same among the rest.
+    times = -torch.log1p(-torch.rand(len(rows), generator=generator, device=rows.device))
+    rows = rows[(times / rays.ranges[rows] ** range_power).argsort()]
     rows = rows[_group(rays)[rows].argsort(stable=True)]
     _, sizes = torch.unique_consecutive(_group(rays)[rows], return_counts=True)
     starts = sizes.cumsum(0) - sizes

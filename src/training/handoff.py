@@ -33,10 +33,10 @@ OF_THIS_RUN = ("phase", "resume")
 OF_STREAMED_DATA = tuple(f"data.{key}" for key in TEMPORAL_DATA_KEYS)
 """Nor do these and the model's `keys_of_temporal_phase`, where that run is of single frames."""
 INPUT_SETTINGS = (
-    *("num_sweeps", "num_lidar_sweeps", "deskew_lidar"),
-    *("min_distance_m", "propagate_points", "test_resize_offset"),
+    *("data.num_sweeps", "data.num_lidar_sweeps", "data.deskew_lidar", "data.timeline.radial_speeds"),
+    *("data.min_distance_m", "data.propagate_points", "data.test_resize_offset"),
 )
-"""Of `data`: what the weights have learnt to see."""
+"""What the weights have learnt to see of data."""
 
 Compose = Callable[[list[str]], tuple[Any, dict[str, Any]]]
 """Overrides to a run's configuration, as dataclasses and as plain values (`compose_config`)."""
@@ -190,9 +190,9 @@ def differing_settings(
         return {key: value for name in node for key, value in flat(node[name], f"{prefix}.{name}").items()}
 
     def settings(tree: dict[str, Any]) -> dict[str, Any]:
-        parts = {name: tree.get(name) for name in ("model", "backbone", "grid")}
-        parts["data"] = {name: value for name, value in (tree.get("data") or {}).items() if name in INPUT_SETTINGS}
-        return {key: value for name, part in parts.items() for key, value in flat(part, name).items()}
+        parts = [flat(tree.get(name), name) for name in ("model", "backbone", "grid", "data")]
+        whole = {key: value for part in parts for key, value in part.items()}
+        return {key: value for key, value in whole.items() if not key.startswith("data.") or key in INPUT_SETTINGS}
 
     before, after = settings(old), settings(new)
     own = ("model.loss.", *(f"{key}." for key in temporal))

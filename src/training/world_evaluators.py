@@ -56,7 +56,7 @@ class WorldScores:
     """Of one sample."""
 
     sums: dict[str, Array] = field(default_factory=dict)  # [2] total and count by number
-    speed_errors: Array | None = None  # [n] m/s, of rays that end on what moves
+    speed_errors: dict[int, Array] = field(default_factory=dict)  # by step: [n] m/s, of rays that end on what moves
     forecasts: dict[str, ForecastScores] = field(default_factory=dict)  # by the prefix of their numbers
 
     def add(self, name: str, values: Tensor | Array, among: Tensor | Array) -> None:
@@ -73,7 +73,8 @@ class OccupancyEvaluator(Evaluator):
 
     `iou@<t>s` is of places along rays, half of them occupied, `iou` of all times; `slice_iou@<t>s` of a lattice one
     metre above the ground, as far as the rays of the time tell of it. `velocity_error_moving`: mean of
-    |predicted - true| m/s where rays end on what moves.
+    |predicted - true| m/s where rays end on what moves, `velocity_median_moving` and `velocity_median_moving@<t>s` the
+    median, over all times and of one.
 
     A sample that several processes saw counts once.
     """
@@ -177,7 +178,8 @@ class OccupancyEvaluator(Evaluator):
         errors, known = (found.cpu() - speeds).abs().nan_to_num(), ~speeds.isnan()
         scores.add("velocity_error_moving", errors, moves & known)
         scores.add("velocity_error_standing", errors, ~moves & known)
-        scores.speed_errors = errors[moves & known].numpy()
+        for step in rays.steps.unique().tolist():
+            scores.speed_errors[step] = errors[moves & known & (rays.steps.cpu() == step)].numpy()
 
     def _truth_of(self, row: int) -> TrueGeometry | None:
         scene = int(self.index.sample_scenes[row])
@@ -196,9 +198,7 @@ class OccupancyEvaluator(Evaluator):
         names = sorted({name for row in rows for name in found[row].sums})
         sums = {name: np.stack([found[row].sums.get(name, np.zeros(2)) for row in rows]) for name in names}
         numbers = {name: float(values[0]) for name, values in self._ratios(sums, np.ones((1, len(rows)))).items()}
-        errors = [found[row].speed_errors for row in rows if found[row].speed_errors is not None]
-        if sum(map(len, errors)):
-            numbers["velocity_median_moving"] = float(np.median(np.concatenate(errors)))
+        numbers |= self._median_speed_errors([found[row].speed_errors for row in rows])
         for prefix in {prefix for row in rows for prefix in found[row].forecasts}:
             joined = ForecastScores.join([found[row].forecasts[prefix] for row in rows])
             medians = median_errors(joined, self.timeline.interval_s)
@@ -206,6 +206,13 @@ class OccupancyEvaluator(Evaluator):
         self.content = _plain(numbers) | {"intervals": self._intervals(sums, self.index.sample_scenes[rows])}
         shown = (name for name in (self.headline, *self.logged) if numbers.get(name) is not None)
         return {self.headline: float("nan")} | {name: numbers[name] for name in shown}
+
+    def _median_speed_errors(self, by_sample: list[dict[int, Array]]) -> dict[str, float]:
+        steps = sorted({step for errors in by_sample for step in errors})
+        joined = {step: np.concatenate([errors[step] for errors in by_sample if step in errors]) for step in steps}
+        named = {f"@{step * self.timeline.interval_s:.1f}s": errors for step, errors in joined.items()}
+        named |= {"": np.concatenate([np.zeros(0), *joined.values()])}
+        return {f"velocity_median_moving{time}": float(np.median(own)) for time, own in named.items() if len(own)}
 
     def _ratios(
         self,

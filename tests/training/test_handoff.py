@@ -29,7 +29,7 @@ from src.errors import (
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.reliability.checkpoints import open_checkpoint
 from src.training import handoff
-from src.training.handoff import find_source, hand_over, norms_handed_over, train_source
+from src.training.handoff import differing_settings, find_source, hand_over, norms_handed_over, train_source
 from src.training.identity import run_identity
 from src.training.module import TrainingModule
 from src.training.run_folder import RunFolder, name_of
@@ -423,6 +423,15 @@ def test_settings_without_weights_that_differ_are_logged(phase_1, caplog):
     warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     text = "{} in the run these weights come from and is {} now"
     assert sorted(warned) == [text.format("data.num_sweeps was 2", 1), text.format("model.ocsf.margin_m was 4.8", 1.6)]
+
+
+def test_a_phase_that_gives_the_network_other_inputs_says_so():
+    before, after = (
+        {"data": {"num_sweeps": 5, "timeline": {"radial_speeds": source, "scored_rays": rays}}, "grid": None}
+        for source, rays in (("radar", 64), ("none", 128))
+    )
+    assert differing_settings(before, after, ()) == {"data.timeline.radial_speeds": ("radar", "none")}
+    assert differing_settings(before, {"data": {"num_sweeps": 6, "timeline": None}}, ()) == {"data.num_sweeps": (5, 6)}
 
 
 # ---------------------------------------------------------------- the commands

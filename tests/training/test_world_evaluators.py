@@ -149,6 +149,9 @@ def test_the_true_geometry_tells_what_moves_and_what_is_solid(tmp_path):
     # Along a ray at an angle the wall's speed is its cosine's share; the lattice ends at the bounds, 40 m.
     bearings = torch.linspace(-0.5, 0.5, 41)
     assert found["velocity_error_moving"] == pytest.approx(float((5 * bearings.cos() - 4).abs().mean()), abs=0.05)
+    of_one_time = float((5 * bearings.cos() - 4).abs().median())
+    assert found["velocity_median_moving@1.0s"] == pytest.approx(of_one_time, abs=0.05)
+    assert found["velocity_median_moving"] == pytest.approx(of_one_time, abs=0.05)  # the wall is as fast at any time
     assert found["velocity_error_standing"] is None
     # 20 to 40 m are said to be matter and 20 to 30 m are, but no ray tells of what lies deeper than a metre.
     assert found["slice_iou@0.0s"] == found["slice_iou@1.0s"] == 1

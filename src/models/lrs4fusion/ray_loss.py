@@ -36,11 +36,13 @@ class LRSLossConfig(LossWeights):
     moving_weight: float  # of the error of what is measured to move faster than MOVING_MPS, within the mean
     range_weight: float
     rays_per_frame: int  # rays of each sample and target time that the ray head learns from
+    ray_range_power: float  # they are drawn with chances in proportion to their ranges to this power
     sampling: RaySampling
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_least(self, "model.loss", {"rays_per_frame": 1, "moving_weight": 1, "velocity_beta_mps": 0})
+        least = {"rays_per_frame": 1, "ray_range_power": 0, "moving_weight": 1, "velocity_beta_mps": 0}
+        require_least(self, "model.loss", least)
 
 
 def occupancy_objective(answer: Answer, rays: RayBundle, bounds: Bounds, config: LRSLossConfig) -> Objective:
@@ -72,7 +74,7 @@ def range_objective(
     ray_ranges: Callable[[RayBundle], Tensor], rays: RayBundle, bounds: Bounds, config: LRSLossConfig
 ) -> Objective:
     """The weighted term `range`: L1 between ranges, of rays that end in the bounds."""
-    drawn = draw_rays(rays, bounds, config.rays_per_frame)
+    drawn = draw_rays(rays, bounds, config.rays_per_frame, range_power=config.ray_range_power)
     errors = (full_precision(ray_ranges(drawn)) - drawn.ranges).abs()
     count = mean_over_ranks(torch.as_tensor(len(drawn), device=errors.device))
     return Objective({"range": config.range_weight * errors.sum() / count}, {})

@@ -106,9 +106,24 @@ def test_rays_are_drawn_without_replacement_from_each_sample_and_time():
     assert torch.equal(draw_rays(rays, BOUNDS, 99).ranges, rays.ranges)
 
 
+def test_far_rays_are_drawn_more_often_by_a_power_of_their_range():
+    """One ray in ten ends three times as far: by the square it is drawn first as often as the other nine."""
+    many = rays_along_x(([10.0] * 9 + [30.0]) * 2000, steps=torch.arange(20_000) // 10)
+    generator = torch.Generator().manual_seed(0)
+    shares = [(draw_rays(many, BOUNDS, 1, generator, power).ranges > 20).float().mean() for power in (0.0, 2.0)]
+    assert shares[0] == pytest.approx(0.1, abs=0.02) and shares[1] == pytest.approx(0.5, abs=0.03)
+    pairs = draw_rays(many, BOUNDS, 2, generator, 2.0)
+    assert torch.equal(pairs.steps.bincount(), torch.full((2000,), 2))
+    drawn = []
+    chosen = settings(rays_per_frame=1, ray_range_power=2.0)
+    range_objective(lambda rays: drawn.append(rays) or rays.ranges, many, BOUNDS, chosen)
+    assert (drawn[0].ranges > 20).float().mean() == pytest.approx(0.5, abs=0.03)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ("ray_range_power=-1", r"model.loss.ray_range_power"),
         ("rays_per_frame=0", r"model.loss.rays_per_frame"),
         ("moving_weight=0.5", r"model.loss.moving_weight"),
         ("velocity_beta_mps=-1", r"model.loss.velocity_beta_mps"),
