@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import nn
+from torch.nn.modules.conv import _ConvNd
 from torch.optim.lr_scheduler import LRScheduler
 
 from src.errors import ConfigError, require_least
@@ -52,7 +53,7 @@ def parameter_groups(
     decayed = {
         id(module.weight)
         for module in model.modules()
-        if isinstance(module, (nn.Linear, nn.Conv2d, nn.ConvTranspose2d, SparseKernel))
+        if isinstance(module, (nn.Linear, _ConvNd, SparseKernel))
     }
     in_backbone = {id(parameter) for parameter in backbone.parameters()} if backbone is not None else set()
     groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}

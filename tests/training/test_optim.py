@@ -66,12 +66,13 @@ def test_only_weights_of_layers_decay():
             "norm": nn.BatchNorm2d(2),
             "sparse": SubmanifoldConv(2, 2, kernel_size=3, ndim=2, bias=True),
             "slots": nn.Embedding(3, 2),
+            "along_rays": nn.Conv1d(2, 2, 4),
         }
     )
     groups = parameter_groups(model, config(), backbone=model["conv"], backbone_lr_multiplier=0.1)
     found = {(g["weight_decay"], round(g["lr"], 9)): sum(p.numel() for p in g["params"]) for g in groups}
-    conv, sparse = 2 * 2 * 9, 2 * 2 * 9
-    assert found == {(0.01, 1e-5): conv, (0.0, 1e-5): 2, (0.01, 1e-4): sparse, (0.0, 1e-4): 4 + 2 + 6}
+    conv, sparse, along_rays = 2 * 2 * 9, 2 * 2 * 9, 2 * 2 * 4
+    assert found == {(0.01, 1e-5): conv, (0.0, 1e-5): 2, (0.01, 1e-4): sparse + along_rays, (0.0, 1e-4): 4 + 2 + 6 + 2}
 
 
 def test_end_points_of_the_cycle_without_a_rise():
