@@ -51,9 +51,7 @@ def parameter_groups(
     Norms, biases, embeddings and learnable slots are not decayed. Empty groups are left out.
     """
     decayed = {
-        id(module.weight)
-        for module in model.modules()
-        if isinstance(module, (nn.Linear, _ConvNd, SparseKernel))
+        id(module.weight) for module in model.modules() if isinstance(module, (nn.Linear, _ConvNd, SparseKernel))
     }
     in_backbone = {id(parameter) for parameter in backbone.parameters()} if backbone is not None else set()
     groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}
