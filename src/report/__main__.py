@@ -145,7 +145,7 @@ def write_claims(reports: Path, scale: str, records: list[SweepRecord], results:
     path = reports / ("README.md" if is_default else f"claims_{scale}.md")
     picture = f"pictures/claims_{scale}.png"
     draw_claims(reports / picture, findings, scale)
-    write_whole(path, claims_page(findings, scale, picture))
+    write_whole(path, claims_page(findings, by_sweep, scale, picture))
     return [path]
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from src.report.claims import Claim, Finding, Verdict, verdict_of
 from src.report.comparisons import LOOKS
 from src.report.escaping import as_code, escape_markdown
 from src.report.results import RunResult
+from src.report.sweep_record import SweepRecord
 from src.report.sweep_table import MISSING, format_paper
-from src.report.sweep_text import SYNTHETIC, describe_epochs, describe_machines
+from src.report.sweep_text import SYNTHETIC, describe_epochs, describe_machines, settings_of
 
 HEADS = ("claim", "measure", "paper", "here", "seeds", "verdict", "command")
 
@@ -22,8 +23,10 @@ is beyond zero on the other side, or holds zero and is as narrow as [claims.yaml
 More of it: [docs/scores.md](../docs/scores.md#when-a-claim-holds)."""
 
 
-def claims_page(findings: list[tuple[Claim, list[Finding]]], scale: str, picture: str) -> str:
-    """The page; `picture` is the address of the figure, seen from it."""
+def claims_page(
+    findings: list[tuple[Claim, list[Finding]]], records: Mapping[str, SweepRecord], scale: str, picture: str
+) -> str:
+    """The page; `records` are of the claims' sweeps by name, `picture` is the address of the figure, seen from it."""
     verdicts = [verdict_of(found) for _, found in findings]
     counts = ", ".join(f"{v} {verdicts.count(v)}" for v in Verdict if v in verdicts)
     parts = [
@@ -31,7 +34,7 @@ def claims_page(findings: list[tuple[Claim, list[Finding]]], scale: str, picture
         f"Of {len(findings)} claims: {counts}. Written by `python -m src.report scale={scale}` from the results of the "
         f"sweeps; `python -m src.study scale={scale}` trains what is missing.",
         f"![Each claim's effect with its interval, and the paper's effect]({picture})",
-        f"## What was run\n\n{_what_was_run(findings, scale)}",
+        f"## What was run\n\n{_what_was_run(findings, records, scale)}",
         f"## The claims\n\n{RULE}\n\n{_table(findings, scale)}",
     ]
     return "\n\n".join(parts) + "\n"
@@ -44,7 +47,7 @@ def command_of(sweep: str, findings: Iterable[Finding], scale: str) -> str:
     return f"python -m src.sweep +sweep={sweep} scale={scale} seeds={seeds}"
 
 
-def _what_was_run(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
+def _what_was_run(findings: list[tuple[Claim, list[Finding]]], records: Mapping[str, SweepRecord], scale: str) -> str:
     worlds: dict[str, set[str]] = {}
     runs: dict[str, RunResult] = {}
     for _, found in findings:
@@ -66,7 +69,15 @@ def _what_was_run(findings: list[tuple[Claim, list[Finding]]], scale: str) -> st
             f" The {SYNTHETIC} is no TruckScenes, and this scale not the paper's: signs and order compare with the "
             "paper's, sizes do not."
         )
-    return escape_markdown(text)
+    own: dict[str, list[str]] = {}
+    for sweep in sorted({sweep for sweeps in worlds.values() for sweep in sweeps}):
+        own.setdefault(" ".join(settings_of(records[sweep])), []).append(f"`{sweep}`")
+    own.pop("", None)
+    text = escape_markdown(text)
+    if own:
+        text += "\n\nSweeps with settings of their own, the same in all their rows:\n"
+        text += "".join(f"\n- {', '.join(sweeps)}: {as_code([settings])}" for settings, sweeps in own.items())
+    return text
 
 
 def _table(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:

@@ -30,8 +30,8 @@ def describe_table(table: SweepTable, record: SweepRecord, results: dict[str, Ru
         any_result = next(iter(results.values()))
         data = f"Data: {any_result.dataset}, split {any_result.data.get('split', 'unknown')}"
     parts = [data, f"scale {record.scale}"]
-    common = [override for override in record.sweep.overrides if key_of(override) not in OF_EVERY_CAPTION]
-    parts += [f"with {' '.join(common + record.changes)}"] if common or record.changes else []
+    settings = settings_of(record)
+    parts += [f"with {' '.join(settings)}"] if settings else []
     parts += describe_epochs(results.values())
     parts.append(f"seed{'s' if len(seeds) > 1 else ''} {_listed(seeds)}{', of which means' if len(seeds) > 1 else ''}")
     parts += describe_machines(results.values())
@@ -42,6 +42,11 @@ def describe_table(table: SweepTable, record: SweepRecord, results: dict[str, Ru
     if not table.is_search:
         text += " Bold is decided against every other row" + ("." if complete else " whose seeds have all finished.")
     return text + _latency(table, [result.latency for result in results.values() if result.latency is not None])
+
+
+def settings_of(record: SweepRecord) -> list[str]:
+    """What all runs of a sweep override, but for what its title and rows tell."""
+    return [one for one in record.sweep.overrides if key_of(one) not in OF_EVERY_CAPTION] + record.changes
 
 
 def describe_epochs(results: Iterable[RunResult]) -> list[str]:

@@ -26,9 +26,9 @@ def report(tmp_path, monkeypatch, capsys):
 def write_sweep(write_run, make_record, tmp_path):
     """Writes the record of a sweep and a run for each row and seed; every score is the row's value for that seed."""
 
-    def write(name, rows, changes=(), scale="mini"):
+    def write(name, rows, changes=(), scale="mini", overrides=()):
         record = make_record(dict.fromkeys(rows, {}), seeds=max(map(len, rows.values())), name=name, scale=scale)
-        record.changes = list(changes)
+        record.changes, record.sweep.overrides = list(changes), list(overrides)
         for label, values in rows.items():
             for seed, value in enumerate(values):
                 end = record.rows[label][seed].rpartition("-")[2]
@@ -53,6 +53,16 @@ def test_claims_with_results_stand_beside_those_that_are_not_run(report, write_s
     assert "Data: synthetic highway world, split val; scale mini; 6 runs of up to 3 seeds; phase1: 6 epochs" in text
     assert "code 0123456789" in text and "(pictures/claims_mini.png)" in text
     assert Image.open(reports / "pictures" / "claims_mini.png").width == 1600
+
+
+def test_the_page_says_which_sweeps_have_settings_of_their_own(report, write_sweep):
+    own = ("phase=phase1", "optim.rise_fraction=0.4", "model.kggi.num_radar_keypoints=256")
+    write_sweep("layers", {"1 layer": [0.1] * 3, "2 layers": [0.2] * 3}, overrides=own)
+    write_sweep("initialization", {"random": [0.1] * 3, "both": [0.2] * 3}, overrides=own)
+    write_sweep("enlargement", {"off": [0.1] * 3, "on, 4.8 m": [0.2] * 3}, overrides=own[:1])
+    text = (report()[0] / "README.md").read_text()
+    listed = [line for line in text.splitlines() if line.startswith("- ")]
+    assert listed == ["- `initialization`, `layers`: `optim.rise_fraction=0.4 model.kggi.num_radar_keypoints=256`"]
 
 
 def test_the_command_trains_all_seeds_that_the_page_reads(report, write_sweep):
