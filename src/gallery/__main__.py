@@ -31,7 +31,7 @@ from src.structures.batch import FrameBatch
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.evidence import Evidence
 from src.structures.taxonomy import CLASSES
-from src.training.identity import key_of
+from src.training.identity import RUN_ID, key_of
 from src.training.run_folder import RunFolder, make_writable
 from src.training.snapshots import SHOWN_SCORE, boxes_of, scene_of, views_of
 
@@ -100,6 +100,12 @@ def read_boxes(config: Config, datamodule: DetectionDataModule, run_id: str) -> 
     return load_submission(folder.path / "submission.json", datamodule.evaluation_set().tokens)
 
 
+def short_names(runs: list[str]) -> list[str]:
+    """Model and phase of each run id, or the whole name where several have the same."""
+    short = [" ".join(run.split("-")[:2]) if RUN_ID.fullmatch(run) else run for run in runs]
+    return [name if short.count(name) == 1 else run for name, run in zip(short, runs, strict=True)]
+
+
 class Gallery:
     """The sheets of some runs on one split."""
 
@@ -118,7 +124,7 @@ class Gallery:
         wanted = {*frames, *film, *truth.samples[misses].tolist(), *predictions.samples[false].tolist()}
         batches = self._read(wanted)
         scale = self.config.scale
-        names = [name.replace(f"-{scale}", "") for name in self.found]
+        names = short_names(list(self.found))
         pictures, last = reports / "pictures", names[-1]
         sheets = {name: f"gallery_{name}_{scale}.png" for name in ("conditions", "misses", "false_positives")}
         whole = [self._frame(batches[sample], sample, tag) for sample, tag in frames.items()]

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from src.pictures.bev import BevScene, paint_detections, paint_ego, upright
 from src.pictures.cameras import PictureViews, paint_boxes, paint_camera
 from src.pictures.canvas import GAP_PX, HALF_PX, MARGIN_PX, SHEET_PX, Canvas
-from src.pictures.contents import MUTED, PictureBoxes, Window, match_boxes
+from src.pictures.contents import INK, MUTED, PictureBoxes, Window, match_boxes
 from src.pictures.legends import class_keys, radar_keys, reading_keys
 
 HEADER_PX = 84
@@ -24,6 +24,9 @@ AROUND_M = 20.0
 CROP_SIZES = 2.5
 """Half of a crop of an image, in heights of the box."""
 MIN_CROP_PX = 24.0
+NAME_PX, ADVANCE = 13, 0.6
+"""Height of a panel's name where it fits, and the mean width of a letter in heights."""
+LINE_PX = 18
 
 
 @dataclass
@@ -46,6 +49,7 @@ def draw_whole_frames(
     high = wide * (up - down) / (right - left)
     camera = (cell - GAP_PX) / 2
     cameras_px = max((camera / frame.views.aspect for frame in frames if frame.views is not None), default=0.0)
+    names_px = cameras_px + 4 + 2 * LINE_PX
 
     def paint(canvas: Canvas, frame: GalleryFrame, left: float, top: float) -> None:
         if frame.views is not None:
@@ -55,14 +59,16 @@ def draw_whole_frames(
                 image, name = frame.views.images[index], frame.views.names[index]
                 paint_camera(axes, image, frame.views.pix_from_ego[index], name, last.predictions, last.ground_truth)
         for place, scene in enumerate(frame.scenes):
-            axes = _panel(canvas, left + place * (wide + GAP_PX), top + cameras_px + 22, wide, high, FRAME_WINDOW)
+            axes = _panel(canvas, left + place * (wide + GAP_PX), top + names_px, wide, high, FRAME_WINDOW)
             paint_detections(axes, scene)
             predictions, truth = scene.predictions, scene.ground_truth
             found, matched = (int(rows.sum()) for rows in match_boxes(predictions, truth))
-            counts = f"{names[place]}: {matched} of {len(truth)} found, {len(predictions) - found} false"
-            canvas.text(left + place * (wide + GAP_PX), top + cameras_px + 4, counts, 13)
+            counts = f"{matched} of {len(truth)} found, {len(predictions) - found} false"
+            for line, text in enumerate((names[place], counts)):
+                at = left + place * (wide + GAP_PX), top + cameras_px + 4 + line * LINE_PX
+                canvas.text(*at, text, _fitting(text, wide), colour=MUTED if line else INK)
 
-    _draw_cells(path, title, frames, cameras_px + 22 + high, score, paint)
+    _draw_cells(path, title, frames, names_px + high, score, paint)
 
 
 def draw_boxes(path: Path, title: str, frames: Sequence[GalleryFrame], names: Sequence[str], score: float) -> None:
@@ -76,7 +82,7 @@ def draw_boxes(path: Path, title: str, frames: Sequence[GalleryFrame], names: Se
         for place, scene in enumerate(frame.scenes, start=1):
             at = left + place * (side + GAP_PX)
             paint_detections(_panel(canvas, at, top, side, side, window), scene)
-            canvas.text(at, top - 19, names[place - 1], 13)
+            canvas.text(at, top - 19, names[place - 1], _fitting(names[place - 1], side))
 
     _draw_cells(path, title, frames, side, score, paint)
 
@@ -104,6 +110,11 @@ def _draw_cells(
         canvas.text(left, top + 4, frame.title, 14, bold=True)
         paint(canvas, frame, left, top + TITLE_PX)
     canvas.save(path, photographs=False)
+
+
+def _fitting(text: str, width: float) -> float:  # px
+    """The height at which a panel's name is no wider than the panel."""
+    return min(NAME_PX, width / (ADVANCE * max(len(text), 1)))
 
 
 def _cell_width(frames: Sequence[GalleryFrame]) -> float:

@@ -6,6 +6,7 @@ import shutil
 import pytest
 from PIL import Image
 
+from src.gallery.__main__ import short_names
 from tests.running import call
 
 SHEETS = ["gallery_conditions_debug.png", "gallery_false_positives_debug.png", "gallery_misses_debug.png"]
@@ -40,6 +41,12 @@ def test_the_page_shows_its_pictures_and_its_command(trained, tmp_path):
     assert all(f"(pictures/{name})" in text for name in [*SHEETS, "gallery_debug.gif"])
     with Image.open(tmp_path / "pictures" / "gallery_debug.gif") as film:
         assert film.n_frames == 3  # of a debug scene
+
+
+def test_panels_are_named_by_what_tells_the_runs_apart():
+    one, two, other = (f"{name}-mini-0123456{digit}" for digit, name in enumerate(["a-phase1", "a-phase1", "b-phase2"]))
+    assert short_names([one, other, "mine"]) == ["a phase1", "b phase2", "mine"]
+    assert short_names([one, two, other]) == [one, two, "b phase2"]
 
 
 @pytest.mark.slow
