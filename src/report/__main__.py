@@ -24,6 +24,7 @@ from src.report.metric_names import DETECTION, RANGES, SPEEDS, find_metric
 from src.report.pages import (
     FURTHER,
     PHASES_OF,
+    called_by_changes,
     compared_experiments,
     comparison_page,
     left_out,
@@ -98,9 +99,10 @@ def write_pages(config: Config, results: dict[str, RunResult], in_sweeps: Collec
     """`<phase>_<scale>.md` of every phase that has runs; of another task than detection `<phase>_<task>_<scale>.md`."""
     models = {result.phase: result.model for result in results.values() if result.phase in PHASES}
     defaults = {phase: defaults_of(config.scale, phase, model) for phase, model in models.items()}
-    detection = [run for run in results.values() if run.task == DETECTION]
-    groups = {phase: runs_on_page(detection, phase, in_sweeps, defaults) for phase in PHASES if phase != FURTHER}
-    for run in results.values():
+    runs = called_by_changes(results.values(), defaults)
+    detection = [run for run in runs if run.task == DETECTION]
+    groups = {phase: runs_on_page(detection, phase, in_sweeps) for phase in PHASES if phase != FURTHER}
+    for run in runs:
         if run.task != DETECTION and run.phase in PHASES and run.run_id not in in_sweeps:
             groups.setdefault(f"{run.phase}_{run.task}", []).append(run)
     reports = Path(config.paths.reports)
@@ -113,7 +115,8 @@ def defaults_of(scale: str, phase: str, model: str) -> dict[str, Any]:
     try:
         return compose_config(choices)[1]
     except ConfigError:
-        return compose_config([*choices, f"model={model}"])[1] | {"model": {}}
+        tree = compose_config([*choices, f"model={model}"])[1]
+        return tree | {"model": {key: value for key, value in tree["model"].items() if key != "name"}}
 
 
 def write_page(reports: Path, name: str, scale: str, runs: list[RunResult]) -> Path:

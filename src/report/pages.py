@@ -83,26 +83,29 @@ objects within 2.4 m of a remembered Gaussian. Of remembered Gaussians: the shar
 of opacity below 0.1, and the error of their velocity beside objects of 10 m/s and more."""
 
 
-def runs_on_page(
-    results: Iterable[RunResult], phase: str, in_sweeps: Collection[str], defaults: dict[str, dict[str, Any]]
-) -> list[RunResult]:
-    """Those of `results` that the page of `phase` shows; none when there is none of the phase itself.
+def called_by_changes(results: Iterable[RunResult], defaults: dict[str, dict[str, Any]]) -> list[RunResult]:
+    """Each run called by what differs from the configuration of a run without settings, of its phase in `defaults`.
 
-    Phase 1, and its further epochs, stand on phase 2's page without their ablations. Runs of sweeps (their ids are
-    `in_sweeps`) have tables of their own: of them only experiments that have a name here are shown. Weights that were
-    scored once more with other settings are left to the tables of their sweeps. `defaults` are the configurations of
-    runs without settings, by phase: a run is called by what differs from these, so an older default never passes for
-    today's.
+    So an older default never passes for today's.
     """
-    names = NAMES_OF_COMPARISON if phase in PHASES_OF else NAMES
     runs: dict[str, RunResult] = {}
     for result in results:
         own = defaults.get(result.phase, {})
         changes = without_defaults(result.overrides, own) + changed_since(result, own)
         runs[result.run_id] = replace(result, overrides=changes)
+    return [_as_by_phase(run, runs, defaults) for run in runs.values()]
+
+
+def runs_on_page(results: Iterable[RunResult], phase: str, in_sweeps: Collection[str]) -> list[RunResult]:
+    """Those of `results` that the page of `phase` shows; none when there is none of the phase itself.
+
+    Phase 1, and its further epochs, stand on phase 2's page without their ablations. Runs of sweeps (their ids are
+    `in_sweeps`) have tables of their own: of them only experiments that have a name here are shown. Weights that were
+    scored once more with other settings are left to the tables of their sweeps.
+    """
+    names = NAMES_OF_COMPARISON if phase in PHASES_OF else NAMES
     shown = []
-    for run in runs.values():
-        run = _as_by_phase(run, runs, defaults)
+    for run in results:
         belongs = run.phase == phase or (run.phase in PHASES_OF.get(phase, ()) and not run.settings)
         belongs = belongs and run.epochs > 0
         known = (run.phase, *_settings_without_dropout(run)) in names
@@ -114,15 +117,15 @@ def runs_on_page(
 def _as_by_phase(run: RunResult, runs: Mapping[str, RunResult], defaults: dict[str, dict[str, Any]]) -> RunResult:
     """Started from the id of the very run that its phase starts from, without that setting.
 
-    What only the phase itself has, as its memory, is no setting of that run.
+    That run has the same settings, but for what only the phase itself has, as its memory.
     """
     source = runs.get(str(run.config["phase"].get("init_from")))
     usual = defaults.get(run.phase, {}).get("phase", {}).get("init_from")
-    if source is None or (source.phase, source.seed) != (usual, run.seed) or source.settings:
+    if source is None or (source.phase, source.seed) != (usual, run.seed):
         return run
     others = [change for change in run.overrides if key_of(change) != "phase.init_from"]
-    shared = [change for change in settings_of(others) if not is_of(change, OF_THE_PHASE)]
-    return run if shared else replace(run, overrides=others)
+    shared = tuple(change for change in settings_of(others) if not is_of(change, OF_THE_PHASE))
+    return replace(run, overrides=others) if shared == source.settings else run
 
 
 def split_by_data(runs: list[RunResult], phase: str) -> tuple[list[RunResult], list[RunResult]]:
@@ -163,6 +166,8 @@ def changed_since(run: RunResult, defaults: dict[str, Any]) -> list[str]:
     Keys that only one of the two knows are left out, except younger ones with a value of before.
     """
     free = [*map(key_of, run.overrides), *OUTSIDE_IDENTITY, *NOT_A_SETTING, "phase.name"]
+    if defaults.get("model", {}).get("name", run.model) == run.model:
+        free = [key for key in free if key != "model"]  # else the choice of another model frees all of it
     if not run.config["phase"].get("temporal", True):
         free += [f"data.{key}" for key in TEMPORAL_DATA_KEYS]
     had = YOUNGER_KEYS | _leaves(run.config)

@@ -1,13 +1,17 @@
 """Which runs stand on which page and what they are called, through the command's own entry."""
 
+import copy
+from dataclasses import replace
+
 import pytest
 from PIL import Image
 
+from src.config import compose_config
 from src.dashboard import single_file as export
 from src.errors import DataError
-from src.report.__main__ import main
+from src.report.__main__ import main, write_pages
 from src.report.pages import changed_since, without_defaults
-from src.report.results import result_path
+from src.report.results import publish_result, read_result, result_path
 from src.report.sweep_record import record_path, write_record
 
 NO_VELOCITY = [
@@ -256,3 +260,26 @@ def test_an_older_default_is_a_setting_today(make_result):
     then["phase"]["temporal"] = False  # what changes nothing there
     assert changed_since(run, today) == ["data.timeline=null", "model.head.nms=per_group"]
     assert changed_since(run, then) == []
+
+
+@pytest.mark.slow
+def test_runs_of_a_world_model_with_other_defaults_are_other_experiments(write_run, tmp_path):
+    choices = ["scale=mini", "phase=lrs_occupancy", "model=lrs4fusion"]
+    run = read_result(publish_result(write_run("0123abcd", choices[2:], 0, 0.3), tmp_path / "reports"))
+    tree = compose_config(choices)[1]
+    older = copy.deepcopy(tree)
+    older["data"]["timeline"]["radial_speeds"], older["model"]["loss"]["sampling"]["free_places"] = "none", "along_rays"
+    results = {
+        name: replace(
+            run, run_id=name, seed=name == "again", task="occupancy", headline="iou", model="lrs4fusion",
+            phase="lrs_occupancy", config=config, metrics={"iou": iou}, overrides=[*choices[2:], *settings],
+        )
+        for name, config, iou, settings in (
+            ("today", tree, 0.5, []), ("again", tree, 0.7, ["phase.epochs=2"]), ("older", older, 0.4, []),
+        )
+    }  # fmt: skip
+    config = compose_config([*choices, f"paths.reports={tmp_path / 'reports'}"])[0]
+    (page,) = write_pages(config, results, set()).values()
+    found = rows(page.read_text(), "| experiment | occupancy IoU along rays, % |")
+    changed = "data.timeline.radial_speeds=none model.loss.sampling.free_places=along_rays model=lrs4fusion"
+    assert found == {"`model=lrs4fusion`": "| `model=lrs4fusion` | 60.0 |", f"`{changed}`": f"| `{changed}` | 40.0 |"}
