@@ -152,11 +152,13 @@ def left_out(others: list[RunResult]) -> str:
 def without_defaults(overrides: list[str], defaults: dict[str, Any]) -> list[str]:
     """The last override of each key, less those that say what `defaults` say.
 
-    A sweep spells out the value of its baseline, which is then the same run as one without settings.
+    A sweep spells out the value of its baseline, which is then the same run as one without settings. `defaults` whose
+    model has no name are of the model that is chosen, which stays a setting.
     """
     last = {key_of(override): override for override in overrides}
     other = {key: override for key, override in last.items() if not _is_default(key, override, defaults)}
-    parts = tuple(f"{key}." for key in other)  # inside one, another choice has other defaults
+    of_its_model = "name" not in defaults.get("model", {})
+    parts = tuple(f"{key}." for key in other if key != "model" or not of_its_model)  # there another choice has others
     return [override for key, override in last.items() if key in other or key.startswith(parts)]
 
 

@@ -275,7 +275,7 @@ def test_runs_of_a_world_model_with_other_defaults_are_other_experiments(write_r
             phase="lrs_occupancy", config=config, metrics={"iou": iou}, overrides=[*choices[2:], *settings],
         )
         for name, config, iou, settings in (
-            ("today", tree, 0.5, []), ("again", tree, 0.7, ["phase.epochs=2"]), ("older", older, 0.4, []),
+            ("today", tree, 0.5, []), ("again", tree, 0.7, ["model.channels=32"]), ("older", older, 0.4, []),
         )
     }  # fmt: skip
     config = compose_config([*choices, f"paths.reports={tmp_path / 'reports'}"])[0]
