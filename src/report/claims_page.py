@@ -10,7 +10,7 @@ from src.report.escaping import as_code, escape_markdown
 from src.report.results import RunResult
 from src.report.sweep_record import SweepRecord
 from src.report.sweep_table import MISSING, format_paper
-from src.report.sweep_text import SYNTHETIC, describe_epochs, describe_machines, settings_of
+from src.report.sweep_text import SYNTHETIC, describe_epochs, describe_machines, sweep_settings
 
 HEADS = ("claim", "measure", "paper", "here", "seeds", "verdict", "command")
 
@@ -71,7 +71,7 @@ def _what_was_run(findings: list[tuple[Claim, list[Finding]]], records: Mapping[
         )
     own: dict[str, list[str]] = {}
     for sweep in sorted({sweep for sweeps in worlds.values() for sweep in sweeps}):
-        own.setdefault(" ".join(settings_of(records[sweep])), []).append(f"`{sweep}`")
+        own.setdefault(" ".join(sweep_settings(records[sweep])), []).append(f"`{sweep}`")
     own.pop("", None)
     text = escape_markdown(text)
     if own:

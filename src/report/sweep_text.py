@@ -30,7 +30,7 @@ def describe_table(table: SweepTable, record: SweepRecord, results: dict[str, Ru
         any_result = next(iter(results.values()))
         data = f"Data: {any_result.dataset}, split {any_result.data.get('split', 'unknown')}"
     parts = [data, f"scale {record.scale}"]
-    settings = settings_of(record)
+    settings = sweep_settings(record)
     parts += [f"with {' '.join(settings)}"] if settings else []
     parts += describe_epochs(results.values())
     parts.append(f"seed{'s' if len(seeds) > 1 else ''} {_listed(seeds)}{', of which means' if len(seeds) > 1 else ''}")
@@ -44,7 +44,7 @@ def describe_table(table: SweepTable, record: SweepRecord, results: dict[str, Ru
     return text + _latency(table, [result.latency for result in results.values() if result.latency is not None])
 
 
-def settings_of(record: SweepRecord) -> list[str]:
+def sweep_settings(record: SweepRecord) -> list[str]:
     """What all runs of a sweep override, but for what its title and rows tell."""
     return [one for one in record.sweep.overrides if key_of(one) not in OF_EVERY_CAPTION] + record.changes
 
