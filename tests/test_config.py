@@ -386,7 +386,8 @@ def test_a_second_score_of_detections_composes_and_an_older_checkpoint_has_none(
 
 @pytest.mark.parametrize(("key", "before"), YOUNGER_KEYS.items())
 def test_what_was_made_before_there_was_a_key_is_what_it_was(key, before):
-    own = ["model=lrs4fusion", "phase=lrs_forecast"] if key == "model.loss.ray_range_power" else ["phase=phase2"]
+    of_world_model = key in ("model.loss.ray_range_power", "model.decoders.measured_motion")
+    own = ["model=lrs4fusion", "phase=lrs_forecast"] if of_world_model else ["phase=phase2"]
     config, tree = compose_config(["scale=debug", *own, f"{key}={json.dumps(before)}"])
     older = without_keys(tree, [key])
     assert older != tree and run_identity(older) == run_identity(tree)

@@ -23,7 +23,7 @@ HORIZONS = ("1s", "3s")
 OCCUPANCY = {
     "iou": "IoU along rays",
     "slice_iou": "IoU above the ground",
-    "velocity_median_moving": "median error of radial velocities of what moves, m/s",
+    "velocity_median_moving": "median error of radial velocities of moving objects, m/s",
     "velocity_error_moving": "mean error, m/s",
 }
 

@@ -58,7 +58,7 @@ class ForecastMoment:
 
 
 def draw_slices(path: Path | str, slices: Sequence[OccupancySlice], title: str, height_m: float) -> None:
-    """Write a PNG of up to four slices side by side: occupancy by its shade, what moves by its radial speed."""
+    """Write a PNG of up to four slices side by side: occupancy by its shade, moving objects by their radial speed."""
     width, height = PANEL_PX
     canvas = Canvas(SHEET_PX, HEADER_PX + CAPTION_PX + height + MARGIN_PX)
     canvas.text(MARGIN_PX, 10, f"{title}: occupancy {height_m:g} m above the ground", 20, bold=True)
@@ -182,7 +182,8 @@ def draw_horizons(path: Path | str, scores: Mapping[str, Any], title: str) -> No
     future = [time for time in times if f"cd@{time}" in scores]
     distances = ("0-50m", "50-150m", "150-250m")
     if future:
-        for kind, of in (("cd", ""), ("cd_moving", " of what moves"), ("cd_unseen", " where the input had not seen")):
+        parts = ("cd", ""), ("cd_moving", " of moving objects"), ("cd_unseen", " where the input had not seen")
+        for kind, of in parts:
             words = f"Chamfer distance{of}, m^2"
             found = {name: bars([f"{prefix}{kind}@{time}" for time in future]) for prefix, name in own.items()}
             panels.append(BarPanel(words, future, found, 2))

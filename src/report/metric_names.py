@@ -99,7 +99,7 @@ FORECASTS = {"iou": Metric("iou", "occupancy IoU along rays", "%", 100.0, 1)}
 for _horizon in ("1s", "3s"):
     for _key, _words in (
         ("cd", "Chamfer"), ("nfcd", "Chamfer 0-50 m"), ("lfcd", "Chamfer 50-250 m"),
-        ("cd_moving", "Chamfer of what moves"), ("cd_unseen", "Chamfer of unseen space"),
+        ("cd_moving", "Chamfer of moving objects"), ("cd_unseen", "Chamfer of unseen space"),
     ):  # fmt: skip
         for _prefix, _of in (("", ""), ("static_", "static world's ")):
             _name = f"{_prefix}{_key}_{_horizon}"
@@ -112,10 +112,10 @@ for _step in range(4):
     for _key, _words in (("iou", "IoU along rays"), ("slice_iou", "IoU above the ground")):
         _name = f"{_key}@{_step}.0s"
         FORECASTS[_name] = Metric(_name, f"{_words} at {_step} s", "%", 100.0, 1)
-    _name, _words = f"velocity_median_moving@{_step}.0s", "median radial velocity error of what moves"
+    _name, _words = f"velocity_median_moving@{_step}.0s", "median radial velocity error of moving objects"
     FORECASTS[_name] = Metric(_name, f"{_words} at {_step} s", "m/s", 1.0, 2, False)
 for _key, _words in (("velocity_error_moving", "mean"), ("velocity_median_moving", "median")):
-    FORECASTS[_key] = Metric(_key, f"{_words} radial velocity error of what moves", "m/s", 1.0, 2, False)
+    FORECASTS[_key] = Metric(_key, f"{_words} radial velocity error of moving objects", "m/s", 1.0, 2, False)
 
 
 def find_metric(name: str, where: str, task: str = DETECTION) -> Metric:

@@ -45,6 +45,7 @@ YOUNGER_KEYS = {
     "model.doppler.along_heading": False,
     "model.dptf.gaussian_path.forget_refuted": False,
     "model.loss.ray_range_power": 0.0,
+    "model.decoders.measured_motion": False,
 }
 """Keys that runs were made without, with the value that does what was done then.
 

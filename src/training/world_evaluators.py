@@ -56,7 +56,7 @@ class WorldScores:
     """Of one sample."""
 
     sums: dict[str, Array] = field(default_factory=dict)  # [2] total and count by number
-    speed_errors: dict[int, Array] = field(default_factory=dict)  # by step: [n] m/s, of rays that end on what moves
+    speed_errors: dict[int, Array] = field(default_factory=dict)  # by step: [n] m/s, of rays that end on moving objects
     forecasts: dict[str, ForecastScores] = field(default_factory=dict)  # by the prefix of their numbers
 
     def add(self, name: str, values: Tensor | Array, among: Tensor | Array) -> None:
@@ -73,8 +73,8 @@ class OccupancyEvaluator(Evaluator):
 
     `iou@<t>s` is of places along rays, half of them occupied, `iou` of all times; `slice_iou@<t>s` of a lattice one
     metre above the ground, as far as the rays of the time tell of it. `velocity_error_moving`: mean of
-    |predicted - true| m/s where rays end on what moves, `velocity_median_moving` and `velocity_median_moving@<t>s` the
-    median, over all times and of one.
+    |predicted - true| m/s where rays end on moving objects, `velocity_median_moving` and
+    `velocity_median_moving@<t>s` the median, over all times and of one.
 
     A sample that several processes saw counts once.
     """
@@ -123,7 +123,7 @@ class OccupancyEvaluator(Evaluator):
 
     def _score(
         self, model: WorldModel, output: Any, batch: FrameBatch, rows: list[int], scores: list[WorldScores]
-    ) -> Tensor | None:  # [R] bool, rays that end on what moves; None where nobody knows
+    ) -> Tensor | None:  # [R] bool, rays that end on moving objects; None where nobody knows
         """Write what is found of each sample of `batch`, whose rays are thinned, into `scores`."""
         moving = torch.zeros(len(batch.rays), dtype=torch.bool)
         known = True
@@ -255,8 +255,9 @@ class OccupancyEvaluator(Evaluator):
 class ForecastEvaluator(OccupancyEvaluator):
     """The same, with forecast LiDAR and beside it, `static_`, that of a world that stands still.
 
-    Names are those of `sums_by_sample` and `median_errors`; `moving` and `unseen` are rays that end on what moves, and
-    where the input had not seen. A `gain` is the share by which a Chamfer distance lies below the static world's.
+    Names are those of `sums_by_sample` and `median_errors`; `moving` and `unseen` are rays that end on moving
+    objects, and where the input had not seen. A `gain` is the share by which a Chamfer distance lies below the static
+    world's.
     Rays are thinned to `data.timeline.scored_rays`, so distances are larger than between whole clouds.
     """
 
@@ -309,7 +310,7 @@ def true_speeds(
     sample: int,
     truth: TrueGeometry | None,
 ) -> tuple[Tensor, Tensor | None]:  # [R] m/s, [R] bool
-    """Speeds over ground along rays of one sample, and which end on what moves: true ones, else those measured.
+    """Speeds over ground along rays of one sample, and which end on moving objects: true ones, else those measured.
 
     The second is None where nothing is known of any.
     """

@@ -227,8 +227,8 @@ def test_a_key_that_an_older_run_lacks_is_the_same_at_its_value_of_before(make_r
                 sweep_tables(make_record({"a": {}}, seeds=2), results)
 
 
-def test_weights_that_a_row_scores_are_of_its_seeds(make_record, results_of):
-    """Their runs have ids of their own; other weights are another configuration."""
+def test_weights_that_a_row_begins_with_are_of_its_seeds(make_record, results_of):
+    """Their runs have ids of their own, given or found by the name of the phase; fresh ones are another configuration."""
 
     def row_of(*sources):
         results = {}
@@ -238,8 +238,9 @@ def test_weights_that_a_row_scores_are_of_its_seeds(make_record, results_of):
         return sweep_tables(make_record({"a": {}}, seeds=2), results)[0].rows[0]
 
     assert row_of("horizon3d-phase1-mini-0123abcd", "horizon3d-phase1-mini-4567cdef").done == 2
+    assert row_of("phase1", "horizon3d-phase1-mini-4567cdef").done == 2
     with pytest.raises(DataError, match="row a: .* differ in more than their seed"):
-        row_of("phase1", "horizon3d-phase1-mini-4567cdef")
+        row_of(None, "horizon3d-phase1-mini-4567cdef")
 
 
 def timed(result, total, spread, **load):

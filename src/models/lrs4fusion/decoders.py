@@ -29,6 +29,7 @@ class DecoderConfig:
     neighbours: list[int]  # voxels that a point sees in V1 .. V4: 1, its own, or 7, with those at its faces
     velocity: bool  # a decoder of radial velocity, where there is something to supervise it
     velocity_unit_mps: float  # in which the network states it
+    measured_motion: bool  # what is measured to move is looked for where it will be, at the speed that was measured
 
     def __post_init__(self) -> None:
         require_least(self, "model.decoders", {"hidden_channels": 1, "num_blocks": 1})
@@ -70,13 +71,13 @@ class Decoders(nn.Module):
 
     def forward(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> tuple[Tensor, Tensor | None]:  # [Q], [Q]
         """What both heads say, the second None where there is none, from one look into the volumes."""
-        place, seen = self.sampler(volumes, queries, batch)
-        speeds = None if self.velocity is None else self.velocity_unit_mps * self.velocity(place, seen)
-        return self.occupancy(place, seen), speeds
+        place, seen, measured = self.sampler(volumes, queries, batch)
+        return self.occupancy(place, seen), None if self.velocity is None else self._speeds(place, seen, measured)
 
     def occupancy_logits(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> Tensor:  # [Q]
         """Logits of the probability that a place is occupied."""
-        return self.occupancy(*self.sampler(volumes, queries, batch))
+        place, seen, _ = self.sampler(volumes, queries, batch)
+        return self.occupancy(place, seen)
 
     def velocities(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> Tensor:  # [Q] m/s
         """Radial velocities, away from the ego positive, over ground: what stands has 0 however the ego moves (O14).
@@ -85,7 +86,10 @@ class Decoders(nn.Module):
         """
         if self.velocity is None:
             raise ConfigError("model.decoders.velocity=false: this model predicts no velocities")
-        return self.velocity_unit_mps * self.velocity(*self.sampler(volumes, queries, batch))
+        return self._speeds(*self.sampler(volumes, queries, batch))
+
+    def _speeds(self, place: Tensor, seen: Tensor, measured: Tensor) -> Tensor:  # [Q] m/s
+        return measured + self.velocity_unit_mps * self.velocity(place, seen)
 
 
 class QuerySampler(nn.Module):
@@ -110,18 +114,22 @@ class QuerySampler(nn.Module):
         volumes: Volumes,
         queries: Tensor,  # [Q, 4] x, y, z m, t s
         batch: Tensor,  # [Q] int64
-    ) -> tuple[Tensor, Tensor]:  # [Q, 4], [Q, out_channels]
-        """Normalised place and time, and the features z."""
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [Q, 4], [Q, out_channels], [Q] m/s
+        """Normalised place and time, the features z, and the radial speed measured of what is at p', 0 for rest."""
         with torch.autocast(queries.device.type, enabled=False):
             points, times = full_precision(queries).split([3, 1], dim=1)
             place = torch.cat([self.grid.normalised(points), times / HORIZON_S], dim=1)
-            here = self._seen(volumes, FUSED_SCALE, points, batch)
+            if volumes.motion is None:
+                here, start = self._seen(volumes, FUSED_SCALE, points, batch), points
+                measured = torch.zeros_like(points[:, 0])
+            else:
+                here, start, measured = volumes.motion.seen_at(points, times.squeeze(1), batch)
             a = self.place(place) + self.context(here)
             for layer in self.hidden:
                 a = F.relu(layer(a))
-            moved = points + self.offset(a)
-            there = [self._seen(volumes, scale, moved, batch) for scale in range(NUM_SCALES)]
-            return place, torch.cat([here, *there], dim=1)
+            source = start + self.offset(a)
+            there = [self._seen(volumes, scale, source, batch) for scale in range(NUM_SCALES)]
+            return place, torch.cat([here, *there], dim=1), measured
 
     def _seen(self, volumes: Volumes, scale: int, points: Tensor, batch: Tensor) -> Tensor:  # [Q, C]
         volume = volumes.scales[scale]

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from src.models.layers.sparse import ConvNormReLU, RowBatchNorm, SparseConv, SubmanifoldConv
+from src.models.lrs4fusion.measured_motion import MeasuredMotion
 from src.ops.site_limit import limit_sites
 from src.structures.sparse_bev import SparseMap
 
@@ -98,6 +99,7 @@ class Volumes:
 
     scales: tuple[SparseMap, ...]  # V1 .. V4
     dropped: tuple[int, ...]  # sites that the guard of each scale has left out, over all samples
+    motion: MeasuredMotion | None = None  # of FUSED_SCALE, where measured speeds move it
 
 
 class LateEncoder(nn.Module):

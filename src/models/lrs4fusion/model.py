@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Self
 
@@ -20,6 +20,7 @@ from src.models.lrs4fusion.bev_neck import BEVNeck
 from src.models.lrs4fusion.decoders import Decoders
 from src.models.lrs4fusion.late_encoder import FUSED_SCALE, FusionStem, LateEncoder, Volumes
 from src.models.lrs4fusion.lrs_config import LRS4FusionConfig, LRSOptions, LRSStage
+from src.models.lrs4fusion.measured_motion import MeasuredMotion, directions, ego_heading
 from src.models.lrs4fusion.ray_head import RayHead
 from src.models.lrs4fusion.ray_loss import occupancy_objective, range_objective
 from src.models.lrs4fusion.sparse_unet import SparseUNet
@@ -121,9 +122,15 @@ class LRS4Fusion(Detector, WorldModel):
         voxels = self.pointnet(batch.lidar_points, batch.lidar_batch, len(batch), batch.lidar_speeds)
         x = self.stem(self.unet(voxels))
         if self.temporal is None:
-            return self.late_encoder(x)
-        warped = self.temporal.recall(memory, batch)
-        return self.late_encoder(x, lambda current: self.temporal(current, warped))
+            volumes, ego_mps = self.late_encoder(x), torch.zeros_like(batch.aug_from_ego[:, :3, 3])
+        else:
+            warped = self.temporal.recall(memory, batch)
+            volumes = self.late_encoder(x, lambda current: self.temporal(current, warped))
+            ego_mps = warped.ego_mps
+        if not self.config.decoders.measured_motion or batch.lidar_speeds is None:
+            return volumes
+        volume, grid = volumes.scales[FUSED_SCALE], self.voxels.at(FUSED_SCALE)
+        return replace(volumes, motion=MeasuredMotion.of(volume, grid, batch, ego_mps))
 
     def remember(self, volumes: Volumes, batch: FrameBatch) -> VolumeMemory | None:
         """What the next frame needs of this one, None without temporal part.
@@ -132,13 +139,15 @@ class LRS4Fusion(Detector, WorldModel):
         """
         if self.temporal is None:
             return None
-        volume, speeds = volumes.scales[FUSED_SCALE], None
+        volume, velocities = volumes.scales[FUSED_SCALE], None
         if self.config.temporal.velocity_compensation:
             indices = volume.indices
             centres = self.temporal.grid.centre_of(indices[:, 1:])
             now = torch.cat([centres, torch.zeros_like(centres[:, :1])], dim=1)
             speeds = torch.cat(_in_parts(partial(self.decoders.velocities, volumes), now, indices[:, 0]))
-        return self.temporal.remember(volume, speeds, batch)
+            heading = ego_heading(batch)[indices[:, 0]] if self.config.decoders.measured_motion else None
+            velocities = speeds[:, None] * directions(centres, heading)
+        return self.temporal.remember(volume, velocities, batch)
 
     def transition(self, batch: FrameBatch, memory: VolumeMemory | None) -> VolumeMemory | None:
         """As in `Detector`."""

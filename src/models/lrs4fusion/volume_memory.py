@@ -17,7 +17,7 @@ class StoredVoxels(StoredRows):
     """Remembered voxels of one frame of every stream: rows of all streams, one after the other."""
 
     xyz: Tensor  # [n, 3] m, voxel centres in the ego frame of their own time
-    velocities: Tensor  # [n, 3] m/s over ground, same axes; along the ray from the ego, which is all that is predicted
+    velocities: Tensor  # [n, 3] m/s over ground, same axes
     features: Tensor  # [n, C] rows of V2
     rows: Tensor  # [n] int64, row of the batch each voxel belongs to, ascending
 

@@ -55,6 +55,7 @@ class WarpedVolume:
 
     volume: SparseMap  # [n, C] on (B, z, y, x) of the second scale
     elapsed_s: Tensor  # [B], 0 where nothing is remembered
+    ego_mps: Tensor  # [B, 3] the ego's mean velocity since, aug frame; 0 where nothing is remembered
 
 
 class WindowedFusion(nn.Module):
@@ -115,7 +116,8 @@ class WindowedFusion(nn.Module):
         if not frames:
             keys = torch.zeros(0, dtype=torch.int64, device=batch.device)
             empty = batch.aug_from_ego.new_zeros(0, self.memory_channels)
-            return WarpedVolume(SparseMap(Sites(shape, keys), empty), batch.aug_from_ego.new_zeros(len(batch)))
+            nothing = batch.aug_from_ego.new_zeros(len(batch), 4)
+            return WarpedVolume(SparseMap(Sites(shape, keys), empty), nothing[:, 0], nothing[:, 1:])
         voxels, motion = frames[0].voxels, frames[0].motion(batch, self.config.max_age_s)
         xyz = voxels.xyz
         if self.config.velocity_compensation:
@@ -125,7 +127,9 @@ class WindowedFusion(nn.Module):
         indices = torch.cat([voxels.rows[:, None], self.grid.cell_of(xyz)], dim=1)[kept]
         sites, owners = Sites.unique(indices, shape)
         features = segment_mean(full_precision(voxels.features)[kept], owners, len(sites))
-        return WarpedVolume(SparseMap(sites, features), motion.elapsed_s)
+        driven = -motion.aug_from_past[:, :3, 3] / motion.elapsed_s.clamp(min=torch.finfo(torch.float32).eps)[:, None]
+        ego_mps = torch.where(motion.usable[:, None], driven, 0.0)
+        return WarpedVolume(SparseMap(sites, features), motion.elapsed_s, ego_mps)
 
     def _check(self, frame: VolumeFrame, batch: FrameBatch) -> None:
         if len(frame.present) != len(batch):
@@ -141,25 +145,24 @@ class WindowedFusion(nn.Module):
     def _in_ego(
         self,
         volume: SparseMap,  # V2
-        speeds_mps: Tensor | None,  # [M] radial, of every voxel; None: all at rest
+        velocities_mps: Tensor | None,  # [M, 3] over ground, aug frame; None: all at rest
         batch: FrameBatch,
     ) -> tuple[Tensor, Tensor]:  # [M, 3] m, [M, 3] m/s
         """Centres and velocities of the voxels in the unaugmented ego frame."""
         indices = volume.indices
         ego_from_aug = torch.linalg.inv_ex(batch.aug_from_ego).inverse[indices[:, 0]]
         centres = self.grid.centre_of(indices[:, 1:])
-        away = centres / centres.norm(dim=1, keepdim=True).clamp(min=torch.finfo(centres.dtype).tiny)
-        velocities = torch.zeros_like(away) if speeds_mps is None else away * speeds_mps[:, None]
+        velocities = torch.zeros_like(centres) if velocities_mps is None else velocities_mps
         return transform_points(ego_from_aug, centres), transform_vectors(ego_from_aug, velocities)
 
     def remember(
         self,
         volume: SparseMap,  # V2
-        speeds_mps: Tensor | None,  # [M] radial, of every voxel; None: all at rest
+        velocities_mps: Tensor | None,  # [M, 3] over ground, aug frame; None: all at rest
         batch: FrameBatch,
     ) -> VolumeMemory:
         """The memory of the next frame, whose features carry their gradient on."""
-        xyz, velocities = self._in_ego(volume, speeds_mps, batch)
+        xyz, velocities = self._in_ego(volume, velocities_mps, batch)
         voxels = StoredVoxels(xyz, velocities, volume.features, volume.indices[:, 0])
         present = torch.ones_like(batch.timestamps_s, dtype=torch.bool)
         frame = VolumeFrame(batch.timestamps_s, batch.global_from_ego, present, self.grid.voxel_m, voxels)

@@ -15,7 +15,7 @@ WIDTHS = (3, 4, 5, 6)
 
 def settings(**changes):
     values = {"hidden_channels": 8, "num_blocks": 2, "neighbours": [7, 7, 1, 1], "velocity": True}
-    values["velocity_unit_mps"] = 10.0
+    values |= {"velocity_unit_mps": 10.0, "measured_motion": False}
     return DecoderConfig(**(values | changes))
 
 
@@ -42,8 +42,8 @@ def queries(count, seed=3):
 def test_the_sampler_looks_at_the_place_and_where_the_offset_leads():
     """z = [V2(p), V1(p'), V2(p'), V3(p'), V4(p')], p' = p + dp; at first p' = p."""
     sampler, world, (q, batch) = decoders().sampler, volumes(), queries(50)
-    place, z = sampler(world, q, batch)
-    assert z.shape == (50, 4 + sum(WIDTHS))
+    place, z, measured = sampler(world, q, batch)
+    assert z.shape == (50, 4 + sum(WIDTHS)) and not measured.any()
     torch.testing.assert_close(place, torch.cat([GRID.normalised(q[:, :3]), q[:, 3:] / 3], 1))
     shift = torch.tensor([0.6, -0.4, 0.1])
     for moved in (torch.zeros(3), shift):

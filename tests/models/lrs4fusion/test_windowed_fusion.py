@@ -7,6 +7,7 @@ import torch
 
 from src.errors import ConfigError
 from src.geometry.voxel_grid import VoxelGrid
+from src.models.lrs4fusion.measured_motion import directions
 from src.models.lrs4fusion.volume_memory import VolumeMemory
 from src.models.lrs4fusion.windowed_fusion import VolumeMemoryConfig, WindowedFusion
 from src.ops.sites import Sites
@@ -42,7 +43,10 @@ def scattered(count, seed=0):
 
 
 def remembered(part, volume, frame, speeds=None):
-    return part.remember(volume, speeds, frame).detached()
+    """What moves goes along its ray."""
+    centres = GRID.centre_of(volume.indices[:, 1:])
+    velocities = None if speeds is None else speeds[:, None] * directions(centres, None)
+    return part.remember(volume, velocities, frame).detached()
 
 
 def test_a_static_world_coincides_with_the_present():
@@ -54,6 +58,8 @@ def test_a_static_world_coincides_with_the_present():
     warped = part.recall(memory, after)
     assert torch.equal(warped.volume.sites.keys, seen_now.sites.keys) and warped.elapsed_s.tolist() == [0.5]
     torch.testing.assert_close(warped.volume.features, seen_now.features)
+    torch.testing.assert_close(warped.ego_mps, torch.tensor([[6.0, 3.0, 0.0]]))
+    assert not part.recall(memory, before).ego_mps.any()  # a memory that is not in the past
 
 
 def test_a_turn_keeps_matter_within_half_a_voxel():

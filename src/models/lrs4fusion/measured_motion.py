@@ -1,0 +1,123 @@
+"""Measured speeds in the volume: which voxels move, and where they are at another time (ours, beside lrs 5.7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from src.geometry.voxel_grid import VoxelGrid
+from src.losses.normalizers import full_precision
+from src.ops.ball_query import OFFSETS, ball_query
+from src.ops.segment_reduce import segment_mean
+from src.ops.sites import Sites
+from src.ops.voxelize import voxel_rows
+from src.structures.batch import FrameBatch
+from src.structures.sparse_bev import SparseMap
+
+MOVING_MPS = 1.0
+TIME_STEP_S = 0.1
+"""Queries within a step of time see the moving voxels at one place."""
+LEAST_COSINE = 0.3
+"""Between a ray and the road: nearer to a right angle a radial speed says too little of one along the road."""
+
+
+@dataclass
+class MeasuredMotion:
+    """One scale of the volume of B samples, split into what is measured to move and the rest; aug frames.
+
+    What moves is taken to go along the ego's heading, as on a road: along the ray it would leave a car that is 20
+    degrees to the side by a third of its speed.
+    """
+
+    grid: VoxelGrid
+    rest: SparseMap  # [n, C] the voxels that are not measured to move
+    xyz: Tensor  # [m, 3] m, centres of those that are
+    velocities: Tensor  # [m, 3] m/s over ground
+    features: Tensor  # [m, C]
+    batch: Tensor  # [m] int64
+    ego_mps: Tensor  # [B, 3] the ego's velocity
+
+    @classmethod
+    def of(
+        cls,
+        volume: SparseMap,  # [n + m, C] on (B, z, y, x)
+        grid: VoxelGrid,  # of the volume
+        batch: FrameBatch,  # with `lidar_speeds`
+        ego_mps: Tensor,  # [B, 3] m/s, aug frame
+    ) -> MeasuredMotion:
+        """A voxel's speed is the mean of those measured in it and its face neighbours; above 1 m/s it moves."""
+        indices = volume.indices
+        xyz = grid.centre_of(indices[:, 1:])
+        speeds = _speeds_around(grid, batch, xyz, indices[:, 0])
+        moves = speeds.abs() > MOVING_MPS
+        stays = (~moves).nonzero().squeeze(1)
+        features = full_precision(volume.features)
+        rest = SparseMap(Sites(volume.sites.shape, volume.sites.keys[stays]), F.embedding(stays, features))
+        xyz, speeds, rows = xyz[moves], speeds[moves, None], indices[moves, 0]
+        velocities = speeds * directions(xyz, ego_heading(batch)[rows])
+        return cls(grid, rest, xyz, velocities, features[moves], rows, ego_mps)
+
+    def seen_at(
+        self,
+        points: Tensor,  # [Q, 3] m
+        times_s: Tensor,  # [Q]
+        batch: Tensor,  # [Q] int64
+    ) -> tuple[Tensor, Tensor, Tensor]:  # [Q, C], [Q, 3] m, [Q] m/s
+        """If all that moves keeps its velocity: features at every place and time, where those are now, their speed.
+
+        The speed is along the ray from where the ego is by then, if it drives on as well; 0 where nothing moves.
+        """
+        steps = (times_s / TIME_STEP_S).round().long()
+        span = 1 + 2 * int(steps.abs().max()) if len(steps) else 1
+        codes, moment = torch.unique(batch * span + steps + span // 2, return_inverse=True)
+        samples, moments_s = codes // span, (codes % span - span // 2) * TIME_STEP_S
+        own, row = (samples[:, None] == self.batch).nonzero().unbind(1)
+        there = self.xyz[row] + self.velocities[row] * moments_s[own, None]
+        inside = self.grid.contains(there).nonzero().squeeze(1)
+        own, row, there = own[inside], row[inside], there[inside]
+        indices = torch.cat([own[:, None], self.grid.cell_of(there)], dim=1)
+        sites, owners = Sites.unique(indices, (len(codes), *self.grid.cells))
+        columns = torch.cat([self.features, self.velocities, torch.ones_like(self.velocities[:, :1])], dim=1)
+        moved = segment_mean(F.embedding(row, columns), owners, len(sites))
+        found = ball_query(moved, sites, self.grid, points, moment, len(OFFSETS))
+        features, velocities, met = found.split([self.features.shape[1], 3, 1], dim=1)
+        here = ball_query(self.rest.features, self.rest.sites, self.grid, points, batch, len(OFFSETS))
+        source = points - velocities * moments_s[moment, None]
+        rays = F.normalize(points - self.ego_mps[batch] * times_s[:, None], dim=1)
+        return torch.where(met > 0, features, here), source, (velocities * rays).sum(1)
+
+
+def ego_heading(batch: FrameBatch) -> Tensor:  # [B, 3]
+    """Unit vectors, aug frame."""
+    return F.normalize(batch.aug_from_ego[:, :3, 0], dim=1)
+
+
+def directions(
+    xyz: Tensor,  # [n, 3] m
+    heading: Tensor | None,  # [n, 3] unit vectors that the road goes along; None: everything moves along its ray
+) -> Tensor:  # [n, 3]
+    """What a radial speed is multiplied with for a velocity: the unit ray r from the ego, or h / (r h) for a heading h.
+
+    Where |r h| < 0.3 it is r again.
+    """
+    rays = F.normalize(xyz, dim=1)
+    if heading is None:
+        return rays
+    cosine = (rays * heading).sum(1, keepdim=True)
+    return torch.where(cosine.abs() < LEAST_COSINE, rays, heading / cosine)
+
+
+def _speeds_around(
+    grid: VoxelGrid,
+    batch: FrameBatch,
+    xyz: Tensor,  # [n, 3] m
+    rows: Tensor,  # [n] int64, their samples
+) -> Tensor:  # [n] m/s
+    known = batch.lidar_speeds.isfinite().nonzero().squeeze(1)
+    points, owners, speeds = batch.lidar_points[known, :3], batch.lidar_batch[known], batch.lidar_speeds[known]
+    sites, voxels, inside = voxel_rows(points, owners, grid.lower_m, grid.voxel_m, grid.cells, len(batch))
+    means = segment_mean(speeds[inside, None], voxels, len(sites))
+    return ball_query(means, sites, grid, xyz, rows, len(OFFSETS)).squeeze(1)

@@ -1,0 +1,152 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from src.geometry.voxel_grid import VoxelGrid
+from src.models.lrs4fusion.decoders import DecoderConfig, Decoders
+from src.models.lrs4fusion.late_encoder import FUSED_SCALE, Volumes
+from src.models.lrs4fusion.measured_motion import MeasuredMotion
+from src.ops.ball_query import ball_query
+from src.ops.sites import Sites
+from src.structures.sparse_bev import SparseMap
+from tests.models.moving import bare_frame, pose
+from tests.ops.maps import random_sites
+
+FINEST = VoxelGrid((-64.0, -64.0, -4.0), (64.0, 64.0, 4.0), (0.5, 0.5, 0.5), num_levels=4)
+GRID = FINEST.at(FUSED_SCALE)  # voxels of 1 m
+CAR, WALL = [20.5, 0.5, 0.5], [30.5, 0.5, 0.5]
+"""Centres of the only two voxels; the ego's heading is x, and the car is nearly ahead."""
+
+
+def volume(*centres, samples=None):
+    cells = GRID.cell_of(torch.tensor(centres))
+    sample = torch.zeros(len(centres)) if samples is None else torch.tensor(samples)
+    sites, order = Sites.from_indices(torch.cat([sample.long()[:, None], cells], 1), (2, *GRID.cells))
+    features = 1 + torch.arange(len(centres)).float()[:, None].expand(-1, 3)  # 1 1 1, then 2 2 2, ...
+    return SparseMap(sites, features[order].clone().requires_grad_())
+
+
+def motion(scale, speeds=(10.0, torch.nan), centres=(CAR, WALL), samples=(0, 0), ego_mps=0.0, augs=None):
+    """Of points in the voxels' centres; `speeds` are along their rays."""
+    frame = replace(
+        bare_frame(0.0, [pose()] * 2, augs),
+        lidar_points=torch.cat([torch.tensor(centres), torch.zeros(len(centres), 2)], 1),
+        lidar_batch=torch.tensor(samples),
+        lidar_speeds=torch.tensor(speeds),
+    )
+    return MeasuredMotion.of(scale, GRID, frame, torch.tensor([[ego_mps, 0.0, 0.0]] * 2))
+
+
+def seen(moving, *queries, batch=None):
+    q = torch.tensor(queries)
+    return moving.seen_at(q[:, :3], q[:, 3], torch.zeros(len(q)).long() if batch is None else torch.tensor(batch))
+
+
+def test_what_is_measured_to_move_is_seen_where_it_will_be():
+    """About 10 m/s: 10 m farther in a second, where the wall stands; 5 m nearer half a second ago."""
+    moving = motion(volume(CAR, WALL))
+    features, source, speeds = seen(moving, [*CAR, 0.0], [30.4, 0.6, 0.5, 1.0], [15.6, 0.4, 0.5, -0.5])
+    torch.testing.assert_close(features, torch.ones(3, 3))
+    assert (source - torch.tensor(CAR)).abs().max() < 0.2  # where the car is now
+    torch.testing.assert_close(speeds, torch.full((3,), 10.0), atol=0.02, rtol=0)
+
+
+def test_it_goes_along_the_road_with_its_radial_speed():
+    """A 4-3-5 triangle to the side: 10 m/s along the ray are 12.5 along the heading, which an augmentation turns."""
+    side, abeam, turned = [20.5, 15.5, 0.5], [2.5, 20.5, 0.5], torch.eye(4)
+    ray = torch.nn.functional.normalize(torch.tensor(side), dim=0)
+    moving = motion(volume(side), (10.0,), (side,), (0,))
+    torch.testing.assert_close(moving.velocities, torch.tensor([[10 / float(ray[0]), 0.0, 0.0]]))
+    assert float(moving.velocities[0, 0]) == pytest.approx(12.5, abs=0.1)
+    turned[:2, :2] = torch.tensor([[0.8, -0.6], [0.6, 0.8]]) * 1.05
+    along = torch.tensor([0.8, 0.6, 0.0])
+    moving = motion(volume(side), (10.0,), (side,), (0,), augs=[turned] * 2)
+    torch.testing.assert_close(moving.velocities[0], 10 / (ray @ along) * along)
+    moving = motion(volume(abeam), (10.0,), (abeam,), (0,))  # nearly at a right angle: along the ray
+    torch.testing.assert_close(moving.velocities[0], 10 * torch.nn.functional.normalize(torch.tensor(abeam), dim=0))
+
+
+def test_a_speed_is_along_the_ray_from_where_the_ego_will_be():
+    """The ego overtakes: in two seconds it is 20 m ahead of a car that is now 20 m ahead of it."""
+    moving = motion(volume(CAR), (10.0,), (CAR,), (0,), ego_mps=30.0)
+    ahead = [40.5, 0.5, 0.5]
+    _, _, speeds = seen(moving, [*CAR, 0.0], [*ahead, 2.0])
+    torch.testing.assert_close(speeds, torch.tensor([10.0, -10.0]), atol=0.05, rtol=0)
+
+
+def test_the_place_that_it_leaves_is_empty_and_what_rests_stays():
+    moving = motion(volume(CAR, WALL))
+    features, source, speeds = seen(moving, [*CAR, 1.0], [*WALL, 2.0], [*WALL, 0.0])
+    assert features[:, 0].tolist() == [0, 2, 2]
+    assert source.tolist() == [CAR, WALL, WALL] and not speeds.any()
+
+
+@pytest.mark.parametrize("speed", [torch.nan, 0.9, -0.9])
+def test_without_a_measured_speed_above_1_mps_all_rests(speed):
+    scale = SparseMap(random_sites((2, *GRID.cells), 4000), torch.randn(4000, 3))
+    points = GRID.centre_of(scale.indices[:100, 1:])
+    batch = scale.indices[:100, 0]
+    moving = motion(scale, [speed] * 100, points.tolist(), batch.tolist())
+    queries = points + 0.3
+    features, source, speeds = moving.seen_at(queries, torch.linspace(-0.5, 3, 100), batch)
+    torch.testing.assert_close(features, ball_query(scale.features, scale.sites, GRID, queries, batch, 7))
+    assert torch.equal(source, queries) and not speeds.any()
+
+
+def test_samples_and_moments_do_not_meet():
+    """The second sample has the same car, at rest; times of one tenth of a second share a place, others do not."""
+    moving = motion(volume(CAR, CAR, samples=[0, 1]), (10.0, 0.0), (CAR, CAR), (0, 1))
+    there = [30.5, 0.5, 0.5]
+    features = seen(moving, [*there, 1.0], [*there, 1.0], [*there, 1.04], [*there, 0.5], batch=[0, 1, 0, 0])[0]
+    assert features[:, 0].tolist() == [1, 0, 1, 0]
+    features = seen(moving, [*CAR, 1.0], [*CAR, 1.0], batch=[0, 1])[0]
+    assert features[:, 0].tolist() == [0, 2]
+
+
+def test_what_leaves_the_region_is_seen_no_more():
+    far = [60.5, 0.5, 0.5]
+    moving = motion(volume(far), (30.0,), (far,), (0,))
+    features, source, speeds = seen(moving, [63.9, 0.5, 0.5, 1.0], [90.5, 0.5, 0.5, 1.0])
+    assert (
+        not features.any()
+        and not speeds.any()
+        and source.tolist() == [pytest.approx([63.9, 0.5, 0.5]), [90.5, 0.5, 0.5]]
+    )
+
+
+def test_speeds_reach_the_faces_neighbours_and_are_means():
+    """Two points of one voxel; the voxel beside them has none of its own and moves with them, the next one rests."""
+    beside, beyond = [21.5, 0.5, 0.5], [22.5, 0.5, 0.5]
+    moving = motion(volume(CAR, beside, beyond), (8.0, 12.0), (CAR, CAR), (0, 0))
+    assert moving.xyz.tolist() == [CAR, beside] and len(moving.rest) == 1
+    torch.testing.assert_close(moving.velocities, torch.tensor([[10.0, 0, 0]]).expand(2, 3), atol=0.01, rtol=0)
+
+
+def test_nothing_measured_and_nothing_asked():
+    moving = motion(volume(CAR, WALL), (torch.nan, torch.nan))
+    features, source, speeds = moving.seen_at(torch.zeros(0, 3), torch.zeros(0), torch.zeros(0).long())
+    assert features.shape == (0, 3) and source.shape == (0, 3) and speeds.shape == (0,)
+
+
+def test_decoders_begin_with_the_measured_speed_of_what_will_be_there():
+    """Untrained, a velocity is the one measured where the matter of (p, t) is now; features there have a gradient."""
+    scales = [SparseMap(random_sites((2, *FINEST.at(level).cells), 50), torch.randn(50, 3)) for level in range(4)]
+    scales[FUSED_SCALE] = volume(CAR, WALL)
+    config = DecoderConfig(
+        hidden_channels=8,
+        num_blocks=2,
+        neighbours=[7, 7, 1, 1],
+        velocity=True,
+        velocity_unit_mps=10.0,
+        measured_motion=True,
+    )
+    model, volumes = Decoders(config, (3, 3, 3, 3), FINEST), Volumes(tuple(scales), (0,) * 4)
+    volumes.motion = motion(scales[FUSED_SCALE])
+    queries = torch.tensor([[*CAR, 0.0], [30.5, 0.5, 0.5, 1.0], [*CAR, 2.0], [*WALL, 0.0]])
+    occupancy, speeds = model(volumes, queries, torch.zeros(4).long())
+    torch.testing.assert_close(speeds, torch.tensor([10.0, 10.0, 0.0, 0.0]), atol=0.01, rtol=0)
+    torch.testing.assert_close(model.velocities(volumes, queries, torch.zeros(4).long()), speeds)
+    occupancy[1].backward()
+    car, wall = scales[FUSED_SCALE].features.grad.abs().sum(1)
+    assert car > 0 and wall == 0
