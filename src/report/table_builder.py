@@ -13,7 +13,7 @@ from src.report.sweep_file import TableConfig
 from src.report.sweep_record import RunState, SweepRecord
 from src.report.sweep_table import PAPER, SweepRow, SweepTable, TableCell
 from src.report.sweep_text import describe_search, describe_table, findings
-from src.training.identity import as_before_younger_keys, key_of, without_keys
+from src.training.identity import RUN_ID, as_before_younger_keys, key_of, without_keys
 
 EARLIER = "; the number is of an earlier training"
 """Of a run that has a result, though it is to be trained, trains, or failed."""
@@ -89,10 +89,11 @@ def check_rows(record: SweepRecord, results: dict[str, RunResult]) -> None:
 
 
 def _experiment(result: RunResult) -> tuple[object, ...]:
-    """What the runs of a row have in common; the run whose weights each begins with, named or not, is of its seed."""
-    fresh = result.config.get("phase", {}).get("init_from") is None
+    """What the runs of a row have in common; the run whose weights each begins with is of its seed, named or not."""
+    source = result.config.get("phase", {}).get("init_from")
+    phase = source.split("-")[1] if RUN_ID.fullmatch(str(source)) else source
     config = without_keys(as_before_younger_keys(result.config), ["seed", "phase.init_from"])
-    return result.model, result.phase, fresh, config or result.settings
+    return result.model, result.phase, phase, config or result.settings
 
 
 def _table_configs(record: SweepRecord) -> list[TableConfig]:

@@ -228,7 +228,7 @@ def test_a_key_that_an_older_run_lacks_is_the_same_at_its_value_of_before(make_r
 
 
 def test_weights_that_a_row_begins_with_are_of_its_seeds(make_record, results_of):
-    """Their runs have ids of their own, given or found by the name of the phase; fresh ones are another configuration."""
+    """Their runs have ids of their own, given or found by the phase's name; another phase is another configuration."""
 
     def row_of(*sources):
         results = {}
@@ -239,8 +239,9 @@ def test_weights_that_a_row_begins_with_are_of_its_seeds(make_record, results_of
 
     assert row_of("horizon3d-phase1-mini-0123abcd", "horizon3d-phase1-mini-4567cdef").done == 2
     assert row_of("phase1", "horizon3d-phase1-mini-4567cdef").done == 2
-    with pytest.raises(DataError, match="row a: .* differ in more than their seed"):
-        row_of(None, "horizon3d-phase1-mini-4567cdef")
+    for other in (None, "phase2", "horizon3d-phase2-mini-0123abcd", "/x/other.ckpt"):
+        with pytest.raises(DataError, match="row a: .* differ in more than their seed"):
+            row_of(other, "horizon3d-phase1-mini-4567cdef")
 
 
 def timed(result, total, spread, **load):

@@ -66,7 +66,7 @@ class Decoders(nn.Module):
         self.velocity = QueryHead(width, hidden, config.num_blocks) if config.velocity else None
         self.velocity_unit_mps = config.velocity_unit_mps
         if self.velocity is not None:
-            nn.init.zeros_(self.velocity.output.weight)  # untrained, everything rests
+            nn.init.zeros_(self.velocity.output.weight)  # untrained, everything rests or goes as measured
             nn.init.zeros_(self.velocity.output.bias)
 
     def forward(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> tuple[Tensor, Tensor | None]:  # [Q], [Q]
@@ -96,7 +96,8 @@ class QuerySampler(nn.Module):
     """Features at a place p and where the offset branch looks instead: z = [V2(p), V1(p'), V2(p'), V3(p'), V4(p')].
 
     p' = p + dp(p, t, V2(p)): for another time than now, dp learns to lead to where the matter of (p, t) is now. It
-    begins at zero.
+    begins at zero. With measured motion V2(p) is that of the voxels as they will lie at t, and p' = p - v t + dp where
+    one that moves by v is met; at p' all scales are those of now.
     """
 
     def __init__(self, hidden: int, neighbours: Sequence[int], channels: Sequence[int], grid: VoxelGrid) -> None:
@@ -123,7 +124,8 @@ class QuerySampler(nn.Module):
                 here, start = self._seen(volumes, FUSED_SCALE, points, batch), points
                 measured = torch.zeros_like(points[:, 0])
             else:
-                here, start, measured = volumes.motion.seen_at(points, times.squeeze(1), batch)
+                near = self.neighbours[FUSED_SCALE]
+                here, start, measured = volumes.motion.seen_at(points, times.squeeze(1), batch, near)
             a = self.place(place) + self.context(here)
             for layer in self.hidden:
                 a = F.relu(layer(a))

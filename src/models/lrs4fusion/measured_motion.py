@@ -19,9 +19,9 @@ from src.structures.sparse_bev import SparseMap
 
 MOVING_MPS = 1.0
 TIME_STEP_S = 0.1
-"""Queries within a step of time see the moving voxels at one place."""
+"""Queries whose times round to the same step see the moving voxels at one place: at 30 m/s up to 1.5 m off."""
 LEAST_COSINE = 0.3
-"""Between a ray and the road: nearer to a right angle a radial speed says too little of one along the road."""
+"""Between a ray and the heading: nearer to a right angle a radial speed says too little of one along the heading."""
 
 
 @dataclass
@@ -29,7 +29,8 @@ class MeasuredMotion:
     """One scale of the volume of B samples, split into what is measured to move and the rest; aug frames.
 
     What moves is taken to go along the ego's heading, as on a road: along the ray it would leave a car that is 20
-    degrees to the side by a third of its speed.
+    degrees to the side by a third of its speed. Rays are taken from the ego's origin although speeds are along those of
+    the sensors, so beside the cab, a few metres away, velocities are wrong.
     """
 
     grid: VoxelGrid
@@ -38,7 +39,7 @@ class MeasuredMotion:
     velocities: Tensor  # [m, 3] m/s over ground
     features: Tensor  # [m, C]
     batch: Tensor  # [m] int64
-    ego_mps: Tensor  # [B, 3] the ego's velocity
+    ego_mps: Tensor  # [B, 3] the ego's velocity, 0 where nothing is remembered
 
     @classmethod
     def of(
@@ -48,7 +49,7 @@ class MeasuredMotion:
         batch: FrameBatch,  # with `lidar_speeds`
         ego_mps: Tensor,  # [B, 3] m/s, aug frame
     ) -> MeasuredMotion:
-        """A voxel's speed is the mean of those measured in it and its face neighbours; above 1 m/s it moves."""
+        """A voxel moves by the `ball_query` of the speeds measured around it, where that is above MOVING_MPS."""
         indices = volume.indices
         xyz = grid.centre_of(indices[:, 1:])
         speeds = _speeds_around(grid, batch, xyz, indices[:, 0])
@@ -65,10 +66,12 @@ class MeasuredMotion:
         points: Tensor,  # [Q, 3] m
         times_s: Tensor,  # [Q]
         batch: Tensor,  # [Q] int64
+        neighbours: int,  # of `ball_query`
     ) -> tuple[Tensor, Tensor, Tensor]:  # [Q, C], [Q, 3] m, [Q] m/s
         """If all that moves keeps its velocity: features at every place and time, where those are now, their speed.
 
         The speed is along the ray from where the ego is by then, if it drives on as well; 0 where nothing moves.
+        Differentiable in the features.
         """
         steps = (times_s / TIME_STEP_S).round().long()
         span = 1 + 2 * int(steps.abs().max()) if len(steps) else 1
@@ -82,9 +85,10 @@ class MeasuredMotion:
         sites, owners = Sites.unique(indices, (len(codes), *self.grid.cells))
         columns = torch.cat([self.features, self.velocities, torch.ones_like(self.velocities[:, :1])], dim=1)
         moved = segment_mean(F.embedding(row, columns), owners, len(sites))
-        found = ball_query(moved, sites, self.grid, points, moment, len(OFFSETS))
+        found = ball_query(moved, sites, self.grid, points, moment, neighbours)
         features, velocities, met = found.split([self.features.shape[1], 3, 1], dim=1)
-        here = ball_query(self.rest.features, self.rest.sites, self.grid, points, batch, len(OFFSETS))
+        here = ball_query(self.rest.features, self.rest.sites, self.grid, points, batch, neighbours)
+        velocities = velocities.detach()
         source = points - velocities * moments_s[moment, None]
         rays = F.normalize(points - self.ego_mps[batch] * times_s[:, None], dim=1)
         return torch.where(met > 0, features, here), source, (velocities * rays).sum(1)
@@ -101,7 +105,7 @@ def directions(
 ) -> Tensor:  # [n, 3]
     """What a radial speed is multiplied with for a velocity: the unit ray r from the ego, or h / (r h) for a heading h.
 
-    Where |r h| < 0.3 it is r again.
+    Where |r h| is below LEAST_COSINE it is r again.
     """
     rays = F.normalize(xyz, dim=1)
     if heading is None:

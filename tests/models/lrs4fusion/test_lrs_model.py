@@ -16,7 +16,7 @@ from src.structures.ray_bundle import RayBundle
 from src.targets.occupancy_rays import sample_queries
 from tests.models.learning import gradients_are_finite, train_step
 from tests.models.lrs4fusion.lrs_frames import cloud, lidar_frame, lrs_config, lrs_model
-from tests.models.moving import pose, tensors_of
+from tests.models.moving import bda, pose, tensors_of
 
 pytestmark = pytest.mark.slow
 
@@ -149,6 +149,28 @@ def test_the_memory_changes_features_and_no_site():
     file.seek(0)
     restored = model.restore_memory(torch.load(file, weights_only=True))
     assert torch.equal(model(now, restored)[0].volumes.scales[3].features, remembering.scales[3].features)
+
+
+def test_measured_speeds_move_the_volume_and_what_is_remembered():
+    """All returns go 5 m/s along their rays, the ego 20 m/s along x, in a turned and larger aug frame."""
+    augment = bda(0.4, scale=1.05)
+    model = lrs_model(OCCUPANCY, "model.decoders.measured_motion=true").eval()
+
+    def seen(time_s, measured=True):
+        speeds = torch.full((400,), 5.0) if measured else None
+        return replace(frame((400,), time_s), aug_from_ego=augment[None], lidar_speeds=speeds)
+
+    output, memory = model(seen(0.0))
+    assert len(output.volumes.motion.xyz) > 100 and not output.volumes.motion.ego_mps.any()
+    later = model.encode(seen(0.5), memory)
+    torch.testing.assert_close(later.motion.ego_mps, (augment[:3, :3] @ torch.tensor([20.0, 0, 0]))[None])
+    assert model.encode(seen(0.5, measured=False), memory).motion is None
+    voxels = memory.frames[0].voxels  # in the ego frame, where the heading is x
+    cosine = F.normalize(voxels.xyz, dim=1)[:, 0]
+    ahead = (cosine.abs() > 0.6) & voxels.velocities.any(1)
+    torch.testing.assert_close(voxels.velocities[ahead, 1:], torch.zeros(int(ahead.sum()), 2), atol=1e-4, rtol=0)
+    radial = 1.05 * voxels.velocities[ahead, 0] * cosine[ahead]
+    assert ahead.sum() > 50 and float(radial.median()) == pytest.approx(5.0, abs=0.2)
 
 
 def test_the_last_transition_carries_a_gradient_where_it_is_asked_for():

@@ -40,7 +40,7 @@ def motion(scale, speeds=(10.0, torch.nan), centres=(CAR, WALL), samples=(0, 0),
 
 def seen(moving, *queries, batch=None):
     q = torch.tensor(queries)
-    return moving.seen_at(q[:, :3], q[:, 3], torch.zeros(len(q)).long() if batch is None else torch.tensor(batch))
+    return moving.seen_at(q[:, :3], q[:, 3], torch.zeros(len(q)).long() if batch is None else torch.tensor(batch), 7)
 
 
 def test_what_is_measured_to_move_is_seen_where_it_will_be():
@@ -89,7 +89,7 @@ def test_without_a_measured_speed_above_1_mps_all_rests(speed):
     batch = scale.indices[:100, 0]
     moving = motion(scale, [speed] * 100, points.tolist(), batch.tolist())
     queries = points + 0.3
-    features, source, speeds = moving.seen_at(queries, torch.linspace(-0.5, 3, 100), batch)
+    features, source, speeds = moving.seen_at(queries, torch.linspace(-0.5, 3, 100), batch, 7)
     torch.testing.assert_close(features, ball_query(scale.features, scale.sites, GRID, queries, batch, 7))
     assert torch.equal(source, queries) and not speeds.any()
 
@@ -125,7 +125,7 @@ def test_speeds_reach_the_faces_neighbours_and_are_means():
 
 def test_nothing_measured_and_nothing_asked():
     moving = motion(volume(CAR, WALL), (torch.nan, torch.nan))
-    features, source, speeds = moving.seen_at(torch.zeros(0, 3), torch.zeros(0), torch.zeros(0).long())
+    features, source, speeds = moving.seen_at(torch.zeros(0, 3), torch.zeros(0), torch.zeros(0).long(), 7)
     assert features.shape == (0, 3) and source.shape == (0, 3) and speeds.shape == (0,)
 
 
