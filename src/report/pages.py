@@ -39,8 +39,14 @@ FURTHER = "phase1_further"
 PHASES_OF = {"phase2": ("phase1", FURTHER, "phase2")}
 """Whose runs a phase's page reads; other phases' pages read their own."""
 
+ANNEALED = ("optim.final_lr_ratio=0.0001", "optim.rise_fraction=0.4")
+"""The whole cycle of the learning rate that phase 1 takes at mini where no phase 2 follows."""
+
 NAMES = {
     ("phase1",): "KGGI + OCSF",
+    ("phase1", *ANNEALED): "KGGI + OCSF, annealed",
+    ("phase1", "model=crt_fusion", *ANNEALED): "CRT-Fusion, annealed",
+    ("phase1", "model=dense_bev", *ANNEALED): "BEVFusion, annealed",
     ("phase1", "model.kggi.initialization=random"): "OCSF, random Gaussians",
     ("phase1", "model.kggi.initialization=keypoint"): "KGGI + OCSF, keypoints only",
     ("phase1", "model.kggi=null", "model.ocsf=null"): "radar only",
