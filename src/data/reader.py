@@ -165,8 +165,8 @@ class FrameReader:
         frame_time_us: int,
         skipped: Skipped,
     ) -> dict[str, torch.Tensor]:
-        """`lidar_tensors` of these files; with the speed of each point where the timeline has a source of speeds."""
-        origins = None if self._speeds is None else True
+        """`lidar_tensors` of these files; where the timeline has a source of speeds, with speeds and origins."""
+        origins = self.settings.lidar_origins or self._speeds is not None
         tensors = self._placed(rows, clouds, aug_from_global, frame_time_us, origins)
         if self._speeds is None:
             return tensors
@@ -175,8 +175,6 @@ class FrameReader:
         speeds = torch.full((len(directed),), torch.nan)
         if len(rays):
             speeds[directed] = self._speeds.along(sample, rays, aug_from_global, frame_time_us, skipped)
-        if not self.settings.lidar_origins:
-            del tensors["lidar_origins"]
         return tensors | {"lidar_speeds": speeds}
 
     def _placed(
@@ -185,7 +183,7 @@ class FrameReader:
         clouds: list[LidarCloud],
         aug_from_global: Array,  # [4, 4]
         frame_time_us: int,
-        origins: bool | None = None,  # None: as the settings say
+        origins: bool = True,
     ) -> dict[str, torch.Tensor]:
         """`lidar_tensors` of these files."""
         pose_times_us = self.index.pose_times_us[self.index.data_poses[rows]]
@@ -196,7 +194,7 @@ class FrameReader:
             [1e-6 * (cloud.times_us - time_us) for cloud, time_us in zip(clouds, pose_times_us, strict=True)],
             aug_from_global,
             self.settings.min_distance_m,
-            self.settings.lidar_origins if origins is None else origins,
+            origins,
         )
 
     # ---------------------------------------------------------------- LiDAR of the timeline
@@ -227,7 +225,7 @@ class FrameReader:
             rows, clouds = self._files.lidar_clouds(sample, files, skipped)
             mounts = self.index.ego_from_sensor[self.index.data_calibrations[rows]]
             clouds = list(map(without_ego_body, clouds, mounts))
-            parts.append(lidar_rays(self._placed(rows, clouds, aug_from_global, frame_time_us, origins=True), step))
+            parts.append(lidar_rays(self._placed(rows, clouds, aug_from_global, frame_time_us), step))
         rays = RayBundle.join(parts)
         if self._speeds is None or not len(rays):
             return rays

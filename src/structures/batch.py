@@ -64,6 +64,8 @@ class FrameBatch(TensorFields):
         self._check_points("lidar", len(LIDAR_POINT_FIELDS))
         if self.lidar_speeds is not None:
             self._expect("lidar_speeds", (0 if self.lidar_points is None else len(self.lidar_points),), torch.float32)
+            if self.lidar_origins is None:
+                raise ValueError("FrameBatch.lidar_origins must be given with lidar_speeds, which are along the rays")
         if self.lidar_origins is not None:
             self._expect(
                 "lidar_origins", (0 if self.lidar_points is None else len(self.lidar_points), 3), torch.float32

@@ -41,7 +41,7 @@ def test_every_sensor_may_be_missing():
     assert len(alone) == 3 and alone.radar_points is None and alone.images is None and alone.device.type == "cpu"
     assert batch(**NO_RADAR).to("cpu").images is not None
     assert len(batch(**NO_RADAR, **NO_CAMERA)) == 3
-    assert batch(**(LIDAR | {"lidar_origins": None})).lidar_origins is None
+    assert batch(**(LIDAR | {"lidar_origins": None, "lidar_speeds": None})).lidar_origins is None
 
 
 def rays(owners):
@@ -108,6 +108,7 @@ def test_a_sample_may_lack_points_boxes_and_images():
         ("lidar_batch", torch.tensor([0, 1, 0, 2, 2])),
         ("lidar_batch", torch.tensor([0, 1, 1, 2, 3])),
         ("lidar_origins", torch.zeros(4, 3)),
+        ("lidar_origins", None),
         ("lidar_speeds", torch.zeros(4)),
         ("images", torch.zeros(3, 4, 3, 8, 16)),
         ("images", torch.zeros(2, 4, 3, 8, 16, dtype=torch.uint8)),

@@ -27,7 +27,7 @@ from src.models.heads.decode import (
     suppress,
     top_candidates,
 )
-from src.models.layers.dense import DenseConvNormReLU, DenseToSparse
+from src.models.layers.dense import DenseConvNormReLU, DenseToSparse, rows_of_map
 from src.models.layers.doppler import Doppler
 from src.models.layers.sparse import ConvNormReLU, SubmanifoldConv
 from src.ops.box_codes import ATTRIBUTE, decoded_boxes
@@ -97,6 +97,7 @@ class HeadOutput:
     logits: Tensor  # [M, 12] float32, columns as taxonomy.CLASSES
     codes: Tensor | None  # [M, 7, CODE_SIZE (+ 11 attributes)] in training with `all`, else evaluated where needed
     doppler: Doppler | None = None  # velocities take their radial part from it
+    motion: Tensor | None = None  # [M, 2] m/s over ground, augmented axes: what the velocities of codes are added to
 
 
 class CenterHead(nn.Module):
@@ -136,6 +137,7 @@ class CenterHead(nn.Module):
         self,
         bev: SparseBEV | Tensor,  # a tensor [B, C, rows, cols] where the head is dense
         doppler: Doppler | None = None,
+        motion: Tensor | None = None,  # [B, 2, rows, cols] of a dense head, as `HeadOutput.motion`
     ) -> HeadOutput:
         """Heat maps of all cells; box codes only where training needs them everywhere."""
         bev = self.shared(bev)
@@ -151,7 +153,7 @@ class CenterHead(nn.Module):
             calls = [[part] for part in parts] if bev.features.device.type == "cpu" else [parts]
             codes = torch.cat([checkpointed_branches(call, bev.features) for call in calls], dim=1)
             codes = codes.unflatten(1, (len(parts), -1))
-        return HeadOutput(bev, logits, codes, doppler)
+        return HeadOutput(bev, logits, codes, doppler, None if motion is None else rows_of_map(motion))
 
     def regress(
         self,
@@ -231,7 +233,7 @@ class CenterHead(nn.Module):
             terms["heatmap"] = heatmap_weight * (zeros.index_add(0, group_of_class, focal) / normalizer).sum()
         if box_weight is None and not self.learned:
             return Objective(terms, diagnostics)
-        predicted = self.regress(output, targets.rows, targets.groups)
+        predicted = _on_motion(output, self.regress(output, targets.rows, targets.groups), targets.rows)
         if output.doppler is not None and output.doppler.in_losses:
             predicted = measured_codes(output, predicted, targets.rows)
         if box_weight is not None:
@@ -277,7 +279,8 @@ class CenterHead(nn.Module):
         radar = None if doppler is None else (doppler.keys, doppler.velocities)
         turned = doppler is not None and doppler.along_heading
         cells = (rows, output.bev.indices, labels, scores)
-        found = decoded_boxes(codes, *cells, threshold, self.grid, ATTRIBUTE_RULES, radar, turned)
+        moving = _on_motion(output, codes, rows)
+        found = decoded_boxes(moving, *cells, threshold, self.grid, ATTRIBUTE_RULES, radar, turned)
         if self.learned:
             found[:, ATTRIBUTE] = learned_attributes(codes[:, CODE_SIZE:], labels).to(found.dtype)
         return found
@@ -293,6 +296,17 @@ def measured_codes(
         return codes
     before, velocities, after = codes.split([CODE_SIZE - 2, 2, codes.shape[1] - CODE_SIZE], dim=1)
     return torch.cat([before, output.doppler.correct(velocities, output.bev.sites.linear()[rows]), after], dim=1)
+
+
+def _on_motion(
+    output: HeadOutput,
+    codes: Tensor,  # [n, CODE_SIZE (+ 11)]
+    rows: Tensor,  # [n] int64, cells
+) -> Tensor:  # [n, CODE_SIZE (+ 11)]
+    """With `HeadOutput.motion` added."""
+    if output.motion is None:
+        return codes
+    return codes + F.pad(output.motion[rows], (CODE_SIZE - 2, codes.shape[1] - CODE_SIZE))
 
 
 def _attribute_loss(logits: Tensor, targets: HeadTargets) -> Tensor:

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from src.geometry.bev_grid import BEVGrid
 from src.geometry.voxel_grid import VoxelGrid
 from src.losses.normalizers import full_precision
 from src.ops.ball_query import OFFSETS, ball_query
-from src.ops.segment_reduce import segment_mean
+from src.ops.segment_reduce import segment_mean, segment_sum
 from src.ops.sites import Sites
 from src.ops.voxelize import voxel_rows
 from src.structures.batch import FrameBatch
 from src.structures.sparse_bev import SparseMap
 
 MOVING_MPS = 1.0
-TIME_STEP_S = 0.1
-"""Queries whose times round to the same step see the moving voxels at one place: at 30 m/s up to 1.5 m off."""
+TIME_STEP_S = 0.05
+"""Queries whose times round to the same step see the moving voxels at one place: at 30 m/s up to 0.75 m off."""
 LEAST_COSINE = 0.3
 """Between a ray and the heading: nearer to a right angle a radial speed says too little of one along the heading."""
 
@@ -29,16 +31,17 @@ class MeasuredMotion:
     """One scale of the volume of B samples, split into what is measured to move and the rest; aug frames.
 
     What moves is taken to go along the ego's heading, as on a road: along the ray it would leave a car that is 20
-    degrees to the side by a third of its speed. Rays are taken from the ego's origin although speeds are along those of
-    the sensors, so beside the cab, a few metres away, velocities are wrong.
+    degrees to the side by a third of its speed.
     """
 
     grid: VoxelGrid
     rest: SparseMap  # [n, C] the voxels that are not measured to move
-    xyz: Tensor  # [m, 3] m, centres of those that are
+    rows: Tensor  # [m] int64, those that are, among all
+    xyz: Tensor  # [m, 3] m, their centres
     velocities: Tensor  # [m, 3] m/s over ground
     features: Tensor  # [m, C]
     batch: Tensor  # [m] int64
+    origins: Tensor  # [B, 3] m, `sensor_origins`
     ego_mps: Tensor  # [B, 3] the ego's velocity, 0 where nothing is remembered
 
     @classmethod
@@ -49,17 +52,20 @@ class MeasuredMotion:
         batch: FrameBatch,  # with `lidar_speeds`
         ego_mps: Tensor,  # [B, 3] m/s, aug frame
     ) -> MeasuredMotion:
-        """A voxel moves by the `ball_query` of the speeds measured around it, where that is above MOVING_MPS."""
+        """A voxel moves where half of its measured points do, or, where it has none, of the `ball_query` around it.
+
+        Points that are measured at MOVING_MPS or less stand.
+        """
         indices = volume.indices
-        xyz = grid.centre_of(indices[:, 1:])
-        speeds = _speeds_around(grid, batch, xyz, indices[:, 0])
-        moves = speeds.abs() > MOVING_MPS
-        stays = (~moves).nonzero().squeeze(1)
+        velocities = _velocities_around(grid, batch, indices)
+        moves = velocities.norm(dim=1) > MOVING_MPS
+        rows, stays = moves.nonzero().squeeze(1), (~moves).nonzero().squeeze(1)
         features = full_precision(volume.features)
         rest = SparseMap(Sites(volume.sites.shape, volume.sites.keys[stays]), F.embedding(stays, features))
-        xyz, speeds, rows = xyz[moves], speeds[moves, None], indices[moves, 0]
-        velocities = speeds * directions(xyz, ego_heading(batch)[rows])
-        return cls(grid, rest, xyz, velocities, features[moves], rows, ego_mps)
+        xyz, owners = grid.centre_of(indices[rows, 1:]), indices[rows, 0]
+        return cls(
+            grid, rest, rows, xyz, velocities[rows], F.embedding(rows, features), owners, sensor_origins(batch), ego_mps
+        )
 
     def seen_at(
         self,
@@ -70,7 +76,7 @@ class MeasuredMotion:
     ) -> tuple[Tensor, Tensor, Tensor]:  # [Q, C], [Q, 3] m, [Q] m/s
         """If all that moves keeps its velocity: features at every place and time, where those are now, their speed.
 
-        The speed is along the ray from where the ego is by then, if it drives on as well; 0 where nothing moves.
+        The speed is along the ray from where the sensors are by then, if it drives on as well; 0 where nothing moves.
         Differentiable in the features.
         """
         steps = (times_s / TIME_STEP_S).round().long()
@@ -89,9 +95,27 @@ class MeasuredMotion:
         features, velocities, met = found.split([self.features.shape[1], 3, 1], dim=1)
         here = ball_query(self.rest.features, self.rest.sites, self.grid, points, batch, neighbours)
         velocities = velocities.detach()
-        source = points - velocities * moments_s[moment, None]
-        rays = F.normalize(points - self.ego_mps[batch] * times_s[:, None], dim=1)
+        source = points - velocities * times_s[:, None]
+        rays = F.normalize(points - self.origins[batch] - self.ego_mps[batch] * times_s[:, None], dim=1)
         return torch.where(met > 0, features, here), source, (velocities * rays).sum(1)
+
+    def on_ground(
+        self,
+        grid: BEVGrid,
+    ) -> Tensor:  # [B, 2, rows, cols] m/s
+        """The mean velocity over ground of what moves in each cell, or else in the eight around it; else 0.
+
+        As in `head_targets` a cell stands for its lower corner.
+        """
+        xy = self.xyz[:, :2] + 0.5 * grid.cell_m
+        inside = grid.contains(xy).nonzero().squeeze(1)
+        row, col = grid.cell_of(xy[inside]).unbind(1)
+        cells = (self.batch[inside] * grid.rows + row) * grid.cols + col
+        shape = (len(self.origins), grid.rows, grid.cols)
+        columns = F.pad(self.velocities[inside, :2], (0, 1), value=1.0)
+        sums = segment_sum(columns, cells, math.prod(shape)).unflatten(0, shape).permute(0, 3, 1, 2)
+        sums = torch.where(sums[:, 2:] > 0, sums, F.avg_pool2d(sums, 3, stride=1, padding=1))
+        return sums[:, :2] / torch.where(sums[:, 2:] > 0, sums[:, 2:], 1)
 
 
 def ego_heading(batch: FrameBatch) -> Tensor:  # [B, 3]
@@ -99,29 +123,40 @@ def ego_heading(batch: FrameBatch) -> Tensor:  # [B, 3]
     return F.normalize(batch.aug_from_ego[:, :3, 0], dim=1)
 
 
+def sensor_origins(batch: FrameBatch) -> Tensor:  # [B, 3] m
+    """Where the LiDARs were when they measured, in the mean over the points of each sample."""
+    return segment_mean(batch.lidar_origins, batch.lidar_batch, len(batch))
+
+
 def directions(
-    xyz: Tensor,  # [n, 3] m
+    rays: Tensor,  # [n, 3] from the sensor, of any length
     heading: Tensor | None,  # [n, 3] unit vectors that the road goes along; None: everything moves along its ray
 ) -> Tensor:  # [n, 3]
-    """What a radial speed is multiplied with for a velocity: the unit ray r from the ego, or h / (r h) for a heading h.
+    """What a radial speed is multiplied with for a velocity: the unit ray r, or h / (r h) for a heading h.
 
     Where |r h| is below LEAST_COSINE it is r again.
     """
-    rays = F.normalize(xyz, dim=1)
+    rays = F.normalize(rays, dim=1)
     if heading is None:
         return rays
     cosine = (rays * heading).sum(1, keepdim=True)
     return torch.where(cosine.abs() < LEAST_COSINE, rays, heading / cosine)
 
 
-def _speeds_around(
+def _velocities_around(
     grid: VoxelGrid,
     batch: FrameBatch,
-    xyz: Tensor,  # [n, 3] m
-    rows: Tensor,  # [n] int64, their samples
-) -> Tensor:  # [n] m/s
+    indices: Tensor,  # [n, 4] int64, voxels
+) -> Tensor:  # [n, 3] m/s
+    """Of the points that move where those are at least half of the measured ones, else 0."""
     known = batch.lidar_speeds.isfinite().nonzero().squeeze(1)
-    points, owners, speeds = batch.lidar_points[known, :3], batch.lidar_batch[known], batch.lidar_speeds[known]
+    points, owners, speeds = batch.lidar_points[known, :3], batch.lidar_batch[known], batch.lidar_speeds[known, None]
+    along = directions(points - batch.lidar_origins[known], ego_heading(batch)[owners])
+    move = (speeds.abs() > MOVING_MPS).to(speeds.dtype)
     sites, voxels, inside = voxel_rows(points, owners, grid.lower_m, grid.voxel_m, grid.cells, len(batch))
-    means = segment_mean(speeds[inside, None], voxels, len(sites))
-    return ball_query(means, sites, grid, xyz, rows, len(OFFSETS)).squeeze(1)
+    means = segment_mean(torch.cat([move * speeds * along, move], dim=1)[inside], voxels, len(sites))
+    found = ball_query(means, sites, grid, grid.centre_of(indices[:, 1:]), indices[:, 0], len(OFFSETS))
+    rows = sites.rows_of(indices)
+    own = (rows >= 0).nonzero().squeeze(1)
+    velocities, share = found.index_copy(0, own, means[rows[own]]).split([3, 1], dim=1)
+    return torch.where(share < 0.5, 0, velocities / share.clamp(min=0.5))

@@ -94,7 +94,7 @@ class LRS4Fusion(Detector, WorldModel):
                 self.voxels.at(len(late.scale_channels) - 1).bev(),
                 options.velocity_code_weight,
                 dense=True,
-                in_channels=self.neck.out_channels,
+                in_channels=self.neck.out_channels + 2 * config.decoders.measured_motion,
             ).to(memory_format=torch.channels_last)
 
     def train(self, mode: bool = True) -> Self:
@@ -111,7 +111,7 @@ class LRS4Fusion(Detector, WorldModel):
         Raises ValueError for a batch without LiDAR, and for a memory of other streams, voxels or widths.
         """
         volumes = self.encode(batch, memory)
-        head = None if self.head is None else self.head(self.neck(volumes.scales[-1]))
+        head = None if self.head is None else self._head_output(volumes)
         remembered = self.remember(volumes, batch)
         return LRSOutput(volumes, head), remembered if remembered is None else remembered.detached()
 
@@ -132,6 +132,17 @@ class LRS4Fusion(Detector, WorldModel):
         volume, grid = volumes.scales[FUSED_SCALE], self.voxels.at(FUSED_SCALE)
         return replace(volumes, motion=MeasuredMotion.of(volume, grid, batch, ego_mps))
 
+    def _head_output(self, volumes: Volumes) -> HeadOutput:
+        """Where motion is measured the head sees it, and what it says of velocities is added to it."""
+        x = self.neck(volumes.scales[-1])
+        if not self.config.decoders.measured_motion:
+            return self.head(x)
+        motion = x.new_zeros(len(x), 2, *x.shape[2:], dtype=torch.float32)
+        if volumes.motion is not None:
+            motion = volumes.motion.on_ground(self.head.grid)
+        seen = (motion / self.config.decoders.velocity_unit_mps).to(x.dtype, memory_format=torch.channels_last)
+        return self.head(torch.cat([x, seen], dim=1), motion=motion)
+
     def remember(self, volumes: Volumes, batch: FrameBatch) -> VolumeMemory | None:
         """What the next frame needs of this one, None without temporal part.
 
@@ -145,8 +156,12 @@ class LRS4Fusion(Detector, WorldModel):
             centres = self.temporal.grid.centre_of(indices[:, 1:])
             now = torch.cat([centres, torch.zeros_like(centres[:, :1])], dim=1)
             speeds = torch.cat(_in_parts(partial(self.decoders.velocities, volumes), now, indices[:, 0]))
-            heading = ego_heading(batch)[indices[:, 0]] if self.config.decoders.measured_motion else None
-            velocities = speeds[:, None] * directions(centres, heading)
+            if volumes.motion is None:
+                velocities = speeds[:, None] * directions(centres, None)
+            else:
+                rays = centres - volumes.motion.origins[indices[:, 0]]
+                velocities = speeds[:, None] * directions(rays, ego_heading(batch)[indices[:, 0]])
+                velocities = velocities.index_copy(0, volumes.motion.rows, volumes.motion.velocities)
         return self.temporal.remember(volume, velocities, batch)
 
     def transition(self, batch: FrameBatch, memory: VolumeMemory | None) -> VolumeMemory | None:

@@ -1,6 +1,6 @@
 """The head on whole maps is the sparse head whose sites are all cells."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -77,6 +77,29 @@ def test_outputs_losses_gradients_and_boxes_are_the_sparse_heads(train_regressio
         for field in fields(one):
             a, b = getattr(one, field.name), getattr(two, field.name)
             assert (a is None) == (b is None) and (a is None or torch.allclose(a.float(), b.float(), atol=1e-3))
+
+
+@pytest.mark.parametrize("train_regression", list(TrainRegression))
+def test_velocities_are_regressed_on_top_of_known_motion(train_regression):
+    """Here x of a velocity is known to be the row of a cell, y its column, in the first sample."""
+    head, x = head_of(True, train_regression), torch.randn(2, C, 24, 32, generator=torch.Generator().manual_seed(1))
+    rows, cols = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing="ij")
+    motion, boxes = (
+        torch.stack([rows, cols]) * torch.tensor([1.0, 0.0])[:, None, None, None],
+        [boxes_of(12, 2), boxes_of(5, 3)],
+    )
+    lower = GRID.to_cells(boxes[0].centers[:, :2]).round().flip(1)  # of the nearest corner
+    rest = [replace(boxes[0], velocities=boxes[0].velocities - lower), boxes[1]]
+    torch.testing.assert_close(
+        head.loss(head(x, motion=motion), boxes, 1.0, 0.25).terms, head.loss(head(x), rest, 1.0, 0.25).terms
+    )
+    head.eval()
+    moved, still = head.decode(head(x, motion=motion)), head.decode(head(x))
+    assert torch.equal(moved[1].velocities, still[1].velocities) and torch.equal(moved[0].centers, still[0].centers)
+    known = moved[0].velocities - still[0].velocities
+    torch.testing.assert_close(known, known.round(), atol=1e-4, rtol=0)
+    offsets = GRID.to_cells(moved[0].centers[:, :2]).flip(1) - known  # as regressed, a small number of cells
+    assert len(known) > 20 and known[:, 1].max() > 24 and offsets.abs().max() < 3
 
 
 def test_an_untrained_map_is_nearly_empty():

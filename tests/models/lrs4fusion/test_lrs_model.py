@@ -20,6 +20,7 @@ from tests.models.moving import bda, pose, tensors_of
 
 pytestmark = pytest.mark.slow
 
+SENSOR = torch.tensor([3.0, 1.0, 2.0])
 OCCUPANCY, FORECAST = "phase.options.stage=occupancy", "phase.options.stage=forecast"
 
 
@@ -152,13 +153,14 @@ def test_the_memory_changes_features_and_no_site():
 
 
 def test_measured_speeds_move_the_volume_and_what_is_remembered():
-    """All returns go 5 m/s along their rays, the ego 20 m/s along x, in a turned and larger aug frame."""
+    """All returns go 5 m/s along their rays from a mast, the ego 20 m/s along x, in a turned and larger aug frame."""
     augment = bda(0.4, scale=1.05)
     model = lrs_model(OCCUPANCY, "model.decoders.measured_motion=true").eval()
 
     def seen(time_s, measured=True):
-        speeds = torch.full((400,), 5.0) if measured else None
-        return replace(frame((400,), time_s), aug_from_ego=augment[None], lidar_speeds=speeds)
+        speeds, origins = (torch.full((400,), 5.0), SENSOR.expand(400, 3)) if measured else (None, None)
+        own = replace(frame((400,), time_s), lidar_origins=origins, lidar_speeds=speeds)
+        return replace(own, aug_from_ego=augment[None])
 
     output, memory = model(seen(0.0))
     assert len(output.volumes.motion.xyz) > 100 and not output.volumes.motion.ego_mps.any()
@@ -166,11 +168,25 @@ def test_measured_speeds_move_the_volume_and_what_is_remembered():
     torch.testing.assert_close(later.motion.ego_mps, (augment[:3, :3] @ torch.tensor([20.0, 0, 0]))[None])
     assert model.encode(seen(0.5, measured=False), memory).motion is None
     voxels = memory.frames[0].voxels  # in the ego frame, where the heading is x
-    cosine = F.normalize(voxels.xyz, dim=1)[:, 0]
+    in_ego = SENSOR @ augment[:3, :3].inverse().T
+    cosine = F.normalize(voxels.xyz - in_ego, dim=1)[:, 0]
     ahead = (cosine.abs() > 0.6) & voxels.velocities.any(1)
-    torch.testing.assert_close(voxels.velocities[ahead, 1:], torch.zeros(int(ahead.sum()), 2), atol=1e-4, rtol=0)
+    aside = voxels.velocities[ahead, 1:].abs().amax(1)
+    assert (aside < 1e-4).float().mean() > 0.99  # a voxel's points may be abeam where its centre is not
     radial = 1.05 * voxels.velocities[ahead, 0] * cosine[ahead]
     assert ahead.sum() > 50 and float(radial.median()) == pytest.approx(5.0, abs=0.2)
+
+
+def test_boxes_begin_with_measured_motion():
+    """What is known of a cell is an input of the head too; without speeds nothing is known."""
+    model = lrs_model("model.decoders.measured_motion=true").eval()
+    batch = replace(frame(), lidar_origins=torch.zeros(700, 3), lidar_speeds=torch.full((700,), 20.0))
+    output, unknown = model(batch)[0], model(replace(batch, lidar_speeds=None))[0]
+    known = output.head.motion.norm(dim=1) > 15
+    assert known.sum() > 20 and not unknown.head.motion.any()
+    assert (output.head.bev.features - unknown.head.bev.features).abs().amax(1)[known].min() > 0
+    model.head.loss(output.head, batch.boxes, 1.0, 0.25).terms["box"].backward()
+    assert model.head.shared[0].conv.weight.grad[:, -2:].any()
 
 
 def test_the_last_transition_carries_a_gradient_where_it_is_asked_for():
@@ -241,7 +257,7 @@ def test_occupancy_of_one_scene_is_learnt():
 def test_measured_speeds_are_an_input():
     """Unknown ones are none at all."""
     model, batch = lrs_model(OCCUPANCY, "model.temporal=null").eval(), frame((300,))
-    speeds = torch.full((300,), torch.nan)
+    speeds, batch = torch.full((300,), torch.nan), replace(batch, lidar_origins=torch.zeros(300, 3))
     some = torch.where(torch.arange(300) % 2 == 0, 9.0, torch.nan)
     without, unknown, known = (
         model.encode(replace(batch, lidar_speeds=value)).scales[0].features for value in (None, speeds, some)
