@@ -45,7 +45,8 @@ YOUNGER_KEYS = {
     "model.doppler.along_heading": False,
     "model.dptf.gaussian_path.forget_refuted": False,
     "model.loss.ray_range_power": 0.0,
-    "model.decoders.measured_motion": False,
+    "model.measured_motion": False,
+    "model.neck.finest_scale": 4,
 }
 """Keys that runs were made without, with the value that does what was done then.
 

@@ -1,7 +1,8 @@
-"""From V4 to the map that the detection head reads: maximum over height, SECOND and its FPN (lrs 5.9)."""
+"""From the volume to the map that the detection head reads: maximum over height, SECOND and its FPN (lrs 5.9)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.models.layers.dense import DenseConvNormReLU
 from src.models.layers.norm import MapBatchNorm
+from src.models.lrs4fusion.late_encoder import NUM_SCALES
 from src.ops.segment_reduce import segment_max
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV, SparseMap
@@ -20,10 +22,11 @@ from src.structures.sparse_bev import SparseBEV, SparseMap
 class BEVNeckConfig:
     """Settings of the neck (`model.neck`). Raises ConfigError for lists that do not fit together."""
 
+    finest_scale: int  # of V1 .. V4 that it reads, and whose cells the map has; coarser ones are repeated beside it
     stage_channels: list[int]
     stage_strides: list[int]
     layers_per_stage: int  # after the strided one
-    fpn_channels: int  # of every stage, at the resolution of V4
+    fpn_channels: int  # of every stage, at the resolution of the map
 
     def __post_init__(self) -> None:
         if not self.stage_channels or len(self.stage_channels) != len(self.stage_strides):
@@ -32,15 +35,18 @@ class BEVNeckConfig:
                 "must be of the same length, one value a stage"
             )
         require_least(self, "model.neck", {"layers_per_stage": 0, "fpn_channels": 1})
+        if not 1 <= self.finest_scale <= NUM_SCALES:
+            raise ConfigError(f"model.neck.finest_scale={self.finest_scale}: must be 1 to {NUM_SCALES}, a scale of V")
 
 
 class BEVNeck(nn.Module):
-    """A sparse volume to a dense map of its columns, as wide as all stages' FPN channels together."""
+    """Scales of a sparse volume to a dense map of their columns, as wide as all stages' FPN channels together."""
 
-    def __init__(self, config: BEVNeckConfig, in_channels: int) -> None:
+    def __init__(self, config: BEVNeckConfig, scale_channels: Sequence[int]) -> None:
         super().__init__()
+        self.level = config.finest_scale - 1
         self.stages, self.ups = nn.ModuleList(), nn.ModuleList()
-        width, stride = in_channels, 1
+        width, stride = sum(scale_channels[self.level :]), 1
         for channels, step in zip(config.stage_channels, config.stage_strides, strict=True):
             rest = (DenseConvNormReLU(channels, channels, 3) for _ in range(config.layers_per_stage))
             self.stages.append(nn.Sequential(DenseConvNormReLU(width, channels, 3, step), *rest))
@@ -50,10 +56,12 @@ class BEVNeck(nn.Module):
 
     def forward(
         self,
-        volume: SparseMap,  # on (B, z, y, x)
+        scales: Sequence[SparseMap],  # all, the finest first, on (B, z, y, x)
     ) -> Tensor:  # [B, out_channels, rows, cols]
-        x = columns(volume).to_dense()
-        size, outputs = x.shape[-2:], []
+        maps = [columns(volume).to_dense() for volume in scales[self.level :]]
+        size, outputs = maps[0].shape[-2:], []
+        repeated = (F.interpolate(x, scale_factor=2**power) for power, x in enumerate(maps) if power)
+        x = torch.cat([maps[0], *(x[..., : size[0], : size[1]] for x in repeated)], dim=1)
         for stage, up in zip(self.stages, self.ups, strict=True):
             x = stage(x)
             outputs.append(up(x)[..., : size[0], : size[1]])  # a stride may have rounded the size up

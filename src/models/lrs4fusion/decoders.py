@@ -29,7 +29,6 @@ class DecoderConfig:
     neighbours: list[int]  # voxels that a point sees in V1 .. V4: 1, its own, or 7, with those at its faces
     velocity: bool  # a decoder of radial velocity, where there is something to supervise it
     velocity_unit_mps: float  # in which the network states it
-    measured_motion: bool  # what is measured to move is looked for where it will be, at the speed that was measured
 
     def __post_init__(self) -> None:
         require_least(self, "model.decoders", {"hidden_channels": 1, "num_blocks": 1})

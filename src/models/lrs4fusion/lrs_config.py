@@ -102,6 +102,7 @@ class LRS4FusionConfig(ModelConfig):
 
     sensors: list[str]  # which of SENSORS are read
     norm_momentum: float  # weight of a new batch in the running statistics; few steps need a large one
+    measured_motion: bool  # measured speeds move returns, voxels and memory, and are where velocities begin
     roi: RoiConfig
     unet: UNetConfig
     late_encoder: LateEncoderConfig

@@ -1,4 +1,4 @@
-"""Measured speeds in the volume: which voxels move, and where they are at another time (ours, beside lrs 5.7)."""
+"""Measured speeds: where returns are at the key time, which voxels move, and where those are at another (ours)."""
 
 from __future__ import annotations
 
@@ -49,15 +49,13 @@ class MeasuredMotion:
         cls,
         volume: SparseMap,  # [n + m, C] on (B, z, y, x)
         grid: VoxelGrid,  # of the volume
-        batch: FrameBatch,  # with `lidar_speeds`
+        batch: FrameBatch,  # with LiDAR and its origins
+        velocities: Tensor,  # [L, 3] `return_velocities`
         ego_mps: Tensor,  # [B, 3] m/s, aug frame
     ) -> MeasuredMotion:
-        """A voxel moves where half of its measured points do, or, where it has none, of the `ball_query` around it.
-
-        Points that are measured at MOVING_MPS or less stand.
-        """
+        """A voxel moves where half of its measured returns do, or, where it has none, of the `ball_query` around it."""
         indices = volume.indices
-        velocities = _velocities_around(grid, batch, indices)
+        velocities = _velocities_around(grid, batch, velocities, indices)
         moves = velocities.norm(dim=1) > MOVING_MPS
         rows, stays = moves.nonzero().squeeze(1), (~moves).nonzero().squeeze(1)
         features = full_precision(volume.features)
@@ -143,18 +141,36 @@ def directions(
     return torch.where(cosine.abs() < LEAST_COSINE, rays, heading / cosine)
 
 
+def return_velocities(
+    batch: FrameBatch,  # with `lidar_speeds`
+) -> Tensor:  # [L, 3] m/s over ground, aug frame
+    """By each return's own ray and speed; 0 up to MOVING_MPS, NaN where the speed is unknown."""
+    speeds, points = batch.lidar_speeds[:, None], batch.lidar_points[:, :3]
+    along = directions(points - batch.lidar_origins, ego_heading(batch)[batch.lidar_batch])
+    return torch.where(speeds.abs() <= MOVING_MPS, 0, speeds * along)
+
+
+def at_key_time(
+    points: Tensor,  # [L, 5] as `FrameBatch.lidar_points`
+    velocities: Tensor,  # [L, 3] `return_velocities`
+) -> Tensor:  # [L, 5]
+    """Where what returned them is when the frame is taken: in 50 ms a car drives 1.5 m."""
+    moved = points[:, :3] + velocities.nan_to_num() * points[:, 4:]
+    return torch.cat([moved, points[:, 3:]], dim=1)
+
+
 def _velocities_around(
     grid: VoxelGrid,
     batch: FrameBatch,
+    velocities: Tensor,  # [L, 3] m/s of its returns
     indices: Tensor,  # [n, 4] int64, voxels
 ) -> Tensor:  # [n, 3] m/s
-    """Of the points that move where those are at least half of the measured ones, else 0."""
-    known = batch.lidar_speeds.isfinite().nonzero().squeeze(1)
-    points, owners, speeds = batch.lidar_points[known, :3], batch.lidar_batch[known], batch.lidar_speeds[known, None]
-    along = directions(points - batch.lidar_origins[known], ego_heading(batch)[owners])
-    move = (speeds.abs() > MOVING_MPS).to(speeds.dtype)
+    """Of the returns that move where those are at least half of the measured ones, else 0."""
+    known = velocities.isfinite().all(1).nonzero().squeeze(1)
+    points, owners, velocities = batch.lidar_points[known, :3], batch.lidar_batch[known], velocities[known]
+    move = velocities.any(1, keepdim=True).to(velocities.dtype)
     sites, voxels, inside = voxel_rows(points, owners, grid.lower_m, grid.voxel_m, grid.cells, len(batch))
-    means = segment_mean(torch.cat([move * speeds * along, move], dim=1)[inside], voxels, len(sites))
+    means = segment_mean(torch.cat([velocities, move], dim=1)[inside], voxels, len(sites))
     found = ball_query(means, sites, grid, grid.centre_of(indices[:, 1:]), indices[:, 0], len(OFFSETS))
     rows = sites.rows_of(indices)
     own = (rows >= 0).nonzero().squeeze(1)

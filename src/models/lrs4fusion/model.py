@@ -20,7 +20,13 @@ from src.models.lrs4fusion.bev_neck import BEVNeck
 from src.models.lrs4fusion.decoders import Decoders
 from src.models.lrs4fusion.late_encoder import FUSED_SCALE, FusionStem, LateEncoder, Volumes
 from src.models.lrs4fusion.lrs_config import LRS4FusionConfig, LRSOptions, LRSStage
-from src.models.lrs4fusion.measured_motion import MeasuredMotion, directions, ego_heading
+from src.models.lrs4fusion.measured_motion import (
+    MeasuredMotion,
+    at_key_time,
+    directions,
+    ego_heading,
+    return_velocities,
+)
 from src.models.lrs4fusion.ray_head import RayHead
 from src.models.lrs4fusion.ray_loss import occupancy_objective, range_objective
 from src.models.lrs4fusion.sparse_unet import SparseUNet
@@ -87,14 +93,14 @@ class LRS4Fusion(Detector, WorldModel):
             self.ray_head = RayHead(config.ray_head, self.voxels.farthest_m)
         if self.stage is LRSStage.detection:
             self.decoders.requires_grad_(False)  # they still say how fast what is remembered moves
-            self.neck = BEVNeck(config.neck, late.scale_channels[-1]).to(memory_format=torch.channels_last)
+            self.neck = BEVNeck(config.neck, late.scale_channels).to(memory_format=torch.channels_last)
             self.head = CenterHead(
                 config.head,
                 config.channels,
-                self.voxels.at(len(late.scale_channels) - 1).bev(),
+                self.voxels.at(self.neck.level).bev(),
                 options.velocity_code_weight,
                 dense=True,
-                in_channels=self.neck.out_channels + 2 * config.decoders.measured_motion,
+                in_channels=self.neck.out_channels + 2 * config.measured_motion,
             ).to(memory_format=torch.channels_last)
 
     def train(self, mode: bool = True) -> Self:
@@ -119,6 +125,10 @@ class LRS4Fusion(Detector, WorldModel):
         """The volumes alone; raises as `forward`."""
         if batch.lidar_points is None or batch.lidar_batch is None:
             raise ValueError("FrameBatch.lidar_points is None, but this model uses LiDAR; read it with the frames")
+        measured = None
+        if self.config.measured_motion and batch.lidar_speeds is not None:
+            measured = return_velocities(batch)
+            batch = replace(batch, lidar_points=at_key_time(batch.lidar_points, measured))
         voxels = self.pointnet(batch.lidar_points, batch.lidar_batch, len(batch), batch.lidar_speeds)
         x = self.stem(self.unet(voxels))
         if self.temporal is None:
@@ -127,15 +137,15 @@ class LRS4Fusion(Detector, WorldModel):
             warped = self.temporal.recall(memory, batch)
             volumes = self.late_encoder(x, lambda current: self.temporal(current, warped))
             ego_mps = warped.ego_mps
-        if not self.config.decoders.measured_motion or batch.lidar_speeds is None:
+        if measured is None:
             return volumes
         volume, grid = volumes.scales[FUSED_SCALE], self.voxels.at(FUSED_SCALE)
-        return replace(volumes, motion=MeasuredMotion.of(volume, grid, batch, ego_mps))
+        return replace(volumes, motion=MeasuredMotion.of(volume, grid, batch, measured, ego_mps))
 
     def _head_output(self, volumes: Volumes) -> HeadOutput:
         """Where motion is measured the head sees it, and what it says of velocities is added to it."""
-        x = self.neck(volumes.scales[-1])
-        if not self.config.decoders.measured_motion:
+        x = self.neck(volumes.scales)
+        if not self.config.measured_motion:
             return self.head(x)
         motion = x.new_zeros(len(x), 2, *x.shape[2:], dtype=torch.float32)
         if volumes.motion is not None:

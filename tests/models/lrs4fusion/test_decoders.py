@@ -15,7 +15,7 @@ WIDTHS = (3, 4, 5, 6)
 
 def settings(**changes):
     values = {"hidden_channels": 8, "num_blocks": 2, "neighbours": [7, 7, 1, 1], "velocity": True}
-    values |= {"velocity_unit_mps": 10.0, "measured_motion": False}
+    values |= {"velocity_unit_mps": 10.0}
     return DecoderConfig(**(values | changes))
 
 

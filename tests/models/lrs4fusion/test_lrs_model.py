@@ -155,7 +155,7 @@ def test_the_memory_changes_features_and_no_site():
 def test_measured_speeds_move_the_volume_and_what_is_remembered():
     """All returns go 5 m/s along their rays from a mast, the ego 20 m/s along x, in a turned and larger aug frame."""
     augment = bda(0.4, scale=1.05)
-    model = lrs_model(OCCUPANCY, "model.decoders.measured_motion=true").eval()
+    model = lrs_model(OCCUPANCY, "model.measured_motion=true").eval()
 
     def seen(time_s, measured=True):
         speeds, origins = (torch.full((400,), 5.0), SENSOR.expand(400, 3)) if measured else (None, None)
@@ -177,9 +177,27 @@ def test_measured_speeds_move_the_volume_and_what_is_remembered():
     assert ahead.sum() > 50 and float(radial.median()) == pytest.approx(5.0, abs=0.2)
 
 
+def test_returns_of_another_time_give_the_voxels_of_the_key_time():
+    """All drive 20 m/s along the heading, which is nearly their ray from a sensor far behind."""
+    model, points = lrs_model(OCCUPANCY, "model.measured_motion=true").eval(), cloud(400)
+    points[:, 4] = torch.linspace(-0.1, 0.1, 400)
+    earlier = points - points[:, 4:] * torch.tensor([20.0, 0, 0, 0, 0])
+    motion = {
+        "lidar_origins": torch.tensor([[-1e4, 0.0, 0.0]]).expand(400, 3),
+        "lidar_speeds": torch.full((400,), 20.0),
+    }
+    still = {"lidar_origins": motion["lidar_origins"], "lidar_speeds": torch.zeros(400)}
+    cells = []
+    for clouds, own in ((earlier, motion), (points, still), (earlier, still)):
+        volume = model.encode(replace(lidar_frame([clouds]), **own)).scales[0]
+        cells.append(set(volume.sites.keys.tolist()))
+    moved, there, smeared = cells
+    assert len(moved & there) / len(moved | there) > 0.98 > 0.9 > len(smeared & there) / len(smeared | there)
+
+
 def test_boxes_begin_with_measured_motion():
     """What is known of a cell is an input of the head too; without speeds nothing is known."""
-    model = lrs_model("model.decoders.measured_motion=true").eval()
+    model = lrs_model("model.measured_motion=true").eval()
     batch = replace(frame(), lidar_origins=torch.zeros(700, 3), lidar_speeds=torch.full((700,), 20.0))
     output, unknown = model(batch)[0], model(replace(batch, lidar_speeds=None))[0]
     known = output.head.motion.norm(dim=1) > 15

@@ -8,7 +8,7 @@ from src.geometry.voxel_grid import VoxelGrid
 from src.models.layers.dense import DenseToSparse
 from src.models.lrs4fusion.decoders import DecoderConfig, Decoders
 from src.models.lrs4fusion.late_encoder import FUSED_SCALE, Volumes
-from src.models.lrs4fusion.measured_motion import MeasuredMotion
+from src.models.lrs4fusion.measured_motion import MeasuredMotion, at_key_time, return_velocities
 from src.ops.ball_query import ball_query
 from src.ops.sites import Sites
 from src.structures.boxes import Boxes3D
@@ -42,12 +42,25 @@ def motion(
         lidar_origins=torch.tensor(sensors).expand(len(centres), 3),
         lidar_speeds=torch.tensor(speeds),
     )
-    return MeasuredMotion.of(scale, GRID, frame, torch.tensor([[ego_mps, 0.0, 0.0]] * 2))
+    return MeasuredMotion.of(scale, GRID, frame, return_velocities(frame), torch.tensor([[ego_mps, 0.0, 0.0]] * 2))
 
 
 def seen(moving, *queries, batch=None):
     q = torch.tensor(queries)
     return moving.seen_at(q[:, :3], q[:, 3], torch.zeros(len(q)).long() if batch is None else torch.tensor(batch), 7)
+
+
+def test_returns_lie_where_their_matter_is_at_the_key_time():
+    """Of an age of 50 ms, 1 m/s or less, unknown, abeam, and measured after the key time."""
+    points = torch.tensor([[20.0, 0, 0, 7, 0.05], [20.0, 0, 0, 7, 0.05], [20.0, 0, 0, 7, 0.05], [0.0, 9, 0, 7, 0.1],
+                           [-20.0, 0, 0, 7, -0.05]])  # fmt: skip
+    frame = replace(
+        bare_frame(0.0, [pose()]), lidar_points=points, lidar_batch=torch.zeros(5).long(),
+        lidar_origins=torch.zeros(5, 3), lidar_speeds=torch.tensor([30.0, 1.0, torch.nan, -4.0, 30.0]),
+    )  # fmt: skip
+    moved = at_key_time(points, return_velocities(frame))
+    assert torch.equal(moved[:, 2:], points[:, 2:])
+    torch.testing.assert_close(moved[:, :2], torch.tensor([[21.5, 0], [20, 0], [20, 0], [0, 8.6], [-18.5, 0]]))
 
 
 def test_what_is_measured_to_move_is_seen_where_it_will_be():
@@ -213,7 +226,6 @@ def test_decoders_begin_with_the_measured_speed_of_what_will_be_there():
         neighbours=[7, 7, 1, 1],
         velocity=True,
         velocity_unit_mps=10.0,
-        measured_motion=True,
     )
     model, volumes = Decoders(config, (3, 3, 3, 3), FINEST), Volumes(tuple(scales), (0,) * 4)
     volumes.motion = motion(scales[FUSED_SCALE])
