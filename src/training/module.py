@@ -72,7 +72,11 @@ class TrainingModule(L.LightningModule):
     # ---------------------------------------------------------------- training
 
     def on_train_start(self) -> None:
-        """Look up what a step changes of the model; it lies on its device by now."""
+        """Look up what a step changes of the model; it lies on its device by now.
+
+        Lightning trains in the modes that it finds, which are those of a new module: nobody has called `train`.
+        """
+        self.train()
         self.guard.watch(self.model)
 
     def on_train_batch_start(self, batch: FrameBatch, batch_idx: int) -> None:

@@ -23,6 +23,7 @@ from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence, WarpedPoints
 from src.structures.gaussians import GaussianSet
 from src.structures.taxonomy import CAMERAS, CLASS_RANGE_M, CLASSES
+from src.training.evaluation_mode import evaluation_mode
 
 SHOWN_SCORE = 0.25
 """Boxes below are left out of pictures: a person looks for what the detector is sure of, the metric for all."""
@@ -53,15 +54,14 @@ def draw_frames(model: Detector, clips: Iterable[list[FrameBatch]], grid: BEVGri
 @torch.no_grad()
 def last_outputs(model: Detector, clips: Iterable[list[FrameBatch]]) -> Iterator[tuple[str, FrameBatch, Any]]:
     """Of every clip the end of its pictures' names, its last frame on the model's device, and the model's output."""
-    was_training, device = model.training, next(model.parameters()).device
-    model.eval()
-    for number, clip in enumerate(clips):
-        memory = None
-        for frame in clip:
-            batch = frame.to(device)
-            output, memory = model(batch, memory)
-        yield f"{number}_{re.sub('[^0-9A-Za-z_-]', '_', batch.tokens[0])[:12]}.png", batch, output
-    model.train(was_training)
+    device = next(model.parameters()).device
+    with evaluation_mode(model):
+        for number, clip in enumerate(clips):
+            memory = None
+            for frame in clip:
+                batch = frame.to(device)
+                output, memory = model(batch, memory)
+            yield f"{number}_{re.sub('[^0-9A-Za-z_-]', '_', batch.tokens[0])[:12]}.png", batch, output
 
 
 def scene_of(

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from src.models.detector import Objective, TemporalMemory
 from src.structures.batch import FrameBatch
+from src.training.evaluation_mode import evaluation_mode
 from src.training.module import TrainingModule
 from src.training.true_motion import TrueMotion
 
@@ -58,13 +59,10 @@ class TemporalModule(TrainingModule):
 
         In training a model may learn through the last of them (`Detector.trains_last_transition`).
         """
-        training, memory = self.model.training, None
-        learns = training and self.model.trains_last_transition
-        self.model.eval()
-        with torch.no_grad():
+        learns, memory = self.model.training and self.model.trains_last_transition, None
+        with evaluation_mode(self.model), torch.no_grad():
             for frame in frames[: len(frames) - learns]:
                 _, memory = self.model(frame, memory)
-        self.model.train(training)
         return self.model.transition(frames[-1], memory) if learns else memory
 
     def select_memory(self, batch: FrameBatch) -> TemporalMemory | None:

@@ -525,6 +525,22 @@ def test_phase_1_for_further_epochs(handed_over, caplog):
 
 
 @pytest.mark.slow
+def test_frozen_statistics_are_those_of_phase_1_after_a_training(handed_over):
+    outputs, first, second, _ = handed_over
+    own = ("phase=phase2", "phase.frozen_statistics=true")
+    call("train", "scale=debug", f"paths.outputs={outputs}", *own)
+    runs = (first, outputs / source_of(*own)[1], second)
+    given, frozen, moved = (
+        torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"] for run in runs
+    )
+    statistics = [key for key in given if key.endswith(("running_mean", "running_var"))]
+    assert len(statistics) > 10 and all(torch.equal(given[key], frozen[key]) for key in statistics)
+    assert not any(torch.equal(given[key], moved[key]) for key in statistics)
+    learnt = "model.head.heatmaps.0.norm.weight"
+    assert not torch.equal(given[learnt], frozen[learnt])
+
+
+@pytest.mark.slow
 def test_weights_are_scored_once_more_with_other_settings(handed_over, tmp_path):
     """Without an epoch: the scores and the weights of the run they come from, unless a setting of inference differs."""
     outputs, _, second, _ = handed_over
