@@ -17,7 +17,6 @@ from src.pictures.contents import (
     CLASS_COLOURS,
     CLASS_MARKERS,
     INK,
-    MOVING_MPS,
     OCCUPANCY_COLOUR,
     SOURCE_COLOURS,
     SOURCES,
@@ -27,7 +26,7 @@ from src.pictures.contents import (
     Window,
     match_boxes,
 )
-from src.structures.taxonomy import CLASSES
+from src.structures.taxonomy import CLASSES, MOVING_MPS
 
 Array = np.ndarray
 

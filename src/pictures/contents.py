@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from src.structures.taxonomy import CLASSES
+from src.structures.taxonomy import CLASSES, MOVING_MPS
 
 Array = np.ndarray
 Window = tuple[tuple[float, float], tuple[float, float]]
@@ -53,8 +53,6 @@ OCCUPANCY_COLOUR = (0.62, 0.47, 0.82)
 BOX_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 FRONT_FACE = (0, 1, 5, 4)
 MATCH_DISTANCE_M = 2.0
-MOVING_MPS = 1.0
-"""Radar points and boxes slower than this count as standing."""
 
 
 class Rows:

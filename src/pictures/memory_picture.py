@@ -15,8 +15,9 @@ from matplotlib.patches import Patch, Rectangle
 
 from src.pictures.bev import bev_panel, paint_arrows, paint_label, upright
 from src.pictures.canvas import DPI, GAP_PX, HALF_PX, MARGIN_PX, SHEET_PX, Canvas
-from src.pictures.contents import INK, MOVING_MPS, MUTED, PictureBoxes, PictureGrid, PictureMemory, Window
+from src.pictures.contents import INK, MUTED, PictureBoxes, PictureGrid, PictureMemory, Window
 from src.pictures.legends import arrow_key
+from src.structures.taxonomy import MOVING_MPS
 
 Array = np.ndarray
 

@@ -16,7 +16,8 @@ from matplotlib.patches import Patch
 from src.pictures.bev import SPEED_COLOURS, SPEED_LIMIT_MPS, bev_panel, upright
 from src.pictures.canvas import GAP_PX, MARGIN_PX, SHEET_PX, Canvas
 from src.pictures.comparison import BarPanel, draw_comparison
-from src.pictures.contents import INK, MOVING_MPS, MUTED, OCCUPANCY_COLOUR, Window
+from src.pictures.contents import INK, MUTED, OCCUPANCY_COLOUR, Window
+from src.structures.taxonomy import MOVING_MPS
 
 Array = np.ndarray
 

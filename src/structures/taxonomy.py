@@ -40,5 +40,8 @@ LIDARS: tuple[str, ...] = tuple(_TAXONOMY["lidars"])
 REFERENCE_CHANNEL = "LIDAR_LEFT"
 """Its key frame defines ego(t): the frame of all network geometry and of evaluation ranges."""
 
+MOVING_MPS = 1.0
+"""What is faster over ground moves: in losses, scores and pictures."""
+
 MAX_BOXES_PER_SAMPLE = 500
 """The official evaluator refuses more."""

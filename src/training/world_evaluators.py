@@ -32,6 +32,7 @@ from src.pictures.world_picture import draw_horizons
 from src.reliability.processes import gather_by_rank
 from src.structures.batch import FrameBatch
 from src.structures.ray_bundle import RayBundle
+from src.structures.taxonomy import MOVING_MPS
 from src.targets.occupancy_rays import FreePlaces, RaySampling, draw_rays, sample_queries
 from src.training.evaluator import Evaluator
 from src.training.ground_slice import GroundSlice, global_from_aug
@@ -43,8 +44,6 @@ SAMPLING = RaySampling(
     min_free_m=1.5, depth_m=0.1, num_queries=4096, free_places=FreePlaces.along_rays, ray_balance=False
 )
 """Places along rays that are asked for: as the paper's training draws them, fewer."""
-MOVING_MPS = 1.0
-"""What is faster over ground moves."""
 SLICE_WINDOW, SLICE_CELL_M = ((-40.0, 40.0), (-40.0, 40.0)), 1.0
 """Where the true geometry is compared with, above the ground."""
 SUBSETS = ("", "_moving", "_unseen")

@@ -20,7 +20,7 @@ REAL_STATISTICS = Path(__file__).with_name("real_statistics.yaml")
 FEWEST_BOXES = 50
 """A real figure that rests on fewer boxes says little."""
 HEAVY = ("truck", "bus", "trailer")
-MOVING_MPS = 10.0
+FAST_MPS = 10.0
 SEEN_POINTS = 3
 SEEN_S = 4.0
 """How long the paper's memory reaches back."""
@@ -309,13 +309,13 @@ class _Tables:
             "speed of boxes m/s": _quantiles(speed, (25, 50, 75)) | {"max": (float(speed.max(initial=0)), None)},
             "speed of cars m/s": _quantiles(cars, (25, 50, 75)),
             "boxes": {"per frame": (len(speed) / len(self.counts.points), None)},
-            "boxes above 10 m/s": {"share %": (100.0 * float(np.mean(speed > MOVING_MPS)), None)},
+            "boxes above 10 m/s": {"share %": (100.0 * float(np.mean(speed > FAST_MPS)), None)},
         }
 
     def remembered(self) -> FigureTable:
         """Moving boxes within their class's range that the accumulated radar hardly or no longer shows."""
         limit = np.array([CLASS_RANGE_M.get(name, 0.0) for name in self.counts.classes])
-        movers = (self.counts.speed_mps > MOVING_MPS) & (self.counts.distance_m < limit)
+        movers = (self.counts.speed_mps > FAST_MPS) & (self.counts.distance_m < limit)
         points = self.counts.accumulated
         rows: Rows = {}
         for least in (SEEN_POINTS, 1):
@@ -327,7 +327,7 @@ class _Tables:
             }
         return FigureTable(
             name="remembered",
-            title=f"Boxes above {MOVING_MPS:g} m/s by their radar points in {self.num_sweeps} sweeps",
+            title=f"Boxes above {FAST_MPS:g} m/s by their radar points in {self.num_sweeps} sweeps",
             unit="percent of those boxes",
             sources=[],
             trust="",

@@ -20,11 +20,9 @@ from src.models.horizon3d.kggi import KGGIConfig, KGGIOutput
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.layers.views import CameraViews
 from src.structures.sparse_bev import SparseBEV
+from src.structures.taxonomy import MOVING_MPS
 from src.targets.box_raster import BoxRaster
 from src.targets.projection import view_boxes
-
-MOVING_MPS = 1.0
-"""A box that is faster moves."""
 
 
 class VelocityGroups(Enum):

@@ -15,8 +15,8 @@ from src.losses.loss_weights import LossWeights
 from src.losses.normalizers import full_precision, mean_over_ranks
 from src.losses.regression import masked_smooth_l1
 from src.models.detector import Objective
-from src.models.lrs4fusion.measured_motion import MOVING_MPS
 from src.structures.ray_bundle import RayBundle
+from src.structures.taxonomy import MOVING_MPS
 from src.targets.occupancy_rays import RaySampling, draw_rays, sample_queries
 
 Answer = Callable[[Tensor, Tensor], tuple[Tensor, Tensor | None]]

@@ -54,6 +54,7 @@ class WarpedVolume:
     """Remembered voxels moved to the present and put into voxels again; those of one voxel are averaged."""
 
     volume: SparseMap  # [n, C] on (B, z, y, x) of the second scale
+    velocities: Tensor  # [n, 3] m/s over ground, aug frame, without gradient
     elapsed_s: Tensor  # [B], 0 where nothing is remembered
     ego_mps: Tensor  # [B, 3] the ego's mean velocity since, aug frame; 0 where nothing is remembered
 
@@ -117,7 +118,9 @@ class WindowedFusion(nn.Module):
             keys = torch.zeros(0, dtype=torch.int64, device=batch.device)
             empty = batch.aug_from_ego.new_zeros(0, self.memory_channels)
             nothing = batch.aug_from_ego.new_zeros(len(batch), 4)
-            return WarpedVolume(SparseMap(Sites(shape, keys), empty), nothing[:, 0], nothing[:, 1:])
+            return WarpedVolume(
+                SparseMap(Sites(shape, keys), empty), empty.new_zeros(0, 3), nothing[:, 0], nothing[:, 1:]
+            )
         voxels, motion = frames[0].voxels, frames[0].motion(batch, self.config.max_age_s)
         xyz = voxels.xyz
         if self.config.velocity_compensation:
@@ -127,9 +130,11 @@ class WindowedFusion(nn.Module):
         indices = torch.cat([voxels.rows[:, None], self.grid.cell_of(xyz)], dim=1)[kept]
         sites, owners = Sites.unique(indices, shape)
         features = segment_mean(full_precision(voxels.features)[kept], owners, len(sites))
+        velocities = transform_vectors(motion.aug_from_past[voxels.rows[kept]], voxels.velocities[kept].detach())
         driven = -motion.aug_from_past[:, :3, 3] / motion.elapsed_s.clamp(min=torch.finfo(torch.float32).eps)[:, None]
         ego_mps = torch.where(motion.usable[:, None], driven, 0.0)
-        return WarpedVolume(SparseMap(sites, features), motion.elapsed_s, ego_mps)
+        velocities = segment_mean(velocities, owners, len(sites))
+        return WarpedVolume(SparseMap(sites, features), velocities, motion.elapsed_s, ego_mps)
 
     def _check(self, frame: VolumeFrame, batch: FrameBatch) -> None:
         if len(frame.present) != len(batch):
