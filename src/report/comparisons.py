@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from src.report.metric_names import Metric
 
-UNDECIDED = "undecided"
+UNDECIDED, EQUAL = "undecided", "equal"
 _T = (
     *(12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160, 2.145, 2.131),
     *(2.120, 2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042),
@@ -43,6 +43,11 @@ class Comparison:
         """Whether the interval as it is shown leaves out zero."""
         return self.low is not None and (round(self.low, self.digits) > 0 or round(self.high, self.digits) < 0)
 
+    @property
+    def equal(self) -> bool:
+        """Whether no pair differs, as where a row's change cannot reach the metric."""
+        return self.low == self.high == 0
+
     def favours(self, metric: Metric) -> bool:
         """Whether it is decided for the first row."""
         return self.decided and (self.mean > 0) == metric.higher_is_better
@@ -60,7 +65,9 @@ class Comparison:
 
     @property
     def text(self) -> str:
-        """The numbers, and that it is undecided."""
+        """The numbers, and that it is undecided; or that all pairs are equal."""
+        if self.equal:
+            return EQUAL
         return self.numbers if self.decided else f"{self.numbers} {UNDECIDED}"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from src.report.comparisons import Comparison
+from src.report.comparisons import EQUAL, UNDECIDED, Comparison
 from src.report.metric_names import Metric
 from src.report.result_schema import Latency
 from src.report.results import RunResult
@@ -160,8 +160,9 @@ def _judge(columns: list[Metric], rows: list[SweepRow], places: list[int]) -> li
 
 
 def _found(where: str, judged: list[Judged]) -> str:
-    """How many of the paper's orderings hold, are the other way round and are undecided; or which rows are better."""
-    left = sum(one.better is None for one in judged)
+    """How many of the paper's orderings hold, are the other way round, undecided or equal; or which rows are better."""
+    equal = sum(one.found.equal for one in judged)
+    left = sum(one.better is None for one in judged) - equal
     of_paper = all(one.stated for one in judged)
     one, many = ("ordering of two rows", "orderings of two rows") if of_paper else ("comparison", "comparisons")
     if left == len(judged):
@@ -175,7 +176,8 @@ def _found(where: str, judged: list[Judged]) -> str:
     else:
         parts = [f"{pair.first} better than {pair.second}" for pair in held]
         parts += [f"{pair.first} worse than {pair.second}" for pair in turned]
-    return f"{where}: {', '.join([*parts, *([f'{left} undecided'] if left else [])])}"
+    counts = {UNDECIDED: left, EQUAL: equal}
+    return f"{where}: {', '.join([*parts, *(f'{count} {word}' for word, count in counts.items() if count)])}"
 
 
 def describe_search(

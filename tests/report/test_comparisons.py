@@ -31,6 +31,13 @@ def test_one_seed_never_decides():
     assert not found.decided and not found.favours(MAP) and found.text == "+89.0 undecided"
 
 
+def test_pairs_that_do_not_differ_are_equal():
+    found = compare({0: 1.5, 1: 2.5, 2: 3.5}, {0: 1.5, 1: 2.5, 2: 3.5}, 1)
+    assert found.equal and not found.decided and found.text == "equal"
+    assert not compare({0: 1.5}, {0: 1.5}, 1).equal  # says nothing of the next
+    assert not compare({0: 1.51, 1: 2.5}, {0: 1.5, 1: 2.5}, 1).equal
+
+
 def test_an_interval_that_ends_at_zero_as_shown_is_undecided():
     assert not Comparison(0.5, 0.04, 0.96, 3, 1).decided and Comparison(0.5, 0.04, 0.96, 3, 2).decided
     assert not Comparison(-0.5, -0.96, -0.04, 3, 1).decided
