@@ -28,8 +28,8 @@ ALIVE_S = 300.0
 FRAME_KINDS = {
     "frame": "Cameras and bird's-eye view",
     "memory": "Memory",
-    "film": "Forecast beside what came, moment by moment",
-    "forecast": "Forecast beside what came",
+    "film": "Forecast and true points, moment by moment",
+    "forecast": "Forecast and true points",
     "occupancy": "Occupancy above the ground",
 }
 """Pictures of a sample, in the order of pages; their names carry its number and the beginning of its token."""

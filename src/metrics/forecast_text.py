@@ -29,8 +29,8 @@ OCCUPANCY = {
 
 
 def format_forecast(metrics: Mapping[str, Any]) -> str:
-    """Each error over the frames up to a horizon, beside the static world's and how far below it; "-" where there is
-    none. In brackets 95 % intervals over scenes.
+    """Each error over the frames up to a horizon, beside the static-world baseline's and how far below it; "-" where
+    there is none. In brackets 95 % intervals over scenes.
     """
     rows = [["", *(f"{name} {horizon}" for horizon in HORIZONS for name in ("forecast", "static", "below, %"))]]
     for name, words in ROWS.items():

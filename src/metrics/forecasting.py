@@ -1,4 +1,4 @@
-"""Forecasts of LiDAR against what came: Chamfer distance between clouds and errors along rays (lrs 7.2)."""
+"""Forecasts of LiDAR against the true points: Chamfer distance between clouds and errors along rays (lrs 7.2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a world model says of space and time: slices of occupancy, and forecasts of LiDAR beside what came."""
+"""What a world model says of space and time: slices of occupancy, and forecasts of LiDAR beside the true points."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ VIEW_PX = (300, 600)
 BEARING_DEG, ELEVATION_DEG = 100.0, (-24.0, 12.0)
 """What the view from the sensors shows to each side, and below and above the horizon."""
 RANGES_M = (3.0, 200.0)
-FORECAST_COLOUR, STATIC_COLOUR, CAME_COLOUR = "#D55E00", "#0072B2", "#7A828B"
+BASELINE = "static-world baseline"
+FORECAST_COLOUR, STATIC_COLOUR, TRUE_COLOUR = "#D55E00", "#0072B2", "#7A828B"
 
 
 @dataclass
@@ -48,12 +49,12 @@ class OccupancySlice:
 
 @dataclass
 class ForecastMoment:
-    """One moment's rays: what came, and what was said that would come."""
+    """One moment's rays: the true ranges and the forecast ones."""
 
     time_s: float
     origins: Array  # [R, 3] m, ego frame of the present
     directions: Array  # [R, 3] of length 1
-    came_m: Array  # [R] ranges
+    true_m: Array  # [R] ranges
     forecast_m: Array  # [R]
     static_m: Array  # [R] of a world that stands still
 
@@ -100,25 +101,25 @@ def _paint_slice(axes: Axes, one: OccupancySlice) -> None:
 
 
 def draw_forecast(path: Path | str, moments: Sequence[ForecastMoment], title: str) -> None:
-    """Write a PNG with a row per moment: the forecast and the static world over what came, and the sensors' views."""
+    """Write a PNG with a row per moment: forecast and baseline over the true points, and the sensors' views."""
     width, height = VIEW_PX
     row_px = CAPTION_PX + height + GAP_PX
     canvas = Canvas(SHEET_PX, HEADER_PX + row_px * len(moments) + MARGIN_PX)
     canvas.text(MARGIN_PX, 10, title, 20, bold=True)
-    names = {"what came": CAME_COLOUR, "forecast": FORECAST_COLOUR, "static world": STATIC_COLOUR}
+    names = {"true points": TRUE_COLOUR, "forecast": FORECAST_COLOUR, BASELINE: STATIC_COLOUR}
     style = {"linestyle": "none", "marker": "o", "markersize": 5}
     canvas.legend(1050, 14, [Line2D([], [], color=colour, label=name, **style) for name, colour in names.items()])
     for row, one in enumerate(moments):
         top = HEADER_PX + row * row_px + CAPTION_PX
         when = f"in {one.time_s:.1f} s"
-        found = {"forecast": one.forecast_m, "static world": one.static_m}
+        found = {"forecast": one.forecast_m, BASELINE: one.static_m}
         for column, (name, ranges) in enumerate(found.items()):
             area = (MARGIN_PX + column * (width + GAP_PX), top, width, height)
             axes = bev_panel(canvas, area, WINDOW, f"{name} {when}")
-            _paint_ends(axes, one, one.came_m, CAME_COLOUR, 2.0)
+            _paint_ends(axes, one, one.true_m, TRUE_COLOUR, 2.0)
             _paint_ends(axes, one, ranges, names[name], 2.1)
         left = 2 * (MARGIN_PX + width + GAP_PX)
-        _paint_views(canvas, one, {"what came": one.came_m} | found, (left, top, SHEET_PX - left - 80, height))
+        _paint_views(canvas, one, {"true points": one.true_m} | found, (left, top, SHEET_PX - left - 80, height))
     canvas.save(path, photographs=False)
 
 
@@ -134,7 +135,7 @@ def _paint_views(
     left, top, width, height = area
     bearing, elevation = np.degrees([np.arctan2(*one.directions[:, 1::-1].T), np.arcsin(one.directions[:, 2])])
     each = (height + CAPTION_PX) / len(views)
-    order = np.argsort(-one.came_m)  # the nearest on top
+    order = np.argsort(-one.true_m)  # the nearest on top
     norm = LogNorm(*RANGES_M, clip=True)
     for row, (name, ranges) in enumerate(views.items()):
         at = top + row * each
@@ -179,7 +180,7 @@ def draw_horizons(path: Path | str, scores: Mapping[str, Any], title: str) -> No
             },
         )
     ]
-    own = {"": "forecast", "static_": "static world"}
+    own = {"": "forecast", "static_": BASELINE}
     future = [time for time in times if f"cd@{time}" in scores]
     distances = ("0-50m", "50-150m", "150-250m")
     if future:

@@ -153,7 +153,7 @@ def write_claims(reports: Path, scale: str, records: list[SweepRecord], results:
 
 
 def draw_claims(path: Path, findings: list[tuple[Claim, list[Finding]]], scale: str) -> None:
-    """All measures in points of percent, claim by claim."""
+    """All measures in percentage points, claim by claim."""
     groups = []
     for number, (claim, found) in enumerate(findings, start=1):
         rows, before = [], ""
@@ -170,7 +170,7 @@ def draw_claims(path: Path, findings: list[tuple[Claim, list[Finding]]], scale: 
             verdict, more = str(finding.verdict), (measure.paper, measure.decides)
             rows.append(ForestRow(label, measure.metric.title, verdict, numbers, *ends, *more))
         groups.append(ForestGroup(f"{number}. {claim.config.sentence}", str(verdict_of(found)), rows))
-    draw_forest(path, groups, f"The paper's claims, scale {scale}", "difference of the two rows, points of percent")
+    draw_forest(path, groups, f"The paper's claims, scale {scale}", "difference of the two rows, percentage points")
 
 
 def write_trade_off(reports: Path, record: SweepRecord, results: dict[str, RunResult]) -> list[Path]:

@@ -35,7 +35,7 @@ class ComparisonConfig:
     over: str
     metrics: Many[str]  # that decide, each by itself
     beside: Many[str] = field(default_factory=list)  # that are shown
-    half_width: float | None = None  # precise enough, in the metrics' unit; null: the file's, in points of percent
+    half_width: float | None = None  # precise enough, in the metrics' unit; null: the file's, in percentage points
 
     @property
     def text(self) -> str:

@@ -15,11 +15,11 @@ from src.report.sweep_text import SYNTHETIC, describe_epochs, describe_machines,
 HEADS = ("claim", "measure", "paper", "here", "seeds", "verdict", "command")
 
 _FEW, _MOST = ", ".join(map(str, sorted(LOOKS)[:-1])), max(LOOKS)
-RULE = f"""Rows are compared by runs of the same seed: the mean difference, looked at with {_FEW} and {_MOST}
+RULE = f"""Rows are compared by runs of the same seed: the mean difference, tested with {_FEW} and {_MOST}
 pairs and no other number, each time with an interval of 1 - 0.05/{len(LOOKS)}, so that stopping at the first
 look that decides keeps the error at 5 %. *Shows*: the interval is beyond zero on the claimed side; *does not show*: it
-is beyond zero on the other side, or holds zero and is as narrow as [claims.yaml](../src/report/claims.yaml) asks; else
-*undecided*. A claim shows where all its measures do. What stands in italics is shown beside them and decides nothing.
+is beyond zero on the other side, or contains zero and is as narrow as [claims.yaml](../src/report/claims.yaml) asks;
+else *undecided*. A claim shows where all its measures do. What is in italics decides nothing.
 More of it: [docs/scores.md](../docs/scores.md#when-a-claim-holds)."""
 
 
@@ -65,10 +65,7 @@ def _what_was_run(findings: list[tuple[Claim, list[Finding]]], records: Mapping[
     parts += [*describe_epochs(runs.values()), *describe_machines(runs.values())]
     text = f"{'; '.join(parts)}."
     if any(run.data["name"] == SYNTHETIC for run in runs.values()):
-        text += (
-            f" The {SYNTHETIC} is no TruckScenes, and this scale not the paper's: signs and order compare with the "
-            "paper's, sizes do not."
-        )
+        text += " Data and scale are not the paper's: compare signs and order, not sizes."
     own: dict[str, list[str]] = {}
     for sweep in sorted({sweep for sweeps in worlds.values() for sweep in sweeps}):
         own.setdefault(" ".join(sweep_settings(records[sweep])), []).append(f"`{sweep}`")

@@ -101,11 +101,11 @@ for _horizon in ("1s", "3s"):
         ("cd", "Chamfer"), ("nfcd", "Chamfer 0-50 m"), ("lfcd", "Chamfer 50-250 m"),
         ("cd_moving", "Chamfer of moving objects"), ("cd_unseen", "Chamfer of unseen space"),
     ):  # fmt: skip
-        for _prefix, _of in (("", ""), ("static_", "static world's ")):
+        for _prefix, _of in (("", ""), ("static_", "static-world ")):
             _name = f"{_prefix}{_key}_{_horizon}"
             FORECASTS[_name] = Metric(_name, f"{_of}{_words} {_horizon}", "m^2", 1.0, 2, False)
         _name = f"{_key}_gain_{_horizon}"
-        FORECASTS[_name] = Metric(_name, f"{_words} {_horizon} below the static world's", "%", 100.0, 1)
+        FORECASTS[_name] = Metric(_name, f"{_words} {_horizon} below the static-world baseline's", "%", 100.0, 1)
     for _key, _words in (("l1", "L1 along rays"), ("l1_median", "median along rays")):
         FORECASTS[f"{_key}_{_horizon}"] = Metric(f"{_key}_{_horizon}", f"{_words} {_horizon}", "m", 1.0, 2, False)
 for _step in range(4):

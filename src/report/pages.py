@@ -40,7 +40,7 @@ PHASES_OF = {"phase2": ("phase1", FURTHER, "phase2")}
 """Whose runs a phase's page reads; other phases' pages read their own."""
 
 ANNEALED = ("optim.final_lr_ratio=0.0001", "optim.rise_fraction=0.4")
-"""The whole cycle of the learning rate that phase 1 takes at mini where no phase 2 follows."""
+"""The full one-cycle schedule that phase 1 takes at mini where no phase follows."""
 
 NAMES = {
     ("phase1",): "KGGI + OCSF",
@@ -53,7 +53,7 @@ NAMES = {
 }
 NAMES_OF_COMPARISON = {
     ("phase1",): "phase 1",
-    (FURTHER,): "phase 1, as many further epochs",
+    (FURTHER,): "phase 1 continued, no memory",
     ("phase2",): "phase 2",
     (
         "phase2",
@@ -80,8 +80,8 @@ DROPOUT_TEXT = """From the share `data.sensor_dropout` of the frames, never a cl
 away, in training and in validation: what is found there comes from the memory alone. These rows compare with one
 another only."""
 
-GAIN_TEXT = """Differences between runs of the same seed with Student's 95 % interval; what holds zero is undecided, and
-so is one seed. Points of percent, and m/s for velocity errors, where less is better."""
+GAIN_TEXT = """Differences between runs of the same seed with Student's 95 % interval; what contains zero is undecided,
+and so is one seed. Percentage points, and m/s for velocity errors, where less is better."""
 
 MEMORY_TEXT = """Recall at 2 m, whatever the score, of objects with fewer than 3 returns in the accumulated input that
 had 3 or more at most eight key frames before (hidden), and of objects without an occupied cell inside; the share of
@@ -105,7 +105,7 @@ def called_by_changes(results: Iterable[RunResult], defaults: dict[str, dict[str
 def runs_on_page(results: Iterable[RunResult], phase: str, in_sweeps: Collection[str]) -> list[RunResult]:
     """Those of `results` that the page of `phase` shows; none when there is none of the phase itself.
 
-    Phase 1, and its further epochs, stand on phase 2's page without their ablations. Runs of sweeps (their ids are
+    Phase 1, and phase 1 continued, stand on phase 2's page without their ablations. Runs of sweeps (their ids are
     `in_sweeps`) have tables of their own: of them only experiments that have a name here are shown. Weights that were
     scored once more with other settings are left to the tables of their sweeps.
     """
@@ -250,7 +250,7 @@ def comparison_page(experiments: list[Experiment], scale: str, picture: str) -> 
     runs = [run for experiment in experiments for run in experiment.runs]
     dropout = [experiment for experiment in experiments if experiment not in without_dropout(experiments)]
     experiments = without_dropout(experiments)
-    text = _page("phase2", scale, "a row of phase 2, and one of further epochs, starts from its seed's phase 1", runs)
+    text = _page("phase2", scale, "rows of phase 2 and of phase 1 continued start from their seed's phase 1", runs)
     summary, by_speed = (SUMMARY, BY_RANGE), (BY_SPEED, CAR_BY_SPEED, ERROR_BY_SPEED, CAR_ERROR_BY_SPEED)
     text += f"![Scores by distance and by speed]({picture})\n\n{_tables(experiments, summary)}\n\n"
     if memory := score_table(experiments, OF_MEMORY + OF_HISTORY):

@@ -1,4 +1,4 @@
-"""Scores of a world model: occupancy and radial velocity, and forecasts of LiDAR beside those of a static world.
+"""Scores of a world model: occupancy and radial velocity, and forecasts of LiDAR beside the static-world baseline.
 
 No annotation is read. What only a synthetic world knows, its true geometry, is compared with where there is any.
 """
@@ -299,7 +299,7 @@ class ForecastEvaluator(OccupancyEvaluator):
 
     @staticmethod
     def describe(metrics: Mapping[str, Any]) -> str:
-        """Beside the static world."""
+        """Beside the static-world baseline."""
         return f"{format_forecast(metrics)}\n\n{format_occupancy(metrics)}"
 
 

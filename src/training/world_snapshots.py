@@ -47,7 +47,7 @@ def draw_world(
     """PNGs of the last frame of each clip. Returns the paths.
 
     `occupancy_*`: slices above the ground at up to four times. Of a model that forecasts also `forecast_*`: after one
-    second and at the horizon, beside the static world and what came; and of the first clip all moments as a film,
+    second and at the horizon, beside the baseline and the true points; and of the first clip all moments as a film,
     `film_*`, an animated PNG.
     """
     paths = []

@@ -37,7 +37,7 @@ def test_pictures_have_their_size_and_torn_ones_are_left_out(world, folders):
         (folder / f"{name}.png").write_bytes(whole)
     pictures = folders.pictures(world.run_id(0, 0))
     assert [p.kind for p in pictures] == ["frame", "film", "occupancy", "curves", "horizons"]
-    assert pictures[1].title == "Forecast beside what came, moment by moment, sample abc"
+    assert pictures[1].title == "Forecast and true points, moment by moment, sample abc"
     assert pictures[4].title == "Scores over time and distance"
 
 
