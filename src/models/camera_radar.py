@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
@@ -22,7 +22,6 @@ from src.models.heads.center_head import BoxOptions, CenterHead, HeadConfig, Hea
 from src.models.layers.lift_splat import LiftedViews, LiftSplatConfig
 from src.models.memory import TemporalConfig
 from src.structures.batch import FrameBatch
-from src.structures.boxes import Boxes3D
 
 
 @dataclass(kw_only=True)
@@ -40,6 +39,7 @@ class CameraRadarConfig(ModelConfig):
 
     temporal_part: ClassVar[str] = "temporal"
     new_in_temporal_phase: ClassVar[str] = r"temporal\."
+    sensors: ClassVar[tuple[str, ...]] = ("camera", "radar")
 
     fused_channels: int  # width of the fused map, which is also what is remembered
     radar_encoder: PillarConfig
@@ -51,17 +51,6 @@ class CameraRadarConfig(ModelConfig):
 
     def __post_init__(self) -> None:
         require_least(self, "model", {"channels": 1, "fused_channels": MIN_CHANNELS})
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Both always: without cameras there is nothing to fuse."""
-        return ("camera", "radar")
-
-    def scaled(
-        self, gaussians: float = 1.0, memory_frames: int | None = None, cells_per_frame: int | None = None
-    ) -> Self:
-        """Remembered maps: there are no Gaussians, and which cells are remembered follows from the map alone."""
-        return self._remembering(memory_frames)
 
 
 @dataclass
@@ -112,22 +101,10 @@ class CameraRadarDetector(Detector):
     def build_fusion(self) -> None:
         """Make `view_transform`, `fuser`, `temporal` and what else lies between the encoders and the decoder."""
 
-    @property
-    def image_backbone(self) -> nn.Module:
-        """Backbone without its neck."""
-        return self.image_encoder.backbone
-
-    def encode(
-        self, batch: FrameBatch, memory: Any
-    ) -> tuple[Tensor, Tensor]:  # [B, N, C_I, h, w], [B, C_radar, rows, cols]
-        """Image features and the radar's map.
-
-        Raises ValueError when images are absent, or when the memory is of another number of streams.
-        """
+    def encode(self, batch: FrameBatch) -> tuple[Tensor, Tensor]:  # [B, N, C_I, h, w], [B, C_radar, rows, cols]
+        """Image features and the radar's map. Raises ValueError when images are absent."""
         if batch.images is None or batch.image_valid is None or batch.pix_from_aug is None:
             raise ValueError("FrameBatch.images is None, but this model uses images; read them with the frames")
-        if memory is not None and memory.frames and memory.batch_size != len(batch):
-            raise ValueError(f"the memory holds {memory.batch_size} streams, but the batch {len(batch)} frames")
         (level,) = self.image_encoder(batch.images)
         return level, self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
 
@@ -140,10 +117,6 @@ class CameraRadarDetector(Detector):
             total = depth_cross_entropy(output.views.depth_logits.flatten(0, 1), target)
             terms["depth"] = weights.depth_weight * total / mean_over_ranks((target >= 0).sum())
         return Objective(terms, counts)
-
-    def decode(self, output: CameraRadarOutput) -> list[Boxes3D]:
-        """Boxes of each frame, best first."""
-        return self.head.decode(output.head)
 
     def diagnostics(self, output: CameraRadarOutput) -> dict[str, Tensor | float]:
         """Pillars and lifted pairs per frame, and how sure depth is."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import torch
@@ -21,8 +21,8 @@ from src.structures.evidence import Evidence
 class ModelConfig:
     """What every model's settings (`model`) have in common, and what commands ask of them.
 
-    Each also has `sensors`, as a property or as a key: which of `taxonomy.SENSORS` are read, all that `forward` takes
-    of a batch, and what a submission states.
+    Each also has `sensors`, a class variable, property or key: which of `taxonomy.SENSORS` are read, all that `forward`
+    takes of a batch, and what a submission states.
     """
 
     temporal_part: ClassVar[str] = ""
@@ -61,13 +61,11 @@ class ModelConfig:
         """The settings of a measurement: with so many times the Gaussians; with so many remembered frames (0: none,
         None: as configured); with so many cells remembered of each, whatever fresh weights call occupied. What a model
         does not have stays as it is."""
-        return self
-
-    def _remembering(self, frames: int | None) -> Self:
-        """Settings with so many remembered frames (0: none, None: as configured), where there is a memory."""
-        if frames is None or self._temporal is None:
+        past = self._temporal
+        if memory_frames is None or past is None or "num_frames" not in {field.name for field in fields(past)}:
             return self
-        return replace(self, **{self.temporal_part: replace(self._temporal, num_frames=frames) if frames else None})
+        past = replace(past, num_frames=memory_frames) if memory_frames else None
+        return replace(self, **{self.temporal_part: past})
 
     def at_range(self, range_m: float) -> Self:
         """The settings with a region of their own, not the `grid`, that reaches at least so far to each side."""
@@ -135,6 +133,8 @@ class Detector(nn.Module, ABC):
     `package.module:function`, that each is; `part: inner` lies within `part`."""
     latency_parts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """The parts of Table 15 by the methods that each is; one within another counts for both."""
+    memory_type: ClassVar[type | None] = None
+    """Of what `forward` remembers, a `TemporalMemory`; None for a model of single frames."""
     trains_last_transition: bool = False
     """Whether a step learns also through the encoding of the frame before, where frames bring their past along."""
     prepared_for: str | None = None
@@ -142,8 +142,9 @@ class Detector(nn.Module, ABC):
 
     @property
     def image_backbone(self) -> nn.Module | None:
-        """The part trained at the backbone's own learning rate, None for a model without one."""
-        return None
+        """The part trained at the backbone's own learning rate: the image encoder's; None without one."""
+        encoder = getattr(self, "image_encoder", None)
+        return None if encoder is None else encoder.backbone
 
     @abstractmethod
     def forward(
@@ -165,7 +166,9 @@ class Detector(nn.Module, ABC):
 
     def restore_memory(self, state: list[dict[str, Any]]) -> Any:
         """The memory that `TemporalMemory.state` described. Raises NotImplementedError for single-frame detectors."""
-        raise NotImplementedError(f"{type(self).__name__} has no memory")
+        if self.memory_type is None:
+            raise NotImplementedError(f"{type(self).__name__} has no memory")
+        return self.memory_type.from_state(state)
 
     def loss(self, output: Any, batch: FrameBatch) -> Objective:
         """Weighted terms by name with their sum `total`, and scalars worth a curve, all in float32."""
@@ -186,9 +189,9 @@ class Detector(nn.Module, ABC):
         Raises ValueError for a batch that lacks what it compares with.
         """
 
-    @abstractmethod
     def decode(self, output: Any) -> list[Boxes3D]:
-        """Predicted boxes with scores, one entry per sample, in the (augmented) ego frame."""
+        """Predicted boxes with scores, one entry per sample, best first, in the (augmented) ego frame: the head's."""
+        return self.head.decode(output.head)
 
     def diagnostics(self, output: Any) -> dict[str, Tensor | float]:
         """Scalars of the output that are worth a curve."""

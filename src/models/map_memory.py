@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -34,29 +33,12 @@ class MapFrame(RememberedFrame):
     aug_from_ego: Tensor  # [B, 4, 4] float32, A of its own time
     cells: Tensor  # [B, rows, cols, C] bfloat16
 
-    def select(
-        self,
-        rows: Tensor,  # [B'] int64, distinct where kept
-        keep: Tensor,  # [B'] bool
-    ) -> MapFrame:
-        """The streams at `rows`, those without `keep` forgotten."""
-        return replace(
-            super().select(rows, keep), aug_from_ego=self.aug_from_ego[rows], cells=self.cells.index_select(0, rows)
-        )
-
 
 @dataclass(frozen=True)
 class MapMemory(FrameMemory[MapFrame]):
     """The last maps of each of B streams, newest first."""
 
-    def state(self) -> list[dict[str, Any]]:
-        """Tensors and plain containers, for a checkpoint."""
-        return [{field.name: getattr(frame, field.name) for field in fields(frame)} for frame in self.frames]
-
-    @classmethod
-    def from_state(cls, state: list[dict[str, Any]]) -> MapMemory:
-        """The memory that `state` described."""
-        return cls(tuple(MapFrame(**entry) for entry in state))
+    frame_type = MapFrame
 
 
 @dataclass

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import Generic, Self, TypeVar
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, Generic, Self, TypeVar, get_args, get_type_hints
 
 import torch
 from torch import Tensor
@@ -75,13 +75,17 @@ class RememberedFrame(TensorFields):
         rows: Tensor,  # [B'] int64, distinct where kept
         keep: Tensor,  # [B'] bool
     ) -> Self:
-        """The streams at `rows`, those without `keep` forgotten; a model's frame selects what it added."""
-        return replace(
-            self,
-            timestamps_s=self.timestamps_s[rows],
-            global_from_ego=self.global_from_ego[rows],
-            present=self.present[rows] & keep,
-        )
+        """The streams at `rows`, those without `keep` forgotten."""
+
+        def selected(value: Any) -> Any:
+            if isinstance(value, StoredRows):
+                return value.of_streams(rows, keep, len(self.present))
+            if isinstance(value, Tensor):
+                return value.index_select(0, rows)
+            return value.map(selected) if isinstance(value, TensorFields) else value
+
+        frame = replace(self, **{field.name: selected(getattr(self, field.name)) for field in fields(self)})
+        return replace(frame, present=frame.present & keep)
 
     def with_velocities(
         self,
@@ -129,6 +133,8 @@ def motions(frames: Sequence[RememberedFrame], batch: FrameBatch, max_age_s: flo
 class FrameMemory(TensorFields, Generic[Frame]):
     """The last key frames of each of B streams, newest first. A value: what changes it makes a new one."""
 
+    frame_type: ClassVar[type[RememberedFrame]]
+
     frames: tuple[Frame, ...]
 
     @property
@@ -146,10 +152,12 @@ class FrameMemory(TensorFields, Generic[Frame]):
 
         Dropped are frames that are not older than the batch's, and, where the pose jumped since a stream's last frame,
         all before the jump. Only consecutive frames are compared: over several seconds the same jump could pass for a
-        drive.
+        drive. Raises ValueError for a batch of another number of streams.
         """
         if not self.frames:
             return self
+        if self.batch_size != len(batch):
+            raise ValueError(f"the memory holds {self.batch_size} streams, but the batch {len(batch)} frames")
         steady = ~self.frames[0].jumped(batch)
         stamps = torch.stack([frame.timestamps_s for frame in self.frames])  # [T, B]
         present = self.present & steady & (stamps < batch.timestamps_s)
@@ -168,6 +176,15 @@ class FrameMemory(TensorFields, Generic[Frame]):
         """The memory with every frame changed."""
         return replace(self, frames=tuple(map(change, self.frames)))
 
+    def state(self) -> list[dict[str, Any]]:
+        """Tensors and plain containers, for a checkpoint."""
+        return [_plain(frame) for frame in self.frames]
+
+    @classmethod
+    def from_state(cls, state: list[dict[str, Any]]) -> Self:
+        """The memory that `state` described."""
+        return cls(tuple(_restored(cls.frame_type, entry) for entry in state))
+
     @classmethod
     def _shared(cls, frames: Iterable[Frame]) -> Self:
         """A memory without the frames that no stream has any more, so that they take no other's slot."""
@@ -176,3 +193,21 @@ class FrameMemory(TensorFields, Generic[Frame]):
             return cls(())
         kept = torch.stack([frame.present for frame in frames]).any(1).tolist()  # one transfer, which synchronises
         return cls(tuple(frame for frame, wanted in zip(frames, kept, strict=True) if wanted))
+
+
+def _plain(value: Any) -> Any:
+    if not isinstance(value, TensorFields):
+        return value
+    return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+
+
+def _restored(kind: type, entry: dict[str, Any]) -> Any:
+    """Of a dataclass, whose fields may be others of `TensorFields`, or None."""
+    hints = get_type_hints(kind)
+    values = dict(entry)
+    for name, value in entry.items():
+        parts = [part for part in (hints[name], *get_args(hints[name])) if isinstance(part, type)]
+        part = next((part for part in parts if issubclass(part, TensorFields)), None)
+        if part is not None and value is not None:
+            values[name] = _restored(part, value)
+    return kind(**values)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -20,7 +20,6 @@ from src.models.heads.query_head import QueryHeadConfig, QueryPrediction, SetPre
 from src.models.layers.views import CameraViews
 from src.models.query_memory import QueryMemory, QueryMemoryConfig, QueryPropagation, RecalledQueries
 from src.structures.batch import FrameBatch
-from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
 from src.structures.queries import Queries
 from src.targets.projection import view_boxes
@@ -49,26 +48,16 @@ class QueryDetectorConfig(ModelConfig):
 
     temporal_part: ClassVar[str] = "temporal"
     new_in_temporal_phase: ClassVar[str] = r"temporal\."
+    sensors: ClassVar[tuple[str, ...]] = ("camera", "radar")
 
     temporal: QueryMemoryConfig | None  # null: single frames, phase 1
     head: QueryHeadConfig
     loss: QueryLossConfig
 
     @property
-    def sensors(self) -> tuple[str, ...]:
-        """Both always: without cameras there is nothing to fuse."""
-        return ("camera", "radar")
-
-    @property
     def image_strides_px(self) -> tuple[int, ...] | None:
         """Levels of the image pyramid that are used; None: all that the neck offers."""
         return None
-
-    def scaled(
-        self, gaussians: float = 1.0, memory_frames: int | None = None, cells_per_frame: int | None = None
-    ) -> Self:
-        """Remembered frames: queries are no Gaussians, and of each frame as many are remembered."""
-        return self._remembering(memory_frames)
 
 
 @dataclass
@@ -95,6 +84,7 @@ class QueryDetector(Detector):
     """
 
     phase_options = BoxOptions
+    memory_type = QueryMemory
     latency_parts = {
         "image_encoder": ("image_encoder.forward",),
         "temporal_fusion": ("temporal.recall", "temporal.remember"),
@@ -135,11 +125,6 @@ class QueryDetector(Detector):
         return Queries.unknown(features, centers, torch.ones_like(centers[..., 0], dtype=torch.bool))
 
     @property
-    def image_backbone(self) -> nn.Module:
-        """Backbone without its neck."""
-        return self.image_encoder.backbone
-
-    @property
     def output_layer(self) -> int:
         """The decoder's layer whose boxes count and whose queries are remembered."""
         return -1
@@ -158,17 +143,11 @@ class QueryDetector(Detector):
         if self.temporal is None:
             layers, _ = self.decoder(queries, None, *seen, self.head)
             return DecoderOutput(layers, layers[self.output_layer], None), None
-        if memory is not None and memory.frames and memory.batch_size != len(batch):
-            raise ValueError(f"the memory holds {memory.batch_size} streams, but the batch {len(batch)} frames")
         recalled = self.temporal.recall(memory, batch)
         queries = Queries.concatenate([queries, recalled.newest])
         layers, features = self.decoder(queries, recalled.older, *seen, self.head)
         head, own = layers[self.output_layer], features[self.output_layer]
         return DecoderOutput(layers, head, recalled), self.temporal.remember(memory, batch, own, head)
-
-    def restore_memory(self, state: list[dict[str, Any]]) -> QueryMemory:
-        """The memory that `QueryMemory.state` described."""
-        return QueryMemory.from_state(state)
 
     def loss_terms(self, output: QueryOutput, batch: FrameBatch) -> Objective:
         """Weighted terms `class` and `box`."""
@@ -186,10 +165,6 @@ class QueryDetector(Detector):
         boxes, samples = upload_boxes(*supervised_boxes(batch.boxes, self.grid), device=batch.device)
         seen = view_boxes(boxes, samples, views.pix_from_aug, views.valid, views.image_size_px)
         return camera_losses(maps, views, seen, depth_range_m, *wanted)
-
-    def decode(self, output: QueryOutput) -> list[Boxes3D]:
-        """Boxes of each frame, best first."""
-        return self.head.decode(output.head)
 
     def diagnostics(self, output: QueryOutput) -> dict[str, Tensor | float]:
         """Queries and what is remembered, per frame."""

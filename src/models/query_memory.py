@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -48,15 +47,6 @@ class QueryFrame(RememberedFrame):
     features: Tensor  # [B, K, C]
     valid: Tensor  # [B, K] bool
 
-    def select(
-        self,
-        rows: Tensor,  # [B'] int64, distinct where kept
-        keep: Tensor,  # [B'] bool
-    ) -> QueryFrame:
-        """The streams at `rows`, those without `keep` forgotten."""
-        own = {name: getattr(self, name)[rows] for name in ("centers", "velocities", "features", "valid")}
-        return replace(super().select(rows, keep), **own)
-
     def with_velocities(self, velocities: Callable[[int, Tensor, Tensor], Tensor]) -> QueryFrame:
         """Of all queries."""
         streams = enumerate(zip(self.centers[..., :2], self.velocities, strict=True))
@@ -67,14 +57,7 @@ class QueryFrame(RememberedFrame):
 class QueryMemory(FrameMemory[QueryFrame]):
     """The last key frames of each of B streams, newest first."""
 
-    def state(self) -> list[dict[str, Any]]:
-        """Tensors and plain containers, for a checkpoint."""
-        return [{field.name: getattr(frame, field.name) for field in fields(frame)} for frame in self.frames]
-
-    @classmethod
-    def from_state(cls, state: list[dict[str, Any]]) -> QueryMemory:
-        """The memory that `state` described."""
-        return cls(tuple(QueryFrame(**entry) for entry in state))
+    frame_type = QueryFrame
 
 
 @dataclass

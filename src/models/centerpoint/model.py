@@ -15,7 +15,6 @@ from src.models.backbones.sparse_voxel import VoxelEncoder, VoxelEncoderConfig
 from src.models.detector import Detector, ModelConfig, Objective
 from src.models.heads.center_head import BoxOptions, CenterHead, HeadConfig, HeadOutput
 from src.structures.batch import FrameBatch
-from src.structures.boxes import Boxes3D
 from src.structures.sparse_bev import SparseBEV
 
 POINT_SCALES = (150.0, 150.0, 5.0, 100.0, 0.5)
@@ -41,17 +40,14 @@ class CenterPointLossConfig(LossWeights):
 class CenterPointConfig(ModelConfig):
     """Settings of the model (`model`)."""
 
+    sensors: ClassVar[tuple[str, ...]] = ("lidar",)
+
     lidar_encoder: LidarEncoderConfig
     head: HeadConfig
     loss: CenterPointLossConfig
 
     def __post_init__(self) -> None:
         require_least(self, "model", {"channels": 1})
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """LiDAR alone."""
-        return ("lidar",)
 
 
 @dataclass
@@ -94,10 +90,6 @@ class CenterPoint(Detector):
         """Weighted terms `heatmap` and `box`."""
         weights = self.config.loss
         return self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
-
-    def decode(self, output: CenterPointOutput) -> list[Boxes3D]:
-        """Boxes of each frame, best first."""
-        return self.head.decode(output.head)
 
     def diagnostics(self, output: CenterPointOutput) -> dict[str, Tensor | float]:
         """Cells of the LiDAR map per frame."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor
 
@@ -48,6 +47,7 @@ class CRTFusionOutput(CameraRadarOutput):
 class CRTFusion(CameraRadarDetector):
     """Multi-view fusion, motion estimator, motion-guided temporal fusion, decoder and dense head."""
 
+    memory_type = StackMemory
     latency_parts = CameraRadarDetector.latency_parts | {
         "temporal_fusion": ("estimator.forward", *CameraRadarDetector.latency_parts["temporal_fusion"])
     }
@@ -67,7 +67,7 @@ class CRTFusion(CameraRadarDetector):
 
         Raises ValueError when images are absent, or when the memory is of another number of streams.
         """
-        level, radar_bev = self.encode(batch, memory)
+        level, radar_bev = self.encode(batch)
         cameras = (batch.pix_from_aug, batch.image_valid, self.image_encoder.image_size_px)
         views = self.view_transform(level, radar_bev, *cameras)
         current = fused = self.fuser(views.bev, radar_bev)
@@ -78,10 +78,6 @@ class CRTFusion(CameraRadarDetector):
             memory_now = self.temporal.remember(batch, fused, motion, moved)
         head = self.head(self.decoder(current))
         return CRTFusionOutput(views, radar_bev, fused, head, motion, moved), memory_now
-
-    def restore_memory(self, state: list[dict[str, Any]]) -> StackMemory:
-        """The memory that `StackMemory.state` described."""
-        return StackMemory.from_state(state)
 
     def loss_terms(self, output: CRTFusionOutput, batch: FrameBatch) -> Objective:
         """Weighted terms `heatmap`, `box`, `depth`, `foreground`, `occupancy` and `velocity`."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -57,24 +56,12 @@ class StackFrame(RememberedFrame):
     ages_s: Tensor  # [B, T] float32, of each map at this time; infinite where there is none
     cells: StoredCellStack
 
-    def select(self, rows: Tensor, keep: Tensor) -> StackFrame:
-        """The streams at `rows` [B'], those without `keep` [B'] forgotten."""
-        cells = self.cells.of_streams(rows, keep, len(self.present))
-        return replace(super().select(rows, keep), ages_s=self.ages_s[rows], cells=cells)
-
 
 @dataclass(frozen=True)
 class StackMemory(FrameMemory[StackFrame]):
     """The last frame of each of B streams, which has taken in those before it."""
 
-    def state(self) -> list[dict[str, Any]]:
-        """Tensors and plain containers, for a checkpoint."""
-        return [vars(frame) | {"cells": vars(frame.cells)} for frame in self.frames]
-
-    @classmethod
-    def from_state(cls, state: list[dict[str, Any]]) -> StackMemory:
-        """The memory that `state` described."""
-        return cls(tuple(StackFrame(**(entry | {"cells": StoredCellStack(**entry["cells"])})) for entry in state))
+    frame_type = StackFrame
 
 
 @dataclass

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from torch import Tensor
 
@@ -29,6 +28,8 @@ class DenseBEVOutput(CameraRadarOutput):
 class DenseBEV(CameraRadarDetector):
     """BEVFusion-style detector: lift-splat and pillars onto one dense map, a convolutional decoder, a dense head."""
 
+    memory_type = MapMemory
+
     def build_fusion(self) -> None:
         """Lift-splat, one convolution of both maps, and the memory."""
         config = self.config
@@ -44,17 +45,13 @@ class DenseBEV(CameraRadarDetector):
 
         Raises ValueError when images are absent, or when the memory is of another number of streams.
         """
-        level, radar_bev = self.encode(batch, memory)
+        level, radar_bev = self.encode(batch)
         views = self.view_transform(level, batch.pix_from_aug, batch.image_valid, self.image_encoder.image_size_px)
         fused = self.fuser(views.bev, radar_bev)
         current, warped_maps, memory_now = fused, None, None
         if self.temporal is not None:
             current, warped_maps, memory_now = self.temporal(memory, batch, fused)
         return DenseBEVOutput(views, radar_bev, fused, self.head(self.decoder(current)), warped_maps), memory_now
-
-    def restore_memory(self, state: list[dict[str, Any]]) -> MapMemory:
-        """The memory that `MapMemory.state` described."""
-        return MapMemory.from_state(state)
 
     def diagnostics(self, output: DenseBEVOutput) -> dict[str, Tensor | float]:
         """Also past maps in use."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -23,6 +24,8 @@ from src.structures.taxonomy import CAMERAS
 class Far3DConfig(QueryDetectorConfig):
     """Settings of the model (`model`). Raises ConfigError for parts that do not go together."""
 
+    sensors: ClassVar[tuple[str, ...]] = ("camera",)
+
     num_queries: int  # at learnt places
     queries: AdaptiveQueryConfig
     decoder: PerspectiveDecoderConfig
@@ -32,11 +35,6 @@ class Far3DConfig(QueryDetectorConfig):
         require_least(self, "model", {"channels": 4, "num_queries": 1})
         if self.channels % 4:
             raise ConfigError(f"model.channels={self.channels}: must be a multiple of 4, the heads of image attention")
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Cameras alone."""
-        return ("camera",)
 
 
 @dataclass

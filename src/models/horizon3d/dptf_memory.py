@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -36,13 +35,10 @@ class MemoryFrame(RememberedFrame):
         keep: Tensor,  # [B'] bool
     ) -> MemoryFrame:
         """The streams at `rows`, those without `keep` forgotten."""
-        cells, gaussians = self.cells, self.gaussians
-        if cells is not None:
-            cells = cells.of_streams(rows, keep, len(self.present))
-        if gaussians is not None:
-            gaussians = gaussians.map(lambda value: value[rows])
-            gaussians = replace(gaussians, valid=gaussians.valid & keep[:, None])
-        return replace(super().select(rows, keep), cells=cells, gaussians=gaussians)
+        frame = super().select(rows, keep)
+        if frame.gaussians is None:
+            return frame
+        return replace(frame, gaussians=replace(frame.gaussians, valid=frame.gaussians.valid & keep[:, None]))
 
     def with_velocities(self, velocities: Callable[[int, Tensor, Tensor], Tensor]) -> MemoryFrame:
         """Of cells and of Gaussians."""
@@ -63,6 +59,8 @@ class MemoryFrame(RememberedFrame):
 class Memory(FrameMemory[MemoryFrame]):
     """The last key frames of each of B streams, newest first. A value: pushing makes a new one."""
 
+    frame_type = MemoryFrame
+
     def push(self, frame: MemoryFrame, num_cell_frames: int, num_gaussian_frames: int) -> Memory:
         """Put the current frame first and drop what no path reads any more, so that memory stays bounded."""
         frames = [frame, *self.frames][: max(num_cell_frames, num_gaussian_frames)]
@@ -76,26 +74,3 @@ class Memory(FrameMemory[MemoryFrame]):
                 for age, old in enumerate(frames)
             )
         )
-
-    def state(self) -> list[dict[str, Any]]:
-        """Tensors and plain containers, for a checkpoint."""
-
-        def plain(part: Any) -> dict[str, Tensor] | None:
-            return None if part is None else {field.name: getattr(part, field.name) for field in fields(part)}
-
-        return [
-            plain(frame) | {"cells": plain(frame.cells), "gaussians": plain(frame.gaussians)} for frame in self.frames
-        ]
-
-    @classmethod
-    def from_state(cls, state: list[dict[str, Any]]) -> Memory:
-        """The memory that `state` described."""
-        frames = []
-        for entry in state:
-            cells, gaussians = entry["cells"], entry["gaussians"]
-            parts = {
-                "cells": None if cells is None else StoredCells(**cells),
-                "gaussians": None if gaussians is None else GaussianSet(**gaussians),
-            }
-            frames.append(MemoryFrame(**(entry | parts)))
-        return cls(tuple(frames))

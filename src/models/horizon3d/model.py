@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from torch import Tensor, nn
+from torch import Tensor
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
@@ -25,7 +23,6 @@ from src.models.layers.views import CameraViews
 from src.ops.fixed_shapes import Capacities
 from src.ops.side_stream import on_side_stream
 from src.structures.batch import FrameBatch
-from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
 from src.structures.taxonomy import CAMERAS
 from src.targets.box_raster import BoxRaster
@@ -38,6 +35,7 @@ class Horizon3D(Detector):
     """
 
     phase_options = BoxOptions
+    memory_type = Memory
     benchmark_parts = {
         "ocsf: gaussian encoder": ("ocsf.encoder.forward",),
         "ocsf: splat": ("src.models.horizon3d.ocsf:splat_set",),
@@ -78,18 +76,11 @@ class Horizon3D(Detector):
         self.dptf = DPTF(config.dptf, channels, grid) if config.dptf is not None else None
         self.head = CenterHead(config.head, channels, grid, options.velocity_code_weight)
 
-    @property
-    def image_backbone(self) -> nn.Module | None:
-        """Backbone without its neck."""
-        return None if self.image_encoder is None else self.image_encoder.backbone
-
     def forward(self, batch: FrameBatch, memory: Memory | None = None) -> tuple[Horizon3DOutput, Memory | None]:
         """Detect in the frames of B streams, given what is remembered of them; the new memory is detached.
 
         Raises ValueError when images are needed and absent, or when the memory is of another number of streams.
         """
-        if memory is not None and memory.frames and memory.batch_size != len(batch):
-            raise ValueError(f"the memory holds {memory.batch_size} streams, but the batch {len(batch)} frames")
         if self.dptf is None:
             return self.detect(batch, None), None
         warped_memory = self.dptf.recall(memory, batch)
@@ -113,10 +104,6 @@ class Horizon3D(Detector):
             return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, None, self.head(fused, doppler["boxes"]))
         dptf = self.dptf.aggregate(fused, warped_memory, doppler["cells"])
         return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, dptf, self.head(dptf.bev, doppler["boxes"]))
-
-    def restore_memory(self, state: list[dict[str, Any]]) -> Memory:
-        """The memory that `Memory.state` described."""
-        return Memory.from_state(state)
 
     def _measure_doppler(self, batch: FrameBatch) -> dict[str, Doppler | None]:
         """For whom the configuration wants it."""
@@ -145,10 +132,6 @@ class Horizon3D(Detector):
         if output.dptf is not None and output.dptf.cells is not None:
             terms |= cell_losses(output.dptf.cells, output.fused_bev, raster, weights)
         return Objective(terms, counts)
-
-    def decode(self, output: Horizon3DOutput) -> list[Boxes3D]:
-        """Boxes of each frame, best first."""
-        return self.head.decode(output.head)
 
     def evidence(self, output: Horizon3DOutput) -> Evidence:
         """Refined Gaussians, the cells of their splat, and the warped memory."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 from torch import Tensor
 
@@ -53,6 +52,7 @@ class HyDRaOutput(CameraRadarOutput):
 class HyDRa(CameraRadarDetector):
     """Height association, lift-splat, squeeze-and-excitation fusion, depth consistency, stacked maps, dense head."""
 
+    memory_type = MapMemory
     latency_parts = CameraRadarDetector.latency_parts | {
         "view_transform": (*CameraRadarDetector.latency_parts["view_transform"], "refinement.forward")
     }
@@ -71,7 +71,7 @@ class HyDRa(CameraRadarDetector):
 
         Raises ValueError when images are absent, or when the memory is of another number of streams.
         """
-        level, radar_bev = self.encode(batch, memory)
+        level, radar_bev = self.encode(batch)
         images = CameraViews([level], batch.pix_from_aug, batch.image_valid, self.image_encoder.image_size_px)
         views = self.view_transform(images, radar_bev)
         fused = self.fuser(views.bev, radar_bev)
@@ -82,10 +82,6 @@ class HyDRa(CameraRadarDetector):
             current, warped_maps, memory_now = self.temporal(memory, batch, fused)
         head = self.head(self.decoder(current))
         return HyDRaOutput(views, radar_bev, fused, head, foreground, warped_maps), memory_now
-
-    def restore_memory(self, state: list[dict[str, Any]]) -> MapMemory:
-        """The memory that `MapMemory.state` described."""
-        return MapMemory.from_state(state)
 
     def loss_terms(self, output: HyDRaOutput, batch: FrameBatch) -> Objective:
         """Also `foreground`: which cells lie in boxes."""

@@ -61,6 +61,7 @@ class LRS4Fusion(Detector, WorldModel):
     """
 
     phase_options = LRSOptions
+    memory_type = VolumeMemory
     latency_parts = {
         "lidar_encoder": ("pointnet.forward", "unet.forward"),
         "late_encoder": ("stem.forward", "late_encoder.forward"),
@@ -175,10 +176,6 @@ class LRS4Fusion(Detector, WorldModel):
     def transition(self, batch: FrameBatch, memory: VolumeMemory | None) -> VolumeMemory | None:
         """As in `Detector`."""
         return self.remember(self.encode(batch, memory), batch)
-
-    def restore_memory(self, state: list[dict[str, Any]]) -> VolumeMemory:
-        """The memory that `VolumeMemory.state` described."""
-        return VolumeMemory.from_state(state)
 
     @torch.no_grad()
     def ray_occupancy(self, volumes: Volumes, rays: RayBundle) -> Tensor:  # [R, N]

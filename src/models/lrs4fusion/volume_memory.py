@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -29,14 +28,6 @@ class VolumeFrame(RememberedFrame):
     voxel_m: tuple[float, ...]  # (x, y, z) edges
     voxels: StoredVoxels
 
-    def select(
-        self,
-        rows: Tensor,  # [B'] int64, distinct where kept
-        keep: Tensor,  # [B'] bool
-    ) -> VolumeFrame:
-        """The streams at `rows`, those without `keep` forgotten."""
-        return replace(super().select(rows, keep), voxels=self.voxels.of_streams(rows, keep, len(self.present)))
-
     def with_velocities(self, velocities: Callable[[int, Tensor, Tensor], Tensor]) -> VolumeFrame:
         """Of voxels, over the ground plane."""
         voxels = self.voxels
@@ -50,19 +41,8 @@ class VolumeFrame(RememberedFrame):
 class VolumeMemory(FrameMemory[VolumeFrame]):
     """The last frame of each of B streams, which has taken in those before it."""
 
+    frame_type = VolumeFrame
+
     def detached(self) -> VolumeMemory:
         """The memory whose features carry no gradient to the frame that they are of."""
         return self.mapped(lambda frame: frame.map(Tensor.detach))
-
-    def state(self) -> list[dict[str, Any]]:
-        """Tensors and plain containers, for a checkpoint."""
-        return [_plain(frame) | {"voxels": _plain(frame.voxels)} for frame in self.frames]
-
-    @classmethod
-    def from_state(cls, state: list[dict[str, Any]]) -> VolumeMemory:
-        """The memory that `state` described."""
-        return cls(tuple(VolumeFrame(**(entry | {"voxels": StoredVoxels(**entry["voxels"])})) for entry in state))
-
-
-def _plain(part: VolumeFrame | StoredVoxels) -> dict[str, Any]:
-    return {field.name: getattr(part, field.name) for field in fields(part)}

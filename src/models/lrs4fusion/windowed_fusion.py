@@ -110,10 +110,9 @@ class WindowedFusion(nn.Module):
         remembered features. Raises ValueError for a memory of another number of streams, voxel size or width.
         """
         shape = (len(batch), *self.grid.cells)
-        frames = memory.frames if memory is not None else ()
+        frames = memory.before(batch).frames if memory is not None else ()
         for frame in frames:
-            self._check(frame, batch)
-        frames = memory.before(batch).frames if frames else ()
+            self._check(frame)
         if not frames:
             keys = torch.zeros(0, dtype=torch.int64, device=batch.device)
             empty = batch.aug_from_ego.new_zeros(0, self.memory_channels)
@@ -136,9 +135,7 @@ class WindowedFusion(nn.Module):
         velocities = segment_mean(velocities, owners, len(sites))
         return WarpedVolume(SparseMap(sites, features), velocities, motion.elapsed_s, ego_mps)
 
-    def _check(self, frame: VolumeFrame, batch: FrameBatch) -> None:
-        if len(frame.present) != len(batch):
-            raise ValueError(f"the memory holds {len(frame.present)} streams, but the batch {len(batch)} frames")
+    def _check(self, frame: VolumeFrame) -> None:
         if frame.voxel_m != self.grid.voxel_m or frame.voxels.features.shape[1] != self.memory_channels:
             raise ValueError(
                 f"the memory holds {frame.voxels.features.shape[1]} channels in voxels of {frame.voxel_m} m, but this "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import nn
 
@@ -19,6 +20,8 @@ from src.structures.batch import FrameBatch
 class PETRConfig(QueryDetectorConfig):
     """Settings of the model (`model`). Raises ConfigError for parts that do not go together."""
 
+    sensors: ClassVar[tuple[str, ...]] = ("camera",)
+
     image_stride_px: int  # of the one level of the image pyramid that queries look at
     num_queries: int
     position: PositionEmbeddingConfig
@@ -26,11 +29,6 @@ class PETRConfig(QueryDetectorConfig):
 
     def __post_init__(self) -> None:
         require_least(self, "model", {"channels": 1, "image_stride_px": 1, "num_queries": 1})
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Cameras alone."""
-        return ("camera",)
 
     @property
     def image_strides_px(self) -> tuple[int, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -62,6 +63,8 @@ class RadarGNNLossConfig(LossWeights):
 class RadarGNNConfig(ModelConfig):
     """Settings of the model (`model`); `channels` is that of the last layer. Raises ConfigError for impossible ones."""
 
+    sensors: ClassVar[tuple[str, ...]] = ("radar",)
+
     graph: GraphConfig
     node_channels: list[int]  # layers of the nodes' embedding
     edge_channels: list[int]  # layers of the edges' embedding
@@ -74,11 +77,6 @@ class RadarGNNConfig(ModelConfig):
         for name in ("node_channels", "edge_channels", "layer_channels"):
             if min(getattr(self, name), default=0) < 1:
                 raise ConfigError(f"model.{name}={getattr(self, name)}: must be one or more positive widths")
-
-    @property
-    def sensors(self) -> tuple[str, ...]:
-        """Radar alone."""
-        return ("radar",)
 
 
 @dataclass
@@ -248,10 +246,6 @@ class RadarGNN(Detector):
         """Weighted terms `class` and `box`."""
         weights = self.config.loss
         return self.head.loss(output.head, batch.boxes, weights.class_weight, weights.box_weight)
-
-    def decode(self, output: RadarGNNOutput) -> list[Boxes3D]:
-        """Boxes of each frame, best first."""
-        return self.head.decode(output.head)
 
     def diagnostics(self, output: RadarGNNOutput) -> dict[str, Tensor | float]:
         """Radar points per frame."""
