@@ -76,7 +76,7 @@ def collate(frames: list[FrameBatch | HorizonError]) -> FrameBatch | HorizonErro
             values[f"{sensor}_batch"] = torch.repeat_interleave(torch.arange(len(frames)), counts)
     values["past"] = tuple(collate(list(part)) for part in zip(*(frame.past for frame in frames), strict=True))
     if frames[0].rays is not None:
-        values["rays"] = RayBundle.join(
+        values["rays"] = RayBundle.concatenate(
             [replace(frame.rays, batch=torch.full_like(frame.rays.batch, at)) for at, frame in enumerate(frames)]
         )
     values["skipped"] = {

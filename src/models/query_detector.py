@@ -144,7 +144,7 @@ class QueryDetector(Detector):
             layers, _ = self.decoder(queries, None, *seen, self.head)
             return DecoderOutput(layers, layers[self.output_layer], None), None
         recalled = self.temporal.recall(memory, batch)
-        queries = Queries.concatenate([queries, recalled.newest])
+        queries = Queries.concatenate([queries, recalled.newest], dim=1)
         layers, features = self.decoder(queries, recalled.older, *seen, self.head)
         head, own = layers[self.output_layer], features[self.output_layer]
         return DecoderOutput(layers, head, recalled), self.temporal.remember(memory, batch, own, head)

@@ -88,9 +88,3 @@ class GaussianSet(TensorFields):
         single = {name: torch.zeros(1, 0) for name in ("opacity_logits", "elapsed_s")}
         sources, valid = torch.zeros(1, 0, dtype=torch.int64), torch.zeros(1, 0, dtype=torch.bool)
         return cls(**pairs, **single, features=torch.zeros(1, 0, 0), sources=sources, valid=valid)
-
-    @staticmethod
-    def concatenate(parts: list[GaussianSet]) -> GaussianSet:
-        """Join sets of the same samples along G."""
-        names = [field.name for field in fields(GaussianSet)]
-        return GaussianSet(**{name: torch.cat([getattr(part, name) for part in parts], dim=1) for name in names})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -28,11 +28,6 @@ class Queries(TensorFields):
 
     def __len__(self) -> int:
         return self.valid.shape[1]
-
-    @classmethod
-    def concatenate(cls, parts: list[Queries]) -> Queries:
-        """The queries of all parts, side by side."""
-        return cls(**{field.name: torch.cat([getattr(one, field.name) for one in parts], 1) for field in fields(cls)})
 
     @classmethod
     def unknown(cls, features: Tensor, centers: Tensor, valid: Tensor) -> Queries:  # [B, Q, C], [B, Q, 3], [B, Q]

@@ -48,8 +48,3 @@ class RayBundle(TensorFields):
     def __getitem__(self, rows: Tensor) -> RayBundle:
         """Some of the rays, by a mask or by row."""
         return self.map(lambda value: value[rows])
-
-    @classmethod
-    def join(cls, parts: list[RayBundle]) -> RayBundle:
-        """All rays in one bundle, in order; each keeps its sample. At least one part."""
-        return cls(**{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(cls)})

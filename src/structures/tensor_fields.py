@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import Any, Self
 
@@ -12,6 +12,12 @@ from torch import Tensor
 
 class TensorFields:
     """Base of a dataclass that holds tensors, others of its kind, lists or tuples of them, and plain values."""
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self], dim: int = 0) -> Self:
+        """All parts joined along one axis of every tensor, in order; at least one part, of tensors alone."""
+        names = [field.name for field in fields(cls)]
+        return cls(**{name: torch.cat([getattr(part, name) for part in parts], dim) for name in names})
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Self:
         """The same with `function` applied to every tensor."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import Enum
 
 import torch
 from torch import Tensor
 
+from src.errors import ConfigError, require_least
 from src.geometry.constants import constant
 from src.geometry.ragged import enumerate_windows
 from src.targets.projection import BoxViews
@@ -16,6 +18,26 @@ class DepthTarget(Enum):
     """What supervises depth."""
 
     box = "box"  # the centre depth of annotated boxes
+
+
+@dataclass(kw_only=True)
+class DepthBinsConfig:
+    """Base of settings with depth bins."""
+
+    num_depth_bins: int  # D, linearly increasing widths
+    depth_range_m: list[float]  # [nearest, farthest] along the optical axis
+
+    @property
+    def depth_range(self) -> tuple[float, float]:
+        """(nearest, farthest) in metres."""
+        return self.depth_range_m[0], self.depth_range_m[1]
+
+    def check_depth_bins(self, key: str) -> None:
+        """Raises ConfigError, naming `key`, for values that cannot work."""
+        require_least(self, key, {"num_depth_bins": 1})
+        low_high = self.depth_range_m
+        if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
+            raise ConfigError(f"{key}.depth_range_m={low_high}: must be [near, far] in metres with 0 < near < far")
 
 
 def lid_edges(

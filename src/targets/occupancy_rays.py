@@ -107,7 +107,7 @@ def sample_queries(
                 batch=rays.batch[drawn],
             )
         )
-    return OccupancyQueries(**{name: torch.cat([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+    return OccupancyQueries.concatenate(parts)
 
 
 def clip_rays(

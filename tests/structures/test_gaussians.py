@@ -19,7 +19,7 @@ def gaussians(count=5, source=Source.RADAR, **changes):
 
 def test_sets_are_joined_along_the_gaussians():
     parts = [gaussians(3), gaussians(0, Source.CAMERA), gaussians(2, Source.HISTORY)]
-    joined = GaussianSet.concatenate(parts)
+    joined = GaussianSet.concatenate(parts, dim=1)
     assert len(joined) == 5 and joined.batch_size == 2
     assert joined.sources.tolist() == [[0, 0, 0, 3, 3]] * 2
     assert torch.equal(joined.features[:, 3:], parts[2].features)

@@ -62,7 +62,7 @@ def rays(times_s, model, samples):
                     torch.full((41,), sample),
                 )  # fmt: skip
             )
-    return RayBundle.join(parts)
+    return RayBundle.concatenate(parts)
 
 
 def index_of(root, count=2, scenes=(0, 1)):

@@ -69,7 +69,7 @@ class Far3D(QueryDetector):
         """
         views = CameraViews.encode(self.image_encoder, batch)
         adaptive, camera = self.proposals(views)
-        queries = Queries.concatenate([self.anchor_queries(len(batch)), adaptive])
+        queries = Queries.concatenate([self.anchor_queries(len(batch)), adaptive], dim=1)
         answers, memory = self.run_decoder(batch, memory, queries, views)
         return Far3DOutput(*answers, views, camera, adaptive), memory
 

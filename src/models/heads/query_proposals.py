@@ -19,33 +19,22 @@ from src.ops.nms import maxpool_peaks
 from src.ops.segment_reduce import topk_per_sample
 from src.structures.queries import Queries
 from src.structures.taxonomy import CLASSES
-from src.targets.depth import lid_centres
+from src.targets.depth import DepthBinsConfig, lid_centres
 
 
 @dataclass(kw_only=True)
-class KeypointQueryConfig:
+class KeypointQueryConfig(DepthBinsConfig):
     """How queries start at objects found in the images (`model.queries`). Raises ConfigError for values that cannot
     work; every other integer of a model's own must be at least 1."""
 
-    num_depth_bins: int  # D, linearly increasing widths
-    depth_range_m: list[float]  # [nearest, farthest] along the optical axis
     keypoint_nms_cells: int  # odd window of local maxima in the keypoint map
 
     def __post_init__(self) -> None:
         counts = [field.name for field in fields(self) if isinstance(getattr(self, field.name), int)]
         require_least(self, "model.queries", dict.fromkeys(counts, 1))
-        low_high = self.depth_range_m
-        if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
-            raise ConfigError(
-                f"model.queries.depth_range_m={low_high}: must be [near, far] in metres with 0 < near < far"
-            )
+        self.check_depth_bins("model.queries")
         if self.keypoint_nms_cells % 2 == 0:
             raise ConfigError(f"model.queries.keypoint_nms_cells={self.keypoint_nms_cells}: must be odd")
-
-    @property
-    def depth_range(self) -> tuple[float, float]:
-        """(nearest, farthest) in metres."""
-        return self.depth_range_m[0], self.depth_range_m[1]
 
 
 @dataclass(kw_only=True)
@@ -93,7 +82,7 @@ class QueryProposals(nn.Module):
         """Radar, camera and learnt queries, in this order."""
         logits, camera = self.heatmap(radar.bev.features), self.camera_head(views.levels[0])
         parts = [self._radar(logits.detach(), radar), self._camera(camera, views), self._learned(len(views.valid))]
-        return Proposals(Queries.concatenate(parts), logits, camera)
+        return Proposals(Queries.concatenate(parts, dim=1), logits, camera)
 
     def _radar(self, logits: Tensor, radar: RadarPoints) -> Queries:
         """The peaks of the heat map of any class; they bring their class, their place and their radial velocity."""

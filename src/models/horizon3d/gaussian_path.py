@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import torch
@@ -103,17 +103,14 @@ class GaussianPath(nn.Module):
         missing = self.config.num_history_gaussians - sum(map(len, parts))
         if self.fixed_capacity and missing > 0:
             parts.append(self._padding(len(batch), missing))
-        return GaussianSet.concatenate(parts) if parts else None
+        return GaussianSet.concatenate(parts, dim=1) if parts else None
 
     def _warp(
         self, frames: list[MemoryFrame], batch: FrameBatch, max_age_s: float, min_speed_mps: float
     ) -> GaussianSet:
         """The Gaussians of T frames in one batch: launches cost more than the arithmetic."""
         sets = [frame.gaussians for frame in frames]
-        past = GaussianSet(
-            **{field.name: torch.cat([getattr(one, field.name) for one in sets]) for field in fields(GaussianSet)}
-        )
-        return self.move(past, motions(frames, batch, max_age_s), min_speed_mps)
+        return self.move(GaussianSet.concatenate(sets), motions(frames, batch, max_age_s), min_speed_mps)
 
     def move(
         self,

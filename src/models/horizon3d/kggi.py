@@ -19,7 +19,7 @@ from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians
 from src.ops.segment_reduce import topk_per_sample
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV
-from src.targets.depth import DepthTarget, lid_centres
+from src.targets.depth import DepthBinsConfig, DepthTarget, lid_centres
 
 INSIDE = 1.0 - 1e-5
 """Random means stay strictly inside the grid, in units of its half extent."""
@@ -34,15 +34,13 @@ class Initialization(Enum):
 
 
 @dataclass(kw_only=True)
-class KGGIConfig:
+class KGGIConfig(DepthBinsConfig):
     """Settings of KGGI (`model.kggi`). Raises ConfigError for values that cannot work on any grid."""
 
     initialization: Initialization  # Table 3
     num_radar_keypoints: int  # K_r
     num_camera_keypoints: int  # K_c
     num_random_keypoints: int  # K_rand; with initialization=random all three counts are random Gaussians
-    num_depth_bins: int  # D, linearly increasing widths
-    depth_range_m: list[float]  # [nearest, farthest] along the optical axis
     depth_target: DepthTarget  # what supervises the depth head
     keypoint_nms_cells: int | None  # odd window of local maxima in the keypoint map; null = every pixel competes
     property_head: bool  # local features correct the learnable attributes
@@ -50,7 +48,7 @@ class KGGIConfig:
 
     def __post_init__(self) -> None:
         least = 0 if self.initialization is Initialization.random else 1
-        own = {"num_radar_keypoints": least, "num_camera_keypoints": least, "num_depth_bins": 1}
+        own = {"num_radar_keypoints": least, "num_camera_keypoints": least}
         own["source_embedding_std"] = 0
         require_least(self, "model.kggi", own)
         if self.num_random_keypoints < 0 or sum(self.counts.values()) < 1:
@@ -58,17 +56,10 @@ class KGGIConfig:
                 f"model.kggi.num_random_keypoints={self.num_random_keypoints}: must not be negative, and "
                 "the three sources together must give at least one Gaussian"
             )
-        low_high = self.depth_range_m
-        if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
-            raise ConfigError(f"model.kggi.depth_range_m={low_high}: must be [near, far] in metres with 0 < near < far")
+        self.check_depth_bins("model.kggi")
         window = self.keypoint_nms_cells
         if window is not None and (window < 3 or window % 2 == 0):
             raise ConfigError(f"model.kggi.keypoint_nms_cells={window}: must be null or an odd number from 3 on")
-
-    @property
-    def depth_range(self) -> tuple[float, float]:
-        """(nearest, farthest) in metres."""
-        return self.depth_range_m[0], self.depth_range_m[1]
 
     @property
     def uses_keypoints(self) -> bool:
@@ -176,7 +167,7 @@ class KGGI(nn.Module):
             parts.append(self._gaussians(Source.RANDOM, means, valid, None))
         if history is not None:
             parts.append(replace(history, features=history.features + self.source_embedding.weight[Source.HISTORY]))
-        return KGGIOutput(GaussianSet.concatenate(parts), logits, camera)
+        return KGGIOutput(GaussianSet.concatenate(parts, dim=1), logits, camera)
 
     def _learnt_means(self) -> Tensor:  # [K, 2] m
         return self.centre_m + self.half_extent_m * self.random_means.clamp(-INSIDE, INSIDE)

@@ -14,39 +14,28 @@ from src.models.backbones.resnet import BasicBlock
 from src.models.layers.dense import DenseConvNormReLU, MapConv2d, map_of_rows, rows_of_map
 from src.ops.segment_reduce import inverse_rows, weighted_segment_sum
 from src.structures.batch import FrameBatch
-from src.targets.depth import lid_centres, paint_depth
+from src.targets.depth import DepthBinsConfig, lid_centres, paint_depth
 from src.targets.projection import view_boxes
 from src.targets.supervision import supervised_boxes, upload_boxes
 
 
 @dataclass(kw_only=True)
-class LiftSplatConfig:
+class LiftSplatConfig(DepthBinsConfig):
     """Settings of the view transform (`model.view_transform`). Raises ConfigError for values that cannot work."""
 
     image_stride_px: int  # level of the image encoder that is lifted
     hidden_channels: int  # of the depth network
     context_channels: int  # width of what is lifted, and of the map
-    num_depth_bins: int  # D, linearly increasing widths
-    depth_range_m: list[float]  # [nearest, farthest] along the optical axis
     z_range_m: list[float]  # [low, high): lifted points outside are dropped
 
     def __post_init__(self) -> None:
-        own = ("image_stride_px", "hidden_channels", "context_channels", "num_depth_bins")
+        own = ("image_stride_px", "hidden_channels", "context_channels")
         require_least(self, "model.view_transform", dict.fromkeys(own, 1))
-        low_high = self.depth_range_m
-        if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
-            raise ConfigError(
-                f"model.view_transform.depth_range_m={low_high}: must be [near, far] in metres with 0 < near < far"
-            )
+        self.check_depth_bins("model.view_transform")
         if len(self.z_range_m) != 2 or not self.z_range_m[0] < self.z_range_m[1]:
             raise ConfigError(
                 f"model.view_transform.z_range_m={self.z_range_m}: must be [low, high] in metres with low < high"
             )
-
-    @property
-    def depth_range(self) -> tuple[float, float]:
-        """(nearest, farthest) in metres."""
-        return self.depth_range_m[0], self.depth_range_m[1]
 
 
 @dataclass

@@ -8,11 +8,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import ConfigError, require_least
+from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
 from src.models.layers.views import CameraViews
-from src.targets.depth import lid_centres
+from src.targets.depth import DepthBinsConfig, lid_centres
 
 HIDDEN_RATIO = 4
 EDGE = 1e-5
@@ -20,27 +20,15 @@ EDGE = 1e-5
 
 
 @dataclass(kw_only=True)
-class PositionEmbeddingConfig:
+class PositionEmbeddingConfig(DepthBinsConfig):
     """Settings of the position embedding (`model.position`). Raises ConfigError for values that cannot work."""
 
-    num_depth_bins: int  # D places on the ray of each pixel, further and further apart
-    depth_range_m: list[float]  # [nearest, farthest] along the optical axis
     z_range_m: list[float]  # that coordinates are normalised by, with the grid's extent in x and y
 
     def __post_init__(self) -> None:
-        require_least(self, "model.position", {"num_depth_bins": 1})
-        low_high = self.depth_range_m
-        if len(low_high) != 2 or not 0 < low_high[0] < low_high[1]:
-            raise ConfigError(
-                f"model.position.depth_range_m={low_high}: must be [near, far] in metres with 0 < near < far"
-            )
+        self.check_depth_bins("model.position")
         if len(self.z_range_m) != 2 or not self.z_range_m[0] < self.z_range_m[1]:
             raise ConfigError(f"model.position.z_range_m={self.z_range_m}: must be [low, high] in metres, ascending")
-
-    @property
-    def depth_range(self) -> tuple[float, float]:
-        """(nearest, farthest) in metres."""
-        return self.depth_range_m[0], self.depth_range_m[1]
 
 
 class PositionEmbedding(nn.Module):
