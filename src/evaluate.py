@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import logging
 from functools import partial
 from pathlib import Path
 
@@ -25,8 +24,6 @@ from src.training.identity import digest_of_changes
 from src.training.run_folder import make_writable, name_of, write_json
 from src.training.temporal_module import TemporalModule
 from src.training.true_motion import Oracle, TrueMotion
-
-logger = logging.getLogger(__name__)
 
 
 def main(overrides: list[str]) -> None:

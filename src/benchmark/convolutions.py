@@ -74,7 +74,7 @@ def layers_of(
         ndim, width = stage.sites.ndim, stage.channels
         if number and number == encoder.bev_stage:
             narrow = stages[number - 1].channels
-            down = SparseConv(narrow, width, 3, ndim, bias=False, stride=2, padding=1)
+            down = SparseConv(narrow, width, 3, ndim, bias=False, stride=2)
             name = f"stage {number + 1} stride 2, {narrow} to {width} channels"
             layers.append(Layer(name, previous, down))
         subm = SubmanifoldConv(width, width, 3, ndim, bias=False)
@@ -84,7 +84,7 @@ def layers_of(
     layers.append(Layer(f"BEV submanifold 2D, {channels} channels", bev_sites, flat))
     cube = SubmanifoldConv(channels, channels, 3, 3, bias=False)
     layers.append(Layer(f"time submanifold (t, y, x), {channels} channels", past_sites, cube))
-    halving = SparseConv(channels, channels, 3, 3, bias=False, stride=(2, 1, 1), padding=1)
+    halving = SparseConv(channels, channels, 3, 3, bias=False, stride=(2, 1, 1))
     layers.append(Layer(f"time stride (2, 1, 1), {channels} channels", past_sites, halving))
     kept = TemporalConv(channels, channels, dilating=False)
     name = f"time stride (2, 1, 1) on occupied columns, {channels} channels"

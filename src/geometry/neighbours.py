@@ -9,6 +9,8 @@ import numpy as np
 
 Array = np.ndarray
 
+RADII = (0.5, 2.0)
+"""In which the nearest point is looked for first."""
 MAX_PAIRS = 4_000_000
 """Candidates that are looked at together, which bounds the memory."""
 
@@ -28,9 +30,8 @@ def neighbours_within(
 def nearest_squared(
     queries: Array,  # [Q, D] float64
     points: Array,  # [P, D] float64, at least one
-    radii: tuple[float, ...] = (0.5, 2.0),
 ) -> Array:  # [Q] float64
-    """Squared distance of every query to its nearest point, exact: first those with one within the radii, by cells,
+    """Squared distance of every query to its nearest point, exact: first those with one within RADII, by cells,
     then the rest against all.
 
     Raises ValueError without a point and for coordinates that are not finite.
@@ -38,7 +39,7 @@ def nearest_squared(
     if not (len(points) and np.isfinite(queries).all() and np.isfinite(points).all()):
         raise ValueError(f"points must be at least one, but got {len(points)}, and all coordinates finite")
     best, rest = np.full(len(queries), np.inf), np.arange(len(queries))
-    for radius in radii:
+    for radius in RADII:
         for query, _, squared in _pairs(queries[rest], points, radius):
             np.minimum.at(best, rest[query], squared)
         rest = rest[np.isinf(best[rest])]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from src.metrics.score_text import align
+from src.metrics.score_text import align, plain
 
 ROWS = {
     "cd": "Chamfer, m^2",
@@ -36,7 +36,7 @@ def format_forecast(metrics: Mapping[str, Any]) -> str:
     for name, words in ROWS.items():
         cells = []
         for horizon in HORIZONS:
-            cells += [_plain(metrics.get(f"{prefix}{name}_{horizon}")) for prefix in ("", "static_")]
+            cells += [plain(metrics.get(f"{prefix}{name}_{horizon}")) for prefix in ("", "static_")]
             cells.append(_gain(metrics, f"{name}_gain_{horizon}"))
         if any(cell not in ("-", "") for cell in cells):
             rows.append([words, *cells])
@@ -48,8 +48,8 @@ def format_occupancy(metrics: Mapping[str, Any]) -> str:
     times = sorted({name.partition("@")[2] for name in metrics if name.startswith("iou@")}, key=lambda t: float(t[:-1]))
     kinds = {kind: words for kind, words in OCCUPANCY.items() if kind.endswith("iou") or metrics.get(kind) is not None}
     rows = [["time", *kinds.values()]]
-    rows += [[time, *(_plain(metrics.get(f"{kind}@{time}")) for kind in kinds)] for time in times]
-    rows.append(["all", *(_plain(metrics.get(kind)) for kind in kinds)])
+    rows += [[time, *(plain(metrics.get(f"{kind}@{time}")) for kind in kinds)] for time in times]
+    rows.append(["all", *(plain(metrics.get(kind)) for kind in kinds)])
     return align(rows)
 
 
@@ -60,7 +60,3 @@ def _gain(metrics: Mapping[str, Any], name: str) -> str:
         return ""
     sure = f" [{100 * bounds[0]:.1f}, {100 * bounds[1]:.1f}]" if bounds else ""
     return f"{100 * value:.1f}{sure}"
-
-
-def _plain(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"

@@ -40,7 +40,7 @@ def format_scores(metrics: Mapping[str, Any]) -> str:
     classes = [["class", "AP", *(f"AP {name}" for name in metrics["ranges"]), *ERRORS, "boxes"]]
     for name, overall in metrics["classes"].items():
         aps = [_percent(part["classes"][name]["AP"]) for part in parts.values()]
-        classes.append([name, *aps, *(_plain(overall[error]) for error in ERRORS), str(overall["num_gt"])])
+        classes.append([name, *aps, *(plain(overall[error]) for error in ERRORS), str(overall["num_gt"])])
     tables = [_summary("range (m)", metrics), classes]
     if LONG_RANGE in metrics:
         tables.append(_summary("long range (m)", metrics[LONG_RANGE]))
@@ -58,7 +58,7 @@ def _summary(corner: str, scores: Mapping[str, Any]) -> list[list[str]]:
     """Over everything and by distance."""
     rows = [[corner, "mAP", "NDS", *(f"m{name}" for name in ERRORS), "boxes"]]
     for name, part in ({"all": scores} | scores["ranges"]).items():
-        errors = [_plain(part[f"m{error}"]) for error in ERRORS]
+        errors = [plain(part[f"m{error}"]) for error in ERRORS]
         rows.append([name, _percent(part["mAP"]), _percent(part["NDS"]), *errors, _boxes(part)])
     return rows
 
@@ -73,9 +73,9 @@ def _intervals(intervals: Mapping[str, Any]) -> list[str]:
 def _speeds(parts: Mapping[str, Any]) -> list[list[str]]:
     rows = [["speed (m/s)", "mAP", *(f"m{name}" for name in ERRORS), "car AP", "car AVE", "classes", "boxes"]]
     for name, part in parts.items():
-        errors = [_plain(part[f"m{error}_present"]) for error in ERRORS]
+        errors = [plain(part[f"m{error}_present"]) for error in ERRORS]
         car, there = part["classes"]["car"], sum(values["num_gt"] > 0 for values in part["classes"].values())
-        cars = [_percent(car["AP"]), _plain(car["AVE"])] if car["num_gt"] else ["-", "-"]
+        cars = [_percent(car["AP"]), plain(car["AVE"])] if car["num_gt"] else ["-", "-"]
         rows.append([name, _percent(part["mAP_present"]), *errors, *cars, str(there), _boxes(part)])
     return rows
 
@@ -103,7 +103,7 @@ def _gaussians(measures: Mapping[str, float | None]) -> list[list[str]]:
     for source in (name.removesuffix("_gaussians") for name in measures if name.endswith("_gaussians")):
         number, wrong = measures[f"{source}_gaussians"], measures[f"{source}_velocity_error"]
         shares = [_percent(measures[f"{source}_{what}"]) for what in ("near", "faint")]
-        rows.append([source, f"{number:.0f}", *shares, _plain(wrong)])
+        rows.append([source, f"{number:.0f}", *shares, plain(wrong)])
     return rows
 
 
@@ -115,7 +115,8 @@ def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.1f}"
 
 
-def _plain(value: float | None) -> str:
+def plain(value: float | None) -> str:
+    """With three digits."""
     return "-" if value is None else f"{value:.3f}"
 
 

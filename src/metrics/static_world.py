@@ -19,6 +19,8 @@ COARSE_POINTS = 8192
 """Of the points at most so many are looked at for the last: where nothing is nearer, which it is says little."""
 ORIGIN_CELL_M = 0.25
 """Rays that begin in one cell see the scan from its middle ray's origin: 0.7 degrees at 10 m are the most it errs."""
+CUBE_M = 2.0
+"""Edge of the cubes that are seen or unseen: as wide as the gaps between the beams at 100 m."""
 NEAR_M = 0.5
 """Points so near to where a ray begins have no direction to speak of."""
 
@@ -114,41 +116,40 @@ def _nearest_bearings(
 def unseen(
     batch: FrameBatch,
     bounds: Bounds,
-    cell_m: float = 2.0,
 ) -> Tensor:  # [R] bool
     """Rays of `batch.rays` that end in the bounds where no ray of the input, past frames included, ended or passed.
 
-    Space is divided into cubes; one of 2 m is as wide as the gaps between the beams at 100 m. Raises ValueError for a
-    batch without the origins of its LiDAR points (`data.lidar_origins`).
+    Space is divided into cubes of CUBE_M. Raises ValueError for a batch without the origins of its LiDAR points
+    (`data.lidar_origins`).
     """
     if batch.rays is None or batch.lidar_origins is None:
         raise ValueError("batch: what was seen follows from FrameBatch.lidar_origins; give data.lidar_origins=true")
     low, high = torch.tensor(bounds, dtype=torch.float32).unbind(1)
-    shape = ((high - low) / cell_m).ceil().long().tolist()
+    shape = ((high - low) / CUBE_M).ceil().long().tolist()
     seen = torch.zeros(len(batch), *shape, dtype=torch.bool)
     for frame in (batch, *batch.past):
         matrix = aug_from_frame(batch, frame)[frame.lidar_batch]
         ends, starts = _moved(matrix, frame.lidar_points[:, :3]), _moved(matrix, frame.lidar_origins)
         owners, ranges = frame.lidar_batch.cpu(), (ends - starts).norm(dim=1)
-        for distance in torch.arange(0, float(ranges.max()) if len(ranges) else 0.0, 0.5 * cell_m).tolist():
+        for distance in torch.arange(0, float(ranges.max()) if len(ranges) else 0.0, 0.5 * CUBE_M).tolist():
             rows = ranges > distance
             passed = starts[rows] + distance / ranges[rows, None] * (ends - starts)[rows]
-            _mark(seen, passed, owners[rows.cpu()], low, cell_m)
-        _mark(seen, ends, owners, low, cell_m)
-    cells, inside = _cells(batch.rays.points, low, cell_m, shape)
+            _mark(seen, passed, owners[rows.cpu()], low)
+        _mark(seen, ends, owners, low)
+    cells, inside = _cells(batch.rays.points, low, shape)
     found = torch.zeros(len(batch.rays), dtype=torch.bool)
     found[inside] = ~seen[batch.rays.batch.cpu()[inside], *cells[inside].unbind(1)]
     return found
 
 
-def _mark(seen: Tensor, points: Tensor, owners: Tensor, low: Tensor, cell_m: float) -> None:
-    cells, inside = _cells(points, low, cell_m, list(seen.shape[1:]))
+def _mark(seen: Tensor, points: Tensor, owners: Tensor, low: Tensor) -> None:
+    cells, inside = _cells(points, low, list(seen.shape[1:]))
     seen[owners[inside], *cells[inside].unbind(1)] = True
 
 
-def _cells(points: Tensor, low: Tensor, cell_m: float, shape: list[int]) -> tuple[Tensor, Tensor]:
+def _cells(points: Tensor, low: Tensor, shape: list[int]) -> tuple[Tensor, Tensor]:
     """Cell [n, 3] of each point and whether it is one of the grid [n], on the CPU."""
-    cells = ((points.cpu() - low) / cell_m).floor().long()
+    cells = ((points.cpu() - low) / CUBE_M).floor().long()
     return cells, ((cells >= 0) & (cells < torch.tensor(shape))).all(1)
 
 

@@ -48,11 +48,6 @@ class KernelMap:
         """The outputs so that those which see through the same offsets stand together."""
         return torch.argsort(tap_bits(self.table), stable=True)
 
-    @property
-    def centre(self) -> int | None:
-        """The offset that joins every row with itself, None for a map that is not submanifold."""
-        return self.num_offsets // 2 if self.mirrored else None
-
     @cached_property
     def ends(self) -> Tensor:  # [K] int32
         """End of each offset's block of pairs."""

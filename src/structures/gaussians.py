@@ -51,11 +51,6 @@ class GaussianSet(TensorFields):
         if self.valid.dtype != torch.bool:
             raise ValueError(f"GaussianSet.valid must be bool, but got {self.valid.dtype}")
 
-    @property
-    def batch_size(self) -> int:
-        """B."""
-        return self.valid.shape[0]
-
     def __len__(self) -> int:
         return self.valid.shape[1]
 

@@ -1,4 +1,4 @@
-"""Where there is matter in a scene at any time, for those who ask a data set and know nothing of worlds."""
+"""What is solid in a scene at any time, for those who ask a data set and know nothing of worlds."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from src.data.true_geometry import TrueGeometry
 from src.world.motion import LEAD_IN_S
 from src.world.simulate import Scene
 from src.world.traffic import STEP_S
-
-Array = np.ndarray
 
 AROUND_M = 260.0
 """How far from the truck's path the ground is known: the corner of what is asked about."""

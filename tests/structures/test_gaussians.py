@@ -20,7 +20,7 @@ def gaussians(count=5, source=Source.RADAR, **changes):
 def test_sets_are_joined_along_the_gaussians():
     parts = [gaussians(3), gaussians(0, Source.CAMERA), gaussians(2, Source.HISTORY)]
     joined = GaussianSet.concatenate(parts, dim=1)
-    assert len(joined) == 5 and joined.batch_size == 2
+    assert joined.valid.shape == (2, 5) and len(joined) == 5
     assert joined.sources.tolist() == [[0, 0, 0, 3, 3]] * 2
     assert torch.equal(joined.features[:, 3:], parts[2].features)
 
@@ -113,5 +113,5 @@ def test_transforms_are_not_rounded_by_autocast():
 
 def test_map_reaches_every_tensor():
     picked = physical().map(lambda value: value[1:, :3])
-    assert picked.batch_size == 1 and len(picked) == 3
+    assert picked.valid.shape == (1, 3)
     assert torch.equal(picked.features, physical().features[1:, :3])

@@ -114,7 +114,7 @@ class VoxelEncoder(nn.Module):
             for index, width in enumerate(widths)
         )
         if config.conv_out is ConvOut.sparse:
-            conv_out = SparseConv(widths[-1], channels, 3, 2, bias=False, stride=1, padding=1)
+            conv_out = SparseConv(widths[-1], channels, 3, 2, bias=False)
         else:
             conv_out = SubmanifoldConv(widths[-1], channels, 3, 2, bias=False)
         self.conv_out = ConvNormReLU(conv_out, **norm)
@@ -237,7 +237,7 @@ def _stage(
     layers: list[nn.Module] = []
     if in_channels is not None:
         kind = partial(PrunedSparseConv, pruning_ratio=pruning_ratio) if pruning_ratio else SparseConv
-        conv = kind(in_channels, channels, 3, ndim, bias=False, stride=2, padding=1)
+        conv = kind(in_channels, channels, 3, ndim, bias=False, stride=2)
         layers.append(ConvNormReLU(conv, **norm))
     layers += [ResidualBlock(channels, ndim, **norm) for _ in range(blocks)]
     return nn.Sequential(*layers)

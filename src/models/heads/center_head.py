@@ -292,8 +292,6 @@ def measured_codes(
     rows: Tensor,  # [n] int64, cells
 ) -> Tensor:  # [n, CODE_SIZE (+ 11)]
     """With what the radar measures of the velocities, the last numbers of a box code."""
-    if output.doppler is None:
-        return codes
     before, velocities, after = codes.split([CODE_SIZE - 2, 2, codes.shape[1] - CODE_SIZE], dim=1)
     return torch.cat([before, output.doppler.correct(velocities, output.bev.sites.linear()[rows]), after], dim=1)
 

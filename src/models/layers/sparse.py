@@ -42,13 +42,12 @@ class SparseKernel(nn.Module):
         ndim: int,
         bias: bool,
         stride: Size = 1,
-        padding: Size | None = None,  # on either side; None: half the kernel
     ) -> None:
         super().__init__()
         self.in_channels, self.out_channels = in_channels, out_channels
         self.kernel_size, self.ndim = per_axis(kernel_size, ndim, "kernel_size"), ndim
         self.stride = stride
-        self.padding = tuple(size // 2 for size in self.kernel_size) if padding is None else padding
+        self.padding = tuple(size // 2 for size in self.kernel_size)
         self.relu = False  # of the layer behind, once that is merged into this one
         num_offsets = math.prod(self.kernel_size)
         self.weight = nn.Parameter(torch.empty(num_offsets, in_channels, out_channels))

@@ -79,7 +79,7 @@ LAYERS = {
     "transposed": lambda bias: nn.ConvTranspose2d(6, 5, 2, 2, bias=bias),
     "linear": lambda bias: nn.Linear(6, 5, bias=bias),
     "submanifold": lambda bias: SubmanifoldConv(6, 5, 3, 2, bias=bias),
-    "strided": lambda bias: SparseConv(6, 5, 3, 2, bias=bias, stride=2, padding=1),
+    "strided": lambda bias: SparseConv(6, 5, 3, 2, bias=bias, stride=2),
 }
 
 

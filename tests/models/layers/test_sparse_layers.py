@@ -44,7 +44,7 @@ def test_submanifold_convolution_is_the_dense_one_on_its_sites(ndim: int) -> Non
 @pytest.mark.parametrize("ndim", [2, 3])
 @pytest.mark.parametrize("stride", [1, 2])
 def test_sparse_convolution_is_the_dense_one_wherever_a_site_reaches(ndim: int, stride: int) -> None:
-    conv, x = SparseConv(3, 5, 3, ndim, bias=False, stride=stride, padding=1), random_map(ndim, 3, count=6)
+    conv, x = SparseConv(3, 5, 3, ndim, bias=False, stride=stride), random_map(ndim, 3, count=6)
     y = conv(x)
     dense = CONV[ndim](x.to_dense(), dense_weight(conv), stride=stride, padding=1)
     torch.testing.assert_close(y.to_dense(), dense)
@@ -99,7 +99,7 @@ def test_residual_block(ndim: int) -> None:
 
 
 def test_samples_do_not_mix() -> None:
-    layer = ConvNormReLU(SparseConv(3, 4, 3, 2, bias=False, stride=1, padding=1), eps=1e-3, momentum=0.1).eval()
+    layer = ConvNormReLU(SparseConv(3, 4, 3, 2, bias=False), eps=1e-3, momentum=0.1).eval()
     x = random_map(2, 3)
     second = x.indices[:, 0] == 1
     y = layer(x)
@@ -112,7 +112,7 @@ def test_map_without_sites() -> None:
     empty = random_map(3, 3, count=0)
     layers = nn.Sequential(
         ConvNormReLU(SubmanifoldConv(3, 4, 3, 3, bias=False), eps=1e-3, momentum=0.1),
-        ConvNormReLU(SparseConv(4, 4, 3, 3, bias=False, stride=2, padding=1), eps=1e-3, momentum=0.1),
+        ConvNormReLU(SparseConv(4, 4, 3, 3, bias=False, stride=2), eps=1e-3, momentum=0.1),
         ResidualBlock(4, 3, eps=1e-3, momentum=0.1),
     )
     y = layers(empty)
@@ -171,7 +171,7 @@ def test_the_faintest_sites_of_every_sample_do_not_dilate() -> None:
     cells = torch.tensor([[0, 0], [0, 6], [0, 10], [0, 15], [0, 20], [1, 3], [1, 15]])
     sites = Sites.from_indices(cells, (2, 24))[0]
     magnitudes = torch.tensor([5.0, -4.0, 1.0, 2.0, 3.0, 0.1, 0.2])
-    layer = PrunedSparseConv(2, 3, 3, 1, bias=False, stride=2, padding=1, pruning_ratio=0.5)
+    layer = PrunedSparseConv(2, 3, 3, 1, bias=False, stride=2, pruning_ratio=0.5)
     found = layer(SparseMap(sites, magnitudes[:, None] * torch.tensor([[1.0, -1.0]])))
     # An even cell has one output, an odd one two, of which the lower is its own.
     assert found.indices.tolist() == [[0, 0], [0, 3], [0, 5], [0, 7], [0, 10], [1, 1], [1, 7], [1, 8]]
