@@ -20,6 +20,7 @@ from src.models.backbones.pillars import PillarConfig, PillarEncoder
 from src.models.detector import Detector, ModelConfig, Objective
 from src.models.heads.center_head import BoxOptions, CenterHead, HeadConfig, HeadOutput
 from src.models.layers.lift_splat import LiftedViews, LiftSplatConfig
+from src.models.layers.views import CameraViews
 from src.models.memory import TemporalConfig
 from src.structures.batch import FrameBatch
 
@@ -101,12 +102,10 @@ class CameraRadarDetector(Detector):
     def build_fusion(self) -> None:
         """Make `view_transform`, `fuser`, `temporal` and what else lies between the encoders and the decoder."""
 
-    def encode(self, batch: FrameBatch) -> tuple[Tensor, Tensor]:  # [B, N, C_I, h, w], [B, C_radar, rows, cols]
-        """Image features and the radar's map. Raises ValueError when images are absent."""
-        if batch.images is None or batch.image_valid is None or batch.pix_from_aug is None:
-            raise ValueError("FrameBatch.images is None, but this model uses images; read them with the frames")
-        (level,) = self.image_encoder(batch.images)
-        return level, self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
+    def encode(self, batch: FrameBatch) -> tuple[CameraViews, Tensor]:  # of one level, [B, C_radar, rows, cols]
+        """Image features and the radar's map. Raises ValueError when images are absent or of another number."""
+        views = CameraViews.encode(self.image_encoder, batch)
+        return views, self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
 
     def loss_terms(self, output: CameraRadarOutput, batch: FrameBatch) -> Objective:
         """Weighted terms `heatmap`, `box` and `depth`."""

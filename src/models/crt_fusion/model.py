@@ -67,9 +67,8 @@ class CRTFusion(CameraRadarDetector):
 
         Raises ValueError when images are absent, or when the memory is of another number of streams.
         """
-        level, radar_bev = self.encode(batch)
-        cameras = (batch.pix_from_aug, batch.image_valid, self.image_encoder.image_size_px)
-        views = self.view_transform(level, radar_bev, *cameras)
+        images, radar_bev = self.encode(batch)
+        views = self.view_transform(images, radar_bev)
         current = fused = self.fuser(views.bev, radar_bev)
         motion, moved, memory_now = self.estimator(fused), None, None
         if self.temporal is not None:

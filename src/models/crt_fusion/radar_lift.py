@@ -11,6 +11,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.layers.azimuth_attention import AzimuthAttention
 from src.models.layers.full_precision import FullPrecisionConv2d
 from src.models.layers.lift_splat import LiftedViews, LiftSplat, LiftSplatConfig
+from src.models.layers.views import CameraViews
 
 
 @dataclass(kw_only=True)
@@ -49,15 +50,12 @@ class RadarLift(LiftSplat):
 
     def forward(
         self,
-        level: Tensor,  # [B, N, C_I, h, w] image features
+        views: CameraViews,  # one level, the image features [B, N, C_I, h, w]
         radar_bev: Tensor,  # [B, C_radar, rows, cols]
-        pix_from_aug: Tensor,  # [B, N, 4, 4]
-        valid: Tensor,  # [B, N] bool
-        image_size_px: tuple[int, int],  # (H, W)
     ) -> RadarLiftedViews:
         """Pool all views of every sample; a missing view contributes nothing."""
-        hidden = self.trunk(self.attention(level, radar_bev, pix_from_aug, valid, image_size_px))
+        hidden = self.trunk(self.attention(views, radar_bev))
         foreground = self.foreground(hidden).squeeze(1)
         lifted = foreground.sigmoid() >= self.config.foreground_threshold
-        views = self.splat(self.depth(hidden), self.context(hidden), pix_from_aug, valid, image_size_px, lifted)
-        return RadarLiftedViews(views.bev, views.depth_logits, views.num_lifted, foreground)
+        found = self.splat(self.depth(hidden), self.context(hidden), views, lifted)
+        return RadarLiftedViews(found.bev, found.depth_logits, found.num_lifted, foreground)

@@ -45,8 +45,8 @@ class DenseBEV(CameraRadarDetector):
 
         Raises ValueError when images are absent, or when the memory is of another number of streams.
         """
-        level, radar_bev = self.encode(batch)
-        views = self.view_transform(level, batch.pix_from_aug, batch.image_valid, self.image_encoder.image_size_px)
+        images, radar_bev = self.encode(batch)
+        views = self.view_transform(images)
         fused = self.fuser(views.bev, radar_bev)
         current, warped_maps, memory_now = fused, None, None
         if self.temporal is not None:

@@ -140,5 +140,5 @@ class HeightLift(LiftSplat):
         """Pool all views of every sample; a missing view contributes nothing."""
         hidden = self.trunk(self.association(views, radar_bev))
         context = self.context(hidden)
-        lifted = self.splat(self.depth(hidden), context, views.pix_from_aug, views.valid, views.image_size_px)
+        lifted = self.splat(self.depth(hidden), context, views)
         return HeightLiftedViews(**vars(lifted), context=context.unflatten(0, views.valid.shape))

@@ -14,7 +14,6 @@ from src.models.detector import Objective
 from src.models.hydra.depth_consistency import DepthConsistency, DepthConsistencyConfig
 from src.models.hydra.height_association import HeightLift, HeightLiftConfig
 from src.models.layers.image_attention import NUM_HEADS
-from src.models.layers.views import CameraViews
 from src.models.map_memory import MapMemory, TemporalFusion, WarpedMaps
 from src.structures.batch import FrameBatch
 from src.targets.box_raster import BoxRaster
@@ -71,8 +70,7 @@ class HyDRa(CameraRadarDetector):
 
         Raises ValueError when images are absent, or when the memory is of another number of streams.
         """
-        level, radar_bev = self.encode(batch)
-        images = CameraViews([level], batch.pix_from_aug, batch.image_valid, self.image_encoder.image_size_px)
+        images, radar_bev = self.encode(batch)
         views = self.view_transform(images, radar_bev)
         fused = self.fuser(views.bev, radar_bev)
         context = replace(images, levels=[views.context])

@@ -8,9 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.tensor_transforms import invert_projection, pixel_centres
+from src.geometry.tensor_transforms import pixel_centres
 from src.models.layers.dense import MapConv2d, rows_of_map
 from src.models.layers.sparse import LinearNormReLU
+from src.models.layers.views import CameraViews
 from src.ops.linear import linear
 from src.ops.segment_reduce import segment_sum
 
@@ -48,19 +49,16 @@ class AzimuthAttention(nn.Module):
 
     def forward(
         self,
-        level: Tensor,  # [B, N, C, h, w]
+        views: CameraViews,  # one level [B, N, C, h, w]
         radar_bev: Tensor,  # [B, C_radar, rows, cols], zero where no point fell
-        pix_from_aug: Tensor,  # [B, N, 4, 4]
-        valid: Tensor,  # [B, N] bool
-        image_size_px: tuple[int, int],  # (H, W)
     ) -> Tensor:  # [B*N, C, h, w]
         """The image features with radar; a missing camera takes none."""
-        (b, n, c, h, w), level = level.shape, level.flatten(0, 1)
+        (b, n, c, h, w), level = views.levels[0].shape, views.levels[0].flatten(0, 1)
         cells = radar_bev.any(1).nonzero()  # [P, 3] (sample, row, col) of the pillars, sample by sample
         keys = (cells[:, 0] * self.grid.rows + cells[:, 1]) * self.grid.cols + cells[:, 2]
         columns = self.columns(level.amax(2).transpose(1, 2).flatten(0, 1))  # [B*N*w, C / 2]
         rows = self.rows(level.amax(3).transpose(1, 2).flatten(0, 1)).view(b * n, h, c)
-        nearest = self.nearest(cells, pix_from_aug, valid, image_size_px, (h, w))  # [B*N*w, K]
+        nearest = self.nearest(cells, views, w)  # [B*N*w, K]
         seen = (nearest.flatten() >= 0).nonzero().squeeze(1)  # [pairs]
         column = torch.div(seen, self.count, rounding_mode="floor")
         pillars = self.pillars(rows_of_map(radar_bev)[keys])[nearest.flatten()[seen]]
@@ -69,7 +67,7 @@ class AzimuthAttention(nn.Module):
         scores = scores.new_full((nearest.numel(),), UNSEEN).index_copy(0, seen, scores)
         weights = scores.view_as(nearest).softmax(1).flatten()[seen]
         found = segment_sum(weights[:, None] * values.float(), column, len(nearest)).view(b * n, w, c)
-        radar = (found.transpose(1, 2)[:, :, None] + rows.transpose(1, 2)[..., None]) * valid.view(-1, 1, 1, 1)
+        radar = (found.transpose(1, 2)[:, :, None] + rows.transpose(1, 2)[..., None]) * views.valid.view(-1, 1, 1, 1)
         for_image, for_radar = self.gates(level + radar).sigmoid().chunk(2, dim=1)
         return level * for_image + radar * for_radar
 
@@ -77,26 +75,23 @@ class AzimuthAttention(nn.Module):
     def nearest(
         self,
         cells: Tensor,  # [P, 3] int64 (sample, row, col), sample by sample
-        pix_from_aug: Tensor,  # [B, N, 4, 4]
-        valid: Tensor,  # [B, N] bool
-        image_size_px: tuple[int, int],
-        level_size: tuple[int, int],  # (h, w)
+        views: CameraViews,
+        num_columns: int,  # w
     ) -> Tensor:  # [B*N*w, K] int64 row of `cells`; -1: there are fewer, or the camera is missing
         """The K pillars of its own sample whose azimuth is nearest to that of each column, taken at mid height."""
-        b, n = valid.shape
-        aug_from_pix = invert_projection(pix_from_aug, valid)
-        u, _, _ = pixel_centres(image_size_px, (1, level_size[1]), cells.device)[0].unbind(-1)  # [w]
+        (b, n), aug_from_pix, image_size_px = views.valid.shape, views.aug_from_pix, views.image_size_px
+        u, _, _ = pixel_centres(image_size_px, (1, num_columns), cells.device)[0].unbind(-1)  # [w]
         axes = aug_from_pix[:, :, None, :2]  # [B, N, 1, 2, 4]
         rays = axes[..., 0] * u[:, None] + axes[..., 1] * (image_size_px[0] / 2) + axes[..., 2]  # [B, N, w, 2]
         azimuth = torch.atan2(rays[..., 1], rays[..., 0])
         xy = self.grid.centre_of(cells[:, 1:])
-        found = cells.new_full((b, n, level_size[1], self.count), -1)
+        found = cells.new_full((b, n, num_columns, self.count), -1)
         first = 0
         for sample, count in enumerate(torch.bincount(cells[:, 0], minlength=b).tolist()):
             own = xy[first : first + count] - aug_from_pix[sample, :, None, :2, 3]  # [N, count, 2] from the camera
             apart = torch.atan2(own[..., 1], own[..., 0])[:, None] - azimuth[sample, :, :, None]  # [N, w, count]
             apart = (torch.remainder(apart + math.pi, 2 * math.pi) - math.pi).abs()
             best = apart.topk(min(self.count, count), dim=2, largest=False).indices + first
-            found[sample, :, :, : best.shape[2]] = torch.where(valid[sample, :, None, None], best, -1)
+            found[sample, :, :, : best.shape[2]] = torch.where(views.valid[sample, :, None, None], best, -1)
             first += count
         return found.flatten(0, 2)

@@ -9,9 +9,10 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.tensor_transforms import invert_projection, pixel_centres
+from src.geometry.tensor_transforms import pixel_centres
 from src.models.backbones.resnet import BasicBlock
 from src.models.layers.dense import DenseConvNormReLU, MapConv2d, map_of_rows, rows_of_map
+from src.models.layers.views import CameraViews
 from src.ops.segment_reduce import inverse_rows, weighted_segment_sum
 from src.structures.batch import FrameBatch
 from src.targets.depth import DepthBinsConfig, lid_centres, paint_depth
@@ -66,33 +67,28 @@ class LiftSplat(nn.Module):
 
     def forward(
         self,
-        level: Tensor,  # [B, N, C_I, h, w] image features
-        pix_from_aug: Tensor,  # [B, N, 4, 4]: (x, y, z, 1) in aug metres -> (u*d, v*d, d, 1)
-        valid: Tensor,  # [B, N] bool, False where the camera is missing
-        image_size_px: tuple[int, int],  # (H, W) of the network input
+        views: CameraViews,  # one level, the image features [B, N, C_I, h, w]
     ) -> LiftedViews:
         """Pool all views of every sample; a missing view contributes nothing."""
-        hidden = self.trunk(level.flatten(0, 1))
-        return self.splat(self.depth(hidden), self.context(hidden), pix_from_aug, valid, image_size_px)
+        hidden = self.trunk(views.levels[0].flatten(0, 1))
+        return self.splat(self.depth(hidden), self.context(hidden), views)
 
     def splat(
         self,
         depth: Tensor,  # [B*N, D, h, w] logits
         context: Tensor,  # [B*N, C, h, w]
-        pix_from_aug: Tensor,  # [B, N, 4, 4]
-        valid: Tensor,  # [B, N] bool
-        image_size_px: tuple[int, int],  # (H, W)
+        views: CameraViews,
         lifted: Tensor | None = None,  # [B*N, h, w] bool, the pixels whose likely bins alone are lifted
     ) -> LiftedViews:
         """Pool depth times context into cells; with `lifted` only of its pixels, and bins of no less than 1 / D."""
-        (b, n), (h, w) = valid.shape, depth.shape[-2:]
+        (b, n), (h, w) = views.valid.shape, depth.shape[-2:]
         with torch.autocast(depth.device.type, enabled=False):  # sums of many terms, weighted by probabilities
             probabilities = rows_of_map(depth.float()).softmax(1)  # [B*N*h*w, D]
-            kept = valid[:, :, None, None, None]
+            kept = views.valid[:, :, None, None, None]
             if lifted is not None:
                 likely = (probabilities >= 1 / depth.shape[1]) & lifted.flatten()[:, None]
                 kept = kept & likely.view(b, n, h, w, -1)
-            pairs, cells, by_pixel = self.pair(self.lift(pix_from_aug, valid, image_size_px, (h, w)), kept)
+            pairs, cells, by_pixel = self.pair(self.lift(views, (h, w)), kept)
             weights = probabilities.flatten().index_select(0, pairs)
             pixels = torch.div(pairs, self.config.num_depth_bins, rounding_mode="floor")
             shape = (b, self.grid.rows, self.grid.cols)
@@ -103,14 +99,12 @@ class LiftSplat(nn.Module):
     @torch.no_grad()
     def lift(
         self,
-        pix_from_aug: Tensor,  # [B, N, 4, 4]
-        valid: Tensor,  # [B, N] bool
-        image_size_px: tuple[int, int],  # (H, W)
+        views: CameraViews,
         level_size: tuple[int, int],  # (h, w)
     ) -> Tensor:  # [B, N, h, w, D, 3] aug metres, float32
         """Points at the pixel centres and the bins' mean depths."""
-        aug_from_pix = invert_projection(pix_from_aug, valid)[:, :, None, None]  # [B, N, 1, 1, 4, 4]
-        pixels = pixel_centres(image_size_px, level_size, pix_from_aug.device).unbind(-1)  # u, v, 1: [h, w] each
+        aug_from_pix = views.aug_from_pix[:, :, None, None]  # [B, N, 1, 1, 4, 4]
+        pixels = pixel_centres(views.image_size_px, level_size, aug_from_pix.device).unbind(-1)  # u, v, 1: [h, w] each
         # Not a matrix product: a GPU may round its factors to fewer digits.
         rays = sum(aug_from_pix[..., :3, i] * part[..., None] for i, part in enumerate(pixels))
         return rays[..., None, :] * self.depth_centres_m[:, None] + aug_from_pix[..., None, :3, 3]

@@ -7,6 +7,7 @@ import torch
 
 from src.models.backbones.bev_decoder import GatedFuser
 from src.models.layers.azimuth_attention import AzimuthAttention
+from src.models.layers.views import CameraViews
 from tests.models.camera_radar_frames import crt_model, radar_map
 from tests.models.dense_bev.dense_frames import GRID, SIZE, make_batch
 from tests.models.surroundings import AXES, camera_matrices
@@ -66,7 +67,7 @@ def test_a_column_attends_to_the_pillars_nearest_in_azimuth(cells):
     valid = torch.ones(2, 4, dtype=torch.bool)
     valid[0, 1], matrices[0, 1] = False, torch.nan
     with torch.no_grad():
-        found = module(level, bev, matrices, valid, SIZE).view_as(level)
+        found = module(CameraViews([level], matrices, valid, SIZE), bev).view_as(level)
         wanted = by_hand(module, level, bev, matrices, valid)
     torch.testing.assert_close(found[valid], wanted[valid], rtol=1e-4, atol=1e-5)
     assert found.isfinite().all()
@@ -77,7 +78,9 @@ def test_one_pillar_straight_ahead_reaches_the_middle_columns_only_as_nearest():
     module = make_attention(count=1)
     ahead, left = (int(GRID.cell_of(torch.tensor([x, y]))[0]) for x, y in ((20.0, 0.4), (10.0, 9.0)))
     cells = torch.tensor([[0, ahead, 50], [0, left, 42]])
-    nearest = module.nearest(cells, camera_matrices(SIZE, AXES)[None, :1], torch.ones(1, 1).bool(), SIZE, (4, 6))
+    nearest = module.nearest(
+        cells, CameraViews([], camera_matrices(SIZE, AXES)[None, :1], torch.ones(1, 1).bool(), SIZE), 6
+    )
     assert nearest.flatten().tolist() == [1, 1, 0, 0, 0, 0]  # left is where columns begin
 
 

@@ -7,6 +7,7 @@ import torch
 
 from src.errors import ConfigError
 from src.models.layers.lift_splat import LiftSplat
+from src.models.layers.views import CameraViews
 from src.targets.depth import lid_centres
 from tests.models.dense_bev.dense_frames import GRID, SIZE, lift_config
 from tests.models.surroundings import AXES, camera_matrices
@@ -63,7 +64,7 @@ def test_it_is_the_published_frustum_pooled(missing):
         if oracle:
             bev, met = frustum_oracle(module, leaf, matrices, valid)
         else:
-            lifted = module(leaf, matrices, valid, SIZE)
+            lifted = module(CameraViews([leaf], matrices, valid, SIZE))
             bev = lifted.bev
         (bev * weight).sum().backward()
         results.append([bev.detach(), leaf.grad, *(p.grad for p in module.parameters())])
@@ -86,7 +87,7 @@ def test_a_pixel_lands_where_its_depth_says():
         module.context.bias[:] = torch.arange(12.0) + 1
     level = torch.randn(1, 4, CHANNELS, 4, 7)  # 7 columns, so that one looks straight ahead
     valid = torch.tensor([[True, False, False, False]])
-    bev = module(level, camera_matrices(SIZE, AXES)[None], valid, SIZE).bev[0]
+    bev = module(CameraViews([level], camera_matrices(SIZE, AXES)[None], valid, SIZE)).bev[0]
     row, col = GRID.cell_of(torch.tensor([float(centres[wanted]), 0.0])).tolist()
     torch.testing.assert_close(bev[:, row, col], 4.0 * (torch.arange(12.0) + 1))  # the column's four pixels
     columns = {int(c) for c in (bev > 1e-6).any(dim=0).nonzero()[:, 1]}
@@ -97,16 +98,16 @@ def test_views_of_other_samples_and_missing_views_stay_out():
     module = make_module().eval()
     level, matrices = torch.randn(2, 4, CHANNELS, 4, 6), camera_matrices(SIZE, AXES).repeat(2, 1, 1, 1)
     valid = torch.ones(2, 4, dtype=torch.bool)
-    both = module(level, matrices, valid, SIZE).bev
+    both = module(CameraViews([level], matrices, valid, SIZE)).bev
     for sample in range(2):
         one = slice(sample, sample + 1)
-        torch.testing.assert_close(both[one], module(level[one], matrices[one], valid[one], SIZE).bev)
+        torch.testing.assert_close(both[one], module(CameraViews([level[one]], matrices[one], valid[one], SIZE)).bev)
     valid[0] = False
     matrices[0] = torch.nan
-    lifted = module(level, matrices, valid, SIZE)
+    lifted = module(CameraViews([level], matrices, valid, SIZE))
     assert not lifted.bev[0].any() and torch.equal(lifted.bev[1], both[1])
     valid[1] = False
-    lifted = module.train()(level, matrices, valid, SIZE)
+    lifted = module.train()(CameraViews([level], matrices, valid, SIZE))
     assert lifted.num_lifted == 0 and not lifted.bev.any()
     lifted.bev.sum().backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in module.parameters())
@@ -115,9 +116,9 @@ def test_views_of_other_samples_and_missing_views_stay_out():
 def test_autocast_changes_neither_geometry_nor_types():
     module = make_module().eval()
     level, valid = torch.randn(1, 4, CHANNELS, 4, 6), torch.ones(1, 4, dtype=torch.bool)
-    plain = module(level, camera_matrices(SIZE, AXES)[None], valid, SIZE)
+    plain = module(CameraViews([level], camera_matrices(SIZE, AXES)[None], valid, SIZE))
     with torch.autocast("cpu", torch.bfloat16):
-        half = module(level, camera_matrices(SIZE, AXES)[None], valid, SIZE)
+        half = module(CameraViews([level], camera_matrices(SIZE, AXES)[None], valid, SIZE))
     assert half.bev.dtype == torch.float32 and half.num_lifted == plain.num_lifted
     assert torch.equal(half.bev.any(dim=1), plain.bev.any(dim=1))
     torch.testing.assert_close(half.bev, plain.bev, rtol=0.1, atol=0.05)
