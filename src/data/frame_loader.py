@@ -77,7 +77,7 @@ def collate(frames: list[FrameBatch | HorizonError]) -> FrameBatch | HorizonErro
     values["past"] = tuple(collate(list(part)) for part in zip(*(frame.past for frame in frames), strict=True))
     if frames[0].rays is not None:
         values["rays"] = RayBundle.concatenate(
-            [replace(frame.rays, batch=torch.full_like(frame.rays.batch, at)) for at, frame in enumerate(frames)]
+            [replace(frame.rays, batch=torch.full_like(frame.rays.batch, at)) for at, frame in enumerate(frames)], dim=0
         )
     values["skipped"] = {
         name: sum(frame.skipped.get(name, 0) for frame in frames) for frame in frames for name in frame.skipped

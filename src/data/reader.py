@@ -226,7 +226,7 @@ class FrameReader:
             mounts = self.index.ego_from_sensor[self.index.data_calibrations[rows]]
             clouds = list(map(without_ego_body, clouds, mounts))
             parts.append(lidar_rays(self._placed(rows, clouds, aug_from_global, frame_time_us), step))
-        rays = RayBundle.concatenate(parts)
+        rays = RayBundle.concatenate(parts, dim=0)
         if self._speeds is None or not len(rays):
             return rays
         return replace(rays, speeds=self._speeds.along(sample, rays, aug_from_global, frame_time_us, skipped))

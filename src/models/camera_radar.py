@@ -21,7 +21,7 @@ from src.models.detector import Detector, ModelConfig, Objective
 from src.models.heads.center_head import BoxOptions, CenterHead, HeadConfig, HeadOutput
 from src.models.layers.lift_splat import LiftedViews, LiftSplatConfig
 from src.models.layers.views import CameraViews
-from src.models.memory import TemporalConfig
+from src.models.memory import FrameMemory, TemporalConfig
 from src.structures.batch import FrameBatch
 
 
@@ -102,8 +102,15 @@ class CameraRadarDetector(Detector):
     def build_fusion(self) -> None:
         """Make `view_transform`, `fuser`, `temporal` and what else lies between the encoders and the decoder."""
 
-    def encode(self, batch: FrameBatch) -> tuple[CameraViews, Tensor]:  # of one level, [B, C_radar, rows, cols]
-        """Image features and the radar's map. Raises ValueError when images are absent or of another number."""
+    def encode(
+        self, batch: FrameBatch, memory: FrameMemory | None
+    ) -> tuple[CameraViews, Tensor]:  # of one level, [B, C_radar, rows, cols]
+        """Image features and the radar's map.
+
+        Raises ValueError when images are absent or of another number, or when the memory is of other streams.
+        """
+        if memory is not None:
+            memory.check_streams(batch)
         views = CameraViews.encode(self.image_encoder, batch)
         return views, self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
 

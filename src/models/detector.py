@@ -90,7 +90,11 @@ class TemporalMemory(Protocol):
         """The same memory on another device."""
 
     def state(self) -> list[dict[str, Any]]:
-        """Tensors and plain containers, for a checkpoint; `Detector.restore_memory` reads them."""
+        """Tensors and plain containers, for a checkpoint."""
+
+    @classmethod
+    def from_state(cls, state: list[dict[str, Any]]) -> Self:
+        """The memory that `state` described."""
 
 
 class FixedForm(Protocol):
@@ -133,8 +137,8 @@ class Detector(nn.Module, ABC):
     `package.module:function`, that each is; `part: inner` lies within `part`."""
     latency_parts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """The parts of Table 15 by the methods that each is; one within another counts for both."""
-    memory_type: ClassVar[type | None] = None
-    """Of what `forward` remembers, a `TemporalMemory`; None for a model of single frames."""
+    memory_type: ClassVar[type[TemporalMemory] | None] = None
+    """Of what `forward` remembers; None for a model of single frames."""
     trains_last_transition: bool = False
     """Whether a step learns also through the encoding of the frame before, where frames bring their past along."""
     prepared_for: str | None = None

@@ -39,7 +39,10 @@ class Motion:
 
 @dataclass
 class RememberedFrame(TensorFields):
-    """Time and pose of one remembered key frame of each of B streams; models add what they remember of it."""
+    """Time and pose of one remembered key frame of each of B streams; models add what they remember of it.
+
+    That is tensors with a leading axis [B], `TensorFields` of them, `StoredRows`, and values that all streams share.
+    """
 
     timestamps_s: Tensor  # [B] float64
     global_from_ego: Tensor  # [B, 4, 4] float64
@@ -154,15 +157,19 @@ class FrameMemory(TensorFields, Generic[Frame]):
         all before the jump. Only consecutive frames are compared: over several seconds the same jump could pass for a
         drive. Raises ValueError for a batch of another number of streams.
         """
+        self.check_streams(batch)
         if not self.frames:
             return self
-        if self.batch_size != len(batch):
-            raise ValueError(f"the memory holds {self.batch_size} streams, but the batch {len(batch)} frames")
         steady = ~self.frames[0].jumped(batch)
         stamps = torch.stack([frame.timestamps_s for frame in self.frames])  # [T, B]
         present = self.present & steady & (stamps < batch.timestamps_s)
         frames = zip(self.frames, present.unbind(0), strict=True)
         return self._shared(replace(frame, present=row) for frame, row in frames)
+
+    def check_streams(self, batch: FrameBatch) -> None:
+        """Raises ValueError for a batch of another number of streams."""
+        if self.frames and self.batch_size != len(batch):
+            raise ValueError(f"the memory holds {self.batch_size} streams, but the batch {len(batch)} frames")
 
     def select(
         self,

@@ -18,7 +18,7 @@ WIDTHS = (3, 3, 1, 2, 1, 1, 1, 1)
 YAW, ATTRIBUTE = 6, 11
 """Their columns."""
 LOG_SIZE_LIMIT = 5.0
-MOVING_MPS = 0.2
+ATTRIBUTE_MOVING_MPS = 0.2
 OVERHEAD_M = 3.5
 DRIVING_MPS = 1.0
 """What is slower does not drive (CRT-Fusion's least speed)."""
@@ -86,7 +86,7 @@ def attributes_by_rule(
     """Attributes by class, speed and height."""
     table = constant(rules, labels.dtype, labels.device)
     high = centers[:, 2] - 0.5 * sizes[:, 2] > OVERHEAD_M
-    return table[2 * high + (velocities.norm(dim=1) > MOVING_MPS), labels]
+    return table[2 * high + (velocities.norm(dim=1) > ATTRIBUTE_MOVING_MPS), labels]
 
 
 def along_heading(

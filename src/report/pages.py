@@ -81,7 +81,8 @@ away, in training and in validation: what is found there comes from the memory a
 another only."""
 
 GAIN_TEXT = """Differences between runs of the same seed with Student's 95 % interval; what contains zero is undecided,
-and so is one seed. Percentage points, and m/s for velocity errors, where less is better."""
+and so is one seed; rows that agree in every pair are equal. Percentage points, and m/s for velocity errors, where less
+is better."""
 
 MEMORY_TEXT = """Recall at 2 m, whatever the score, of objects with fewer than 3 returns in the accumulated input that
 had 3 or more at most eight key frames before (hidden), and of objects without an occupied cell inside; the share of

@@ -124,7 +124,7 @@ class Judged(NamedTuple):
 
     first: str  # label, with the metric where there are several
     second: str
-    better: bool | None  # the first one here; None if undecided
+    better: bool | None  # the first one here; None if undecided or equal
     found: Comparison
     stated: bool  # the paper has the first one before the other
 
@@ -165,6 +165,8 @@ def _found(where: str, judged: list[Judged]) -> str:
     left = sum(one.better is None for one in judged) - equal
     of_paper = all(one.stated for one in judged)
     one, many = ("ordering of two rows", "orderings of two rows") if of_paper else ("comparison", "comparisons")
+    if equal == len(judged):
+        return f"{where}: {f'the one {one}' if equal == 1 else f'all {equal} {many}'} equal"
     if left == len(judged):
         return f"{where}: {f'the one {one}' if left == 1 else f'all {left} {many}'} undecided"
     held = [pair for pair in judged if pair.better]

@@ -14,7 +14,7 @@ class TensorFields:
     """Base of a dataclass that holds tensors, others of its kind, lists or tuples of them, and plain values."""
 
     @classmethod
-    def concatenate(cls, parts: Sequence[Self], dim: int = 0) -> Self:
+    def concatenate(cls, parts: Sequence[Self], dim: int) -> Self:
         """All parts joined along one axis of every tensor, in order; at least one part, of tensors alone."""
         names = [field.name for field in fields(cls)]
         return cls(**{name: torch.cat([getattr(part, name) for part in parts], dim) for name in names})

@@ -107,7 +107,7 @@ def sample_queries(
                 batch=rays.batch[drawn],
             )
         )
-    return OccupancyQueries.concatenate(parts)
+    return OccupancyQueries.concatenate(parts, dim=0)
 
 
 def clip_rays(

@@ -116,7 +116,7 @@ class OccupancyEvaluator(Evaluator):
             parts.append(draw_rays(rays, model.bounds, self.timeline.scored_rays, generator))
             if truth is not None:
                 self._score_slice(model, output, batch, sample, rays, truth, own)
-        self._score(model, output, replace(batch, rays=RayBundle.concatenate(parts)), rows, scores)
+        self._score(model, output, replace(batch, rays=RayBundle.concatenate(parts, dim=0)), rows, scores)
         for row, own in zip(rows, scores, strict=True):
             self.found.setdefault(row, own)
 

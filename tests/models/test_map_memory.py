@@ -86,12 +86,13 @@ def test_the_newest_frames_stay_and_streams_come_and_go():
     fusion = make_fusion(num_frames=2)
     memory = None
     for step in range(4):
-        frame = bare_frame(0.5 * step, [pose(step), pose(step, 1.0)])
+        frame = bare_frame(0.5 * step, [pose(step), pose(step, 1.0)], [torch.eye(4), bda(0.2)])
         value = torch.tensor([1.0, 10.0]).view(2, 1, 1, 1) * (step + 1)
         memory = fusion.remember(memory, frame, value.expand(2, 2, 96, 96))
     assert [frame.timestamps_s.tolist() for frame in memory.frames] == [[1.5, 1.5], [1.0, 1.0]]
     swapped = memory.select(torch.tensor([1, 0]), torch.tensor([True, False]))
     assert [frame.present.tolist() for frame in swapped.frames] == [[True, False]] * 2
+    assert torch.equal(swapped.frames[0].aug_from_ego, torch.stack([bda(0.2), torch.eye(4)]))
     recalled = fusion.recall(swapped, bare_frame(2.0, [pose(3.0, 1.0), pose(3.0)]))
     centre = [past[:, 0, 48, 48].tolist() for past in fusion.maps(recalled)]
     assert centre == [[40.0, 0.0], [30.0, 0.0]]

@@ -363,6 +363,14 @@ def test_a_table_without_main_metrics_is_judged_over_all(make_record, results_of
     assert table.text[1] == ("Over all metrics: 1 of 2 orderings of two rows holds here (mAVE: a before b), 1 equal.")
 
 
+def test_rows_that_agree_in_every_pair_are_equal(make_record, results_of):
+    record = make_record({"a": {}, "b": {}}, columns=("mAP",), baseline="b")
+    (table,) = sweep_tables(
+        record, results_of({f"{label}{seed}": 0.1 * (seed + 1) for label in "ab" for seed in range(3)})
+    )
+    assert table.text[1] == "mAP: the one comparison equal."
+
+
 def test_rows_that_the_paper_does_not_have_are_held_against_their_baseline(make_record, results_of):
     record = make_record({"a": {}, "b": {}, "c": {}}, columns=("mAP",), baseline="b")
     (table,) = sweep_tables(record, results_of(THREE | {"c0": 0.26, "c1": 0.25, "c2": 0.30}))

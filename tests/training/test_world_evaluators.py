@@ -62,7 +62,7 @@ def rays(times_s, model, samples):
                     torch.full((41,), sample),
                 )  # fmt: skip
             )
-    return RayBundle.concatenate(parts)
+    return RayBundle.concatenate(parts, dim=0)
 
 
 def index_of(root, count=2, scenes=(0, 1)):

@@ -65,9 +65,9 @@ class CRTFusion(CameraRadarDetector):
     ) -> tuple[CRTFusionOutput, StackMemory | None]:
         """Detect in the frames of B streams, given what is remembered of them; the new memory is detached.
 
-        Raises ValueError when images are absent, or when the memory is of another number of streams.
+        Raises ValueError when images are absent or of another number, or when the memory is of other streams.
         """
-        images, radar_bev = self.encode(batch)
+        images, radar_bev = self.encode(batch, memory)
         views = self.view_transform(images, radar_bev)
         current = fused = self.fuser(views.bev, radar_bev)
         motion, moved, memory_now = self.estimator(fused), None, None

@@ -43,9 +43,9 @@ class DenseBEV(CameraRadarDetector):
     def forward(self, batch: FrameBatch, memory: MapMemory | None = None) -> tuple[DenseBEVOutput, MapMemory | None]:
         """Detect in the frames of B streams, given what is remembered of them; the new memory is detached.
 
-        Raises ValueError when images are absent, or when the memory is of another number of streams.
+        Raises ValueError when images are absent or of another number, or when the memory is of other streams.
         """
-        images, radar_bev = self.encode(batch)
+        images, radar_bev = self.encode(batch, memory)
         views = self.view_transform(images)
         fused = self.fuser(views.bev, radar_bev)
         current, warped_maps, memory_now = fused, None, None

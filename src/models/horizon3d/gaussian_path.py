@@ -110,7 +110,7 @@ class GaussianPath(nn.Module):
     ) -> GaussianSet:
         """The Gaussians of T frames in one batch: launches cost more than the arithmetic."""
         sets = [frame.gaussians for frame in frames]
-        return self.move(GaussianSet.concatenate(sets), motions(frames, batch, max_age_s), min_speed_mps)
+        return self.move(GaussianSet.concatenate(sets, dim=0), motions(frames, batch, max_age_s), min_speed_mps)
 
     def move(
         self,

@@ -81,6 +81,8 @@ class Horizon3D(Detector):
 
         Raises ValueError when images are needed and absent, or when the memory is of another number of streams.
         """
+        if memory is not None:
+            memory.check_streams(batch)
         if self.dptf is None:
             return self.detect(batch, None), None
         warped_memory = self.dptf.recall(memory, batch)

@@ -68,9 +68,9 @@ class HyDRa(CameraRadarDetector):
     def forward(self, batch: FrameBatch, memory: MapMemory | None = None) -> tuple[HyDRaOutput, MapMemory | None]:
         """Detect in the frames of B streams, given what is remembered of them; the new memory is detached.
 
-        Raises ValueError when images are absent, or when the memory is of another number of streams.
+        Raises ValueError when images are absent or of another number, or when the memory is of other streams.
         """
-        images, radar_bev = self.encode(batch)
+        images, radar_bev = self.encode(batch, memory)
         views = self.view_transform(images, radar_bev)
         fused = self.fuser(views.bev, radar_bev)
         context = replace(images, levels=[views.context])

@@ -12,7 +12,6 @@ from torch import Tensor
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.voxel_grid import VoxelGrid
 from src.losses.normalizers import full_precision
-from src.models.lrs4fusion.windowed_fusion import WarpedVolume
 from src.ops.ball_query import OFFSETS, ball_query
 from src.ops.segment_reduce import segment_mean, segment_sum
 from src.ops.sites import Sites
@@ -21,14 +20,10 @@ from src.structures.batch import FrameBatch
 from src.structures.sparse_bev import SparseMap
 from src.structures.taxonomy import MOVING_MPS
 
-REMEMBERED_MPS = 3.0
-"""What memory says is partly decoded, where what stands has errors of 1 m/s."""
 TIME_STEP_S = 0.05
 """Queries whose times round to the same step see the moving voxels at one place: at 30 m/s up to 0.75 m off."""
 LEAST_COSINE = 0.3
 """Between a ray and the heading: nearer to a right angle a radial speed says too little of one along the heading."""
-REACHES = ((1.6, 1.6), (1.6, 8.0))
-"""How far to the side and ahead (m) a cell asks for motion: the middle of a truck is 8 m from the face that is seen."""
 
 
 @dataclass
@@ -56,21 +51,11 @@ class MeasuredMotion:
         grid: VoxelGrid,  # of the volume
         batch: FrameBatch,  # with LiDAR and its origins
         velocities: Tensor,  # [L, 3] `return_velocities`
-        warped: WarpedVolume | None,  # what is remembered of the volume
+        ego_mps: Tensor,  # [B, 3] m/s, aug frame
     ) -> MeasuredMotion:
-        """A voxel moves where half of its measured returns do, or, where it has none, of the `ball_query` around it.
-
-        Where nothing is measured now, what was remembered to move there still does.
-        """
+        """A voxel moves where half of its measured returns do, or, where it has none, of the `ball_query` around it."""
         indices = volume.indices
-        velocities, known = _velocities_around(grid, batch, velocities, indices)
-        ego_mps = torch.zeros_like(batch.aug_from_ego[:, :3, 3])
-        if warped is not None:
-            ego_mps = warped.ego_mps
-            centres, sites = grid.centre_of(indices[:, 1:]), warped.volume.sites
-            remembered = ball_query(warped.velocities, sites, grid, centres, indices[:, 0], len(OFFSETS))
-            moved = remembered.norm(dim=1, keepdim=True) > REMEMBERED_MPS
-            velocities = torch.where(known, velocities, torch.where(moved, remembered, 0))
+        velocities = _velocities_around(grid, batch, velocities, indices)
         moves = velocities.norm(dim=1) > MOVING_MPS
         rows, stays = moves.nonzero().squeeze(1), (~moves).nonzero().squeeze(1)
         features = full_precision(volume.features)
@@ -116,7 +101,7 @@ class MeasuredMotion:
         self,
         grid: BEVGrid,
     ) -> Tensor:  # [B, 2, rows, cols] m/s
-        """The mean velocity over ground of what moves in each cell, or else in the nearest of REACHES; else 0.
+        """The mean velocity over ground of what moves in each cell, or else in the eight around it; else 0.
 
         As in `head_targets` a cell stands for its lower corner.
         """
@@ -127,11 +112,7 @@ class MeasuredMotion:
         shape = (len(self.origins), grid.rows, grid.cols)
         columns = F.pad(self.velocities[inside, :2], (0, 1), value=1.0)
         sums = segment_sum(columns, cells, math.prod(shape)).unflatten(0, shape).permute(0, 3, 1, 2)
-        every = sums
-        for reach in REACHES:
-            size = [2 * round(metres / grid.cell_m) + 1 for metres in reach]
-            around = F.avg_pool2d(every, size, stride=1, padding=[n // 2 for n in size])
-            sums = torch.where(sums[:, 2:] > 0, sums, around)
+        sums = torch.where(sums[:, 2:] > 0, sums, F.avg_pool2d(sums, 3, stride=1, padding=1))
         return sums[:, :2] / torch.where(sums[:, 2:] > 0, sums[:, 2:], 1)
 
 
@@ -183,16 +164,15 @@ def _velocities_around(
     batch: FrameBatch,
     velocities: Tensor,  # [L, 3] m/s of its returns
     indices: Tensor,  # [n, 4] int64, voxels
-) -> tuple[Tensor, Tensor]:  # [n, 3] m/s, [n, 1] bool
-    """Of the returns that move where those are at least half of the measured ones, else 0; whether any is measured."""
+) -> Tensor:  # [n, 3] m/s
+    """Of the returns that move where those are at least half of the measured ones, else 0."""
     known = velocities.isfinite().all(1).nonzero().squeeze(1)
     points, owners, velocities = batch.lidar_points[known, :3], batch.lidar_batch[known], velocities[known]
     move = velocities.any(1, keepdim=True).to(velocities.dtype)
     sites, voxels, inside = voxel_rows(points, owners, grid.lower_m, grid.voxel_m, grid.cells, len(batch))
-    columns = torch.cat([velocities, move, torch.ones_like(move)], dim=1)
-    means = segment_mean(columns[inside], voxels, len(sites))
+    means = segment_mean(torch.cat([velocities, move], dim=1)[inside], voxels, len(sites))
     found = ball_query(means, sites, grid, grid.centre_of(indices[:, 1:]), indices[:, 0], len(OFFSETS))
     rows = sites.rows_of(indices)
     own = (rows >= 0).nonzero().squeeze(1)
-    velocities, share, known = found.index_copy(0, own, means[rows[own]]).split([3, 1, 1], dim=1)
-    return torch.where(share < 0.5, 0, velocities / share.clamp(min=0.5)), known > 0
+    velocities, share = found.index_copy(0, own, means[rows[own]]).split([3, 1], dim=1)
+    return torch.where(share < 0.5, 0, velocities / share.clamp(min=0.5))

@@ -132,14 +132,16 @@ class LRS4Fusion(Detector, WorldModel):
             batch = replace(batch, lidar_points=at_key_time(batch.lidar_points, measured))
         voxels = self.pointnet(batch.lidar_points, batch.lidar_batch, len(batch), batch.lidar_speeds)
         x = self.stem(self.unet(voxels))
-        warped = None if self.temporal is None else self.temporal.recall(memory, batch)
-        volumes = (
-            self.late_encoder(x) if warped is None else self.late_encoder(x, partial(self.temporal, warped=warped))
-        )
+        if self.temporal is None:
+            volumes, ego_mps = self.late_encoder(x), torch.zeros_like(batch.aug_from_ego[:, :3, 3])
+        else:
+            warped = self.temporal.recall(memory, batch)
+            volumes = self.late_encoder(x, lambda current: self.temporal(current, warped))
+            ego_mps = warped.ego_mps
         if measured is None:
             return volumes
         volume, grid = volumes.scales[FUSED_SCALE], self.voxels.at(FUSED_SCALE)
-        return replace(volumes, motion=MeasuredMotion.of(volume, grid, batch, measured, warped))
+        return replace(volumes, motion=MeasuredMotion.of(volume, grid, batch, measured, ego_mps))
 
     def _head_output(self, volumes: Volumes) -> HeadOutput:
         """Where motion is measured the head sees it, and what it says of velocities is added to it."""

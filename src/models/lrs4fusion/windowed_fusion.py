@@ -54,7 +54,6 @@ class WarpedVolume:
     """Remembered voxels moved to the present and put into voxels again; those of one voxel are averaged."""
 
     volume: SparseMap  # [n, C] on (B, z, y, x) of the second scale
-    velocities: Tensor  # [n, 3] m/s over ground, aug frame, without gradient
     elapsed_s: Tensor  # [B], 0 where nothing is remembered
     ego_mps: Tensor  # [B, 3] the ego's mean velocity since, aug frame; 0 where nothing is remembered
 
@@ -110,16 +109,15 @@ class WindowedFusion(nn.Module):
         remembered features. Raises ValueError for a memory of another number of streams, voxel size or width.
         """
         shape = (len(batch), *self.grid.cells)
-        frames = memory.before(batch).frames if memory is not None else ()
+        frames = memory.frames if memory is not None else ()
         for frame in frames:
             self._check(frame)
+        frames = memory.before(batch).frames if frames else ()
         if not frames:
             keys = torch.zeros(0, dtype=torch.int64, device=batch.device)
             empty = batch.aug_from_ego.new_zeros(0, self.memory_channels)
             nothing = batch.aug_from_ego.new_zeros(len(batch), 4)
-            return WarpedVolume(
-                SparseMap(Sites(shape, keys), empty), empty.new_zeros(0, 3), nothing[:, 0], nothing[:, 1:]
-            )
+            return WarpedVolume(SparseMap(Sites(shape, keys), empty), nothing[:, 0], nothing[:, 1:])
         voxels, motion = frames[0].voxels, frames[0].motion(batch, self.config.max_age_s)
         xyz = voxels.xyz
         if self.config.velocity_compensation:
@@ -129,11 +127,9 @@ class WindowedFusion(nn.Module):
         indices = torch.cat([voxels.rows[:, None], self.grid.cell_of(xyz)], dim=1)[kept]
         sites, owners = Sites.unique(indices, shape)
         features = segment_mean(full_precision(voxels.features)[kept], owners, len(sites))
-        velocities = transform_vectors(motion.aug_from_past[voxels.rows[kept]], voxels.velocities[kept].detach())
         driven = -motion.aug_from_past[:, :3, 3] / motion.elapsed_s.clamp(min=torch.finfo(torch.float32).eps)[:, None]
         ego_mps = torch.where(motion.usable[:, None], driven, 0.0)
-        velocities = segment_mean(velocities, owners, len(sites))
-        return WarpedVolume(SparseMap(sites, features), velocities, motion.elapsed_s, ego_mps)
+        return WarpedVolume(SparseMap(sites, features), motion.elapsed_s, ego_mps)
 
     def _check(self, frame: VolumeFrame) -> None:
         if frame.voxel_m != self.grid.voxel_m or frame.voxels.features.shape[1] != self.memory_channels:

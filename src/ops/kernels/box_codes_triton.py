@@ -13,10 +13,10 @@ from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import Values, constant
 from src.ops.backend import runs_kernels
 from src.ops.box_codes import (
+    ATTRIBUTE_MOVING_MPS,
     DRIVING_MPS,
     LEAST_COSINE,
     LOG_SIZE_LIMIT,
-    MOVING_MPS,
     OVERHEAD_M,
     WIDTHS,
     YAW,
@@ -45,7 +45,7 @@ def decoded_boxes_triton(
                 *(scores.contiguous(), constant(rules, torch.int64, labels.device), keys, measured, out),
                 *(len(rows), codes.shape[1], len(rules[0]), len(keys), len(keys).bit_length(), grid.rows, grid.cols),
                 *(grid.x_min_m, grid.y_min_m, grid.cell_m, threshold, BIN_MPS, MIN_SPEED_MPS, LOG_SIZE_LIMIT),
-                *(MOVING_MPS, OVERHEAD_M, DRIVING_MPS, LEAST_COSINE, math.sqrt(0.5)),
+                *(ATTRIBUTE_MOVING_MPS, OVERHEAD_M, DRIVING_MPS, LEAST_COSINE, math.sqrt(0.5)),
                 MEASURED=radar is not None,
                 TURNED=turned,
                 BINS=NUM_BINS,

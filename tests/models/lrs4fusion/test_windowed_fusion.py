@@ -62,17 +62,6 @@ def test_a_static_world_coincides_with_the_present():
     assert not part.recall(memory, before).ego_mps.any()  # a memory that is not in the past
 
 
-def test_velocities_turn_with_the_frame_and_are_means_of_a_voxel():
-    """Two voxels at 8 and 4 m/s along x, one behind the other, meet after half a second; the new frame is turned."""
-    part, turned = fusion(), bda(0.4, scale=1.05)
-    volume = volume_at(torch.tensor([[0.25, 0.25, 0.25], [2.25, 0.25, 0.25]]))
-    velocities = torch.tensor([[8.0, 0, 0], [4.0, 0, 0]])
-    memory = part.remember(volume, velocities, bare_frame(0.0, [pose()])).detached()
-    warped = part.recall(memory, bare_frame(0.5, [pose(yaw=math.pi / 2)], [turned]))
-    torch.testing.assert_close(warped.velocities, (turned[:3, :3] @ torch.tensor([0.0, -6.0, 0]))[None])
-    assert part.recall(None, bare_frame(0.5, [pose()])).velocities.shape == (0, 3)
-
-
 def test_a_turn_keeps_matter_within_half_a_voxel():
     part, world = fusion(), scattered(80, seed=3)
     before, after = bare_frame(0.0, [pose()]), bare_frame(0.2, [pose(4.0, 0.0, 0.3)])
