@@ -122,7 +122,8 @@ def findings(columns: list[Metric], rows: list[SweepRow], result: RunResult | No
 class Judged(NamedTuple):
     """Two rows beside one another."""
 
-    first: str  # label, with the metric where there are several
+    metric: str  # with a colon where there are several, else nothing
+    first: str  # label
     second: str
     better: bool | None  # the first one here; None if undecided or equal
     found: Comparison
@@ -131,7 +132,7 @@ class Judged(NamedTuple):
     @property
     def words(self) -> str:
         """The paper's order."""
-        return f"{self.first} before {self.second}"
+        return f"{self.metric}{self.first} before {self.second}"
 
 
 def _judge(columns: list[Metric], rows: list[SweepRow], places: list[int]) -> list[Judged]:
@@ -155,7 +156,7 @@ def _judge(columns: list[Metric], rows: list[SweepRow], places: list[int]) -> li
             found = first.cells[place].compared_with(second.cells[place], column)
             if found is not None:
                 better = found.favours(column) if found.decided else None
-                judged.append(Judged(prefix + first.label, second.label, better, found, bool(stated)))
+                judged.append(Judged(prefix, first.label, second.label, better, found, bool(stated)))
     return judged
 
 
@@ -176,10 +177,13 @@ def _found(where: str, judged: list[Judged]) -> str:
         parts[0] += f" ({_listed([pair.words for pair in held])})" if 0 < len(held) <= NAMED else ""
         parts += [f"{len(turned)} the other way round ({_listed([pair.words for pair in turned])})"] if turned else []
     else:
-        parts = [f"{pair.first} better than {pair.second}" for pair in held]
-        parts += [f"{pair.first} worse than {pair.second}" for pair in turned]
-    counts = {UNDECIDED: left, EQUAL: equal}
-    return f"{where}: {', '.join([*parts, *(f'{count} {word}' for word, count in counts.items() if count)])}"
+        alike: dict[tuple[str, str], list[str]] = {}
+        for word, pairs in (("better", held), ("worse", turned)):
+            for pair in pairs:
+                alike.setdefault((pair.metric, f"{word} than {pair.second}"), []).append(pair.first)
+        parts = [f"{metric}{' and '.join(rows)} {words}" for (metric, words), rows in alike.items()]
+    parts += [f"{count} {word}" for word, count in {UNDECIDED: left, EQUAL: equal}.items() if count]
+    return f"{where}: {('; ' if any(pair.metric for pair in judged) else ', ').join(parts)}"
 
 
 def describe_search(

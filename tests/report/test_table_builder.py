@@ -360,7 +360,7 @@ def test_a_table_without_main_metrics_is_judged_over_all(make_record, results_of
         for label in "ab":
             results[f"{PREFIX}{label}{seed}"].metrics["classes.car.AP"] = 0.5
     (table,) = sweep_tables(record, results)
-    assert table.text[1] == ("Over all metrics: 1 of 2 orderings of two rows holds here (mAVE: a before b), 1 equal.")
+    assert table.text[1] == ("Over all metrics: 1 of 2 orderings of two rows holds here (mAVE: a before b); 1 equal.")
 
 
 def test_rows_that_agree_in_every_pair_are_equal(make_record, results_of):
