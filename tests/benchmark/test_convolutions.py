@@ -43,8 +43,8 @@ def layers():
     return [
         Layer("flat", sites_on(flat, 30), SubmanifoldConv(4, 6, 3, 2, bias=False)),
         Layer("deep", sites_on(deep, 40), SubmanifoldConv(4, 6, 3, 3, bias=False)),
-        Layer("down", sites_on(deep, 40), SparseConv(4, 6, 3, 3, False, 2, 1)),
-        Layer("time", sites_on(deep, 40), SparseConv(4, 6, 3, 3, False, (2, 1, 1), 1)),
+        Layer("down", sites_on(deep, 40), SparseConv(4, 6, 3, 3, False, 2)),
+        Layer("time", sites_on(deep, 40), SparseConv(4, 6, 3, 3, False, (2, 1, 1))),
     ]
 
 
