@@ -51,6 +51,10 @@ NAMES = {
     ("phase1", "model.kggi.initialization=keypoint"): "KGGI + OCSF, keypoints only",
     ("phase1", "model.kggi=null", "model.ocsf=null"): "radar only",
 }
+for _phase in ("lrs_occupancy", "lrs_forecast", "lrs_detection"):
+    NAMES[_phase, "model=lrs4fusion"] = "LRS4Fusion"
+    _without = ("model.measured_motion=false", "model.neck.finest_scale=4", "model=lrs4fusion")
+    NAMES[_phase, *_without] = "LRS4Fusion, no measured motion, boxes from V4"
 NAMES_OF_COMPARISON = {
     ("phase1",): "phase 1",
     (FURTHER,): "phase 1 continued, no memory",
@@ -215,13 +219,13 @@ def phase_page(runs: list[RunResult], scale: str) -> str:
 
     Raises ValueError when they are of different data.
     """
+    experiments = group_runs(runs, lambda run: NAMES.get((run.phase, *run.settings)))
     if runs[0].task == DETECTION:
-        experiments = group_runs(runs, lambda run: NAMES.get((run.phase, *run.settings)))
         tables = [score_table(experiments, columns) for columns in (SUMMARY, BY_RANGE, BY_LONG_RANGE)]
         tables += [class_table(experiments), cost_table(experiments)]
         what = f"{', '.join(map(str, sorted({run.epochs for run in runs})))} epochs"
     else:
-        experiments, what = group_runs(runs, lambda run: None), f"task {runs[0].task}"
+        what = f"task {runs[0].task}"
         tables = [score_table(experiments, metrics_of(runs[0])), cost_table(experiments, epochs=True)]
     return _page(runs[0].phase, scale, what, runs) + "\n\n".join(filter(None, tables)) + "\n"
 
