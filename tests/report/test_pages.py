@@ -282,4 +282,4 @@ def test_runs_of_a_world_model_with_other_defaults_are_other_experiments(write_r
     (page,) = write_pages(config, results, set()).values()
     found = rows(page.read_text(), "| experiment | occupancy IoU along rays, % |")
     changed = "data.timeline.radial_speeds=none model.loss.sampling.free_places=along_rays model=lrs4fusion"
-    assert found == {"`model=lrs4fusion`": "| `model=lrs4fusion` | 60.0 |", f"`{changed}`": f"| `{changed}` | 40.0 |"}
+    assert found == {"LRS4Fusion": "| LRS4Fusion | 60.0 |", f"`{changed}`": f"| `{changed}` | 40.0 |"}
