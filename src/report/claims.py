@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -21,6 +22,8 @@ from src.report.results import RunResult
 from src.report.sweep_file import SweepConfig
 from src.report.sweep_record import SweepRecord
 from src.report.table_builder import is_done
+
+logger = logging.getLogger(__name__)
 
 CLAIMS = Path(__file__).with_name("claims.yaml")
 
@@ -214,6 +217,12 @@ def verdict_of(findings: list[Finding]) -> Verdict:
 
 
 def _runs(record: SweepRecord | None, label: str, results: Mapping[str, RunResult]) -> dict[int, RunResult]:
-    """Finished runs of a row, by seed."""
+    """Finished runs of a row, by seed. Warns of a record that lacks the row: of another version of its sweep."""
+    if record is not None and label not in record.rows:
+        logger.warning(
+            "the record of sweep %s, scale %s, has no row %r, which claims.yaml names; its runs count once `python -m "
+            "src.sweep +sweep=%s scale=%s workers=0 published=true` has recorded it again",
+            *(record.name, record.scale, label, record.name, record.scale),
+        )
     runs = {} if record is None else record.rows.get(label, {})
     return {seed: results[run_id] for seed, run_id in runs.items() if is_done(record, run_id, results)}

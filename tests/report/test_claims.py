@@ -1,12 +1,15 @@
 """The paper's claims: the file itself, its mistakes, and what made runs say of a claim."""
 
 import json
+import logging
+from pathlib import Path
 
 import pytest
 
 from src.errors import ConfigError
 from src.report.claims import Verdict, judge, load_claims, verdict_of
 from src.report.sweep_file import RowConfig, SweepConfig
+from src.report.sweep_record import read_records
 from src.sweep.compose import load_sweep
 
 COMPARISON = {"sweep": "margin", "row": "large", "over": "small", "metrics": ["mAP"]}
@@ -149,3 +152,18 @@ def test_pairs_are_of_finished_runs_of_one_seed(judged):
     assert finding.pairs == finding.found.pairs == 3 and [run.seed for run in finding.results] == [0, 0, 2, 2, 3, 3]
     (finding,) = judged(values, states={"a3": {"state": "running"}})  # its result is of an earlier training
     assert finding.pairs == 2 and finding.verdict is Verdict.UNDECIDED
+
+
+def test_a_record_that_does_not_know_a_claims_row_is_named(judged, caplog):
+    """As after a row is called something else: its runs would seem not to be there."""
+    with caplog.at_level(logging.WARNING):
+        (found,) = judged({"large": [30.0, 31.0, 32.0], "huge": [1.0, 2.0, 3.0]})
+    assert found.verdict is Verdict.NOT_RUN and "+sweep=epsilon" in caplog.text and "no row 'small'" in caplog.text
+
+
+def test_committed_records_know_every_row_that_the_claims_name(caplog):
+    records, damaged = read_records(Path(__file__).parents[2] / "reports")
+    assert records and not damaged
+    for claim in load_claims(load_sweep):
+        judge(claim, {record.name: record for record in records}, {})
+    assert not caplog.text
