@@ -9,9 +9,11 @@ from torch import Tensor
 from src.geometry.constants import constant
 from src.geometry.voxel_grid import VoxelGrid
 from src.ops.segment_reduce import segment_sum, weighted_segment_sum
-from src.ops.sites import Sites, rows_of_keys
+from src.ops.site_index import SiteIndex, Windows
+from src.ops.sites import Sites
 
 OFFSETS = ((0, 0, 0), (-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
+"""Of a voxel (z, y, x) and its face neighbours."""
 SOFTENING = 0.1
 """Of a voxel's edge along x, added to distances: at a centre the weight of that voxel stays finite."""
 
@@ -38,14 +40,28 @@ def ball_query(
         points = points.detach()  # the weight is 1 wherever in the voxel it lies
     cells, inside = grid.cell_of(points.detach()), grid.contains(points.detach())
     cells = torch.where(inside[:, None], cells, 0)
-    offsets = constant(OFFSETS[:neighbours], torch.int64, points.device)  # [K, 3]
-    steps = (offsets * constant(sites.strides[1:], torch.int64, points.device)).sum(1)
-    keys = sites.keys_of(torch.cat([batch[:, None], cells], dim=1))[:, None] + steps  # a face lies in the halo at most
-    rows = rows_of_keys(sites.keys, keys.flatten()).view(-1, neighbours)
-    point, place = ((rows >= 0) & inside[:, None]).nonzero().unbind(1)  # pairs, point by point
-    picks, centres = rows[point, place], grid.centre_of(sites.indices()[:, 1:]).to(points.dtype)
+    keys = sites.keys_of(torch.cat([batch[:, None], cells], dim=1))
+    windows, taps = _windows(sites, keys, neighbours)
+    point, place = (windows.found().index_select(0, taps) & inside).t().nonzero().unbind(1)  # pairs, point by point
+    picks = windows.sites(taps.index_select(0, place), point)
+    centres = grid.centre_of(sites.indices()[:, 1:]).to(points.dtype)
     distance = (F.embedding(point, points) - F.embedding(picks, centres)).norm(dim=1)
     weights = 1 / (SOFTENING * grid.voxel_m[0] + distance)
     total = segment_sum(weights[:, None], point, len(points))
     weights = weights / F.embedding(point, total).squeeze(1)
     return weighted_segment_sum(features.to(weights.dtype), weights, picks, point, len(points))
+
+
+def _windows(
+    sites: Sites,
+    keys: Tensor,  # [q] int64, of voxels of the grid: their faces lie in the halo at most
+    neighbours: int,
+) -> tuple[Windows, Tensor]:  # and [neighbours] int64
+    """Runs of cells that hold each voxel and its neighbours, and which row of `Windows.found` is which of OFFSETS."""
+    reach = int(neighbours > 1)  # along x
+    width, offsets = 1 + 2 * reach, OFFSETS[:neighbours]
+    lines = list(dict.fromkeys((z, y) for z, y, _ in offsets))
+    taps = tuple(lines.index((z, y)) * width + x + reach for z, y, x in offsets)
+    rows = tuple(z * (sites.strides[1] // sites.strides[2]) + y for z, y in lines)
+    windows = SiteIndex.of(sites).windows(keys - reach, constant(rows, torch.int64, keys.device), width)
+    return windows, constant(taps, torch.int64, keys.device)

@@ -12,6 +12,7 @@ from src.ops.fixed_shapes import fixed_shapes
 from src.ops.kernel_map import KernelMap, TableMap, counts_kept
 from src.ops.moved_keys import NONE, Axis, moved_keys
 from src.ops.neighbour_table import moved_table, neighbour_table, stacked_table
+from src.ops.site_index import SiteIndex
 from src.ops.sites import HALO, Sites, padded_sites
 
 Size = int | tuple[int, ...]
@@ -74,11 +75,8 @@ def window_map(inputs: Sites, outputs: Sites, kernel_size: Size) -> KernelMap:
     if makes_tables(outputs):
         table, bits = neighbour_table(inputs.keys, outputs.keys, _taps(outputs, kernel, centred=True))
         return TableMap(table, len(inputs), bits=bits)
-    found, where = _search(
-        inputs.keys, _corners(outputs, kernel), outputs.strides[1:], kernel, torch.Size(kernel).numel()
-    )
-    hits, rows, counts = _hits(found)
-    return KernelMap(where.reshape(-1).index_select(0, hits).to(torch.int32), rows, counts, len(inputs), len(outputs))
+    pairs = _pairs(inputs, _corners(outputs, kernel), kernel, torch.Size(kernel).numel())
+    return KernelMap(*pairs, len(inputs), len(outputs))
 
 
 def stacked_map(
@@ -190,9 +188,7 @@ def _build_submanifold(sites: Sites, kernel: tuple[int, ...]) -> KernelMap:
     rows = arange(num, torch.int32, device)
     if half == 0:
         return KernelMap(rows, rows, (num,), num, num, mirrored=True, identity=True)
-    found, where = _search(sites.keys, _corners(sites, kernel), sites.strides[1:], kernel, half)
-    hits, outputs, counts = _hits(found)
-    inputs = where.reshape(-1).index_select(0, hits).to(torch.int32)
+    inputs, outputs, counts = _pairs(sites, _corners(sites, kernel), kernel, half)
     blocks_in, blocks_out = inputs.split(counts), outputs.split(counts)
     return KernelMap(
         torch.cat([inputs, rows, *blocks_out[::-1]]),
@@ -222,9 +218,10 @@ def _build_strided(
         fits = (coarse * stride[axis] == moved) & (coarse >= 0) & (coarse < shape[axis + 1])
         targets = targets.unsqueeze(-2) + coarse * out.strides[axis + 1]
         valid = valid.unsqueeze(-2) & fits
-    hits, inputs, counts = _hits(valid.flatten(0, -2))
-    out.keys, outputs = torch.unique(targets.reshape(-1).index_select(0, hits), return_inverse=True)
-    return KernelMap(inputs, outputs.to(torch.int32), counts, len(sites), len(out)), out
+    taps, inputs, counts = _hits(valid.flatten(0, -2))
+    reached = targets.flatten().index_select(0, taps * len(sites) + inputs)
+    out.keys, outputs = torch.unique(reached, return_inverse=True)
+    return KernelMap(inputs.to(torch.int32), outputs.to(torch.int32), counts, len(sites), len(out)), out
 
 
 def _build_temporal(
@@ -289,48 +286,39 @@ def _map_between(
         table, bits = moved_table(sites.keys, out.keys, *plan, shift, _taps(sites, kernel))
         return TableMap(table, len(sites), bits=bits)
     corners = moved_keys(out.keys, *plan, (shift,))[0]
-    found, where = _search(sites.keys, corners, sites.strides[1:], kernel, torch.Size(kernel).numel())
-    hits, outputs, counts = _hits(found)
-    inputs = where.reshape(-1).index_select(0, hits).to(torch.int32)
-    return KernelMap(inputs, outputs, counts, len(sites), len(out))
+    return KernelMap(*_pairs(sites, corners, kernel, torch.Size(kernel).numel()), len(sites), len(out))
 
 
-def _search(
-    keys: Tensor,  # [n] int64, sorted
+def _pairs(
+    sites: Sites,
     corners: Tensor,  # [m] int64, key of the first kernel tap of every output
-    strides: tuple[int, ...],
     kernel: tuple[int, ...],
     num_taps: int,
-) -> tuple[Tensor, Tensor]:  # [num_taps, m] bool, [num_taps, m] int64
-    """Whether each of the first `num_taps` taps meets a site, and its row (of no meaning where it does not).
+) -> tuple[Tensor, Tensor, tuple[int, ...]]:  # [pairs] int32, [pairs] int32
+    """Inputs, outputs and counts of the pairs of the first `num_taps` taps, on a CPU.
 
-    The taps of one kernel row are neighbours among the sorted keys, so one binary search serves the whole row.
+    The taps of one kernel row lie side by side, so one look-up serves the whole row.
     """
-    padded = torch.cat([keys, keys.new_full((1,), torch.iinfo(torch.int64).max)])
-    found, where = [], []
-    for lead in itertools.product(*(range(size) for size in kernel[:-1])):
-        if len(found) >= num_taps:
-            break
-        first = corners + sum(offset * step for offset, step in zip(lead, strides[:-1], strict=True))
-        position = torch.searchsorted(keys, first)
-        for tap in range(min(kernel[-1], num_taps - len(found))):
-            hit = padded.index_select(0, position) == first + tap
-            found.append(hit)
-            where.append(position)
-            position = position + hit
-    return torch.stack(found), torch.stack(where)
+    row_step = sites.strides[-2]
+    rows = tuple(
+        sum(offset * step // row_step for offset, step in zip(lead, sites.strides[1:-1], strict=True))
+        for lead in itertools.islice(
+            itertools.product(*(range(size) for size in kernel[:-1])), -(-num_taps // kernel[-1])
+        )
+    )
+    windows = SiteIndex.of(sites).windows(corners, constant(rows, torch.int64, sites.device), kernel[-1])
+    taps, outputs, counts = _hits(windows.found()[:num_taps])
+    return windows.sites(taps, outputs), outputs.to(torch.int32), counts
 
 
 def _hits(
     found: Tensor,  # [K, m] bool
 ) -> tuple[Tensor, Tensor, tuple[int, ...]]:
-    """Flat positions [hits] int64 of what was found, offset by offset, its columns [hits] int32, and counts per offset.
-
-    Synchronises with a GPU once.
-    """
-    counts = tuple(found.sum(1).tolist())
-    hits = torch.nonzero_static(found.reshape(-1), size=sum(counts)).squeeze(1)
-    return hits, torch.remainder(hits, max(found.shape[1], 1)).to(torch.int32), counts
+    """Rows and columns [hits] int64 of what was found, row by row, and how many in each row."""
+    counts = found.sum(1)
+    taps = torch.repeat_interleave(counts, output_size=int(counts.sum()))
+    hits = torch.nonzero_static(found.reshape(-1), size=len(taps)).squeeze(1)
+    return taps, hits - taps * found.shape[1], tuple(counts.tolist())
 
 
 def _output_shape(

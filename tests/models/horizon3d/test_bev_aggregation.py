@@ -120,7 +120,8 @@ def test_aggregation_equals_a_dense_convolution_masked_to_the_sites(num_frames, 
         expected[now[:, 0], :, now[:, 1], now[:, 2]] += fused.features
         output = path.aggregate(fused, warped)
     assert torch.equal(output.indices, mask[:, 0, 0].nonzero())
-    torch.testing.assert_close(output.to_dense(), expected, rtol=0, atol=1e-9)
+    # Times are embedded in float32, whose last digit depends on how many stand side by side.
+    torch.testing.assert_close(output.to_dense(), expected, rtol=0, atol=1e-7)
 
 
 def test_time_embedding_tells_old_from_new():
