@@ -19,6 +19,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import cells_in_boxes
 from src.ops.deform_sample import deform_attend_images, sample_sparse_bev
 from src.ops.farthest_point import farthest_points
+from src.ops.kernel_maps import submanifold_map
 from src.ops.segment_reduce import segment_sum
 from src.ops.sites import Sites
 from src.ops.splat import splat_gaussians
@@ -150,7 +151,9 @@ def measure_operations(
         lambda: voxelize(points, points[:, :3], owners, lower, size, shape, 1)[1],
         lambda: naive_voxels(points, lower, size),
     )
-    return rows + compare("voxels", "unique rows + index_add", voxels, device)
+    rows += compare("voxels", "unique rows + index_add", voxels, device)
+    sites, *_ = voxelize(points, points[:, :3], owners, lower, size, shape, 1)
+    return rows + compare("kernel map", "a search for each neighbour", map_candidates(sites), device)
 
 
 def compare(
@@ -244,6 +247,23 @@ def attend_everywhere(
         weighed = (weights[:, :, :, :, number] * visible[:, :, None]).permute(0, 3, 2, 1, 4)  # [B, N, heads, Q, P]
         total = total + torch.einsum("bnhcqp,bnhqp->bqhc", sampled, weighed)
     return total.flatten(2)
+
+
+def map_candidates(sites: Sites) -> Candidates:
+    """The pairs of a 3x3x3 submanifold convolution, input below output."""
+    offsets = torch.cartesian_prod(*[torch.arange(-1, 2, device=sites.device)] * 3)
+    moved = F.pad(offsets, (1, 0))[:, None] + sites.indices()  # [27, n, 4]
+
+    def ours() -> Tensor:
+        pairs = submanifold_map(Sites(sites.shape, sites.keys), 3)
+        return torch.stack([pairs.inputs, pairs.outputs])
+
+    def naive() -> Tensor:
+        rows = torch.cat([sites.rows_of(cells) for cells in moved])
+        found = (rows >= 0).nonzero().squeeze(1)
+        return torch.stack([rows[found], found % len(sites)])
+
+    return ours, naive
 
 
 def naive_farthest_points(points: Tensor, count: int) -> Tensor:

@@ -14,6 +14,7 @@ from src.benchmark.__main__ import main
 from src.benchmark.scenes import Highway
 from src.config import compose_config
 from src.errors import ConfigError, DataError
+from src.ops.sites import Sites
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +56,12 @@ def measured(name, outputs, folder, *own):
 
 def column(rows, key, name):
     return {row[key]: row.get(name) for row in rows}
+
+
+def test_the_naive_kernel_map_has_the_same_pairs():
+    cells = torch.randperm(2 * 5 * 6 * 7)[:200].sort().values
+    ours, naive_one = naive.map_candidates(Sites.from_linear(cells, (2, 5, 6, 7)))
+    assert torch.equal(ours().long(), naive_one())
 
 
 @pytest.mark.slow
@@ -183,6 +190,7 @@ def test_ops(outputs, tmp_path, monkeypatch):
         "farthest points",
         "box raster",
         "voxels",
+        "kernel map",
     } == others
 
 
