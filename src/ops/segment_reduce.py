@@ -211,7 +211,7 @@ def inverse_rows(
 def weighted_segment_sum(
     values: Tensor,  # [n, C]
     weights: Tensor,  # [pairs]
-    picks: Tensor,  # [pairs] int64, row of `values`
+    picks: Tensor,  # [pairs] integer, row of `values`
     segment: Tensor,  # [pairs] int64, ascending
     num_segments: int,
     by_pick: Tensor | None = None,  # [pairs] int64, the pairs ordered by `picks`, where the caller knows it

@@ -12,15 +12,16 @@ from src.ops.sites import HALO, Sites
 
 SHIFT = 4
 CHUNK = 1 << SHIFT
-"""Cells along the last axis from one word to the next. A word holds a bit of each of twice as many, so that whatever of
-at most this many cells begins in its first half lies in it."""
+"""Cells along the last axis from one word to the next. A word has bits for twice as many, so it holds any run of at
+most CHUNK cells that begins in its first half."""
 
 
 @dataclass(frozen=True, eq=False)
 class SiteIndex:
     """Sites by rows, lines of cells along the last axis; only rows that hold a site have words.
 
-    On a CPU kernel maps of tens of thousands of sites take a third to a half of the time that searches take.
+    On a CPU kernel maps of tens of thousands of sites that share rows, as voxels of a scene do, take a third to a half
+    of the time that searches take. Memory: 8 bytes a row of the grid, and for every CHUNK cells of a row with sites.
     """
 
     begins: Tensor  # [rows of the grid, with a margin] int64, first word of each row, 0 for one without sites
@@ -32,19 +33,20 @@ class SiteIndex:
     @classmethod
     def of(cls, sites: Sites) -> SiteIndex:
         """The index of the sites, cached on them."""
-        if "index" not in sites.cache:
-            sites.cache["index"] = cls._build(sites)
-        return sites.cache["index"]
+        if "site_index" not in sites.cache:
+            sites.cache["site_index"] = cls._build(sites)
+        return sites.cache["site_index"]
 
     @classmethod
     def _build(cls, sites: Sites) -> SiteIndex:
         keys, stride, num = sites.keys, sites.strides[-2], len(sites)
-        margin = HALO * sum(step // stride for step in sites.strides[1:-1])  # a window may reach so far
+        steps = sum(step // stride for step in sites.strides[1:-1])
+        margin, tail = HALO * steps, CHUNK * steps  # windows may reach so far, those of padding behind the grid
         width = -(-(stride + HALO) // CHUNK) + 2  # a chunk before the cells, as words reach into the one behind them
         row = torch.div(keys, stride, rounding_mode="floor")
         place = keys - row * stride + (HALO + CHUNK)
         begin = _changes(row).cumsum(0).mul_(width)
-        begins = keys.new_zeros(sites.end // stride + 2 * margin + 1)
+        begins = keys.new_zeros(margin + sites.end // stride + tail + 1)
         begins.index_copy_(0, row + margin, begin)
         at = begin + (place >> SHIFT)
         bits = _bit(place & (CHUNK - 1)).mul_(_changes(keys))  # padding repeats a key
@@ -57,8 +59,8 @@ class SiteIndex:
 
     def windows(
         self,
-        corners: Tensor,  # [m] int64, keys of cells, at most HALO outside the grid
-        rows: Tensor,  # [L] int64, rows from there
+        corners: Tensor,  # [m] int64, keys of cells
+        rows: Tensor,  # [L] int64, rows from there; no window begins more than HALO outside the grid
         taps: int,  # at most CHUNK
     ) -> Windows:
         """The `taps` cells from each corner on in each of the rows. Raises ValueError for too many of them."""
@@ -81,7 +83,7 @@ class Windows:
     words: Tensor  # [L, m] int32
     start: Tensor  # [m] int32, bit of the first cell
     taps: int
-    first: Tensor
+    first: Tensor  # of the index
 
     def found(self) -> Tensor:  # [L * taps, m] bool
         """Whether each cell is a site."""

@@ -70,18 +70,20 @@ def test_sets_and_convolutions_are_those_of_varying_shapes(shape):
         assert torch.equal(rows[:150], wanted_rows) and (rows[150:] >= len(wanted)).all()
     generator = torch.Generator().manual_seed(1)
     features = torch.randn(len(sites), 5, generator=generator)
-    weight = torch.randn(3**ndim, 5, 4, generator=generator)
+    weights = torch.randn(5**ndim, 5, 4, generator=generator)
     wide = torch.rand(len(sites), generator=generator) > 0.5
     builds = {
         "submanifold": lambda of: (submanifold_map(of, 3), of),
         "strided": lambda of: strided_map(of, 3, 2, 1),
         "dilating": lambda of: strided_map(of, 3, 1, 1),
+        "reaching far": lambda of: strided_map(of, 5, 2, 1),
         "pruned": lambda of: pruned_map(of, wide[: len(of)], 3, 2, 1),
     }
     if ndim == 3:
         builds["temporal"] = lambda of: temporal_map(of, 3, (2, 1, 1), 1)
     for name, build in builds.items():
         kernel_map, out = build(wanted)
+        weight = weights[: kernel_map.num_offsets]
         truth = sparse_conv(features[: len(wanted)], weight, kernel_map)
         with in_fixed_shapes(shapes(voxels=3000, cells=1000)) as fixed:
             fixed_map, fixed_out = build(sites)

@@ -28,7 +28,7 @@ def test_finds_exactly_the_sites_of_every_window(shape: tuple[int, ...], count: 
     rows_of = {tuple(cell): row for row, cell in enumerate(sites.indices().tolist())}
     begins = [range(shape[0]), *(range(size) for size in shape[1:-1]), range(-HALO, shape[-1])]
     corners = list(itertools.product(*begins))
-    lines = [0, 1, -HALO] if len(shape) > 2 else [0]  # along the last axis but one
+    lines = [0, HALO, -HALO] if len(shape) > 2 else [0]  # along the last axis but one
     windows = SiteIndex.of(sites).windows(sites.keys_of(torch.tensor(corners)), torch.tensor(lines), taps)
     expected = [
         [rows_of.get((*before, row + line, x + tap), -1) for *before, row, x in corners]
