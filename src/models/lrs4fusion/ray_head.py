@@ -12,8 +12,6 @@ from src.errors import ConfigError, require_least
 from src.losses.normalizers import full_precision
 
 KERNEL, STRIDE = 4, 2
-START = 0.1
-"""Of r_max: about what an untrained head forecasts."""
 
 
 @dataclass(kw_only=True)
@@ -76,22 +74,6 @@ class RayHead(nn.Module):
         self.mlp = nn.ModuleList(
             nn.Linear(before, after) for before, after in zip(widths[:-1], widths[1:], strict=True)
         )
-        self._initialise()
-
-    @torch.no_grad()
-    def _initialise(self) -> None:
-        """Encodings that average out over a ray, weights that keep their size through ReLUs, and ranges near START.
-
-        Torch's own initialisation gives all rays the same range to the centimetre, and with some seeds most units die
-        before they have learnt another.
-        """
-        self.occupancy.bias.copy_(-0.5 * (self.occupancy.weight + self.place.weight).squeeze(1))
-        self.place.bias.zero_()
-        for layer in (*self.convs, *self.mlp):
-            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
-            nn.init.zeros_(layer.bias)
-        self.mlp[-1].weight.mul_(START)
-        self.mlp[-1].bias.fill_(START)
 
     @property
     def samples_m(self) -> Tensor:  # [N]
