@@ -101,12 +101,15 @@ def test_aggregation_equals_a_dense_convolution_masked_to_the_sites(num_frames, 
 
     x, mask = torch.zeros(2, C + 32, slots, 5, 6).double(), torch.zeros(2, 1, slots, 5, 6).double()
     with torch.no_grad():
-        for cells, rows, age in (
-            (past, old, warped.elapsed_s),
-            (torch.cat([now[:, :1], torch.full((9, 1), num_frames), now[:, 1:]], 1), fused.features, torch.zeros(9)),
+        ages = torch.zeros(2, slots)
+        ages[past[:, 0], past[:, 1]] = warped.elapsed_s
+        times = path.time(ages.flatten()).double().view(2, slots, -1)  # all at once: float32 rounds by their number
+        for cells, rows in (
+            (past, old),
+            (torch.cat([now[:, :1], torch.full((9, 1), num_frames), now[:, 1:]], 1), fused.features),
         ):
             b, t, row, col = cells.unbind(1)
-            x[b, :, t, row, col] = torch.cat([rows, path.time(age).double()], 1)
+            x[b, :, t, row, col] = torch.cat([rows, times[b, t]], 1)
             mask[b, 0, t, row, col] = 1
         for number, (conv, norm) in enumerate(zip(path.convs, path.norms, strict=True)):
             weight = conv.weight.permute(2, 1, 0).unflatten(2, (3, 3, 3))
@@ -120,8 +123,7 @@ def test_aggregation_equals_a_dense_convolution_masked_to_the_sites(num_frames, 
         expected[now[:, 0], :, now[:, 1], now[:, 2]] += fused.features
         output = path.aggregate(fused, warped)
     assert torch.equal(output.indices, mask[:, 0, 0].nonzero())
-    # Times are embedded in float32, whose last digit depends on how many stand side by side.
-    torch.testing.assert_close(output.to_dense(), expected, rtol=0, atol=1e-7)
+    torch.testing.assert_close(output.to_dense(), expected, rtol=0, atol=1e-9)
 
 
 def test_time_embedding_tells_old_from_new():
