@@ -1,4 +1,4 @@
-"""Convolution of whole maps with channels last, on a CPU as matrix products where these are faster."""
+"""Convolution of images and whole maps, on a CPU in the type and as the products that are fastest there."""
 
 from __future__ import annotations
 
@@ -10,7 +10,21 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx, once_differentiable
 
 from src.ops.linear import linear
-from src.ops.products import MOST_ROWS, matmul_tn, row_spans, slow_weight_gradients
+from src.ops.products import MOST_ROWS, convolution_type, matmul_tn, row_spans, slow_weight_gradients
+
+
+def conv2d(
+    x: Tensor,  # [B, C, H, W]
+    weight: Tensor,  # [C', C, k, k]
+    bias: Tensor | None = None,  # [C']
+    stride: int = 1,
+    padding: int = 0,
+) -> Tensor:  # [B, C', H', W'] of x's type
+    """F.conv2d, whose operands and result are rounded to the type that `convolution_type` chooses."""
+    dtype = convolution_type(x, weight, stride)
+    if dtype == x.dtype:
+        return F.conv2d(x, weight, bias, stride, padding)
+    return _Conv.apply(x, weight, bias, stride, padding, dtype)
 
 
 def map_conv2d(
@@ -32,7 +46,35 @@ def map_conv2d(
         return rows.view(*cells.shape[:3], len(weight)).permute(0, 3, 1, 2)
     if slow_weight_gradients() and torch.is_grad_enabled() and weight.requires_grad:
         return _MapConv.apply(x, weight, bias, stride)
-    return F.conv2d(x, weight, bias, stride, padding)
+    return conv2d(x, weight, bias, stride, padding)
+
+
+class _Conv(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: FunctionCtx,
+        x: Tensor,
+        weight: Tensor,
+        bias: Tensor | None,
+        stride: int,
+        padding: int,
+        dtype: torch.dtype,
+    ) -> Tensor:
+        rounded = x.to(dtype), weight.to(dtype)
+        ctx.save_for_backward(*rounded)
+        ctx.stride, ctx.padding, ctx.dtype = stride, padding, x.dtype
+        return F.conv2d(*rounded, bias if bias is None else bias.to(dtype), stride, padding).to(x.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, ...]:
+        x, weight = ctx.saved_tensors
+        grad_bias = grad.sum((0, 2, 3)) if ctx.needs_input_grad[2] else None
+        grad = grad.to(x.dtype, memory_format=torch.channels_last)
+        sizes = [ctx.stride] * 2, [ctx.padding] * 2, [1] * 2, False, [0] * 2, 1
+        wanted = [*ctx.needs_input_grad[:2], False]
+        grads = torch.ops.aten.convolution_backward(grad, x, weight, None, *sizes, wanted)[:2]
+        return *(one if one is None else one.to(ctx.dtype) for one in grads), grad_bias, None, None, None
 
 
 class _MapConv(torch.autograd.Function):

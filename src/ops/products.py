@@ -19,6 +19,8 @@ MOST_ROWS = 4096
 LEAST_ROWS, LEAST_WIDTHS = 512, (32, 64)
 """Products of fewer rows, or of matrices narrower than this on their narrow and on their wide side, stay as they are:
 the operands' rounding costs what bfloat16 saves."""
+LEAST_CHANNELS = 16
+"""Of a convolution, on either side, likewise; it has the rows of its output."""
 
 _bfloat16: ContextVar[bool] = ContextVar("bfloat16 products", default=False)
 
@@ -27,7 +29,8 @@ _bfloat16: ContextVar[bool] = ContextVar("bfloat16 products", default=False)
 def bfloat16_products(wanted: bool = True) -> Iterator[None]:
     """Within the context large products of float32 on a CPU that has the instructions take operands in bfloat16.
 
-    Each is chosen by `product_type`, and its gradients follow it. Sums, and everything else, stay in float32.
+    Each is chosen by `product_type` or `convolution_type`, and its gradients follow it. Sums, and everything else, stay
+    in float32.
     """
     token = _bfloat16.set(wanted and multiplies_bfloat16())
     try:
@@ -46,6 +49,18 @@ def product_type(
     if large and x.dtype == torch.float32 and x.device.type == "cpu" and _bfloat16.get():
         return torch.bfloat16
     return x.dtype
+
+
+def convolution_type(
+    x: Tensor,  # [B, C, H, W]
+    weight: Tensor,  # [C', C, k, k]
+    stride: int,
+) -> torch.dtype:
+    """The type in which maps are best convolved: their own, or bfloat16 in its context."""
+    if x.dtype != torch.float32 or x.device.type != "cpu" or not _bfloat16.get():
+        return x.dtype  # before any size is read, which an export would take for a condition
+    large = len(x) * x.shape[2] * x.shape[3] >= LEAST_ROWS * stride**2 and min(weight.shape[:2]) >= LEAST_CHANNELS
+    return torch.bfloat16 if large else x.dtype
 
 
 def matmul(
@@ -129,7 +144,8 @@ def slow_weight_gradients() -> bool:
 
 def describe_products(wanted: bool) -> dict[str, Any]:
     """What a CPU multiplies by and in, where bfloat16 is wanted or not, for the record of a run."""
-    large = f"from {LEAST_ROWS} rows and widths of {LEAST_WIDTHS[0]} and {LEAST_WIDTHS[1]}"
+    widths = f"widths of {LEAST_WIDTHS[0]} and {LEAST_WIDTHS[1]}, in convolutions of {LEAST_CHANNELS}"
+    large = f"from {LEAST_ROWS} rows and {widths}"
     return {
         "float32": "oneDNN" if prefers_onednn() else "torch",
         "bfloat16": large if wanted and multiplies_bfloat16() else "never",

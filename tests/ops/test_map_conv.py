@@ -5,8 +5,9 @@ import torch
 import torch.nn.functional as F
 from torch.autograd import gradcheck
 
-from src.ops import map_conv
-from src.ops.map_conv import map_conv2d, weight_gradient
+from src.ops import map_conv, products
+from src.ops.map_conv import conv2d, map_conv2d, weight_gradient
+from src.ops.products import bfloat16_products
 
 
 @pytest.fixture(params=[False, True], ids=["oneDNN", "products"])
@@ -63,3 +64,37 @@ def test_autocast_convolves_in_its_type(gradients):
     with torch.autocast("cpu", torch.bfloat16):
         out = map_conv2d(torch.randn(1, 16, 8, 8), torch.randn(16, 16, 1, 1))
     assert out.dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize("bias", [True, False])
+@pytest.mark.parametrize(("kernel_size", "stride", "padding"), [(1, 1, 0), (3, 1, 1), (3, 2, 1), (7, 2, 3), (2, 2, 0)])
+def test_large_convolutions_round_their_operands_in_the_context(kernel_size, stride, padding, bias, monkeypatch):
+    """Values and gradients are those of the rounded operands, each rounded once; without the context nothing is."""
+    monkeypatch.setattr(products, "multiplies_bfloat16", lambda: True)
+    torch.manual_seed(0)
+    leaves = [torch.randn(2, 16, 48, 50), torch.randn(24, 16, kernel_size, kernel_size)]
+    leaves += [torch.randn(24)] if bias else []
+    leaves = [leaf.to(memory_format=torch.channels_last) if leaf.dim() == 4 else leaf for leaf in leaves]
+    exact, rounded = ([leaf.clone().requires_grad_() for leaf in leaves] for _ in range(2))
+    rest = (None,) if not bias else ()
+    with bfloat16_products():
+        out = conv2d(*rounded, *rest, stride, padding)
+    pull = torch.randn_like(out)
+    results = [(out, *torch.autograd.grad(out, rounded, pull))]
+    doubles = [leaf.detach().bfloat16().double().requires_grad_() for leaf in exact]
+    expected = F.conv2d(*doubles, *rest, stride, padding)
+    coarse = torch.autograd.grad(expected, doubles[:2], pull.bfloat16().double())
+    results.append((expected, *coarse, *([pull.sum((0, 2, 3)).double()] if bias else [])))
+    for own, other in zip(*results, strict=True):
+        assert own.dtype == torch.float32
+        torch.testing.assert_close(own.double(), other, rtol=2**-8, atol=1e-3 * other.abs().max().item())
+    assert torch.equal(conv2d(*exact, *rest, stride, padding), F.conv2d(*exact, *rest, stride, padding))
+    assert not torch.equal(out, F.conv2d(*exact, *rest, stride, padding))
+
+
+def test_small_convolutions_stay_in_float32(monkeypatch):
+    monkeypatch.setattr(products, "multiplies_bfloat16", lambda: True)
+    with bfloat16_products():
+        for channels, size in ((3, 64), (16, 8)):
+            x, weight = torch.randn(1, channels, size, size), torch.randn(16, channels, 3, 3)
+            assert torch.equal(conv2d(x, weight, None, 1, 1), F.conv2d(x, weight, None, 1, 1))

@@ -14,6 +14,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.resnet import BasicBlock
 from src.models.layers.dense import DenseConvNormReLU, MapConv2d, map_of_rows
 from src.models.layers.norm import MapBatchNorm
+from src.ops.map_conv import map_conv2d
 
 MIN_CHANNELS = 16
 """Least width of what a strided stage reads: below it the backward pass of a strided 1x1 convolution with channels last
@@ -154,10 +155,22 @@ class BEVDecoder(nn.Module):
         for stage in self.stages:
             x = stage(x)
             outputs.append(x)
-        finest = outputs[0]
-        if len(outputs) > 1:
-            finest = torch.cat([finest, _resized(x, finest.shape[-2:])], dim=1)
-        return self.output(self.lateral(fused) + _resized(self.join(finest), fused.shape[-2:]))
+        joined = self._join(outputs[0], x) if len(outputs) > 1 else self.join(outputs[0])
+        return self.output(self.lateral(fused) + _resized(joined, fused.shape[-2:]))
+
+    def _join(
+        self,
+        finest: Tensor,  # [B, C_1, h, w]
+        coarsest: Tensor,  # [B, C_n, h', w']
+    ) -> Tensor:  # [B, C, h, w]
+        """`join` of both side by side, the coarsest brought to (h, w).
+
+        A convolution of single cells and interpolation may change places: fewer channels are interpolated.
+        """
+        mixing, smoothing = self.join
+        own, other = mixing.conv.weight.split([finest.shape[1], coarsest.shape[1]], dim=1)
+        mixed = map_conv2d(finest, own, mixing.conv.bias) + _resized(map_conv2d(coarsest, other), finest.shape[-2:])
+        return smoothing(F.relu(mixing.norm(mixed), inplace=True))
 
 
 def _resized(

@@ -13,6 +13,7 @@ from src.errors import ConfigError
 from src.models.backbones.resnet import BasicBlock, Bottleneck, ResNet
 from src.models.backbones.vovnet import VoVNet99
 from src.models.backbones.weights import BackboneName, load_backbone_weights
+from src.models.layers.dense import Conv2d
 from src.models.layers.norm import MapBatchNorm
 
 COARSEST_STRIDE = 32
@@ -82,8 +83,8 @@ class FPN(nn.Module):
         super().__init__()
         self.strides = strides
         self.first_stage = 1 + self.offered.index(strides[0])
-        self.laterals = nn.ModuleList(nn.Conv2d(width, channels, 1) for width in in_channels[self.first_stage :])
-        self.outputs = nn.ModuleList(nn.Conv2d(channels, channels, 3, padding=1) for _ in strides)
+        self.laterals = nn.ModuleList(Conv2d(width, channels, 1) for width in in_channels[self.first_stage :])
+        self.outputs = nn.ModuleList(Conv2d(channels, channels, 3, padding=1) for _ in strides)
         for conv in (*self.laterals, *self.outputs):
             nn.init.xavier_uniform_(conv.weight)
             nn.init.zeros_(conv.bias)
@@ -112,9 +113,9 @@ class SecondFPN16(nn.Module):
         part = channels // 4
         at_4, at_8, at_16, at_32 = in_channels
         resample = (
-            nn.Conv2d(at_4, part, 4, 4, bias=False),
-            nn.Conv2d(at_8, part, 2, 2, bias=False),
-            nn.Conv2d(at_16, part, 1, bias=False),
+            Conv2d(at_4, part, 4, 4, bias=False),
+            Conv2d(at_8, part, 2, 2, bias=False),
+            Conv2d(at_16, part, 1, bias=False),
             nn.ConvTranspose2d(at_32, part, 2, 2, bias=False),
         )
         self.branches = nn.ModuleList(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from src.models.layers.dense import Conv2d
 from src.models.layers.merging import with_relu
 from src.models.layers.norm import MapBatchNorm
 
@@ -15,7 +16,7 @@ class BasicBlock(nn.Module):
     expansion = 1
     norm_pairs = (("conv1", "bn1"), ("conv2", "bn2"))
 
-    def __init__(self, in_channels: int, width: int, stride: int, conv: type[nn.Conv2d] = nn.Conv2d) -> None:
+    def __init__(self, in_channels: int, width: int, stride: int, conv: type[nn.Conv2d] = Conv2d) -> None:
         super().__init__()
         self.conv1 = conv(in_channels, width, 3, stride, 1, bias=False)
         self.bn1 = MapBatchNorm(width)
@@ -48,11 +49,11 @@ class Bottleneck(nn.Module):
     def __init__(self, in_channels: int, width: int, stride: int) -> None:
         super().__init__()
         out_channels = width * self.expansion
-        self.conv1 = nn.Conv2d(in_channels, width, 1, bias=False)
+        self.conv1 = Conv2d(in_channels, width, 1, bias=False)
         self.bn1 = MapBatchNorm(width)
-        self.conv2 = nn.Conv2d(width, width, 3, stride, 1, bias=False)
+        self.conv2 = Conv2d(width, width, 3, stride, 1, bias=False)
         self.bn2 = MapBatchNorm(width)
-        self.conv3 = nn.Conv2d(width, out_channels, 1, bias=False)
+        self.conv3 = Conv2d(width, out_channels, 1, bias=False)
         self.bn3 = MapBatchNorm(out_channels)
         self.downsample = _projection(in_channels, out_channels, stride)
         self.merged = False
@@ -75,7 +76,7 @@ class Bottleneck(nn.Module):
         return F.relu(y + self.downsample(x))
 
 
-def _projection(in_channels: int, out_channels: int, stride: int, conv: type[nn.Conv2d] = nn.Conv2d) -> nn.Module:
+def _projection(in_channels: int, out_channels: int, stride: int, conv: type[nn.Conv2d] = Conv2d) -> nn.Module:
     if stride == 1 and in_channels == out_channels:
         return nn.Identity()
     return nn.Sequential(
@@ -95,7 +96,7 @@ class ResNet(nn.Module):
 
     def __init__(self, block: type[BasicBlock] | type[Bottleneck], widths: list[int], blocks: list[int]) -> None:
         super().__init__()
-        self.conv1 = nn.Conv2d(3, widths[0], 7, 2, 3, bias=False)
+        self.conv1 = Conv2d(3, widths[0], 7, 2, 3, bias=False)
         self.bn1 = MapBatchNorm(widths[0])
         self.maxpool = nn.MaxPool2d(3, 2, 1)
         channels = widths[0]

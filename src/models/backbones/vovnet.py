@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from src.models.layers.dense import Conv2d
 from src.models.layers.norm import MapBatchNorm
 
 STEM_CHANNELS = (64, 64, 128)
@@ -22,7 +23,7 @@ class ConvNorm(nn.Module):
 
     def __init__(self, in_channels: int, out_channels: int, kernel_size: int, stride: int = 1) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(in_channels, out_channels, kernel_size, stride, kernel_size // 2, bias=False)
+        self.conv = Conv2d(in_channels, out_channels, kernel_size, stride, kernel_size // 2, bias=False)
         self.bn = MapBatchNorm(out_channels)
 
     def forward(
@@ -37,7 +38,7 @@ class ChannelAttention(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.fc = nn.Conv2d(channels, channels, 1)
+        self.fc = Conv2d(channels, channels, 1)
 
     def forward(
         self,

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.heads.query_head import QueryPrediction, SetPredictionHead
+from src.models.layers.dense import Conv2d
 from src.models.layers.global_attention import FFN_RATIO, GlobalAttention
 from src.models.layers.image_attention import ImageCrossAttention, PointOffsets, feed_forward
 from src.models.layers.query_attention import QueryEmbedding
@@ -105,7 +106,7 @@ class PerspectiveDecoder(nn.Module):
             raise ConfigError(f"model.decoder.num_heads={config.num_heads}: must divide model.channels={channels}")
         self.embedding = QueryEmbedding(channels, grid)
         self.scaling = CameraScaling(image_channels)
-        self.image_value = nn.Conv2d(image_channels, channels, 1)
+        self.image_value = Conv2d(image_channels, channels, 1)
         sizes = (channels, num_views, num_levels)
         self.layers = nn.ModuleList(PerspectiveLayer(config, *sizes) for _ in range(config.num_layers))
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import depth_cross_entropy, penalty_reduced_focal
 from src.losses.normalizers import mean_over_ranks
+from src.models.layers.dense import Conv2d
 from src.models.layers.full_precision import FullPrecisionConv2d
 from src.models.layers.merging import with_relu
 from src.models.layers.views import CameraViews
@@ -42,13 +43,13 @@ class CameraKeypointHead(nn.Module):
         super().__init__()
         groups = max(1, channels // CHANNELS_PER_NORM_GROUP)
         self.shared = nn.Sequential(
-            nn.Conv2d(in_channels, channels, 3, padding=1, bias=False), nn.GroupNorm(groups, channels), nn.ReLU()
+            Conv2d(in_channels, channels, 3, padding=1, bias=False), nn.GroupNorm(groups, channels), nn.ReLU()
         )
         self.keypoint = nn.Sequential(
-            nn.Conv2d(channels, channels // 2, 3, padding=1), nn.ReLU(), FullPrecisionConv2d(channels // 2, 1, 1)
+            Conv2d(channels, channels // 2, 3, padding=1), nn.ReLU(), FullPrecisionConv2d(channels // 2, 1, 1)
         )
         self.depth = nn.Sequential(
-            nn.Conv2d(channels, channels, 3, padding=1, bias=False),
+            Conv2d(channels, channels, 3, padding=1, bias=False),
             nn.GroupNorm(groups, channels),
             nn.ReLU(),
             FullPrecisionConv2d(channels, num_depth_bins, 1),

@@ -14,6 +14,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import arange
 from src.models.horizon3d.cross_attention import RadarCrossAttention
 from src.models.horizon3d.temporal_attention import TemporalSelfAttention, attention_mask
+from src.models.layers.dense import Conv2d
 from src.models.layers.doppler import Doppler
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.image_attention import ImageCrossAttention, attention_linear, linear_relu_norm
@@ -345,7 +346,7 @@ class GaussianEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.anchor = AnchorEncoder(channels, grid, bounds)
-        self.image_value = nn.Conv2d(image_channels, channels, 1)
+        self.image_value = Conv2d(image_channels, channels, 1)
         self.layers = nn.ModuleList(make_layer() for _ in range(num_layers))
 
     def forward(

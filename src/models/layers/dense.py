@@ -1,4 +1,4 @@
-"""Layers on whole BEV maps [B, C, rows, cols], which lie in memory as rows of cells (channels last)."""
+"""Convolutions of images, and layers on whole BEV maps [B, C, rows, cols] with channels last in memory."""
 
 from __future__ import annotations
 
@@ -7,9 +7,19 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.models.layers.norm import MapBatchNorm
-from src.ops.map_conv import map_conv2d
+from src.ops.map_conv import conv2d, map_conv2d
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV
+
+
+class Conv2d(nn.Conv2d):
+    """A convolution by `conv2d`, neither dilated nor grouped, with one stride and padding."""
+
+    def forward(
+        self,
+        x: Tensor,  # [M, C, H, W]
+    ) -> Tensor:  # [M, C', H', W']
+        return conv2d(x, self.weight, self.bias, self.stride[0], self.padding[0])
 
 
 class MapConv2d(nn.Conv2d):

@@ -11,6 +11,7 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.point_transformer import PaddedPoints
 from src.models.heads.query_head import QueryPrediction, SetPredictionHead
+from src.models.layers.dense import Conv2d
 from src.models.layers.image_attention import ImageCrossAttention, PointOffsets, feed_forward
 from src.models.layers.query_attention import DistanceAttention, QueryEmbedding
 from src.models.layers.views import CameraViews
@@ -89,7 +90,7 @@ class QueryDecoder(nn.Module):
         if channels % config.num_heads:
             raise ConfigError(f"model.decoder.num_heads={config.num_heads}: must divide model.channels={channels}")
         self.embedding = QueryEmbedding(channels, grid)
-        self.image_value = nn.Conv2d(image_channels, channels, 1)
+        self.image_value = Conv2d(image_channels, channels, 1)
         sizes = (channels, num_views, num_levels)
         self.layers = nn.ModuleList(QueryDecoderLayer(config, *sizes) for _ in range(config.num_layers))
         self.norm = nn.LayerNorm(channels)

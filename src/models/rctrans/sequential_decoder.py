@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.heads.query_head import QueryPrediction, SetPredictionHead
+from src.models.layers.dense import Conv2d
 from src.models.layers.global_attention import GlobalDecoderLayer
 from src.models.layers.position_embedding import PositionEmbedding, PositionEmbeddingConfig
 from src.models.layers.query_attention import SinePositionEmbedding
@@ -116,5 +117,5 @@ class SequentialDecoder(nn.Module):
 def token_layers(in_channels: int, channels: int) -> nn.Sequential:
     """A sensor's map to the width of the queries."""
     return nn.Sequential(
-        nn.Conv2d(in_channels, channels, 3, padding=1), nn.ReLU(), nn.Conv2d(channels, channels, 3, padding=1)
+        Conv2d(in_channels, channels, 3, padding=1), nn.ReLU(), Conv2d(channels, channels, 3, padding=1)
     )

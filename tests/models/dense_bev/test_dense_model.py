@@ -4,6 +4,7 @@ from dataclasses import fields
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from src.assembly import build_model
 from src.config import compose_config
@@ -214,3 +215,18 @@ def test_two_frames_can_be_learnt_by_heart():
             mine = sure[sure.labels == label]
             assert len(mine) and (mine.centers[:, :2] - centre[:2]).norm(dim=1).min() < 0.8
         assert len(sure) <= len(truth) + 1
+
+
+def test_the_decoder_joins_the_finest_and_the_coarsest_stage():
+    """The literal form: interpolate, concatenate, convolve."""
+    torch.manual_seed(0)
+    config = BEVDecoderConfig(stage_channels=[16, 24], stage_strides=[2, 2], blocks_per_stage=1)
+    decoder = BEVDecoder(config, 16, 5, GRID).double()
+    fused = torch.randn(2, 16, *GRID.cells, dtype=torch.float64)
+    for training in (True, False):
+        decoder.train(training)
+        finest = decoder.stages[0](fused)
+        coarsest = F.interpolate(decoder.stages[1](finest), size=finest.shape[-2:], mode="bilinear")
+        joined = decoder.join(torch.cat([finest, coarsest], dim=1))
+        joined = F.interpolate(joined, size=fused.shape[-2:], mode="bilinear")
+        torch.testing.assert_close(decoder(fused), decoder.output(decoder.lateral(fused) + joined))
