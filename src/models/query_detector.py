@@ -18,6 +18,7 @@ from src.models.heads.center_head import BoxOptions
 from src.models.heads.keypoint_head import CameraMaps, camera_losses
 from src.models.heads.query_head import QueryHeadConfig, QueryPrediction, SetPredictionHead
 from src.models.layers.views import CameraViews
+from src.models.query_denoising import DenoisingConfig, NoisyQueries, denoising_loss, noisy_queries
 from src.models.query_memory import QueryMemory, QueryMemoryConfig, QueryPropagation, RecalledQueries
 from src.structures.batch import FrameBatch
 from src.structures.evidence import Evidence
@@ -51,6 +52,7 @@ class QueryDetectorConfig(ModelConfig):
     sensors: ClassVar[tuple[str, ...]] = ("camera", "radar")
 
     temporal: QueryMemoryConfig | None  # null: single frames, phase 1
+    denoising: DenoisingConfig | None  # null: none
     head: QueryHeadConfig
     loss: QueryLossConfig
 
@@ -67,6 +69,14 @@ class QueryOutput:
     layers: list[QueryPrediction]  # of the decoder
     head: QueryPrediction  # of the layer that boxes are taken from
     recalled: RecalledQueries | None  # None in phase 1
+    denoised: Denoised | None  # in training
+
+
+class Denoised(NamedTuple):
+    """Queries that began near true objects, and what each layer says to them."""
+
+    noisy: NoisyQueries
+    layers: list[QueryPrediction]
 
 
 class DecoderOutput(NamedTuple):
@@ -75,6 +85,7 @@ class DecoderOutput(NamedTuple):
     layers: list[QueryPrediction]
     head: QueryPrediction
     recalled: RecalledQueries | None
+    denoised: Denoised | None
 
 
 class QueryDetector(Detector):
@@ -140,19 +151,32 @@ class QueryDetector(Detector):
 
         Raises ValueError for a memory of another number of streams.
         """
+        recalled, older, denoised = None, None, None
+        if self.temporal is not None:
+            recalled = self.temporal.recall(memory, batch)
+            queries, older = Queries.concatenate([queries, recalled.newest], dim=1), recalled.older
+        count, settings = len(queries), self.config.denoising
+        noisy = None
+        if settings is not None and self.training and torch.is_grad_enabled() and batch.boxes is not None:
+            noisy = noisy_queries(settings, batch.boxes, self.grid, self.config.channels, batch.device)
+            queries = queries.beside(noisy.queries)
+        layers, features = self.decoder(queries, older, *seen, self.head)
+        if noisy is not None:
+            layers, others = zip(*(layer.split(count) for layer in layers), strict=True)
+            denoised = Denoised(noisy, list(others))
+        output = DecoderOutput(list(layers), layers[self.output_layer], recalled, denoised)
         if self.temporal is None:
-            layers, _ = self.decoder(queries, None, *seen, self.head)
-            return DecoderOutput(layers, layers[self.output_layer], None), None
-        recalled = self.temporal.recall(memory, batch)
-        queries = Queries.concatenate([queries, recalled.newest], dim=1)
-        layers, features = self.decoder(queries, recalled.older, *seen, self.head)
-        head, own = layers[self.output_layer], features[self.output_layer]
-        return DecoderOutput(layers, head, recalled), self.temporal.remember(memory, batch, own, head)
+            return output, None
+        own = features[self.output_layer][:, :count]
+        return output, self.temporal.remember(memory, batch, own, output.head)
 
     def loss_terms(self, output: QueryOutput, batch: FrameBatch) -> Objective:
-        """Weighted terms `class` and `box`."""
+        """Weighted terms `class` and `box`, and in training `denoising`."""
         weights = self.config.loss
         terms, counts = self.head.loss(output.layers, batch.boxes, weights.class_weight, weights.box_weight)
+        if output.denoised is not None:
+            loss = denoising_loss(*output.denoised, self.head, weights.class_weight, weights.box_weight)
+            terms["denoising"] = self.config.denoising.weight * loss
         return Objective(terms, counts)
 
     def camera_terms(

@@ -15,9 +15,13 @@ class TensorFields:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self], dim: int) -> Self:
-        """All parts joined along one axis of every tensor, in order; at least one part, of tensors alone."""
-        names = [field.name for field in fields(cls)]
-        return cls(**{name: torch.cat([getattr(part, name) for part in parts], dim) for name in names})
+        """All parts joined along one axis of every tensor, in order; at least one part, of tensors alone.
+
+        A field is None where it is in all of them.
+        """
+        columns = {field.name: [getattr(part, field.name) for part in parts] for field in fields(cls)}
+        empty = {name for name, values in columns.items() if all(value is None for value in values)}
+        return cls(**{name: None if name in empty else torch.cat(values, dim) for name, values in columns.items()})
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Self:
         """The same with `function` applied to every tensor."""

@@ -82,7 +82,7 @@ class PerspectiveLayer(nn.Module):
     ) -> Tensor:  # [B, Q, C]
         """The queries' features after this layer."""
         x = queries.features
-        x = self.norms[0](x + self.self_attention.among(x, embedding, queries.valid, past))
+        x = self.norms[0](x + self.self_attention.among(queries, embedding, past))
         query = x + embedding
         points = self.offsets(query, queries.centers)
         x = self.norms[1](x + self.image_attention(x, query, points, views, values))

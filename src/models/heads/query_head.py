@@ -54,6 +54,12 @@ class QueryPrediction:
     codes: Tensor  # [B, Q, CODE_SIZE] float32: centre (m), log sizes (log m), cos, sin of the yaw, velocity (m/s)
     valid: Tensor  # [B, Q] bool
 
+    def split(self, count: int) -> tuple[QueryPrediction, QueryPrediction]:
+        """Of the first so many queries, and of the others."""
+        values = (self.logits, self.codes, self.valid)
+        first, others = ([value[:, part] for value in values] for part in (slice(count), slice(count, None)))
+        return QueryPrediction(*first), QueryPrediction(*others)
+
 
 class SetPredictionHead(nn.Module):
     """Two networks of two layers, shared by all layers of a decoder as in StreamPETR."""
@@ -118,11 +124,17 @@ class SetPredictionHead(nn.Module):
             focal = (sigmoid_focal(logits, target) * valid[..., None]).sum()
             terms["class"] = class_weight * focal / matched
         if box_weight is not None:
-            weights = constant(self.code_weights, torch.float32, codes.device)
-            errors = masked_l1(codes[layers, rows], wanted[own]) * weights
-            terms["box"] = box_weight * errors.sum() / matched
+            terms["box"] = box_weight * self.code_errors(codes[layers, rows], wanted[own]).sum() / matched
         frames, found = len(boxes), len(rows) / len(predictions)
         return Objective(terms, {"objects": len(objects) / frames, "missed_objects": (len(objects) - found) / frames})
+
+    def code_errors(
+        self,
+        codes: Tensor,  # [n, CODE_SIZE]
+        wanted: Tensor,  # [n, CODE_SIZE], NaN where unknown
+    ) -> Tensor:  # [n, CODE_SIZE]
+        """Weighted absolute errors."""
+        return masked_l1(codes, wanted) * constant(self.code_weights, torch.float32, codes.device)
 
     @torch.no_grad()
     def match(

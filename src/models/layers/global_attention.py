@@ -26,28 +26,32 @@ class GlobalAttention(nn.Module):
         query: Tensor,  # [B, Q, C]
         key: Tensor,  # [B, G, C]
         value: Tensor,  # [B, G, C]
-        valid: Tensor,  # [B, G] bool
+        valid: Tensor,  # [B, G] bool, or [B, Q, G] of each query
     ) -> Tensor:  # [B, Q, C]
         """What each query gathers."""
         split = (self.num_heads, -1)
         parts = (layer(x) for layer, x in ((self.query, query), (self.key, key), (self.value, value)))
         heads = (x.unflatten(-1, split).transpose(1, 2) for x in parts)
-        some = valid.any(1)[:, None]
-        gathered = F.scaled_dot_product_attention(*heads, attn_mask=(valid | ~some)[:, None, None])
-        return self.output(gathered.transpose(1, 2).flatten(2) * some[..., None])
+        valid = valid if valid.dim() == 3 else valid[:, None]
+        some = valid.any(2, keepdim=True)
+        gathered = F.scaled_dot_product_attention(*heads, attn_mask=(valid | ~some)[:, None])
+        return self.output(gathered.transpose(1, 2).flatten(2) * some)
 
     def among(
         self,
-        x: Tensor,  # [B, Q, C]
+        queries: Queries,
         embedding: Tensor,  # [B, Q, C]
-        valid: Tensor,  # [B, Q] bool
         past: tuple[Tensor, Tensor, Tensor] | None,  # further keys [B, n, C], values [B, n, C], valid [B, n]
     ) -> Tensor:  # [B, Q, C]
         """What queries gather from one another and from the past; keys hold their embedding, values do not."""
-        own = (x + embedding, x, valid)
+        values, further = queries.features, None
+        keys = query = values + embedding
         if past is not None:
-            own = tuple(torch.cat([one, two.to(one.dtype)], dim=1) for one, two in zip(own, past, strict=True))
-        return self(x + embedding, *own)
+            *past, further = past
+            keys, values = (
+                torch.cat([one, two.to(one.dtype)], dim=1) for one, two in zip((keys, values), past, strict=True)
+            )
+        return self(query, keys, values, queries.seen(further))
 
 
 class GlobalDecoderLayer(nn.Module):
@@ -69,6 +73,6 @@ class GlobalDecoderLayer(nn.Module):
     ) -> Tensor:  # [B, Q, C]
         """The queries' features after this layer."""
         x = queries.features
-        x = self.norms[0](x + self.self_attention.among(x, embedding, queries.valid, past))
+        x = self.norms[0](x + self.self_attention.among(queries, embedding, past))
         x = self.norms[1](x + self.image_attention(x + embedding, *tokens))
         return self.norms[2](x + self.mlp(x))

@@ -82,7 +82,7 @@ class DistanceAttention(nn.Module):
         centers: Tensor,  # [B, Q, 3] m
         keys: Tensor,  # [B, G, C]
         key_centers: Tensor,  # [B, G, 3] m
-        valid: Tensor,  # [B, G] bool
+        valid: Tensor,  # [B, G] bool, or [B, Q, G] of each query
     ) -> Tensor:  # [B, Q, C]
         """What each query gathers; keys that are not valid are padding."""
         picks, seen = self.nearest(centers, key_centers, valid)  # [B, Q, K] each
@@ -111,6 +111,6 @@ class DistanceAttention(nn.Module):
         """The keys nearest to each query, nearest first, and which of them exist."""
         exact = "donot_use_mm_for_euclid_dist"  # the difference of squares would be wrong by decimetres at 150 m
         apart = torch.cdist(centers[..., :2].float(), key_centers[..., :2].float(), compute_mode=exact)
-        apart = apart.masked_fill(~valid[:, None], torch.inf)
+        apart = apart.masked_fill(~(valid if valid.dim() == 3 else valid[:, None]), torch.inf)
         distance, picks = apart.topk(min(self.count, apart.shape[2]), dim=2, largest=False)
         return picks, distance.isfinite()

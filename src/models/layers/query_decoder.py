@@ -61,11 +61,12 @@ class QueryDecoderLayer(nn.Module):
         """The queries' features after this layer."""
         x, centers = queries.features, queries.centers
         query = self.norms[0](x) + embedding
-        keys = [query, centers, queries.valid]
+        keys, places = query, centers
         if past is not None:
-            own = (past.features.to(query.dtype), past.centers, past.valid)
-            keys = [torch.cat(pair, dim=1) for pair in zip(keys, own, strict=True)]
-        x = x + self.self_attention(query, centers, *keys)
+            keys = torch.cat([keys, past.features.to(query.dtype)], dim=1)
+            places = torch.cat([places, past.centers], dim=1)
+        seen = queries.seen(None if past is None else past.valid)
+        x = x + self.self_attention(query, centers, keys, places, seen)
         query = self.norms[1](x) + embedding
         x = x + self.radar_attention(query, centers, radar.features, radar.xyz, radar.valid)
         query = self.norms[2](x) + embedding
