@@ -56,9 +56,9 @@ def convolution_type(
     weight: Tensor,  # [C', C, k, k]
     stride: int,
 ) -> torch.dtype:
-    """The type in which maps are best convolved: their own, or bfloat16 in its context."""
-    if x.dtype != torch.float32 or x.device.type != "cpu" or not _bfloat16.get():
-        return x.dtype  # before any size is read, which an export would take for a condition
+    """The type in which maps are best convolved: their own, or bfloat16 in its context, but not in compiled parts."""
+    if torch.compiler.is_compiling() or x.dtype != torch.float32 or x.device.type != "cpu" or not _bfloat16.get():
+        return x.dtype  # a compiler cannot read the context, and would take sizes for conditions
     large = len(x) * x.shape[2] * x.shape[3] >= LEAST_ROWS * stride**2 and min(weight.shape[:2]) >= LEAST_CHANNELS
     return torch.bfloat16 if large else x.dtype
 

@@ -136,7 +136,7 @@ def test_sizes_stand_beside_horizon3ds(family, scale):
 
 @pytest.mark.slow
 def test_two_frames_are_overfitted(family):
-    """Over 0.9 AP at one cell, averaged over the classes present."""
-    model, batch = small_model(family), make_batch(boxes=(5, 4))
+    """Over 0.9 AP at one cell, averaged over the classes present; in so few steps denoising is in the way."""
+    model, batch = small_model(family, "model.denoising=null"), make_batch(boxes=(5, 4))
     steps, falling, rate = OVERFITTING[family]
     assert overfitted_precision(model, batch, steps, rate, falling) > 0.9
