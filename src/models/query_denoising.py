@@ -27,12 +27,11 @@ class DenoisingConfig:
     num_groups: int  # of a query for each object; no group sees another
     extent: float  # of the noise, in half sizes of the box along its axes
     background_from: float  # noise longer than this share of the extent makes the query one of no object
-    weight: float  # of both terms, on those of the other queries
 
     def __post_init__(self) -> None:
-        require_least(self, "model.denoising", {"num_groups": 1, "extent": 0, "background_from": 0, "weight": 0})
+        require_least(self, "model.denoising", {"num_groups": 1, "extent": 0, "background_from": 0})
         if self.extent == 0:
-            raise ConfigError("model.denoising.extent=0: must be above 0; model.denoising=null switches it off")
+            raise ConfigError("model.denoising.extent=0: must be above 0; model.loss.denoising_weight=null is without")
 
 
 @dataclass

@@ -33,6 +33,7 @@ class QueryLossConfig(LossWeights):
 
     class_weight: float | None  # of every layer's queries
     box_weight: float | None
+    denoising_weight: float | None  # of both for queries near true objects
 
 
 @dataclass(kw_only=True)
@@ -52,7 +53,7 @@ class QueryDetectorConfig(ModelConfig):
     sensors: ClassVar[tuple[str, ...]] = ("camera", "radar")
 
     temporal: QueryMemoryConfig | None  # null: single frames, phase 1
-    denoising: DenoisingConfig | None  # null: none
+    denoising: DenoisingConfig
     head: QueryHeadConfig
     loss: QueryLossConfig
 
@@ -155,10 +156,9 @@ class QueryDetector(Detector):
         if self.temporal is not None:
             recalled = self.temporal.recall(memory, batch)
             queries, older = Queries.concatenate([queries, recalled.newest], dim=1), recalled.older
-        count, settings = len(queries), self.config.denoising
-        noisy = None
-        if settings is not None and self.training and torch.is_grad_enabled() and batch.boxes is not None:
-            noisy = noisy_queries(settings, batch.boxes, self.grid, self.config.channels, batch.device)
+        count, noisy, wanted = len(queries), None, self.config.loss.denoising_weight is not None
+        if wanted and self.training and torch.is_grad_enabled() and batch.boxes is not None:
+            noisy = noisy_queries(self.config.denoising, batch.boxes, self.grid, self.config.channels, batch.device)
             queries = queries.beside(noisy.queries)
         layers, features = self.decoder(queries, older, *seen, self.head)
         if noisy is not None:
@@ -176,7 +176,7 @@ class QueryDetector(Detector):
         terms, counts = self.head.loss(output.layers, batch.boxes, weights.class_weight, weights.box_weight)
         if output.denoised is not None:
             loss = denoising_loss(*output.denoised, self.head, weights.class_weight, weights.box_weight)
-            terms["denoising"] = self.config.denoising.weight * loss
+            terms["denoising"] = weights.denoising_weight * loss
         return Objective(terms, counts)
 
     def camera_terms(

@@ -45,7 +45,7 @@ def map_conv2d(
         rows = linear(cells.reshape(-1, x.shape[1]), weight.flatten(1).t(), bias)
         return rows.view(*cells.shape[:3], len(weight)).permute(0, 3, 1, 2)
     if slow_weight_gradients() and torch.is_grad_enabled() and weight.requires_grad:
-        return _MapConv.apply(x, weight, bias, stride)
+        return _Conv.apply(x, weight, bias, stride, padding, x.dtype)
     return conv2d(x, weight, bias, stride, padding)
 
 
@@ -60,41 +60,26 @@ class _Conv(torch.autograd.Function):
         padding: int,
         dtype: torch.dtype,
     ) -> Tensor:
-        rounded = x.to(dtype), weight.to(dtype)
-        ctx.save_for_backward(*rounded)
-        ctx.stride, ctx.padding, ctx.dtype = stride, padding, x.dtype
-        return F.conv2d(*rounded, bias if bias is None else bias.to(dtype), stride, padding).to(x.dtype)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, ...]:
-        x, weight = ctx.saved_tensors
-        grad_bias = grad.sum((0, 2, 3)) if ctx.needs_input_grad[2] else None
-        grad = grad.to(x.dtype, memory_format=torch.channels_last)
-        sizes = [ctx.stride] * 2, [ctx.padding] * 2, [1] * 2, False, [0] * 2, 1
-        wanted = [*ctx.needs_input_grad[:2], False]
-        grads = torch.ops.aten.convolution_backward(grad, x, weight, None, *sizes, wanted)[:2]
-        return *(one if one is None else one.to(ctx.dtype) for one in grads), grad_bias, None, None, None
-
-
-class _MapConv(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: FunctionCtx, x: Tensor, weight: Tensor, bias: Tensor | None, stride: int) -> Tensor:
+        own = x.dtype
+        x, weight = x.to(dtype), weight.to(dtype)
         ctx.save_for_backward(x, weight)
-        ctx.stride = stride
-        return F.conv2d(x, weight, bias, stride, weight.shape[2] // 2)
+        ctx.stride, ctx.padding, ctx.dtype = stride, padding, own
+        return F.conv2d(x, weight, bias if bias is None else bias.to(dtype), stride, padding).to(own)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor | None, ...]:
-        (x, weight), stride = ctx.saved_tensors, ctx.stride
-        grad = grad.contiguous(memory_format=torch.channels_last)
-        grad_x = None
-        if ctx.needs_input_grad[0]:
-            sizes = [stride] * 2, [weight.shape[2] // 2] * 2, [1] * 2, False, [0] * 2, 1
-            grad_x = torch.ops.aten.convolution_backward(grad, x, weight, None, *sizes, [True, False, False])[0]
-        grad_bias = grad.sum((0, 2, 3)) if ctx.needs_input_grad[2] else None
-        return grad_x, weight_gradient(x, grad, weight.shape[2], stride), grad_bias, None
+        (x, weight), (for_x, for_weight, for_bias) = ctx.saved_tensors, ctx.needs_input_grad[:3]
+        grad_bias = grad.sum((0, 2, 3)) if for_bias else None
+        grad = grad.to(x.dtype, memory_format=torch.channels_last)
+        products = slow_weight_gradients() and ctx.padding == weight.shape[2] // 2
+        sizes = [ctx.stride] * 2, [ctx.padding] * 2, [1] * 2, False, [0] * 2, 1
+        wanted = [for_x, for_weight and not products, False]
+        grad_x, grad_weight, _ = torch.ops.aten.convolution_backward(grad, x, weight, None, *sizes, wanted)
+        if for_weight and products:
+            grad_weight = weight_gradient(x, grad, weight.shape[2], ctx.stride)
+        grads = (one if one is None else one.to(ctx.dtype) for one in (grad_x, grad_weight))
+        return *grads, grad_bias, None, None, None
 
 
 def weight_gradient(

@@ -144,8 +144,8 @@ def slow_weight_gradients() -> bool:
 
 def describe_products(wanted: bool) -> dict[str, Any]:
     """What a CPU multiplies by and in, where bfloat16 is wanted or not, for the record of a run."""
-    widths = f"widths of {LEAST_WIDTHS[0]} and {LEAST_WIDTHS[1]}, in convolutions of {LEAST_CHANNELS}"
-    large = f"from {LEAST_ROWS} rows and {widths}"
+    widths = f"widths of {LEAST_WIDTHS[0]} and {LEAST_WIDTHS[1]}"
+    large = f"from {LEAST_ROWS} rows and {widths}; convolutions from {LEAST_CHANNELS} channels"
     return {
         "float32": "oneDNN" if prefers_onednn() else "torch",
         "bfloat16": large if wanted and multiplies_bfloat16() else "never",

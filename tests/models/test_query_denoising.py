@@ -6,20 +6,22 @@ from dataclasses import replace
 import pytest
 import torch
 
+from src.config import compose_config
 from src.errors import ConfigError
 from src.models.heads.query_head import QueryPrediction, box_codes
 from src.models.query_denoising import DenoisingConfig, NoisyQueries, denoising_loss, noisy_queries
 from src.structures.boxes import Boxes3D
 from src.structures.queries import Queries
 from tests.models.dense_bev.dense_frames import GRID, drive, make_batch
-from tests.models.learning import train_step
+from tests.models.learning import gradients_are_finite, train_step
 from tests.models.query_frames import FAMILIES, small_model
 
 CPU = torch.device("cpu")
+ON, OFF = "model.loss.denoising_weight=1.0", "model.loss.denoising_weight=null"
 
 
 def config(**changes):
-    return DenoisingConfig(**({"num_groups": 3, "extent": 1.0, "background_from": 0.75, "weight": 1.0} | changes))
+    return DenoisingConfig(**({"num_groups": 3, "extent": 1.0, "background_from": 0.75} | changes))
 
 
 def test_each_object_has_a_query_within_its_box_in_every_group():
@@ -93,12 +95,12 @@ def test_nobody_else_notices_them(family, phase):
     """The same predictions and the same memory as without; in evaluation there are none."""
     results = []
     frames = [drive(0), drive(1)]
-    for overrides in ((), ("model.denoising=null",)):
-        model, memory = small_model(family, *overrides, phase=phase).train(), None
+    for settings in (ON, OFF):
+        model, memory = small_model(family, settings, phase=phase).train(), None
         for batch in frames:
             output, memory = model(batch, memory)
         results.append((output, memory))
-        assert (output.denoised is None) == bool(overrides)
+        assert (output.denoised is None) == (settings != ON)
         assert model.eval()(batch, None)[0].denoised is None
     (own, remembered), (plain, expected) = results
     assert own.denoised.noisy.queries.valid.any()
@@ -112,12 +114,25 @@ def test_nobody_else_notices_them(family, phase):
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_frames_without_objects_have_none(family):
-    model = small_model(family)
+    model = small_model(family, ON)
     output, terms = train_step(model, make_batch(boxes=(0, 0)))
     assert len(output.denoised.noisy.queries) == 0 and terms["denoising"] == 0
 
 
-@pytest.mark.parametrize(("key", "value"), [("num_groups", 0), ("extent", 0), ("extent", -1), ("weight", -1.0)])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_they_teach(family):
+    """Their term is part of the total, and its gradients are finite; at full size it is on."""
+    model = small_model(family, ON)
+    _, terms = train_step(model, make_batch())
+    assert terms["denoising"] > 0 and gradients_are_finite(model)
+    torch.testing.assert_close(terms["total"], sum(value for name, value in terms.items() if name != "total"))
+    twice = small_model(family, ON.replace("1.0", "2.0"))
+    torch.testing.assert_close(train_step(twice, make_batch())[1]["denoising"], 2 * terms["denoising"])
+    full = compose_config(["scale=paper", f"model={family}", "data.root=x"])[0].model
+    assert full.denoising == config(num_groups=10) and full.loss.denoising_weight == 1.0
+
+
+@pytest.mark.parametrize(("key", "value"), [("num_groups", 0), ("extent", 0), ("extent", -1)])
 def test_mistakes_are_named(key, value):
     with pytest.raises(ConfigError, match=f"model.denoising.{key}={value}"):
         config(**{key: value})

@@ -50,7 +50,7 @@ def test_gradients_of_the_weights_are_exact():
 def test_gradcheck(gradients):
     """The function itself; only its entry asks for float32."""
     leaves = [torch.randn(*shape, dtype=torch.float64, requires_grad=True) for shape in ((2, 3, 4, 6), (2, 3, 3, 3))]
-    assert gradcheck(lambda x, weight: map_conv._MapConv.apply(x, weight, None, 2), leaves)
+    assert gradcheck(lambda x, weight: map_conv._Conv.apply(x, weight, None, 2, 1, torch.float64), leaves)
 
 
 def test_a_map_that_needs_no_gradient_gets_none(gradients):
