@@ -15,9 +15,9 @@ from src.metrics.bootstrap import score_report
 from src.metrics.detection import score_detections
 from src.metrics.score_text import format_scores
 from src.metrics.submission import load_submission
-from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.checkpoints import load_model_weights, read_checkpoint
 from src.reliability.command import run_command
+from src.reliability.cpu import tune_cpu
 from src.training.evaluator import Evaluator
 from src.training.fit import build_evaluation_trainer
 from src.training.identity import digest_of_changes
@@ -61,7 +61,7 @@ def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[Evalu
 
     Also the names of the files that it left in `out`, a submission where there was any box.
     """
-    tune_cpu_allocator()
+    tune_cpu()
     checkpoint = read_checkpoint(path)
     tree = checkpoint["horizon3d"]["config"]
     config = restore_config(tree, overrides)

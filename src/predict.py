@@ -16,9 +16,9 @@ from src.errors import ConfigError
 from src.metrics.submission import to_global
 from src.pictures.film import Film
 from src.pictures.frame import draw_frame
-from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.checkpoints import read_checkpoint
 from src.reliability.command import run_command
+from src.reliability.cpu import tune_cpu
 from src.streaming import StreamingDetector
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
@@ -41,7 +41,7 @@ def main(overrides: list[str]) -> None:
     if command.checkpoint is None or command.predictions is not None:
         raise ConfigError("give checkpoint=PATH (predictions=FILE.json is scored by python -m src.evaluate)")
     refuse_options_of_others(command, "predict")
-    tune_cpu_allocator()
+    tune_cpu()
     path = Path(command.checkpoint)
     checkpoint = read_checkpoint(path)
     config = restore_config(checkpoint["horizon3d"]["config"], overrides)

@@ -16,9 +16,9 @@ from src.assembly import build_datamodule, build_module, check_data, data_root, 
 from src.config import PHASES, Config, compose_config, refuse_options_of_others
 from src.data.datamodule import DetectionDataModule
 from src.pictures.learning_curves import draw_curves
-from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.checkpoints import OpenCheckpoint, open_checkpoint
 from src.reliability.command import run_command
+from src.reliability.cpu import tune_cpu
 from src.reliability.processes import (
     check_devices,
     created_externally,
@@ -121,7 +121,7 @@ def run(
     overrides: list[str],
 ) -> None:
     """Train on every process; the main one then leaves results and pictures."""
-    tune_cpu_allocator()
+    tune_cpu()
     L.seed_everything(config.seed, verbose=False)
     datamodule = build_datamodule(config, start.root)
     data = datamodule.state_dict()  # the folder may be away when the first checkpoint is written

@@ -28,8 +28,8 @@ from src.benchmark.page import markdown, page_name, page_of, write_page
 from src.benchmark.suite_latency import latency_page, measure_latency
 from src.config import BenchmarkSuite, Config, compose_config, refuse_options_of_others
 from src.errors import DataError
-from src.reliability.allocator import tune_cpu_allocator
 from src.reliability.command import run_command
+from src.reliability.cpu import tune_cpu
 from src.training.run_folder import make_writable, write_json
 
 
@@ -40,7 +40,7 @@ def main(overrides: list[str]) -> None:
     of_one_frame = config.suite in (BenchmarkSuite.model, BenchmarkSuite.launches, BenchmarkSuite.gpu)
     if of_one_frame and not any(word.startswith("data.batch_size=") for word in overrides):
         config.data.batch_size = 1
-    tune_cpu_allocator()
+    tune_cpu()
     if config.out:
         make_writable(Path(config.out), "out")
     if config.suite is BenchmarkSuite.latency:

@@ -81,6 +81,8 @@ class SpconvMap:
 class SpconvLayer(nn.Module):
     """spconv's layer in the place of one of ours."""
 
+    relu = False  # our blocks ask: merged for inference, ours apply it themselves
+
     def __init__(self, spconv: ModuleType, kernel: SparseKernel, key: str) -> None:
         super().__init__()
         self.spconv, self.layer = spconv, build_layer(spconv, kernel, key)

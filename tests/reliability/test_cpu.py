@@ -5,23 +5,23 @@ from pathlib import Path
 import pytest
 
 from src.errors import ConfigError
-from src.reliability.allocator import tune_cpu_allocator
+from src.reliability.cpu import tune_allocator
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the switch belongs to glibc")
 def test_switch_can_be_set_twice():
-    assert tune_cpu_allocator() == tune_cpu_allocator()
+    assert tune_allocator() == tune_allocator()
 
 
 GIVEN = Path("/sys/kernel/mm/transparent_hugepage/enabled")
 LOOK = """
 import torch
-from src.reliability.allocator import tune_cpu_allocator
+from src.reliability.cpu import tune_allocator
 def pages():
     words = [line.split() for line in open("/proc/self/smaps_rollup")]
     return {word[0]: int(word[1]) for word in words if word[0] in ("Rss:", "AnonHugePages:")}
 before = pages()
-assert tune_cpu_allocator()
+assert tune_allocator()
 reserved = pages()
 kept = torch.ones(16 << 20)
 after = pages()
@@ -39,12 +39,29 @@ def test_large_tensors_lie_in_huge_pages_and_what_is_reserved_takes_no_memory():
 
 def test_other_platforms_are_left_alone(monkeypatch):
     monkeypatch.setattr(sys, "platform", "darwin")
-    assert tune_cpu_allocator() is False
+    assert tune_allocator() is False
 
 
 def test_the_variable_leaves_it_alone_or_is_refused(monkeypatch):
     monkeypatch.setenv("HORIZON3D_ALLOCATOR", "default")
-    assert tune_cpu_allocator() is False
+    assert tune_allocator() is False
     monkeypatch.setenv("HORIZON3D_ALLOCATOR", "jemalloc")
     with pytest.raises(ConfigError, match="HORIZON3D_ALLOCATOR=jemalloc: must be tuned or default"):
-        tune_cpu_allocator()
+        tune_allocator()
+
+
+DENORMAL = """
+import torch
+from src.reliability.cpu import tune_cpu
+tune_cpu()
+torch.set_num_threads(2)
+weight = torch.full((1 << 20,), 1e-20, requires_grad=True)
+(weight * 1e-20).sum().backward(torch.tensor(1e-20))
+print(int((weight.detach() * 1e-20).count_nonzero()), int(weight.grad.count_nonzero()))
+"""
+
+
+def test_denormal_numbers_are_zero_in_every_thread_forwards_and_backwards():
+    """In a fresh process: 1e-40 is no longer a number."""
+    found = subprocess.run([sys.executable, "-c", DENORMAL], capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["0", "0"]
