@@ -164,9 +164,13 @@ class Detector(nn.Module, ABC):
         """How a frame runs in fixed shapes, None without; capacities None are the detector's own."""
         return None
 
+    def present(self, batch: FrameBatch, memory: Any) -> Any:
+        """The output of `forward` where no frame follows."""
+        return self(batch, memory)[0]
+
     def transition(self, batch: FrameBatch, memory: Any) -> Any:
-        """The memory that `forward` gives, not detached; asked for where `trains_last_transition`."""
-        raise NotImplementedError(f"{type(self).__name__} does not learn what to remember")
+        """The memory of `forward` where the frame is only remembered; not detached with `trains_last_transition`."""
+        return self(batch, memory)[1]
 
     def restore_memory(self, state: list[dict[str, Any]]) -> Any:
         """The memory that `TemporalMemory.state` described. Raises NotImplementedError for single-frame detectors."""

@@ -44,7 +44,7 @@ class TemporalModule(TrainingModule):
         """
         past = self._used = self.remember(batch.past) if batch.past else self.select_memory(batch)
         if batch.past:
-            return self.model(batch, past)[0]
+            return self.model.present(batch, past)
         if self.oracle is not None and past is not None:
             past = self.oracle.correct(past, batch)
         # Before the forward pass: on a GPU the look at the streams would otherwise wait for all of it.
@@ -62,7 +62,7 @@ class TemporalModule(TrainingModule):
         learns, memory = self.model.training and self.model.trains_last_transition, None
         with evaluation_mode(self.model), torch.no_grad():
             for frame in frames[: len(frames) - learns]:
-                _, memory = self.model(frame, memory)
+                memory = self.model.transition(frame, memory)
         return self.model.transition(frames[-1], memory) if learns else memory
 
     def select_memory(self, batch: FrameBatch) -> TemporalMemory | None:

@@ -96,17 +96,18 @@ def test_the_last_frame_of_the_past_is_learnt_through_where_the_model_asks_for_i
         trains_last_transition = True
 
         def transition(self, batch, memory):
-            seen.append((self.training, torch.is_grad_enabled(), memory.values))
+            seen.append((self.training, torch.is_grad_enabled(), None if memory is None else memory.values))
             return ToyMemory(self.forward(batch, memory)[0])
 
     module.model.__class__ = Learner
     first, second, third = (toy_batch(None, None, number) for number in range(3))
     wanted = module.remember((first, second))
-    assert not seen and not wanted.values.requires_grad
+    assert {entry[:2] for entry in seen} == {(False, False)} and not wanted.values.requires_grad
     module.train()
     memory = module.remember((first, second, third))
     assert memory.values.requires_grad and module.model.training
-    assert seen[0][:2] == (True, True) and torch.equal(seen[0][2], wanted.values)
+    assert {entry[:2] for entry in seen[:-1]} == {(False, False)}
+    assert seen[-1][:2] == (True, True) and torch.equal(seen[-1][2], wanted.values)
 
 
 def test_depth_and_age_of_the_memory_are_logged(module):

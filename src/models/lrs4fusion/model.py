@@ -117,10 +117,14 @@ class LRS4Fusion(Detector, WorldModel):
 
         Raises ValueError for a batch without LiDAR, and for a memory of other streams, voxels or widths.
         """
+        output = self.present(batch, memory)
+        remembered = self.remember(output.volumes, batch)
+        return output, remembered if remembered is None else remembered.detached()
+
+    def present(self, batch: FrameBatch, memory: VolumeMemory | None) -> LRSOutput:
+        """As in `Detector`."""
         volumes = self.encode(batch, memory)
-        head = None if self.head is None else self._head_output(volumes)
-        remembered = self.remember(volumes, batch)
-        return LRSOutput(volumes, head), remembered if remembered is None else remembered.detached()
+        return LRSOutput(volumes, None if self.head is None else self._head_output(volumes))
 
     def encode(self, batch: FrameBatch, memory: VolumeMemory | None = None) -> Volumes:
         """The volumes alone; raises as `forward`."""
