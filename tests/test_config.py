@@ -146,7 +146,7 @@ FULL_SIZE = {
     "model.kggi": {
         "initialization": "both", "num_radar_keypoints": 1024, "num_camera_keypoints": 256,
         "num_random_keypoints": 256, "num_depth_bins": 80, "depth_range_m": [1.0, 160.0], "depth_target": "box",
-        "keypoint_nms_cells": None, "property_head": True, "source_embedding_std": 1.0,
+        "num_radar_peaks": 0, "keypoint_nms_cells": None, "property_head": True, "source_embedding_std": 1.0,
     },
     "model.ocsf": {
         "num_layers": 2, "num_learnable_points": 6, "margin_m": 4.8, "occupancy_threshold": 0.1,

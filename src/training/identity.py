@@ -41,6 +41,7 @@ YOUNGER_KEYS = {
     "data.train_scenes": None,
     "phase.long_range": None,
     "model.radar_encoder.pruning_ratio": 0.0,
+    "model.kggi.num_radar_peaks": 0,
     "model.doppler.in_losses": True,
     "model.doppler.along_heading": False,
     "model.dptf.gaussian_path.forget_refuted": False,

@@ -16,6 +16,7 @@ from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.views import CameraViews
 from src.ops.gather_cells import gather_cells
 from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians
+from src.ops.nms import maxpool_peaks
 from src.ops.segment_reduce import topk_per_sample
 from src.structures.gaussians import GaussianSet, Source
 from src.structures.sparse_bev import SparseBEV
@@ -41,6 +42,7 @@ class KGGIConfig(DepthBinsConfig):
     num_radar_keypoints: int  # K_r
     num_camera_keypoints: int  # K_c
     num_random_keypoints: int  # K_rand; with initialization=random all three counts are random Gaussians
+    num_radar_peaks: int  # so many of the radar keypoints are maxima of 3 x 3 cells, before the best of all others
     depth_target: DepthTarget  # what supervises the depth head
     keypoint_nms_cells: int | None  # odd window of local maxima in the keypoint map; null = every pixel competes
     property_head: bool  # local features correct the learnable attributes
@@ -49,12 +51,17 @@ class KGGIConfig(DepthBinsConfig):
     def __post_init__(self) -> None:
         least = 0 if self.initialization is Initialization.random else 1
         own = {"num_radar_keypoints": least, "num_camera_keypoints": least}
-        own["source_embedding_std"] = 0
+        own |= {"num_radar_peaks": 0, "source_embedding_std": 0}
         require_least(self, "model.kggi", own)
         if self.num_random_keypoints < 0 or sum(self.counts.values()) < 1:
             raise ConfigError(
                 f"model.kggi.num_random_keypoints={self.num_random_keypoints}: must not be negative, and "
                 "the three sources together must give at least one Gaussian"
+            )
+        if self.num_radar_peaks > self.num_radar_keypoints:
+            raise ConfigError(
+                f"model.kggi.num_radar_peaks={self.num_radar_peaks}: must not exceed "
+                f"model.kggi.num_radar_keypoints={self.num_radar_keypoints}, of which they are a part"
             )
         self.check_depth_bins("model.kggi")
         window = self.keypoint_nms_cells
@@ -76,6 +83,19 @@ class KGGIConfig(DepthBinsConfig):
             random = 0
         counts = {Source.RADAR: radar, Source.CAMERA: camera, Source.RANDOM: random}
         return {source: count for source, count in counts.items() if count}
+
+
+def with_peaks_first(
+    logits: Tensor,  # [M] of cells
+    bev: SparseBEV,
+    count: int,
+) -> Tensor:  # [M]
+    """Scores in the order of the logits, but for the `count` best maxima of 3 x 3 cells of each sample, which lead."""
+    scores = logits.sigmoid()
+    peaks = maxpool_peaks(scores[:, None], bev.sites).squeeze(1)
+    best = topk_per_sample(scores + peaks, bev.indices[:, 0], bev.batch_size, count).flatten()
+    lead = scores.new_zeros(len(scores) + 1).index_fill(0, best.remainder(len(scores) + 1), 1.0)  # -1: the row too many
+    return scores + lead[:-1]
 
 
 @dataclass
@@ -177,6 +197,8 @@ class KGGI(nn.Module):
         scores: Tensor,  # [M]
         radar_bev: SparseBEV,
     ) -> tuple[Tensor, Tensor, Tensor]:  # [B, K, 2] m, [B, K] bool, [B, K, C]
+        if self.config.num_radar_peaks:
+            scores = with_peaks_first(scores, radar_bev, self.config.num_radar_peaks)
         rows = topk_per_sample(scores, radar_bev.indices[:, 0], radar_bev.batch_size, self.config.num_radar_keypoints)
         return gather_cells(radar_bev.features, radar_bev.indices, rows, self.grid)
 

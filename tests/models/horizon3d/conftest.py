@@ -99,6 +99,7 @@ def make_config():
             "num_radar_keypoints": 24,
             "num_camera_keypoints": 12,
             "num_random_keypoints": 8,
+            "num_radar_peaks": 0,
             "num_depth_bins": 16,
             "depth_range_m": [1.0, 40.0],
             "depth_target": DepthTarget.box,

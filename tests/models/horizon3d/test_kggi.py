@@ -131,6 +131,23 @@ def test_radar_keypoints_are_the_best_cells_and_the_rest_is_padding(make_config,
     assert gaussians.valid[0, :5].tolist() == [True, True, True, False, False]
 
 
+@pytest.mark.parametrize(("peaks", "order"), [(0, [1, 2, 0]), (1, [1, 2, 0]), (2, [1, 3, 2]), (3, [1, 3, 2])])
+def test_so_many_radar_keypoints_are_peaks(make_config, grid, make_views, peaks, order):
+    """Three cells in a row with the best in the middle, and one alone that is worse; another sample's has few cells."""
+    cells = ((0, 5, 5), (0, 5, 6), (0, 5, 7), (0, 20, 30), (1, 5, 6))
+    radar, scores = make_radar(grid, cells, b=2), torch.tensor([2.0, 3.0, 2.5, -4.0, -9.0])
+    radar = radar.with_features(torch.cat([scores[:, None], radar.features[:, 1:]], dim=1))
+    kggi = make_kggi(make_config, grid, num_radar_keypoints=3, num_radar_peaks=peaks)
+    kggi.objectness = torch.nn.Linear(16, 1, bias=False)
+    with torch.no_grad():
+        kggi.objectness.weight.copy_(torch.eye(1, 16))
+    gaussians = kggi(radar, make_views(2)).gaussians
+    wanted = grid.centre_of(radar.indices[:, 1:])
+    torch.testing.assert_close(gaussians.means[0, :3], wanted[order])
+    torch.testing.assert_close(gaussians.means[1, 0], wanted[4])
+    assert gaussians.valid[:, :3].tolist() == [[True, True, True], [True, False, False]]
+
+
 def test_depth_is_the_mean_over_the_best_bin_and_its_neighbours():
     centres = torch.tensor([1.0, 2.0, 4.0, 8.0])
     probabilities = torch.tensor([[0.1, 0.2, 0.4, 0.3], [0.7, 0.1, 0.1, 0.1], [0.1, 0.1, 0.1, 0.7]])
@@ -235,6 +252,7 @@ def test_selection_passes_no_gradient_but_local_features_do(make_config, grid, m
         ({"num_random_keypoints": -1}, "num_random_keypoints=-1"),
         ({"depth_range_m": [5.0, 2.0]}, "depth_range_m"),
         ({"keypoint_nms_cells": 2}, "keypoint_nms_cells=2"),
+        ({"num_radar_peaks": 25}, "num_radar_peaks=25.*num_radar_keypoints=24"),
         ({"num_depth_bins": 0}, "num_depth_bins=0"),
     ],
 )

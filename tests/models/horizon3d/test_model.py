@@ -250,7 +250,7 @@ def test_boxes_may_move_along_their_heading(make_model, make_batch):
         {"gate_kernel_size": 3},
         {"num_learnable_points": 0},
         {"num_layers": 1},
-        {"keypoint_nms_cells": 3},
+        {"keypoint_nms_cells": 3, "num_radar_peaks": 12},
         {"initialization": Initialization.keypoint},
         {"margin_m": 0.0},
         {"max_occupied_cells": 20},
