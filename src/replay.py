@@ -30,6 +30,7 @@ from src.config import Config, compose_config, refuse_options_of_others, restore
 from src.errors import ConfigError, DivergedError
 from src.ops.precision import computing
 from src.reliability.command import run_command
+from src.reliability.cpu import tune_cpu
 from src.reliability.nonfinite import describe_gradients, gradient_norm, read_dump
 from src.structures.batch import LIDAR_POINT_FIELDS, RADAR_POINT_FIELDS, FrameBatch
 from src.training.module import TrainingModule
@@ -42,6 +43,7 @@ def main(overrides: list[str]) -> None:
     """Run a dumped step again. Raises DivergedError at the first number that is not finite."""
     command, _ = compose_config(overrides)
     refuse_options_of_others(command, "replay")
+    tune_cpu()  # as the step that it repeats
     if command.checkpoint is None:
         raise ConfigError("give checkpoint=PATH of a dump, nonfinite-step*.pt in the folder of a run")
     path = Path(command.checkpoint)

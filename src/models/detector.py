@@ -164,8 +164,8 @@ class Detector(nn.Module, ABC):
         """How a frame runs in fixed shapes, None without; capacities None are the detector's own."""
         return None
 
-    def present(self, batch: FrameBatch, memory: Any) -> Any:
-        """The output of `forward` where no frame follows."""
+    def output_alone(self, batch: FrameBatch, memory: Any) -> Any:
+        """The output of `forward`, of a frame that none follows."""
         return self(batch, memory)[0]
 
     def transition(self, batch: FrameBatch, memory: Any) -> Any:

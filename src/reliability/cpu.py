@@ -25,11 +25,10 @@ MADV_HUGEPAGE = 14
 
 
 def tune_cpu() -> None:
-    """What every entry point does once before any work, since threads take the switches from who starts them.
+    """What commands that run a model do once before any work, since threads take the switches from who starts them.
 
-    Numbers below 1e-38 become 0: where the softmax of attention saturates, gradients shrink to them, and processors
-    take a hundred times as long over each (measured: a step of PETR 0.90 instead of 0.33 s). Raises as
-    `tune_allocator`.
+    Denormal numbers, below 1e-38, become 0: where the softmax of attention saturates, gradients shrink to them, and
+    processors are slow over each (a step of a saturated PETR took 0.90 instead of 0.33 s). Raises as `tune_allocator`.
     """
     tune_allocator()
     torch.set_flush_denormal(True)

@@ -61,7 +61,7 @@ for _speed in SPEEDS:
     for _key, _words, *_rest in (
         ("mAP_present", "mAP", "%", 100.0, 1, True),
         ("mAVE_present", "mAVE", "m/s", 1.0, 2, False),
-        ("car.AP", "car AP", "%", 100.0, 1, True),
+        *((f"{name}.AP", f"{name} AP".replace("_", " "), "%", 100.0, 1, True) for name in CLASSES),
         ("car.AVE", "car AVE", "m/s", 1.0, 2, False),
     ):
         METRICS[f"speeds.{_speed}.{_key}"] = Metric(f"speeds.{_speed}.{_key}", f"{_words} {_speed} m/s", *_rest)

@@ -44,6 +44,12 @@ class ClassCount(TypedDict):
     num_gt: Count
 
 
+class ClassAP(ClassCount):
+    """A class within a speed class."""
+
+    AP: NotRequired[Share]  # older runs have the car's alone
+
+
 class CarScores(ClassCount):
     """The car within a speed class."""
 
@@ -52,7 +58,7 @@ class CarScores(ClassCount):
 
 
 @with_config(OPEN)
-class SpeedClasses(TypedDict, extra_items=ClassCount):
+class SpeedClasses(TypedDict, extra_items=ClassAP):
     """The classes within a speed class, by name."""
 
     car: CarScores

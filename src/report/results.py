@@ -224,12 +224,14 @@ def _flat_scores(scores: Scores) -> dict[str, float | None]:
     values = {prefix + key: value for prefix, part in groups.items() for key, value in part.items()}
     values = {name: value for name, value in values.items() if name in METRICS}
     for name, part in scores.get("speeds", {}).items():
-        car, prefix = part["classes"]["car"], f"speeds.{name}."
+        classes, prefix = part["classes"], f"speeds.{name}."
         values |= {prefix + key: part[key] for key in ("mAP_present", "mAVE_present")}
-        values[prefix + "boxes"] = sum(of_class["num_gt"] for of_class in part["classes"].values())
-        values[prefix + "car.boxes"] = car["num_gt"]
-        for key in ("AP", "AVE"):  # the official numbers of a class without ground truth are 0 and 1, and say nothing
-            values[f"{prefix}car.{key}"] = car[key] if car["num_gt"] else None
+        values[prefix + "boxes"] = sum(of_class["num_gt"] for of_class in classes.values())
+        values[prefix + "car.boxes"] = classes["car"]["num_gt"]
+        # The official numbers of a class without ground truth are 0 and 1, and say nothing.
+        numbers = [(f"{word}.AP", of_class) for word, of_class in classes.items() if "AP" in of_class]
+        for word, of_class in (*numbers, ("car.AVE", classes["car"])):
+            values[prefix + word] = of_class[word.partition(".")[2]] if of_class["num_gt"] else None
     return values
 
 

@@ -44,7 +44,7 @@ class TemporalModule(TrainingModule):
         """
         past = self._used = self.remember(batch.past) if batch.past else self.select_memory(batch)
         if batch.past:
-            return self.model.present(batch, past)
+            return self.model.output_alone(batch, past)
         if self.oracle is not None and past is not None:
             past = self.oracle.correct(past, batch)
         # Before the forward pass: on a GPU the look at the streams would otherwise wait for all of it.

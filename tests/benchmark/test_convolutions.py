@@ -29,7 +29,7 @@ from src.structures.sparse_bev import SparseMap
 
 CPU = torch.device("cpu")
 SPCONV = load_spconv(CPU)
-needs_spconv = pytest.mark.skipif(SPCONV is None, reason="spconv is not installed: an optional baseline")
+needs_spconv = pytest.mark.skipif(SPCONV is None, reason="spconv, of the extra `oracle`, is not installed")
 
 
 def sites_on(shape, number, seed=0):

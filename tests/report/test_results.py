@@ -76,11 +76,11 @@ def with_intervals(folder, bounds, scenes=20):
 def test_intervals_and_measures_are_read_by_name(write_run, reports):
     bounds = {"mAP": [0.2, 0.4], "measures.moving_AP": [0.3, 0.5], "speeds.25+.classes.car.AP": [0.1, 0.9],
               "ranges.0-25.mAP": [0.0, 1.0], "classes.car.ATE": [1.0, 2.0], "speeds.25+.classes.bus.AP": [0.0, 0.1],
-              "tags.rain.mAP": [0.0, 0.1]}  # fmt: skip
+              "speeds.25+.classes.bus.ATE": [1.0, 2.0], "tags.rain.mAP": [0.0, 0.1]}  # fmt: skip
     path = publish_result(with_intervals(write_run("a", [], 0, 0.3, speeds=True), bounds), reports)
     result = read_result(path)
     assert result.intervals == {"mAP": [0.2, 0.4], "measures.moving_AP": [0.3, 0.5], "speeds.25+.car.AP": [0.1, 0.9],
-                                "ranges.0-25.mAP": [0.0, 1.0]}  # fmt: skip
+                                "speeds.25+.bus.AP": [0.0, 0.1], "ranges.0-25.mAP": [0.0, 1.0]}  # fmt: skip
     assert result.scenes == 20 and result.metrics["measures.moving_AP"] == 0.4
     assert result.metrics["measures.history_near"] is None
     assert "tags.rain.mAP" not in path.read_text() and "classes.car.ATE" not in path.read_text(), "nobody reads them"
@@ -157,12 +157,16 @@ def test_speeds_are_read_where_they_are(write_run, reports, publish_all):
     folder = write_run("b", [], 1, 0.4, speeds=True)
     damage(folder / "metrics.json", lambda m: m["speeds"]["25+"].update(mAP_present=None))  # nothing that fast
     damage(folder / "metrics.json", lambda m: m["speeds"]["10-25"]["classes"]["car"].update(AP=0, AVE=1, num_gt=0))
+    damage(folder / "metrics.json", lambda m: m["speeds"]["25+"]["classes"]["truck"].pop("AP"))  # as older runs have it
+    damage(folder / "metrics.json", lambda m: m["speeds"]["0-0.5"]["classes"]["truck"].update(AP=0.1, num_gt=0))
     publish_all()
     old, new = read_results(reports)[0].values()
     assert not [key for key in old.metrics if key.startswith("speeds")]
     assert new.metrics["speeds.0-0.5.mAP_present"] == 0.4 and new.metrics["speeds.25+.mAP_present"] is None
     assert new.metrics["speeds.0-0.5.car.AP"] == 0.4 and new.metrics["speeds.0-0.5.car.AVE"] == 1.6
     assert new.metrics["speeds.10-25.car.AP"] is None and new.metrics["speeds.10-25.car.AVE"] is None
+    assert new.metrics["speeds.0-0.5.truck.AP"] is None and "speeds.25+.truck.AP" not in new.metrics
+    assert new.metrics["speeds.10-25.truck.AP"] == 0.4 and "speeds.10-25.truck.AVE" not in new.metrics
     assert new.metrics["speeds.10-25.boxes"] == 10 and new.metrics["speeds.0-0.5.car.boxes"] == 3
 
 

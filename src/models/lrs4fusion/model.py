@@ -117,11 +117,11 @@ class LRS4Fusion(Detector, WorldModel):
 
         Raises ValueError for a batch without LiDAR, and for a memory of other streams, voxels or widths.
         """
-        output = self.present(batch, memory)
+        output = self.output_alone(batch, memory)
         remembered = self.remember(output.volumes, batch)
         return output, remembered if remembered is None else remembered.detached()
 
-    def present(self, batch: FrameBatch, memory: VolumeMemory | None) -> LRSOutput:
+    def output_alone(self, batch: FrameBatch, memory: VolumeMemory | None) -> LRSOutput:
         """As in `Detector`."""
         volumes = self.encode(batch, memory)
         return LRSOutput(volumes, None if self.head is None else self._head_output(volumes))
