@@ -100,11 +100,10 @@ def write_pages(config: Config, results: dict[str, RunResult], in_sweeps: Collec
     models = {result.phase: result.model for result in results.values() if result.phase in PHASES}
     defaults = {phase: defaults_of(config.scale, phase, model) for phase, model in models.items()}
     runs = called_by_changes(results.values(), defaults)
-    detection = [run for run in runs if run.task == DETECTION]
-    groups = {phase: runs_on_page(detection, phase, in_sweeps) for phase in PHASES if phase != FURTHER}
-    for run in runs:
-        if run.task != DETECTION and run.phase in PHASES and run.run_id not in in_sweeps:
-            groups.setdefault(f"{run.phase}_{run.task}", []).append(run)
+    groups = {}
+    for task in dict.fromkeys(run.task for run in runs):
+        own, ending = [run for run in runs if run.task == task], "" if task == DETECTION else f"_{task}"
+        groups |= {phase + ending: runs_on_page(own, phase, in_sweeps) for phase in PHASES if phase != FURTHER}
     reports = Path(config.paths.reports)
     return {name: write_page(reports, name, config.scale, runs) for name, runs in groups.items() if runs}
 

@@ -283,3 +283,5 @@ def test_runs_of_a_world_model_with_other_defaults_are_other_experiments(write_r
     found = rows(page.read_text(), "| experiment | occupancy IoU along rays, % |")
     changed = "data.timeline.radial_speeds=none model.loss.sampling.free_places=along_rays model=lrs4fusion"
     assert found == {"LRS4Fusion": "| LRS4Fusion | 60.0 |", f"`{changed}`": f"| `{changed}` | 40.0 |"}
+    (page,) = write_pages(config, results, set(results)).values()  # all of them in tables of sweeps as well
+    assert rows(page.read_text(), "| experiment | occupancy IoU") == {"LRS4Fusion": "| LRS4Fusion | 60.0 |"}
