@@ -3,9 +3,9 @@
 suite=model     the configured model part by part: time forward and with backward, arithmetic, memory traffic, share of
                 the roofline bound on this machine, peak memory. With phase=phase2 the memory is full, but an untrained
                 model holds no cell worth remembering: model.dptf.bev_path.memory_threshold=0 keeps all. The weights
-                are random unless checkpoint=PATH (of the same configuration) is given
+                are random unless checkpoint=PATH (of the same configuration) is given; a phase that learns from LiDAR
+                rays alone takes a made frame: no world is written for it
 suite=ops       each heavy operation beside GEMM, other libraries and naive implementations, in turns
-                a phase that learns from LiDAR rays alone takes a made frame: no world is written for it
 suite=scaling   cost against range, objects, radar points, Gaussians and memory, the configured model beside others that
                 need no LiDAR; of a model that reads LiDAR, alone, against range
 suite=training  frames per second of the phase's training step, with its loader and without

@@ -172,11 +172,11 @@ def _camera(yaw: float, height: int, width: int) -> Tensor:  # [4, 4]
     return pix_from_cam @ cam_from_ego
 
 
-def lidar_frame(road: Highway, seed: int = 0) -> FrameBatch:
+def lidar_frame(road: Highway) -> FrameBatch:
     """One frame of a LiDAR on the truck's roof: what its rays met as points, and as rays to learn from at TARGETS_S,
     at all of which the world is the same. The truck stands at the origin.
     """
-    rays = _lidar_rays(road, torch.Generator().manual_seed(seed))
+    rays = _lidar_rays(road, torch.Generator().manual_seed(0))
     rest = torch.tensor([[20.0, 0.0]]).expand(len(rays), -1)  # intensity, age
     return FrameBatch(
         tokens=["synthetic"],

@@ -17,7 +17,7 @@ import torch
 from torch import nn
 
 from src.benchmark.parts import Paths, backward_from, wrapped_parts
-from src.ops.sparse_conv_cpu import release_scratch
+from src.ops.scratch import release_scratch
 
 PATIENCE = 4.0  # a first call that takes so many times what a candidate may take is its only one
 

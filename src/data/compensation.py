@@ -76,7 +76,8 @@ def ego_motion(
         at = int(np.argmax(~(speed <= MAX_EGO_SPEED_MPS)))
         raise DataError(
             f"{index.root / index.version}/ego_pose.json: the poses around time {int(times_us[at])} us move at "
-            f"{speed[at]:.0f} m/s; a truck stays below {MAX_EGO_SPEED_MPS:.0f}, so the pose table is damaged there"
+            f"{speed[at]:.0f} m/s; a truck stays below {MAX_EGO_SPEED_MPS:.0f}, so the pose table is damaged there; "
+            "unpack the release again"
         )
     return velocity, rate
 

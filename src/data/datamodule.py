@@ -198,10 +198,6 @@ class DetectionDataModule(L.LightningDataModule):
             clips.append(list(self._in_order(scene[max(0, end - length) : end])))
         return clips
 
-    def scene_names(self) -> list[str]:
-        """Names of the validation split's scenes, in the order of `stream`."""
-        return list(self._scenes())
-
     def stream(self, scenes: list[str] | None = None) -> Iterator[FrameBatch]:
         """The frames of some or all scenes of the validation split one by one, in stream 0; each scene is a clip.
 

@@ -81,7 +81,6 @@ def frame_from_sensors(
     cameras: Mapping[str, Camera | None],
     radars: Mapping[str, Sequence[RadarSweep] | None],
     settings: ReaderSettings,
-    token: str = "",
     lidars: Mapping[str, Sequence[LidarSweep] | None] | None = None,
 ) -> FrameBatch:
     """A batch of one frame, without annotations and augmentation, as `FrameReader.read` makes it from a data set.
@@ -96,7 +95,7 @@ def frame_from_sensors(
     timestamp_s = float(_seconds(timestamp_s, "timestamp_s of the frame"))
     global_from_ego = _rigid(global_from_ego, "global_from_ego of the frame")
     batch = {
-        "tokens": [token or f"{timestamp_s:.6f}"],
+        "tokens": [f"{timestamp_s:.6f}"],
         "timestamps_s": torch.tensor([timestamp_s], dtype=torch.float64),
         "global_from_ego": torch.from_numpy(global_from_ego[None]),
         "aug_from_ego": torch.eye(4)[None],

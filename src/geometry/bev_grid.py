@@ -84,6 +84,22 @@ class BEVGrid:
         g = self.to_cells(xy)
         return ((g >= 0) & (g < constant((self.cols, self.rows), g.dtype, g.device))).all(-1)
 
+    def contains_points(
+        self,
+        points: Tensor,  # [..., 3 or more] x, y, z in metres
+    ) -> Tensor:  # [...] bool
+        """Whether each point lies in a cell of the grid and in the height band; NaN does not."""
+        low, high = self.z_range_m
+        return self.contains(points[..., :2]) & (points[..., 2] >= low) & (points[..., 2] < high)
+
+    def keys_of(
+        self,
+        samples: Tensor,  # [...] int64
+        cells: Tensor,  # [..., 2] int64 (row, col) in the grid
+    ) -> Tensor:  # [...] int64
+        """Linear index of each cell among those of all samples, row by row."""
+        return (samples * self.rows + cells[..., 0]) * self.cols + cells[..., 1]
+
     def centre_of(
         self,
         cells: Tensor,  # [..., 2] (row, col)

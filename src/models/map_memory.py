@@ -45,7 +45,7 @@ class MapMemory(FrameMemory[MapFrame]):
 class WarpedMaps:
     """Past maps and their motion to the current augmented frame, newest first; `TemporalFusion.maps` resamples them."""
 
-    frames: tuple[MapFrame, ...]  # at most as many as configured
+    frames: tuple[MapFrame, ...]  # of the batch's past (`FrameMemory.before`), at most as many as configured
     motions: list[Motion]
     usable: Tensor  # [frames of the configuration, B] bool
 
@@ -76,7 +76,7 @@ class TemporalFusion(nn.Module):
     ) -> tuple[Tensor, WarpedMaps, MapMemory]:
         """The current map changed by the past, what of the past is in use, and the memory with the current map."""
         warped_maps = self.recall(memory, batch)
-        return self.aggregate(fused, warped_maps), warped_maps, self.remember(memory, batch, fused)
+        return self.aggregate(fused, warped_maps), warped_maps, self.remember(warped_maps.frames, batch, fused)
 
     @torch.no_grad()
     def recall(self, memory: MapMemory | None, batch: FrameBatch) -> WarpedMaps:
@@ -124,11 +124,11 @@ class TemporalFusion(nn.Module):
     @torch.no_grad()
     def remember(
         self,
-        memory: MapMemory | None,
+        past: tuple[MapFrame, ...],  # of `WarpedMaps`
         batch: FrameBatch,
         fused: Tensor,  # [B, C, rows, cols]
     ) -> MapMemory:
-        """The memory with the current map added, less what is not in its past (`FrameMemory.before`)."""
+        """The past with the current map added."""
         frame = MapFrame(
             batch.timestamps_s,
             batch.global_from_ego,
@@ -136,5 +136,4 @@ class TemporalFusion(nn.Module):
             batch.aug_from_ego,
             fused.detach().permute(0, 2, 3, 1).to(STORED).contiguous(),
         )
-        past = memory.before(batch).frames if memory is not None else ()
         return MapMemory((frame, *past)[: self.config.num_frames])

@@ -80,15 +80,6 @@ class Denoised(NamedTuple):
     layers: list[QueryPrediction]
 
 
-class DecoderOutput(NamedTuple):
-    """The fields of `QueryOutput`, in their order."""
-
-    layers: list[QueryPrediction]
-    head: QueryPrediction
-    recalled: RecalledQueries | None
-    denoised: Denoised | None
-
-
 class QueryDetector(Detector):
     """An image encoder, what the family sees and asks, a decoder of queries, and the best of them remembered.
 
@@ -147,7 +138,7 @@ class QueryDetector(Detector):
         memory: QueryMemory | None,
         queries: Queries,  # of this frame
         *seen: Any,  # as the decoder takes it
-    ) -> tuple[DecoderOutput, QueryMemory | None]:
+    ) -> tuple[QueryOutput, QueryMemory | None]:
         """What the decoder says to these queries and those of the last frame, and the memory with this frame, detached.
 
         Raises ValueError for a memory of another number of streams.
@@ -164,11 +155,11 @@ class QueryDetector(Detector):
         if noisy is not None:
             layers, others = zip(*(layer.split(count) for layer in layers), strict=True)
             denoised = Denoised(noisy, list(others))
-        output = DecoderOutput(list(layers), layers[self.output_layer], recalled, denoised)
+        output = QueryOutput(list(layers), layers[self.output_layer], recalled, denoised)
         if self.temporal is None:
             return output, None
         own = features[self.output_layer][:, :count]
-        return output, self.temporal.remember(memory, batch, own, output.head)
+        return output, self.temporal.remember(recalled.past, batch, own, output.head)
 
     def loss_terms(self, output: QueryOutput, batch: FrameBatch) -> Objective:
         """Weighted terms `class` and `box`, and in training `denoising`."""

@@ -64,6 +64,7 @@ class QueryMemory(FrameMemory[QueryFrame]):
 class RecalledQueries:
     """Remembered queries in the present."""
 
+    past: tuple[QueryFrame, ...]  # of the batch (`FrameMemory.before`), at most as many as configured
     queries: Queries  # [B, T * K], newest frame first
     elapsed_s: Tensor  # [B, T * K]
     usable: Tensor  # [B, T] bool, which past frames each stream has
@@ -133,9 +134,8 @@ class QueryPropagation(nn.Module):
         Of those that are too old, not in the past or outside the grid nothing is valid; frames that are missing are
         padding, so that shapes are always the same.
         """
-        frames = list(memory.before(batch).frames[: self.config.num_frames]) if memory is not None else []
-        missing = self.config.num_frames - len(frames)
-        frames += [self._nothing(batch)] * missing
+        past = memory.before(batch).frames[: self.config.num_frames] if memory is not None else ()
+        frames = [*past, *[self._nothing(batch)] * (self.config.num_frames - len(past))]
         motion = motions(frames, batch, self.config.max_age_s)  # [T, B]
         centers, velocities, features, valid = (
             torch.stack([getattr(frame, name) for frame in frames])
@@ -154,21 +154,21 @@ class QueryPropagation(nn.Module):
             features = self.norm(features, torch.cat([*told, driven[..., :2, 0]], dim=-1))
         logits = features.new_full((*valid.shape, len(CLASSES)), UNKNOWN_LOGIT)
         queries = Queries(features, centers, velocities, logits, valid).map(_by_sample)
-        return RecalledQueries(queries, _by_sample(elapsed), motion.usable.t(), self.config.queries_per_frame)
+        return RecalledQueries(past, queries, _by_sample(elapsed), motion.usable.t(), self.config.queries_per_frame)
 
     @torch.no_grad()
     def remember(
         self,
-        memory: QueryMemory | None,
+        past: tuple[QueryFrame, ...],  # of `RecalledQueries`
         batch: FrameBatch,
         features: Tensor,  # [B, Q, C]
         prediction: QueryPrediction,
     ) -> QueryMemory:
-        """The memory with the best queries of the batch added, less what is not in its past (`FrameMemory.before`)."""
+        """The past with the best queries of the batch added."""
         wanted = self.config.queries_per_frame
         scores = torch.where(prediction.valid, prediction.logits.amax(-1), -torch.inf)
         best, picks = scores.topk(min(wanted, scores.shape[1]), dim=1)
-        ego_from_aug = torch.linalg.inv_ex(batch.aug_from_ego).inverse[:, None]
+        ego_from_aug = batch.ego_from_aug[:, None]
         codes = prediction.codes.gather(1, picks[..., None].expand(-1, -1, prediction.codes.shape[-1]))
         centers, velocities = codes[..., :3], codes[..., -2:]
         frame = QueryFrame(
@@ -180,7 +180,6 @@ class QueryPropagation(nn.Module):
             features=_padded(features.float().gather(1, picks[..., None].expand(-1, -1, self.channels)), wanted),
             valid=_padded(best.isfinite()[..., None], wanted).squeeze(-1),
         )
-        past = memory.before(batch).frames if memory is not None else ()
         return QueryMemory((frame, *past)[: self.config.num_frames])
 
     def _nothing(self, batch: FrameBatch) -> QueryFrame:

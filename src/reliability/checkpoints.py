@@ -32,6 +32,7 @@ LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 WAIT_S = 240.0
 """How long a save waits for a disk: less than the other processes of a training wait for this one."""
 RETRY_EVERY_S = 5.0
+_REMEDY = "copy it again, or name another checkpoint"
 TRANSIENT = {errno.ENOSPC, errno.EDQUOT, errno.ENOENT, errno.ESTALE, errno.EIO}
 """Disk full, unmounted or failing: others make room and mounts come back. A read-only folder stays so."""
 
@@ -233,7 +234,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             file.seek(0)
             content = torch.load(file, map_location="cpu", weights_only=True)
     except zipfile.BadZipFile as error:
-        raise CheckpointError(f"checkpoint {path} is truncated, or no checkpoint at all ({error})") from error
+        raise CheckpointError(
+            f"checkpoint {path} is truncated, or no checkpoint at all ({error}); {_REMEDY}"
+        ) from error
     except pickle.UnpicklingError as error:
         raise CheckpointError(
             f"checkpoint {path} holds more than tensors and plain values, so it is not of this project; "
@@ -241,7 +244,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         ) from error
     except _BROKEN as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CheckpointError(f"checkpoint {path} is truncated or damaged ({reason})") from error
+        raise CheckpointError(f"checkpoint {path} is truncated or damaged ({reason}); {_REMEDY}") from error
     if not _is_ours(content):
         raise CheckpointError(
             f"checkpoint {path} is not of this project: it lacks 'state_dict' (tensors by name) or the configuration "
@@ -254,7 +257,9 @@ def _verify(file: BinaryIO, path: Path) -> None:
     """Raises CheckpointError or BadZipFile unless the file is what was once written; torch loads flipped bits."""
     digests = _digests(file)
     if digests is not None and digests[0] != digests[1]:
-        raise CheckpointError(f"checkpoint {path} is damaged: its SHA-256 is not the one it states at its end")
+        raise CheckpointError(
+            f"checkpoint {path} is damaged: its SHA-256 is not the one it states at its end; {_REMEDY}"
+        )
     fault = fault_of_archive(file)
     if fault is not None:
         raise CheckpointError(
@@ -265,11 +270,11 @@ def _verify(file: BinaryIO, path: Path) -> None:
         file.seek(-len(_END), os.SEEK_END)
         end = file.read()
         if end[:4] != _END[:4] or end[-2:] != _END[-2:]:
-            raise CheckpointError(f"checkpoint {path} is damaged: the digest at its end is torn")
+            raise CheckpointError(f"checkpoint {path} is damaged: the digest at its end is torn; {_REMEDY}")
         with zipfile.ZipFile(file) as archive:
             damaged = archive.testzip()
         if damaged is not None:
-            raise CheckpointError(f"checkpoint {path} is damaged: the checksum of {damaged} in it is wrong")
+            raise CheckpointError(f"checkpoint {path} is damaged: the checksum of {damaged} in it is wrong; {_REMEDY}")
 
 
 def _digests(file: BinaryIO) -> tuple[str, str] | None:
@@ -324,7 +329,10 @@ def load_model_weights(
     ]
     if problems:
         more = f" and {len(problems) - 6} more" if len(problems) > 6 else ""
-        raise CheckpointError(f"checkpoint {path} is of another model: {'; '.join(problems[:6])}{more}")
+        raise CheckpointError(
+            f"checkpoint {path} is of another model: {'; '.join(problems[:6])}{more}; name one of this model and "
+            "configuration"
+        )
     broken = [key for key, value in state.items() if not torch.isfinite(value).all()]
     if broken:
         raise CheckpointError(f"checkpoint {path} holds weights that are not finite, {broken[0]} for one")

@@ -27,7 +27,8 @@ INTERRUPT_GRACE_S = 2.0
 def run_command(main: Callable[[list[str]], None]) -> None:
     """Run an entry point on the command line's `key=value`s; known errors end with one message and their exit code.
 
-    Exit codes: 0 finished, 3 configuration or checkpoint, 4 data, 5 diverged, 6 interrupted and resumable, 1 a defect.
+    Exit codes: 0 finished, 3 configuration or checkpoint, 4 data, 5 diverged, 6 interrupted and resumable, 141 cut
+    short by a closed pipe, 1 anything else.
     """
     line = "%(asctime)s %(levelname).1s %(name)s: %(message)s"
     logging.basicConfig(level=logging.INFO, format=line, datefmt="%H:%M:%S")

@@ -24,7 +24,7 @@ from src.report.result_schema import Bounds, DataNames, Latency, OtherScores, Pe
 from src.training.identity import OUTSIDE_IDENTITY, is_of, key_of, without_keys
 
 FORMAT = 1
-RUN_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
+FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 MAX_POINTS = 200
 """Of a learning curve."""
 LARGEST_POINT = 1e15
@@ -154,7 +154,7 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
     config = _read_config(run_folder / "config.yaml")
     latency_path = run_folder / "latency.json"
     latency = read_as(Latency, latency_path, "delete it and measure again") if latency_path.is_file() else None
-    if not RUN_ID.fullmatch(record.run_id):
+    if not FOLDER_NAME.fullmatch(record.run_id):
         name = f"{run_folder / 'run.json'}: run_id"
         raise DataError(f"{name} must be the name of a folder, but is {record.run_id!r:.80}; {remedy}")
     overrides = [_without_local_path(o) for o in record.overrides if not is_of(o, OUTSIDE_IDENTITY)]

@@ -124,3 +124,8 @@ class FrameBatch(TensorFields):
     def device(self) -> torch.device:
         """Where the tensors lie."""
         return self.timestamps_s.device
+
+    @property
+    def ego_from_aug(self) -> Tensor:  # [B, 4, 4] float32
+        """The inverse of A_t."""
+        return torch.linalg.inv_ex(self.aug_from_ego).inverse

@@ -21,9 +21,9 @@ from src.report.comparisons import LOOKS
 from src.report.results import RunResult, read_results
 from src.report.sweep_record import RunState, SweepRecord, read_record, record_path
 from src.report.time_left import progress_line
-from src.sweep.__main__ import Identifier, resume_command, run_plan
 from src.sweep.compose import SweepCommand, compose_sweep, load_sweep
 from src.sweep.plan import Plan, changes_of, compose_file, join_overrides, make_plan, without_published
+from src.sweep.run_plan import Identifier, resume_command, run_plan
 from src.sweep.run_status import is_done
 from src.training.identity import key_of
 

@@ -21,7 +21,7 @@ from yaml import YAMLError
 
 from src.config import CONF, GROUPS, SCALES, Config, hydra_message
 from src.errors import ConfigError
-from src.reliability.passwords import masked
+from src.reliability.passwords import masked, said_key
 from src.report.json_format import parse_as
 from src.report.plain_yaml import check_plain_yaml
 from src.report.sweep_file import (
@@ -105,8 +105,9 @@ def _check_places(overrides: list[str]) -> None:
         if near and "." not in key and name not in OWN_KEYS and key not in of_runs:
             raise ConfigError(f"{name}: did you mean {near[0]}?")
         if name != "storage" and masked(override) != override:
-            name = name if masked(name) == name and "@" not in name else "the command line"
-            raise ConfigError(f"{name}: holds what looks like a password; a database's address is given as storage=...")
+            raise ConfigError(
+                f"{said_key(name)}: holds what looks like a password; a database's address is given as storage=..."
+            )
 
 
 def load_sweep(name: str) -> SweepConfig:

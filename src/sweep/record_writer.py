@@ -22,7 +22,7 @@ class RecordWriter:
     """Writes `reports/sweeps/<stem>.json` of a plan; several runners may write the same one."""
 
     def __init__(self, plan: Plan, study: SweepStudy, command: str, outputs: Path, reports: Path) -> None:
-        self.plan, self.study, self.command, self.outputs, self.reports = plan, study, command, outputs, reports
+        self.plan, self.study, self.command, self.outputs = plan, study, command, outputs
         self.path = record_path(reports, plan.sweep.name, plan.scale, plan.changes)
         self._done: set[str] = set()
 

@@ -13,14 +13,18 @@ from src.structures.boxes import Boxes3D
 
 
 def supervised_boxes(
-    boxes: list[Boxes3D],  # B, augmented ego frame
+    boxes: list[Boxes3D] | None,  # B, augmented ego frame
     grid: BEVGrid,
 ) -> tuple[Boxes3D, Tensor]:  # K boxes of all samples, [K] int64 sample of each, ascending
     """Join the boxes of a batch that lie in the grid, were seen and have an extent.
 
     A box without any lidar or radar point (`num_points` 0), with its centre outside the grid, with a value that is
     not finite (velocities excepted) or with a size of zero supervises nothing. `num_points` None counts as seen.
+
+    Raises ValueError for a batch without annotations.
     """
+    if boxes is None:
+        raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
     joined, sample = join_boxes(boxes), box_samples(boxes)
     usable = grid.contains(joined.centers[:, :2]) & (joined.sizes > 0).all(1)
     values = torch.cat([joined.centers, joined.sizes, joined.yaws[:, None]], dim=1)

@@ -21,7 +21,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from src.errors import CheckpointError, ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
 from src.models.detector import Detector
-from src.reliability.checkpoints import OpenCheckpoint, load_model_weights, open_checkpoint
+from src.reliability.checkpoints import LAST, OpenCheckpoint, load_model_weights, open_checkpoint
 from src.reliability.processes import die_with_parent
 from src.training.identity import RUN_ID, TEMPORAL_DATA_KEYS, is_of, run_identity
 from src.training.run_folder import RunFolder
@@ -80,7 +80,7 @@ def find_source(
         path = Path(name)
         if RUN_ID.fullmatch(name) and not path.is_file():
             folder = RunFolder(Path(config.paths.outputs), name)
-            return WeightSource(name, folder.checkpoints / "last.ckpt", None, folder)
+            return WeightSource(name, folder.checkpoints / LAST, None, folder)
         if not path.is_file():
             raise CheckpointError(
                 f"phase.init_from={name}: there is no such checkpoint, and no phase ({', '.join(phases)}) or run of "
@@ -97,7 +97,7 @@ def find_source(
     its_source = find_source(its_config, wanted, compose, phases)  # what that run starts from is part of its identity
     identity = run_identity(tree, its_source.identity if its_source is not None else None)
     folder = RunFolder(Path(config.paths.outputs), identity)
-    return WeightSource(folder.run_id, folder.checkpoints / "last.ckpt", wanted, folder)
+    return WeightSource(folder.run_id, folder.checkpoints / LAST, wanted, folder)
 
 
 def train_source(source: WeightSource, train_missing: bool, processes_exist: bool) -> None:
@@ -146,7 +146,7 @@ def open_source(source: WeightSource) -> OpenCheckpoint:
     except CheckpointError as error:
         if source.overrides is None:
             raise
-        raise CheckpointError(f"{error}; make it anew with\n    {source.command} resume=restart") from error
+        raise CheckpointError(f"{error}; or make it anew with\n    {source.command} resume=restart") from error
 
 
 def hand_over(model: Detector, weights: OpenCheckpoint, tree: dict[str, Any]) -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from src.benchmark.timing import added_mib, interleaved, median_iqr, milliseconds, timed_parts
-from src.ops.sparse_conv_cpu import scratch
+from src.ops.scratch import scratch
 
 CPU = torch.device("cpu")
 

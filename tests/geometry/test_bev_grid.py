@@ -21,6 +21,15 @@ def test_cells_and_centres_by_hand():
 def test_upper_edges_and_nan_lie_outside():
     points = torch.tensor([[2.5, -2.0], [1.0, -1.0], [-0.5, -3.0], [math.nan, -2.0]])
     assert SMALL.contains(points).tolist() == [False, False, True, False]
+    low_and_high = torch.tensor([-3.0, 4.9, 5.0, math.nan])
+    inside = torch.cat([points[2].expand(4, 2), low_and_high[:, None]], 1)
+    assert SMALL.contains_points(inside).tolist() == [True, True, False, False]
+    assert not SMALL.contains_points(torch.tensor([2.5, -2.0, 0.0]))
+
+
+def test_keys_count_cells_of_all_samples_row_by_row():
+    cells = torch.tensor([[0, 0], [0, 5], [1, 0], [3, 5]])
+    assert SMALL.keys_of(torch.tensor([0, 0, 1, 2]), cells).tolist() == [0, 5, 24 + 6, 48 + 23]
 
 
 @pytest.mark.parametrize(

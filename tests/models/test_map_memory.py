@@ -20,6 +20,10 @@ def make_fusion(grid=WIDE, channels=2, **changes):
     return TemporalFusion(memory_config(**changes), channels, grid)
 
 
+def remember(fusion, memory, batch, fused):
+    return fusion.remember(fusion.recall(memory, batch).frames, batch, fused)
+
+
 def world_at(xy):
     """Two smooth functions of global positions, metres from the origin of the drive."""
     x, y = xy.double().unbind(-1)
@@ -51,7 +55,7 @@ def test_a_standing_world_looks_the_same_from_memory(then, now):
     fusion = make_fusion()
     past = bare_frame([0.0, 3.0], [pose(0.0, 0.0, 0.1), pose(5.0, -3.0, -2.0)], [then, then])
     batch = bare_frame([0.5, 3.5], [pose(9.0, 2.0, 0.25), pose(1.0, -1.0, -1.8)], [now, now])
-    memory = fusion.remember(None, past, map_of(past))
+    memory = remember(fusion, None, past, map_of(past))
     with torch.autocast("cpu", torch.bfloat16):
         found = next(fusion.maps(fusion.recall(memory, batch)))
     near = slice(28, 68)  # what both frames cover
@@ -64,7 +68,7 @@ def test_whole_cells_move_without_loss():
     """8 m ahead are ten columns; what leaves is gone and what appears is zero."""
     fusion = make_fusion(channels=1)
     first = torch.arange(96.0 * 96).view(1, 1, 96, 96) % 128  # exact in bfloat16
-    memory = fusion.remember(None, bare_frame(0.0, [pose()]), first)
+    memory = remember(fusion, None, bare_frame(0.0, [pose()]), first)
     found = next(fusion.maps(fusion.recall(memory, bare_frame(0.5, [pose(8.0)]))))
     torch.testing.assert_close(found[..., 1:-1, :86], first[..., 1:-1, 10:], rtol=0, atol=2e-2)
     assert not found[..., 87:].any()
@@ -74,7 +78,7 @@ def test_whole_cells_move_without_loss():
 def test_what_is_not_a_usable_past_is_zero_and_only_in_its_stream(elapsed_s, metres):
     fusion = make_fusion()
     past = bare_frame(10.0, [pose(), pose()])
-    memory = fusion.remember(None, past, map_of(past) + 3.0)
+    memory = remember(fusion, None, past, map_of(past) + 3.0)
     batch = bare_frame([10.0 + elapsed_s, 10.5], [pose(metres), pose(5.0)])
     recalled = fusion.recall(memory, batch)
     assert recalled.usable[0].tolist() == [False, True]
@@ -88,7 +92,7 @@ def test_the_newest_frames_stay_and_streams_come_and_go():
     for step in range(4):
         frame = bare_frame(0.5 * step, [pose(step), pose(step, 1.0)], [torch.eye(4), bda(0.2)])
         value = torch.tensor([1.0, 10.0]).view(2, 1, 1, 1) * (step + 1)
-        memory = fusion.remember(memory, frame, value.expand(2, 2, 96, 96))
+        memory = remember(fusion, memory, frame, value.expand(2, 2, 96, 96))
     assert [frame.timestamps_s.tolist() for frame in memory.frames] == [[1.5, 1.5], [1.0, 1.0]]
     swapped = memory.select(torch.tensor([1, 0]), torch.tensor([True, False]))
     assert [frame.present.tolist() for frame in swapped.frames] == [[True, False]] * 2
@@ -106,7 +110,7 @@ def test_aggregation_is_the_convolution_of_all_maps_side_by_side():
     memory = None
     for step in range(2):  # of three that there is room for
         frame = bare_frame(0.5 * step, [pose(4.0 * step), pose(step, 1.0)])
-        memory = fusion.remember(memory, frame, torch.randn(2, 2, 96, 96))
+        memory = remember(fusion, memory, frame, torch.randn(2, 2, 96, 96))
     warped_maps = fusion.recall(memory, bare_frame(1.0, [pose(8.0), pose(2.0, 1.0)]))
     fused = torch.randn(2, 2, 96, 96)
     past = list(fusion.maps(warped_maps))
@@ -119,7 +123,7 @@ def test_aggregation_is_the_convolution_of_all_maps_side_by_side():
 def test_memory_survives_a_checkpoint():
     fusion = make_fusion()
     past = bare_frame(0.0, [pose()], [bda(0.2, 1.03)])
-    memory = fusion.remember(None, past, map_of(past))
+    memory = remember(fusion, None, past, map_of(past))
     buffer = io.BytesIO()
     torch.save(memory.to("cpu").state(), buffer)
     buffer.seek(0)
@@ -133,7 +137,7 @@ def test_remembering_keeps_no_graph_and_no_alias():
     fusion = make_fusion()
     past = bare_frame(0.0, [pose()])
     fused = map_of(past).requires_grad_()
-    cells = fusion.remember(None, past, fused * 1.0).frames[0].cells
+    cells = remember(fusion, None, past, fused * 1.0).frames[0].cells
     assert not cells.requires_grad and cells.dtype == torch.bfloat16 and cells.is_contiguous()
 
 

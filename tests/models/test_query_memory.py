@@ -37,7 +37,8 @@ def remember(propagation, memory, batch, *queries):
         logits[:, number, number % 12] = logit
         features[:, number, :2] = torch.tensor([number + 1.0, number])
     prediction = QueryPrediction(logits, codes, torch.ones(b, n, dtype=torch.bool))
-    return propagation.remember(memory, batch, features.requires_grad_(), prediction)
+    past = propagation.recall(memory, batch).past
+    return propagation.remember(past, batch, features.requires_grad_(), prediction)
 
 
 def seen(recalled, sample=0):

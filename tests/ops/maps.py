@@ -1,4 +1,4 @@
-"""Random sites and the kinds of kernel maps over (t, y, x), or (z, y, x)."""
+"""Random sites, the kinds of kernel maps over (t, y, x), or (z, y, x), and what a convolution makes of them."""
 
 import torch
 
@@ -25,3 +25,12 @@ def map_of(mode, sites):
 def stack_of(sites, kernel, parts):
     """`stacked_map` of two subsets, given as the rows that each has of the sites."""
     return stacked_map(sites, kernel, tuple(inverse_rows(rows, len(sites)) for rows in parts), tuple(map(len, parts)))
+
+
+def values_and_gradients(convolve, kernel_map, width=3, dtype=torch.float64):
+    torch.manual_seed(0)
+    x = torch.randn(kernel_map.num_inputs, width, dtype=dtype).requires_grad_()
+    w = torch.randn(kernel_map.num_offsets, width, width + 1, dtype=dtype).requires_grad_()
+    out = convolve(x, w, kernel_map, None)
+    (out * torch.randn(out.shape, dtype=dtype)).sum().backward()
+    return out.detach(), x.grad, w.grad

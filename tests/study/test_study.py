@@ -10,8 +10,8 @@ from src.report.results import RunResult
 from src.report.sweep_record import read_record
 from src.study import __main__ as study
 from src.sweep import compose as sweep_config
-from src.sweep.__main__ import Identifier, definition
 from src.sweep.record_writer import RecordWriter
+from src.sweep.run_plan import Identifier, definition
 from src.sweep.sweep_study import SweepStudy, default_storage
 from tests.sweep.fake_train import identify
 

@@ -109,7 +109,6 @@ class SecondFPN16(nn.Module):
 
     def __init__(self, in_channels: list[int], channels: int, strides: tuple[int, ...] = offered) -> None:
         super().__init__()
-        self.strides = strides
         part = channels // 4
         at_4, at_8, at_16, at_32 = in_channels
         resample = (
@@ -133,16 +132,15 @@ class ImageEncoder(nn.Module):
     """Backbone and neck over all cameras of all samples (method 3).
 
     Feature row r of a level with stride s covers pixel rows r * s to (r + 1) * s of the input image, whether or not
-    padding is trimmed. `strides` and `channels` describe the output, by default all levels of the neck;
-    `lr_multiplier` is meant for the parameters of `backbone`. Loads `config.weights` when given: raises CheckpointError
-    for a file that does not fit, and ConfigError for a stride that the neck does not offer.
+    padding is trimmed. `strides` and `channels` describe the output, by default all levels of the neck. Loads
+    `config.weights` when given: raises CheckpointError for a file that does not fit, and ConfigError for a stride that
+    the neck does not offer.
     """
 
     def __init__(self, config: ImageEncoderConfig, strides: tuple[int, ...] | None = None) -> None:
         super().__init__()
         self.image_size_px = tuple(config.image_size_px)
         self.trim_padding = config.trim_padding
-        self.lr_multiplier = config.lr_multiplier
         self.backbone = build_backbone(config)
         neck = FPN if config.neck is NeckName.fpn else SecondFPN16
         self.channels, self.strides = config.neck_channels, neck.offered if strides is None else strides

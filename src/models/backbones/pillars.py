@@ -91,13 +91,10 @@ class PillarEncoder(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # [n, 13], [V] int64, [n] int64, [V, 7]
         """Features of the points inside, linear keys of the pillars they form, the pillar of each point, and the mean
         point of each pillar."""
-        low, high = self.grid.z_range_m
-        inside = self.grid.contains(points[:, :2]) & (points[:, 2] >= low) & (points[:, 2] < high)
-        kept = inside.nonzero().squeeze(1)
+        kept = self.grid.contains_points(points).nonzero().squeeze(1)
         points, batch = points[kept], batch[kept]
         cell = self.grid.cell_of(points[:, :2])
-        keys = (batch * self.grid.rows + cell[:, 0]) * self.grid.cols + cell[:, 1]
-        cells, rows = torch.unique(keys, return_inverse=True)
+        cells, rows = torch.unique(self.grid.keys_of(batch, cell), return_inverse=True)
         from_centre = (points[:, :2] - self.grid.centre_of(cell)) / self.grid.cell_m
         means = segment_mean(points, rows, len(cells))
         units = points.new_tensor([self.grid.cell_m, self.grid.cell_m, POINT_SCALES[2]])

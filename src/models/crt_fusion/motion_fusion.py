@@ -140,7 +140,7 @@ class MotionGuidedFusion(nn.Module):
         best = best[best >= 0]  # sample by sample, so their rows ascend
         kept, rows = kept[best], rows[best]
         row = torch.div(kept, self.grid.cols, rounding_mode="floor") % self.grid.rows
-        ego_from_aug = torch.linalg.inv_ex(batch.aug_from_ego).inverse[rows]
+        ego_from_aug = batch.ego_from_aug[rows]
         older = rows_of_map(moved.maps)[kept, : -self.channels]
         cells = StoredCellStack(
             xy=transform_points_xy(ego_from_aug, self.grid.centre_of(torch.stack([row, kept % self.grid.cols], 1))),

@@ -70,8 +70,8 @@ class Far3D(QueryDetector):
         views = CameraViews.encode(self.image_encoder, batch)
         adaptive, camera = self.proposals(views)
         queries = Queries.concatenate([self.anchor_queries(len(batch)), adaptive], dim=1)
-        answers, memory = self.run_decoder(batch, memory, queries, views)
-        return Far3DOutput(*answers, views, camera, adaptive), memory
+        output, memory = self.run_decoder(batch, memory, queries, views)
+        return Far3DOutput(**vars(output), views=views, camera=camera, adaptive=adaptive), memory
 
     def loss_terms(self, output: Far3DOutput, batch: FrameBatch) -> Objective:
         """Weighted terms `class`, `box`, `keypoint` and `depth`."""

@@ -214,8 +214,6 @@ class CenterHead(nn.Module):
         Focal loss per group over its positive cells, L1 per group over its objects (method 8.1). Without objects the
         box term is 0 with zero gradients. Raises ValueError for a batch without annotations.
         """
-        if boxes is None:
-            raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
         targets = self.targets(output, boxes)
         counts = {
             "objects": len(targets.rows),

@@ -107,8 +107,6 @@ class SetPredictionHead(nn.Module):
         Focal loss of every query, L1 of those that an object is assigned to; both over the objects that found one. A
         weight of None leaves its term out. Raises ValueError for a batch without annotations.
         """
-        if boxes is None:
-            raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
         logits, codes, valid = (
             torch.stack([getattr(one, name) for one in predictions]).flatten(1, 2)
             for name in ("logits", "codes", "valid")

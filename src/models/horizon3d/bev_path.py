@@ -12,7 +12,7 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import repeat_interleave
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
-from src.models.horizon3d.dptf_memory import Memory, StoredCells
+from src.models.horizon3d.dptf_memory import Memory, StoredCells, stored_features
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.layers.doppler import Doppler
 from src.models.layers.full_precision import FullPrecisionLinear
@@ -142,14 +142,11 @@ class BEVPath(nn.Module):
         best = topk_per_sample(score[kept], indices[:, 0], len(batch), self.config.max_cells_per_frame).flatten()
         best = best[best >= 0]  # sample by sample, so their rows ascend
         kept, indices = kept[best], indices[best]
-        ego_from_aug = torch.linalg.inv_ex(batch.aug_from_ego).inverse[indices[:, 0]]  # [n, 4, 4]
-        features = fused.features.detach()[kept]
-        if torch.is_autocast_enabled(features.device.type):
-            features = features.to(torch.get_autocast_dtype(features.device.type))
+        ego_from_aug = batch.ego_from_aug[indices[:, 0]]  # [n, 4, 4]
         return StoredCells(
             xy=transform_points_xy(ego_from_aug, self.grid.centre_of(indices[:, 1:])),
             velocities=transform_vectors_xy(ego_from_aug, cells.velocities.detach()[kept]),
-            features=features,
+            features=stored_features(fused.features.detach()[kept]),
             rows=indices[:, 0],
         )
 

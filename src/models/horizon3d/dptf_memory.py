@@ -12,6 +12,13 @@ from src.models.memory import FrameMemory, RememberedFrame, StoredRows
 from src.structures.gaussians import GaussianSet
 
 
+def stored_features(features: Tensor) -> Tensor:
+    """Features as they are remembered: under autocast in its type."""
+    if not torch.is_autocast_enabled(features.device.type):
+        return features
+    return features.to(torch.get_autocast_dtype(features.device.type))
+
+
 @dataclass
 class StoredCells(StoredRows):
     """Remembered BEV cells of one key frame of every stream: rows of all streams, one after the other."""

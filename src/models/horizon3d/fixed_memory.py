@@ -12,7 +12,7 @@ from src.geometry.constants import constant, where_scalar
 from src.geometry.tensor_transforms import transform_points_xy
 from src.models.horizon3d.bev_path import BEVPath, CellPrediction, PaddedWarpedCells
 from src.models.horizon3d.dptf import DPTF, WarpedMemory
-from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
+from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells, stored_features
 from src.models.horizon3d.gaussian_path import GaussianPath
 from src.models.horizon3d.output import Horizon3DOutput
 from src.models.memory import Motion, RememberedFrame
@@ -172,9 +172,7 @@ def _best_cells(
     score = cells.occupancy_logits.sigmoid()
     chosen = (score > path.config.memory_threshold) & (fused.sites.keys < fused.sites.end)
     best = where_scalar(chosen, score, -1.0).argsort(descending=True, stable=True)[:count]
-    features = fused.features
-    if torch.is_autocast_enabled(features.device.type):
-        features = features.to(torch.get_autocast_dtype(features.device.type))
+    features = stored_features(fused.features)
     columns = (cell_centres(fused.sites.keys, path.grid), cells.velocities, features.float(), chosen[:, None].float())
     rows = torch.cat(columns, dim=1).index_select(0, best)
     return F.pad(rows, (0, 0, 0, count - len(rows)))[None] if len(rows) < count else rows[None]
@@ -189,10 +187,8 @@ def _chosen_gaussians(
 ) -> Tensor:  # [1, n, GAUSSIAN_WIDTH + C]
     """As `GaussianPath.store`, of a frame that is not augmented."""
     picks = path.sample(gaussians, active, batch)[0]
-    features = gaussians.features
-    if torch.is_autocast_enabled(features.device.type):
-        features = features.to(torch.get_autocast_dtype(features.device.type))
-    rows = _gaussian_rows(replace(gaussians, features=features))[0].index_select(0, picks.clamp(min=0))
+    stored = replace(gaussians, features=stored_features(gaussians.features))
+    rows = _gaussian_rows(stored)[0].index_select(0, picks.clamp(min=0))
     return torch.cat([rows[:, :-1], (picks >= 0).float()[:, None]], dim=1)[None]
 
 

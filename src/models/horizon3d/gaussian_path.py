@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant, where_scalar
-from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
+from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, stored_features
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.memory import Motion, motions
 from src.ops.farthest_point import farthest_points
@@ -184,11 +184,8 @@ class GaussianPath(nn.Module):
         picks = self.sample(gaussians, active, batch)
         rows = picks.clamp(min=0)
         chosen = gaussians.map(lambda value: _gather(value.detach(), rows))
-        ego = chosen.transform(torch.linalg.inv_ex(batch.aug_from_ego).inverse)
-        features = ego.features
-        if torch.is_autocast_enabled(features.device.type):
-            features = features.to(torch.get_autocast_dtype(features.device.type))
-        return replace(ego, features=features, valid=picks >= 0)
+        ego = chosen.transform(batch.ego_from_aug)
+        return replace(ego, features=stored_features(ego.features), valid=picks >= 0)
 
     def sample(
         self,

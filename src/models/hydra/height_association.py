@@ -87,7 +87,7 @@ class HeightAssociation(nn.Module):
     ) -> tuple[Tensor, Tensor]:  # [B*N*w, D, width], [B*N*w, D] bool
         """The radar as every column sees it: the mean of the pillars in each depth bin, and where there are any."""
         cells = radar_bev.any(1).nonzero()  # [P, 3] (sample, row, col) of the pillars
-        keys = (cells[:, 0] * self.grid.rows + cells[:, 1]) * self.grid.cols + cells[:, 2]
+        keys = self.grid.keys_of(cells[:, 0], cells[:, 1:])
         pillars = self.returns(F.embedding(keys, rows_of_map(radar_bev)))
         picks, bins = self.seen_at(views, cells)
         shape = (views.valid.numel() * views.levels[0].shape[-1], self.num_bins)

@@ -55,7 +55,7 @@ class AzimuthAttention(nn.Module):
         """The image features with radar; a missing camera takes none."""
         (b, n, c, h, w), level = views.levels[0].shape, views.levels[0].flatten(0, 1)
         cells = radar_bev.any(1).nonzero()  # [P, 3] (sample, row, col) of the pillars, sample by sample
-        keys = (cells[:, 0] * self.grid.rows + cells[:, 1]) * self.grid.cols + cells[:, 2]
+        keys = self.grid.keys_of(cells[:, 0], cells[:, 1:])
         columns = self.columns(level.amax(2).transpose(1, 2).flatten(0, 1))  # [B*N*w, C / 2]
         rows = self.rows(level.amax(3).transpose(1, 2).flatten(0, 1)).view(b * n, h, c)
         nearest = self.nearest(cells, views, w)  # [B*N*w, K]

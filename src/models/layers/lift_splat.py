@@ -124,8 +124,7 @@ class LiftSplat(nn.Module):
         hits = inside.flatten().nonzero().squeeze(1)  # synchronises a GPU
         cell = self.grid.cell_of(points.view(-1, 3).index_select(0, hits)[:, :2])
         sample = torch.div(hits, points[0].numel() // 3, rounding_mode="floor")
-        keys = (sample * self.grid.rows + cell[:, 0]) * self.grid.cols + cell[:, 1]
-        keys, order = torch.sort(keys, stable=True)
+        keys, order = torch.sort(self.grid.keys_of(sample, cell), stable=True)
         return hits[order], keys, inverse_rows(order, len(order))
 
     @torch.no_grad()

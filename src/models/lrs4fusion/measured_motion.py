@@ -107,8 +107,7 @@ class MeasuredMotion:
         """
         xy = self.xyz[:, :2] + 0.5 * grid.cell_m
         inside = grid.contains(xy).nonzero().squeeze(1)
-        row, col = grid.cell_of(xy[inside]).unbind(1)
-        cells = (self.batch[inside] * grid.rows + row) * grid.cols + col
+        cells = grid.keys_of(self.batch[inside], grid.cell_of(xy[inside]))
         shape = (len(self.origins), grid.rows, grid.cols)
         columns = F.pad(self.velocities[inside, :2], (0, 1), value=1.0)
         sums = segment_sum(columns, cells, math.prod(shape)).unflatten(0, shape).permute(0, 3, 1, 2)

@@ -148,7 +148,7 @@ class WindowedFusion(nn.Module):
     ) -> tuple[Tensor, Tensor]:  # [M, 3] m, [M, 3] m/s
         """Centres and velocities of the voxels in the unaugmented ego frame."""
         indices = volume.indices
-        ego_from_aug = torch.linalg.inv_ex(batch.aug_from_ego).inverse[indices[:, 0]]
+        ego_from_aug = batch.ego_from_aug[indices[:, 0]]
         centres = self.grid.centre_of(indices[:, 1:])
         velocities = torch.zeros_like(centres) if velocities_mps is None else velocities_mps
         return transform_points(ego_from_aug, centres), transform_vectors(ego_from_aug, velocities)

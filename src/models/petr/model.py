@@ -62,5 +62,4 @@ class PETR(QueryDetector):
         value = self.image_value(views.levels[0].movedim(2, -1))  # [B, N, h, w, C]
         valid = views.valid[:, :, None, None].expand(value.shape[:-1]).flatten(1)
         images = ((value + self.position(views)).flatten(1, 3), value.flatten(1, 3), valid)
-        answers, memory = self.run_decoder(batch, memory, self.anchor_queries(len(batch)), images)
-        return QueryOutput(*answers), memory
+        return self.run_decoder(batch, memory, self.anchor_queries(len(batch)), images)

@@ -165,8 +165,6 @@ class PointHead(nn.Module):
         Diagnostics, per frame: objects, and those without a point within them, which teach nothing. Raises ValueError
         for a batch without annotations.
         """
-        if boxes is None:
-            raise ValueError("FrameBatch.boxes is None, but a loss needs annotations")
         graph, logits = prediction.graph, prediction.logits
         objects, samples = upload_boxes(*supervised_boxes(boxes, self.grid), device=logits.device)
         owner, held = self.owners(graph, objects, samples)
@@ -233,9 +231,8 @@ class RadarGNN(Detector):
 
     def encode(self, batch: FrameBatch) -> tuple[Tensor, PointGraph]:  # [n, C]
         """Features of the n points inside, and their graph."""
-        points, (low, high) = batch.radar_points, self.grid.z_range_m
-        inside = self.grid.contains(points[:, :2]) & (points[:, 2] >= low) & (points[:, 2] < high)
-        rows = inside.nonzero().squeeze(1)
+        points = batch.radar_points
+        rows = self.grid.contains_points(points).nonzero().squeeze(1)
         graph = build_graph(self.config.graph, points[rows], batch.radar_batch[rows], len(batch))
         x, edges = self.nodes(graph.nodes), self.edges(graph.edges)
         for layer in self.layers:

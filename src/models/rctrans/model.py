@@ -79,8 +79,8 @@ class RCTrans(QueryDetector):
         views = CameraViews.encode(self.image_encoder, batch)
         pillars = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
         radar = self.densifier(pillars)
-        answers, memory = self.run_decoder(batch, memory, self.anchor_queries(len(batch)), radar, views)
-        return RCTransOutput(*answers, pillars), memory
+        output, memory = self.run_decoder(batch, memory, self.anchor_queries(len(batch)), radar, views)
+        return RCTransOutput(**vars(output), pillars=pillars), memory
 
     def diagnostics(self, output: RCTransOutput) -> dict[str, Tensor | float]:
         """Pillars, queries and what is remembered, per frame."""

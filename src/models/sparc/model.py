@@ -80,8 +80,8 @@ class SpaRC(QueryDetector):
         radar = self.radar_encoder(batch.radar_points, batch.radar_batch, len(batch))
         radar, views = self.fusion(radar, CameraViews.encode(self.image_encoder, batch))
         proposals = self.proposals(radar, views)
-        answers, memory = self.run_decoder(batch, memory, proposals.queries, radar.padded(), views)
-        return SpaRCOutput(*answers, radar, views, proposals), memory
+        output, memory = self.run_decoder(batch, memory, proposals.queries, radar.padded(), views)
+        return SpaRCOutput(**vars(output), radar=radar, views=views, proposals=proposals), memory
 
     def loss_terms(self, output: SpaRCOutput, batch: FrameBatch) -> Objective:
         """Weighted terms `class`, `box`, `heatmap`, `keypoint` and `depth`."""

@@ -1,36 +1,29 @@
-"""Blocks of offsets change nothing, products in bfloat16 are as near as its digits allow, and reused memory."""
-
-import threading
+"""Blocks of offsets change nothing, and products in bfloat16 are as near as its digits allow."""
 
 import pytest
 import torch
 
 from src.ops.kernel_maps import submanifold_map
-from src.ops.products import bfloat16_products
+from src.ops.products import bfloat16_products, product_type
 from src.ops.sites import Sites
-from src.ops.sparse_conv import plain_sparse_conv, sparse_conv
-from src.ops.sparse_conv_cpu import blocks, scratch
-from tests.ops.maps import map_of, random_sites, stack_of
+from src.ops.sparse_conv import plain_sparse_conv
+from src.ops.sparse_conv_blocks import blocked_sparse_conv, blocks
+from tests.ops.maps import map_of, random_sites, stack_of, values_and_gradients
 
 
-def values_and_gradients(convolve, kernel_map, width=3, dtype=torch.float64):
-    torch.manual_seed(0)
-    x = torch.randn(kernel_map.num_inputs, width, dtype=dtype).requires_grad_()
-    w = torch.randn(kernel_map.num_offsets, width, width + 1, dtype=dtype).requires_grad_()
-    out = convolve(x, w, kernel_map, None)
-    (out * torch.randn(out.shape, dtype=dtype)).sum().backward()
-    return out.detach(), x.grad, w.grad
+def blocked(x, w, kernel_map, bias):
+    return blocked_sparse_conv(x, w, kernel_map, bias, product_type(x, w.shape[2]))
 
 
 @pytest.mark.parametrize("fill", [0.0, 0.3, 2.0])
 @pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal", "inverse"])
 def test_blocks_and_their_size_change_nothing(mode, fill, monkeypatch):
     """One block of all 27 offsets, one for each plane or row of the kernel, several products of a block."""
-    monkeypatch.setattr("src.ops.sparse_conv_cpu.LEAST_FILL", fill)
-    monkeypatch.setattr("src.ops.sparse_conv_cpu.SMALL", 0)
-    monkeypatch.setattr("src.ops.sparse_conv_cpu.GATHERED_BYTES", 1)
+    monkeypatch.setattr("src.ops.sparse_conv_blocks.LEAST_FILL", fill)
+    monkeypatch.setattr("src.ops.sparse_conv_blocks.SMALL", 0)
+    monkeypatch.setattr("src.ops.sparse_conv_blocks.GATHERED_BYTES", 1)
     kernel_map = map_of(mode, random_sites((2, 9, 16, 17), 1200))
-    found = values_and_gradients(sparse_conv, kernel_map)
+    found = values_and_gradients(blocked, kernel_map)
     for backward in (False, True):
         sizes = {part.offsets.stop - part.offsets.start for part in blocks(kernel_map, backward)}
         assert sizes == {27} if fill == 0 else sizes == {3} if fill == 2 else len(sizes) == 1
@@ -41,7 +34,7 @@ def test_blocks_and_their_size_change_nothing(mode, fill, monkeypatch):
 def test_as_many_rows_as_fill_their_steps(rows):
     """All rows of a block that has every one of them: the features' padding is then a step longer than the block's."""
     kernel_map = submanifold_map(Sites.from_linear(torch.arange(rows), (1, 1, rows)), (1, 3))
-    found = values_and_gradients(sparse_conv, kernel_map)
+    found = values_and_gradients(blocked, kernel_map)
     assert any(part.rows is None and len(part.table) == rows for part in blocks(kernel_map, backward=True))
     torch.testing.assert_close(found, values_and_gradients(plain_sparse_conv, kernel_map))
 
@@ -70,53 +63,18 @@ def test_blocks_hold_every_pair_once():
 def test_products_in_bfloat16_are_as_near_as_its_digits_allow():
     """Values and gradients of a convolution whose products are large; sums are in float32."""
     kernel_map = submanifold_map(random_sites((1, 60, 60), 2000), 3)
-    exact = values_and_gradients(sparse_conv, kernel_map, 64, torch.float32)
+    exact = values_and_gradients(blocked, kernel_map, 64, torch.float32)
     with bfloat16_products():
-        near = values_and_gradients(sparse_conv, kernel_map, 64, torch.float32)
+        near = values_and_gradients(blocked, kernel_map, 64, torch.float32)
     for a, b in zip(exact, near, strict=True):
         assert b.dtype == torch.float32 and (a - b).norm() < 0.005 * a.norm()
 
 
 def test_half_precision_sums_over_products_in_full(monkeypatch):
     """Ones of 200 products: sums in bfloat16 would stop growing at 256 of them."""
-    monkeypatch.setattr("src.ops.sparse_conv_cpu.GATHERED_BYTES", 1)
+    monkeypatch.setattr("src.ops.sparse_conv_blocks.GATHERED_BYTES", 1)
     kernel_map = submanifold_map(Sites.from_linear(torch.arange(51200), (1, 1, 51200)), (1, 3))
     x = torch.ones(51200, 1, dtype=torch.bfloat16)
     weight = torch.ones(3, 1, 1, dtype=torch.bfloat16, requires_grad=True)
-    sparse_conv(x, weight, kernel_map).sum().backward()
+    blocked(x, weight, kernel_map, None).sum().backward()
     assert weight.grad.flatten().tolist() == pytest.approx([51199, 51200, 51199], rel=0.005)
-
-
-def place_of(name, rows, dtype=torch.float32):
-    block = scratch(name, rows, 3, dtype, torch.device("cpu"))
-    assert block.shape == (rows, 3) and block.dtype == dtype
-    return block, block.data_ptr()
-
-
-def test_the_same_name_gives_the_same_memory_until_more_is_needed():
-    first, place = place_of("a", 50)
-    assert place_of("a", 20, torch.float64)[1] == place and place_of("b", 20)[1] != place
-    larger, elsewhere = place_of("a", 500)
-    assert elsewhere != place and place_of("a", 50)[1] == elsewhere
-    assert first.shape == (50, 3) and larger.shape == (500, 3)  # both alive, so that addresses tell them apart
-
-
-def test_threads_do_not_share_memory():
-    """Two detectors in two threads would write into each other's rows: torch lets go of the interpreter meanwhile."""
-    mine, place = place_of("shared", 50)
-    found = []
-    thread = threading.Thread(target=lambda: found.append(place_of("shared", 50)))
-    thread.start()
-    thread.join()
-    assert mine.shape == found[0][0].shape and found[0][1] != place
-
-
-def test_training_after_inference_in_the_same_process():
-    """Memory reused between calls must not be bound to inference mode."""
-    kernel_map = submanifold_map(random_sites((1, 9, 9), 30), 3)
-    x, w = torch.randn(30, 3), torch.randn(9, 3, 700, requires_grad=True)
-    with torch.inference_mode():
-        expected = sparse_conv(x, w, kernel_map)
-    out = sparse_conv(x, w, kernel_map)
-    out.sum().backward()
-    assert torch.equal(out, expected) and w.grad.isfinite().all()

@@ -1,0 +1,196 @@
+"""What a sweep and the study do with a plan: train what is missing, measure latencies, write and show the tables."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import logging
+import os
+import re
+import shlex
+import signal
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from src.config import PHASES, Config, compose_config
+from src.errors import HorizonError, InterruptedRunError
+from src.reliability.checkpoints import LAST
+from src.reliability.passwords import masked
+from src.reliability.processes import die_with_parent
+from src.report.results import publish_result, read_results
+from src.report.sweep_record import SweepRecord
+from src.report.table_builder import write_sweep_tables
+from src.report.time_left import progress_line
+from src.sweep.compose import SweepCommand
+from src.sweep.latency_runs import measure_latencies
+from src.sweep.launcher import Launcher
+from src.sweep.plan import Plan, RunIdentity, join_overrides, split_machine
+from src.sweep.record_writer import RecordWriter
+from src.sweep.run_status import is_done
+from src.sweep.runner import Runner
+from src.sweep.search import Search
+from src.sweep.sweep_study import FORMAT, SweepStudy, default_storage
+from src.training.handoff import find_source
+from src.training.identity import key_of, run_identity
+from src.training.run_folder import RunFolder, make_writable
+
+logger = logging.getLogger(__name__)
+
+
+class Identifier:
+    """Run ids as `python -m src.train` computes them; command lines that differ in the seed alone are composed once."""
+
+    def __init__(self) -> None:
+        self._composed: dict[tuple[str, ...], tuple[Config, dict[str, Any]]] = {}
+
+    def compose(self, overrides: list[str]) -> tuple[Config, dict[str, Any]]:
+        """As `compose_config`."""
+        plain = [override for override in overrides if not re.fullmatch(r"seed=\d+", override)]
+        if tuple(plain) not in self._composed:
+            self._composed[tuple(plain)] = compose_config(plain)
+        config, tree = self._composed[tuple(plain)]
+        seeds = [int(override.removeprefix("seed=")) for override in overrides if override not in plain]
+        if not seeds:
+            return config, tree
+        return dataclasses.replace(config, seed=seeds[-1]), copy.deepcopy(tree) | {"seed": seeds[-1]}
+
+    def __call__(self, overrides: list[str]) -> RunIdentity:
+        """The run that a command line resolves to. Raises HorizonError for what `python -m src.train` refuses."""
+        config, tree = self.compose(overrides)
+        source = find_source(config, overrides, self.compose, PHASES)
+        run_id = run_identity(tree, source.identity if source is not None else None)
+        return RunIdentity(run_id, config.scale, source and source.overrides, config.phase.task)
+
+
+def definition(plan: Plan, common: list[str]) -> dict[str, Any]:
+    """What a study must have been made by. Rows may change: each run is known by what it is, not by its row."""
+    if not plan.sweep.is_search:
+        return {"format": FORMAT, "kind": "rows"}
+    fixed, _ = split_machine(join_overrides(plan.sweep.overrides, common))
+    space = {key: dataclasses.asdict(dimension) for key, dimension in sorted(plan.sweep.space.items())}
+    return {
+        "format": FORMAT,
+        "kind": "search",
+        "objective": plan.sweep.objective,
+        "overrides": sorted(fixed),
+        "seeds": plan.seeds,
+        "space": space,
+    }
+
+
+def resume_command(module: str, overrides: list[str]) -> str:
+    """The command line that goes on with this one, without passwords."""
+    return shlex.join(["python", "-m", module, *[masked(override) for override in overrides]])
+
+
+def run_plan(
+    plan: Plan,
+    command: SweepCommand,
+    common: list[str],
+    identify: Identifier,
+    outputs: Path,
+    reports: Path,
+    again: str,
+) -> None:
+    """Train what is missing, measure latencies, write and show the tables; `again` is the command that resumes it.
+
+    Raises InterruptedRunError when it was stopped, HorizonError when a run has failed.
+    """
+    make_writable(outputs / "sweeps", "paths.outputs")
+    make_writable(reports / "sweeps", "paths.reports")
+    check_data_of_finished(plan, identify, outputs)
+    study = SweepStudy(outputs, plan.study, command.storage or default_storage(outputs), definition(plan, common))
+    launcher = Launcher(
+        [sys.executable, "-m", "src.train"],
+        study.folder,
+        command.workers,
+        visible_gpus(),
+        in_child=partial(die_with_parent, signal.SIGTERM),  # a killed runner leaves checkpoints, no orphans
+        group=plan.study,
+    )
+    parts = (plan, study, RecordWriter(plan, study, again, outputs, reports), launcher)
+    publish = partial(publish_result, reports=reports)
+    is_search = plan.sweep.is_search
+    runner = Search(*parts, publish, common=common, identify=identify) if is_search else Runner(*parts, publish)
+    record = runner.run()
+    if runner.stop.requested:
+        print(progress_line(record, command.workers, time.time()))
+        raise InterruptedRunError(f"the sweep was stopped; nothing finished is lost, resume it with\n    {again}")
+    if plan.sweep.latency and command.workers:
+        measured = measure_latencies(record, outputs, partial(latency_command, outputs), runner)
+        logger.info("latency measured of %d runs", measured)
+    finish(record, runner, outputs, reports, again)
+
+
+def check_data_of_finished(plan: Plan, identify: Identifier, outputs: Path) -> None:
+    """Raises DataError where a finished run was trained on other data than `data.root` holds, as training it would."""
+    finished = [
+        spec
+        for spec in plan.specs.values()
+        if any(key_of(override) == "data.root" for override in spec.machine)
+        and spec.run_id not in plan.published
+        and is_done(outputs / spec.run_id)
+    ]
+    if not finished:
+        return
+    from src.assembly import check_data, samples_of  # the reader is not needed before
+
+    known: dict[str, dict[str, Any]] = {}
+
+    def find(config: Config) -> dict[str, Any]:
+        key = repr((config.data, config.model.sensors))
+        if key not in known:
+            known[key] = samples_of(config)
+        return known[key]
+
+    for spec in finished:
+        config, _ = identify.compose(join_overrides(spec.overrides, spec.machine))
+        check_data(config, outputs / spec.run_id, RunFolder(outputs, spec.run_id).read_result()[0], find)
+
+
+def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, again: str) -> None:
+    """Write and show the tables. Raises HorizonError listing what failed."""
+    problems = []
+    failed = [run for run in record.runs.values() if run.state == "failed"]
+    if failed:
+        problems = [f"{len(failed)} of {len(record.runs)} runs failed:"]
+        for run in failed:
+            log = str(outputs / run.log) if run.log is not None else "none"
+            problems.append(f"  {run.label}, seed {run.seed} ({run.run_id}): {run.reason}; log: {log}")
+        problems.append(f"the same command retries them:\n    {again}")
+    runner.publish_done(strictly=True)
+    try:
+        paths = write_sweep_tables(reports, record, read_results(reports, record.scale)[0])
+    except HorizonError as error:
+        if not problems:
+            raise
+        paths = []
+        problems.append(str(error))
+    for path in paths:
+        if path.suffix == ".md":
+            print(f"\n{path.read_text()}")
+    for path in paths:
+        print(f"table: {path}")
+    print(progress_line(record, 1, time.time()))
+    if problems:
+        raise HorizonError("\n".join(problems))
+
+
+def latency_command(outputs: Path, folder: Path) -> list[str]:
+    """What measures the latency of a finished run, into `latency.json` of its folder."""
+    checkpoint = folder / "checkpoints" / LAST
+    suite = [f"checkpoint={checkpoint}", f"out={folder}", f"paths.outputs={outputs}"]
+    return [sys.executable, "-m", "src.benchmark", "suite=latency", *suite]
+
+
+def visible_gpus() -> list[str]:
+    """Names of the GPUs this process may use, as CUDA_VISIBLE_DEVICES writes them."""
+    chosen = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if chosen is not None:
+        return [name for name in chosen.split(",") if name.strip()] if torch.cuda.device_count() else []
+    return [str(index) for index in range(torch.cuda.device_count())]
