@@ -7,6 +7,7 @@ import logging
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -30,8 +31,12 @@ from src.benchmark.timing import MODES, added_mib, clock, interleaved, ratio_col
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.layers.sparse import SparseConv, SparseKernel, SubmanifoldConv, TemporalConv
+from src.ops.kernel_maps import KernelMap
 from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv
+from src.ops.sparse_conv_blocks import blocked_sparse_conv
+from src.ops.sparse_conv_cpu import form_of
+from src.ops.sparse_conv_tiles import tiled_sparse_conv
 from src.structures.sparse_bev import SparseMap
 
 logger = logging.getLogger(__name__)
@@ -115,6 +120,10 @@ def measure_layer(
     flops = 2 * len(kernel_map.inputs) * layer.kernel.in_channels * layer.kernel.out_channels
     functions: dict[str, Callable[[], Tensor]] = {"ours": lambda: sparse_conv(features, weight, kernel_map)}
     leaves: dict[str, list[Tensor]] = {"ours": [features, weight]}
+    if device.type == "cpu":
+        name, convolve = other_form(features, weight, kernel_map)
+        functions[name] = lambda: convolve(features, weight, kernel_map, None)
+        leaves[name] = [features, weight]
     if spconv is not None and not layer.temporal:
         baseline = build_layer(spconv, layer.kernel, "pairs").to(device)
         empty = sparse_tensor(spconv, SparseMap(layer.sites, features))
@@ -153,6 +162,12 @@ def measure_layer(
         row |= {"map ms": 1e3 * statistics.median(maps)} if maps else {}
         rows.append(row | agreement | sizes)
     return rows
+
+
+def other_form(features: Tensor, weight: Tensor, kernel_map: KernelMap) -> tuple[str, Callable[..., Tensor]]:
+    """The form of the convolution that a CPU does not take, so that a page shows where the choice is wrong."""
+    tiles, dtype = form_of(features, weight, kernel_map)
+    return ("blocks", partial(blocked_sparse_conv, dtype=dtype)) if tiles else ("tiles", tiled_sparse_conv)
 
 
 def rate_columns(seconds: dict[str, list[float]], flops: float, gemm: Gemm) -> dict[str, float]:

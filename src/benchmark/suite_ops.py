@@ -59,7 +59,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
             "range.",
             "Dense convolution: scatter to the whole grid, torch's convolution, gather; left blank where it does not "
             "fit. Kernel maps are cached on the sites by all (made once for all layers of a stage): `map ms` is ours. "
-            "The backbone makes its maps anew.",
+            "The backbone makes its maps anew. `tiles` or `blocks`: the form that this processor does not take.",
             "spconv: " + ("not installed, so its columns are absent." if spconv is None else spconv_note(device)),
             f"Dense splat: {sizes.splat_subset} of {sizes.gaussians} Gaussians against every cell, time and memory "
             "multiplied; all of them would not fit.",

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.tensor_transforms import rotate
 from src.losses.classification import sigmoid_focal
 from src.losses.normalizers import mean_over_ranks
 from src.models.heads.query_head import QueryPrediction, SetPredictionHead, box_codes
@@ -63,7 +64,7 @@ def noisy_queries(
     noise = 2 * torch.rand(*rows.shape, 3, device=device) - 1
     shift = 0.5 * config.extent * noise * objects.sizes[picks]
     cos, sin = objects.yaws[picks].cos(), objects.yaws[picks].sin()
-    turned = torch.stack([cos * shift[..., 0] - sin * shift[..., 1], sin * shift[..., 0] + cos * shift[..., 1]], dim=-1)
+    turned = torch.stack(rotate(cos, sin, shift[..., 0], shift[..., 1]), dim=-1)
     centers = objects.centers[picks] + torch.cat([turned, shift[..., 2:]], dim=-1)
     queries = Queries.unknown(centers.new_zeros(*rows.shape, channels), centers, valid)
     groups = torch.arange(1, config.num_groups + 1, device=device).repeat_interleave(size)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from src.ops.kernel_maps import KernelMap
@@ -21,16 +22,26 @@ def cpu_sparse_conv(
     kernel_map: KernelMap,
     bias: Tensor | None,  # [Cout]
 ) -> Tensor:  # [M_out, Cout]
-    """`sparse_conv` in tiles where the library takes products of any shape: up to twice as fast as in blocks.
+    """`sparse_conv` in the form of `form_of`."""
+    tiles, dtype = form_of(features, weight, kernel_map)
+    if tiles:
+        return tiled_sparse_conv(features, weight, kernel_map, bias)
+    return blocked_sparse_conv(features, weight, kernel_map, bias, dtype)
 
-    oneDNN, which multiplies bfloat16, and float32 where `prefers_onednn`, makes a program for every shape it meets:
-    there it is blocks, of few shapes.
+
+def form_of(
+    features: Tensor,  # [M_in, Cin]
+    weight: Tensor,  # [K, Cin, Cout]
+    kernel_map: KernelMap,
+) -> tuple[bool, torch.dtype]:
+    """Whether tiles are fastest, or blocks, and in which type.
+
+    Tiles where the library takes products of any shape: up to twice as fast as blocks. oneDNN, which multiplies
+    bfloat16, and float32 where `prefers_onednn`, makes a program for every shape it meets: there it is blocks.
     """
     dtype = product_type(features, weight.shape[2])
     if dtype != features.dtype and not prefers_onednn():
         places = max(kernel_map.num_offsets * kernel_map.num_outputs, 1)
         if min(weight.shape[1:]) * len(kernel_map.inputs) / places < LEAST_PAIRS_HALF:
             dtype = features.dtype
-    if dtype.itemsize < 4 or prefers_onednn():
-        return blocked_sparse_conv(features, weight, kernel_map, bias, dtype)
-    return tiled_sparse_conv(features, weight, kernel_map, bias)
+    return dtype.itemsize >= 4 and not prefers_onednn(), dtype

@@ -14,6 +14,7 @@ from src.benchmark.__main__ import main
 from src.benchmark.scenes import Highway
 from src.config import compose_config
 from src.errors import ConfigError, DataError
+from src.ops.products import prefers_onednn
 from src.ops.sites import Sites
 
 
@@ -175,6 +176,8 @@ def test_ops(outputs, tmp_path, monkeypatch):
     assert {row["mode"] for row in layers} == {"forward", "f+b"} and all(row["% of GEMM"] > 0 for row in layers)
     assert any(row.get("x faster than dense") for row in layers)
     assert any("x faster than dense" not in row for row in layers)  # too large
+    other = "tiles" if prefers_onednn() else "blocks"
+    assert all(row[f"x faster than {other}"] > 0 for row in layers)
     for row in [*layers, *result["radar backbone"]]:
         assert row.get("spconv differs by", 0.0) < 1e-5
     assert {row["mode"] for row in result["other operations"] if row["operation"] == "splat"} == {"forward", "f+b"}
