@@ -228,10 +228,13 @@ def _flat_scores(scores: Scores) -> dict[str, float | None]:
         values |= {prefix + key: part[key] for key in ("mAP_present", "mAVE_present")}
         values[prefix + "boxes"] = sum(of_class["num_gt"] for of_class in classes.values())
         values[prefix + "car.boxes"] = classes["car"]["num_gt"]
-        # The official numbers of a class without ground truth are 0 and 1, and say nothing.
-        numbers = [(f"{word}.AP", of_class) for word, of_class in classes.items() if "AP" in of_class]
-        for word, of_class in (*numbers, ("car.AVE", classes["car"])):
-            values[prefix + word] = of_class[word.partition(".")[2]] if of_class["num_gt"] else None
+        # The official numbers of a class without ground truth are 0 and 1, and say nothing; nor does the error of one
+        # of which hardly anything is found, officially 1.
+        for word, of_class in classes.items():
+            if "AP" in of_class:
+                values[f"{prefix}{word}.AP"] = of_class["AP"] if of_class["num_gt"] else None
+        car = classes["car"]
+        values[prefix + "car.AVE"] = car["AVE"] if car["num_gt"] and car["AVE"] != 1.0 else None
     return values
 
 

@@ -159,12 +159,14 @@ def test_speeds_are_read_where_they_are(write_run, reports, publish_all):
     damage(folder / "metrics.json", lambda m: m["speeds"]["10-25"]["classes"]["car"].update(AP=0, AVE=1, num_gt=0))
     damage(folder / "metrics.json", lambda m: m["speeds"]["25+"]["classes"]["truck"].pop("AP"))  # as older runs have it
     damage(folder / "metrics.json", lambda m: m["speeds"]["0-0.5"]["classes"]["truck"].update(AP=0.1, num_gt=0))
+    damage(folder / "metrics.json", lambda m: m["speeds"]["25+"]["classes"]["car"].update(AP=0.02, AVE=1.0))  # missed
     publish_all()
     old, new = read_results(reports)[0].values()
     assert not [key for key in old.metrics if key.startswith("speeds")]
     assert new.metrics["speeds.0-0.5.mAP_present"] == 0.4 and new.metrics["speeds.25+.mAP_present"] is None
     assert new.metrics["speeds.0-0.5.car.AP"] == 0.4 and new.metrics["speeds.0-0.5.car.AVE"] == 1.6
     assert new.metrics["speeds.10-25.car.AP"] is None and new.metrics["speeds.10-25.car.AVE"] is None
+    assert new.metrics["speeds.25+.car.AP"] == 0.02 and new.metrics["speeds.25+.car.AVE"] is None
     assert new.metrics["speeds.0-0.5.truck.AP"] is None and "speeds.25+.truck.AP" not in new.metrics
     assert new.metrics["speeds.10-25.truck.AP"] == 0.4 and "speeds.10-25.truck.AVE" not in new.metrics
     assert new.metrics["speeds.10-25.boxes"] == 10 and new.metrics["speeds.0-0.5.car.boxes"] == 3
