@@ -28,7 +28,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models import FAMILIES, read_phase_options
 from src.models.backbones.image import ImageEncoderConfig
 from src.ops.precision import Precision
-from src.reliability.passwords import masked, said_key
+from src.reliability.passwords import masked, shown_key
 from src.reliability.untrusted import fault_of_tree
 from src.training.identity import YOUNGER_KEYS, key_of
 from src.training.optim import OptimConfig
@@ -259,7 +259,7 @@ def _refuse_hidden(override: str) -> None:
         raise ConfigError(f"{name}: settings of Hydra itself are none of a run's")
     if masked(override) != override:
         raise ConfigError(
-            f"{said_key(name)}: holds what looks like a password, which would be written down with the run"
+            f"{shown_key(name)}: holds what looks like a password, which would be written down with the run"
         )
 
 

@@ -10,7 +10,7 @@ from src.ops.products import prefers_onednn, product_type
 from src.ops.sparse_conv_blocks import blocked_sparse_conv
 from src.ops.sparse_conv_tiles import tiled_sparse_conv
 
-LEAST_PAIRS_HALF = 26.0
+LEAST_FILLED_CHANNELS = 26.0
 """Channels of the narrow side times the share of (output, offset) pairs that exist, from which blocks in bfloat16 are
 faster than tiles in float32, since few of their products are of zeros. Measured with AMX: equal at 27, 0.6 of the time
 at 45 and 52, 1.2 to 1.4 times as long at 15 to 18."""
@@ -42,6 +42,6 @@ def form_of(
     dtype = product_type(features, weight.shape[2])
     if dtype != features.dtype and not prefers_onednn():
         places = max(kernel_map.num_offsets * kernel_map.num_outputs, 1)
-        if min(weight.shape[1:]) * len(kernel_map.inputs) / places < LEAST_PAIRS_HALF:
+        if min(weight.shape[1:]) * len(kernel_map.inputs) / places < LEAST_FILLED_CHANNELS:
             dtype = features.dtype
     return dtype.itemsize >= 4 and not prefers_onednn(), dtype

@@ -19,7 +19,7 @@ def masked(text: str) -> str:
     return AS_OPTION.sub(r"\1***", IN_AUTHORITY.sub(r"\1***", text))
 
 
-def said_key(name: str) -> str:
+def shown_key(name: str) -> str:
     """The key of an override as a message may name it: one that holds a password itself is not shown."""
     return name if masked(name) == name and "@" not in name else "the command line"
 

@@ -21,7 +21,7 @@ from yaml import YAMLError
 
 from src.config import CONF, GROUPS, SCALES, Config, hydra_message
 from src.errors import ConfigError
-from src.reliability.passwords import masked, said_key
+from src.reliability.passwords import masked, shown_key
 from src.report.json_format import parse_as
 from src.report.plain_yaml import check_plain_yaml
 from src.report.sweep_file import (
@@ -106,7 +106,7 @@ def _check_places(overrides: list[str]) -> None:
             raise ConfigError(f"{name}: did you mean {near[0]}?")
         if name != "storage" and masked(override) != override:
             raise ConfigError(
-                f"{said_key(name)}: holds what looks like a password; a database's address is given as storage=..."
+                f"{shown_key(name)}: holds what looks like a password; a database's address is given as storage=..."
             )
 
 
