@@ -16,9 +16,10 @@ from src.benchmark.scenes import Highway, highway_frame, highway_points
 from src.benchmark.simulated_device import DEVICE, SimulatedDevice, Tally
 from src.benchmark.simulated_kernels import simulated_kernels
 from src.config import Config
+from src.errors import ConfigError
 from src.models.deploy.whole_frames import WholeFrames
 from src.ops.fixed_shapes import Capacities
-from src.ops.precision import computing
+from src.ops.precision import Precision, computing
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CLASSES
@@ -34,7 +35,12 @@ CPU = torch.device("cpu")
 
 
 def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
-    """A table by part of a frame and of a step, and the places with most of each."""
+    """A table by part of a frame and of a step, and the places with most of each. Raises ConfigError for autocast."""
+    if config.precision == Precision.MIXED:
+        raise ConfigError(
+            f"suite=launches counts on a simulated device, which has no autocast: precision={config.precision} cannot "
+            f"run there; give precision={Precision.FULL}"
+        )
     case = make_case(config)
     frame, frame_parts = count(case, case.prepared, case.infer)
     step, step_parts = count(case, case.model, case.step)

@@ -12,7 +12,7 @@ from src.benchmark.simulated_device import DEVICE, SimulatedDevice
 from src.geometry.constants import upload
 from src.ops import backend
 from src.ops.segment_reduce import segment_sum
-from tests.running import command
+from tests.running import call, command
 
 # Of the debug scale, phase 2: an architecture of the same parts. A change that needs more says why here.
 BUDGETS = {
@@ -88,3 +88,10 @@ def test_a_frame_and_a_training_step_keep_their_budgets(tmp_path):
         assert all(spent[key] <= budget[key] for key in budget), (name, spent)
         inner = [row for part, row in parts.items() if part != "whole" and (":" not in part or "decode" in part)]
         assert sum(row["launches"] for row in inner) == spent["launches"]
+
+
+def test_autocast_is_refused_with_what_to_give_instead(tmp_path):
+    overrides = ("suite=launches", "scale=debug", "phase=phase2", "precision=bf16-mixed", f"out={tmp_path}")
+    result = call("benchmark.__main__", *overrides, expect=3)
+    assert "precision=bf16-mixed" in result.stderr and "give precision=32-true" in result.stderr
+    assert not any(tmp_path.iterdir())

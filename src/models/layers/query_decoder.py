@@ -76,7 +76,10 @@ class QueryDecoderLayer(nn.Module):
 
 
 class QueryDecoder(nn.Module):
-    """Layers whose predictions are where the next one looks; gradients do not pass from place to place."""
+    """Layers each of which predicts relative to where its query began, and looks where the one before it predicted.
+
+    Gradients do not pass from place to place. Changes of changes would ask one head for another answer in every layer.
+    """
 
     def __init__(
         self,
@@ -103,11 +106,11 @@ class QueryDecoder(nn.Module):
         values = [self.image_value(x.flatten(0, 1)).unflatten(0, x.shape[:2]) for x in views.levels]
         if past is not None:
             past = replace(past, features=past.features + self.embedding(past))
-        predictions, features = [], []
+        predictions, features, start = [], [], queries
         for layer in self.layers:
             x = layer(queries, self.embedding(queries), past, radar, views, values)
             features.append(self.norm(x))
-            predictions.append(head(features[-1], queries))
+            predictions.append(head(features[-1], start))
             codes = predictions[-1].codes.detach()
             queries = replace(queries, features=x, centers=codes[..., :3], velocities=codes[..., -2:])
         return predictions, features

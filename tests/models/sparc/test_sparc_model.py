@@ -23,6 +23,21 @@ def test_without_cameras_their_terms_are_zero_and_their_queries_padding():
     assert found["radar_points"] == len(output.radar.bev) / 2 and found["queries"] <= 48
 
 
+def test_layers_predict_relative_to_where_queries_began_and_look_where_the_last_one_predicted():
+    model, batch = small_model("sparc").eval(), make_batch()
+    with torch.no_grad():
+        model.head.box[-1].weight.zero_()
+        model.head.box[-1].bias[:3] = torch.tensor([3.0, -2.0, 0.5])
+    looked = []
+    for layer in model.decoder.layers:
+        layer.register_forward_pre_hook(lambda _, arguments: looked.append(arguments[0].centers))
+    output, _ = model(batch)
+    began = output.proposals.queries.centers
+    moved = began + torch.tensor([3.0, -2.0, 0.5])
+    torch.testing.assert_close(torch.stack(looked), torch.stack([began, moved]))
+    torch.testing.assert_close(torch.stack([one.codes[..., :3] for one in output.layers]), torch.stack([moved, moved]))
+
+
 def test_autocast_keeps_places_in_float32():
     with torch.autocast("cpu", torch.bfloat16):
         output, _ = small_model("sparc")(make_batch())
