@@ -34,7 +34,7 @@ OVERFITTING = {
     "far3d": (240, 150, 2e-3),
     "petr": (300, 150, 3e-3),
     "rctrans": (240, 150, 2e-3),
-    "sparc": (150, 100, 3e-3),
+    "sparc": (240, 150, 2e-3),
 }
 """Steps, how many before the end the rate begins to fall, and the rate."""
 EVERY = [(b, n) for b in range(2) for n in range(4)]
