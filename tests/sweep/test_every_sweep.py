@@ -12,7 +12,7 @@ from src.report.table_builder import sweep_tables
 from src.sweep.compose import sweep_files
 
 ROOT = Path(__file__).resolve().parents[2]
-PARTS_OF_SOME = ("kggi", "ocsf", "gaussian_encoder", "dptf", "view_transform", "temporal_fusion")
+PARTS_OF_SOME = ("image_encoder", "kggi", "ocsf", "gaussian_encoder", "dptf", "view_transform", "temporal_fusion")
 """Of Table 15: not every model has each of them."""
 SELDOM = ("speeds.", "classes.", "lfcd", "cd_unseen")
 """The debug world lacks most of them: it is small, and so is what a forecast may miss there."""
