@@ -13,10 +13,8 @@ from src.structures.batch import FrameBatch
 
 Array = np.ndarray
 
-RADII_RAD = tuple(np.radians([0.5, 2.0, 8.0]))
-"""A ray meets the point nearest to its direction, looked for within these one after the other."""
-COARSE_POINTS = 8192
-"""Of the points at most so many are looked at for the last: where nothing is nearer, which it is says little."""
+RADII_RAD = tuple(np.radians([0.25, 0.5, 1.0, 2.0]))
+"""A ray ends at the first point within the smallest of these around it that holds any; beyond them, on the road."""
 ORIGIN_CELL_M = 0.25
 """Rays that begin in one cell see the scan from its middle ray's origin: 0.7 degrees at 10 m are the most it errs."""
 CUBE_M = 2.0
@@ -28,16 +26,15 @@ NEAR_M = 0.5
 def static_world(
     batch: FrameBatch,
     max_range_m: float,
-    past: bool = True,
 ) -> Tensor:  # [R] m
-    """Range of every ray of `batch.rays` in a world that stands still since the last scans: those of all LiDARs at the
-    sample's own frame, and with `past` those of `batch.past`, moved by the ego's motion.
+    """Range of every ray of `batch.rays`, traced through the last scans, where everything stands still: those of all
+    LiDARs at the sample's own frame and those of `batch.past`, moved by the ego's motion.
 
     Raises ValueError for a batch without rays or LiDAR.
     """
     if batch.rays is None or batch.lidar_points is None:
         raise ValueError("batch: the static world is looked up for FrameBatch.rays in FrameBatch.lidar_points")
-    points, owners = aggregated_scan(batch, past)
+    points, owners = aggregated_scan(batch)
     rays, found = batch.rays, torch.empty_like(batch.rays.ranges)
     for sample in range(len(batch)):
         own = rays.batch == sample
@@ -49,11 +46,10 @@ def static_world(
 
 def aggregated_scan(
     batch: FrameBatch,
-    past: bool = True,
 ) -> tuple[Tensor, Tensor]:  # [L, 3] m in the batch's (augmented) ego frames, [L] int64 sample
-    """The points of the frame's own sweeps, with `past` also of the frames before it."""
+    """The points of the frame's own sweeps and of the frames before it."""
     clouds, owners = [batch.lidar_points[:, :3]], [batch.lidar_batch]
-    for frame in batch.past if past else ():
+    for frame in batch.past:
         aug_from_past = aug_from_frame(batch, frame)[frame.lidar_batch]
         clouds.append(_moved(aug_from_past, frame.lidar_points[:, :3]))
         owners.append(frame.lidar_batch)
@@ -68,16 +64,18 @@ def aug_from_frame(batch: FrameBatch, other: FrameBatch) -> Tensor:  # [B, 4, 4]
 
 
 def look_up_ranges(
-    points: Array,  # [P, 3] m
+    points: Array,  # [P, 3] m, above the road at z = 0
     origins: Array,  # [R, 3] m
     directions: Array,  # [R, 3] unit length
     max_range_m: float,
 ) -> Array:  # [R] m
-    """How far along each ray the point lies whose direction, seen from where the ray begins, is nearest to the ray's.
+    """How far each ray goes among points as wide as a beam: to the first near it, else to a flat road at z = 0.
 
-    `max_range_m` where no point lies within the largest of RADII_RAD: nothing is known to stand there.
+    `max_range_m` where it meets neither: nothing is known to stand there.
     """
     found = np.full(len(origins), max_range_m)
+    down = (directions[:, 2] < 0) & (origins[:, 2] > 0)
+    found[down] = np.minimum(-origins[down, 2] / directions[down, 2], max_range_m)
     _, cell = np.unique(np.floor(origins / ORIGIN_CELL_M).astype(np.int64), axis=0, return_inverse=True)
     order = np.argsort(cell.ravel(), kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(cell.ravel()[order])) + 1) if len(order) else ():
@@ -85,18 +83,19 @@ def look_up_ranges(
         offsets = points - middle
         away = np.linalg.norm(offsets, axis=1)
         kept = np.flatnonzero(away > NEAR_M)
-        met = _nearest_bearings(directions[rows], offsets[kept] / away[kept, None])
+        met = _first_met(directions[rows], offsets[kept] / away[kept, None], away[kept])
         rows, met = rows[met >= 0], kept[met[met >= 0]]
         ends = offsets[met] + middle - origins[rows]
         found[rows] = np.clip((ends * directions[rows]).sum(1), 0.0, max_range_m)
     return found
 
 
-def _nearest_bearings(
+def _first_met(
     directions: Array,  # [r, 3] unit length
     bearings: Array,  # [p, 3] unit length
-) -> Array:  # [r] int64, row of the bearing, -1 for none
-    """By the chord, which is near enough to the angle."""
+    away: Array,  # [p] m
+) -> Array:  # [r] int64, row of the point, -1 for none
+    """Angles as chords, which are near enough."""
     found = np.full(len(directions), -1)
     axis = directions.mean(0) / max(np.linalg.norm(directions.mean(0)), 1e-9)
     widest = np.arccos(np.clip((directions @ axis).min(), -1, 1))
@@ -104,10 +103,8 @@ def _nearest_bearings(
     for radius in RADII_RAD:
         rest = np.flatnonzero(found < 0)
         ahead = np.flatnonzero(aside >= np.cos(min(widest + radius, np.pi)) - 1e-12)
-        if radius == RADII_RAD[-1]:
-            ahead = ahead[:: len(ahead) // COARSE_POINTS + 1]
-        ray, point, squared = neighbours_within(directions[rest], bearings[ahead], radius)
-        nearest = np.lexsort((squared, ray))
+        ray, point, _ = neighbours_within(directions[rest], bearings[ahead], radius)
+        nearest = np.lexsort((away[ahead[point]], ray))
         ray, first = np.unique(ray[nearest], return_index=True)
         found[rest[ray]] = ahead[point[nearest][first]]
     return found

@@ -106,8 +106,14 @@ for _horizon in ("1s", "3s"):
             FORECASTS[_name] = Metric(_name, f"{_of}{_words} {_horizon}", "m^2", 1.0, 2, False)
         _name = f"{_key}_gain_{_horizon}"
         FORECASTS[_name] = Metric(_name, f"{_words} {_horizon} below the static-world baseline's", "%", 100.0, 1)
-    for _key, _words in (("l1", "L1 along rays"), ("l1_median", "median along rays")):
-        FORECASTS[f"{_key}_{_horizon}"] = Metric(f"{_key}_{_horizon}", f"{_words} {_horizon}", "m", 1.0, 2, False)
+    for _key, _words in (
+        ("l1", "L1 along rays"), ("l1_median", "median along rays"),
+        *((f"l1_{_range}m", f"L1 along rays of {_range} m") for _range in LONG_RANGES),
+        *((f"l1_median_{_range}m", f"median along rays of {_range} m") for _range in LONG_RANGES),
+    ):  # fmt: skip
+        for _prefix, _of in (("", ""), ("static_", "static-world ")):
+            _name = f"{_prefix}{_key}_{_horizon}"
+            FORECASTS[_name] = Metric(_name, f"{_of}{_words} {_horizon}", "m", 1.0, 2, False)
 for _step in range(4):
     for _key, _words in (("iou", "IoU along rays"), ("slice_iou", "IoU above the ground")):
         _name = f"{_key}@{_step}.0s"

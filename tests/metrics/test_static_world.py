@@ -35,14 +35,22 @@ def test_rays_of_a_truck_that_drove_on_meet_the_wall_where_it_stands():
     found = look_up_ranges(wall(50.0), origins, unit(ends - origins), 300.0)
     away = np.linalg.norm(ends - origins, axis=1)
     assert np.abs(found - away).max() < 0.2 and np.median(np.abs(found - away)) < 0.03
-    assert (look_up_ranges(np.zeros((0, 3)), origins, unit(ends - origins), 300.0) == 300.0).all()
+    directions = unit(ends - origins)
+    road = np.where(directions[:, 2] < 0, 2 / np.abs(directions[:, 2]), np.inf).clip(max=300)
+    np.testing.assert_allclose(look_up_ranges(np.zeros((0, 3)), origins, directions, 300.0), road)
 
 
-def test_the_nearest_direction_is_taken_and_looked_for_ever_wider():
-    points = np.array([[100.0, 0.0, 0.0], [20.0, 1.0, 0.0]])
-    directions = unit(np.array([[1.0, 0.005, 0.0], [20.0, 0.8, 0.0], [20.0, 3.0, 0.0], [1.0, -4.0, 0.0]]))
-    found = look_up_ranges(points, np.zeros((4, 3)), directions, 300.0)
-    np.testing.assert_allclose(found, [100, 20.02, 19.9, 300], atol=0.05)
+def test_the_first_point_in_a_ray_of_growing_width_is_met_else_the_road():
+    points = np.array([[100.0, 0.0, 5.0], [20.0, 0.1, 5.0], [40.0, 9.0, 5.0]])  # the second 0.29 degrees aside
+    directions = unit(np.array([[1.0, 0, 0], [1.0, 0.003, 0], [40.0, 10.0, 0], [40.0, 11.5, 0], [40.0, -8.0, -4.0]]))
+    found = look_up_ranges(points, np.array([[0.0, 0, 5.0]]).repeat(5, 0), directions, 300.0)
+    # the narrowest width that holds a point decides before what is nearest: 0 degrees, then 0.11
+    np.testing.assert_allclose(found, [100, 20, 41, 300, np.sqrt(50**2 + 10**2 + 5**2)], atol=0.05)
+    within_a_beam = np.array([[100.0, 0.0, 5.0], [20.0, 0.05, 5.0]])  # both within 0.25 degrees: the far one is hidden
+    ahead = look_up_ranges(within_a_beam, np.array([[0.0, 0, 5.0]]), np.array([[1.0, 0, 0]]), 300.0)
+    assert ahead == pytest.approx(20, abs=0.01)
+    level, up = look_up_ranges(points[:0], np.full((2, 3), 2.0), unit(np.array([[0.0, 1, -0.001], [0, 1, 1]])), 300.0)
+    assert (level, up) == (300.0, 300.0)  # the road 2 km away, and none
 
 
 def frame(points, origins=None, at=0.0, **rest):
@@ -66,13 +74,13 @@ def rays_to(ends):
     return RayBundle(torch.zeros_like(ends), directions, ranges, zeros, zeros, integers, integers)
 
 
-def test_past_scans_are_moved_by_the_ego_and_used_on_demand():
+def test_past_scans_are_moved_by_the_ego():
     past = frame([[30.0, 5.0, 0.0]], at=10.0)
     batch = frame([[50.0, 0.0, 0.0]], at=12.0, past=(past,), rays=rays_to([[28.0, 5.0, 0], [60.0, 0, 0]]))
-    points, owners = aggregated_scan(batch, past=True)
+    points, owners = aggregated_scan(batch)
     torch.testing.assert_close(points, torch.tensor([[50.0, 0, 0], [28.0, 5, 0]])) and owners.tolist() == [0, 0]
-    assert static_world(batch, 300.0, past=True).tolist() == pytest.approx([np.hypot(28, 5), 50])
-    assert static_world(batch, 300.0, past=False).tolist() == [300.0, 50.0]  # 10 degrees away is another direction
+    assert static_world(batch, 300.0).tolist() == pytest.approx([np.hypot(28, 5), 50])
+    assert static_world(replace(batch, past=()), 300.0).tolist() == [300.0, 50.0]  # 10 degrees away is another direction
     with pytest.raises(ValueError, match="FrameBatch.rays"):
         static_world(past, 300.0)
     assert static_world(replace(frame(np.zeros((0, 3))), rays=batch.rays), 300.0).tolist() == [300.0, 300.0]
