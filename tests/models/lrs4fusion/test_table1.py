@@ -129,7 +129,11 @@ def test_detection_neck_and_head(models):
     ups = [(up.conv.in_channels, up.conv.out_channels, up.conv.stride[0]) for up in model.neck.ups]
     assert ups == [(128, 256, 1), (256, 256, 2)] and model.neck.out_channels == 512
     shared = model.head.shared[0].conv
-    assert (shared.in_channels, shared.out_channels) == (512, 64)
+    assert (shared.in_channels, shared.out_channels, shared.kernel_size) == (512, 64, (3, 3))
+    widths = [[output.out_features for output in branches.outputs] for branches in model.head.regressions]
+    assert widths == [[2, 1, 3, 2, 2]] * 7  # offset, height, log-size, heading, velocity
+    assert sum(branches.outputs[0].out_features for branches in model.head.heatmaps) == 12
+    assert {layer.kernel_size for stage in model.neck.stages for layer in _dense(stage)} == {(3, 3)}
     assert model.head.grid.cells == (128, 224) and model.head.grid.cell_m == 1.5625
 
 
