@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from src.geometry.constants import on_device
+from src.models.memory import FrameMemory
 from src.ops.fixed_shapes import Capacities
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
@@ -72,31 +73,6 @@ class ModelConfig:
         return self
 
 
-class TemporalMemory(Protocol):
-    """What a temporal detector carries from frame to frame, detached, one row per stream."""
-
-    @property
-    def present(self) -> Tensor:  # [T, B] bool
-        """Which streams remember their last, last but one, ... frame."""
-
-    def select(
-        self,
-        rows: Tensor,  # [B'] int64, row of each stream of the next batch in this memory
-        keep: Tensor,  # [B'] bool, False: the stream starts anew
-    ) -> Self:
-        """Memory for the next batch's streams."""
-
-    def to(self, device: torch.device | str) -> Self:
-        """The same memory on another device."""
-
-    def state(self) -> list[dict[str, Any]]:
-        """Tensors and plain containers, for a checkpoint."""
-
-    @classmethod
-    def from_state(cls, state: list[dict[str, Any]]) -> Self:
-        """The memory that `state` described."""
-
-
 class FixedForm(Protocol):
     """A frame of one stream by a detector in fixed shapes (`ops/fixed_shapes.py`), which always launches the same."""
 
@@ -137,7 +113,7 @@ class Detector(nn.Module, ABC):
     `package.module:function`, that each is; `part: inner` lies within `part`."""
     latency_parts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """The parts of Table 15 by the methods that each is; one within another counts for both."""
-    memory_type: ClassVar[type[TemporalMemory] | None] = None
+    memory_type: ClassVar[type[FrameMemory] | None] = None
     """Of what `forward` remembers; None for a model of single frames."""
     trains_last_transition: bool = False
     """Whether a step learns also through the encoding of the frame before, where frames bring their past along."""
@@ -157,7 +133,7 @@ class Detector(nn.Module, ABC):
         """Everything that `loss` and `decode` need for the B frames of a batch, and the memory with these frames added.
 
         `memory` is what the call for the previous frames of the same streams returned, row by row (see
-        `TemporalMemory.select`); None where there is none. A detector of single frames takes and returns None.
+        `FrameMemory.select`); None where there is none. A detector of single frames takes and returns None.
         """
 
     def fixed_form(self, capacities: Capacities | None = None) -> FixedForm | None:
@@ -173,7 +149,7 @@ class Detector(nn.Module, ABC):
         return self(batch, memory)[1]
 
     def restore_memory(self, state: list[dict[str, Any]]) -> Any:
-        """The memory that `TemporalMemory.state` described. Raises NotImplementedError for single-frame detectors."""
+        """The memory that `FrameMemory.state` described. Raises NotImplementedError for single-frame detectors."""
         if self.memory_type is None:
             raise NotImplementedError(f"{type(self).__name__} has no memory")
         return self.memory_type.from_state(state)

@@ -11,7 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.models.detector import Objective, TemporalMemory
+from src.models.detector import Objective
+from src.models.memory import FrameMemory
 from src.structures.batch import FrameBatch
 from src.training.evaluation_mode import evaluation_mode
 from src.training.module import TrainingModule
@@ -32,9 +33,9 @@ class TemporalModule(TrainingModule):
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
         # Sets of streams take turns (`data.stream_sets`): the streams [B] int64 of each last batch, and their memory.
-        self.memories: list[tuple[Tensor, TemporalMemory]] = []
-        self._before_step: list[tuple[Tensor, TemporalMemory]] = []
-        self._used: TemporalMemory | None = None  # by the last batch
+        self.memories: list[tuple[Tensor, FrameMemory]] = []
+        self._before_step: list[tuple[Tensor, FrameMemory]] = []
+        self._used: FrameMemory | None = None  # by the last batch
         self.oracle: TrueMotion | None = None  # of an evaluation
 
     def run(self, batch: FrameBatch) -> Any:
@@ -54,7 +55,7 @@ class TemporalModule(TrainingModule):
             self.memories.append((batch.streams, memory))
         return output
 
-    def remember(self, frames: tuple[FrameBatch, ...]) -> TemporalMemory | None:
+    def remember(self, frames: tuple[FrameBatch, ...]) -> FrameMemory | None:
         """What the model, as it is used later, remembers of the frames before a batch, without gradient.
 
         In training a model may learn through the last of them (`Detector.trains_last_transition`).
@@ -65,7 +66,7 @@ class TemporalModule(TrainingModule):
                 memory = self.model.transition(frame, memory)
         return self.model.transition(frames[-1], memory) if learns else memory
 
-    def select_memory(self, batch: FrameBatch) -> TemporalMemory | None:
+    def select_memory(self, batch: FrameBatch) -> FrameMemory | None:
         """Memory of the batch's streams, row by row, or None where none of them has any."""
         if batch.streams is None:
             raise ValueError(
@@ -134,7 +135,7 @@ class TemporalModule(TrainingModule):
         self.forget()
 
     def rank_state(self) -> dict[str, Any]:
-        """As the base, with `memories`: a list of {streams: list[int], frames: `TemporalMemory.state`}."""
+        """As the base, with `memories`: a list of {streams: list[int], frames: `FrameMemory.state`}."""
         return super().rank_state() | {"memories": _plain(self.memories)}
 
     def restore_rank(self, state: dict[str, Any]) -> None:
@@ -155,7 +156,7 @@ class TemporalModule(TrainingModule):
             )
 
 
-def _plain(memories: list[tuple[Tensor, TemporalMemory]]) -> list[dict[str, Any]]:
+def _plain(memories: list[tuple[Tensor, FrameMemory]]) -> list[dict[str, Any]]:
     return [{"streams": streams.tolist(), "frames": memory.to("cpu").state()} for streams, memory in memories]
 
 

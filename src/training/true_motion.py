@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from src.errors import ConfigError
 from src.geometry.box_distance import footprint_distances
 from src.geometry.tensor_transforms import rotate
 from src.metrics.diagnostics import NEAR_M
@@ -42,8 +41,6 @@ class TrueMotion:
 
     def correct(self, memory: FrameMemory, batch: FrameBatch) -> FrameMemory:
         """The memory as it should be for the batch's frames. Raises ConfigError for one that holds no velocities."""
-        if not isinstance(memory, FrameMemory):
-            raise ConfigError(f"oracle={self.oracle.value}: {type(memory).__name__} remembers no velocities")
         now = [self.truth.index_of[token] for token in batch.tokens]
         return memory.mapped(lambda frame: frame.with_velocities(partial(self._velocities, frame, now)))
 

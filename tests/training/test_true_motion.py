@@ -153,5 +153,3 @@ def test_a_memory_without_velocities_has_nothing_to_be_told():
     )
     with pytest.raises(ConfigError, match="RememberedFrame holds no velocities"):
         TrueMotion(SET, Oracle.velocity).correct(Sums((plain,)), batch())
-    with pytest.raises(ConfigError, match="oracle=motion: list remembers no velocities"):
-        TrueMotion(SET, Oracle.motion).correct([], batch())
