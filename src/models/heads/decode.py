@@ -9,9 +9,8 @@ from enum import Enum
 import torch
 from torch import Tensor
 
-from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant, on_device
-from src.ops.box_codes import WIDTHS, attributes_by_rule, box_geometry
+from src.ops.box_codes import WIDTHS
 from src.ops.nms import conflicting_pairs, greedy_survivors
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import ATTRIBUTES, CLASS_ATTRIBUTE_PREFIX, CLASS_RANGE_M, CLASSES
@@ -126,26 +125,6 @@ def top_candidates(
     return Candidates(rows[order], labels[order], best[order], counts)
 
 
-def boxes_from_codes(
-    cells: Tensor,  # [n, 2] int64 (row, col)
-    codes: Tensor,  # [n, CODE_SIZE]
-    labels: Tensor,  # [n] int64
-    scores: Tensor,  # [n]
-    grid: BEVGrid,
-) -> Boxes3D:
-    """Boxes by `box_geometry`; attributes are not set."""
-    centers, sizes, yaws = box_geometry(cells, codes, grid)
-    return Boxes3D(
-        centers=centers,
-        sizes=sizes,
-        yaws=yaws,
-        velocities=codes[:, 8:10],
-        labels=labels,
-        attributes=torch.full_like(labels, -1),
-        scores=scores,
-    )
-
-
 def boxes_of_columns(
     columns: Tensor,  # [n, sum of WIDTHS]
 ) -> Boxes3D:
@@ -198,13 +177,6 @@ def suppress(
         chosen[block % len(chosen)] += [row for row in kept[:MAX_BOXES_PER_GROUP] if near[row]]
     best = [sorted(rows, key=lambda row: -scores[row])[:max_boxes] for rows in chosen]  # stable: ties by group
     return [boxes[on_device(rows, torch.int64, boxes.labels.device)] for rows in best]
-
-
-def rule_attributes(
-    boxes: Boxes3D,
-) -> Tensor:  # [K] int64, -1 for none
-    """Attributes from the speed (table of method 7)."""
-    return attributes_by_rule(boxes.velocities, boxes.centers, boxes.sizes, boxes.labels, ATTRIBUTE_RULES)
 
 
 def allowed_attributes(device: torch.device) -> Tensor:  # [12, 11] bool

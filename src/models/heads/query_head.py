@@ -15,9 +15,10 @@ from src.losses.classification import sigmoid_focal
 from src.losses.normalizers import mean_over_ranks
 from src.losses.regression import masked_l1
 from src.models.detector import Objective
-from src.models.heads.decode import Suppression, boxes_from_codes, rule_attributes, suppress, top_candidates
+from src.models.heads.decode import ATTRIBUTE_RULES, Suppression, suppress, top_candidates
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.ops.assignment import assign
+from src.ops.box_codes import LOG_SIZE_LIMIT, attributes_by_rule
 from src.structures.boxes import Boxes3D
 from src.structures.queries import SPEED_UNIT_MPS, Queries
 from src.structures.taxonomy import CLASSES, MAX_BOXES_PER_SAMPLE
@@ -179,8 +180,8 @@ class SetPredictionHead(nn.Module):
         batch_size, size = prediction.valid.shape
         scores = prediction.logits.sigmoid() * prediction.valid[..., None]
         sample = torch.arange(batch_size, device=scores.device).repeat_interleave(size)
-        codes, method = prediction.codes.flatten(0, 1), Suppression.maxpool
-        return decode_codes(scores.flatten(0, 1), codes, sample, batch_size, self.grid, self.config, method)
+        scores, codes = scores.flatten(0, 1), prediction.codes.flatten(0, 1)
+        return decode_codes(scores, codes, sample, batch_size, self.config, Suppression.maxpool)
 
 
 def decode_codes(
@@ -188,17 +189,15 @@ def decode_codes(
     codes: Tensor,  # [n, CODE_SIZE], as in `QueryPrediction`
     sample: Tensor,  # [n] int64, ascending
     batch_size: int,
-    grid: BEVGrid,
     config: QueryHeadConfig,
     method: Suppression,  # `maxpool`: nothing is suppressed
 ) -> list[Boxes3D]:
     """Boxes of each sample, best first, at most `max_boxes`: one for each row and class above the threshold."""
     best = top_candidates(scores, sample, batch_size, config.score_threshold)
-    codes = codes[best.rows]
-    codes = torch.cat([grid.to_cells(codes[:, :2]), codes[:, 2:]], dim=1)  # as offsets from the first cell
-    cells = codes.new_zeros(len(codes), 2, dtype=torch.int64)
-    boxes = boxes_from_codes(cells, codes, best.labels, best.scores, grid)
-    boxes.attributes = rule_attributes(boxes)
+    centers, log_sizes, heading, velocities = codes[best.rows].split([3, 3, 2, 2], dim=1)
+    sizes, yaws = log_sizes.clamp(-LOG_SIZE_LIMIT, LOG_SIZE_LIMIT).exp(), torch.atan2(heading[:, 1], heading[:, 0])
+    attributes = attributes_by_rule(velocities, centers, sizes, best.labels, ATTRIBUTE_RULES)
+    boxes = Boxes3D(centers, sizes, yaws, velocities, best.labels, attributes, best.scores)
     return suppress(boxes, best.counts, method, config.max_boxes)
 
 

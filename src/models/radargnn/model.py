@@ -205,7 +205,7 @@ class PointHead(nn.Module):
         class above the threshold."""
         graph, scores = prediction.graph, prediction.logits.sigmoid()
         codes = graph.to_frame(prediction.codes, slice(None))
-        return decode_codes(scores, codes, graph.sample, graph.batch_size, self.grid, self.config, self.config.nms)
+        return decode_codes(scores, codes, graph.sample, graph.batch_size, self.config, self.config.nms)
 
 
 class RadarGNN(Detector):

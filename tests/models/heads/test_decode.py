@@ -9,15 +9,15 @@ import torch
 
 from src.geometry.bev_grid import BEVGrid
 from src.models.heads.decode import (
+    ATTRIBUTE_RULES,
     CIRCLE_GROUPS,
     CIRCLE_RADII_M,
     Suppression,
-    boxes_from_codes,
     learned_attributes,
-    rule_attributes,
     suppress,
     top_candidates,
 )
+from src.ops.box_codes import attributes_by_rule, box_geometry
 from src.ops.nms import conflicting_pairs, greedy_survivors
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import ATTRIBUTES, CLASS_RANGE_M, CLASSES
@@ -51,16 +51,16 @@ def test_golden_decoding(dtype: torch.dtype, tolerance: float) -> None:
     cells = torch.from_numpy(CASE["cells"].astype(np.int64))
     best = top_candidates(scores, cells[:, 0], int(cells[-1, 0]) + 1, META["score_thresh"], META["K"])
     groups = torch.arange(7).repeat_interleave(torch.tensor([sum(counts) for counts in best.counts]))
-    boxes = boxes_from_codes(cells[best.rows, 1:], codes[best.rows, groups], best.labels, best.scores, GRID)
+    codes = codes[best.rows, groups]
+    centers, sizes, yaws = box_geometry(cells[best.rows, 1:], codes, GRID)
+    boxes = torch.cat([centers, sizes, yaws[:, None], codes[:, 8:10]], dim=1)
     blocks = torch.arange(len(boxes)).split(sum(best.counts, []))
     for block, rows in enumerate(blocks):
         group, sample = divmod(block, len(best.counts[0]))
         names, key = HEAD_GROUPS[group], f"decode/g{group}/b{sample}"
-        mine = boxes[rows]
-        found = torch.cat([mine.centers, mine.sizes, mine.yaws[:, None], mine.velocities], dim=1)
-        np.testing.assert_allclose(found, CASE[f"{key}/boxes"], rtol=0, atol=tolerance)
-        np.testing.assert_allclose(mine.scores, CASE[f"{key}/scores"], rtol=0, atol=tolerance)
-        assert [names.index(CLASSES[label]) for label in mine.labels] == CASE[f"{key}/labels"].tolist()
+        np.testing.assert_allclose(boxes[rows], CASE[f"{key}/boxes"], rtol=0, atol=tolerance)
+        np.testing.assert_allclose(best.scores[rows], CASE[f"{key}/scores"], rtol=0, atol=tolerance)
+        assert [names.index(CLASSES[label]) for label in best.labels[rows]] == CASE[f"{key}/labels"].tolist()
 
 
 def test_equal_scores_come_in_the_order_of_the_cells_and_only_the_best_of_a_group_and_sample() -> None:
@@ -128,7 +128,7 @@ def test_golden_circle_suppression(radius: float) -> None:
 def test_log_sizes_are_clamped() -> None:
     codes = torch.zeros(1, 10)
     codes[0, 3:6] = torch.tensor([9.0, -9.0, 1.0])
-    sizes = boxes_from_codes(torch.zeros(1, 2).long(), codes, torch.zeros(1).long(), torch.ones(1), GRID).sizes
+    _, sizes, _ = box_geometry(torch.zeros(1, 2).long(), codes, GRID)
     torch.testing.assert_close(sizes[0].log(), torch.tensor([5.0, -5.0, 1.0]))
 
 
@@ -190,7 +190,8 @@ def test_attribute_rule() -> None:
         ("traffic_cone", 0.0, 5.0): None,
         ("animal", 0.0, 5.0): None,
     }
-    found = rule_attributes(make_boxes(*[(name, 0, 0, z, speed, 0.5) for name, z, speed in expected]))
+    boxes = make_boxes(*[(name, 0, 0, z, speed, 0.5) for name, z, speed in expected])
+    found = attributes_by_rule(boxes.velocities, boxes.centers, boxes.sizes, boxes.labels, ATTRIBUTE_RULES)
     names = [None if index < 0 else ATTRIBUTES[index] for index in found.tolist()]
     assert names == list(expected.values())
 
