@@ -122,9 +122,14 @@ def save_submission(config: Config, path: Path, tokens: list[str], table: Detect
     return True
 
 
-def build_module(config: Config, tree: dict[str, Any], datamodule: DetectionDataModule) -> TrainingModule:
+def build_module(
+    config: Config,
+    tree: dict[str, Any],
+    datamodule: DetectionDataModule,
+    model: Detector | None = None,  # None: as `build_model`
+) -> TrainingModule:
     """The LightningModule of a run; `tree` is the configuration as plain values."""
-    model = build_model(config)
+    model = build_model(config) if model is None else model
     return MODULES[config.phase.module](
         model,
         optim=config.optim,

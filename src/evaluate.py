@@ -8,14 +8,14 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from src.assembly import build_datamodule, build_module, data_root, save_submission
+from src.assembly import build_datamodule, build_module, data_root, restored_model, save_submission
 from src.config import compose_config, refuse_options_of_others, restore_config
 from src.errors import ConfigError, DataError
 from src.metrics.bootstrap import score_report
 from src.metrics.detection import score_detections
 from src.metrics.score_text import format_scores
 from src.metrics.submission import load_submission
-from src.reliability.checkpoints import load_model_weights, read_checkpoint
+from src.reliability.checkpoints import read_checkpoint
 from src.reliability.command import run_command
 from src.reliability.cpu import tune_cpu
 from src.training.evaluator import Evaluator
@@ -67,8 +67,7 @@ def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[Evalu
     config = restore_config(tree, overrides)
     config.trainer.device()  # or an error, before data are made
     datamodule = build_datamodule(config, data_root(config, write=False))
-    module = build_module(config, tree, datamodule)
-    load_model_weights(module.model, checkpoint, path)
+    module = build_module(config, tree, datamodule, restored_model(config, checkpoint, path))
     if config.oracle is not Oracle.none:
         if not isinstance(module, TemporalModule):
             raise ConfigError(f"oracle={config.oracle.value}: this checkpoint is of single frames and has no memory")

@@ -51,6 +51,16 @@ def by_place(box):
 
 
 @pytest.mark.slow
+def test_an_evaluation_needs_the_checkpoint_alone(outputs, tmp_path):
+    """The backbone's pretrained file, which training began from, need not be on this machine."""
+    backbone = ("backbone=resnet50", "backbone.image_size_px=[64,192]", "backbone.weights=/nowhere/weights.pth")
+    settings = ("phase=phase1", "data.world.num_val_scenes=2", f"paths.outputs={outputs}", *backbone)
+    path = write_checkpoint(tmp_path / "a.ckpt", *settings)
+    evaluate.main([f"checkpoint={path}", f"paths.outputs={outputs}", f"out={tmp_path}"])
+    assert "mAP" in json.loads((tmp_path / "metrics.json").read_text())
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
 def test_boxes_are_those_of_evaluate(checkpoints, outputs, tmp_path, phase):
     base = (f"paths.outputs={outputs}",)

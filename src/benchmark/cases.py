@@ -10,12 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.assembly import build_model
+from src.assembly import build_model, restored_model
 from src.config import Config
 from src.models.deploy.inference import prepare_for_inference
 from src.models.detector import Detector
 from src.ops.precision import computing
-from src.reliability.checkpoints import load_model_weights, read_checkpoint
+from src.reliability.checkpoints import read_checkpoint
 from src.structures.batch import FrameBatch
 from src.structures.gaussians import GaussianSet
 from src.training.phases import EVALUATORS
@@ -78,17 +78,18 @@ class Case:
 
 def build_case(config: Config, batch: FrameBatch, device: torch.device) -> Case:
     """The configured model, with weights of `checkpoint=PATH` if given, before its first batch."""
-    model = build_model(config).to(device)
-    load_weights(config, model)
+    model = measured_model(config).to(device)
     prepared = prepare_for_inference(model, config.precision)
     learns_boxes = EVALUATORS[config.phase.task].labels
     return Case(model.train(), prepared, batch, None, device, config.precision, learns_boxes)
 
 
-def load_weights(config: Config, model: Detector) -> None:
-    """Weights of `checkpoint=PATH`, if given; it must be of this configuration."""
-    if config.checkpoint is not None:
-        load_model_weights(model, read_checkpoint(Path(config.checkpoint)), Path(config.checkpoint))
+def measured_model(config: Config) -> Detector:
+    """The configured model, with the weights of `checkpoint=PATH`, if given, which must be of this configuration."""
+    if config.checkpoint is None:
+        return build_model(config)
+    path = Path(config.checkpoint)
+    return restored_model(config, read_checkpoint(path), path)
 
 
 def expect_trained_scores(case: Case) -> tuple[Any, Any]:

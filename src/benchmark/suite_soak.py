@@ -21,8 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.assembly import build_datamodule, build_model, build_module, data_root
-from src.benchmark.cases import CELLS_PER_VEHICLE, KEY_FRAME_S, Case, expect_trained_scores, load_weights
+from src.assembly import build_datamodule, build_module, data_root
+from src.benchmark.cases import CELLS_PER_VEHICLE, KEY_FRAME_S, Case, expect_trained_scores, measured_model
 from src.benchmark.page import page_name
 from src.benchmark.parts import tensors_in, wrapped_parts
 from src.benchmark.plots import draw_soak
@@ -104,8 +104,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
 def make_detector(config: Config, datamodule: DetectionDataModule, device: torch.device) -> StreamingDetector:
     """The configured model, as prediction prepares it."""
     torch.manual_seed(config.seed)
-    model = build_model(config)
-    load_weights(config, model)
+    model = measured_model(config)
     detector = StreamingDetector(model, config.grid.build(), datamodule.settings, device, config.precision)
     if config.checkpoint is None:
         frame = next(datamodule.stream()).to(device)
@@ -167,8 +166,7 @@ def soak_training(
 ) -> list[Row]:
     """The curve of a training of so many frames, rounded up to whole epochs, in a folder that is removed again."""
     torch.manual_seed(config.seed)
-    module = build_module(config, tree, datamodule)
-    load_weights(config, module.model)
+    module = build_module(config, tree, datamodule, measured_model(config))
     epochs = math.ceil(frames / epoch_frames(config, datamodule))
     curve = Curve(frames, device, lambda: [memory for _, memory in module.memories])
 
