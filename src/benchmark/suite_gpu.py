@@ -56,8 +56,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
 
 def full_case(config: Config, device: torch.device) -> Case:
     """The configured model, its images in full size, on the road of the scale."""
-    image_size_px = None if config.backbone is None else tuple(config.backbone.image_size_px)
-    return make_case(config, device, ROADS[config.scale], image_size_px)
+    return make_case(config, device, ROADS[config.scale], tuple(config.backbone.image_size_px))
 
 
 def frame_seconds(case: Case, road: Highway, frames: int) -> list[float]:

@@ -70,13 +70,12 @@ def make_case(
     config: Config,
     device: torch.device = CPU,
     road: Highway = ROAD,
-    image_size_px: tuple[int, int] | None = IMAGE_SIZE_PX,
+    image_size_px: tuple[int, int] = IMAGE_SIZE_PX,
 ) -> Case:
     """The configured model on a made frame, its memory full."""
     torch.manual_seed(config.seed)
-    if config.backbone is not None:
-        config = replace(config, backbone=replace(config.backbone, image_size_px=list(image_size_px)))
-    batch = made_batch(config.data.batch_size, road, image_size_px or IMAGE_SIZE_PX).to(device)
+    config = replace(config, backbone=replace(config.backbone, image_size_px=list(image_size_px)))
+    batch = made_batch(config.data.batch_size, road, image_size_px).to(device)
     case = build_case(config, batch, device)
     with torch.no_grad():
         for _ in range(config.model.memory_frames):
