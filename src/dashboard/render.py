@@ -25,6 +25,7 @@ from src.dashboard.folders import Picture
 from src.report.metric_names import METRICS, Metric
 from src.report.score_tables import metrics_of
 from src.report.time_left import duration
+from src.training.identity import leaves
 
 TEMPLATES = Path(__file__).parent / "templates"
 SUMMARY = tuple(METRICS[name] for name in ("mAP", "NDS", "mAVE"))
@@ -233,19 +234,15 @@ def train_command(run: Run) -> str | None:
     return " ".join(["python -m src.train", *overrides]) if overrides is not None else None
 
 
-def flat_config(tree: Any, prefix: str = "") -> list[tuple[str, str]]:
+def flat_config(tree: dict[str, Any]) -> list[tuple[str, str]]:
     """Dotted keys and values of a configuration, in its order."""
-    if isinstance(tree, dict) and tree:
-        return [
-            pair
-            for key, value in tree.items()
-            for pair in flat_config(value, f"{prefix}.{key}" if prefix else str(key))
-        ]
-    if tree == {}:
-        return []
     words = {None: "null", True: "true", False: "false"}
-    text = words[tree] if tree is None or isinstance(tree, bool) else str(tree)
-    return [(prefix, text.replace("\n", " "))]
+
+    def written(value: Any) -> str:
+        text = words[value] if value is None or isinstance(value, bool) else str(value)
+        return text.replace("\n", " ")
+
+    return [(key, written(value)) for key, value in leaves(tree).items()]
 
 
 def config_difference(mine: list[tuple[str, str]], theirs: list[tuple[str, str]]) -> list[tuple[str, str, str]]:

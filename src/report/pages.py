@@ -32,7 +32,7 @@ from src.report.score_tables import (
     metrics_of,
     score_table,
 )
-from src.training.identity import OUTSIDE_IDENTITY, TEMPORAL_DATA_KEYS, YOUNGER_KEYS, is_of, key_of
+from src.training.identity import OUTSIDE_IDENTITY, TEMPORAL_DATA_KEYS, YOUNGER_KEYS, is_of, key_of, leaves
 
 FURTHER = "phase1_further"
 """What phase 2 is compared with; it stands on that page alone."""
@@ -183,20 +183,12 @@ def changed_since(run: RunResult, defaults: dict[str, Any]) -> list[str]:
         free = [key for key in free if key != "model"]  # else the choice of another model frees all of it
     if not run.config["phase"].get("temporal", True):
         free += [f"data.{key}" for key in TEMPORAL_DATA_KEYS]
-    had = YOUNGER_KEYS | _leaves(run.config)
+    had = YOUNGER_KEYS | leaves(run.config)
     return [
         f"{key}={json.dumps(had[key]) if not isinstance(had[key], str) else had[key]}"
-        for key, today in _leaves(defaults).items()
+        for key, today in leaves(defaults).items()
         if key in had and had[key] != today and not is_of(key, free)
     ]
-
-
-def _leaves(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Values by dotted key."""
-    leaves: dict[str, Any] = {}
-    for key, value in tree.items():
-        leaves |= _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return leaves
 
 
 def _is_default(key: str, override: str, defaults: dict[str, Any]) -> bool:

@@ -23,7 +23,7 @@ from src.errors import CheckpointError, ConfigError, DataError, DivergedError, H
 from src.models.detector import Detector
 from src.reliability.checkpoints import LAST, OpenCheckpoint, load_model_weights, open_checkpoint
 from src.reliability.processes import die_with_parent
-from src.training.identity import RUN_ID, TEMPORAL_DATA_KEYS, is_of, run_identity
+from src.training.identity import RUN_ID, TEMPORAL_DATA_KEYS, is_of, leaves, run_identity
 from src.training.run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
@@ -184,14 +184,8 @@ def differing_settings(
     Loss weights and what is temporal are the new phase's own.
     """
 
-    def flat(node: Any, prefix: str) -> dict[str, Any]:
-        if not isinstance(node, dict):
-            return {prefix: node}
-        return {key: value for name in node for key, value in flat(node[name], f"{prefix}.{name}").items()}
-
     def settings(tree: dict[str, Any]) -> dict[str, Any]:
-        parts = [flat(tree.get(name), name) for name in ("model", "backbone", "grid", "data")]
-        whole = {key: value for part in parts for key, value in part.items()}
+        whole = leaves({name: tree.get(name) for name in ("model", "backbone", "grid", "data")})
         return {key: value for key, value in whole.items() if not key.startswith("data.") or key in INPUT_SETTINGS}
 
     before, after = settings(old), settings(new)

@@ -88,6 +88,14 @@ def without_keys(tree: dict[str, Any], keys: Iterable[str]) -> dict[str, Any]:
     return tree
 
 
+def leaves(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of a configuration by dotted key, in its order; an empty node has none."""
+    found: dict[str, Any] = {}
+    for key, value in tree.items():
+        found |= leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return found
+
+
 def _value_at(tree: dict[str, Any], key: str) -> Any:
     """What stands at a dotted key; None where there is nothing."""
     node: Any = tree
