@@ -15,8 +15,9 @@ from src.losses.loss_weights import LossWeights
 from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.detector import Detector, ModelConfig, Objective
 from src.models.heads.center_head import BoxOptions
+from src.models.heads.decode import DecodeConfig
 from src.models.heads.keypoint_head import CameraMaps, camera_losses
-from src.models.heads.query_head import QueryHeadConfig, QueryPrediction, SetPredictionHead
+from src.models.heads.query_head import QueryPrediction, SetPredictionHead
 from src.models.layers.views import CameraViews
 from src.models.query_denoising import DenoisingConfig, NoisyQueries, denoising_loss, noisy_queries
 from src.models.query_memory import QueryMemory, QueryMemoryConfig, QueryPropagation, RecalledQueries
@@ -54,7 +55,7 @@ class QueryDetectorConfig(ModelConfig):
 
     temporal: QueryMemoryConfig | None  # null: single frames, phase 1
     denoising: DenoisingConfig
-    head: QueryHeadConfig
+    head: DecodeConfig
     loss: QueryLossConfig
 
     @property

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import ConfigError, require_least
+from src.errors import require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
 from src.losses.classification import penalty_reduced_focal
@@ -20,6 +20,7 @@ from src.models.heads.branches import Branches, checkpointed_branches
 from src.models.heads.decode import (
     ATTRIBUTE_RULES,
     AttributeSource,
+    DecodeConfig,
     Suppression,
     allowed_attributes,
     boxes_of_columns,
@@ -35,7 +36,7 @@ from src.ops.nms import maxpool_peaks
 from src.ops.segment_reduce import segment_count
 from src.structures.boxes import Boxes3D
 from src.structures.sparse_bev import SparseBEV
-from src.structures.taxonomy import ATTRIBUTES, CLASSES, MAX_BOXES_PER_SAMPLE
+from src.structures.taxonomy import ATTRIBUTES, CLASSES
 from src.targets.heatmap import CODE_SIZE, GROUP_OF_CLASS, HEAD_GROUPS, HeadTargets, head_targets
 
 # Probability 0.1 for every cell at the start, so that the focal loss is not drowned by background.
@@ -61,22 +62,12 @@ class TrainRegression(Enum):
 
 
 @dataclass(kw_only=True)
-class HeadConfig:
+class HeadConfig(DecodeConfig):
     """Settings of the head (`model.head`). Raises ConfigError for impossible values."""
 
     nms: Suppression  # method 7
-    score_threshold: float  # boxes at or below are dropped
-    max_boxes: int  # per sample, best scores
     attributes: AttributeSource
     train_regression: TrainRegression
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.score_threshold < 1:
-            raise ConfigError(f"model.head.score_threshold={self.score_threshold}: must be in 0..1, 1 excluded")
-        if not 1 <= self.max_boxes <= MAX_BOXES_PER_SAMPLE:
-            raise ConfigError(
-                f"model.head.max_boxes={self.max_boxes}: must be in 1..{MAX_BOXES_PER_SAMPLE}; evaluators refuse more"
-            )
 
 
 @dataclass(kw_only=True)

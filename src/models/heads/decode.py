@@ -9,11 +9,12 @@ from enum import Enum
 import torch
 from torch import Tensor
 
+from src.errors import ConfigError
 from src.geometry.constants import constant, on_device
 from src.ops.box_codes import WIDTHS
 from src.ops.nms import conflicting_pairs, greedy_survivors
 from src.structures.boxes import Boxes3D
-from src.structures.taxonomy import ATTRIBUTES, CLASS_ATTRIBUTE_PREFIX, CLASS_RANGE_M, CLASSES
+from src.structures.taxonomy import ATTRIBUTES, CLASS_ATTRIBUTE_PREFIX, CLASS_RANGE_M, CLASSES, MAX_BOXES_PER_SAMPLE
 from src.targets.heatmap import GROUP_OF_CLASS, HEAD_GROUPS
 
 MAX_CANDIDATES_PER_GROUP = 500
@@ -78,6 +79,22 @@ class AttributeSource(Enum):
 
     rule = "rule"
     learned = "learned"
+
+
+@dataclass(kw_only=True)
+class DecodeConfig:
+    """Which boxes every head gives (`model.head`). Raises ConfigError for impossible values."""
+
+    score_threshold: float  # boxes at or below are dropped
+    max_boxes: int  # per sample, best scores
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.score_threshold < 1:
+            raise ConfigError(f"model.head.score_threshold={self.score_threshold}: must be in 0..1, 1 excluded")
+        if not 1 <= self.max_boxes <= MAX_BOXES_PER_SAMPLE:
+            raise ConfigError(
+                f"model.head.max_boxes={self.max_boxes}: must be in 1..{MAX_BOXES_PER_SAMPLE}; evaluators refuse more"
+            )
 
 
 @dataclass

@@ -8,20 +8,19 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant, on_device
 from src.losses.classification import sigmoid_focal
 from src.losses.normalizers import mean_over_ranks
 from src.losses.regression import masked_l1
 from src.models.detector import Objective
-from src.models.heads.decode import ATTRIBUTE_RULES, Suppression, suppress, top_candidates
+from src.models.heads.decode import ATTRIBUTE_RULES, DecodeConfig, Suppression, suppress, top_candidates
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.ops.assignment import assign
 from src.ops.box_codes import LOG_SIZE_LIMIT, attributes_by_rule
 from src.structures.boxes import Boxes3D
 from src.structures.queries import SPEED_UNIT_MPS, Queries
-from src.structures.taxonomy import CLASSES, MAX_BOXES_PER_SAMPLE
+from src.structures.taxonomy import CLASSES
 from src.targets.heatmap import CODE_SIZE
 from src.targets.supervision import supervised_boxes, upload_boxes
 
@@ -29,22 +28,6 @@ INITIAL_SIZE_M = (4.5, 2.0, 1.8)
 """Length, width and height before the head has learnt any."""
 CLASS_COST, BOX_COST = 2.0, 0.25
 """Of the assignment, as in DETR3D and what came of it; velocities cost nothing there."""
-
-
-@dataclass(kw_only=True)
-class QueryHeadConfig:
-    """Settings of the head (`model.head`). Raises ConfigError for impossible values."""
-
-    score_threshold: float  # boxes at or below are dropped
-    max_boxes: int  # per sample, best scores
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.score_threshold < 1:
-            raise ConfigError(f"model.head.score_threshold={self.score_threshold}: must be in 0..1, 1 excluded")
-        if not 1 <= self.max_boxes <= MAX_BOXES_PER_SAMPLE:
-            raise ConfigError(
-                f"model.head.max_boxes={self.max_boxes}: must be in 1..{MAX_BOXES_PER_SAMPLE}; evaluators refuse more"
-            )
 
 
 @dataclass
@@ -65,7 +48,7 @@ class QueryPrediction:
 class SetPredictionHead(nn.Module):
     """Two networks of two layers, shared by all layers of a decoder as in StreamPETR."""
 
-    def __init__(self, config: QueryHeadConfig, channels: int, grid: BEVGrid, velocity_code_weight: float) -> None:
+    def __init__(self, config: DecodeConfig, channels: int, grid: BEVGrid, velocity_code_weight: float) -> None:
         super().__init__()
         self.config, self.grid = config, grid
         self.code_weights = (1.0,) * (CODE_SIZE - 2) + (velocity_code_weight,) * 2
@@ -189,7 +172,7 @@ def decode_codes(
     codes: Tensor,  # [n, CODE_SIZE], as in `QueryPrediction`
     sample: Tensor,  # [n] int64, ascending
     batch_size: int,
-    config: QueryHeadConfig,
+    config: DecodeConfig,
     method: Suppression,  # `maxpool`: nothing is suppressed
 ) -> list[Boxes3D]:
     """Boxes of each sample, best first, at most `max_boxes`: one for each row and class above the threshold."""

@@ -21,8 +21,8 @@ from src.losses.regression import masked_l1
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.detector import Detector, ModelConfig, Objective
 from src.models.heads.center_head import BoxOptions
-from src.models.heads.decode import Suppression
-from src.models.heads.query_head import INITIAL_SIZE_M, QueryHeadConfig, box_codes, decode_codes
+from src.models.heads.decode import DecodeConfig, Suppression
+from src.models.heads.query_head import INITIAL_SIZE_M, box_codes, decode_codes
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.sparse import RowBatchNorm
 from src.models.radargnn.graph import GraphConfig, PointGraph, build_graph
@@ -38,7 +38,7 @@ SCORE_BIAS = -4.6
 
 
 @dataclass(kw_only=True)
-class PointHeadConfig(QueryHeadConfig):
+class PointHeadConfig(DecodeConfig):
     """Settings of the head (`model.head`). Raises ConfigError for impossible values."""
 
     nms: Suppression  # of the boxes that points of one object give

@@ -5,7 +5,8 @@ import torch.nn.functional as F
 from torch import nn
 
 from src.models.far3d.perspective_decoder import CameraScaling, PerspectiveDecoder, PerspectiveDecoderConfig
-from src.models.heads.query_head import QueryHeadConfig, SetPredictionHead
+from src.models.heads.decode import DecodeConfig
+from src.models.heads.query_head import SetPredictionHead
 from src.models.layers.views import CameraViews
 from src.structures.queries import Queries
 from tests.models.dense_bev.dense_frames import GRID, SIZE, make_batch
@@ -17,7 +18,7 @@ def make(num_layers=2):
     torch.manual_seed(0)
     config = PerspectiveDecoderConfig(num_layers=num_layers, num_heads=2, num_points=POINTS)
     decoder = PerspectiveDecoder(config, C, IMAGE, 4, 2, GRID)
-    return decoder, SetPredictionHead(QueryHeadConfig(score_threshold=0.0, max_boxes=10), C, GRID, 1.0)
+    return decoder, SetPredictionHead(DecodeConfig(score_threshold=0.0, max_boxes=10), C, GRID, 1.0)
 
 
 def scene():

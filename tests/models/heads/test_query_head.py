@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from src.geometry.bev_grid import BEVGrid
-from src.models.heads.query_head import QueryHeadConfig, QueryPrediction, SetPredictionHead, box_codes
+from src.models.heads.decode import DecodeConfig
+from src.models.heads.query_head import QueryPrediction, SetPredictionHead, box_codes
 from src.structures.boxes import Boxes3D
 from src.structures.queries import UNKNOWN_LOGIT, Queries
 
@@ -16,7 +17,7 @@ GRID = BEVGrid(cells=(100, 100), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.
 
 def make_head(threshold=0.0, max_boxes=300, velocity_weight=0.2):
     torch.manual_seed(0)
-    return SetPredictionHead(QueryHeadConfig(score_threshold=threshold, max_boxes=max_boxes), 8, GRID, velocity_weight)
+    return SetPredictionHead(DecodeConfig(score_threshold=threshold, max_boxes=max_boxes), 8, GRID, velocity_weight)
 
 
 def make_boxes(places, labels, speed=3.0):

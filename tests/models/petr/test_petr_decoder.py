@@ -3,7 +3,8 @@
 import torch
 from torch import nn
 
-from src.models.heads.query_head import QueryHeadConfig, SetPredictionHead
+from src.models.heads.decode import DecodeConfig
+from src.models.heads.query_head import SetPredictionHead
 from src.models.petr.decoder import PETRDecoder, PETRDecoderConfig
 from src.structures.queries import Queries
 from tests.models.dense_bev.dense_frames import GRID
@@ -11,7 +12,7 @@ from tests.models.dense_bev.dense_frames import GRID
 
 def test_every_layers_boxes_are_relative_to_the_anchors():
     torch.manual_seed(0)
-    head = SetPredictionHead(QueryHeadConfig(score_threshold=0.0, max_boxes=10), 8, GRID, 1.0)
+    head = SetPredictionHead(DecodeConfig(score_threshold=0.0, max_boxes=10), 8, GRID, 1.0)
     nn.init.constant_(head.box[-1].bias, 0.0)
     with torch.no_grad():
         head.box[-1].bias[0] = 3.0

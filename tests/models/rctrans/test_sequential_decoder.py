@@ -7,7 +7,8 @@ import torch
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.heads.query_head import QueryHeadConfig, SetPredictionHead
+from src.models.heads.decode import DecodeConfig
+from src.models.heads.query_head import SetPredictionHead
 from src.models.layers.position_embedding import PositionEmbeddingConfig
 from src.models.layers.views import CameraViews
 from src.models.rctrans.sequential_decoder import SequentialDecoder, SequentialDecoderConfig
@@ -23,7 +24,7 @@ def make(num_layers=3, num_inference_layers=2):
     torch.manual_seed(0)
     config = SequentialDecoderConfig(num_layers=num_layers, num_inference_layers=num_inference_layers, num_heads=2)
     position = PositionEmbeddingConfig(num_depth_bins=4, depth_range_m=[2.0, 32.0], z_range_m=[-10.0, 10.0])
-    head = SetPredictionHead(QueryHeadConfig(score_threshold=0.0, max_boxes=10), C, FINE, 1.0)
+    head = SetPredictionHead(DecodeConfig(score_threshold=0.0, max_boxes=10), C, FINE, 1.0)
     torch.nn.init.normal_(head.box[-1].weight, std=2.0)  # boxes far from where queries stand
     return SequentialDecoder(config, position, C, RADAR, IMAGE, GRID), head
 
