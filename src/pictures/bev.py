@@ -82,18 +82,22 @@ def bev_panel(
     canvas.text(left, top - 21, note, 13)
     canvas.legend(left + 10 + 9.2 * len(caption), top - 23, keys, size_px=12)
     axes = canvas.axes(left, top, width, height)
-    right_m, up_m = window
-    axes.set_xlim(*right_m)
-    axes.set_ylim(*up_m)
+    frame_ground(axes, window)
     axes.set_aspect("equal", adjustable="box")
+    paint_rings(axes, *window)
+    paint_ego(axes)
+    return axes
+
+
+def frame_ground(axes: Axes, window: Window) -> None:
+    """An empty plot of the ground: its limits, its colours, no ticks."""
+    axes.set_xlim(*window[0])
+    axes.set_ylim(*window[1])
     axes.set_xticks([])
     axes.set_yticks([])
     axes.set_facecolor("#FBFBFC")
     for spine in axes.spines.values():
         spine.set_color("#C9CED4")
-    paint_rings(axes, right_m, up_m)
-    paint_ego(axes)
-    return axes
 
 
 def paint_rings(axes: Axes, right_m: tuple[float, float], up_m: tuple[float, float]) -> None:

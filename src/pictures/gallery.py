@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from src.pictures.bev import BevScene, paint_detections, paint_ego, upright
+from src.pictures.bev import BevScene, frame_ground, paint_detections, paint_ego, upright
 from src.pictures.cameras import PictureViews, paint_boxes, paint_camera
 from src.pictures.canvas import GAP_PX, HALF_PX, MARGIN_PX, SHEET_PX, Canvas
 from src.pictures.contents import INK, MUTED, PictureBoxes, Window, match_boxes
@@ -124,13 +124,7 @@ def _cell_width(frames: Sequence[GalleryFrame]) -> float:
 
 def _panel(canvas: Canvas, left: float, top: float, width: float, height: float, window: Window) -> Axes:
     axes = canvas.axes(left, top, width, height)
-    axes.set_xlim(*window[0])
-    axes.set_ylim(*window[1])
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.set_facecolor("#FBFBFC")
-    for spine in axes.spines.values():
-        spine.set_color("#C9CED4")
+    frame_ground(axes, window)
     paint_ego(axes)
     return axes
 
