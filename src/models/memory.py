@@ -121,6 +121,17 @@ class StoredRows(TensorFields):
         order = order[moved[order] >= 0]
         return replace(self.map(lambda value: value[order]), rows=moved[order])
 
+    def by_stream(
+        self,
+        velocities: Callable[[int, Tensor, Tensor], Tensor],  # see `RememberedFrame.with_velocities`
+        batch_size: int,  # B
+        xy: Tensor,  # [n, 2] m, places of the rows
+        own: Tensor,  # [n, 2] m/s, their velocities as remembered
+    ) -> Tensor:  # [n, 2] m/s
+        """The other velocities of all rows, asked for stream by stream."""
+        streams = [self.rows == stream for stream in range(batch_size)]
+        return torch.cat([velocities(stream, xy[at], own[at]) for stream, at in enumerate(streams)])  # the rows ascend
+
 
 Frame = TypeVar("Frame", bound=RememberedFrame)
 

@@ -8,6 +8,7 @@ import torch
 
 from src.errors import ConfigError
 from src.geometry.transforms import pose_matrix
+from src.models.crt_fusion.motion_fusion import StackFrame, StackMemory, StoredCellStack
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
 from src.models.memory import FrameMemory, RememberedFrame
 from src.structures.batch import FrameBatch
@@ -110,6 +111,19 @@ def test_gaussians_are_told_as_well():
     (found,) = corrected(Oracle.velocity, frame(gaussians=gaussians))
     (of_cells,) = corrected(Oracle.velocity, frame(cells=cells()))
     torch.testing.assert_close(found.gaussians.velocities[0], of_cells.cells.velocities)
+
+
+def test_the_cells_of_crt_fusion_are_told_as_well():
+    frame_of_maps = StackFrame(
+        timestamps_s=torch.tensor([7.0]).double(),
+        global_from_ego=torch.from_numpy(NORTH)[None],
+        present=torch.tensor([True]),
+        ages_s=torch.tensor([[0.0, 0.5]]),
+        cells=StoredCellStack(XY, PREDICTED.clone(), torch.zeros(6, 4), torch.zeros(6, dtype=torch.int64)),
+    )
+    (of_cells,) = corrected(Oracle.velocity, frame(cells=cells()))
+    (found,) = TrueMotion(SET, Oracle.velocity).correct(StackMemory((frame_of_maps,)), batch()).frames
+    torch.testing.assert_close(found.cells.velocities, of_cells.cells.velocities)
 
 
 def test_streams_do_not_mix_and_another_scene_is_not_known():

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -55,6 +56,11 @@ class StackFrame(RememberedFrame):
 
     ages_s: Tensor  # [B, T] float32, of each map at this time; infinite where there is none
     cells: StoredCellStack
+
+    def with_velocities(self, velocities: Callable[[int, Tensor, Tensor], Tensor]) -> StackFrame:
+        """Of the cells, which carry the maps of every age."""
+        told = self.cells.by_stream(velocities, len(self.present), self.cells.xy, self.cells.velocities)
+        return replace(self, cells=replace(self.cells, velocities=told))
 
 
 @dataclass(frozen=True)

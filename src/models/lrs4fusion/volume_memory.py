@@ -31,9 +31,7 @@ class VolumeFrame(RememberedFrame):
     def with_velocities(self, velocities: Callable[[int, Tensor, Tensor], Tensor]) -> VolumeFrame:
         """Of voxels, over the ground plane."""
         voxels = self.voxels
-        own = [voxels.rows == row for row in range(len(self.present))]
-        parts = [velocities(row, voxels.xyz[at, :2], voxels.velocities[at, :2]) for row, at in enumerate(own)]
-        flat = torch.cat(parts)  # their rows ascend
+        flat = voxels.by_stream(velocities, len(self.present), voxels.xyz[:, :2], voxels.velocities[:, :2])
         return replace(self, voxels=replace(voxels, velocities=torch.cat([flat, torch.zeros_like(flat[:, :1])], 1)))
 
 
