@@ -15,6 +15,7 @@ from src.geometry.tensor_transforms import transform_points, transform_vectors_x
 from src.models.heads.query_head import QueryPrediction
 from src.models.memory import FrameMemory, RememberedFrame, TemporalConfig, motions
 from src.ops.frame_motion import zero_slow_velocities
+from src.ops.take_rows import take_rows
 from src.structures.batch import FrameBatch
 from src.structures.evidence import Evidence, WarpedPoints
 from src.structures.queries import SPEED_UNIT_MPS, UNKNOWN_LOGIT, Queries
@@ -169,7 +170,7 @@ class QueryPropagation(nn.Module):
         scores = torch.where(prediction.valid, prediction.logits.amax(-1), -torch.inf)
         best, picks = scores.topk(min(wanted, scores.shape[1]), dim=1)
         ego_from_aug = batch.ego_from_aug[:, None]
-        codes = prediction.codes.gather(1, picks[..., None].expand(-1, -1, prediction.codes.shape[-1]))
+        codes = take_rows(prediction.codes, picks)
         centers, velocities = codes[..., :3], codes[..., -2:]
         frame = QueryFrame(
             batch.timestamps_s,
@@ -177,7 +178,7 @@ class QueryPropagation(nn.Module):
             torch.ones_like(batch.timestamps_s, dtype=torch.bool),
             centers=_padded(transform_points(ego_from_aug, centers), wanted),
             velocities=_padded(transform_vectors_xy(ego_from_aug, velocities), wanted),
-            features=_padded(features.float().gather(1, picks[..., None].expand(-1, -1, self.channels)), wanted),
+            features=_padded(take_rows(features.float(), picks), wanted),
             valid=_padded(best.isfinite()[..., None], wanted).squeeze(-1),
         )
         return QueryMemory((frame, *past)[: self.config.num_frames])

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
@@ -14,6 +14,7 @@ from src.models.heads.keypoint_head import CameraKeypointHead, CameraMaps, best_
 from src.models.heads.query_proposals import KeypointQueryConfig
 from src.models.layers.views import CameraViews
 from src.ops.score_and_lift_pixels import most_likely_depth, peak_scores
+from src.ops.take_rows import take_rows
 from src.structures.queries import Queries
 from src.targets.depth import lid_centres
 
@@ -57,17 +58,9 @@ class AdaptiveQueries(nn.Module):
             best, picks = best_pixels(scores, self.config.num_proposals)
             valid = best > threshold
             centers, seen = (
-                torch.where(valid[..., None], _at(picks, table), 0.0)
+                torch.where(valid[..., None], take_rows(table.flatten(1, 3), picks), 0.0)
                 for table in (places, maps.features.movedim(2, -1))
             )
             odds = torch.where(valid, best.logit(1e-6) - math.log(threshold / (1 - threshold)), 0.0)
         features = self.context(torch.cat([seen, odds[..., None].to(seen.dtype)], dim=-1))
         return Queries.unknown(features, centers, valid), maps
-
-
-def _at(
-    picks: Tensor,  # [B, K] int64
-    table: Tensor,  # [B, N, h, w, C]
-) -> Tensor:  # [B, K, C]
-    rows = table.flatten(1, 3)
-    return rows.gather(1, picks[..., None].expand(-1, -1, rows.shape[-1]))

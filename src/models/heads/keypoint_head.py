@@ -16,6 +16,7 @@ from src.models.layers.full_precision import FullPrecisionConv2d
 from src.models.layers.merging import with_relu
 from src.models.layers.views import CameraViews
 from src.ops.score_and_lift_pixels import score_and_lift_pixels
+from src.ops.take_rows import take_rows
 from src.targets.depth import paint_depth
 from src.targets.keypoints import keypoint_heatmap
 from src.targets.projection import BoxViews
@@ -88,9 +89,9 @@ def lift_keypoints(
         inputs = (maps.keypoint_logits, maps.depth_logits, depth_centres_m, views.aug_from_pix, views.valid)
         scores, points = score_and_lift_pixels(*inputs, views.image_size_px, grid, nms_cells)
         best, picks = best_pixels(scores, count)
-        points = points.flatten(1, 3).gather(1, picks[..., None].expand(-1, -1, 3))
+        points = take_rows(points.flatten(1, 3), picks)
     local = maps.features.movedim(2, -1).flatten(1, 3)  # [B, N*h*w, C]
-    return points, best > 0, local.gather(1, picks[..., None].expand(-1, -1, local.shape[-1]))
+    return points, best > 0, take_rows(local, picks)
 
 
 def best_pixels(

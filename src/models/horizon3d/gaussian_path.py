@@ -18,6 +18,7 @@ from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.memory import Motion, motions
 from src.ops.farthest_point import farthest_points
 from src.ops.frame_motion import warp_gaussians
+from src.ops.take_rows import take_rows
 from src.structures.batch import FrameBatch
 from src.structures.gaussians import GaussianSet, Source
 
@@ -183,7 +184,7 @@ class GaussianPath(nn.Module):
         """A subset of the active Gaussians of any source; padding where fewer are active."""
         picks = self.sample(gaussians, active, batch)
         rows = picks.clamp(min=0)
-        chosen = gaussians.map(lambda value: _gather(value.detach(), rows))
+        chosen = gaussians.map(lambda value: take_rows(value.detach(), rows))
         ego = chosen.transform(batch.ego_from_aug)
         return replace(ego, features=stored_features(ego.features), valid=picks >= 0)
 
@@ -203,14 +204,6 @@ class GaussianPath(nn.Module):
         score, picks = where_scalar(active, score, -torch.inf).topk(min(count, active.shape[1]), dim=1)
         picks = where_scalar(score > -torch.inf, picks, -1)
         return F.pad(picks, (0, count - picks.shape[1]), value=-1)
-
-
-def _gather(
-    value: Tensor,  # [B, G, ...]
-    rows: Tensor,  # [B, K] int64
-) -> Tensor:  # [B, K, ...]
-    index = rows.view(*rows.shape, *(1,) * (value.dim() - 2)).expand(*rows.shape, *value.shape[2:])
-    return value.gather(1, index)
 
 
 def _random_scores(batch: FrameBatch, active: Tensor) -> Tensor:  # [B, G] in 0..1
