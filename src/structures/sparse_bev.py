@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from src.ops.sites import Sites, union
@@ -60,14 +59,6 @@ class SparseMap:
         cells = torch.Size(self.sites.shape).numel()
         rows = self.features.new_zeros(cells, self.channels).index_copy(0, self.sites.linear(), self.features)
         return rows.view(*self.sites.shape, self.channels).movedim(-1, 1).contiguous()
-
-    def lookup(
-        self,
-        indices: Tensor,  # [q, 1 + d] int64 (batch, *cell), may lie outside the grid
-    ) -> Tensor:  # [q, C]
-        """Features at the given cells, zero where no site is active."""
-        rows = self.sites.rows_of(indices)
-        return F.embedding(rows + 1, F.pad(self.features, (0, 0, 1, 0)))
 
     def union(self, other: Self) -> tuple[Self, Self]:
         """Both maps on the sites of either, with zeros where a map has no site; they share one `Sites` object.

@@ -33,6 +33,12 @@ def bev_of(cells, grid=GRID, features=None, batch_size=1):
     return SparseBEV(sites, features[order]), order
 
 
+def rows_at(bev, cells):
+    """Features of a map at cells [n, 3] (batch, row, col), zero where no site is active."""
+    batch, row, col = cells.unbind(1)
+    return bev.to_dense()[batch, :, row, col]
+
+
 def random_cells(count, batch_size, grid, seed):
     generator = torch.Generator().manual_seed(seed)
     numbers = torch.randperm(batch_size * grid.rows * grid.cols, generator=generator)[:count].sort().values

@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from src.models.horizon3d.bev_path import WarpedCells
-from tests.models.horizon3d.cells import FULL, TINY, C, bev_of, make_path, random_cells
+from tests.models.horizon3d.cells import FULL, TINY, C, bev_of, make_path, random_cells, rows_at
 
 
 def warped_of(indices, features=None, elapsed_s=None, num_frames=8):
@@ -76,7 +76,7 @@ def test_output_sites_are_the_columns_of_either_input_unless_dilating(num_frames
     dilating = make_path(TINY, num_frames=num_frames, spatial_dilation=True).eval()
     grown = dilating.aggregate(fused, warped_of(past, num_frames=num_frames))
     assert len(grown) > len(columns) and set(columns) <= {tuple(cell) for cell in grown.indices.tolist()}
-    assert torch.equal(grown.lookup(fused.indices), fused.features)
+    assert torch.equal(rows_at(grown, fused.indices), fused.features)
 
 
 @pytest.mark.parametrize("dilating", [False, True])
@@ -168,5 +168,5 @@ def test_a_full_memory_at_full_size():
     fused, _ = bev_of(torch.stack([now * 0, now // 384, now % 384], 1), FULL, features)
     with torch.no_grad():
         output = path.aggregate(fused, warped_of(past, torch.randn(len(past), 128, generator=generator)))
-    assert torch.equal(output.lookup(fused.indices), fused.features)
+    assert torch.equal(rows_at(output, fused.indices), fused.features)
     assert 20000 < len(output) <= 20000 + 8 * 4096

@@ -10,6 +10,7 @@ import torch
 from src.models.horizon3d.dptf_memory import Memory
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.reliability.checkpoints import load_model_weights
+from tests.models.horizon3d.cells import rows_at
 from tests.models.moving import UTM, bda, pose, tensors_of
 
 ADDED = re.compile(Horizon3DConfig.new_in_temporal_phase)
@@ -130,7 +131,7 @@ def test_an_untrained_bev_path_adds_nothing_to_a_full_memory(pair, drive, traini
         output, _ = model(batch, memory)
     fused, bev = output.fused_bev, output.dptf.bev
     assert len(memory.frames) == 3 and sorted(output.dptf.warped.indices[:, 1].unique().tolist()) == [0, 1, 2]
-    assert torch.equal(bev.lookup(fused.indices), fused.features)
+    assert torch.equal(rows_at(bev, fused.indices), fused.features)
     foreign = fused.sites.rows_of(bev.indices) < 0
     assert foreign.sum() > 20 and not bev.features[foreign].any()
 

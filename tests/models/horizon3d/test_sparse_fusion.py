@@ -8,6 +8,7 @@ import torch
 from src.models.horizon3d.sparse_fusion import SparseFusion
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV
+from tests.models.horizon3d.cells import rows_at
 
 SHAPE = (2, 20, 20)
 
@@ -53,8 +54,8 @@ def test_an_identity_start_passes_the_radar_map_through(kernel):
     fusion = SparseFusion(8, kernel, identity_start=True).eval()
     gaussian, radar = make_map([[0, 3, 3], [0, 3, 4]]), make_map([[0, 3, 4], [1, 5, 5]])
     out = fusion(gaussian, radar)
-    assert not out.lookup(torch.tensor([[0, 3, 3]])).any()
-    torch.testing.assert_close(out.lookup(radar.indices), radar.features.relu() / (1 + 1e-5) ** 0.5)
+    assert not rows_at(out, torch.tensor([[0, 3, 3]])).any()
+    torch.testing.assert_close(rows_at(out, radar.indices), radar.features.relu() / (1 + 1e-5) ** 0.5)
     fusion.train()
     stay = {name for name, _ in fusion.named_parameters()}
     optimizer = torch.optim.SGD(fusion.parameters(), lr=0.1)
