@@ -80,6 +80,11 @@ class BoxOptions:
         require_least(self, "phase.options", {"velocity_code_weight": 0})
 
 
+def code_weights(velocity_code_weight: float) -> tuple[float, ...]:  # CODE_SIZE
+    """Weight of each number of a box code in the box loss."""
+    return (1.0,) * (CODE_SIZE - 2) + (velocity_code_weight,) * 2
+
+
 @dataclass
 class HeadOutput:
     """Predictions on the M active cells of B samples."""
@@ -109,7 +114,7 @@ class CenterHead(nn.Module):
         super().__init__()
         self.config, self.grid, self.dense = config, grid, dense
         self.learned = config.attributes is AttributeSource.learned
-        self.code_weights = (1.0,) * (CODE_SIZE - 2) + (velocity_code_weight,) * 2
+        self.code_weights = code_weights(velocity_code_weight)
         if dense:
             self.shared = nn.Sequential(
                 DenseConvNormReLU(in_channels or channels, channels, 3, bias=True), DenseToSparse()

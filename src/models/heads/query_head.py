@@ -14,6 +14,7 @@ from src.losses.classification import sigmoid_focal
 from src.losses.normalizers import mean_over_ranks
 from src.losses.regression import masked_l1
 from src.models.detector import Objective
+from src.models.heads.center_head import code_weights
 from src.models.heads.decode import ATTRIBUTE_RULES, DecodeConfig, Suppression, suppress, top_candidates
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.ops.assignment import assign
@@ -51,7 +52,7 @@ class SetPredictionHead(nn.Module):
     def __init__(self, config: DecodeConfig, channels: int, grid: BEVGrid, velocity_code_weight: float) -> None:
         super().__init__()
         self.config, self.grid = config, grid
-        self.code_weights = (1.0,) * (CODE_SIZE - 2) + (velocity_code_weight,) * 2
+        self.code_weights = code_weights(velocity_code_weight)
         self.classes, self.box = (
             nn.Sequential(
                 nn.Linear(channels, channels),
@@ -64,9 +65,7 @@ class SetPredictionHead(nn.Module):
         for layer in (self.classes[-1], self.box[-1]):
             nn.init.normal_(layer.weight, std=0.01)
             nn.init.zeros_(layer.bias)
-        with torch.no_grad():
-            self.box[-1].bias[3:6] = torch.tensor(INITIAL_SIZE_M).log()
-            self.box[-1].bias[6] = 1.0
+        start_codes(self.box[-1].bias)
 
     def forward(
         self,
@@ -182,6 +181,16 @@ def decode_codes(
     attributes = attributes_by_rule(velocities, centers, sizes, best.labels, ATTRIBUTE_RULES)
     boxes = Boxes3D(centers, sizes, yaws, velocities, best.labels, attributes, best.scores)
     return suppress(boxes, best.counts, method, config.max_boxes)
+
+
+@torch.no_grad()
+def start_codes(
+    bias: Tensor,  # [CODE_SIZE], of the layer that gives box codes
+) -> None:
+    """Before the head has learnt any, boxes stand where their queries or points do, INITIAL_SIZE_M large, along x."""
+    bias.zero_()
+    bias[3:6] = torch.tensor(INITIAL_SIZE_M).log()
+    bias[6] = 1.0
 
 
 def box_codes(boxes: Boxes3D) -> Tensor:  # [K, CODE_SIZE], as in `QueryPrediction`

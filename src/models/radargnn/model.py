@@ -20,9 +20,9 @@ from src.losses.normalizers import mean_over_ranks
 from src.losses.regression import masked_l1
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.detector import Detector, ModelConfig, Objective
-from src.models.heads.center_head import BoxOptions
+from src.models.heads.center_head import BoxOptions, code_weights
 from src.models.heads.decode import DecodeConfig, Suppression
-from src.models.heads.query_head import INITIAL_SIZE_M, box_codes, decode_codes
+from src.models.heads.query_head import box_codes, decode_codes, start_codes
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.sparse import RowBatchNorm
 from src.models.radargnn.graph import GraphConfig, PointGraph, build_graph
@@ -133,14 +133,11 @@ class PointHead(nn.Module):
     def __init__(self, config: PointHeadConfig, channels: int, grid: BEVGrid, velocity_code_weight: float) -> None:
         super().__init__()
         self.config, self.grid = config, grid
-        self.code_weights = (1.0,) * (CODE_SIZE - 2) + (velocity_code_weight,) * 2
+        self.code_weights = code_weights(velocity_code_weight)
         hidden, self.classes = config.hidden_channels, FullPrecisionLinear(channels, len(CLASSES))
         self.box = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), FullPrecisionLinear(hidden, CODE_SIZE))
         nn.init.constant_(self.classes.bias, SCORE_BIAS)
-        with torch.no_grad():
-            self.box[-1].bias.zero_()
-            self.box[-1].bias[3:6] = torch.tensor(INITIAL_SIZE_M).log()
-            self.box[-1].bias[6] = 1.0
+        start_codes(self.box[-1].bias)
 
     def forward(
         self,
