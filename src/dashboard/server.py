@@ -29,8 +29,8 @@ def create_app(reports: Path, outputs: Path | None) -> Starlette:
         live_address, lambda picture: f"/pictures/{quote(picture.run_id)}/{quote(picture.name)}", live=True
     )
 
-    def page(board: Board, mark: str, content: Page, status: int = 200) -> Response:
-        return HTMLResponse(renderer.document(board, [content], mark), status)
+    def page(board: Board, mark: str, content: Page) -> Response:
+        return HTMLResponse(renderer.document(board, [content], mark))
 
     def overview(request: Request) -> Response:
         board, mark = reader.read()

@@ -53,6 +53,8 @@ OCCUPANCY_COLOUR = (0.62, 0.47, 0.82)
 BOX_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 FRONT_FACE = (0, 1, 5, 4)
 MATCH_DISTANCE_M = 2.0
+OUTLINE_CORNERS = 24
+"""Of the polygon that an ellipse is drawn as."""
 
 
 class Rows:
@@ -136,9 +138,9 @@ class PictureGaussians(Rows):
     opacities: Array  # [G] in 0..1
     sources: Array  # [G] integer, index into SOURCES
 
-    def outlines(self, corners: int = 24) -> Array:
-        """The one-sigma ellipses as polygons [G, corners, 2] m."""
-        turn = np.linspace(0, 2 * np.pi, corners, endpoint=False)
+    def outlines(self) -> Array:
+        """The one-sigma ellipses as polygons [G, OUTLINE_CORNERS, 2] m."""
+        turn = np.linspace(0, 2 * np.pi, OUTLINE_CORNERS, endpoint=False)
         along, across = self.scales[:, :1] * np.cos(turn), self.scales[:, 1:] * np.sin(turn)  # [G, corners]
         length = np.linalg.norm(self.directions, axis=1, keepdims=True)
         cos, sin = (self.directions / np.where(length > 0, length, 1)).T[..., None]

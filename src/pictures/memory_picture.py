@@ -39,6 +39,8 @@ AGE_COLOURS = LinearSegmentedColormap.from_list("age", ("#241571", "#7B1FA2", "#
 """From fresh, dark, to old, pale; by the root of the age, so that the fresh ones, which both paths hold, stay apart."""
 TRUTH_COLOUR = "#0B8F62"
 STANDING_COLOUR = "#5A636D"
+MOST_KEYS = 8
+"""Ages in a legend."""
 
 
 @dataclass
@@ -85,9 +87,9 @@ class AgeScale:
         first, last = (self.ages_s[0], self.ages_s[-1]) if self.ages_s else (0.0, 0.0)
         return AGE_COLOURS(PowerNorm(0.5, first, max(last, first + 0.5))(np.asarray(elapsed_s)))
 
-    def keys(self, most: int = 8) -> list[Artist]:
-        """Legend keys of at most so many ages, spread evenly."""
-        picks = np.unique(np.linspace(0, len(self.ages_s) - 1, most).round().astype(int)) if self.ages_s else []
+    def keys(self) -> list[Artist]:
+        """Legend keys of at most MOST_KEYS ages, spread evenly."""
+        picks = np.unique(np.linspace(0, len(self.ages_s) - 1, MOST_KEYS).round().astype(int)) if self.ages_s else []
         ages = [self.ages_s[pick] for pick in picks]
         return [
             Patch(facecolor=colour, edgecolor="none", label=f"{age:.1f} s")

@@ -38,13 +38,13 @@ class Boxes3D(TensorFields):
         return self.centers.shape[0]
 
     @classmethod
-    def empty(cls, device: torch.device | str = "cpu") -> Boxes3D:
+    def empty(cls) -> Boxes3D:
         """No box at all; scores and num_points are present and empty."""
         floats = {"centers": (0, 3), "sizes": (0, 3), "yaws": (0,), "velocities": (0, 2), "scores": (0,)}
         integers = ("labels", "attributes", "num_points")
         return cls(
-            **{name: torch.zeros(shape, device=device) for name, shape in floats.items()},
-            **{name: torch.zeros(0, dtype=torch.int64, device=device) for name in integers},
+            **{name: torch.zeros(shape) for name, shape in floats.items()},
+            **{name: torch.zeros(0, dtype=torch.int64) for name in integers},
         )
 
     def __getitem__(self, rows: Tensor) -> Boxes3D:

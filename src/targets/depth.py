@@ -44,24 +44,22 @@ def lid_edges(
     depth_range_m: tuple[float, float],
     num_bins: int,
     dtype: torch.dtype = torch.float32,
-    device: torch.device | str = "cpu",
 ) -> Tensor:  # [num_bins + 1] m
     """Bin edges e_i = low + delta i (i + 1) / 2 with delta = 2 (high - low) / (n (n + 1)) (method 4.2)."""
     low, high = depth_range_m
     number = torch.arange(num_bins + 1, dtype=torch.float64)
     edges = low + (high - low) * number * (number + 1) / (num_bins * (num_bins + 1))
-    return edges.to(device=device, dtype=dtype)
+    return edges.to(dtype)
 
 
 def lid_centres(
     depth_range_m: tuple[float, float],
     num_bins: int,
     dtype: torch.dtype = torch.float32,
-    device: torch.device | str = "cpu",
 ) -> Tensor:  # [num_bins] m
     """Mean of the two edges of each bin: the depth a bin stands for."""
     edges = lid_edges(depth_range_m, num_bins, torch.float64)
-    return (0.5 * (edges[:-1] + edges[1:])).to(device=device, dtype=dtype)
+    return (0.5 * (edges[:-1] + edges[1:])).to(dtype)
 
 
 def lid_index(

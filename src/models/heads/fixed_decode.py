@@ -78,7 +78,7 @@ def best_candidates(
     logits: Tensor,  # [M, classes]
     sites: Sites,
     count: int,
-    peaks: bool = False,
+    peaks: bool,  # of local maxima alone
 ) -> Sequence[Tensor]:  # [groups, count] each: float32; int64, row; int64, index into CLASSES
     """The best (cell, class) pairs of every group in descending order, ties by cell and class."""
     ranks = candidate_sort_keys(logits, sites, CLASS_TABLE, peaks).topk(count, dim=1).values

@@ -24,7 +24,7 @@ class SparseFusion(nn.Module):
     """Compute both equations by `gated_fusion_conv`. The literal form multiplies zeros in half of the rows: some 5 % of
     a training step and of a frame on a CPU (mini scale)."""
 
-    def __init__(self, channels: int, gate_kernel_size: int, identity_start: bool = False) -> None:
+    def __init__(self, channels: int, gate_kernel_size: int, identity_start: bool) -> None:
         super().__init__()
         both = 2 * channels
         self.norm_gaussian, self.norm_radar = RowBatchNorm(channels), RowBatchNorm(channels)

@@ -22,7 +22,7 @@ def make_map(cells, channels=8):
 @pytest.mark.parametrize("skip_zeros", [False, True])
 def test_equations_11_and_12_on_one_cell_by_hand(skip_zeros):
     torch.manual_seed(0)
-    fusion = SparseFusion(8, 1).eval()
+    fusion = SparseFusion(8, 1, identity_start=False).eval()
     fusion.skip_zeros = skip_zeros
     gaussian, radar = make_map([[0, 3, 3]]), make_map([[0, 3, 3]])
     f_g = gaussian.features[0] / (1 + 1e-5) ** 0.5  # batch norm with its initial running statistics
@@ -40,7 +40,7 @@ def test_equations_11_and_12_on_one_cell_by_hand(skip_zeros):
 @pytest.mark.parametrize("kernel", [1, 3])
 def test_union_of_cells_and_samples_apart(kernel):
     torch.manual_seed(0)
-    fusion = SparseFusion(8, kernel).eval()
+    fusion = SparseFusion(8, kernel, identity_start=False).eval()
     gaussian, radar = make_map([[0, 3, 3], [1, 5, 5]]), make_map([[0, 3, 4], [1, 5, 5], [1, 9, 9]])
     out = fusion(gaussian, radar)
     assert out.indices.tolist() == [[0, 3, 3], [0, 3, 4], [1, 5, 5], [1, 9, 9]]
@@ -69,7 +69,7 @@ def test_an_identity_start_passes_the_radar_map_through(kernel):
 
 @pytest.mark.parametrize("cells", [([], [[0, 1, 1]]), ([[0, 1, 1]], []), ([], [])])
 def test_empty_branches(cells):
-    fusion = SparseFusion(8, 1).train()
+    fusion = SparseFusion(8, 1, identity_start=False).train()
     out = fusion(make_map(cells[0]), make_map(cells[1]))
     out.features.sum().backward()
     assert out.features.isfinite().all() and len(out) == len(cells[0]) + len(cells[1])
@@ -80,7 +80,7 @@ def test_empty_branches(cells):
 def test_skipping_zeros_agrees_with_the_equations(kernel, training):
     """Values, gradients and running statistics."""
     torch.manual_seed(0)
-    fast = SparseFusion(8, kernel).double().train(training)
+    fast = SparseFusion(8, kernel, identity_start=False).double().train(training)
     for norm in (fast.norm_gaussian, fast.norm_radar, fast.norm1, fast.norm2):
         torch.nn.init.uniform_(norm.weight, 0.5, 2.0)
         torch.nn.init.uniform_(norm.bias, -1.0, 1.0)
