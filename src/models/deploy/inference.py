@@ -64,14 +64,8 @@ def prepare_for_inference(model: Detector, precision: str = Precision.FULL) -> D
 
 def fold_norm(layer: Linear, norm: _BatchNorm) -> None:
     """Put a batch norm's running statistics and affine map into the layer before it, computed in float64."""
-    if norm.running_mean is None or norm.running_var is None:
-        raise ValueError(f"{norm}: a batch norm without running statistics cannot be folded")
-    scale = (norm.running_var.double() + norm.eps).rsqrt()
-    if norm.weight is not None:
-        scale = scale * norm.weight.double()
-    shift = -norm.running_mean.double() * scale
-    if norm.bias is not None:
-        shift = shift + norm.bias.double()
+    scale = norm.weight.double() * (norm.running_var.double() + norm.eps).rsqrt()
+    shift = norm.bias.double() - norm.running_mean.double() * scale
     axis = 1 if isinstance(layer, nn.ConvTranspose2d) else 2 if isinstance(layer, SparseKernel) else 0
     shape = [-1 if number == axis else 1 for number in range(layer.weight.dim())]
     weight = layer.weight.double() * scale.view(shape)
