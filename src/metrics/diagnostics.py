@@ -20,7 +20,8 @@ from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import EvaluationSet
 from src.structures.evidence import Evidence, SplattedCells
-from src.structures.gaussians import GaussianSet, Source
+from src.structures.gaussians import GaussianSet
+from src.structures.taxonomy import Source
 
 Array = np.ndarray
 

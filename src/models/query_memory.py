@@ -18,8 +18,8 @@ from src.ops.frame_motion import zero_slow_velocities
 from src.ops.take_rows import take_rows
 from src.structures.batch import FrameBatch
 from src.structures.evidence import Evidence, WarpedPoints
-from src.structures.queries import SPEED_UNIT_MPS, UNKNOWN_LOGIT, Queries
-from src.structures.taxonomy import CLASSES
+from src.structures.queries import UNKNOWN_LOGIT, Queries
+from src.structures.taxonomy import CLASSES, SPEED_UNIT_MPS
 
 MOTION_NUMBERS = 7
 """Age (s), velocity (2), ego displacement (2) and its turn as cosine and sine (2)."""

@@ -19,14 +19,13 @@ from src.pictures.contents import (
     INK,
     OCCUPANCY_COLOUR,
     SOURCE_COLOURS,
-    SOURCES,
     PictureBoxes,
     PictureGaussians,
     PictureGrid,
     Window,
     match_boxes,
 )
-from src.structures.taxonomy import CLASSES, MOVING_MPS
+from src.structures.taxonomy import CLASSES, MOVING_MPS, SOURCES
 
 Array = np.ndarray
 

@@ -40,7 +40,6 @@ CLASS_MARKERS: dict[str, str] = {
 }
 """Classes whose footprint is too small to be seen from above at 150 m; the others show as rectangles."""
 
-SOURCES = ("radar", "camera", "random", "history")
 SOURCE_COLOURS: dict[str, str] = {
     "radar": "#D55E00",
     "camera": "#0072B2",

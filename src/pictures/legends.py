@@ -9,8 +9,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from src.pictures.bev import ARROW_S, LIDAR_COLOUR, MISSED_COLOUR, SPEED_COLOURS, STANDING_COLOUR, BevScene
-from src.pictures.contents import CLASS_COLOURS, CLASS_MARKERS, INK, OCCUPANCY_COLOUR, SOURCE_COLOURS, SOURCES
-from src.structures.taxonomy import CLASSES
+from src.pictures.contents import CLASS_COLOURS, CLASS_MARKERS, INK, OCCUPANCY_COLOUR, SOURCE_COLOURS
+from src.structures.taxonomy import CLASSES, SOURCES
 
 
 def class_keys(present: set[int]) -> list[Artist]:

@@ -6,7 +6,7 @@ import difflib
 from dataclasses import dataclass
 
 from src.errors import ConfigError
-from src.structures.taxonomy import CLASSES
+from src.structures.taxonomy import CLASSES, SOURCES
 
 DETECTION = "detection"
 """The task (`phase.task`) whose numbers have names here."""
@@ -14,8 +14,6 @@ RANGES = ("0-25", "25-50", "50-100", "100-150")
 LONG_RANGES = ("0-50", "50-150", "150-250")
 """Of the second score of detections (`phase.long_range`)."""
 SPEEDS = ("0-0.5", "0.5-10", "10-25", "25+")
-SOURCES = ("radar", "camera", "random", "history")
-"""Where Gaussians come from."""
 PARTS = ("image_encoder", "radar_encoder", "kggi", "ocsf", "dptf", "detection_head", "total")
 """What a frame's latency is made of (Table 15)."""
 FURTHER_PARTS = ("gaussian_encoder", "view_transform", "temporal_fusion", "lidar_encoder")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from enum import IntEnum
 
 import torch
 import torch.nn.functional as F
@@ -11,15 +10,6 @@ from torch import Tensor
 
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
 from src.structures.tensor_fields import TensorFields
-
-
-class Source(IntEnum):
-    """Where a Gaussian came from."""
-
-    RADAR = 0
-    CAMERA = 1
-    RANDOM = 2
-    HISTORY = 3
 
 
 @dataclass
@@ -36,7 +26,7 @@ class GaussianSet(TensorFields):
     opacity_logits: Tensor  # [B, G]
     velocities: Tensor  # [B, G, 2] m/s over ground, augmented ego axes
     features: Tensor  # [B, G, C]
-    sources: Tensor  # [B, G] int64, see Source
+    sources: Tensor  # [B, G] int64, see `taxonomy.Source`
     elapsed_s: Tensor  # [B, G] age of the observation, 0 for the current frame
     valid: Tensor  # [B, G] bool
 

@@ -11,8 +11,6 @@ from torch import Tensor
 from src.structures.taxonomy import CLASSES
 from src.structures.tensor_fields import TensorFields
 
-SPEED_UNIT_MPS = 10.0
-"""In which networks state velocities of queries; metres per second alone learn too slowly."""
 UNKNOWN_LOGIT = -4.6
 """Where scores of queries start of which nothing is known: probability 0.01."""
 

@@ -1,7 +1,9 @@
-"""Classes, attributes, channels and evaluation ranges of MAN TruckScenes; the tables stand in taxonomy.yaml."""
+"""Classes, attributes, channels and evaluation ranges of MAN TruckScenes, whose tables stand in taxonomy.yaml, and what
+else all parts call by one name. Imports no torch."""
 
 from __future__ import annotations
 
+from enum import IntEnum
 from pathlib import Path
 
 import yaml
@@ -43,5 +45,22 @@ REFERENCE_CHANNEL = "LIDAR_LEFT"
 MOVING_MPS = 1.0
 """What is faster over ground moves: in losses, scores and pictures."""
 
+SPEED_UNIT_MPS = 10.0
+"""In which networks state velocities: their targets are ten times those of their neighbours, which one learning rate
+would otherwise not reach in a short training. Losses and outputs stay in m/s."""
+
 MAX_BOXES_PER_SAMPLE = 500
 """The official evaluator refuses more."""
+
+
+class Source(IntEnum):
+    """Where a Gaussian came from."""
+
+    RADAR = 0
+    CAMERA = 1
+    RANDOM = 2
+    HISTORY = 3
+
+
+SOURCES = tuple(source.name.lower() for source in Source)
+"""Their names in pictures and tables."""

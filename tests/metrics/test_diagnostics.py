@@ -14,7 +14,8 @@ from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
 from src.structures.evidence import Evidence, SplattedCells
-from src.structures.gaussians import GaussianSet, Source
+from src.structures.gaussians import GaussianSet
+from src.structures.taxonomy import Source
 from tests.evaluation_sets import set_of
 from tests.targets.box_rows import GRID, boxes_of
 

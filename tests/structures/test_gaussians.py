@@ -3,7 +3,8 @@ import math
 import pytest
 import torch
 
-from src.structures.gaussians import GaussianSet, Source
+from src.structures.gaussians import GaussianSet
+from src.structures.taxonomy import Source
 
 
 def gaussians(count=5, source=Source.RADAR, **changes):

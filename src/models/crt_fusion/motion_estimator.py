@@ -10,12 +10,11 @@ from src.losses.normalizers import mean_over_ranks
 from src.losses.regression import masked_l1
 from src.models.layers.dense import DenseConvNormReLU, rows_of_map
 from src.models.layers.full_precision import FullPrecisionConv2d
+from src.structures.taxonomy import SPEED_UNIT_MPS
 from src.targets.box_raster import BoxRaster
 
 OCCUPANCY_BIAS = -4.6
 """An untrained cell is occupied with probability 0.01, below the threshold of the memory."""
-VELOCITY_UNIT_MPS = 10.0
-"""The velocity head is linear in this unit, as Horizon3D's (method 6.1)."""
 
 
 @dataclass
@@ -41,7 +40,7 @@ class MotionEstimator(nn.Module):
         fused: Tensor,  # [B, C, rows, cols]
     ) -> CellMotion:
         occupancy, velocity = rows_of_map(self.output(self.hidden(fused))).split([1, 2], dim=1)
-        return CellMotion(occupancy.squeeze(1), VELOCITY_UNIT_MPS * velocity)
+        return CellMotion(occupancy.squeeze(1), SPEED_UNIT_MPS * velocity)
 
 
 def velocity_loss(motion: CellMotion, raster: BoxRaster) -> Tensor:  # []

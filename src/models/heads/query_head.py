@@ -20,8 +20,8 @@ from src.models.layers.full_precision import FullPrecisionLinear
 from src.ops.assignment import assign
 from src.ops.box_codes import LOG_SIZE_LIMIT, attributes_by_rule
 from src.structures.boxes import Boxes3D
-from src.structures.queries import SPEED_UNIT_MPS, Queries
-from src.structures.taxonomy import CLASSES
+from src.structures.queries import Queries
+from src.structures.taxonomy import CLASSES, SPEED_UNIT_MPS
 from src.targets.heatmap import CODE_SIZE
 from src.targets.supervision import supervised_boxes, upload_boxes
 

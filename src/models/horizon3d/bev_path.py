@@ -25,13 +25,11 @@ from src.ops.segment_reduce import gather_rows, segment_mean, topk_per_sample
 from src.ops.sites import Sites, places_among
 from src.structures.batch import FrameBatch
 from src.structures.sparse_bev import SparseBEV, SparseMap
+from src.structures.taxonomy import SPEED_UNIT_MPS
 
 OCCUPANCY_BIAS = -4.6
 """An untrained cell is occupied with probability 0.01, well below the memory threshold (method 6.1)."""
 TIME_CHANNELS = 32
-VELOCITY_UNIT_MPS = 10.0
-"""The velocity head is linear in this unit: its targets are ten times those of its neighbours, which one learning rate
-would otherwise not reach in a short training. Losses and outputs stay in m/s."""
 NORM = {"eps": 1e-5, "momentum": 0.1}
 
 
@@ -128,7 +126,7 @@ class BEVPath(nn.Module):
                 values.append(head[1](head[0](fused).features))
         if self.velocity is None:
             values = list(values[0].split([1, 2], dim=1))
-        regressed = VELOCITY_UNIT_MPS * values[1]
+        regressed = SPEED_UNIT_MPS * values[1]
         velocities = regressed if doppler is None else doppler.correct(regressed, fused.sites.linear())
         in_losses = doppler is None or doppler.in_losses
         return CellPrediction(values[0].squeeze(1), velocities, velocities if in_losses else regressed)

@@ -20,8 +20,9 @@ from src.ops.cell_keys import cell_centres, cell_keys
 from src.ops.frame_motion import zero_slow_velocities
 from src.ops.sites import HALO
 from src.structures.batch import FrameBatch
-from src.structures.gaussians import GaussianSet, Source
+from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV
+from src.structures.taxonomy import Source
 
 FRAME_WIDTH = 20
 """Of a frame: time (s), pose [4, 4], and whether there is one, its cells and its Gaussians."""

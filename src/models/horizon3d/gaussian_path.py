@@ -20,7 +20,8 @@ from src.ops.farthest_point import farthest_points
 from src.ops.frame_motion import warp_gaussians
 from src.ops.take_rows import take_rows
 from src.structures.batch import FrameBatch
-from src.structures.gaussians import GaussianSet, Source
+from src.structures.gaussians import GaussianSet
+from src.structures.taxonomy import Source
 
 
 class Sampling(Enum):

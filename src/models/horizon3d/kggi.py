@@ -18,8 +18,9 @@ from src.ops.gather_cells import gather_cells
 from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians
 from src.ops.nms import maxpool_peaks
 from src.ops.segment_reduce import topk_per_sample
-from src.structures.gaussians import GaussianSet, Source
+from src.structures.gaussians import GaussianSet
 from src.structures.sparse_bev import SparseBEV
+from src.structures.taxonomy import Source
 from src.targets.depth import DepthBinsConfig, DepthTarget, lid_centres
 
 INSIDE = 1.0 - 1e-5

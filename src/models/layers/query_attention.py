@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
 from src.models.layers.image_attention import attention_linear
-from src.structures.queries import SPEED_UNIT_MPS, Queries
+from src.structures.queries import Queries
+from src.structures.taxonomy import SPEED_UNIT_MPS
 
 OFFSET_UNIT_M = 4.0
 FREQUENCIES = 7

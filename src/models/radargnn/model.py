@@ -28,8 +28,7 @@ from src.models.layers.sparse import RowBatchNorm
 from src.models.radargnn.graph import GraphConfig, PointGraph, build_graph
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
-from src.structures.queries import SPEED_UNIT_MPS
-from src.structures.taxonomy import CLASSES
+from src.structures.taxonomy import CLASSES, SPEED_UNIT_MPS
 from src.targets.heatmap import CODE_SIZE
 from src.targets.supervision import supervised_boxes, upload_boxes
 

@@ -5,7 +5,8 @@ import torch
 
 from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
 from src.models.horizon3d.fixed_memory import FixedMemory
-from src.structures.gaussians import GaussianSet, Source
+from src.structures.gaussians import GaussianSet
+from src.structures.taxonomy import Source
 
 
 class Path:

@@ -16,7 +16,8 @@ from src.models.horizon3d.gaussian_path import (
     SelfAttentionConfig,
     VelocityFrom,
 )
-from src.structures.gaussians import GaussianSet, Source
+from src.structures.gaussians import GaussianSet
+from src.structures.taxonomy import Source
 from tests.models.moving import UTM, bare_frame, bda, pose
 
 CHANNELS = 6

@@ -9,8 +9,8 @@ from src.models.horizon3d.gaussian_encoder import GaussianBounds
 from src.models.horizon3d.kggi import KGGI, Initialization
 from src.ops.score_and_lift_pixels import most_likely_depth, peak_scores
 from src.ops.sites import Sites
-from src.structures.gaussians import Source
 from src.structures.sparse_bev import SparseBEV
+from src.structures.taxonomy import Source
 
 BOUNDS = GaussianBounds((0.2, 3.2), 4.0, 60.0, 1.0)
 ROWS, COLS = 8, 12  # cells of the finest level

@@ -7,7 +7,8 @@ import torch
 
 from src.errors import ConfigError
 from src.models.horizon3d.gaussian_path import Sampling, SelfAttentionConfig
-from src.structures.gaussians import GaussianSet, Source
+from src.structures.gaussians import GaussianSet
+from src.structures.taxonomy import Source
 from tests.models.moving import pose
 
 CURRENT = 24 + 12 + 8  # Gaussians of one frame in the small configuration
