@@ -16,7 +16,7 @@ BLOCKS = (1, 3, 9, 3)
 CONVS_PER_BLOCK = 5
 
 
-class ConvNorm(nn.Module):
+class ImageConvNormReLU(nn.Module):
     """Convolution without bias, batch norm, ReLU; keeps the resolution at stride 1."""
 
     norm_pairs = (("conv", "bn"),)
@@ -33,7 +33,7 @@ class ConvNorm(nn.Module):
         return F.relu(self.bn(self.conv(x)))
 
 
-class ChannelAttention(nn.Module):
+class EffectiveSE(nn.Module):
     """Effective squeeze and excitation: one 1x1 convolution of the global mean gates the channels."""
 
     def __init__(self, channels: int) -> None:
@@ -47,15 +47,15 @@ class ChannelAttention(nn.Module):
         return x * F.hardsigmoid(self.fc(x.mean((2, 3), keepdim=True)))
 
 
-class OneShotBlock(nn.Module):
-    """Five 3x3 convolutions in a row; input and all five outputs are concatenated once and reduced."""
+class OSAModule(nn.Module):
+    """One-shot aggregation: input and outputs of five 3x3 convolutions in a row are concatenated once and reduced."""
 
     def __init__(self, in_channels: int, mid_channels: int, out_channels: int, identity: bool) -> None:
         super().__init__()
         widths = [in_channels] + [mid_channels] * CONVS_PER_BLOCK
-        self.conv_mid = nn.ModuleList(ConvNorm(a, mid_channels, 3) for a in widths[:-1])
-        self.conv_concat = ConvNorm(sum(widths), out_channels, 1)
-        self.attn = ChannelAttention(out_channels)
+        self.conv_mid = nn.ModuleList(ImageConvNormReLU(a, mid_channels, 3) for a in widths[:-1])
+        self.conv_concat = ImageConvNormReLU(sum(widths), out_channels, 1)
+        self.attn = EffectiveSE(out_channels)
         self.identity = identity
 
     def forward(
@@ -70,7 +70,7 @@ class OneShotBlock(nn.Module):
 
 
 class Stage(nn.Module):
-    """One-shot blocks at one resolution; every stage but the first halves it before."""
+    """OSA modules at one resolution; every stage but the first halves it before."""
 
     def __init__(self, in_channels: int, mid_channels: int, out_channels: int, blocks: int, pool: bool) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class Stage(nn.Module):
         self.pool = nn.MaxPool2d(3, 2, ceil_mode=True) if pool else nn.Identity()
         self.blocks = nn.Sequential(
             *(
-                OneShotBlock(in_channels if index == 0 else out_channels, mid_channels, out_channels, index > 0)
+                OSAModule(in_channels if index == 0 else out_channels, mid_channels, out_channels, index > 0)
                 for index in range(blocks)
             )
         )
@@ -100,7 +100,7 @@ class VoVNet99(nn.Module):
         super().__init__()
         stem_inputs = (3, *STEM_CHANNELS[:-1])
         self.stem = nn.Sequential(
-            *(ConvNorm(a, b, 3, s) for a, b, s in zip(stem_inputs, STEM_CHANNELS, (2, 1, 2), strict=True))
+            *(ImageConvNormReLU(a, b, 3, s) for a, b, s in zip(stem_inputs, STEM_CHANNELS, (2, 1, 2), strict=True))
         )
         inputs = (STEM_CHANNELS[-1], *OUT_CHANNELS[:-1])
         self.stages = nn.Sequential(

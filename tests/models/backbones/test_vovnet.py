@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from src.models.backbones.vovnet import ChannelAttention, VoVNet99
+from src.models.backbones.vovnet import EffectiveSE, VoVNet99
 from src.models.backbones.weights import BackboneName, load_backbone_weights
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "vovnet99"
@@ -68,7 +68,7 @@ def test_every_parameter_gets_a_gradient() -> None:
 
 
 def test_attention_gates_by_the_mean() -> None:
-    gate = ChannelAttention(2)
+    gate = EffectiveSE(2)
     nn.init.zeros_(gate.fc.weight)
     with torch.no_grad():
         gate.fc.bias.copy_(torch.tensor([0.0, 6.0]))
