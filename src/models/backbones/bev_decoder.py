@@ -1,4 +1,4 @@
-"""The dense BEV trunk: fusion of the two maps, residual stages, and a neck back to full resolution (method 13)."""
+"""The dense BEV trunk: residual stages, and a neck back to full resolution (method 13); HyDRa's fusion of two maps."""
 
 from __future__ import annotations
 
@@ -42,24 +42,6 @@ class BEVDecoderConfig:
         require_least(self, "model.decoder", {"blocks_per_stage": 1})
 
 
-class ConvFuser(nn.Module):
-    """Camera and radar map side by side through one 3x3 convolution."""
-
-    def __init__(self, in_channels: int, channels: int) -> None:
-        super().__init__()
-        self.conv = DenseConvNormReLU(in_channels, channels, 3)
-
-    def forward(
-        self,
-        camera: Tensor,  # [B, C_camera, rows, cols]
-        radar: Tensor,  # [B, C_radar, rows, cols]
-    ) -> Tensor:  # [B, C, rows, cols]
-        if torch.is_autocast_enabled(camera.device.type):  # before they are joined: half the bytes
-            half = torch.get_autocast_dtype(camera.device.type)
-            camera, radar = camera.to(half), radar.to(half)
-        return self.conv(torch.cat([camera, radar], dim=1))
-
-
 class SqueezeFuser(nn.Module):
     """Camera and radar map side by side, squeeze and excitation (HyDRa; Hu et al. 2018), then a 1x1 convolution.
 
@@ -90,29 +72,6 @@ class SqueezeFuser(nn.Module):
             x = x + self.conv.bias
         x = map_of_rows(x.flatten(0, 1), (len(camera), *camera.shape[2:]))
         return F.relu(self.norm(x), inplace=True)
-
-
-class GatedFuser(nn.Module):
-    """Radar-camera gating (CRT-Fusion): both maps by a convolution, added with weights that each cell takes from both.
-
-    The camera map says in one more channel where anything was lifted to.
-    """
-
-    def __init__(self, camera_channels: int, radar_channels: int, channels: int) -> None:
-        super().__init__()
-        self.camera = DenseConvNormReLU(camera_channels + 1, channels, 3)
-        self.radar = DenseConvNormReLU(radar_channels, channels, 3)
-        self.gates = MapConv2d(channels, 2 * channels, 1)
-
-    def forward(
-        self,
-        camera: Tensor,  # [B, C_camera, rows, cols], zero where nothing was lifted to
-        radar: Tensor,  # [B, C_radar, rows, cols]
-    ) -> Tensor:  # [B, C, rows, cols]
-        camera = self.camera(torch.cat([camera, (camera != 0).any(1, keepdim=True).to(camera.dtype)], dim=1))
-        radar = self.radar(radar)
-        for_camera, for_radar = self.gates(camera + radar).sigmoid().chunk(2, dim=1)
-        return camera * for_camera + radar * for_radar
 
 
 class BEVDecoder(nn.Module):

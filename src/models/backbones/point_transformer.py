@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.pillars import PillarConfig, PillarEncoder
-from src.models.layers.image_attention import feed_forward
+from src.models.layers.feed_forward import feed_forward
 from src.models.layers.sparse import SubmanifoldConv
 from src.ops.segment_reduce import segment_count, topk_per_sample
 from src.ops.sites import Sites

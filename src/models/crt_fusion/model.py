@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from src.losses.classification import occupancy_focal, sigmoid_focal
 from src.losses.normalizers import mean_over_ranks
-from src.models.backbones.bev_decoder import GatedFuser
 from src.models.camera_radar import CameraRadarConfig, CameraRadarDetector, CameraRadarLossConfig, CameraRadarOutput
 from src.models.crt_fusion.motion_estimator import CellMotion, MotionEstimator, velocity_loss
 from src.models.crt_fusion.motion_fusion import MotionFusionConfig, MotionGuidedFusion, MovedMaps, StackMemory
 from src.models.crt_fusion.radar_lift import RadarLift, RadarLiftConfig
 from src.models.detector import Objective
+from src.models.layers.dense import DenseConvNormReLU, MapConv2d
 from src.structures.batch import FrameBatch
 from src.targets.box_raster import BoxRaster
 
@@ -42,6 +43,29 @@ class CRTFusionOutput(CameraRadarOutput):
 
     motion: CellMotion
     moved: MovedMaps | None  # None in phase 1
+
+
+class GatedFuser(nn.Module):
+    """Radar-camera gating (CRT-Fusion): both maps by a convolution, added with weights that each cell takes from both.
+
+    The camera map says in one more channel where anything was lifted to.
+    """
+
+    def __init__(self, camera_channels: int, radar_channels: int, channels: int) -> None:
+        super().__init__()
+        self.camera = DenseConvNormReLU(camera_channels + 1, channels, 3)
+        self.radar = DenseConvNormReLU(radar_channels, channels, 3)
+        self.gates = MapConv2d(channels, 2 * channels, 1)
+
+    def forward(
+        self,
+        camera: Tensor,  # [B, C_camera, rows, cols], zero where nothing was lifted to
+        radar: Tensor,  # [B, C_radar, rows, cols]
+    ) -> Tensor:  # [B, C, rows, cols]
+        camera = self.camera(torch.cat([camera, (camera != 0).any(1, keepdim=True).to(camera.dtype)], dim=1))
+        radar = self.radar(radar)
+        for_camera, for_radar = self.gates(camera + radar).sigmoid().chunk(2, dim=1)
+        return camera * for_camera + radar * for_radar
 
 
 class CRTFusion(CameraRadarDetector):

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
-from src.models.backbones.bev_decoder import ConvFuser
 from src.models.camera_radar import CameraRadarConfig, CameraRadarDetector, CameraRadarOutput
+from src.models.layers.dense import DenseConvNormReLU
 from src.models.layers.lift_splat import LiftSplat
 from src.models.map_memory import MapMemory, TemporalFusion, WarpedMaps
 from src.structures.batch import FrameBatch
@@ -23,6 +24,24 @@ class DenseBEVOutput(CameraRadarOutput):
     """One frame through the model."""
 
     warped_maps: WarpedMaps | None  # None in phase 1
+
+
+class ConvFuser(nn.Module):
+    """Camera and radar map side by side through one 3x3 convolution."""
+
+    def __init__(self, in_channels: int, channels: int) -> None:
+        super().__init__()
+        self.conv = DenseConvNormReLU(in_channels, channels, 3)
+
+    def forward(
+        self,
+        camera: Tensor,  # [B, C_camera, rows, cols]
+        radar: Tensor,  # [B, C_radar, rows, cols]
+    ) -> Tensor:  # [B, C, rows, cols]
+        if torch.is_autocast_enabled(camera.device.type):  # before they are joined: half the bytes
+            half = torch.get_autocast_dtype(camera.device.type)
+            camera, radar = camera.to(half), radar.to(half)
+        return self.conv(torch.cat([camera, radar], dim=1))
 
 
 class DenseBEV(CameraRadarDetector):

@@ -12,8 +12,9 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.heads.query_head import QueryPrediction, SetPredictionHead
 from src.models.layers.dense import Conv2d
+from src.models.layers.feed_forward import feed_forward
 from src.models.layers.global_attention import FFN_RATIO, GlobalAttention
-from src.models.layers.image_attention import ImageCrossAttention, PointOffsets, feed_forward
+from src.models.layers.image_attention import ImageCrossAttention, PointOffsets
 from src.models.layers.query_attention import QueryEmbedding
 from src.models.layers.views import CameraViews
 from src.structures.queries import Queries

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import arange
-from src.models.layers.image_attention import NUM_HEADS, attention_linear
+from src.models.layers.feed_forward import NUM_HEADS, attention_linear
 from src.ops.deform_sample import deform_attend_bev
 from src.ops.linear import linear
 from src.structures.sparse_bev import SparseBEV

@@ -16,8 +16,9 @@ from src.models.horizon3d.cross_attention import RadarCrossAttention
 from src.models.horizon3d.temporal_attention import TemporalSelfAttention, attention_mask
 from src.models.layers.dense import Conv2d
 from src.models.layers.doppler import Doppler
+from src.models.layers.feed_forward import attention_linear, linear_relu_norm
 from src.models.layers.full_precision import FullPrecisionLinear
-from src.models.layers.image_attention import ImageCrossAttention, attention_linear, linear_relu_norm
+from src.models.layers.image_attention import ImageCrossAttention
 from src.models.layers.merging import LinearReLU, block_diagonal, joined_linear, with_relu
 from src.models.layers.norm import layer_norm
 from src.models.layers.sparse import SubmanifoldConv

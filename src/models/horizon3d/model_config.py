@@ -15,7 +15,7 @@ from src.models.horizon3d.kggi import KGGIConfig
 from src.models.horizon3d.loss import Horizon3DLossConfig
 from src.models.horizon3d.ocsf import OCSFConfig
 from src.models.layers.doppler import DopplerConfig
-from src.models.layers.image_attention import NUM_HEADS
+from src.models.layers.feed_forward import NUM_HEADS
 
 CHANNEL_MULTIPLE = 4 * NUM_HEADS
 """C splits into attention heads of at least 4 channels and into groups of 4 for the camera head's norm."""

@@ -11,8 +11,9 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.layers.dense import DenseConvNormReLU, MapConv2d, map_of_rows, rows_of_map
+from src.models.layers.feed_forward import attention_linear, feed_forward
 from src.models.layers.full_precision import FullPrecisionConv2d
-from src.models.layers.image_attention import ImageCrossAttention, attention_linear, feed_forward
+from src.models.layers.image_attention import ImageCrossAttention
 from src.models.layers.query_attention import SinePositionEmbedding
 from src.models.layers.views import CameraViews
 from src.structures.taxonomy import CAMERAS

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.layers.dense import rows_of_map
+from src.models.layers.feed_forward import feed_forward
 from src.models.layers.global_attention import GlobalAttention
-from src.models.layers.image_attention import feed_forward
 from src.models.layers.lift_splat import LiftedViews, LiftSplat, LiftSplatConfig
 from src.models.layers.views import CameraViews
 from src.ops.segment_reduce import segment_count, segment_mean

@@ -13,7 +13,7 @@ from src.models.camera_radar import CameraRadarConfig, CameraRadarDetector, Came
 from src.models.detector import Objective
 from src.models.hydra.depth_consistency import DepthConsistency, DepthConsistencyConfig
 from src.models.hydra.height_association import HeightLift, HeightLiftConfig
-from src.models.layers.image_attention import NUM_HEADS
+from src.models.layers.feed_forward import NUM_HEADS
 from src.models.map_memory import MapMemory, TemporalFusion, WarpedMaps
 from src.structures.batch import FrameBatch
 from src.targets.box_raster import BoxRaster

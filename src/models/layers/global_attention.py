@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.models.layers.image_attention import attention_linear, feed_forward
+from src.models.layers.feed_forward import attention_linear, feed_forward
 from src.structures.queries import Queries
 
 FFN_RATIO = 8

@@ -9,36 +9,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
+from src.models.layers.feed_forward import NUM_HEADS, attention_linear, linear_relu_norm
 from src.models.layers.views import CameraViews
 from src.ops.deform_sample import attend_views, deform_attend_images
 from src.ops.view_samples import view_attention_weights, view_sampling_locations
 
-NUM_HEADS = 4
 INITIAL_HEIGHT_M = 1.0
-
-
-def linear_relu_norm(in_channels: int, channels: int) -> nn.Sequential:
-    """Linear, ReLU, LayerNorm, twice."""
-    layers: list[nn.Module] = []
-    for width in (in_channels, channels):
-        layers += [nn.Linear(width, channels), nn.ReLU(), nn.LayerNorm(channels)]
-    return nn.Sequential(*layers)
-
-
-def feed_forward(channels: int, ratio: int) -> nn.Sequential:
-    """Linear to `ratio` times the channels, ReLU, linear back (the MLP of a transformer layer)."""
-    return nn.Sequential(nn.Linear(channels, ratio * channels), nn.ReLU(), nn.Linear(ratio * channels, channels))
-
-
-def attention_linear(in_channels: int, out_channels: int, zero: bool = False) -> nn.Linear:
-    """Linear layer with zero bias and Xavier (or zero) weights."""
-    layer = nn.Linear(in_channels, out_channels)
-    nn.init.zeros_(layer.bias)
-    if zero:
-        nn.init.zeros_(layer.weight)
-    else:
-        nn.init.xavier_uniform_(layer.weight)
-    return layer
 
 
 class PointOffsets(nn.Linear):

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
-from src.models.layers.image_attention import attention_linear
+from src.models.layers.feed_forward import attention_linear
 from src.structures.queries import Queries
 from src.structures.taxonomy import SPEED_UNIT_MPS
 

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.layers.dense import DenseConvNormReLU, map_of_rows, rows_of_map
+from src.models.layers.feed_forward import feed_forward
 from src.models.layers.global_attention import GlobalAttention
-from src.models.layers.image_attention import feed_forward
 from src.models.layers.query_attention import SinePositionEmbedding
 
 DOWNS = 3

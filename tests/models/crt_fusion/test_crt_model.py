@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from src.errors import ConfigError
+from src.models.crt_fusion.model import GatedFuser
 from tests.models.camera_radar_frames import crt_model
 from tests.models.dense_bev.dense_frames import GRID, make_batch
 from tests.models.learning import (
@@ -59,3 +60,15 @@ def test_autocast_keeps_positions_and_losses_in_float32():
 def test_mistakes_are_named(overrides, message):
     with pytest.raises(ConfigError, match=message):
         crt_model(overrides)
+
+
+def test_gates_weigh_both_maps():
+    torch.manual_seed(0)
+    fuser = GatedFuser(2, 3, 4).eval()
+    camera, radar = torch.randn(1, 2, 5, 6), torch.randn(1, 3, 5, 6)
+    camera[:, :, 2] = 0.0  # nothing was lifted to this row
+    flag = torch.ones(1, 1, 5, 6)
+    flag[:, :, 2] = 0.0
+    c, r = fuser.camera(torch.cat([camera, flag], 1)), fuser.radar(radar)
+    gate = fuser.gates(c + r).sigmoid()
+    torch.testing.assert_close(fuser(camera, radar), c * gate[:, :4] + r * gate[:, 4:])

@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from src.models.backbones.bev_decoder import GatedFuser
 from src.models.layers.azimuth_attention import AzimuthAttention
 from src.models.layers.views import CameraViews
 from tests.models.camera_radar_frames import crt_model, radar_map
@@ -99,15 +98,3 @@ def test_only_foreground_pixels_and_likely_depths_are_lifted():
         lift.depth.bias[3] = 5.0
         sure = model(batch)[0].views  # one bin of every pixel
         assert 0 < sure.num_lifted <= whole.depth_logits[:, :, 0].numel()
-
-
-def test_gates_weigh_both_maps():
-    torch.manual_seed(0)
-    fuser = GatedFuser(2, 3, 4).eval()
-    camera, radar = torch.randn(1, 2, 5, 6), torch.randn(1, 3, 5, 6)
-    camera[:, :, 2] = 0.0  # nothing was lifted to this row
-    flag = torch.ones(1, 1, 5, 6)
-    flag[:, :, 2] = 0.0
-    c, r = fuser.camera(torch.cat([camera, flag], 1)), fuser.radar(radar)
-    gate = fuser.gates(c + r).sigmoid()
-    torch.testing.assert_close(fuser(camera, radar), c * gate[:, :4] + r * gate[:, 4:])

@@ -1,0 +1,31 @@
+"""What layers of transformers are made of: their linear layers, their MLPs, their heads."""
+
+from __future__ import annotations
+
+from torch import nn
+
+NUM_HEADS = 4
+
+
+def linear_relu_norm(in_channels: int, channels: int) -> nn.Sequential:
+    """Linear, ReLU, LayerNorm, twice."""
+    layers: list[nn.Module] = []
+    for width in (in_channels, channels):
+        layers += [nn.Linear(width, channels), nn.ReLU(), nn.LayerNorm(channels)]
+    return nn.Sequential(*layers)
+
+
+def feed_forward(channels: int, ratio: int) -> nn.Sequential:
+    """Linear to `ratio` times the channels, ReLU, linear back (the MLP of a transformer layer)."""
+    return nn.Sequential(nn.Linear(channels, ratio * channels), nn.ReLU(), nn.Linear(ratio * channels, channels))
+
+
+def attention_linear(in_channels: int, out_channels: int, zero: bool = False) -> nn.Linear:
+    """Linear layer with zero bias and Xavier (or zero) weights."""
+    layer = nn.Linear(in_channels, out_channels)
+    nn.init.zeros_(layer.bias)
+    if zero:
+        nn.init.zeros_(layer.weight)
+    else:
+        nn.init.xavier_uniform_(layer.weight)
+    return layer
