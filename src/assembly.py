@@ -90,17 +90,18 @@ def build_datamodule(config: Config, root: Path) -> DetectionDataModule:
     )
 
 
-def build_model(config: Config) -> Detector:
-    """The configured detector with fresh weights (and pretrained backbone weights where given)."""
-    return build_model_of(config.model, config.grid.build(), config.backbone, config.phase.options)
+def build_model(config: Config, pretrained: bool = True) -> Detector:
+    """The configured detector with fresh weights (and pretrained backbone weights where given).
+
+    With `pretrained` false their file, which may not be on this machine, is not read: a checkpoint brings all weights.
+    """
+    backbone = config.backbone if pretrained else replace(config.backbone, weights=None)
+    return build_model_of(config.model, config.grid.build(), backbone, config.phase.options)
 
 
 def restored_model(config: Config, checkpoint: dict[str, Any], path: Path) -> Detector:
-    """The configured detector with the weights of a checkpoint that has been read from `path`.
-
-    Every weight comes from the checkpoint; the file that training began from may not be on this machine.
-    """
-    model = build_model(replace(config, backbone=replace(config.backbone, weights=None)))
+    """The configured detector with the weights of a checkpoint that has been read from `path`."""
+    model = build_model(config, pretrained=False)
     load_model_weights(model, checkpoint, path)
     return model
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import lightning as L
 
-from src.assembly import build_datamodule, build_module, check_data, data_root, save_submission
+from src.assembly import build_datamodule, build_model, build_module, check_data, data_root, save_submission
 from src.config import PHASES, Config, compose_config, refuse_options_of_others
 from src.data.datamodule import DetectionDataModule
 from src.pictures.learning_curves import draw_curves
@@ -125,7 +125,8 @@ def run(
     L.seed_everything(config.seed, verbose=False)
     datamodule = build_datamodule(config, start.root)
     data = datamodule.state_dict()  # the folder may be away when the first checkpoint is written
-    module = build_module(config, tree, datamodule)
+    model = build_model(config, pretrained=start.resume is None and start.weights is None)
+    module = build_module(config, tree, datamodule, model)
     if start.resume is not None:
         logger.info("resuming from %s", start.resume.path)
     elif start.weights is not None:

@@ -5,9 +5,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from src.config import compose_config
 from src.errors import DataError
+from src.models.backbones.resnet import Bottleneck, ResNet
 from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
 from src.sweep import compose
 from src.sweep.__main__ import main as run_sweep
@@ -95,6 +97,21 @@ def test_a_killed_run_does_not_resume_on_other_data(outputs, worlds, tmp_path):
     refused_on_other_data(outputs, worlds)
     moved = shutil.copytree(worlds / "here", tmp_path / "moved")
     assert "resuming from" in train(outputs, moved).stderr
+
+
+def test_what_starts_from_a_checkpoint_needs_no_pretrained_file(worlds, tmp_path):
+    """Neither a run that resumes nor the phase after it."""
+    weights = tmp_path / "resnet50.pth"
+    torch.save(ResNet(Bottleneck, [64, 128, 256, 512], [3, 4, 6, 3]).state_dict(), weights)
+    command = ("train", "scale=debug", "model=dense_bev", "data.world=null", f"data.root={worlds / 'here'}",
+               "backbone=resnet50", "backbone.image_size_px=[64,192]", f"backbone.weights={weights}",
+               "trainer.num_pictures=0", f"paths.outputs={tmp_path}")  # fmt: skip
+    call(*command, "phase=phase1")
+    weights.unlink()
+    (folder,) = tmp_path.glob("dense_bev-phase1-debug-????????")
+    (folder / "run.json").unlink()
+    assert "resuming from" in call(*command, "phase=phase1").stderr
+    assert "weights from" in call(*command, "phase=phase2").stderr
 
 
 def test_a_run_of_before_there_were_digests_goes_on(outputs, worlds):
