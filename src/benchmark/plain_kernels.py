@@ -383,9 +383,9 @@ def _gather_product(
 @_of_kernel
 def _log_free(
     q: Tensor, gaussian: Tensor, logits: Tensor, starts: Tensor, out: Tensor, occupied: Tensor, num: int, step: int,
-    extra: float, least: float, threshold: float,
+    least: float, threshold: float,
 ) -> None:  # fmt: skip
-    own = (F.softplus(-logits)[gaussian] + 0.5 * q + extra).clamp(min=least)
+    own = (F.softplus(-logits)[gaussian] + 0.5 * q).clamp(min=least)
     out.copy_(_segment_sum(log1mexp(own)[:, None], starts)[:, 0])
     occupied.copy_(-torch.expm1(out) > threshold)
 

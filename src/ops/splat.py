@@ -19,8 +19,9 @@ from src.ops.gaussian_cells import GaussianCellPairs, gaussian_cells
 from src.ops.segment_reduce import gather_segment_sum, inverse_rows, rank_per_sample, weighted_segment_sum
 from src.ops.sites import Sites
 
-# A contribution is at most 1 - CAP, so that the logarithm of the free probability stays finite.
+# A contribution is at most 1 - CAP, so that the logarithm of the free probability stays finite; its -log is at least:
 CAP = 1e-4
+LEAST_SURPRISE = -math.log1p(-CAP)
 
 Choice = tuple[Tensor, float, int, int]
 """Of the occupied cells: the support, threshold, max_cells and the cells of a sample."""
@@ -77,14 +78,12 @@ def splat_gaussians(
     threshold: float,
     max_cells: int,
     support_sigmas: float,
-    smooth_cap: bool = False,
 ) -> Splat:
     """Splat Gaussians onto BEV cells (Eq. 4-6, method 5.6).
 
     k_i(p) = exp(-q/2) within `support_sigmas`, else 0; a_i = sigmoid(o_i) k_i, at most 1 - 1e-4; S = sum log(1 - a_i);
     alpha = 1 - exp(S); Omega = {alpha > threshold}; F_G(p) = sum k_i(p) f_i on Omega. At most `max_cells` cells a
-    sample stay in Omega, the most occupied ones. The hard cap stops the gradient of a contribution it binds for;
-    `smooth_cap` adds 1e-4 to -log a instead, which moves alpha by up to 1e-4 and keeps every gradient alive.
+    sample stay in Omega, the most occupied ones. The cap stops the gradient of a contribution it binds for.
 
     Gradients of `log_free` and `features` reach all five float inputs; Omega is a constant set. Computed in float32
     (float64 for float64 inputs) whatever autocast says, the same on every run. Gaussians of different samples never
@@ -106,7 +105,7 @@ def splat_gaussians(
         pairs, support = gaussian_cells(*gaussians[:3], batch, grid, batch_size, support_sigmas)
         choice = (support, threshold, max_cells, grid.rows * grid.cols)
         log_free, out, occupied_rows, peak_cell, peak_contribution, num_cut = implementation(splat_reference)(
-            *gaussians, pairs, choice, smooth_cap
+            *gaussians, pairs, choice
         )
     # In fixed shapes the rows of the support are its keys.
     keys = support.index_select(0, occupied_rows) if fixed_shapes() is None else occupied_rows
@@ -126,31 +125,21 @@ class _LogFree(torch.autograd.Function):
     """S per support cell (Eq. 5), with the closed-form gradients of method 5.6."""
 
     @staticmethod
-    def forward(
-        ctx: FunctionCtx,
-        q: Tensor,
-        opacity_logits: Tensor,
-        pairs: GaussianCellPairs,
-        smooth_cap: bool,
-    ) -> Tensor:
+    def forward(ctx: FunctionCtx, q: Tensor, opacity_logits: Tensor, pairs: GaussianCellPairs) -> Tensor:
         surprise = F.softplus(-opacity_logits).index_select(0, pairs.gaussian) + 0.5 * q  # -log a
-        if smooth_cap:
-            surprise = surprise + CAP
-        else:
-            surprise = surprise.clamp(min=-math.log1p(-CAP))
+        surprise = surprise.clamp(min=LEAST_SURPRISE)
         ctx.save_for_backward(surprise, opacity_logits)
-        ctx.pairs, ctx.smooth_cap = pairs, smooth_cap
+        ctx.pairs = pairs
         return gather_segment_sum(log1mexp(surprise)[:, None], pairs.pair_index, pairs.cell_starts).squeeze(1)
 
     @staticmethod
-    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
+    def backward(ctx: FunctionCtx, grad: Tensor) -> tuple[Tensor, Tensor, None]:
         surprise, opacity_logits = ctx.saved_tensors
         pairs: GaussianCellPairs = ctx.pairs
         slope = grad.index_select(0, pairs.cell) / torch.expm1(surprise)  # d log(1 - a) / d(-log a) = a / (1 - a)
-        if not ctx.smooth_cap:
-            slope = where_scalar(surprise > -math.log1p(-CAP), slope, 0.0)
+        slope = where_scalar(surprise > LEAST_SURPRISE, slope, 0.0)
         grad_logits = _gaussian_sum(slope[:, None], pairs).squeeze(1) * -torch.sigmoid(-opacity_logits)
-        return 0.5 * slope, grad_logits, None, None
+        return 0.5 * slope, grad_logits, None
 
 
 class _Distance(torch.autograd.Function):
@@ -203,12 +192,11 @@ def splat_reference(
     features: Tensor,
     pairs: GaussianCellPairs,
     choice: Choice,
-    smooth_cap: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, int]:
     """Plain torch form: `log_free`, `features`, `occupied_rows`, `peak_cell`, `peak_contribution` and `num_cut`."""
     support, threshold, *limits = choice
     q = _Distance.apply(means, scales, directions, pairs)
-    log_free = _LogFree.apply(q, opacity_logits, pairs, smooth_cap)
+    log_free = _LogFree.apply(q, opacity_logits, pairs)
     occupied = -torch.expm1(log_free.detach()) > threshold
     occupied_rows, num_cut = occupied_cells(occupied, log_free.detach(), support, *limits)
 

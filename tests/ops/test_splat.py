@@ -102,14 +102,13 @@ def test_equals_brute_force_with_two_samples(sigmas):
     torch.testing.assert_close(out.peak_contribution, best.values.clamp(min=0), rtol=0, atol=1e-4)  # uncapped
 
 
-@pytest.mark.parametrize("smooth_cap", [False, True])
-def test_gradcheck(smooth_cap):
+def test_gradcheck():
     means, scales, directions, logits, features = random_gaussians(6, SMALL, seed=3, channels=2)
     batch = torch.tensor([0, 1, 0, 1, 0, 1])
     inputs = [x.requires_grad_() for x in (means, scales, directions, logits, features)]
 
     def run(*values):
-        out = splat_gaussians(*values, batch, SMALL, 2, smooth_cap=smooth_cap)
+        out = splat_gaussians(*values, batch, SMALL, 2)
         assert len(out.support) > 20 and len(out.occupied) > 5
         return out.log_free, out.features
 
@@ -138,9 +137,8 @@ def test_order_of_the_gaussians_does_not_matter():
     assert torch.equal(first.peak_cell[shuffle], second.peak_cell)
 
 
-@pytest.mark.parametrize("smooth_cap", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_full_opacity_on_a_cell_centre_stays_finite(smooth_cap, dtype):
+def test_full_opacity_on_a_cell_centre_stays_finite(dtype):
     centre = SMALL.centre_of(torch.tensor([[2, 3]]), dtype)
     inputs = [
         centre,
@@ -150,7 +148,7 @@ def test_full_opacity_on_a_cell_centre_stays_finite(smooth_cap, dtype):
         torch.ones(1, 2, dtype=dtype),
     ]
     inputs = [x.requires_grad_() for x in inputs]
-    out = splat_gaussians(*inputs, torch.zeros(1, dtype=torch.int64), SMALL, 1, smooth_cap=smooth_cap)
+    out = splat_gaussians(*inputs, torch.zeros(1, dtype=torch.int64), SMALL, 1)
     peak = (out.support == out.peak_cell[0]).nonzero().item()
     assert out.support[peak] == 2 * 8 + 3
     assert out.log_free[peak].item() == pytest.approx(math.log(1e-4), rel=1e-3)
@@ -159,15 +157,14 @@ def test_full_opacity_on_a_cell_centre_stays_finite(smooth_cap, dtype):
     assert all(x.grad.isfinite().all() for x in inputs)
 
 
-def test_hard_cap_stops_the_gradient_and_the_smooth_one_does_not():
-    logits = torch.tensor([15.0], dtype=torch.float64, requires_grad=True)
+def test_the_cap_stops_the_gradient_where_it_binds_alone():
     centre, ones = SMALL.centre_of(torch.tensor([[2, 3]]), torch.float64), torch.ones(1, 2, dtype=torch.float64)
     grads = []
-    for smooth_cap in (False, True):
+    for logit in (15.0, 5.0):
+        logits = torch.tensor([logit], dtype=torch.float64, requires_grad=True)
         out = splat_gaussians(
-            centre, ones * 0.2, ones * torch.tensor([1, 0]), logits, ones, torch.zeros(1, dtype=torch.int64), SMALL, 1,
-            smooth_cap=smooth_cap,
-        )  # fmt: skip
+            centre, ones * 0.2, ones * torch.tensor([1, 0]), logits, ones, torch.zeros(1, dtype=torch.int64), SMALL, 1
+        )
         grads.append(torch.autograd.grad(out.log_free[out.occupied_rows[0]], logits)[0].item())
     assert grads[0] == 0 and grads[1] < 0
 

@@ -12,7 +12,7 @@ from torch.autograd.function import FunctionCtx
 
 from src.ops.backend import runs_kernels
 from src.ops.gaussian_cells import GaussianCellPairs
-from src.ops.splat import CAP, Choice, occupied_cells, occupied_places, splat_reference
+from src.ops.splat import LEAST_SURPRISE, Choice, occupied_cells, occupied_places, splat_reference
 
 # Cells a program sums the free probability of, one lane each.
 CELLS = 128
@@ -34,15 +34,12 @@ def splat_triton(
     features: Tensor,
     pairs: GaussianCellPairs,
     choice: Choice,
-    smooth_cap: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, int]:
     """The reference's results by three kernels over the pairs forward and one backward."""
     gaussians = (means, scales, directions, opacity_logits, features)
     if means.dtype != torch.float32 or not runs_kernels(means):
-        return splat_reference(*gaussians, pairs, choice, smooth_cap)
-    # Any surprise -log a that the cap binds for becomes `least`; the smooth cap adds to all of them instead.
-    extra, least = (CAP, 0.0) if smooth_cap else (0.0, -math.log1p(-CAP))
-    return _Splat.apply(*gaussians, pairs, choice, extra, least)
+        return splat_reference(*gaussians, pairs, choice)
+    return _Splat.apply(*gaussians, pairs, choice)
 
 
 class _Splat(torch.autograd.Function):
@@ -58,8 +55,6 @@ class _Splat(torch.autograd.Function):
         features: Tensor,
         pairs: GaussianCellPairs,
         choice: Choice,
-        extra: float,
-        least: float,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, int]:
         support, threshold, *limits = choice
         features, stride = features.contiguous(), opacity_logits.stride(0)
@@ -68,7 +63,7 @@ class _Splat(torch.autograd.Function):
             if len(support) > 0:
                 _log_free[(triton.cdiv(len(support), CELLS),)](
                     *(pairs.q, pairs.gaussian, opacity_logits, pairs.cell_starts, log_free, occupied),
-                    *(len(support), stride, extra, least, threshold),
+                    *(len(support), stride, LEAST_SURPRISE, threshold),
                     BLOCK=CELLS,
                     num_warps=4,
                     enable_fp_fusion=True,
@@ -97,7 +92,7 @@ class _Splat(torch.autograd.Function):
                     enable_fp_fusion=True,
                 )
         ctx.save_for_backward(scales, directions, opacity_logits, features, occupied_rows, support)
-        ctx.pairs, ctx.extra, ctx.least = pairs, extra, least
+        ctx.pairs = pairs
         ctx.mark_non_differentiable(occupied_rows, peak_cell, contribution)
         return log_free, out, occupied_rows, peak_cell, contribution, num_cut
 
@@ -115,14 +110,14 @@ class _Splat(torch.autograd.Function):
                     *(pairs.q, pairs.delta, pairs.cell, pairs.by_gaussian, pairs.gaussian_starts, place),
                     *(scales.contiguous(), directions.contiguous(), opacity_logits, features),
                     *(grad_log_free.contiguous(), grad_out.contiguous(), shape_grad, grad_features),
-                    *(features.shape[1], opacity_logits.stride(0), ctx.extra, ctx.least),
+                    *(features.shape[1], opacity_logits.stride(0), LEAST_SURPRISE),
                     BLOCK_PAIRS=min(max(TILE // width, 2), PAIRS_OF_GAUSSIAN),
                     BLOCK_CHANNELS=width,
                     num_warps=8,
                     enable_fp_fusion=True,
                 )
         means_grad, scales_grad, directions_grad, logits_grad = shape_grad.split((2, 2, 2, 1), 1)
-        return means_grad, scales_grad, directions_grad, logits_grad.squeeze(1), grad_features, *(None,) * 4
+        return means_grad, scales_grad, directions_grad, logits_grad.squeeze(1), grad_features, None, None
 
 
 @triton.jit
@@ -164,7 +159,7 @@ def _surprise(logit):  # noqa: ANN001, ANN202
 
 @triton.jit
 def _log_free(  # noqa: ANN202
-    q, gaussian, logits, starts, out, occupied, num, stride, extra, least, threshold,  # noqa: ANN001
+    q, gaussian, logits, starts, out, occupied, num, stride, least, threshold,  # noqa: ANN001
     BLOCK: tl.constexpr,
 ):  # fmt: skip
     """S = sum of log(1 - a) per cell (Eq. 5), and whether alpha is above the threshold: a lane a cell, pair by pair."""
@@ -178,7 +173,7 @@ def _log_free(  # noqa: ANN202
         owner = tl.load(gaussian + first + step, mask=inside, other=0)
         own = _surprise(tl.load(logits + stride * owner, mask=inside, other=0.0))
         own += 0.5 * tl.load(q + first + step, mask=inside, other=0.0)
-        total += tl.where(inside, _log_of_free(tl.maximum(own + extra, least)), 0.0)
+        total += tl.where(inside, _log_of_free(tl.maximum(own, least)), 0.0)
     tl.store(out + cell, total, mask=live)
     tl.store(occupied + cell, (_free(-total) > threshold).to(tl.uint8), mask=live)
 
@@ -238,7 +233,7 @@ def _gaussian_gradient(  # noqa: ANN202
     q, delta, cell, by_gaussian, starts, place,  # noqa: ANN001
     scales, directions, logits, features,  # noqa: ANN001
     grad_log_free, grad_out, shape_grad, grad_features,  # noqa: ANN001
-    channels, stride, extra, least,  # noqa: ANN001
+    channels, stride, least,  # noqa: ANN001
     BLOCK_PAIRS: tl.constexpr, BLOCK_CHANNELS: tl.constexpr,
 ):  # fmt: skip
     """All gradients of one Gaussian, in closed form (method 5.6)."""
@@ -262,7 +257,7 @@ def _gaussian_gradient(  # noqa: ANN202
         row = tl.load(cell + pair, mask=live, other=0)
         distance = tl.load(q + pair, mask=live, other=0.0)
         # Through S: d log(1 - a) / d(-log a) = a / (1 - a), nothing where the cap binds.
-        u = tl.maximum(base + 0.5 * distance + extra, least)
+        u = tl.maximum(base + 0.5 * distance, least)
         slope = tl.load(grad_log_free + row, mask=live, other=0.0) * tl.exp(-u) / _free(tl.where(live, u, 1.0))
         slope = tl.where(live & (u > least), slope, 0.0)
         by_logit += slope

@@ -186,7 +186,7 @@ def main():
     gaussian_cells_triton.padded_pairs_triton(*shapes, batch, *choice, 9)
     windows = gaussian_cells_triton.all_windows(*shapes, grid, 3.0)
     gaussian_cells_triton.all_candidates(windows, *shapes[1:], batch, *choice, 9, True)
-    log_free, features, *_ = splat_triton.splat_triton(*inputs, pairs, (support, 0.1, 99, 80), False)
+    log_free, features, *_ = splat_triton.splat_triton(*inputs, pairs, (support, 0.1, 99, 80))
     torch.autograd.grad(log_free.sum() + features.sum(), inputs)
 
 

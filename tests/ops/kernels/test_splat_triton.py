@@ -55,11 +55,10 @@ def compare(gaussians, batch, batch_size, **choices):
     return found
 
 
-@pytest.mark.parametrize("smooth_cap", [False, True])
 @pytest.mark.parametrize("sigmas", [1.5, 3.0])
-def test_values_and_gradients_of_two_samples(device, smooth_cap, sigmas):
+def test_values_and_gradients_of_two_samples(device, sigmas):
     batch = torch.arange(24, device=device) % 2
-    out = compare(random_gaussians(24, device), batch, 2, smooth_cap=smooth_cap, support_sigmas=sigmas)
+    out = compare(random_gaussians(24, device), batch, 2, support_sigmas=sigmas)
     assert 20 < len(out.occupied) < len(out.support) and not out.active.all()
 
 
@@ -88,9 +87,8 @@ def test_faint_and_opaque_contributions(device):
         torch.ones(num, 2),
     ]
     batch = torch.arange(num, device=device)
-    for smooth_cap in (False, True):
-        out = compare([x.to(device) for x in gaussians], batch, num, smooth_cap=smooth_cap, threshold=1e-12)
-        assert out.active.all() and out.log_free.min() < -9 and out.log_free.max() > -1e-8
+    out = compare([x.to(device) for x in gaussians], batch, num, threshold=1e-12)
+    assert out.active.all() and out.log_free.min() < -9 and out.log_free.max() > -1e-8
 
 
 def test_the_guard_cuts_the_same_cells(device):
