@@ -48,7 +48,6 @@ class MatchedParts:
     moving: Part | None  # None where speeds are not asked for
     sums: dict[str, Array]  # [S, 2] see `_motion_sums` and `sums_by_sample`
     truth_kept: Array  # [k] bool, ground truth that survives the official filters
-    predictions_kept: Array  # [n] bool
 
 
 @dataclass
@@ -149,7 +148,6 @@ def match_parts(
         sums=(_motion_sums(ranking, matching) if by_speed else {})
         | sums_by_sample(diagnoses, evaluation_set, truth_kept, found),
         truth_kept=truth_kept,
-        predictions_kept=kept,
     )
 
 
@@ -175,30 +173,23 @@ def measure_parts(parts: MatchedParts) -> dict[str, float | None]:
 
 
 def _score(part: Part) -> SubsetScores:
-    """Curves and scores."""
-    num_classes, num_points, thresholds_m = len(CLASSES), len(RECALLS), part.ranking.protocol.thresholds_m
+    num_classes, thresholds_m = len(CLASSES), part.ranking.protocol.thresholds_m
     num_gt = np.bincount(part.ranking.truth.labels[part.truth_members], minlength=num_classes)
-    precision = np.zeros((num_classes, len(thresholds_m), num_points))
-    confidence = np.zeros_like(precision)
-    error_curves = np.ones((num_classes, len(ERRORS), num_points))
+    precision = np.zeros((num_classes, len(thresholds_m), len(RECALLS)))
     errors = np.ones((num_classes, len(ERRORS)))
     for listed in part.lists():
         c, t, scores = listed.label, listed.threshold, part.ranking.scores[listed.places]
-        precision[c, t], confidence[c, t] = precision_and_confidence(listed.matched, scores, int(num_gt[c]))
+        precision[c, t], confidence = precision_and_confidence(listed.matched, scores, int(num_gt[c]))
         if listed.errors is None:
             continue
         match_scores = scores[listed.matched]
         for e, values in enumerate(listed.errors.T):
-            error_curves[c, e] = error_curve(values, match_scores, confidence[c, t])
-            errors[c, e] = mean_error(error_curves[c, e], confidence[c, t])
+            errors[c, e] = mean_error(error_curve(values, match_scores, confidence), confidence)
     return SubsetScores(
         thresholds_m=thresholds_m,
         num_gt=num_gt,
         ap=average_precision(precision),
         errors=np.where(UNDEFINED_ERRORS, np.nan, errors),
-        precision=precision,
-        confidence=confidence,
-        error_curves=error_curves,
     )
 
 

@@ -89,13 +89,8 @@ class PartScores:
         return _each(values, number) | {"classes": classes}
 
 
-@dataclass
 class SubsetScores(PartScores):
-    """The scores of one evaluation with the curves they are read from."""
-
-    precision: Array  # [12, T, 101] over recall
-    confidence: Array  # [12, T, 101]
-    error_curves: Array  # [12, 5, 101] at the error threshold
+    """The scores of one evaluation."""
 
     def as_dict(self, number: Callable[[Array], object], by_speed: bool = False) -> dict[str, object]:
         """As the base, with the number of boxes of each class."""

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from src.errors import DataError
+from src.metrics.curves import RECALLS, error_curve, precision_and_confidence
 from src.metrics.detection import score_detections
+from src.metrics.protocol import OFFICIAL
 from src.metrics.score_text import format_scores
 from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERRORS
 from src.structures.detections import DetectionTable, EvaluationSet
@@ -58,21 +60,35 @@ def test_tags_agree_with_official_numbers(golden, scores):
     assert all(np.isnan(scores.tags[name].nds) for name in TAGS_WITHOUT_SCORE)
 
 
+def curves_of(part):
+    """Precision and confidence [12, 4, 101] and error curves [12, 5, 101] of a part, from the functions that score."""
+    counts = np.bincount(part.ranking.truth.labels[part.truth_members], minlength=len(CLASSES))
+    precision = np.zeros((len(CLASSES), len(DISTANCE_THRESHOLDS_M), len(RECALLS)))
+    confidence, errors = np.zeros_like(precision), np.ones((len(CLASSES), len(ERRORS), len(RECALLS)))
+    for listed in part.lists():
+        c, t, scores = listed.label, listed.threshold, part.ranking.scores[listed.places]
+        precision[c, t], confidence[c, t] = precision_and_confidence(listed.matched, scores, counts[c])
+        if listed.errors is not None:
+            errors[c] = [error_curve(values, scores[listed.matched], confidence[c, t]) for values in listed.errors.T]
+    return precision, confidence, errors
+
+
 def test_curves_agree_with_official_curves(golden, scores):
+    precision, confidence, errors = curves_of(scores.parts.overall)
     for c, name in enumerate(CLASSES):
         for t, threshold in enumerate(DISTANCE_THRESHOLDS_M):
             curves = golden["expected"]["curves"][name][str(threshold)]
-            np.testing.assert_allclose(scores.overall.precision[c, t], curves["precision"], rtol=0, atol=1e-10)
-            np.testing.assert_allclose(scores.overall.confidence[c, t], curves["confidence"], rtol=0, atol=1e-10)
+            np.testing.assert_allclose(precision[c, t], curves["precision"], rtol=0, atol=1e-10)
+            np.testing.assert_allclose(confidence[c, t], curves["confidence"], rtol=0, atol=1e-10)
         curves = golden["expected"]["curves"][name]["2.0"]
         for e, error in enumerate(OFFICIAL_ERRORS):
-            np.testing.assert_allclose(scores.overall.error_curves[c, e], curves[error], rtol=0, atol=1e-10)
+            np.testing.assert_allclose(errors[c, e], curves[error], rtol=0, atol=1e-10)
 
 
 def test_filters_keep_the_official_boxes(golden, golden_set, golden_predictions, scores):
     for table, kept, expected in (
         (golden_set.ground_truth, scores.parts.truth_kept, golden["expected"]["gt_kept"]),
-        (golden_predictions, scores.parts.predictions_kept, golden["expected"]["pred_kept"]),
+        (golden_predictions, OFFICIAL.counted(golden_set, golden_predictions), golden["expected"]["pred_kept"]),
     ):
         for sample, token in enumerate(golden_set.tokens):
             assert np.flatnonzero(kept[table.samples == sample]).tolist() == expected[token]
@@ -117,12 +133,12 @@ def boxes(xy, label="car", scores=None, points=10, samples=None) -> DetectionTab
     )
 
 
-def one_sample(truth, racks=None, tags=("weather.clear",)) -> EvaluationSet:
-    return set_of(truth, tags=tags, racks=racks or DetectionTable.empty())
+def one_sample(truth, racks=None) -> EvaluationSet:
+    return set_of(truth, tags=("weather.clear",), racks=racks or DetectionTable.empty())
 
 
-def class_ap(evaluation_set, predictions, label="car", **options):
-    return score_detections(evaluation_set, predictions, **options).overall.ap[CLASSES.index(label)]
+def car_ap(evaluation_set, predictions):
+    return score_detections(evaluation_set, predictions).overall.ap[CLASSES.index("car")]
 
 
 def test_perfect_predictions_score_one():
@@ -140,7 +156,7 @@ def test_equal_scores_let_the_later_box_go_first():
     near_first = boxes([(10, 0), (13, 0)], scores=[0.5, 0.5])
     # Match, then false positive: precision is 1 up to recall 1, where the last prediction's 1/2 counts.
     match_first = (89 * 0.9 + 0.4) / 90 / 0.9
-    assert class_ap(one_sample(truth), near_last).tolist() == pytest.approx([match_first] * 4)
+    assert car_ap(one_sample(truth), near_last).tolist() == pytest.approx([match_first] * 4)
     # The later box, 3 m off, takes the ground truth at 4 m; at 2 m it is a false positive before the match.
     found = score_detections(one_sample(truth), near_first).overall
     assert found.ap[0, 3] == pytest.approx(match_first) and found.errors[0, 0] < 1
@@ -151,16 +167,16 @@ def test_equal_scores_let_the_later_box_go_first():
 
 def test_a_match_is_nearer_than_the_threshold():
     truth = boxes([(10, 0)])
-    assert class_ap(one_sample(truth), boxes([(12, 0)], scores=[0.5])).tolist() == pytest.approx([0, 0, 0, 1])
-    assert class_ap(one_sample(truth), boxes([(11.999, 0)], scores=[0.5])).tolist() == pytest.approx([0, 0, 1, 1])
+    assert car_ap(one_sample(truth), boxes([(12, 0)], scores=[0.5])).tolist() == pytest.approx([0, 0, 0, 1])
+    assert car_ap(one_sample(truth), boxes([(11.999, 0)], scores=[0.5])).tolist() == pytest.approx([0, 0, 1, 1])
 
 
 def test_range_is_exclusive_and_zero_points_are_dropped():
     truth = boxes([(150, 0), (149.9, 0)])
     kept = score_detections(one_sample(truth), boxes([(150, 0)], scores=[0.5])).parts.truth_kept
     assert kept.tolist() == [False, True]
-    found = score_detections(one_sample(truth), boxes([(10, 0)], scores=[0.5], points=0))
-    assert found.parts.predictions_kept.tolist() == [False]
+    kept = OFFICIAL.counted(one_sample(truth), boxes([(10, 0)], scores=[0.5], points=0))
+    assert kept.tolist() == [False]
 
 
 def test_a_rack_holds_its_border_in_all_three_directions():
@@ -170,8 +186,8 @@ def test_a_rack_holds_its_border_in_all_three_directions():
     cycles = boxes(xy, label="bicycle", scores=[0.5] * 5)
     cycles.centers[4, 2] = 1.001
     cars = boxes([(10, 0)], scores=[0.5])
-    found = score_detections(one_sample(boxes([(50, 0)]), rack), DetectionTable.concatenate([cycles, cars]))
-    assert found.parts.predictions_kept.tolist() == [False, True, False, True, True, True]
+    kept = OFFICIAL.counted(one_sample(boxes([(50, 0)]), rack), DetectionTable.concatenate([cycles, cars]))
+    assert kept.tolist() == [False, True, False, True, True, True]
 
 
 def test_ranges_match_within_the_bin_only():

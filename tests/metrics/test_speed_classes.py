@@ -8,6 +8,7 @@ import pytest
 from src.benchmark.suite_metric import random_problem
 from src.metrics.detection import score_detections
 from src.metrics.filtering import speed_classes
+from src.metrics.protocol import OFFICIAL
 from src.metrics.score_text import format_scores
 from src.metrics.scores import DISTANCE_THRESHOLDS_M
 from src.structures.detections import DetectionTable
@@ -244,7 +245,7 @@ def test_agrees_with_the_evaluation_written_again(seed):
         ego = evaluation_set.ego_centers[table.samples]
         table.centers = ego + (table.centers - ego) * 0.1
     scores = score_detections(evaluation_set, predictions)
-    truth, predictions = truth[scores.parts.truth_kept], predictions[scores.parts.predictions_kept]
+    truth, predictions = truth[scores.parts.truth_kept], predictions[OFFICIAL.counted(evaluation_set, predictions)]
     seen = 0
     for (low, high), part in zip(
         [(0, 0.5), (0.5, 10), (10, 25), (25, np.inf)], (scores.speeds[name] for name in NAMES), strict=True
