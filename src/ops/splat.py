@@ -45,11 +45,6 @@ class Splat:
     num_cut: int  # occupied cells dropped by the max_cells guard; in fixed shapes more of them overflow
 
     @property
-    def active(self) -> Tensor:  # [G] bool
-        """The Gaussian reaches an occupied cell."""
-        return self.peak_cell >= 0
-
-    @property
     def occupancy(self) -> Tensor:  # [n]
         """alpha = 1 - exp(S) on the support."""
         return -torch.expm1(self.log_free)

@@ -71,10 +71,10 @@ def test_golden_case(dtype):
     torch.testing.assert_close(out.log_free.double(), golden("S"), rtol=1e-10 if exact else 2e-4, atol=1e-10)
     torch.testing.assert_close(out.features.double(), golden("F_G"), rtol=0, atol=1e-10 if exact else 1e-4)
     torch.testing.assert_close(log1mexp(-out.log_free).double(), golden("alpha").log(), rtol=1e-3, atol=1e-6)
-    assert torch.equal(out.active, golden("active"))
+    assert torch.equal(out.peak_cell >= 0, golden("active"))
     clear = golden("argmax_margin") >= 1e-5
     assert torch.equal(out.peak_cell[clear], golden("argmax_cell").long()[clear])
-    assert not out.active[6] and out.peak_cell[6] == -1 and out.num_cut == 0
+    assert out.peak_cell[6] == -1 and out.num_cut == 0
 
     weighted = {"alpha": (out.occupancy, "w_alpha"), "S": (out.log_free, "w_S"), "F": (out.features, "w_F")}
     for kind, (value, weight) in weighted.items():
@@ -97,7 +97,7 @@ def test_equals_brute_force_with_two_samples(sigmas):
     assert torch.equal(out.occupied.linear(), occupied.flatten().nonzero().squeeze(1))
     torch.testing.assert_close(out.features, features.flatten(0, 1)[out.occupied.linear()])
     best = torch.where(occupied[batch], contribution, -1.0).max(1)
-    assert torch.equal(out.active, best.values > 0)
+    assert torch.equal(out.peak_cell >= 0, best.values > 0)
     assert torch.equal(out.peak_cell, torch.where(best.values > 0, best.indices + batch * 48, -1))
     torch.testing.assert_close(out.peak_contribution, best.values.clamp(min=0), rtol=0, atol=1e-4)  # uncapped
 
@@ -172,7 +172,7 @@ def test_the_cap_stops_the_gradient_where_it_binds_alone():
 def test_no_gaussians():
     empty = [torch.zeros(0, *size, requires_grad=True) for size in ((2,), (2,), (2,), (), (4,))]
     out = splat_gaussians(*empty, torch.zeros(0, dtype=torch.int64), SMALL, 2)
-    assert len(out.support) == len(out.log_free) == len(out.occupied) == len(out.active) == 0
+    assert len(out.support) == len(out.log_free) == len(out.occupied) == len(out.peak_cell) == 0
     assert out.features.shape == (0, 4) and out.occupied.shape == (2, 6, 8) and out.num_cut == 0
     (out.log_free.sum() + out.features.sum()).backward()
     assert all(x.grad is not None for x in empty)
@@ -190,7 +190,7 @@ def test_gaussians_outside_or_not_finite_light_nothing():
         SMALL,
         1,
     )
-    assert len(out.support) == 0 and not out.active.any() and (out.peak_cell == -1).all()
+    assert len(out.support) == 0 and (out.peak_cell == -1).all()
 
 
 def test_smallest_scale_always_reaches_a_cell():
@@ -276,7 +276,7 @@ def test_real_gaussians_light_up_the_real_predictions():
         GRID,
         1,
     )
-    assert num == 450 and out.active.all()
+    assert num == 450 and (out.peak_cell >= 0).all()
     centres = torch.tensor([box[:2] for box in frame["pred_boxes"]])
     assert len(centres) == 29
     lit = out.occupied.indices()[:, 1:]
