@@ -50,6 +50,17 @@ def nearest_squared(
     return best
 
 
+def expand_ranges(
+    starts: Array,  # [q] int
+    ends: Array,  # [q] int, at least starts
+) -> tuple[Array, Array]:
+    """Every (q, i) with starts[q] <= i < ends[q], in order: two arrays [p] int64."""
+    counts = (ends - starts).astype(np.int64)
+    rows = np.repeat(np.arange(len(counts)), counts)
+    before = np.cumsum(counts) - counts
+    return rows, np.arange(len(rows)) + (starts - before)[rows]
+
+
 def _pairs(queries: Array, points: Array, radius: float) -> Iterator[tuple[Array, Array, Array]]:
     if not (len(queries) and len(points)):
         return
@@ -68,9 +79,8 @@ def _pairs(queries: Array, points: Array, radius: float) -> Iterator[tuple[Array
         counts = ends - starts
         some = np.flatnonzero(counts)
         for part in np.split(some, np.flatnonzero(np.diff(np.cumsum(counts[some]) // MAX_PAIRS)) + 1):
-            query = np.repeat(part, counts[part])
-            within = np.arange(len(query)) - np.repeat(np.cumsum(counts[part]) - counts[part], counts[part])
-            point, query = order[starts[query] + within], along[query]
+            rows, places = expand_ranges(starts[part], ends[part])
+            point, query = order[places], along[part[rows]]
             squared = ((queries[query] - points[point]) ** 2).sum(1)
             kept = squared <= radius * radius
             yield query[kept], point[kept], squared[kept]

@@ -58,11 +58,6 @@ class VoxelGrid:
         x, y, z = (round((high - low) / size) for low, high, size in extents)
         return z, y, x
 
-    @property
-    def farthest_m(self) -> float:
-        """Distance of the farthest corner from the ego: 270 m for the paper's region."""
-        return math.hypot(*(max(abs(low), abs(high)) for low, high in zip(self.lower_m, self.upper_m, strict=True)))
-
     def at(self, level: int) -> VoxelGrid:
         """The same region in voxels 2^level times as long. Raises ValueError for a level that the grid lacks."""
         if not 0 <= level < self.num_levels:

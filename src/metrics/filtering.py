@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from src.geometry.neighbours import expand_ranges
 from src.geometry.transforms import quaternion_to_matrix
 from src.structures.detections import DetectionTable, EvaluationSet
-from src.structures.taxonomy import CLASS_RANGE_M, CLASSES
+from src.structures.taxonomy import CLASSES
 
 Array = np.ndarray
 
@@ -24,11 +25,6 @@ def ego_distances(evaluation_set: EvaluationSet, table: DetectionTable) -> Array
     x = table.centers[:, 0] - ego[table.samples, 0]
     y = table.centers[:, 1] - ego[table.samples, 1]
     return np.sqrt(x * x + y * y)
-
-
-def class_ranges_m() -> Array:
-    """Of each label, [12] metres."""
-    return np.array([CLASS_RANGE_M[name] for name in CLASSES])
 
 
 def has_points_and_no_rack(
@@ -77,14 +73,3 @@ def _inside_rack(boxes: DetectionTable, racks: DetectionTable) -> Array:
     result = np.zeros(len(boxes), dtype=bool)
     result[pairs_box[inside]] = True
     return result
-
-
-def expand_ranges(
-    starts: Array,  # [q] int
-    ends: Array,  # [q] int, at least starts
-) -> tuple[Array, Array]:
-    """Every (q, i) with starts[q] <= i < ends[q], in order: two arrays [p] int64."""
-    counts = (ends - starts).astype(np.int64)
-    rows = np.repeat(np.arange(len(counts)), counts)
-    before = np.cumsum(counts) - counts
-    return rows, np.arange(len(rows)) + (starts - before)[rows]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from src.metrics.filtering import expand_ranges
+from src.geometry.neighbours import expand_ranges
 
 Array = np.ndarray
 

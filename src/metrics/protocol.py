@@ -9,11 +9,15 @@ import numpy as np
 
 from src.errors import ConfigError
 from src.geometry.transforms import quaternion_to_matrix
-from src.metrics.filtering import class_ranges_m, ego_distances, has_points_and_no_rack
+from src.metrics.filtering import ego_distances, has_points_and_no_rack
 from src.metrics.scores import DISTANCE_THRESHOLDS_M, ERROR_THRESHOLD_M
 from src.structures.detections import DetectionTable, EvaluationSet
+from src.structures.taxonomy import CLASS_RANGE_M, CLASSES
 
 Array = np.ndarray
+
+CLASS_RANGES_M = np.array([CLASS_RANGE_M[name] for name in CLASSES])
+"""Of each label."""
 
 
 @dataclass(kw_only=True)
@@ -54,7 +58,7 @@ class Protocol:
         The same holds for ground truth and predictions; a prediction that states 0 points is dropped too.
         """
         if self.region_m is None:
-            near = ego_distances(evaluation_set, table) < class_ranges_m()[table.labels]
+            near = ego_distances(evaluation_set, table) < CLASS_RANGES_M[table.labels]
         else:
             offsets = table.centers - evaluation_set.ego_centers[table.samples]
             axes = quaternion_to_matrix(evaluation_set.ego_rotations)[table.samples]  # columns: the ego's in global

@@ -8,12 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from src.data.timeline import TimelineConfig
 from src.data.true_geometry import TrueGeometry
-from src.geometry.bounds import Bounds
+from src.geometry.bounds import farthest_m
 from src.metrics.static_world import static_world
 from src.models.world_model import WorldModel
 from src.pictures.film import Film
@@ -109,8 +108,3 @@ def _write_film(path: Path, moments: Iterable[ForecastMoment], title: str) -> No
             film.add(picture, moment.time_s)
     if film:
         film.write_animation(path)
-
-
-def farthest_m(bounds: Bounds) -> float:
-    """Distance of the farthest corner."""
-    return float(np.linalg.norm(np.abs(bounds).max(axis=1)))

@@ -5,6 +5,7 @@ import torch
 
 from src.config import compose_config
 from src.errors import ConfigError
+from src.geometry.bounds import farthest_m
 from src.geometry.voxel_grid import VoxelGrid
 
 GRID = VoxelGrid((-8.0, -4.0, -2.0), (24.0, 4.0, 2.0), (0.5, 0.25, 0.125), num_levels=3)
@@ -30,7 +31,8 @@ def test_cells_follow_from_region_and_voxel():
 )
 def test_the_presets_are_those_of_the_specification(name, cells, farthest, columns, cell_m):
     grid = preset(name)
-    assert grid.cells == cells and round(grid.farthest_m, 1) == farthest
+    assert grid.cells == cells
+    assert round(farthest_m(tuple(zip(grid.lower_m, grid.upper_m, strict=True))), 1) == farthest
     bev = grid.at(3).bev()
     assert bev.cells == columns and math.isclose(bev.cell_m, cell_m)
     assert (bev.x_min_m, bev.y_min_m, *bev.z_range_m) == pytest.approx((*grid.lower_m[:2], -12.0, 12.0))

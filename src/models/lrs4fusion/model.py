@@ -12,7 +12,7 @@ from torch import Tensor
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.geometry.bounds import Bounds
+from src.geometry.bounds import Bounds, farthest_m
 from src.models.backbones.image import ImageEncoderConfig
 from src.models.detector import Detector, Objective
 from src.models.heads.center_head import CenterHead, HeadOutput
@@ -91,7 +91,7 @@ class LRS4Fusion(Detector, WorldModel):
         self.ray_head = self.neck = self.head = None
         if self.stage is LRSStage.forecast:
             self.requires_grad_(False)
-            self.ray_head = RayHead(config.ray_head, self.voxels.farthest_m)
+            self.ray_head = RayHead(config.ray_head, farthest_m(self.bounds))
         if self.stage is LRSStage.detection:
             self.decoders.requires_grad_(False)  # they still say how fast what is remembered moves
             self.neck = BEVNeck(config.neck, late.scale_channels).to(memory_format=torch.channels_last)
