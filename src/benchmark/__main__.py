@@ -6,8 +6,8 @@ suite=model     the configured model part by part: time forward and with backwar
                 are random unless checkpoint=PATH (of the same configuration) is given; a phase that learns from LiDAR
                 rays alone takes a made frame: no world is written for it
 suite=ops       each heavy operation beside GEMM, other libraries and naive implementations, in turns
-suite=scaling   cost against range, objects, radar points, Gaussians and memory, the configured model beside others that
-                need no LiDAR; of a model that reads LiDAR, alone, against range
+suite=scaling   cost against range, objects, radar points, Gaussians and memory, the configured model beside the
+                dense baseline; of a model that reads LiDAR, alone, against range
 suite=training  frames per second of the phase's training step, with its loader and without
 suite=latency   a frame of the trained model checkpoint=PATH, part by part, with full memory in phase 2, over the frames
                 that it was validated on; into DIR/latency.json, where DIR is the run's folder if tables are to show it

@@ -1,4 +1,4 @@
-"""What an encoder layer reads of the shape of Gaussians and makes of it anew, without gradient (method 5.2, 5.4)."""
+"""What an encoder layer reads of the shape of Gaussians and makes of it anew (method 5.2, 5.4)."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from src.data.augment import (
-    AugmentationConfig,
     BevAugmentationConfig,
     ImageAugmentationConfig,
     draw_bev_transform,
@@ -73,7 +72,3 @@ def test_generator_is_known_by_its_three_names():
 def test_impossible_ranges(make):
     with pytest.raises(ConfigError, match="data.augmentation"):
         make()
-
-
-def test_parts_can_be_off():
-    assert AugmentationConfig(image=None, bev=None).bev is None
