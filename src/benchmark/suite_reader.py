@@ -27,6 +27,7 @@ from src.data.images import width_fit
 from src.data.jpeg import decoder_name
 from src.data.pcd import RADAR_FIELDS, read_radar_points
 from src.data.schema import CHANNELS
+from src.data.sensor_files import sweeps_before
 from src.data.splits import split_samples
 from src.structures.taxonomy import CAMERAS, LIDARS, RADARS
 
@@ -97,14 +98,9 @@ def full_samples(datamodule: DetectionDataModule) -> list[int]:
 
 def sweep_paths(datamodule: DetectionDataModule, sample: int, channels: tuple[str, ...], num_sweeps: int) -> list[str]:
     """Files of a frame's sweeps."""
-    index, paths = datamodule.index, []
-    for channel in channels:
-        row = int(index.key_data[sample, CHANNELS.index(channel)])
-        for _ in range(num_sweeps):
-            if row >= 0:
-                paths.append(str(index.root / index.filename(row)))
-                row = int(index.data_previous[row])
-    return paths
+    index = datamodule.index
+    rows = index.key_data[sample, [CHANNELS.index(channel) for channel in channels]]
+    return [str(index.root / index.filename(row)) for row in sweeps_before(index, rows, num_sweeps)]
 
 
 # -------------------------------------------------------------------- stages

@@ -18,7 +18,7 @@ from src.data.point_tensors import lidar_tensors, radar_tensors
 from src.data.rays import lidar_rays, without_ego_body
 from src.data.return_speeds import ReturnSpeeds
 from src.data.schema import CHANNELS, DatasetIndex
-from src.data.sensor_files import OnBadFile, SensorFiles, Skipped
+from src.data.sensor_files import OnBadFile, SensorFiles, Skipped, sweeps_before
 from src.data.timeline import LidarTimeline, RadialSpeeds, TimelineConfig
 from src.geometry.camera import pixels_from_points
 from src.geometry.transforms import invert_rigid, quaternion_to_matrix, yaw_of
@@ -201,7 +201,7 @@ class FrameReader:
 
     def _past_frame(self, sample: int, step: int, aug_from_ego: Array, skipped: Skipped) -> FrameBatch:
         """The LiDAR frame at a moment, in the ego frame of its LIDAR_LEFT sweep or else of the first there is."""
-        files = self._files.with_sweeps_before(self.timeline.sweeps(sample, step), self.settings.num_lidar_sweeps)
+        files = sweeps_before(self.index, self.timeline.sweeps(sample, step), self.settings.num_lidar_sweeps)
         rows, clouds = self._files.lidar_clouds(sample, files, skipped)
         frame, aug_from_global = self._key_frame(sample, aug_from_ego), np.eye(4)
         if len(rows):
@@ -221,7 +221,7 @@ class FrameReader:
         """Returns of one sweep of each LiDAR at each moment; a moment without sweeps gives no rays."""
         frame_time_us, parts = int(self.index.frame_times_us[sample]), []
         for step in steps:
-            files = self._files.with_sweeps_before(self.timeline.sweeps(sample, step), 1)
+            files = sweeps_before(self.index, self.timeline.sweeps(sample, step), 1)
             rows, clouds = self._files.lidar_clouds(sample, files, skipped)
             mounts = self.index.ego_from_sensor[self.index.data_calibrations[rows]]
             clouds = list(map(without_ego_body, clouds, mounts))

@@ -45,6 +45,18 @@ class Skipped:
     lost: bool = False  # the key frame's own pose is wrong, so that no annotation is where it says
 
 
+def sweeps_before(index: DatasetIndex, rows: Array, count: int) -> list[int]:
+    """Of each sensor the rows of `count` files that end with the given one; -1 stands for none."""
+    files = []
+    for row in rows.tolist():
+        for _ in range(count):
+            if row < 0:
+                break
+            files.append(row)
+            row = int(index.data_previous[row])
+    return files
+
+
 class SensorFiles:
     """Finds and reads the sensor files of one release."""
 
@@ -61,18 +73,7 @@ class SensorFiles:
         for channel, row in zip(channels, rows, strict=True):
             if row < 0 and count:
                 skipped.channels[f"{channel} (not recorded)"] += 1
-        return self.with_sweeps_before(rows, count)
-
-    def with_sweeps_before(self, rows: Array, count: int) -> list[int]:
-        """Of each sensor `count` files that end with the given one; -1 stands for none."""
-        files = []
-        for row in rows.tolist():
-            for _ in range(count):
-                if row < 0:
-                    break
-                files.append(row)
-                row = int(self.index.data_previous[row])
-        return files
+        return sweeps_before(self.index, rows, count)
 
     def radar_clouds(self, sample: int, files: list[int], skipped: Skipped) -> tuple[Array, list[Array]]:
         """Rows [S] of those files that could be read, and their points: S of [n, 7] in the order of RADAR_FIELDS."""
@@ -130,11 +131,7 @@ class SensorFiles:
             if self.on_bad_file is OnBadFile.error:
                 remedy = "restore the file, or skip and count such files with data.on_bad_file=skip"
                 raise DataError(f"{error} (sample {self.index.sample_tokens[sample]}); {remedy}") from error
-            skipped.channels[channel] += 1
-            skipped.files.append(name)
-            if name not in self._reported:
-                self._reported.add(name)
-                _log.warning("skipped: %s", error)
+            self._skip(channel, name, str(error), skipped)
             return None
 
     def with_known_poses(
@@ -162,12 +159,17 @@ class SensorFiles:
             good &= motion_known(index, index.pose_times_us[poses])
         for row, channel in zip(rows[~good].tolist(), np.array(channels)[~good].tolist(), strict=True):
             name = index.filename(row)
-            skipped.channels[f"{channel} (ego pose)"] += 1
-            skipped.files.append(name)
-            if name not in self._reported:
-                self._reported.add(name)
-                _log.warning("skipped: the ego pose of %s is not one that a truck can have driven to", name)
+            reason = f"the ego pose of {name} is not one that a truck can have driven to"
+            self._skip(f"{channel} (ego pose)", name, reason, skipped)
         return rows[good].tolist(), np.array(channels)[good].tolist()
+
+    def _skip(self, channel: str, name: str, reason: str, skipped: Skipped) -> None:
+        """Count a file that the frame does without; the reason is told once."""
+        skipped.channels[channel] += 1
+        skipped.files.append(name)
+        if name not in self._reported:
+            self._reported.add(name)
+            _log.warning("skipped: %s", reason)
 
     def lost(self, sample: int) -> bool:
         """Whether none of a key frame's files was recorded where a truck could have come from its pose."""
