@@ -31,7 +31,7 @@ from src.benchmark.timing import MODES, added_mib, clock, interleaved, ratio_col
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.layers.sparse import SparseConv, SparseKernel, SubmanifoldConv, TemporalConv
-from src.ops.kernel_maps import KernelMap
+from src.ops.kernel_map import KernelMap
 from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv
 from src.ops.sparse_conv_blocks import blocked_sparse_conv
@@ -144,7 +144,7 @@ def measure_layer(
         turned = torch.zeros_like(gradient).index_copy(0, order, gradient)
         both["spconv"] = lambda: torch.autograd.grad(functions["spconv"](), leaves["spconv"], turned)
         if threads == 1 or device.type == "cuda":
-            agreement["spconv differs by"] = spconv_difference(layer, functions, both, order)
+            agreement["spconv differs by"] = spconv_difference(functions, both, order)
         else:
             reference = sparse_conv(features, weight, kernel_map).detach()
             runs = (functions["spconv"]().detach().index_select(0, order) for _ in range(SPCONV_TRIALS))
@@ -178,7 +178,6 @@ def rate_columns(seconds: dict[str, list[float]], flops: float, gemm: Gemm) -> d
 
 
 def spconv_difference(
-    layer: Layer,
     functions: dict[str, Callable[[], Tensor]],
     both: dict[str, Callable[[], tuple[Tensor, ...]]],
     order: Tensor,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from src.ops.kernel_maps import KernelMap
+from src.ops.kernel_map import KernelMap
 from src.ops.segment_reduce import rank_per_sample, segment_count
 from src.ops.sites import Sites, rows_of_keys
 

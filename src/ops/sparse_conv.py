@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from src.ops.backend import COUNTED, chosen, implementation
-from src.ops.kernel_maps import KernelMap
+from src.ops.kernel_map import KernelMap
 from src.ops.linear import linear
 from src.ops.segment_reduce import gather_segment_sum
 from src.ops.sparse_conv_cpu import cpu_sparse_conv

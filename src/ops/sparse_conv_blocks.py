@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from src.ops.kernel_maps import KernelMap
+from src.ops.kernel_map import KernelMap
 from src.ops.products import MOST_ROWS, ROW_STEP, matmul, row_spans, row_steps
 from src.ops.scratch import scratch
 from src.ops.sparse_conv_function import SparseConvFunction

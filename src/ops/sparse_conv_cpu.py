@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from src.ops.kernel_maps import KernelMap
+from src.ops.kernel_map import KernelMap
 from src.ops.products import prefers_onednn, product_type
 from src.ops.sparse_conv_blocks import blocked_sparse_conv
 from src.ops.sparse_conv_tiles import tiled_sparse_conv

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from src.ops.kernel_maps import KernelMap
+from src.ops.kernel_map import KernelMap
 
 
 class SparseConvFunction(torch.autograd.Function):

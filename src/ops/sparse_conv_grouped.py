@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from src.ops.kernel_maps import KernelMap
+from src.ops.kernel_map import KernelMap
 from src.ops.segment_reduce import gather_segment_sum
 from src.ops.sparse_conv_function import SparseConvFunction
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from src.ops.kernel_maps import KernelMap
+from src.ops.kernel_map import KernelMap
 from src.ops.scratch import scratch
 from src.ops.segment_reduce import gather_segment_sum
 from src.ops.sparse_conv_function import SparseConvFunction

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from src.ops.kernel_maps import KernelMap
+from src.ops.kernel_map import KernelMap
 from src.ops.segment_reduce import segment_sum
 
 

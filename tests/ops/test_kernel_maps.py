@@ -3,7 +3,8 @@ import itertools
 import pytest
 import torch
 
-from src.ops.kernel_maps import KernelMap, pruned_map, strided_map, submanifold_map, temporal_map, window_map
+from src.ops.kernel_map import KernelMap
+from src.ops.kernel_maps import pruned_map, strided_map, submanifold_map, temporal_map, window_map
 from src.ops.sites import Sites
 from tests.ops.maps import random_sites
 

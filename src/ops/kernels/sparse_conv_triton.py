@@ -8,7 +8,7 @@ import triton.language as tl
 from torch import Tensor
 
 from src.ops.backend import interpreted, runs_kernels
-from src.ops.kernel_maps import KernelMap
+from src.ops.kernel_map import KernelMap
 from src.ops.sparse_conv import sparse_conv_reference, sparse_conv_relu_reference
 from src.ops.sparse_conv_function import SparseConvFunction
 
