@@ -84,6 +84,11 @@ def build_case(config: Config, batch: FrameBatch, device: torch.device) -> Case:
     return Case(model.train(), prepared, batch, None, device, config.precision, learns_boxes)
 
 
+def later(batch: FrameBatch) -> FrameBatch:
+    """The next key frame of a truck that stands."""
+    return replace(batch, timestamps_s=batch.timestamps_s + KEY_FRAME_S)
+
+
 def measured_model(config: Config) -> Detector:
     """The configured model, with the weights of `checkpoint=PATH`, if given, which must be of this configuration."""
     if config.checkpoint is None:

@@ -48,7 +48,7 @@ def is_within(name: str) -> bool:
 def wrapped_parts(
     model: nn.Module,
     parts: Paths,
-    wrap: Callable[[str, str, Callable[..., Any]], Callable[..., Any]],  # of part, path and the function
+    wrap: Callable[[str, Callable[..., Any]], Callable[..., Any]],  # of part and the function
 ) -> Iterator[None]:
     """Within the context every method and function that is a part is wrapped, for each part that it belongs to.
 
@@ -61,7 +61,7 @@ def wrapped_parts(
                 place, colon, function = path.rpartition(":" if ":" in path else ".")
                 owner = importlib.import_module(place) if colon == ":" else modules.get(place)
                 if colon == ":" or hasattr(owner, function):
-                    stack.enter_context(patch.object(owner, function, wrap(name, path, getattr(owner, function))))
+                    stack.enter_context(patch.object(owner, function, wrap(name, getattr(owner, function))))
         yield
 
 
@@ -84,7 +84,7 @@ def record_calls(model: Detector, parts: Paths, run: Callable[[], Any]) -> dict[
     """The calls of every part that happen while the model runs once; parts that are not called are left out."""
     calls: dict[str, list[Call]] = {name: [] for name in parts}
 
-    def wrap(name: str, path: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def wrap(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **named: Any) -> Any:
             kept = fresh((arguments, named))  # before the part fills the caches of its inputs
             result = function(*arguments, **named)

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Self
 from unittest.mock import patch
@@ -88,24 +89,20 @@ class SimTensor(Tensor):
 _active: list[Tally] = []
 
 
-class SimulatedDevice:
+@contextmanager
+def simulated_device() -> Iterator[Tally]:
     """Context in which tensors can be moved to `sim:0`; yields what is counted. Contexts do not nest.
 
     Gradients need that the first was entered before the process's first backward pass, which counts the devices.
     """
-
-    def __enter__(self) -> Tally:
-        _register()
-        tally = Tally()
-        _active.append(tally)
-        self.stack = ExitStack()
-        self.stack.callback(_active.pop)
-        for context in (_Literals(), _Dispatch(), patch.object(Tensor, "pin_memory", _pinned)):
-            self.stack.enter_context(context)
-        return tally
-
-    def __exit__(self, *error: Any) -> None:
-        self.stack.close()
+    _register()
+    tally = Tally()
+    _active.append(tally)
+    try:
+        with _Literals(), _Dispatch(), patch.object(Tensor, "pin_memory", _pinned):
+            yield tally
+    finally:
+        _active.pop()
 
 
 def _pinned(tensor: Tensor) -> Tensor:

@@ -10,12 +10,13 @@ from typing import Any
 
 import torch
 
-from src.benchmark.cases import KEY_FRAME_S, Case, build_case, expect_trained_scores
+from src.benchmark.cases import Case, build_case, expect_trained_scores, later
 from src.benchmark.parts import is_within, parts_of, wrapped_parts
 from src.benchmark.scenes import Highway, highway_frame, highway_points
-from src.benchmark.simulated_device import DEVICE, SimulatedDevice, Tally
+from src.benchmark.simulated_device import DEVICE, Tally, simulated_device
 from src.benchmark.simulated_kernels import simulated_kernels
 from src.config import Config
+from src.data.frame_loader import collate
 from src.errors import ConfigError
 from src.models.deploy.whole_frames import WholeFrames
 from src.ops.fixed_shapes import Capacities
@@ -85,23 +86,11 @@ def make_case(
     return case
 
 
-def later(batch: FrameBatch) -> FrameBatch:
-    """The next key frame of a truck that stands."""
-    return replace(batch, timestamps_s=batch.timestamps_s + KEY_FRAME_S)
-
-
 def made_batch(batch_size: int, road: Highway, image_size_px: tuple[int, int], seed: int = 0) -> FrameBatch:
     """Frames of a made highway with boxes, each sample another draw."""
-    frames = [highway_frame(highway_points(road, seed + row), image_size_px) for row in range(batch_size)]
-    owners = [torch.full((len(frame.radar_points),), row) for row, frame in enumerate(frames)]
-    joined = {
-        name: torch.cat([getattr(frame, name) for frame in frames])
-        for name in (
-            "timestamps_s", "global_from_ego", "aug_from_ego", "radar_points", "images", "image_valid", "pix_from_aug",
-        )
-    }  # fmt: skip
-    joined |= {"radar_batch": torch.cat(owners), "boxes": [made_boxes(seed + row) for row in range(batch_size)]}
-    return FrameBatch([f"synthetic {row}" for row in range(batch_size)], **joined)
+    draws = range(seed, seed + batch_size)
+    frames = [highway_frame(highway_points(road, draw), image_size_px) for draw in draws]
+    return collate([replace(frame, boxes=[made_boxes(draw)]) for frame, draw in zip(frames, draws, strict=True)])
 
 
 def made_boxes(seed: int) -> Boxes3D:
@@ -124,7 +113,7 @@ def made_boxes(seed: int) -> Boxes3D:
 
 def count(case: Case, model: torch.nn.Module, run: Callable[[], Any]) -> tuple[Tally, dict[str, Counter[str]]]:
     """The tally of a run on the simulated device, and that of each part; the case is on the CPU again afterwards."""
-    with SimulatedDevice() as tally, simulated_kernels():
+    with simulated_device() as tally, simulated_kernels():
         held = (case.model, case.prepared, case.batch, case.memory, case.device)
         moved = on_simulated_device(model)
         case.model = case.prepared = moved
@@ -141,7 +130,7 @@ def count_in_fixed_shapes(case: Case) -> tuple[Tally, dict[str, Counter[str]]] |
         return None
     frame = made_batch(1, ROAD, tuple(case.batch.images.shape[-2:]) if case.batch.images is not None else IMAGE_SIZE_PX)
     with (
-        SimulatedDevice() as tally,
+        simulated_device() as tally,
         simulated_kernels(),
         torch.no_grad(),
         computing(case.precision, torch.device(DEVICE)),
@@ -158,7 +147,7 @@ def count_parts(
     """The tally of each part of a run, which that of all is afterwards."""
     found: dict[str, Counter[str]] = {}
 
-    def counted(name: str, path: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **named: Any) -> Any:
             before = tally.totals()
             result = function(*arguments, **named)

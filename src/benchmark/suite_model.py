@@ -5,13 +5,12 @@ from __future__ import annotations
 import logging
 import statistics
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import torch
 
 from src.assembly import build_datamodule, data_root
-from src.benchmark.cases import CANDIDATES, KEY_FRAME_S, Case, build_case, expect_trained_scores
+from src.benchmark.cases import CANDIDATES, Case, build_case, expect_trained_scores, later
 from src.benchmark.counting import counted_work, distinct_bytes
 from src.benchmark.machine import gemm_rate, measure_roofline
 from src.benchmark.operation_table import OPERATIONS_NOTE, operation_table
@@ -97,7 +96,7 @@ def make_case(config: Config, device: torch.device) -> Case:
     with torch.no_grad():
         for _ in range(config.model.memory_frames):
             _, case.memory = case.run()
-            case.batch = replace(case.batch, timestamps_s=case.batch.timestamps_s + KEY_FRAME_S)
+            case.batch = later(case.batch)
     if not config.checkpoint:
         expect_trained_scores(case)
     return case

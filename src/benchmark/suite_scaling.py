@@ -22,6 +22,7 @@ from src.benchmark.cases import (
     build_case,
     expect_trained_occupancy,
     expect_trained_scores,
+    later,
 )
 from src.benchmark.counting import counted_work
 from src.benchmark.page import gpu_notes, page_name
@@ -281,7 +282,7 @@ def fill_memory(case: Case, memory: Any, num_frames: int) -> None:
     with torch.no_grad(), case.computing():
         # Once more by the model, which keeps of each frame what it reads at that age.
         _, case.memory = case.prepared(before, type(memory)(tuple(past)))
-    case.batch = replace(case.batch, timestamps_s=case.batch.timestamps_s + KEY_FRAME_S)
+    case.batch = later(case.batch)
 
 
 def behind(frame: Any, steps: int) -> Tensor:  # [B, 4, 4]

@@ -170,7 +170,7 @@ def soak_training(
     epochs = math.ceil(frames / epoch_frames(config, datamodule))
     curve = Curve(frames, device, lambda: [memory for _, memory in module.memories])
 
-    def watched(name: str, path: str, method: Callable[..., Any]) -> Callable[..., Any]:
+    def watched(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **named: Any) -> Any:
             result = method(*arguments, **named)
             if name == "epoch":  # before it came a validation and a checkpoint

@@ -97,7 +97,7 @@ def timed_parts(model: nn.Module, parts: Paths, now: Callable[[], float]) -> Ite
     """Within the context the calls of every part add their seconds to what it yields, under the part's name."""
     seconds: dict[str, float] = {}
 
-    def timed(name: str, path: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **named: Any) -> Any:
             started = now()
             result = function(*arguments, **named)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from src.benchmark.plain_kernels import KERNELS
-from src.benchmark.simulated_device import DEVICE, SimulatedDevice
+from src.benchmark.simulated_device import DEVICE, simulated_device
 from src.geometry.constants import upload
 from src.ops import backend
 from src.ops.segment_reduce import segment_sum
@@ -23,7 +23,7 @@ BUDGETS = {
 
 
 def counted(run):
-    with SimulatedDevice() as tally:
+    with simulated_device() as tally:
         values = torch.arange(6.0).to(DEVICE)
         tally.__init__()
         run(values)
@@ -51,21 +51,21 @@ def test_launches_waits_and_uploads_of_single_operations(run, launches, waits, u
 
 
 def test_tensors_of_two_devices_in_one_operation_are_found():
-    with SimulatedDevice() as tally:
+    with simulated_device() as tally:
         torch.ones(2).to(DEVICE) + torch.ones(2)
     assert [name for name, _ in tally.mixed] == ["add"]
 
 
 def test_values_are_those_of_the_cpu():
     values, rows = torch.randn(5, 3), torch.tensor([1, 0, 1, 3, 0])
-    with SimulatedDevice():
+    with simulated_device():
         found = segment_sum(values.to(DEVICE), rows.to(DEVICE), 4).cpu()
     assert torch.equal(found, segment_sum(values, rows, 4))
 
 
 def test_tensors_of_one_type_are_uploaded_together():
     host = [torch.tensor([[1.0, 2.0]]), torch.tensor([3]), torch.zeros(0, 2), torch.tensor([True, False])]
-    with SimulatedDevice() as tally:
+    with simulated_device() as tally:
         moved = upload([*host, host[1] + 1], torch.device(DEVICE))
         assert tally.totals()["uploads"] == 3 and tally.totals()["waits"] == 0
         found = [tensor.cpu() for tensor in moved]

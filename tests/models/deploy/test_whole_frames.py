@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from src.benchmark.simulated_device import DEVICE, SimulatedDevice
+from src.benchmark.simulated_device import DEVICE, simulated_device
 from src.benchmark.simulated_kernels import simulated_kernels
 from src.errors import ConfigError
 from src.geometry.constants import constant
@@ -181,7 +181,7 @@ def test_every_frame_launches_the_same_and_waits_for_its_result_alone(checkpoint
     frames = [make_frame(plain, 0.5 * k, seed=k, num_points=n) for k, n in enumerate((60, 150, 3))]
     frames.append(make_frame(plain, 1.5, seed=9, cameras=CAMERAS[:1]))
     sequences, boxes = [], []
-    with SimulatedDevice() as tally, simulated_kernels(), torch.no_grad():
+    with simulated_device() as tally, simulated_kernels(), torch.no_grad():
         form = copy.deepcopy(plain.model).to(DEVICE).fixed_form(ROOM)
         whole = WholeFrames(form, torch.device(DEVICE), captured=False)
         whole.step(frames[0])  # uploads the constants
