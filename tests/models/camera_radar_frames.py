@@ -6,7 +6,7 @@ import torch
 
 from src.config import compose_config
 from src.models import build_model
-from tests.models.dense_bev.dense_frames import GRID, backbone
+from tests.models.frames import GRID, backbone
 
 
 def settings(family):

@@ -4,7 +4,7 @@ import torch
 
 from src.config import compose_config
 from src.models import build_model
-from tests.models.dense_bev.dense_frames import GRID, backbone
+from tests.models.frames import GRID, backbone
 
 FAMILIES = {
     "far3d": ("model.queries.depth_range_m=[1,40]", "model.num_queries=32"),

@@ -12,7 +12,7 @@ from src.models.crt_fusion.model import CRTFusionLossConfig
 from src.models.hydra.model import HyDRaLossConfig
 from tests.models.camera_radar_frames import settings, small_model
 from tests.models.crt_fusion.test_crt_model import TERMS as CRT_TERMS
-from tests.models.dense_bev.dense_frames import GRID, make_batch
+from tests.models.frames import GRID, make_batch
 from tests.models.hydra.test_hydra_model import TERMS as HYDRA_TERMS
 from tests.models.learning import (
     gradients_are_finite,

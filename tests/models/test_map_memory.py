@@ -9,7 +9,8 @@ from torch import nn
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.map_memory import MapMemory, TemporalFusion
-from tests.models.dense_bev.dense_frames import memory_config, pose
+from tests.models.dense_bev.dense_frames import memory_config
+from tests.models.frames import pose
 from tests.models.moving import bare_frame, bda
 
 WIDE = BEVGrid(cells=(96, 96), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))

@@ -12,7 +12,7 @@ from src.models.heads.query_head import QueryPrediction, box_codes
 from src.models.query_denoising import DenoisingConfig, NoisyQueries, denoising_loss, noisy_queries
 from src.structures.boxes import Boxes3D
 from src.structures.queries import Queries
-from tests.models.dense_bev.dense_frames import GRID, drive, make_batch
+from tests.models.frames import GRID, drive, make_batch
 from tests.models.learning import gradients_are_finite, train_step
 from tests.models.query_frames import FAMILIES, small_model
 

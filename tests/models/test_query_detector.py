@@ -9,7 +9,7 @@ from src.assembly import build_model as full_model
 from src.config import compose_config
 from src.errors import ConfigError
 from src.models import build_model
-from tests.models.dense_bev.dense_frames import GRID, drive, fill, make_batch
+from tests.models.frames import GRID, drive, fill, make_batch
 from tests.models.learning import (
     gradients_are_finite,
     images_and_annotations_are_needed,

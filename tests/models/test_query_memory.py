@@ -12,7 +12,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.heads.query_head import QueryPrediction
 from src.models.query_memory import MotionNorm, QueryMemory, QueryMemoryConfig, QueryPropagation
 from src.models.sparc.model import SpaRCConfig
-from tests.models.dense_bev.dense_frames import drive, fill, pose
+from tests.models.frames import drive, fill, pose
 from tests.models.moving import bare_frame, bda
 from tests.models.query_frames import small_model
 

@@ -11,7 +11,8 @@ from torch import nn
 from src.models import FAMILIES
 from src.reliability.checkpoints import load_model_weights
 from tests.models.camera_radar_frames import crt_model, hydra_model
-from tests.models.dense_bev.dense_frames import dense_model, drive, fill, memory_config, pose
+from tests.models.dense_bev.dense_frames import dense_model, memory_config
+from tests.models.frames import drive, fill, pose
 from tests.models.learning import gradients_are_finite
 from tests.models.query_frames import small_model
 

@@ -2,7 +2,6 @@
 
 import copy
 import csv
-import importlib.util
 import os
 import signal
 from dataclasses import dataclass, replace
@@ -37,6 +36,9 @@ from src.training.optim import OptimConfig
 from src.training.run_folder import Resume, RunFolder
 from src.training.temporal_module import TemporalModule
 from tests.evaluation_sets import set_of
+from tests.models.frames import make_batch
+from tests.models.horizon3d.small_model import dptf_config, make_model
+from tests.models.surroundings import DIAGONALS
 from tests.training.toys import STEPS as TOY_STEPS
 from tests.training.toys import Positions, toy_batch, toy_module, toy_trainer
 from tests.training.two_ranks import become, spawn_two
@@ -44,20 +46,6 @@ from tests.training.two_ranks import become, spawn_two
 STREAMS, STEPS = 4, 3
 FIRST_RANK, SECOND_RANK = (0, 1), (2, 3)
 COLUMNS = tuple(DetectionTable.__dataclass_fields__)
-
-
-def _of_the_models_tests():
-    """The small model and its frames are described beside the model's own tests."""
-    path = Path(__file__).parents[1] / "models" / "horizon3d" / "conftest.py"
-    spec = importlib.util.spec_from_file_location("horizon3d_conftest", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-parts = _of_the_models_tests()
-grid, backbone, make_batch = parts.grid, parts.backbone, parts.make_batch
-make_config, make_model = parts.make_config, parts.make_model
 
 
 @dataclass
@@ -137,11 +125,11 @@ def in_two_processes(work):
 
 
 @pytest.fixture
-def frames(make_batch):
+def frames():
     """Batches of one: (stream, step, points, boxes, cameras) -> that stream's frame of a step of half a second."""
 
     def build(stream, step, points=60, boxes=5, cameras=True):
-        frame = make_batch(points=(points,), boxes=(boxes,), seed=10 * step + stream)
+        frame = make_batch((points,), (boxes,), 10 * step + stream, headings=DIAGONALS, origin=(0.0, 0.0))
         frame = replace(
             frame,
             tokens=[f"{stream}/{step}"],
@@ -154,9 +142,9 @@ def frames(make_batch):
 
 
 @pytest.fixture
-def work(make_model, frames, tmp_path):
+def work(frames, tmp_path):
     """Three steps in which one process or the other, or a stream, lacks what the other has."""
-    model = make_model(dptf=parts.dptf_config(), initialization=Initialization.keypoint)
+    model = make_model(dptf=dptf_config(), initialization=Initialization.keypoint)
     model.head.config = replace(model.head.config, score_threshold=0.05)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():

@@ -6,7 +6,7 @@ import torch
 from src.errors import ConfigError
 from src.models.backbones.pillars import PillarConfig, PillarEncoder
 from src.models.backbones.sparse_voxel import POINT_SCALES
-from tests.models.dense_bev.dense_frames import GRID, make_batch
+from tests.models.frames import GRID, make_batch
 
 
 def make_encoder(num_layers=4):

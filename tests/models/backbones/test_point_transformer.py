@@ -12,7 +12,7 @@ from src.models.backbones.point_transformer import (
 )
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV
-from tests.models.dense_bev.dense_frames import GRID, make_batch
+from tests.models.frames import GRID, make_batch
 
 
 def make_config(**changes):

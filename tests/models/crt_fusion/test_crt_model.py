@@ -6,7 +6,7 @@ import torch
 from src.errors import ConfigError
 from src.models.crt_fusion.model import GatedFuser
 from tests.models.camera_radar_frames import crt_model
-from tests.models.dense_bev.dense_frames import GRID, make_batch
+from tests.models.frames import GRID, make_batch
 from tests.models.learning import (
     gradients_are_finite,
     missing_cameras_do_not_matter,

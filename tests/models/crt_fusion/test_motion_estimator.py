@@ -6,7 +6,7 @@ from src.losses.classification import occupancy_focal, sigmoid_focal
 from src.models.crt_fusion.motion_estimator import CellMotion, MotionEstimator, velocity_loss
 from src.structures.boxes import Boxes3D
 from src.targets.box_raster import BoxRaster
-from tests.models.dense_bev.dense_frames import GRID
+from tests.models.frames import GRID
 
 
 def boxes(*rows):

@@ -10,7 +10,7 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.crt_fusion.motion_estimator import CellMotion
 from src.models.crt_fusion.motion_fusion import MotionFusionConfig, MotionGuidedFusion, StackMemory
-from tests.models.dense_bev.dense_frames import pose
+from tests.models.frames import pose
 from tests.models.moving import bare_frame, bda
 
 WIDE = BEVGrid(cells=(40, 60), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))

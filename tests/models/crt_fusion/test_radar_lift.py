@@ -8,7 +8,7 @@ import torch
 from src.models.layers.azimuth_attention import AzimuthAttention
 from src.models.layers.views import CameraViews
 from tests.models.camera_radar_frames import crt_model, radar_map
-from tests.models.dense_bev.dense_frames import GRID, SIZE, make_batch
+from tests.models.frames import GRID, SIZE, make_batch
 from tests.models.surroundings import AXES, camera_matrices
 
 

@@ -16,7 +16,8 @@ from src.models.backbones.image import NeckName
 from src.models.camera_radar import CameraRadarLossConfig
 from src.models.dense_bev.model import DenseBEV, DenseBEVConfig
 from src.structures.boxes import Boxes3D
-from tests.models.dense_bev.dense_frames import GRID, backbone, dense_config, dense_model, make_batch, memory_config
+from tests.models.dense_bev.dense_frames import dense_config, dense_model, memory_config
+from tests.models.frames import GRID, backbone, make_batch
 from tests.models.learning import (
     gradients_are_finite,
     parameters_that_stay,

@@ -11,7 +11,7 @@ from src.models.far3d.adaptive_queries import AdaptiveQueries, AdaptiveQueryConf
 from src.models.heads.keypoint_head import CameraMaps
 from src.models.layers.views import CameraViews
 from src.targets.depth import lid_centres
-from tests.models.dense_bev.dense_frames import GRID, SIZE, make_batch
+from tests.models.frames import GRID, SIZE, make_batch
 
 BINS, NEAR, FAR = 6, 2.0, 40.0
 SHAPE = (2, 4, 4, 6)  # B, N, h, w at stride 16

@@ -9,7 +9,7 @@ from src.models.heads.decode import DecodeConfig
 from src.models.heads.query_head import SetPredictionHead
 from src.models.layers.views import CameraViews
 from src.structures.queries import Queries
-from tests.models.dense_bev.dense_frames import GRID, SIZE, make_batch
+from tests.models.frames import GRID, SIZE, make_batch
 
 C, IMAGE, POINTS, HEADS = 8, 5, 3, 4
 

@@ -9,7 +9,7 @@ from src.models.layers.views import CameraViews
 from src.ops.sites import Sites
 from src.structures.queries import UNKNOWN_LOGIT
 from src.structures.sparse_bev import SparseBEV
-from tests.models.dense_bev.dense_frames import GRID, SIZE
+from tests.models.frames import GRID, SIZE
 from tests.models.surroundings import AXES, camera_matrices
 
 CELLS = ((0, 10, 10), (0, 10, 11), (0, 10, 30), (1, 20, 20))

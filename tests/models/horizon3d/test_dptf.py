@@ -11,16 +11,17 @@ from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.horizon3d.splatting import GaussianSplat
 from src.structures.gaussians import GaussianSet
 from tests.models.horizon3d.cells import GRID, C, bev_of
+from tests.models.horizon3d.small_model import dptf_config
 from tests.models.moving import bare_frame, bda, pose
 
 
 @pytest.fixture
-def make_parts(make_dptf):
+def make_parts():
     """Path switches and values -> DPTF, and a function that remembers one cell and one Gaussian of a stream."""
 
     def build(**changes):
         torch.manual_seed(0)
-        dptf = DPTF(make_dptf(**changes), C, GRID)
+        dptf = DPTF(dptf_config(**changes), C, GRID)
 
         def remember(memory, batch):
             b = len(batch)
@@ -134,13 +135,13 @@ def test_a_jump_of_the_pose_forgets_its_lane_for_good_and_no_other(make_parts):
         memory = remember(memory, batch)
 
 
-def test_impossible_settings_are_refused(make_dptf):
+def test_impossible_settings_are_refused():
     with pytest.raises(ConfigError, match="min_contribution=1.0"):
-        make_dptf(min_contribution=1.0)
+        dptf_config(min_contribution=1.0)
     with pytest.raises(ConfigError, match="nothing to remember"):
-        make_dptf(bev_path=False, gaussian_path=False)
+        dptf_config(bev_path=False, gaussian_path=False)
     for age in (0.0, -1.0, float("nan")):
         with pytest.raises(ConfigError, match="max_age_s"):
-            make_dptf(max_age_s=age)
+            dptf_config(max_age_s=age)
     with pytest.raises(ConfigError, match="min_speed_mps=-1.0"):
-        make_dptf(min_speed_mps=-1.0)
+        dptf_config(min_speed_mps=-1.0)

@@ -9,6 +9,7 @@ from src.errors import ConfigError
 from src.models.horizon3d.gaussian_path import Sampling, SelfAttentionConfig
 from src.structures.gaussians import GaussianSet
 from src.structures.taxonomy import Source
+from tests.models.horizon3d.small_model import dptf_config
 from tests.models.moving import pose
 
 CURRENT = 24 + 12 + 8  # Gaussians of one frame in the small configuration
@@ -45,11 +46,11 @@ def lively(model):
 
 
 @pytest.fixture
-def with_past(make_model, make_batch, make_dptf):
+def with_past(make_model, make_batch):
     """A lively model in eval mode, the memory of one frame of two streams, and the next frames."""
 
     def build(**changes):
-        model = lively(make_model(dptf=make_dptf(**changes))).eval()
+        model = lively(make_model(dptf=dptf_config(**changes))).eval()
         with torch.no_grad():
             _, memory = model(at(make_batch(), 10.0))
         return model, memory, at(make_batch(seed=1), 10.5, 6.0)
@@ -154,9 +155,9 @@ def two_steps(model, first, second):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TOGGLES)
-def test_every_row_of_the_tables_trains(make_model, make_batch, make_dptf, name):
+def test_every_row_of_the_tables_trains(make_model, make_batch, name):
     changes = TOGGLES[name]
-    model = make_model(dptf=make_dptf(**changes))
+    model = make_model(dptf=dptf_config(**changes))
     output, terms, memory = two_steps(model, at(make_batch(), 10.0), at(make_batch(seed=1), 10.5, 5.0))
     bev_terms = CELL_TERMS if changes.get("bev_path", True) else set()
     assert set(terms) == PHASE_1_TERMS | bev_terms | {"gaussian_velocity", "total"}
@@ -172,23 +173,23 @@ def test_every_row_of_the_tables_trains(make_model, make_batch, make_dptf, name)
     assert len(model.eval().decode(output)) == 2
 
 
-def test_radar_only_with_the_bev_path(make_model, make_batch, make_dptf):
-    model = make_model(radar_only=True, dptf=make_dptf(gaussian_path=False), doppler=("cells", "boxes"))
+def test_radar_only_with_the_bev_path(make_model, make_batch):
+    model = make_model(radar_only=True, dptf=dptf_config(gaussian_path=False), doppler=("cells", "boxes"))
     batches = [at(make_batch(seed=i, images=False), 10.0 + 0.5 * i, 5.0 * i) for i in range(2)]
     output, terms, memory = two_steps(model, *batches)
     assert set(terms) == {"heatmap", "box", "total"} | CELL_TERMS
     assert output.ocsf is None and len(memory.frames) == 2 and memory.frames[0].gaussians is None
 
 
-def test_what_cannot_go_together_is_refused(make_config, make_model, make_dptf):
+def test_what_cannot_go_together_is_refused(make_config, make_model):
     with pytest.raises(ConfigError, match="bev_path=null and model.dptf.gaussian_path=null.*model.dptf=null"):
-        make_dptf(bev_path=False, gaussian_path=False)
+        dptf_config(bev_path=False, gaussian_path=False)
     with pytest.raises(ConfigError, match="model.ocsf=null makes no Gaussians.*gaussian_path=null"):
-        make_config(radar_only=True, dptf=make_dptf())
+        make_config(radar_only=True, dptf=dptf_config())
     with pytest.raises(ConfigError, match="num_heads=3.*model.channels=16"):
-        make_model(dptf=make_dptf(self_attention=SelfAttentionConfig(num_heads=3)))
+        make_model(dptf=dptf_config(self_attention=SelfAttentionConfig(num_heads=3)))
     with pytest.raises(ConfigError, match="max_age_s=0.*positive"):
-        make_dptf(max_age_s=0.0)
+        dptf_config(max_age_s=0.0)
 
 
 def test_a_memory_of_other_streams_is_refused(with_past, make_batch):

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -10,8 +11,11 @@ import torch
 from src.models.horizon3d.dptf_memory import Memory
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.reliability.checkpoints import load_model_weights
+from tests.models import frames
 from tests.models.horizon3d.cells import rows_at
-from tests.models.moving import UTM, bda, pose, tensors_of
+from tests.models.horizon3d.small_model import dptf_config
+from tests.models.moving import UTM, tensors_of
+from tests.models.surroundings import DIAGONALS
 
 ADDED = re.compile(Horizon3DConfig.new_in_temporal_phase)
 
@@ -27,26 +31,13 @@ EVERYTHING = {"memory_threshold": 0.0}  # an untrained occupancy head stays belo
 
 
 @pytest.fixture
-def drive(make_batch):
-    """Step k of a drive of two streams at 10 and 20 m/s, half a second a step, each stream augmented in its own way."""
-
-    def frame(step, **changes):
-        batch = make_batch(**({"seed": step} | changes))
-        b, k = len(batch), step
-        return replace(
-            batch,
-            timestamps_s=torch.tensor([100.0 + 0.5 * k, 7.0 + 0.5 * k], dtype=torch.float64)[:b],
-            global_from_ego=torch.stack([pose(5.0 * k, 0.0, 0.02 * k, UTM), pose(10.0 * k, 1.0, 0.3)])[:b],
-            aug_from_ego=torch.stack([bda(0.1, 1.02), bda(-0.2, 0.97, flip_y=True)])[:b],
-            streams=torch.arange(b),
-            starts=torch.full((b,), step == 0),
-        )
-
-    return frame
+def drive():
+    """The drive, of which one stream begins at the origin of the global frame."""
+    return partial(frames.drive, headings=DIAGONALS, origins=(UTM, (0.0, 0.0)))
 
 
 @pytest.fixture
-def pair(make_model, make_dptf):
+def pair(make_model):
     """A phase-1 model whose every tensor is random, and the phase-2 model that took its weights."""
 
     def build(changes, model_changes):
@@ -56,7 +47,7 @@ def pair(make_model, make_dptf):
             for value in first.state_dict().values():
                 if value.is_floating_point():
                     value.add_(0.05 * torch.rand(value.shape, generator=generator))
-        second = make_model(seed=3, dptf=make_dptf(**EVERYTHING, **changes), **model_changes)
+        second = make_model(seed=3, dptf=dptf_config(**EVERYTHING, **changes), **model_changes)
         state = {f"model.{key}": value.clone() for key, value in first.state_dict().items()}
         new = load_model_weights(second, {"state_dict": state}, Path("phase1.ckpt"), ADDED)
         assert set(new) == second.state_dict().keys() - first.state_dict().keys()
@@ -73,11 +64,8 @@ def same(first, second):
 
 def fill(model, drive, steps, **changes):
     """Memory after some frames, and the frame that follows."""
-    memory = None
-    with torch.no_grad():
-        for step in range(steps):
-            _, memory = model(drive(step, **changes), memory)
-    return memory, drive(steps, **changes)
+    frame = partial(drive, **changes)
+    return frames.fill(model, steps, frame), frame(steps)
 
 
 @pytest.mark.slow
@@ -155,10 +143,10 @@ def test_an_untrained_self_attention_adds_nothing_to_a_full_memory(pair, drive):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS.values(), ids=VARIANTS)
-def test_every_parameter_has_had_a_gradient_after_one_step_with_memory(make_model, make_dptf, drive, variant):
+def test_every_parameter_has_had_a_gradient_after_one_step_with_memory(make_model, drive, variant):
     """Zero-initialised outputs hide what is behind them in the first of the two steps."""
     changes, model_changes = variant
-    model = make_model(dptf=make_dptf(**EVERYTHING, **changes), **model_changes)
+    model = make_model(dptf=dptf_config(**EVERYTHING, **changes), **model_changes)
     optimizer, moved = torch.optim.SGD(model.parameters(), lr=1e-2), set()
     _, memory = model(drive(0, boxes=(12, 12)))
     for step in (1, 2):
@@ -174,8 +162,8 @@ def test_every_parameter_has_had_a_gradient_after_one_step_with_memory(make_mode
     assert [name for name in sorted(still) if not (name.startswith("head.regressions") and name.endswith("bias"))] == []
 
 
-def test_no_gradient_flows_into_the_frame_before(make_model, make_dptf, drive):
-    model, memory = make_model(dptf=make_dptf(**EVERYTHING)), None
+def test_no_gradient_flows_into_the_frame_before(make_model, drive):
+    model, memory = make_model(dptf=dptf_config(**EVERYTHING)), None
     before, memory = model(drive(0), memory)
     assert not any(tensor.requires_grad for tensor in tensors_of(memory))
     batch = drive(1)
@@ -200,8 +188,8 @@ EMPTY = {
 @pytest.mark.parametrize("now", EMPTY.values(), ids=EMPTY)
 @pytest.mark.parametrize("past", [{}, {"points": (0, 0)}], ids=["a full memory", "a memory without radar"])
 @pytest.mark.parametrize("radar_only", [False, True])
-def test_empty_frames_with_memory_give_finite_losses_and_gradients(make_model, make_dptf, drive, past, now, radar_only):
-    dptf = make_dptf(**EVERYTHING, gaussian_path=not radar_only)
+def test_empty_frames_with_memory_give_finite_losses_and_gradients(make_model, drive, past, now, radar_only):
+    dptf = dptf_config(**EVERYTHING, gaussian_path=not radar_only)
     model = make_model(dptf=dptf, radar_only=radar_only)
     memory, _ = fill(model, drive, 2, **past)
     batch = drive(2, **now)
@@ -216,8 +204,8 @@ def test_empty_frames_with_memory_give_finite_losses_and_gradients(make_model, m
     assert output.head.logits.isfinite().all() and len(model.decode(output)) == 2
 
 
-def test_no_visible_gaussian_and_no_radar_now_or_before(make_model, make_dptf, drive):
-    model = make_model(dptf=make_dptf(**EVERYTHING))
+def test_no_visible_gaussian_and_no_radar_now_or_before(make_model, drive):
+    model = make_model(dptf=dptf_config(**EVERYTHING))
     with torch.no_grad():
         for layer in model.ocsf.encoder.layers:
             layer.refinement.output.bias[6] = -30.0  # opacity: nothing opens a cell
@@ -277,8 +265,8 @@ def test_an_unusable_past_is_as_none(pair, drive, spoilt):
 
 
 @pytest.mark.slow
-def test_memory_under_autocast_is_halved_where_it_may_be_and_stays_finite(make_model, make_dptf, drive):
-    model, memory = make_model(dptf=make_dptf(**EVERYTHING)), None
+def test_memory_under_autocast_is_halved_where_it_may_be_and_stays_finite(make_model, drive):
+    model, memory = make_model(dptf=dptf_config(**EVERYTHING)), None
     for step in range(3):
         batch = drive(step)
         with torch.autocast("cpu", torch.bfloat16):
@@ -300,8 +288,8 @@ def test_memory_under_autocast_is_halved_where_it_may_be_and_stays_finite(make_m
 
 
 @pytest.mark.slow
-def test_memory_does_not_grow_over_30_frames_and_survives_its_state(make_model, make_dptf, drive):
-    config = make_dptf(**EVERYTHING)
+def test_memory_does_not_grow_over_30_frames_and_survives_its_state(make_model, drive):
+    config = dptf_config(**EVERYTHING)
     model, memory, sizes = make_model(dptf=config).eval(), None, []
     with torch.no_grad():
         for step in range(30):

@@ -12,6 +12,7 @@ from src.models.horizon3d.model import Horizon3D
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CLASSES
+from tests.models.horizon3d.small_model import dptf_config
 from tests.models.moving import UTM, pose
 
 GRID = BEVGrid(cells=(44, 176), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
@@ -146,11 +147,11 @@ def shares_found(model, seed=10**6, streams=64):
 
 
 @pytest.mark.slow
-def test_velocity_compensation_beats_none_on_fast_traffic(make_config, make_dptf):
+def test_velocity_compensation_beats_none_on_fast_traffic(make_config):
     """Trained alike, both models find parked vehicles that the radar no longer sees, and only one finds the fast."""
     shares = {}
     for compensated in (True, False):
-        dptf = make_dptf(gaussian_path=False, num_frames=1, velocity_compensation=compensated)
+        dptf = dptf_config(gaussian_path=False, num_frames=1, velocity_compensation=compensated)
         config = make_config(radar_only=True, dptf=dptf, box_weight=0.5, cell_velocity_weight=1.0)
         # A short training: running statistics have to keep up.
         config = replace(config, radar_encoder=replace(config.radar_encoder, norm_momentum=0.1))

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from src.models.hydra.depth_consistency import DepthConsistency, DepthConsistencyConfig
 from src.models.layers.views import CameraViews
 from src.targets.depth import lid_edges
-from tests.models.dense_bev.dense_frames import GRID, SIZE
+from tests.models.frames import GRID, SIZE
 from tests.models.surroundings import AXES, camera_matrices
 
 LEVEL, BINS, RANGE_M = (4, 6), 16, (1.0, 40.0)

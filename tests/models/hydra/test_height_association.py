@@ -9,7 +9,7 @@ from src.models.hydra.height_association import HeightAssociation
 from src.models.layers.views import CameraViews
 from src.targets.depth import lid_edges
 from tests.models.camera_radar_frames import hydra_model, radar_map
-from tests.models.dense_bev.dense_frames import GRID, SIZE, make_batch
+from tests.models.frames import GRID, SIZE, make_batch
 from tests.models.surroundings import AXES, camera_matrices
 
 LEVEL = (4, 6)  # h, w

@@ -6,7 +6,7 @@ import torch
 from src.errors import ConfigError
 from src.models.backbones.bev_decoder import SqueezeFuser
 from tests.models.camera_radar_frames import hydra_model
-from tests.models.dense_bev.dense_frames import GRID, drive, make_batch
+from tests.models.frames import GRID, drive, make_batch
 from tests.models.learning import (
     gradients_are_finite,
     missing_cameras_do_not_matter,

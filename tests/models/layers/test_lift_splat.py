@@ -9,7 +9,8 @@ from src.errors import ConfigError
 from src.models.layers.lift_splat import LiftSplat
 from src.models.layers.views import CameraViews
 from src.targets.depth import lid_centres
-from tests.models.dense_bev.dense_frames import GRID, SIZE, lift_config
+from tests.models.dense_bev.dense_frames import lift_config
+from tests.models.frames import GRID, SIZE
 from tests.models.surroundings import AXES, camera_matrices
 
 CHANNELS = 6

@@ -8,7 +8,7 @@ from torch import nn
 
 from src.models.layers.position_embedding import EDGE, PositionEmbedding, PositionEmbeddingConfig
 from src.models.layers.views import CameraViews
-from tests.models.dense_bev.dense_frames import GRID, SIZE, make_batch
+from tests.models.frames import GRID, SIZE, make_batch
 
 DEPTHS, NEAR, FAR, LOW, HIGH = 5, 2.0, 32.0, -10.0, 10.0
 

@@ -7,7 +7,7 @@ from src.models.heads.decode import DecodeConfig
 from src.models.heads.query_head import SetPredictionHead
 from src.models.petr.decoder import PETRDecoder, PETRDecoderConfig
 from src.structures.queries import Queries
-from tests.models.dense_bev.dense_frames import GRID
+from tests.models.frames import GRID
 
 
 def test_every_layers_boxes_are_relative_to_the_anchors():

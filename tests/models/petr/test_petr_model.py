@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from src.errors import ConfigError
-from tests.models.dense_bev.dense_frames import make_batch
+from tests.models.frames import make_batch
 from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
 from tests.models.query_frames import small_model
 

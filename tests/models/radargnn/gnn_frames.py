@@ -4,7 +4,7 @@ import torch
 
 from src.config import compose_config
 from src.models import build_model
-from tests.models.dense_bev.dense_frames import GRID
+from tests.models.frames import GRID
 
 SMALL = ("scale=debug", "model=radargnn", "data.root=x", "phase=phase1")
 

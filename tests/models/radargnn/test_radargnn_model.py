@@ -12,7 +12,7 @@ from src.models import build_model
 from src.models.radargnn.graph import GraphConfig, Invariance, build_graph
 from src.models.radargnn.model import MessagePassing, RadarGNNLossConfig, RadarGNNOutput
 from src.structures.boxes import Boxes3D
-from tests.models.dense_bev.dense_frames import make_batch
+from tests.models.frames import make_batch
 from tests.models.learning import (
     gradients_are_finite,
     overfitted_precision,

@@ -13,8 +13,8 @@ from src.models.layers.position_embedding import PositionEmbeddingConfig
 from src.models.layers.views import CameraViews
 from src.models.rctrans.sequential_decoder import SequentialDecoder, SequentialDecoderConfig
 from src.structures.queries import Queries
-from tests.models.dense_bev.dense_frames import GRID as FINE
-from tests.models.dense_bev.dense_frames import SIZE, make_batch
+from tests.models.frames import GRID as FINE
+from tests.models.frames import SIZE, make_batch
 
 GRID = BEVGrid(cells=(24, 32), cell_m=1.6, centre_m=FINE.centre_m, z_range_m=FINE.z_range_m)
 C, RADAR, IMAGE = 8, 3, 5

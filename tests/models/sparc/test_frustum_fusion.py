@@ -11,7 +11,7 @@ from src.models.layers.views import CameraViews
 from src.models.sparc.frustum_fusion import FrustumFusionConfig, SparseFrustumFusion
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV
-from tests.models.dense_bev.dense_frames import GRID, SIZE
+from tests.models.frames import GRID, SIZE
 from tests.models.surroundings import AXES, camera_matrices
 
 STRIDES = (8, 16, 32)

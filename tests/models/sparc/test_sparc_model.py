@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from src.errors import ConfigError
-from tests.models.dense_bev.dense_frames import make_batch
+from tests.models.frames import make_batch
 from tests.models.learning import parameters_that_stay, train_step
 from tests.models.query_frames import small_model
 
