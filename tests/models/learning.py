@@ -20,6 +20,24 @@ def gradients_are_finite(model):
     return all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
 
 
+def little_input_gives_finite_losses(model, batch):
+    """Finite losses and gradients, and boxes of each sample, of frames in which points or objects lack."""
+    _, terms = train_step(model, batch)
+    assert all(value.isfinite() for value in terms.values()) and gradients_are_finite(model)
+    assert len(model.eval().decode(model(batch)[0])) == len(batch)
+
+
+def autocast_step(model, batch):
+    """Output of a step under bfloat16; its losses are float32 and finite, as its gradients are."""
+    with torch.autocast("cpu", torch.bfloat16):
+        output, _ = model(batch)
+        terms = model.loss(output, batch).terms
+    terms["total"].backward()
+    assert all(value.dtype == torch.float32 and value.isfinite() for value in terms.values())
+    assert gradients_are_finite(model)
+    return output
+
+
 def parameters_that_stay(model, batch, lr):
     """Names of those without a gradient in both of two steps, but for branches' biases.
 

@@ -21,7 +21,13 @@ from src.models.horizon3d.ocsf import CrossAttention, RefineFrom
 from src.models.layers.doppler import Doppler
 from src.ops.box_codes import along_heading
 from src.structures.boxes import Boxes3D
-from tests.models.learning import gradients_are_finite, parameters_that_stay, train_step
+from tests.models.learning import (
+    autocast_step,
+    gradients_are_finite,
+    little_input_gives_finite_losses,
+    parameters_that_stay,
+    train_step,
+)
 
 CONF = Path(__file__).parents[3] / "conf"
 ALL_TERMS = {"heatmap", "box", "keypoint", "depth", "radar_objectness", "occupancy_focal", "occupancy_dice", "total"}
@@ -75,10 +81,7 @@ def test_images_are_joined_before_gaussians_look_at_them(make_model, make_batch,
 @pytest.mark.parametrize("radar_only", [False, True])
 def test_empty_inputs_give_finite_losses(make_model, make_batch, shape, radar_only):
     model, batch = make_model(radar_only=radar_only, gaussian_velocity_in_phase1=True), make_batch(**shape)
-    _, terms = train_step(model, batch)
-    assert all(value.isfinite() for value in terms.values())
-    assert gradients_are_finite(model)
-    assert len(model.eval().decode(model(batch)[0])) == len(batch)
+    little_input_gives_finite_losses(model, batch)
 
 
 @pytest.mark.slow
@@ -280,10 +283,7 @@ def test_enlarged_boxes_supervise_more_cells(make_model, make_batch):
 
 def test_autocast_keeps_attributes_and_losses_in_float32(make_model, make_batch):
     model, batch = make_model(), make_batch()
-    with torch.autocast("cpu", torch.bfloat16):
-        output = model(batch)[0]
-        terms = model.loss(output, batch).terms
-    terms["total"].backward()
+    output = autocast_step(model, batch)
     gaussians = output.ocsf.gaussians
     for name in ("means", "scales", "directions", "opacity_logits", "velocities"):
         assert getattr(gaussians, name).dtype == torch.float32, name
@@ -291,8 +291,6 @@ def test_autocast_keeps_attributes_and_losses_in_float32(make_model, make_batch)
     camera = output.kggi.camera
     for value in (output.kggi.objectness_logits, camera.keypoint_logits, camera.depth_logits, output.head.logits):
         assert (value != value.bfloat16()).float().mean() > 0.8  # what is ranked, or read in metres, is not rounded
-    assert all(value.dtype == torch.float32 and value.isfinite() for value in terms.values())
-    assert gradients_are_finite(model)
 
 
 def test_diagnostics_count_cells_and_gaussians(make_model, make_batch):
