@@ -72,10 +72,10 @@ def check_text(content: Any) -> None:
 # -------------------------------------------------------------------- images
 
 
-def picture(mode: str = "RGB", size_px: tuple[int, int] = SOURCE_PX) -> Image.Image:
-    image = Image.new("RGB", size_px[::-1], (90, 120, 160))
+def picture(mode: str = "RGB") -> Image.Image:
+    image = Image.new("RGB", SOURCE_PX[::-1], (90, 120, 160))
     ImageDraw.Draw(image).polygon([(5, 40), (60, 4), (90, 44)], fill=(200, 60, 20))
-    noise = np.random.default_rng(0).integers(0, 30, (*size_px, 3))
+    noise = np.random.default_rng(0).integers(0, 30, (*SOURCE_PX, 3))
     return Image.fromarray((np.asarray(image) // 2 + noise).astype(np.uint8)).convert(mode)
 
 
@@ -97,7 +97,7 @@ def jpeg_examples() -> list[bytes]:
     return [*examples, buffer.getvalue()]
 
 
-def read_jpeg(path: Path, number: int, chosen: list[Callable] = [jpeg._checked_decoder]) -> None:  # noqa: B006
+def read_jpeg(path: Path, chosen: list[Callable] = [jpeg._checked_decoder]) -> None:  # noqa: B006
     """By both decoders in turns, at full and at reduced size."""
     both = {True: chosen[0], False: lambda: None}
     jpeg._checked_decoder = both[path.stat().st_size % 2 == 0]
@@ -120,7 +120,7 @@ def radar_examples() -> list[bytes]:
     ]  # fmt: skip
 
 
-def read_radar(path: Path, number: int) -> None:
+def read_radar(path: Path) -> None:
     points = read_radar_points(path)
     assert points.shape[1:] == (7,) and points.dtype == np.float32 and len(points) <= 1_000_000
     assert not np.isnan(points).any()
@@ -136,7 +136,7 @@ def lidar_examples() -> list[bytes]:
     return [lidar_bytes(points, times), lidar_pcd(table), lidar_pcd(table[:0]), plain]
 
 
-def read_lidar(path: Path, number: int) -> None:
+def read_lidar(path: Path) -> None:
     points, times = read_lidar_points(path)
     assert points.shape[1:] == (4,) and points.dtype == np.float32 and len(points) == len(times) <= 1_000_000
     assert times.dtype == np.int64 and ((times > 0) & (times < 1e17)).all()
@@ -196,28 +196,23 @@ def use_index(index: DatasetIndex) -> None:
     assert torch.isfinite(frame.global_from_ego).all() and torch.isfinite(frame.pix_from_aug).all()
 
 
-def place_of_table(number: int) -> str:
-    return f"{VERSION}/{TABLES[number]}.json"
-
-
 def copy_tables(folder: Path) -> None:
     shutil.copytree(tiny_root() / VERSION, folder / VERSION, dirs_exist_ok=True)
     shutil.copy(tiny_root() / "splits.json", folder)
 
 
-def read_tables(path: Path, number: int) -> None:
+def read_tables(path: Path) -> None:
     use_index(build_index(path.parents[1], VERSION))
 
 
 def table_kind(name: str) -> Kind:
-    number = TABLES.index(name)
     return Kind(
         name=f"table {name}", examples=[(tiny_root() / VERSION / f"{name}.json").read_bytes()],
-        mutate=either(changed_json), read=read_tables, place=lambda _: place_of_table(number), prepare=copy_tables,
+        mutate=either(changed_json), read=read_tables, place=f"{VERSION}/{name}.json", prepare=copy_tables,
     )  # fmt: skip
 
 
-def read_splits(path: Path, number: int) -> None:
+def read_splits(path: Path) -> None:
     index = build_index_once(path.parent)
     assert set(split_samples(index, "train").tolist()) <= {0, 1, 2, 3, 4, 5}
 
@@ -227,7 +222,7 @@ def build_index_once(folder: Path) -> DatasetIndex:
     return build_index(folder, VERSION)
 
 
-def read_world(path: Path, number: int) -> None:
+def read_world(path: Path) -> None:
     assert isinstance(_read_stored(path.parent), dict)
 
 
@@ -246,7 +241,7 @@ def cache_file() -> tuple[str, bytes]:
         return path.name, path.read_bytes()
 
 
-def read_cache(path: Path, number: int) -> None:
+def read_cache(path: Path) -> None:
     """Broken caches are built again, so nothing is ever refused; what comes out is the data set either way."""
     index = load_index(tiny_root(), VERSION, path.parent)
     check_index(index)
@@ -290,14 +285,14 @@ def check_weights(module: nn.Module) -> None:
         assert torch.isfinite(value).all(), f"{name} is not finite"
 
 
-def read_weights(path: Path, number: int) -> None:
+def read_weights(path: Path) -> None:
     content = read_checkpoint(path)
     module = Toy()
     load_model_weights(module, content, path)
     check_weights(module)
 
 
-def read_backbone(path: Path, number: int) -> None:
+def read_backbone(path: Path) -> None:
     module = nn.ModuleDict({"stem": nn.Conv2d(3, 4, 3), "layer1": nn.BatchNorm2d(4)})
     load_backbone_weights(module, path, BackboneName.small)
     check_weights(module)
@@ -321,7 +316,7 @@ def compose_once() -> None:
     )
 
 
-def restore(path: Path, number: int) -> None:
+def restore(path: Path) -> None:
     """The configuration of a checkpoint, here as the JSON that stands for its plain values."""
     try:
         stored = json.loads(path.read_bytes())
@@ -349,7 +344,7 @@ def submission_example() -> bytes:
     return json.dumps({"meta": {"use_camera": True}, "results": results}).encode()
 
 
-def read_submission(path: Path, number: int) -> None:
+def read_submission(path: Path) -> None:
     table = load_submission(path, TOKENS)
     assert len(table) and (table.sizes > 0).all() and np.isfinite(table.scores).all()
     for name in ("centers", "sizes", "rotations", "velocities"):
@@ -392,7 +387,7 @@ def write_run(folder: Path) -> None:
         (folder / RUN / name).write_bytes(content)
 
 
-def read_run(path: Path, number: int) -> None:
+def read_run(path: Path) -> None:
     """As the report, the sweep runner, the dashboard and a resumed training read a run's folder."""
     folder, outputs = path.parent, path.parents[1]
     for name in ("mAP", "NDS", "classes.car.AP", "ranges.50-100.mAP"):
@@ -420,7 +415,7 @@ def read_run(path: Path, number: int) -> None:
 
 def run_kind(name: str, change: Callable) -> Kind:
     return Kind(name=name, examples=[RUN_FILES[name]], mutate=either(change), read=read_run,
-                place=lambda _: f"{RUN}/{name}", prepare=write_run)  # fmt: skip
+                place=f"{RUN}/{name}", prepare=write_run)  # fmt: skip
 
 
 @functools.cache
@@ -430,7 +425,7 @@ def result_example() -> bytes:
         return publish_result(Path(folder) / RUN, Path(folder)).read_bytes()
 
 
-def read_published(path: Path, number: int) -> None:
+def read_published(path: Path) -> None:
     result = read_result(path)
     assert all(value is None or abs(value) <= 1e16 for value in result.metrics.values())
     for points in result.curves.values():
@@ -459,7 +454,7 @@ def record_example() -> bytes:
         return path.read_bytes()
 
 
-def read_sweep_record(path: Path, number: int) -> None:
+def read_sweep_record(path: Path) -> None:
     record = read_record(path)
     assert record.stem == path.stem and 0 <= record.planned < 1e9
     check_text(dataclasses.asdict(record))
@@ -476,7 +471,7 @@ def use_sweeps_of(folder: Path) -> None:
     src.sweep.compose.SWEEPS = folder
 
 
-def read_sweep_file(path: Path, number: int) -> None:
+def read_sweep_file(path: Path) -> None:
     sweep = load_sweep(path.stem)
     assert sweep.name == path.stem and bool(sweep.rows) != bool(sweep.space)
     assert all(np.isfinite(value) for row in sweep.rows for value in row.paper.values())
@@ -497,7 +492,7 @@ def prepare_pictures(folder: Path) -> None:
     (folder / RUN / "pictures").mkdir(exist_ok=True)
 
 
-def read_pictures(path: Path, number: int) -> None:
+def read_pictures(path: Path) -> None:
     for found in RunFolders(path.parents[2]).pictures(RUN):
         assert isinstance(found, Picture) and 0 <= found.width < 2**32
         address = _data_address(found)
@@ -511,55 +506,55 @@ def kinds() -> list[Kind]:
     """Every kind, with its whole examples."""
     name, cache = cache_file()
     plain = [
-        Kind(name="JPEG image", examples=jpeg_examples(), mutate=damaged, read=read_jpeg, place=lambda _: "image.jpg"),
-        Kind(name="radar PCD", examples=radar_examples(), mutate=damaged, read=read_radar, place=lambda _: "radar.pcd"),
-        Kind(name="lidar PCD", examples=lidar_examples(), mutate=damaged, read=read_lidar, place=lambda _: "lidar.pcd"),
+        Kind(name="JPEG image", examples=jpeg_examples(), mutate=damaged, read=read_jpeg, place="image.jpg"),
+        Kind(name="radar PCD", examples=radar_examples(), mutate=damaged, read=read_radar, place="radar.pcd"),
+        Kind(name="lidar PCD", examples=lidar_examples(), mutate=damaged, read=read_lidar, place="lidar.pcd"),
         *(table_kind(table) for table in TABLES),
         Kind(
             name="splits.json", examples=[(tiny_root() / "splits.json").read_bytes()], mutate=either(changed_json),
-            read=read_splits, place=lambda _: "splits.json", prepare=copy_tables,
+            read=read_splits, place="splits.json", prepare=copy_tables,
         ),
         Kind(
             name="world.json", examples=[json.dumps(plain_tree()["data"]["world"]).encode()],
-            mutate=either(changed_json), read=read_world, place=lambda _: "world.json", prepare=prepare_world,
+            mutate=either(changed_json), read=read_world, place="world.json", prepare=prepare_world,
         ),
-        Kind(name="table cache", examples=[cache], mutate=archive, read=read_cache, place=lambda _: name),
+        Kind(name="table cache", examples=[cache], mutate=archive, read=read_cache, place=name),
         Kind(
             name="checkpoint", examples=[saved(checkpoint_content())], mutate=archive, read=read_weights,
-            place=lambda _: "last.ckpt",
+            place="last.ckpt",
         ),
         Kind(
             name="checkpoint's configuration", examples=[json.dumps(plain_tree()).encode()],
-            mutate=either(changed_json), read=restore, place=lambda _: "tree.json",
+            mutate=either(changed_json), read=restore, place="tree.json",
             prepare=lambda _: compose_once(),
         ),
         Kind(
             name="backbone weights", examples=backbone_examples(),
             mutate=lambda rng, content, others: (archive if content[:2] == b"PK" else damaged)(rng, content, others),
-            read=read_backbone, place=lambda _: "backbone.pth",
+            read=read_backbone, place="backbone.pth",
         ),
         Kind(
             name="submission", examples=[submission_example()], mutate=either(changed_json), read=read_submission,
-            place=lambda _: "submission.json",
+            place="submission.json",
         ),
         run_kind("run.json", changed_json), run_kind("metrics.json", changed_json),
         run_kind("latency.json", changed_json), run_kind("config.yaml", changed_yaml),
         run_kind("metrics.csv", changed_csv),
         Kind(
             name="result", examples=[result_example()], mutate=either(changed_json), read=read_published,
-            place=lambda _: f"{RUN}.json",
+            place=f"{RUN}.json",
         ),
         Kind(
             name="sweep record", examples=[record_example()], mutate=either(changed_json), read=read_sweep_record,
-            place=lambda _: "epsilon_mini.json",
+            place="epsilon_mini.json",
         ),
         Kind(
             name="sweep file", examples=sweep_examples(), mutate=either(changed_yaml), read=read_sweep_file,
-            place=lambda _: "mine.yaml", prepare=use_sweeps_of,
+            place="mine.yaml", prepare=use_sweeps_of,
         ),
         Kind(
             name="dashboard picture", examples=[png_example()], mutate=damaged, read=read_pictures,
-            place=lambda _: f"{RUN}/pictures/frame_0.png", prepare=prepare_pictures,
+            place=f"{RUN}/pictures/frame_0.png", prepare=prepare_pictures,
         ),
     ]  # fmt: skip
     return plain

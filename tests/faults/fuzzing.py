@@ -31,15 +31,14 @@ MOST_FAULTS = 5
 class Kind:
     """One kind of file: whole examples, how they are damaged, and how they are read.
 
-    `read` gets the path and raises AssertionError for a value that cannot be; `files` says where a file is put, by its
-    example's number.
+    `read` raises AssertionError for a value that cannot be.
     """
 
     name: str
     examples: list[bytes]
     mutate: Mutate
-    read: Callable[[Path, int], Any]  # path and number of the example
-    place: Callable[[int], str]  # path below the folder
+    read: Callable[[Path], Any]
+    place: str  # path below the folder
     errors: tuple[type[BaseException], ...] = (HorizonError,)
     prepare: Callable[[Path], None] = lambda folder: None  # once, in the child
 
@@ -54,12 +53,10 @@ class Outcome:
     faults: list[str] = field(default_factory=list)  # each with what repeats it
 
 
-def damaged_file(kind: Kind, seed: int, case: int, strangers: list[bytes]) -> tuple[int, str, bytes]:
-    """Example, what was done to it, and the bytes of one case; the same for the same numbers."""
+def damaged_file(kind: Kind, seed: int, case: int, strangers: list[bytes]) -> tuple[str, bytes]:
+    """What was done to an example, and the bytes of one case; the same for the same numbers."""
     rng = random.Random(f"{seed}/{kind.name}/{case}")
-    number = rng.randrange(len(kind.examples))
-    said, content = kind.mutate(rng, kind.examples[number], strangers)
-    return number, said, content
+    return kind.mutate(rng, kind.examples[rng.randrange(len(kind.examples))], strangers)
 
 
 def run_cases(kind: Kind, seed: int, cases: range, folder: Path, strangers: list[bytes]) -> Outcome:
@@ -114,14 +111,14 @@ def _read_all(
         shared[0:8] = case.to_bytes(8, "little")
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, WALL_S)
-        number, said, content = damaged_file(kind, seed, case, strangers)
-        path = folder / kind.place(number)
+        said, content = damaged_file(kind, seed, case, strangers)
+        path = folder / kind.place
         path.parent.mkdir(parents=True, exist_ok=True)
         whole = path.read_bytes() if path.is_file() else None
         path.write_bytes(content)
         signal.setitimer(signal.ITIMER_PROF, CPU_S)
         try:
-            kind.read(path, number)
+            kind.read(path)
             accepted += 1
         except kind.errors as error:
             refused += 1
@@ -145,7 +142,7 @@ def _report(pipe: int, kind: Kind, seed: int, case: int, said: str, fault: str) 
 
 
 def _named(kind: Kind, seed: int, case: int, strangers: list[bytes], fault: str) -> str:
-    return _line(kind, seed, case, damaged_file(kind, seed, case, strangers)[1], fault)
+    return _line(kind, seed, case, damaged_file(kind, seed, case, strangers)[0], fault)
 
 
 def _line(kind: Kind, seed: int, case: int, said: str, fault: str) -> str:
