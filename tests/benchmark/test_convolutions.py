@@ -32,8 +32,8 @@ SPCONV = load_spconv(CPU)
 needs_spconv = pytest.mark.skipif(SPCONV is None, reason="spconv, of the extra `oracle`, is not installed")
 
 
-def sites_on(shape, number, seed=0):
-    draw = torch.Generator().manual_seed(seed)
+def sites_on(shape, number):
+    draw = torch.Generator().manual_seed(0)
     cells = torch.stack([torch.randint(0, size, (number,), generator=draw) for size in shape], 1)
     return Sites.unique(cells, shape)[0]
 

@@ -62,14 +62,14 @@ def test_every_point_is_where_it_stands_and_began_where_the_sensor_was(lidar_set
             sensor = [(ego_from_global @ ego_pose(KEY_S + t) @ mount(channel))[:3, 3] for t in after_s]
             np.testing.assert_allclose(origins[rows], sensor, atol=2e-3)
             rays = points[rows, :3] - origins[rows]
-            raw = read_lidar_points(lidar_path(lidar_set, channel, 1, sweep)).points[:, :3]
+            raw = read_lidar_points(lidar_path(lidar_set, channel, sweep)).points[:, :3]
             np.testing.assert_allclose(np.linalg.norm(rays, axis=1), np.linalg.norm(raw, axis=1), atol=4e-3)
     assert np.linalg.norm(origins[0] - origins[len(STATIC) - 1]) > 1.8  # 20 m/s for 0.095 s
 
 
-def lidar_path(data_set, channel, sample, sweep=0):
+def lidar_path(data_set, channel, sweep=0):
     index = load_index(data_set.root, VERSION, None)
-    row = int(index.key_data[sample, CHANNELS.index(channel)])
+    row = int(index.key_data[1, CHANNELS.index(channel)])
     for _ in range(sweep):
         row = int(index.data_previous[row])
     return data_set.root / index.filename(row)
@@ -78,7 +78,7 @@ def lidar_path(data_set, channel, sample, sweep=0):
 def test_without_deskewing_a_sweep_stays_as_it_was_measured(lidar_set):
     one = ONLY_LIDAR | {"num_lidar_sweeps": 1}
     frame = lidar_set.reader(**one, deskew_lidar=False, lidar_origins=True).read(1, None)
-    raw = read_lidar_points(lidar_path(lidar_set, "LIDAR_LEFT", 1)).points[:, :3]
+    raw = read_lidar_points(lidar_path(lidar_set, "LIDAR_LEFT")).points[:, :3]
     left = slice(0, len(STATIC))
     np.testing.assert_allclose(frame.lidar_points[left, :3], apply(mount("LIDAR_LEFT"), raw), atol=1e-4)
     assert (frame.lidar_points[left, 4] == 0).all()
@@ -89,7 +89,7 @@ def test_without_deskewing_a_sweep_stays_as_it_was_measured(lidar_set):
 def test_fewer_sweeps_at_a_scenes_start_and_near_points_are_dropped(lidar_set, broken_lidar):
     frame = lidar_set.reader(**(ONLY_LIDAR | {"num_lidar_sweeps": 9})).read(0, None)
     assert len(frame.lidar_points) == 2 * 6 * len(STATIC)
-    path = lidar_path(broken_lidar, "LIDAR_LEFT", 1)
+    path = lidar_path(broken_lidar, "LIDAR_LEFT")
     cloud = np.zeros((5, 4))
     cloud[:, :3] = [[0.9, -0.9, 3], [0.9, 1.1, 0], [1.1, 0.2, 0], [0, 0, 0], [np.nan, np.nan, np.nan]]
     path.write_bytes(lidar_bytes(cloud, np.full(5, int(KEY_S * 1e6))))
@@ -138,7 +138,7 @@ def damage(path, fault):
     ],
 )
 def test_bad_files_stop_or_are_counted(broken_lidar, fault, words):
-    path = lidar_path(broken_lidar, "LIDAR_REAR", 1, 1)
+    path = lidar_path(broken_lidar, "LIDAR_REAR", 1)
     damage(path, fault)
     with pytest.raises(DataError, match=f"{path.name}: .*{words}.*data.on_bad_file=skip"):
         broken_lidar.reader(**ONLY_LIDAR).read(1, None)

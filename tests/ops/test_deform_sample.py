@@ -12,10 +12,10 @@ from src.ops.sites import Sites
 GRID = BEVGrid(cells=(6, 8), cell_m=0.8, centre_m=(0.4, -0.2), z_range_m=(-3.0, 5.0))
 
 
-def scene(channels=3, sites=25, points=60, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    linear = torch.randperm(2 * 48, generator=generator)[:sites].sort().values
-    values = torch.randn(sites, channels, generator=generator, dtype=torch.float64)
+def scene(channels=3, points=60):
+    generator = torch.Generator().manual_seed(0)
+    linear = torch.randperm(2 * 48, generator=generator)[:25].sort().values
+    values = torch.randn(25, channels, generator=generator, dtype=torch.float64)
     xy = torch.rand(points, 2, generator=generator, dtype=torch.float64) * torch.tensor([9.0, 7.0])
     xy = xy - torch.tensor([4.1, 3.7])  # beyond the grid on every side
     batch = torch.randint(0, 2, (points,), generator=generator)
@@ -95,8 +95,8 @@ def form(request, monkeypatch):
         monkeypatch.setattr(deform_sample, "_sum_by_image", lambda *inputs: attend_views_reference(*inputs[:3]))
 
 
-def pyramid(batch=2, queries=5, views=3, heads=2, points=4, seed=0):
-    generator = torch.Generator().manual_seed(seed)
+def pyramid(batch=2, queries=5, views=3):
+    heads, points, generator = 2, 4, torch.Generator().manual_seed(0)
 
     def normal(*size):
         return torch.randn(*size, generator=generator, dtype=torch.float64)

@@ -132,8 +132,8 @@ def test_peaks_see_no_padding():
     assert torch.equal(found[: len(wanted)], maxpool_peaks(scores[: len(wanted)], wanted))
 
 
-def gaussians(count=30, seed=5):
-    generator = torch.Generator().manual_seed(seed)
+def gaussians():
+    count, generator = 30, torch.Generator().manual_seed(5)
     means = torch.rand(count, 2, generator=generator) * 20 - 10
     angle = 6 * torch.rand(count, generator=generator)
     return {

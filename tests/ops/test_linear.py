@@ -12,12 +12,12 @@ NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA 
 DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, NO_GPU])]
 
 
-def values_and_gradients(layer, rows, bias=True, widths=(64, 48), dtype=torch.float32):
+def values_and_gradients(layer, rows, bias=True, widths=(64, 48)):
     torch.manual_seed(0)
-    x, weight, shift = (torch.rand(*size, dtype=dtype) for size in ((rows, widths[0]), widths, widths[1:]))
+    x, weight, shift = (torch.rand(*size) for size in ((rows, widths[0]), widths, widths[1:]))
     operands = [value.requires_grad_() for value in (x, weight, shift)[: 2 + bias]]
     out = layer(*operands)
-    return out, *torch.autograd.grad(out, operands, torch.rand(out.shape, dtype=dtype))
+    return out, *torch.autograd.grad(out, operands, torch.rand(out.shape))
 
 
 def plain(x, weight, bias=0.0):
