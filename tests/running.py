@@ -6,9 +6,11 @@ import logging
 import multiprocessing
 import os
 import runpy
+import signal
 import subprocess
 import sys
 import tempfile
+import time
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
@@ -62,6 +64,34 @@ def command(module, *overrides, expect=0, timeout=480, env=None):
     result = ended(run_module, module, *overrides, timeout=timeout, env=env)
     assert result.returncode == expect, result.stdout[-3000:] + result.stderr[-3000:]
     return result
+
+
+def wait_for(condition, timeout=60):
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def killed_training(outputs, *overrides):
+    """A training in `outputs` that gets SIGKILL, with all that it started, between its first checkpoint and its end."""
+    said = outputs.with_name("said")
+    process = fork(run_module, "train", *overrides, f"paths.outputs={outputs}", out=said, err=said)
+    deadline = time.monotonic() + 400
+    while not list(outputs.glob("*/checkpoints/last.ckpt")):
+        assert time.monotonic() < deadline and process.is_alive(), said.read_text()[-2000:]
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.join()
+    assert not list(outputs.glob("*/metrics.json"))
+
+
+def process_of_rank(parent, rank):
+    """Process id of the child that was started as `rank`."""
+    for child in Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split():
+        if f"LOCAL_RANK={rank}".encode() in Path(f"/proc/{child}/environ").read_bytes().split(b"\0"):
+            return int(child)
+    raise AssertionError(f"no process of rank {rank}")
 
 
 def call(module, *overrides, expect=0):

@@ -2,14 +2,11 @@
 
 import csv
 import json
-import os
-import signal
 import subprocess
-import time
 
 import pytest
 
-from tests.running import ROOT, call, command, fork, run_module
+from tests.running import ROOT, call, command, killed_training
 
 pytestmark = pytest.mark.slow
 
@@ -115,15 +112,7 @@ def test_a_killed_run_resumes_and_ends_with_the_same_weights(trained, outputs, t
     (world,) = (outputs / "worlds").iterdir()
     arguments = (*changes, f"data.root={world}")
     call("train", *arguments, f"paths.outputs={whole}")
-    said = tmp_path / "said"
-    process = fork(run_module, "train", *arguments, f"paths.outputs={killed}", out=said, err=said)
-    deadline = time.monotonic() + 400
-    while not list(killed.glob("*/checkpoints/last.ckpt")):
-        assert time.monotonic() < deadline and process.is_alive()
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.join()
-    assert not list(killed.glob("*/metrics.json"))
+    killed_training(killed, *arguments)
     call("train", *arguments, f"paths.outputs={killed}")
     (a,) = whole.glob("horizon3d-*/checkpoints/last.ckpt")
     (b,) = killed.glob("horizon3d-*/checkpoints/last.ckpt")

@@ -3,14 +3,12 @@
 import json
 import os
 import shutil
-import signal
-import time
 
 import pytest
 import torch
 from PIL import Image
 
-from tests.running import call, fork, run_module
+from tests.running import call, killed_training
 
 pytestmark = pytest.mark.slow
 MODEL = ("model=lrs4fusion", "scale=debug", "trainer.num_pictures=0")
@@ -146,16 +144,9 @@ def test_a_source_of_another_region_is_refused(occupancy, outputs):
 def test_a_killed_run_of_unlabelled_frames_ends_with_the_same_weights(unlabelled, tmp_path):
     arguments = (*MODEL, "phase=lrs_occupancy", "phase.epochs=3", "data.batch_size=1")
     arguments += ("data.world=null", f"data.root={unlabelled}")
-    whole, killed, said = tmp_path / "whole", tmp_path / "killed", tmp_path / "said"
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
     call("train", *arguments, f"paths.outputs={whole}")
-    process = fork(run_module, "train", *arguments, f"paths.outputs={killed}", out=said, err=said)
-    deadline = time.monotonic() + 400
-    while not list(killed.glob("*/checkpoints/last.ckpt")):
-        assert time.monotonic() < deadline and process.is_alive(), said.read_text()[-2000:]
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.join()
-    assert not list(killed.glob("*/metrics.json"))
+    killed_training(killed, *arguments)
     call("train", *arguments, f"paths.outputs={killed}")
     first, second = (only(outputs, "lrs_occupancy") for outputs in (whole, killed))
     wanted, found = weights(first), weights(second)

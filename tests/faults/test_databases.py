@@ -3,8 +3,6 @@
 import logging
 import sqlite3
 import threading
-import time
-from collections import Counter
 
 import pytest
 
@@ -12,7 +10,8 @@ from src.errors import ConfigError
 from src.report.sweep_record import read_record, record_path
 from src.sweep import runner as runner_module
 from src.sweep.sweep_study import GRACE_PERIOD_S
-from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep
+from tests.running import wait_for
+from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep, trained
 
 ROWS = {"a": ["model.x=1"], "b": ["model.x=2"], "c": ["model.x=3"]}
 pytestmark = pytest.mark.faults
@@ -26,19 +25,6 @@ def at_the_root(monkeypatch):
 
 def sweep_of(seconds, rows=ROWS):
     return make_sweep(rows, overrides=[f"fake.seconds={seconds}"])
-
-
-def lines(folder, what):
-    path = folder / "outputs" / "trained.txt"
-    found = path.read_text().splitlines() if path.exists() else []
-    return Counter(line.split()[1] for line in found if line.startswith(what))
-
-
-def wait_for(condition, timeout=60):
-    deadline = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def beside(action):
@@ -64,7 +50,7 @@ def away(folder, began, until):
     """Overwrite the database once a run has begun, and bring the old content back when `until` is true."""
 
     def act():
-        wait_for(lambda: lines(folder, "begin").total() >= began)
+        wait_for(lambda: trained(folder, "begin").total() >= began)
         content = database(folder).read_bytes()
         database(folder).write_bytes(b"no database " * 1000)
         wait_for(until)
@@ -82,7 +68,7 @@ def test_a_database_that_comes_back_costs_no_run(tmp_path, caplog):
     thread.join()
     assert not failures and "retrying for 15 minutes" in caplog.text
     assert record.count("done") == 3
-    assert set(lines(tmp_path, "begin").values()) == {1} and lines(tmp_path, "begin").total() == 3
+    assert set(trained(tmp_path, "begin").values()) == {1} and trained(tmp_path, "begin").total() == 3
 
 
 def test_a_run_that_failed_meanwhile_is_released(tmp_path, caplog):
@@ -99,7 +85,7 @@ def test_a_run_that_failed_meanwhile_is_released(tmp_path, caplog):
     enough.cancel()
     thread.join()
     assert not failures
-    assert record.count("done") == 1 and lines(tmp_path, "begin").total() == 2
+    assert record.count("done") == 1 and trained(tmp_path, "begin").total() == 2
 
 
 @pytest.mark.parametrize("loss", ["garbage", "deleted"])
@@ -107,7 +93,7 @@ def test_a_database_that_is_lost_ends_the_sweep_and_no_finished_run(tmp_path, mo
     monkeypatch.setattr(runner_module, "DATABASE_TIMEOUT_S", 1.0)
 
     def lose():
-        wait_for(lambda: lines(tmp_path, "begin").total() >= 2)
+        wait_for(lambda: trained(tmp_path, "begin").total() >= 2)
         if loss == "garbage":
             database(tmp_path).write_bytes(b"no database " * 1000)
         else:
@@ -118,13 +104,13 @@ def test_a_database_that_is_lost_ends_the_sweep_and_no_finished_run(tmp_path, mo
         make_runner(tmp_path, sweep_of(0.6)).run()
     thread.join()
     assert not failures and "\n" not in str(caught.value) and caught.value.exit_code == 3
-    ended = lines(tmp_path, "end")
+    ended = trained(tmp_path, "end")
     assert ended
 
     database(tmp_path).unlink(missing_ok=True)  # what the message advises
     record = make_runner(tmp_path, sweep_of(0.0)).run()
     assert record.count("done") == 3
-    assert all(lines(tmp_path, "end")[name] == 1 for name in ended)  # none of them was trained again
+    assert all(trained(tmp_path, "end")[name] == 1 for name in ended)  # none of them was trained again
     stored = read_record(record_path(tmp_path / "reports", "fake", "debug"))
     assert stored.count("done") == 3
 
@@ -134,7 +120,7 @@ def test_a_clock_that_jumps_ahead_makes_no_run_train_twice(tmp_path):
     second = []
 
     def jump():
-        wait_for(lambda: lines(tmp_path, "begin").total() == 1)
+        wait_for(lambda: trained(tmp_path, "begin").total() == 1)
         with sqlite3.connect(database(tmp_path), timeout=30) as connection:
             past = f"-{10 * GRACE_PERIOD_S} seconds"
             wait_for(lambda: connection.execute("SELECT count(*) FROM trial_heartbeats").fetchone()[0] == 1)
@@ -149,4 +135,4 @@ def test_a_clock_that_jumps_ahead_makes_no_run_train_twice(tmp_path):
     record = make_runner(tmp_path, sweep_of(2.0, {"a": ["model.x=1"]})).run()
     thread.join()
     assert not failures and len(second) == 2
-    assert lines(tmp_path, "begin").total() == 1 and record.count("done") == 1
+    assert trained(tmp_path, "begin").total() == 1 and record.count("done") == 1

@@ -20,6 +20,7 @@ import pytest
 from src.reliability import processes
 from src.reliability.checkpoints import read_checkpoint
 from src.reliability.processes import launch
+from tests.running import process_of_rank
 
 pytestmark = [
     pytest.mark.faults,
@@ -254,14 +255,6 @@ def after_rows(running, place, outputs, rows):
     while sum(len(path.read_text().splitlines()) for path in log.glob("horizon3d-*/metrics.csv")) <= rows:
         assert time.monotonic() < deadline and running.poll() is None, running.communicate()[0][-3000:]
         time.sleep(0.02)
-
-
-def process_of_rank(parent, rank):
-    """Process id of the child that was started as `rank`."""
-    for child in Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split():
-        if f"LOCAL_RANK={rank}".encode() in Path(f"/proc/{child}/environ").read_bytes().split(b"\0"):
-            return int(child)
-    raise AssertionError(f"no process of rank {rank}")
 
 
 def test_torchrun_starts_again_after_a_killed_rank_and_nothing_is_lost(place, undisturbed):

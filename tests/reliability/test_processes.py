@@ -24,6 +24,7 @@ from src.reliability.processes import (
     launch,
     process_group,
 )
+from tests.running import process_of_rank
 
 ROOT = Path(__file__).resolve().parents[2]
 LAUNCHERS = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "WORLD_SIZE", "TORCHELASTIC_RUN_ID", "SLURM_NTASKS")
@@ -329,14 +330,6 @@ def wait_for(path, *running, timeout=300):
             process.poll() for process in running
         ]
         time.sleep(0.05)
-
-
-def process_of_rank(parent, rank):
-    """Process id of the child that was started as `rank`."""
-    for child in Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split():
-        if f"LOCAL_RANK={rank}".encode() in Path(f"/proc/{child}/environ").read_bytes().split(b"\0"):
-            return int(child)
-    raise AssertionError(f"no process of rank {rank}")
 
 
 def last_checkpoint(outputs, phase):

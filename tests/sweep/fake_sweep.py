@@ -5,6 +5,7 @@ import json
 import logging
 import signal
 import sys
+from collections import Counter
 from pathlib import Path
 
 from src.errors import HorizonError
@@ -41,6 +42,13 @@ def make_runner(
     launcher = Launcher(command, study.folder, workers, [], in_child=lambda: prctl(1, signal.SIGTERM))
     parts = (plan, study, writer, launcher, publish or (lambda path: None))
     return Search(*parts, common=common, identify=identify) if sweep.is_search else Runner(*parts)
+
+
+def trained(folder, what="end"):
+    """How often each run began or came to an end, by name."""
+    path = Path(folder) / "outputs" / "trained.txt"
+    lines = path.read_text().splitlines() if path.exists() else []
+    return Counter(line.split()[1] for line in lines if line.startswith(what))
 
 
 if __name__ == "__main__":

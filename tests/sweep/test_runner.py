@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,8 @@ from src.errors import ConfigError
 from src.report.sweep_file import TableConfig
 from src.report.sweep_record import read_record, record_path, write_record
 from src.sweep.launcher import ExitStatus
-from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep
+from tests.running import wait_for
+from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep, trained
 from tests.sweep.fake_train import identify
 
 pytestmark = pytest.mark.slow
@@ -40,19 +40,6 @@ def finish(process, expect=0, timeout=90):
     out, err = process.communicate(timeout=timeout)
     assert process.returncode == expect, out + err
     return err
-
-
-def trained(folder, what="end"):
-    path = Path(folder) / "outputs" / "trained.txt"
-    lines = path.read_text().splitlines() if path.exists() else []
-    return Counter(line.split()[1] for line in lines if line.startswith(what))
-
-
-def wait_for(condition, timeout=60):
-    deadline = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def record_of(folder):

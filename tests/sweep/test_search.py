@@ -8,8 +8,9 @@ import pytest
 
 from src.errors import ConfigError
 from src.sweep.search import _PruningWatch
-from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep
-from tests.sweep.test_runner import fault, finish, record_of, start, trained, wait_for
+from tests.running import wait_for
+from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep, trained
+from tests.sweep.test_runner import fault, finish, record_of, start
 
 pytestmark = pytest.mark.slow
 SPACE = {"fake.score": {"low": 0.1, "high": 0.9}, "model.x": {"choices": [1, 2, None]}}

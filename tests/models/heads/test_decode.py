@@ -18,10 +18,10 @@ from src.models.heads.decode import (
     top_candidates,
 )
 from src.ops.box_codes import attributes_by_rule, box_geometry
-from src.ops.nms import conflicting_pairs, greedy_survivors
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import ATTRIBUTES, CLASS_RANGE_M, CLASSES
 from src.targets.heatmap import HEAD_GROUPS
+from tests.ops.test_nms import nms_rotated
 
 GRID = BEVGrid(cells=(384, 384), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
 CASE = np.load(Path(__file__).parents[2] / "golden" / "voxelnext_head_targets" / "case.npz")
@@ -75,13 +75,6 @@ def test_equal_scores_come_in_the_order_of_the_cells_and_only_the_best_of_a_grou
     assert best.scores.tolist() == pytest.approx([0.7, 0.5, 0.5, 0.9, *[0.6] * 5])
 
 
-def survivors(bev: torch.Tensor, scores: torch.Tensor, radius_m: float | None) -> torch.Tensor:
-    """Rows that stay of one block of boxes, best first."""
-    order = scores.argsort(descending=True, stable=True)
-    better, worse = conflicting_pairs(bev[order], [len(order)], [radius_m], 0.2)
-    return order[greedy_survivors(better.tolist(), worse.tolist(), len(order))]
-
-
 @pytest.mark.parametrize("method", Suppression)
 @pytest.mark.parametrize("at_once", ["each block", "all blocks"])
 def test_all_groups_at_once_equal_one_after_the_other(method: Suppression, at_once: str, monkeypatch) -> None:
@@ -105,7 +98,7 @@ def test_all_groups_at_once_equal_one_after_the_other(method: Suppression, at_on
         circle = method is Suppression.circle or (method is Suppression.per_group and group in CIRCLE_GROUPS)
         kept = torch.arange(len(rows))
         if method is not Suppression.maxpool:
-            kept = survivors(mine.bev(), mine.scores, CIRCLE_RADII_M[group] if circle else None)
+            kept = nms_rotated(mine.bev(), mine.scores, 0.2, CIRCLE_RADII_M[group] if circle else None)
         return rows[kept[:83]]
 
     found = suppress(boxes, counts, method, 100)
@@ -122,7 +115,7 @@ def test_all_groups_at_once_equal_one_after_the_other(method: Suppression, at_on
 def test_golden_circle_suppression(radius: float) -> None:
     table = torch.from_numpy(CASE["circle/xy_score"])
     bev = torch.nn.functional.pad(table[:, :2], (0, 3))
-    assert survivors(bev, table[:, 2], radius).tolist() == CASE[f"circle/keep_{radius}"].tolist()
+    assert nms_rotated(bev, table[:, 2], 0.2, radius).tolist() == CASE[f"circle/keep_{radius}"].tolist()
 
 
 def test_log_sizes_are_clamped() -> None:
