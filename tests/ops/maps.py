@@ -7,10 +7,10 @@ from src.ops.segment_reduce import inverse_rows
 from src.ops.sites import Sites
 
 
-def random_sites(shape, count, seed=0):
+def random_sites(shape, count, seed=0, device="cpu"):
     generator = torch.Generator().manual_seed(seed)
     picks = torch.randperm(torch.Size(shape).numel(), generator=generator)[:count]
-    return Sites.from_linear(picks.sort().values, shape)
+    return Sites.from_linear(picks.sort().values.to(device), shape)
 
 
 def map_of(mode, sites):

@@ -4,16 +4,11 @@ import torch
 from src.ops.kernel_maps import strided_map, submanifold_map, temporal_map
 from src.ops.sites import Sites
 from src.ops.sparse_conv import sparse_conv, sparse_conv_relu
+from tests.ops.maps import random_sites
 
 # Largest error over the largest value against float64 on the same operands: float32 sums, and one rounding to the
 # type of the output (which the interpreter cuts off for bfloat16: a whole unit in the last place instead of half).
 TOLERANCE = {torch.float32: 2e-6, torch.float16: 6e-4, torch.bfloat16: 8e-3}
-
-
-def random_sites(shape, count, device, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    picks = torch.randperm(torch.Size(shape).numel(), generator=generator)[:count]
-    return Sites.from_linear(picks.sort().values.to(device), shape)
 
 
 def run(kernel_map, features, weight, bias, grad, dtype):
@@ -50,8 +45,8 @@ def compare(kernel_map, c_in, c_out, device, dtype=torch.float32, bias=True):
 def build(mode, device):
     """Kernel maps with more rows than a block of the kernel has, in two samples."""
     if mode == "2d":
-        return submanifold_map(random_sites((2, 9, 8), 100, device), 3)
-    sites = random_sites((2, 4, 6, 7), 90, device)
+        return submanifold_map(random_sites((2, 9, 8), 100, device=device), 3)
+    sites = random_sites((2, 4, 6, 7), 90, device=device)
     if mode == "3d":
         return submanifold_map(sites, 3)
     if mode == "strided":
@@ -74,7 +69,7 @@ def test_values_and_gradients(device, mode):
 
 @pytest.mark.parametrize(("c_in", "c_out"), [(1, 1), (16, 16), (40, 17), (33, 130), (150, 70)])
 def test_any_number_of_channels(device, c_in, c_out):
-    compare(submanifold_map(random_sites((1, 3, 3), 5, device), (1, 3)), c_in, c_out, device)
+    compare(submanifold_map(random_sites((1, 3, 3), 5, device=device), (1, 3)), c_in, c_out, device)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -103,18 +98,18 @@ def test_many_spans_of_pairs(device, monkeypatch):
 
 
 def test_more_taps_than_bits_order_the_rows(device):
-    kernel_map = submanifold_map(random_sites((1, 3, 3, 3), 9, device), 5)
+    kernel_map = submanifold_map(random_sites((1, 3, 3, 3), 9, device=device), 5)
     assert kernel_map.num_offsets == 125
     compare(kernel_map, 2, 3, device)
 
 
 def test_one_site(device):
-    compare(submanifold_map(random_sites((1, 4, 4), 1, device), 3), 3, 2, device)
+    compare(submanifold_map(random_sites((1, 4, 4), 1, device=device), 3), 3, 2, device)
 
 
 @pytest.mark.parametrize("mode", ["submanifold", "strided", "temporal"])
 def test_no_sites(device, mode):
-    sites = random_sites((2, 4, 5, 6), 0, device)
+    sites = random_sites((2, 4, 5, 6), 0, device=device)
     if mode == "submanifold":
         kernel_map = submanifold_map(sites, 3)
     else:
@@ -126,7 +121,7 @@ def test_no_sites(device, mode):
 
 def test_samples_do_not_mix(device):
     """Two samples together give what each gives alone, also where the last row of one meets the first of the next."""
-    both = random_sites((2, 4, 5), 30, device)
+    both = random_sites((2, 4, 5), 30, device=device)
     features = torch.randn(30, 6, generator=torch.Generator().manual_seed(1)).to(device)
     weight = torch.randn(9, 6, 4, generator=torch.Generator().manual_seed(2)).to(device)
     together = sparse_conv(features, weight, submanifold_map(both, 3))
@@ -138,7 +133,7 @@ def test_samples_do_not_mix(device):
 
 
 def test_a_kernel_of_one_offset_stays_a_linear_layer(device):
-    kernel_map = submanifold_map(random_sites((1, 4, 4), 6, device), 1)
+    kernel_map = submanifold_map(random_sites((1, 4, 4), 6, device=device), 1)
     with pytest.raises(AssertionError, match="left its work"):
         compare(kernel_map, 3, 4, device)
 
