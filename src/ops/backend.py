@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import importlib
 import os
+import pkgutil
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from src.errors import ConfigError
+from src.ops import kernels
 
 REFERENCE = "reference"
 COUNTED = "counted"  # the reference, with no product but those of the formula, for counting arithmetic
@@ -18,44 +21,6 @@ TRITON = "triton"
 # The environment variable that chooses the backend of a process, and the one of Triton's interpreter.
 VARIABLE = "HORIZON3D_OPS"
 INTERPRETER = "TRITON_INTERPRET"
-# Modules with an operation's kernel, imported when it first runs in that backend: Triton is a large import.
-KERNELS = {
-    "attend_cells": "src.ops.kernels.attend_cells_triton",
-    "attend_views": "src.ops.kernels.attend_views_triton",
-    "candidate_sort_keys": "src.ops.kernels.candidate_sort_keys_triton",
-    "decoded_boxes": "src.ops.kernels.box_codes_triton",
-    "farthest_points": "src.ops.kernels.farthest_point_triton",
-    "radial_votes": "src.ops.kernels.radial_correction_triton",
-    "unpack_candidates": "src.ops.kernels.candidate_sort_keys_triton",
-    "cell_centres": "src.ops.kernels.cell_keys_triton",
-    "cell_keys": "src.ops.kernels.cell_keys_triton",
-    "distinct_keys": "src.ops.kernels.distinct_keys_triton",
-    "group_sum": "src.ops.kernels.segment_reduce_triton",
-    "grouped_keys": "src.ops.kernels.distinct_keys_triton",
-    "refined_attributes": "src.ops.kernels.gaussian_shapes_triton",
-    "relative_motion": "src.ops.kernels.frame_motion_triton",
-    "relu_norm_columns": "src.ops.kernels.add_layer_norm_triton",
-    "sampling_points": "src.ops.kernels.gaussian_shapes_triton",
-    "warp_gaussians": "src.ops.kernels.frame_motion_triton",
-    "moved_keys": "src.ops.kernels.moved_keys_triton",
-    "moved_table": "src.ops.kernels.neighbour_table_triton",
-    "initial_gaussians": "src.ops.kernels.initial_gaussians_triton",
-    "near_pairs": "src.ops.kernels.gaussian_cells_triton",
-    "neighbour_table": "src.ops.kernels.neighbour_table_triton",
-    "padded_pairs": "src.ops.kernels.gaussian_cells_triton",
-    "radial_correction": "src.ops.kernels.radial_correction_triton",
-    "score_and_lift_pixels": "src.ops.kernels.score_and_lift_pixels_triton",
-    "sparse_conv": "src.ops.kernels.sparse_conv_triton",
-    "sparse_conv_relu": "src.ops.kernels.sparse_conv_triton",
-    "splat": "src.ops.kernels.splat_triton",
-    "add_layer_norm": "src.ops.kernels.add_layer_norm_triton",
-    "stacked_table": "src.ops.kernels.neighbour_table_triton",
-    "gather_rows": "src.ops.kernels.segment_reduce_triton",
-    "gather_cells": "src.ops.kernels.gather_cells_triton",
-    "view_sampling_locations": "src.ops.kernels.view_samples_triton",
-    "view_attention_weights": "src.ops.kernels.view_samples_triton",
-    "transposed_table": "src.ops.kernels.neighbour_table_triton",
-}
 
 _chosen: str | None = None  # until the first operation asks
 
@@ -85,11 +50,21 @@ def chosen() -> str:
 
 
 def implementation(reference: Callable[..., Any]) -> Callable[..., Any]:
-    """The function that runs an operation in the chosen backend, of its torch reference `<operation>_reference`."""
+    """The function that runs an operation in the chosen backend, of its torch reference.
+
+    That of `<operation>_reference` in `src/ops/<file>.py` is `<operation>_triton` in `kernels/<file>_triton.py`, which
+    is imported when it first runs: Triton is a large import.
+    """
     if chosen() != TRITON:
         return reference
-    operation = reference.__name__.removesuffix("_reference")
-    return getattr(importlib.import_module(KERNELS[operation]), f"{operation}_{TRITON}")
+    file, operation = reference.__module__.rpartition(".")[2], reference.__name__.removesuffix("_reference")
+    return getattr(importlib.import_module(f"{kernels.__name__}.{file}_{TRITON}"), f"{operation}_{TRITON}")
+
+
+def kernel_modules() -> list[ModuleType]:
+    """All files of kernels, imported."""
+    names = [found.name for found in pkgutil.iter_modules(kernels.__path__)]
+    return [importlib.import_module(f"{kernels.__name__}.{name}") for name in names]
 
 
 def runs_kernels(tensor: Tensor) -> bool:

@@ -21,11 +21,10 @@ from src.ops.initial_gaussians import Keypoints, Slots
 from src.ops.kernel_maps import submanifold_map
 from src.ops.kernels import (
     add_layer_norm_triton,
-    attend_cells_triton,
-    attend_views_triton,
     box_codes_triton,
     candidate_sort_keys_triton,
     cell_keys_triton,
+    deform_sample_triton,
     distinct_keys_triton,
     farthest_point_triton,
     frame_motion_triton,
@@ -72,8 +71,8 @@ def main():
     driver.set_active(Target())
     JITFunction.run = compile_only(JITFunction.run)
     kernels = (
-        *(attend_cells_triton, attend_views_triton, box_codes_triton, candidate_sort_keys_triton),
-        *(cell_keys_triton, distinct_keys_triton, farthest_point_triton, frame_motion_triton),
+        *(box_codes_triton, candidate_sort_keys_triton, cell_keys_triton, deform_sample_triton),
+        *(distinct_keys_triton, farthest_point_triton, frame_motion_triton),
         *(gaussian_cells_triton, gaussian_shapes_triton, initial_gaussians_triton, moved_keys_triton),
         *(neighbour_table_triton, radial_correction_triton, score_and_lift_pixels_triton, segment_reduce_triton),
         *(sparse_conv_triton, splat_triton, add_layer_norm_triton, gather_cells_triton),
@@ -130,8 +129,8 @@ def main():
     table, points, shares = torch.arange(80), torch.zeros(7, 3, 2), torch.zeros(7, 4, 3)
     for dtype in (torch.float32, torch.bfloat16):
         values = torch.zeros(80, 4, 32, dtype=dtype)
-        attend_cells_triton.attend_cells_triton(values, table, points, torch.zeros(7).long(), shares, grid)
-    attend_views_triton.attend_views_triton(
+        deform_sample_triton.attend_cells_triton(values, table, points, torch.zeros(7).long(), shares, grid)
+    deform_sample_triton.attend_views_triton(
         [torch.zeros(2, 128, 8, 9)], torch.zeros(2, 7, 3, 2), torch.zeros(1, 7, 4, 2, 1, 3)
     )
     radial_correction_triton.radial_correction_triton(

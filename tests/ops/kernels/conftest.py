@@ -1,6 +1,5 @@
 """Where kernels run: on a GPU, or on the CPU in the process of Triton's interpreter (see test_without_a_gpu.py)."""
 
-import importlib
 import os
 from importlib.util import find_spec
 
@@ -22,10 +21,11 @@ def device(request, monkeypatch):
         pytest.skip("Triton is not installed")
     monkeypatch.setattr(backend, "_chosen", "triton")
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
-    for operation, name in backend.KERNELS.items():
-        module, fallback = importlib.import_module(name), f"{operation}_reference"
-        assert backend.implementation(getattr(module, fallback)) is getattr(module, f"{operation}_triton")
-        monkeypatch.setattr(module, fallback, for_float64(getattr(module, fallback)))
+    for module in backend.kernel_modules():
+        for fallback in [name for name in vars(module) if name.endswith("_reference")]:
+            kernel = getattr(module, fallback.replace("_reference", "_triton"))
+            assert backend.implementation(getattr(module, fallback)) is kernel
+            monkeypatch.setattr(module, fallback, for_float64(getattr(module, fallback)))
     return torch.device(request.param)
 
 
