@@ -21,6 +21,7 @@ from src.data.timeline import TimelineConfig
 from src.data.true_geometry import TRUTH_FOLDER, TrueGeometry
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.bounds import farthest_m
 from src.metrics.bootstrap import interval, intervals_of
 from src.metrics.diagnostics import ratios
 from src.metrics.forecast_text import format_forecast, format_occupancy
@@ -36,7 +37,7 @@ from src.structures.taxonomy import MOVING_MPS
 from src.targets.occupancy_rays import FreePlaces, RaySampling, draw_rays, sample_queries
 from src.training.evaluator import Evaluator
 from src.training.ground_slice import GroundSlice, global_from_aug
-from src.training.world_snapshots import draw_world, farthest_m
+from src.training.world_snapshots import draw_world
 
 Array = np.ndarray
 

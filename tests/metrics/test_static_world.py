@@ -78,9 +78,10 @@ def test_past_scans_are_moved_by_the_ego():
     past = frame([[30.0, 5.0, 0.0]], at=10.0)
     batch = frame([[50.0, 0.0, 0.0]], at=12.0, past=(past,), rays=rays_to([[28.0, 5.0, 0], [60.0, 0, 0]]))
     points, owners = aggregated_scan(batch)
-    torch.testing.assert_close(points, torch.tensor([[50.0, 0, 0], [28.0, 5, 0]])) and owners.tolist() == [0, 0]
+    torch.testing.assert_close(points, torch.tensor([[50.0, 0, 0], [28.0, 5, 0]]))
+    assert owners.tolist() == [0, 0]
     assert static_world(batch, 300.0).tolist() == pytest.approx([np.hypot(28, 5), 50])
-    assert static_world(replace(batch, past=()), 300.0).tolist() == [300.0, 50.0]  # 10 degrees away is another direction
+    assert static_world(replace(batch, past=()), 300.0).tolist() == [300.0, 50.0]  # 10 degrees aside
     with pytest.raises(ValueError, match="FrameBatch.rays"):
         static_world(past, 300.0)
     assert static_world(replace(frame(np.zeros((0, 3))), rays=batch.rays), 300.0).tolist() == [300.0, 300.0]
