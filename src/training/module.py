@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import lightning as L
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from src.models.detector import Detector, Objective
 from src.reliability.nonfinite import StepGuard, finite_everywhere, gradient_norm, step_seed
@@ -56,6 +56,7 @@ class TrainingModule(L.LightningModule):
         self.skipped = SkippedFiles()
         self.guard = StepGuard(skip_nonfinite)
         self.frozen_norms = frozen_norms
+        self.own_statistics: dict[str, Tensor] = {}  # of this rank, from the checkpoint of an unfinished epoch
 
     def train(self, mode: bool = True) -> Self:
         """As the base, but for the frozen norms."""
@@ -70,6 +71,12 @@ class TrainingModule(L.LightningModule):
         return output
 
     # ---------------------------------------------------------------- training
+
+    def on_fit_start(self) -> None:
+        """Give each rank its own running statistics back: DDP, just set up, has rank 0's on all."""
+        for name, value in running_statistics(self).items():
+            if name in self.own_statistics:
+                value.copy_(self.own_statistics[name])
 
     def on_train_start(self) -> None:
         """Look up what a step changes of the model; it lies on its device by now.
@@ -180,8 +187,7 @@ class TrainingModule(L.LightningModule):
             self.guard.restore_counts(states[0]["nonfinite"])
         if same:
             own = states[self.trainer.global_rank]
-            if "statistics" in own:
-                checkpoint["state_dict"] |= own["statistics"]  # those that it holds are rank 0's
+            self.own_statistics = own.get("statistics", {})
             self.restore_rank(own)
         elif self.trainer.global_rank == 0:
             self.adopt_ranks(states)

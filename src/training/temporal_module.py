@@ -112,7 +112,8 @@ class TemporalModule(TrainingModule):
         self._before_step = list(self.memories)
 
     def on_fit_start(self) -> None:
-        """Bring a restored memory to the device: a checkpoint is read before the module is moved there."""
+        """As the base; a restored memory goes to the device, where the module has been moved since it was read."""
+        super().on_fit_start()
         self.memories = [(streams.to(self.device), memory.to(self.device)) for streams, memory in self.memories]
 
     def on_train_epoch_start(self) -> None:
