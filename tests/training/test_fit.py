@@ -12,6 +12,7 @@ import lightning as L
 import numpy as np
 import pytest
 import torch
+from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 
 from src.benchmark.suite_metric import random_problem
@@ -24,6 +25,7 @@ from src.models.horizon3d.kggi import Initialization
 from src.reliability.processes import (
     SharedStatistics,
     build_strategy,
+    gather_by_rank,
     is_main_process,
     process_group,
     running_statistics,
@@ -236,7 +238,7 @@ def test_two_processes_score_as_one_does_their_checkpoint(work):
 
 
 def statistics_as(rank, port, folder):
-    """What a norm of each rank holds after the callback, and the state that a checkpoint of that time would have."""
+    """What a norm of each rank holds before and after the callback, and once more after it resumes with DDP around."""
     become(rank, 2, port)
     with process_group("cpu", 2):
         module = toy_module(TrainingModule)
@@ -245,28 +247,28 @@ def statistics_as(rank, port, folder):
         module.model.norm.running_var *= 1.0 + 4.0 * rank
         state = module.rank_state()
         SharedStatistics().on_train_epoch_end(None, module)
-        torch.save((state["statistics"], running_statistics(module)), folder / f"{rank}.pt")
+        shared = copy.deepcopy(running_statistics(module))
+        module._trainer = SimpleNamespace(global_rank=rank, world_size=2)
+        module.on_load_checkpoint({"horizon3d": {"ranks": gather_by_rank(state)}})
+        DistributedDataParallel(module, **build_strategy("cpu", 2)._ddp_kwargs)
+        module.on_fit_start()
+        torch.save((state["statistics"], shared, running_statistics(module)), folder / f"{rank}.pt")
 
 
 @pytest.mark.slow
 def test_ranks_share_the_mean_of_their_statistics_and_resume_with_their_own(tmp_path):
     spawn_two(statistics_as, tmp_path)
     for rank in range(2):
-        own, shared = torch.load(tmp_path / f"{rank}.pt", weights_only=True)
+        own, shared, resumed = torch.load(tmp_path / f"{rank}.pt", weights_only=True)
         assert {name: value.tolist() for name, value in shared.items()} == {
             "model.norm.running_mean": [0.5, 3.0],
             "model.norm.running_var": [3.0, 3.0],
         }
         assert own["model.norm.running_mean"].tolist() == [rank, 3.0]
-        module = toy_module(TrainingModule)
-        module._trainer = SimpleNamespace(global_rank=rank, world_size=2)
-        states = [{"means": {}, "statistics": own} if of == rank else {"means": {}} for of in range(2)]
-        checkpoint = {
-            "horizon3d": {"ranks": states},
-            "state_dict": {"model.norm.running_mean": "of rank 0", "other": 1},
+        assert {name: value.tolist() for name, value in resumed.items()} == {
+            "model.norm.running_mean": [rank, 3.0],
+            "model.norm.running_var": [1.0 + 4.0 * rank] * 2,
         }
-        module.on_load_checkpoint(checkpoint)
-        assert checkpoint["state_dict"] == {**own, "other": 1}
 
 
 # ---------------------------------------------------------------- resuming with another number of processes
