@@ -18,7 +18,7 @@ WORLD = [
 ]  # fmt: skip
 
 
-EPOCHS, BATCH_SIZE = 24, 2
+EPOCHS, BATCH_SIZE = 36, 2
 
 
 @pytest.fixture(scope="module")
