@@ -32,7 +32,8 @@ BEARING_DEG, ELEVATION_DEG = 100.0, (-24.0, 12.0)
 """What the view from the sensors shows to each side, and below and above the horizon."""
 RANGES_M = (3.0, 200.0)
 BASELINE = "static-world baseline"
-FORECAST_COLOUR, STATIC_COLOUR, TRUE_COLOUR = "#D55E00", "#0072B2", "#7A828B"
+FORECAST_COLOUR, STATIC_COLOUR, TRUE_COLOUR = "#F0A36B", "#7DB9DE", INK
+SENSORS_COLOUR = "#B5006E"
 
 
 @dataclass
@@ -107,8 +108,9 @@ def draw_forecast(path: Path | str, moments: Sequence[ForecastMoment], title: st
     canvas = Canvas(SHEET_PX, HEADER_PX + row_px * len(moments) + MARGIN_PX)
     canvas.text(MARGIN_PX, 10, title, 20, bold=True)
     names = {"true points": TRUE_COLOUR, "forecast": FORECAST_COLOUR, BASELINE: STATIC_COLOUR}
+    names |= {"LiDARs at that time": SENSORS_COLOUR}
     style = {"linestyle": "none", "marker": "o", "markersize": 5}
-    canvas.legend(1050, 14, [Line2D([], [], color=colour, label=name, **style) for name, colour in names.items()])
+    canvas.legend(880, 14, [Line2D([], [], color=colour, label=name, **style) for name, colour in names.items()])
     for row, one in enumerate(moments):
         top = HEADER_PX + row * row_px + CAPTION_PX
         when = f"in {one.time_s:.1f} s"
@@ -116,16 +118,17 @@ def draw_forecast(path: Path | str, moments: Sequence[ForecastMoment], title: st
         for column, (name, ranges) in enumerate(found.items()):
             area = (MARGIN_PX + column * (width + GAP_PX), top, width, height)
             axes = bev_panel(canvas, area, WINDOW, f"{name} {when}")
-            _paint_ends(axes, one, one.true_m, TRUE_COLOUR, 2.0)
-            _paint_ends(axes, one, ranges, names[name], 2.1)
+            _paint_ends(axes, one, ranges, names[name], 3.0)
+            _paint_ends(axes, one, one.true_m, TRUE_COLOUR, 1.1)  # within the other's where that is right
+            axes.plot(*upright(one.origins[:, :2]).T, "o", color=SENSORS_COLOUR, markersize=2.0, markeredgewidth=0)
         left = 2 * (MARGIN_PX + width + GAP_PX)
         _paint_views(canvas, one, {"true points": one.true_m} | found, (left, top, SHEET_PX - left - 80, height))
     canvas.save(path, photographs=False)
 
 
-def _paint_ends(axes: Axes, one: ForecastMoment, ranges: Array, colour: str, order: float) -> None:
+def _paint_ends(axes: Axes, one: ForecastMoment, ranges: Array, colour: str, size: float) -> None:
     ends = upright((one.origins + ranges[:, None] * one.directions)[:, :2])
-    axes.plot(*ends.T, linestyle="none", marker="o", markersize=1.6, markeredgewidth=0, color=colour, zorder=order)
+    axes.plot(*ends.T, "o", markersize=size, markeredgewidth=0, color=colour)
 
 
 def _paint_views(
