@@ -17,24 +17,30 @@ GIVEN = Path("/sys/kernel/mm/transparent_hugepage/enabled")
 LOOK = """
 import torch
 from src.reliability.cpu import tune_allocator
-def pages():
-    words = [line.split() for line in open("/proc/self/smaps_rollup")]
-    return {word[0]: int(word[1]) for word in words if word[0] in ("Rss:", "AnonHugePages:")}
-before = pages()
+def resident_kib():
+    return next(int(line.split()[1]) for line in open("/proc/self/smaps_rollup") if line.startswith("Rss:"))
+before = resident_kib()
 assert tune_allocator()
-reserved = pages()
+reserved = resident_kib()
 kept = torch.ones(16 << 20)
-after = pages()
-print(reserved["Rss:"] - before["Rss:"], after["Rss:"] - reserved["Rss:"], after["AnonHugePages:"])
+after = resident_kib()
+middle = kept.data_ptr() + kept.nbytes // 2
+for line in open("/proc/self/smaps"):
+    ends = line.split()[0].split("-")
+    if len(ends) == 2:
+        inside = int(ends[0], 16) <= middle < int(ends[1], 16)
+    elif inside and line.startswith("VmFlags:"):
+        flags = line.split()
+print(reserved - before, after - reserved, "hg" in flags)
 """
 
 
 @pytest.mark.skipif(not GIVEN.exists() or "[never]" in GIVEN.read_text(), reason="no huge pages here")
-def test_large_tensors_lie_in_huge_pages_and_what_is_reserved_takes_no_memory():
-    """64 MiB in a fresh process."""
+def test_large_tensors_lie_where_huge_pages_are_asked_for_and_what_is_reserved_takes_no_memory():
+    """64 MiB in a fresh process. How many huge pages Linux then gives depends on how broken up free memory is."""
     found = subprocess.run([sys.executable, "-c", LOOK], capture_output=True, text=True, check=True)
-    reserved_kib, taken_kib, huge_kib = map(int, found.stdout.split())
-    assert reserved_kib < 4096 and 60000 < taken_kib < 80000 and huge_kib > 60000
+    reserved_kib, taken_kib, asked = found.stdout.split()
+    assert int(reserved_kib) < 4096 and 60000 < int(taken_kib) < 80000 and asked == "True"
 
 
 def test_other_platforms_are_left_alone(monkeypatch):
