@@ -148,10 +148,17 @@ class DetectionDataModule(L.LightningDataModule):
         self.index: DatasetIndex = load_index(root, config.version, cache, labels)
         self.labels = labels
         lidars = [CHANNELS.index(name) for name in LIDARS]
-        if "lidar" in sensors and not np.isin(self.index.data_channels, lidars).any():
+        files, keys = np.isin(self.index.data_channels, lidars).sum(), (self.index.key_data[:, lidars] >= 0).sum()
+        if "lidar" in sensors and not files:
             raise DataError(
                 f"{root / config.version}: holds no LiDAR files, but {read_by} reads {' and '.join(sensors)}; choose a "
                 "data set with LiDAR or another model"
+            )
+        if config.timeline is not None and files <= keys:
+            raise DataError(
+                f"{root / config.version}/sample_data.json: has {keys} LiDAR files at key frames and none between, "
+                f"which {read_by} reads by data.timeline; a synthetic world has them with data.world.lidar=true "
+                "data.world.lidar_sweeps_per_key_frame=5"
             )
         self.reader = FrameReader(self.index, self.settings)
 

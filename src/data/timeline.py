@@ -8,7 +8,7 @@ from enum import Enum
 import numpy as np
 
 from src.data.schema import CHANNELS, DatasetIndex
-from src.errors import DataError, require_least
+from src.errors import require_least
 from src.structures.taxonomy import LIDARS
 
 Array = np.ndarray
@@ -99,18 +99,10 @@ class SweepTimeline:
 
 
 class LidarTimeline:
-    """The moments about each key frame at which there is LiDAR. Raises DataError for a data set that has none."""
+    """The moments about each key frame at which there is LiDAR."""
 
     def __init__(self, index: DatasetIndex, config: TimelineConfig) -> None:
         self.index, self.config, self._sweeps = index, config, SweepTimeline(index, LIDARS)
-        files = int(np.isin(index.data_channels, self._sweeps.channels).sum())
-        keys = int((index.key_data[:, self._sweeps.channels] >= 0).sum())
-        if files <= keys:
-            raise DataError(
-                f"{index.root / index.version}/sample_data.json: has {keys} LiDAR files at key frames and none "
-                "between, which data.timeline reads; a synthetic world has them with data.world.lidar=true "
-                "data.world.lidar_sweeps_per_key_frame=5"
-            )
 
     def time_us(self, sample: int, step: int) -> int:
         """The moment so many intervals after a key frame."""

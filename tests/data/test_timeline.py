@@ -9,7 +9,6 @@ import torch
 from src.data.cache import load_index
 from src.data.clips import FrameKey
 from src.data.datamodule import DetectionDataModule
-from src.data.reader import FrameReader
 from src.data.sensor_files import OnBadFile
 from src.data.timeline import LidarTimeline, SweepTimeline, TimelineConfig
 from src.errors import ConfigError, DataError
@@ -135,15 +134,17 @@ def test_what_a_timeline_cannot_be():
         config(timeline=FIVE_HERTZ).reader_settings(("radar",), None)
 
 
-def test_data_without_lidar_or_without_sweeps_between_are_refused(data_set, broken_tables):
-    settings = config(timeline=FIVE_HERTZ)
+def test_data_without_lidar_or_without_sweeps_between_are_refused(data_set, broken_tables, tmp_path):
     for row, sensor in enumerate(broken_tables.records("sensor")):
         if sensor["channel"].startswith("LIDAR"):
             broken_tables.edit("sensor", row, channel="SONAR")
-    with pytest.raises(DataError, match="holds no LiDAR files, but the model reads lidar"):
-        DetectionDataModule(config(), broken_tables.root, ("lidar",), None, 0, broken_tables.root / "c", temporal=True)
-    with pytest.raises(DataError, match="none between.*data.world.lidar=true"):
-        FrameReader(load_index(data_set.root, VERSION, None), settings.reader_settings(("lidar",), None))
+    faults = {
+        "holds no LiDAR files, but the model reads lidar": (config(), broken_tables),
+        "none between, which the model reads.*data.world.lidar=true": (config(timeline=FIVE_HERTZ), data_set),
+    }
+    for message, (settings, data) in faults.items():
+        with pytest.raises(DataError, match=message):
+            DetectionDataModule(settings, data.root, ("lidar",), None, 0, tmp_path, temporal=True)
 
 
 def test_a_damaged_file_stops_or_is_counted_once_in_a_frame(broken_lidar):
