@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from operator import itemgetter
 from pathlib import Path
@@ -17,6 +18,7 @@ from src.pictures.learning_curves import LINE_COLOURS, LINE_DASHES, style_axes
 MARKERS = "os^Dv<>Ph"
 COLUMNS, PANEL_PX, GAP_PX = 4, (300, 220), (92, 96)
 SOAK_PANEL_PX, SOAK_GAP_PX = (400, 170), (112, 96)
+LABEL_GAP_PT = 9.0
 LEFT_PX, TOP_PX = 66, 104
 SOAK_PANELS = {
     "memory, MiB": ("RSS MiB", "heap MiB", "workers MiB", "CUDA MiB", "CUDA reserved MiB", "remembered MiB"),
@@ -69,6 +71,7 @@ def draw_scaling(path: Path, measured: dict[str, Rows], title: str) -> None:
             factor = 6.0 if axes.get_yscale() == "log" else 1.5
             axes.set_ylim(top=factor * axes.get_ylim()[1])  # room for the legend
             axes.legend(loc="upper left", fontsize=7, frameon=False, labelcolor=INK, ncols=2, columnspacing=0.8)
+        _part_labels(axes)
     canvas.legend(12, 48, canvas.figure.axes[0].get_legend_handles_labels()[0])
     canvas.save(path, photographs=False)
 
@@ -118,6 +121,16 @@ def _panel(
         beside = {"textcoords": "offset points", "va": "center", "fontsize": 8, "color": INK}
         axes.annotate(text, line[-1], (6, 0), annotation_clip=False, **beside)
     return axes
+
+
+def _part_labels(axes: Axes) -> None:
+    """Last values that would lie upon each other are moved up, once the limits are final."""
+    points_per_pixel = 72.0 / axes.figure.dpi
+    top = -math.inf
+    for label in sorted(axes.texts, key=lambda label: label.xy[1]):
+        own = points_per_pixel * float(axes.transData.transform(label.xy)[1])
+        top = max(own, top + LABEL_GAP_PT)
+        label.set_position((6, top - own))
 
 
 def _log_where_wide(axes: Axes) -> None:
