@@ -55,6 +55,17 @@ def test_samples_lie_evenly_in_the_middle_of_their_steps():
     torch.testing.assert_close(samples.diff(), torch.full((199,), 0.25))
 
 
+def test_an_untrained_head_tells_rays_apart():
+    """Matter 10 m deep from 2 to 180 m away; with torch's own initialisation all ranges lie within 2 cm."""
+    config = settings(num_samples=512, encode_channels=32, conv_channels=[32, 16, 16, 16, 8, 8], mlp_channels=[32, 16])
+    begin = torch.linspace(2, 180, 64)[:, None]
+    for seed in range(3):
+        torch.manual_seed(seed)
+        head = RayHead(config, 200.0)
+        occupancy = ((head.samples_m >= begin) & (head.samples_m < begin + 10)).float()
+        assert head(occupancy).std() > 1.0
+
+
 @pytest.mark.slow
 def test_it_learns_where_occupancy_begins():
     torch.manual_seed(0)
