@@ -37,14 +37,3 @@ def pixels_from_points(
     result = np.array(np.broadcast_to(np.asarray(cam_from_src, np.float64), cam_from_src.shape))
     result[..., :3, :] = projection @ cam_from_src[..., :3, :]
     return result
-
-
-def project(
-    points: Array,  # [..., 3] m, source frame
-    pix_from_src: Array,  # [4, 4] as from pixels_from_points
-) -> tuple[Array, Array]:  # [..., 2] pixels (u, v), [...] depth d in m along the optical axis
-    """Pixels and depths of points; behind the camera (d <= 0) the pixels mean nothing."""
-    homogeneous = points @ pix_from_src[:3, :3].T + pix_from_src[:3, 3]
-    depth = homogeneous[..., 2]
-    safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
-    return homogeneous[..., :2] / safe[..., None], depth

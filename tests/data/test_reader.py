@@ -16,7 +16,6 @@ from src.data.point_tensors import radar_tensors
 from src.data.reader import FrameReader
 from src.data.sensor_files import OnBadFile
 from src.errors import DataError
-from src.geometry.camera import project
 from src.geometry.transforms import invert_rigid, quaternion_to_matrix, rigid
 from src.structures.taxonomy import CAMERAS, CLASSES, RADARS
 from tests.data.tiny_set import (
@@ -28,6 +27,7 @@ from tests.data.tiny_set import (
     ego_pose,
     mount,
     pcd_bytes,
+    project,
     reader_settings,
 )
 

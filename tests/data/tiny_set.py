@@ -17,7 +17,7 @@ from src.data.cache import load_index
 from src.data.reader import FrameReader, ReaderSettings
 from src.data.sensor_files import OnBadFile
 from src.data.timeline import RadialSpeeds, TimelineConfig
-from src.geometry.camera import pixels_from_points, project
+from src.geometry.camera import pixels_from_points
 from src.geometry.transforms import invert_rigid, matrix_to_quaternion, rigid
 from src.structures.taxonomy import ATTRIBUTES, BICYCLE_RACK, CAMERAS, CATEGORY_TO_CLASS, IGNORED_CATEGORIES, RADARS
 
@@ -29,6 +29,17 @@ ORIGIN = np.array([691_000.0, 5_334_000.0, 0.0])
 TARGET_VELOCITY = np.array([14.0, 9.0, 0.0])  # global
 STATIC = ORIGIN + np.random.default_rng(3).uniform([-80, -80, 0], [80, 80, 6], size=(20, 3))
 BLOB = ORIGIN + np.array([36.0, 17.0, 1.5])  # seen by both front cameras of the first frames
+
+
+def project(
+    points: np.ndarray,  # [..., 3] m, source frame
+    pix_from_src: np.ndarray,  # [4, 4] as from pixels_from_points
+) -> tuple[np.ndarray, np.ndarray]:  # [..., 2] pixels (u, v), [...] depth d in m along the optical axis
+    """Pixels and depths of points; behind the camera (d <= 0) the pixels mean nothing."""
+    homogeneous = points @ pix_from_src[:3, :3].T + pix_from_src[:3, 3]
+    depth = homogeneous[..., 2]
+    safe = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
+    return homogeneous[..., :2] / safe[..., None], depth
 
 
 def token(*names: object) -> str:

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from src.geometry.camera import image_transform, pixels_from_points, project
+from src.geometry.camera import image_transform, pixels_from_points
+from tests.data.tiny_set import project
 
 INTRINSICS = np.array([[1000.0, 0, 320], [0, 900.0, 240], [0, 0, 1]])
 
