@@ -141,14 +141,23 @@ def test_a_source_of_another_region_is_refused(occupancy, outputs):
     assert "unet" in said.stderr
 
 
-def test_a_killed_run_of_unlabelled_frames_ends_with_the_same_weights(unlabelled, tmp_path):
-    arguments = (*MODEL, "phase=lrs_occupancy", "phase.epochs=3", "data.batch_size=1")
-    arguments += ("data.world=null", f"data.root={unlabelled}")
+@pytest.mark.parametrize(
+    "phase",
+    [
+        "lrs_occupancy",
+        *(pytest.param(f"lrs_{name}", marks=pytest.mark.exhaustive) for name in ("forecast", "detection")),
+    ],
+)
+def test_a_killed_run_ends_with_the_same_weights(phase, occupancy, world, unlabelled, tmp_path):
+    """What learns without labels has none."""
+    source = "null" if phase == "lrs_occupancy" else occupancy / "checkpoints" / "last.ckpt"
+    arguments = (*MODEL, f"phase={phase}", f"phase.init_from={source}", "phase.epochs=3", "data.batch_size=1")
+    arguments += ("data.world=null", f"data.root={world if phase == 'lrs_detection' else unlabelled}")
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     call("train", *arguments, f"paths.outputs={whole}")
     killed_training(killed, *arguments)
     call("train", *arguments, f"paths.outputs={killed}")
-    first, second = (only(outputs, "lrs_occupancy") for outputs in (whole, killed))
+    first, second = (only(outputs, phase) for outputs in (whole, killed))
     wanted, found = weights(first), weights(second)
     assert wanted.keys() == found.keys() and all(torch.equal(wanted[name], found[name]) for name in wanted)
     assert (first / "metrics.json").read_text() == (second / "metrics.json").read_text()
