@@ -80,7 +80,7 @@ class RayHead(nn.Module):
         """Encodings of zero mean over what they encode, and Kaiming's weights (ours).
 
         torch's own fade through eight layers of ReLU: an untrained head gives all rays one range within centimetres,
-        up to four fifths of the first convolution's channels die, and with two seeds of three the head learns little.
+        many channels die, and with some seeds the head learns little.
         """
         for layer in (*self.convs, *self.mlp[:-1]):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
