@@ -138,7 +138,7 @@ FULL_SIZE = {
         "name": "resnet50", "image_size_px": [256, 864], "weights": None, "lr_multiplier": 1.0, "neck": "fpn",
         "trim_padding": False,
     },
-    "model": {"channels": 128},
+    "model": {"channels": 128, "neck_channels": []},
     "model.radar_encoder": {
         "voxel_size_m": [0.1, 0.1, 0.2], "stage_channels": [16, 32, 64, 128, 128, 128], "max_voxels": 60000,
         "conv_out": "sparse", "height_tolerance_deg": 0.0, "pruning_ratio": 0.0,
@@ -284,6 +284,7 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["phase=phase2", "model.dptf.gaussian_path.num_frames=0"], "num_frames=0.*gaussian_path=null"),
         (["phase=phase2", "model.dptf.gaussian_path.self_attention.num_heads=0"], "num_heads=0.*self_attention=null"),
         (["phase=phase2", "model.dptf.gaussian_path.self_attention.num_heads=3"], "num_heads=3.*model.channels=64"),
+        (["model.neck_channels=[64,0]"], r"model.neck_channels=\[64, 0\]: must list positive widths"),
         (["phase=phase2", "model.dptf.gaussian_path.selfattention=null"], "did you mean .*self_attention"),
         (["data.groups_per_scene=0"], "groups_per_scene"),
         (["data.stream_sets=0"], "stream_sets"),

@@ -42,6 +42,7 @@ YOUNGER_KEYS = {
     "phase.long_range": None,
     "model.radar_encoder.pruning_ratio": 0.0,
     "model.kggi.num_radar_peaks": 0,
+    "model.neck_channels": [],
     "model.doppler.in_losses": True,
     "model.doppler.along_heading": False,
     "model.dptf.gaussian_path.forget_refuted": False,

@@ -9,7 +9,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.detector import Detector, Objective
-from src.models.heads.center_head import BoxOptions, CenterHead
+from src.models.heads.center_head import BoxOptions, CenterHead, HeadOutput
 from src.models.horizon3d.dptf import DPTF, WarpedMemory
 from src.models.horizon3d.dptf_memory import Memory
 from src.models.horizon3d.fixed_form import FixedHorizon3D
@@ -19,11 +19,13 @@ from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import OCSF
 from src.models.horizon3d.output import Horizon3DOutput
 from src.models.layers.doppler import Doppler
+from src.models.layers.sparse_neck import SparseNeck
 from src.models.layers.views import CameraViews
 from src.ops.fixed_shapes import Capacities
 from src.ops.side_stream import on_side_stream
 from src.structures.batch import FrameBatch
 from src.structures.evidence import Evidence
+from src.structures.sparse_bev import SparseBEV
 from src.structures.taxonomy import CAMERAS
 from src.targets.box_raster import BoxRaster
 
@@ -74,6 +76,7 @@ class Horizon3D(Detector):
             self.kggi = KGGI(config.kggi, channels, width, grid, config.ocsf.bounds)
             self.ocsf = OCSF(config.ocsf, channels, width, len(CAMERAS), levels, grid, config.temporal_heads)
         self.dptf = DPTF(config.dptf, channels, grid) if config.dptf is not None else None
+        self.neck = SparseNeck(channels, config.neck_channels) if config.neck_channels else None
         self.head = CenterHead(config.head, channels, grid, options.velocity_code_weight)
 
     def forward(self, batch: FrameBatch, memory: Memory | None = None) -> tuple[Horizon3DOutput, Memory | None]:
@@ -103,9 +106,12 @@ class Horizon3D(Detector):
             ocsf = self.ocsf(kggi.gaussians, radar_bev, views, doppler["gaussians"])
             fused = ocsf.fused_bev
         if self.dptf is None:
-            return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, None, self.head(fused, doppler["boxes"]))
+            return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, None, self._read_map(fused, doppler["boxes"]))
         dptf = self.dptf.aggregate(fused, warped_memory, doppler["cells"])
-        return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, dptf, self.head(dptf.bev, doppler["boxes"]))
+        return Horizon3DOutput(radar_bev, views, kggi, ocsf, fused, dptf, self._read_map(dptf.bev, doppler["boxes"]))
+
+    def _read_map(self, bev: SparseBEV, doppler: Doppler | None) -> HeadOutput:
+        return self.head(bev if self.neck is None else self.neck(bev), doppler)
 
     def _measure_doppler(self, batch: FrameBatch) -> dict[str, Doppler | None]:
         """For whom the configuration wants it."""

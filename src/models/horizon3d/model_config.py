@@ -34,6 +34,7 @@ class Horizon3DConfig(ModelConfig):
     ocsf: OCSFConfig | None
     dptf: DPTFConfig | None  # null: single frames, phase 1
     doppler: DopplerConfig
+    neck_channels: list[int]  # of a sparse neck before the head, at strides 2, 4, ...; []: none
     head: HeadConfig
     loss: Horizon3DLossConfig
 
@@ -54,6 +55,8 @@ class Horizon3DConfig(ModelConfig):
                 f"model.channels={self.channels}: must be a positive multiple of {CHANNEL_MULTIPLE}, whole norm groups "
                 f"of 4 channels in each of {NUM_HEADS} attention heads"
             )
+        if min(self.neck_channels, default=1) < 1:
+            raise ConfigError(f"model.neck_channels={self.neck_channels}: must list positive widths, or nothing")
         if self.temporal_heads is not None and self.channels % self.temporal_heads:
             raise ConfigError(
                 f"model.dptf.gaussian_path.self_attention.num_heads={self.temporal_heads}: must divide "

@@ -65,7 +65,7 @@ VARIANTS = {
         "phase=phase2", "model.radar_encoder.conv_out=sparse", "model.radar_encoder.local_means=true",
         "model.radar_encoder.point_count_channel=true", "model.radar_encoder.pruning_ratio=0.5",
         "model.ocsf.gate_kernel_size=3", "model.head.attributes=learned", "model.head.nms=per_group",
-        "model.kggi.num_radar_peaks=6", "model.kggi.num_radar_keypoints=12",
+        "model.kggi.num_radar_peaks=6", "model.kggi.num_radar_keypoints=12", "model.neck_channels=[16,24]",
         "model.dptf.gaussian_path.velocity_from=cells", "model.dptf.gaussian_path.num_frames=1",
     ),
 }  # fmt: skip

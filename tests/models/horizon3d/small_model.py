@@ -94,6 +94,7 @@ def make_config(radar_only=False, dptf=None, doppler=(), **changes):
             in_losses=True,
             along_heading=False,
         ),
+        neck_channels=[],
         head=head_config(),
         loss=Horizon3DLossConfig(**loss),
     )
