@@ -53,7 +53,7 @@ class Horizon3D(Detector):
         "ocsf": ("ocsf.forward",),
         "gaussian_encoder": ("ocsf.encoder.forward",),  # within ocsf (Table 14)
         "dptf": ("dptf.recall", "dptf.aggregate", "dptf.remember"),
-        "detection_head": ("head.forward", "head.decode"),
+        "detection_head": ("neck.forward", "head.forward", "head.decode"),
     }
 
     def __init__(
