@@ -9,14 +9,14 @@ from torch import nn
 from src.models.layers.sparse import ConvNormReLU, ResidualBlock, SparseConv, SparseInverseConv
 from src.structures.sparse_bev import SparseMap
 
-NORM = {"eps": 1e-3, "momentum": 0.1}
+NORM = {"eps": 1e-3, "momentum": 0.1}  # as VoxelNeXt's backbone, with torch's momentum: trainings are short
 
 
 class SparseNeck(nn.Module):
     """A pyramid of levels at strides 2, 4, ..., each added on the way up to the next finer one (ours).
 
-    What BEVFusion's decoder does on a dense map: each cell sees the whole of a long vehicle and what stands around it.
-    The sites stay, so the cost follows what is occupied.
+    What BEVFusion's decoder does on a dense map: with three levels a cell sees some 35 cells to each
+    side, long vehicles whole. The sites stay, so the cost follows what is occupied.
     """
 
     def __init__(
