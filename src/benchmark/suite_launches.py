@@ -78,7 +78,7 @@ def make_case(
     config = replace(config, backbone=replace(config.backbone, image_size_px=list(image_size_px)))
     batch = made_batch(config.data.batch_size, road, image_size_px).to(device)
     case = build_case(config, batch, device)
-    with torch.no_grad():
+    with torch.no_grad(), case.computing():
         for _ in range(config.model.memory_frames):
             _, case.memory = case.prepared(case.batch, case.memory)
             case.batch = later(case.batch)
