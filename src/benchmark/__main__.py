@@ -10,7 +10,8 @@ suite=scaling   cost against range, objects, radar points, Gaussians and memory,
                 dense baseline; of a model that reads LiDAR, alone, against range
 suite=training  frames per second of the phase's training step, with its loader and without
 suite=latency   a frame of the trained model checkpoint=PATH, part by part, with full memory in phase 2, over the frames
-                that it was validated on; into DIR/latency.json, where DIR is the run's folder if tables are to show it
+                that it was validated on; into DIR/latency.json, where DIR is the run's folder if tables are to show it.
+                Without a checkpoint, of the configured model with fresh weights that are as busy as trained ones
 suite=soak      memory, time and handles over thousands of streamed frames, in inference and in training (phase=phase2)
 suite=metric    our metric against the official evaluator on one val-sized problem
 suite=launches  launches, waits and uploads of a frame and of a training step on a GPU, counted on a simulated one

@@ -11,11 +11,14 @@ import torch
 from torch import Tensor
 
 from src.assembly import build_model, restored_model
+from src.benchmark.scenes import ROADS
 from src.config import Config
+from src.data.reader import ReaderSettings
 from src.models.deploy.inference import prepare_for_inference
 from src.models.detector import Detector
 from src.ops.precision import computing
 from src.reliability.checkpoints import read_checkpoint
+from src.streaming import StreamingDetector
 from src.structures.batch import FrameBatch
 from src.structures.gaussians import GaussianSet
 from src.training.phases import EVALUATORS
@@ -82,6 +85,37 @@ def build_case(config: Config, batch: FrameBatch, device: torch.device) -> Case:
     prepared = prepare_for_inference(model, config.precision)
     learns_boxes = EVALUATORS[config.phase.task].labels
     return Case(model.train(), prepared, batch, None, device, config.precision, learns_boxes)
+
+
+def fresh_detector(config: Config, settings: ReaderSettings, frame: FrameBatch) -> StreamingDetector:
+    """The configured model with fresh weights or those of `checkpoint=PATH`, as prediction prepares it. Fresh weights
+    find as many boxes in `frame` as trained ones."""
+    torch.manual_seed(config.seed)
+    device = config.trainer.device()
+    detector = StreamingDetector(measured_model(config), config.grid.build(), settings, device, config.precision)
+    if config.checkpoint is None:
+        expect_trained_scores(detector_case(detector, frame))
+    return detector
+
+
+def detector_case(detector: StreamingDetector, frame: FrameBatch) -> Case:
+    """A detector before a frame, without memory; not for gradients."""
+    model, device = detector.model, detector.device
+    return Case(model, model, frame.to(device), None, device, detector.precision, learns_boxes=True)
+
+
+def remembering(config: Config) -> Config:
+    """The configuration with as many remembered cells as traffic fills, whatever fresh weights call occupied."""
+    cells = ROADS[config.scale].num_vehicles * CELLS_PER_VEHICLE[config.scale]
+    return replace(config, model=config.model.scaled(cells_per_frame=cells))
+
+
+def fill_memory(case: Case, num_frames: int) -> None:
+    """Let it remember so many frames in which the truck stands."""
+    with torch.no_grad(), case.computing():
+        for _ in range(num_frames):
+            _, case.memory = case.prepared(case.batch, case.memory)
+            case.batch = later(case.batch)
 
 
 def later(batch: FrameBatch) -> FrameBatch:

@@ -1,4 +1,4 @@
-"""suite=latency: milliseconds of a trained model's frame by part, in the streaming that prediction uses."""
+"""suite=latency: milliseconds of a model's frame by part, in the streaming that prediction uses."""
 
 from __future__ import annotations
 
@@ -10,6 +10,15 @@ from typing import Any
 import torch
 
 from src.assembly import build_datamodule, data_root
+from src.benchmark.cases import (
+    OCCUPIED_CELLS,
+    detector_case,
+    expect_trained_occupancy,
+    expect_trained_scores,
+    fill_memory,
+    fresh_detector,
+    remembering,
+)
 from src.benchmark.counting import counted_work
 from src.benchmark.machine import busy_cores, describe_machine, processor
 from src.benchmark.page import page_of
@@ -17,10 +26,13 @@ from src.benchmark.timing import clock, median_iqr, peak_bytes, timed_parts
 from src.config import Config, restore_config
 from src.data.clips import scenes_of
 from src.data.datamodule import DetectionDataModule
+from src.data.reader import ReaderSettings
 from src.data.splits import split_samples
 from src.errors import ConfigError
 from src.reliability.checkpoints import read_checkpoint
 from src.streaming import StreamingDetector
+from src.structures.batch import FrameBatch
+from src.training.phases import EVALUATORS
 from src.training.run_folder import current_commit
 
 LATENCY_FORMAT = 1
@@ -29,16 +41,37 @@ MEASURED_FRAMES = 20
 
 
 def measure_latency(command: Config, overrides: list[str]) -> dict[str, Any]:
-    """What `latency.json` holds: a checkpoint's own model on its own validation frames; see `benchmark_latency`."""
-    if command.checkpoint is None:
-        raise ConfigError("suite=latency measures a trained model; give checkpoint=PATH of one")
-    path = Path(command.checkpoint)
-    checkpoint = read_checkpoint(path)
-    config = restore_config(checkpoint["horizon3d"]["config"], overrides)
-    detector = StreamingDetector.restore(config, checkpoint, path, config.trainer.device())
-    datamodule = build_datamodule(config, data_root(config, write=False))
+    """What `latency.json` holds, see `benchmark_latency`: of a checkpoint's own model on its own validation frames, or
+    of the configured one with fresh weights, see `busy_detector`.
+
+    Raises ConfigError for a phase that learns no boxes.
+    """
+    if command.checkpoint is not None:
+        path = Path(command.checkpoint)
+        checkpoint = read_checkpoint(path)
+        config = restore_config(checkpoint["horizon3d"]["config"], overrides)
+        detector = StreamingDetector.restore(config, checkpoint, path, config.trainer.device())
+        datamodule = build_datamodule(config, data_root(config, write=False))
+    else:
+        config = command
+        if not EVALUATORS[config.phase.task].labels:
+            raise ConfigError(f"suite=latency times boxes, but phase={config.phase.name} learns none")
+        datamodule = build_datamodule(config, data_root(config))
+        detector = busy_detector(config, datamodule.settings, next(datamodule.stream()))
     result = benchmark_latency(detector, datamodule, config.model.memory_frames)
-    return {"format": LATENCY_FORMAT, **result, "precision": config.precision, "commit": current_commit()}
+    known = {"trained": command.checkpoint is not None, "precision": config.precision, "commit": current_commit()}
+    return {"format": LATENCY_FORMAT, **result, **known}
+
+
+def busy_detector(config: Config, settings: ReaderSettings, frame: FrameBatch) -> StreamingDetector:
+    """Fresh weights with as much to do as trained ones: candidates for boxes, cells that Gaussians occupy, cells that
+    are remembered. What else a model computes hardly follows its weights."""
+    detector = fresh_detector(remembering(config), settings, frame)
+    case = detector_case(detector, frame)
+    fill_memory(case, config.model.memory_frames)
+    expect_trained_occupancy(case, OCCUPIED_CELLS[config.scale])
+    expect_trained_scores(case)
+    return detector
 
 
 def latency_page(content: dict[str, Any], overrides: list[str]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from src.benchmark.cases import Case, build_case, expect_trained_scores, later
+from src.benchmark.cases import Case, build_case, expect_trained_scores, fill_memory
 from src.benchmark.parts import is_within, parts_of, wrapped_parts
 from src.benchmark.scenes import Highway, highway_frame, highway_points
 from src.benchmark.simulated_device import DEVICE, Tally, simulated_device
@@ -78,10 +78,7 @@ def make_case(
     config = replace(config, backbone=replace(config.backbone, image_size_px=list(image_size_px)))
     batch = made_batch(config.data.batch_size, road, image_size_px).to(device)
     case = build_case(config, batch, device)
-    with torch.no_grad(), case.computing():
-        for _ in range(config.model.memory_frames):
-            _, case.memory = case.prepared(case.batch, case.memory)
-            case.batch = later(case.batch)
+    fill_memory(case, config.model.memory_frames)
     expect_trained_scores(case)
     return case
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from src.assembly import build_datamodule, data_root
-from src.benchmark.cases import CANDIDATES, Case, build_case, expect_trained_scores, later
+from src.benchmark.cases import CANDIDATES, Case, build_case, expect_trained_scores, fill_memory
 from src.benchmark.counting import counted_work, distinct_bytes
 from src.benchmark.machine import gemm_rate, measure_roofline
 from src.benchmark.operation_table import OPERATIONS_NOTE, operation_table
@@ -93,10 +93,7 @@ def make_case(config: Config, device: torch.device) -> Case:
     else:
         batch = lidar_frame(ROADS[config.scale])
     case = build_case(config, batch.to(device), device)
-    with torch.no_grad():
-        for _ in range(config.model.memory_frames):
-            _, case.memory = case.run()
-            case.batch = later(case.batch)
+    fill_memory(case, config.model.memory_frames)
     if not config.checkpoint:
         expect_trained_scores(case)
     return case

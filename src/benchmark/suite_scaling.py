@@ -252,7 +252,7 @@ def make_case(config: Config, point: Point, device: torch.device) -> tuple[Case,
         encoder.forward = lambda images: features
     output, memory = expect_trained_scores(case)
     if settings.memory_frames:
-        fill_memory(case, memory, settings.memory_frames)
+        fill_from_behind(case, memory, settings.memory_frames)
     if point.occupied_cells is not None:
         expect_trained_occupancy(case, point.occupied_cells)
         expect_trained_scores(case)
@@ -271,7 +271,7 @@ def settings_at(config: Config, point: Point) -> ModelConfig:
     return replace(settings, radar_encoder=replace(encoder, pruning_ratio=point.pruning_ratio))
 
 
-def fill_memory(case: Case, memory: Any, num_frames: int) -> None:
+def fill_from_behind(case: Case, memory: Any, num_frames: int) -> None:
     """Make a memory of one frame a full one: the same frame seen from further and further behind."""
     (frame,) = memory.frames
     past = []

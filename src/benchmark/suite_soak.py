@@ -22,11 +22,10 @@ import torch
 from torch import Tensor
 
 from src.assembly import build_datamodule, build_module, data_root
-from src.benchmark.cases import CELLS_PER_VEHICLE, KEY_FRAME_S, Case, expect_trained_scores, measured_model
+from src.benchmark.cases import KEY_FRAME_S, fresh_detector, measured_model, remembering
 from src.benchmark.page import page_name
 from src.benchmark.parts import tensors_in, wrapped_parts
 from src.benchmark.plots import draw_soak
-from src.benchmark.scenes import ROADS
 from src.benchmark.timing import clock, median_iqr, status_bytes, trim_heap
 from src.config import Config
 from src.data.datamodule import DetectionDataModule
@@ -57,12 +56,11 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     device = config.trainer.device()
     config = replace(config, optim=replace(config.optim, lr=UNLEARNED))
     if config.checkpoint is None:
-        cells = ROADS[config.scale].num_vehicles * CELLS_PER_VEHICLE[config.scale]
-        config = replace(config, model=config.model.scaled(cells_per_frame=cells))
+        config = remembering(config)
     datamodule = build_datamodule(config, data_root(config))
     frames, curves = FRAMES[config.scale], {}
     for name in (DRIVE, CLIPS):
-        detector = make_detector(config, datamodule, device)
+        detector = fresh_detector(config, datamodule.settings, next(datamodule.stream()))
         curves[name] = soak_inference(detector, datamodule, frames, one_drive=name == DRIVE)
         del detector
     curves[TRAINING] = soak_training(config, tree, datamodule, frames, device)
@@ -99,17 +97,6 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
 
 
 # ---------------------------------------------------------------- the three passes
-
-
-def make_detector(config: Config, datamodule: DetectionDataModule, device: torch.device) -> StreamingDetector:
-    """The configured model, as prediction prepares it."""
-    torch.manual_seed(config.seed)
-    model = measured_model(config)
-    detector = StreamingDetector(model, config.grid.build(), datamodule.settings, device, config.precision)
-    if config.checkpoint is None:
-        frame = next(datamodule.stream()).to(device)
-        expect_trained_scores(Case(model, detector.model, frame, None, device, config.precision, learns_boxes=True))
-    return detector
 
 
 def soak_inference(

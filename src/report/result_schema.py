@@ -121,6 +121,7 @@ class Latency(TypedDict):
     gflop: NotRequired[Score]  # older files lack it, as the next two
     load: NotRequired[Score]
     cores: NotRequired[Score]
+    trained: NotRequired[bool]  # False of fresh weights
 
 
 class DataNames(TypedDict, extra_items=str):

@@ -169,9 +169,24 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
         "curves": curves_of(run_folder / "metrics.csv"),
         "latency": latency,
     }
+    return _write_result(result_path(reports, record.run_id), content)
+
+
+def publish_latency(folder: Path, reports: Path, run_id: str) -> Path:
+    """Give a result the latency that was measured into `latency.json` of a folder; returns the result's path.
+
+    Raises DataError naming file and key where either is not as it should be.
+    """
+    path = result_path(reports, run_id)
+    read_result(path)
+    latency = read_as(Latency, folder / "latency.json", "delete it and measure again")
+    return _write_result(path, from_json(path.read_bytes()) | {"latency": latency})
+
+
+def _write_result(path: Path, content: dict[str, Any]) -> Path:
+    """Unless it is there as it would be written."""
     lines = (f"{json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
     text = "{\n" + ",\n".join(lines) + "\n}\n"  # a line per key: compact, and a change is seen where it is
-    path = result_path(reports, record.run_id)
     if not path.is_file() or path.read_bytes() != text.encode():
         write_whole(path, text)
     return path

@@ -29,7 +29,7 @@ from src.training.identity import key_of
 
 logger = logging.getLogger(__name__)
 
-SET_BY_THE_RULE = ("sweep", "seed", "seeds", "trials")
+SET_BY_THE_RULE = ("sweep", "seed", "seeds", "trials", "latency")
 
 
 def main(overrides: list[str]) -> None:

@@ -36,7 +36,7 @@ from src.sweep.sweep_study import check_address
 from src.training.identity import key_of
 
 SWEEPS = CONF.parent / "sweeps"
-OWN_KEYS = ("sweep", "seeds", "workers", "storage", "dry_run", "trials", "published")
+OWN_KEYS = ("sweep", "seeds", "workers", "storage", "dry_run", "trials", "published", "latency")
 MOST_SEEDS = 1000
 FILE_PARTS = (SweepConfig, RowConfig, TableConfig, PlotConfig, PaperRowConfig, DimensionConfig)
 FILE_KEYS = [field.name for part in FILE_PARTS for field in dataclasses.fields(part)]
@@ -52,6 +52,7 @@ class SweepCommand:
     dry_run: bool
     trials: int | None
     published: bool
+    latency: bool
     sweep: Any = None  # SweepConfig, of a file that Hydra does not read
 
     def __post_init__(self) -> None:
@@ -157,6 +158,8 @@ def _compose(sweep: SweepConfig, overrides: list[str]) -> SweepCommand:
     command: SweepCommand = OmegaConf.to_object(tree)
     if command.trials is not None and not sweep.is_search:
         raise ConfigError(f"trials={command.trials} is for searches; a sweep of rows trains each of them")
+    if command.latency and not sweep.latency:
+        raise ConfigError(f"latency=true: no table of sweeps/{sweep.name}.yaml shows a latency; leave it out")
     if command.published and sweep.is_search:
         raise ConfigError("published=true is for sweeps of rows; a search goes on from its own trials")
     command.sweep = sweep if command.trials is None else dataclasses.replace(sweep, trials=command.trials)

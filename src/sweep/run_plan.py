@@ -19,7 +19,6 @@ import torch
 
 from src.config import PHASES, Config, compose_config
 from src.errors import HorizonError, InterruptedRunError
-from src.reliability.checkpoints import LAST
 from src.reliability.passwords import masked
 from src.reliability.processes import die_with_parent
 from src.report.results import publish_result, read_results
@@ -121,8 +120,8 @@ def run_plan(
     if runner.stop.requested:
         print(progress_line(record, command.workers, time.time()))
         raise InterruptedRunError(f"the sweep was stopped; nothing finished is lost, resume it with\n    {again}")
-    if plan.sweep.latency and command.workers:
-        measured = measure_latencies(record, outputs, partial(latency_command, outputs), runner)
+    if plan.sweep.latency and (command.workers or command.latency):
+        measured = measure_latencies(record, outputs, reports, runner, command.latency)
         logger.info("latency measured of %d runs", measured)
     finish(record, runner, outputs, reports, again)
 
@@ -179,13 +178,6 @@ def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, ag
     print(progress_line(record, 1, time.time()))
     if problems:
         raise HorizonError("\n".join(problems))
-
-
-def latency_command(outputs: Path, folder: Path) -> list[str]:
-    """What measures the latency of a finished run, into `latency.json` of its folder."""
-    checkpoint = folder / "checkpoints" / LAST
-    suite = [f"checkpoint={checkpoint}", f"out={folder}", f"paths.outputs={outputs}"]
-    return [sys.executable, "-m", "src.benchmark", "suite=latency", *suite]
 
 
 def visible_gpus() -> list[str]:

@@ -1,5 +1,6 @@
 """suite=latency: the parts of a frame add up, and frames count once the memory is full."""
 
+import itertools
 import json
 import os
 import types
@@ -9,7 +10,9 @@ import torch
 
 from src.benchmark import suite_latency as latency
 from src.benchmark.__main__ import main, report_latency
+from src.benchmark.cases import CELLS_PER_VEHICLE, OCCUPIED_CELLS
 from src.benchmark.page import number
+from src.benchmark.scenes import ROADS
 from src.benchmark.suite_latency import benchmark_latency
 from src.errors import CheckpointError, ConfigError
 from src.report.metric_names import METRICS
@@ -134,9 +137,29 @@ def test_a_busy_machine_is_warned_of(tmp_path, monkeypatch, capsys, load, warned
     assert (f"warning: {load} of 4 cores" in capsys.readouterr().out) == warned
 
 
-def test_latency_needs_a_checkpoint(tmp_path):
-    with pytest.raises(ConfigError, match="checkpoint=PATH"):
-        main(["suite=latency", f"out={tmp_path}"])
+@pytest.mark.slow
+def test_without_a_checkpoint_fresh_weights_are_as_busy_as_trained_ones(outputs, tmp_path, monkeypatch):
+    monkeypatch.setattr(latency, "MEASURED_FRAMES", 2)
+    seen = []
+
+    def measured(detector, datamodule, memory_frames):
+        for frame in itertools.islice(datamodule.stream(), 2):
+            output = detector.run(frame)[1]
+            seen.append(len(output.ocsf.splat.cells.occupied))
+            kept = [len(remembered.cells.rows) for remembered in detector.memory.frames]
+        assert max(kept) == ROADS["debug"].num_vehicles * CELLS_PER_VEHICLE["debug"]
+        return benchmark_latency(detector, datamodule, memory_frames)
+
+    monkeypatch.setattr(latency, "benchmark_latency", measured)
+    words = ["suite=latency", "scale=debug", "phase=phase2", "trainer=cpu", f"paths.outputs={outputs}"]
+    main([*words, f"out={tmp_path}"])
+    assert json.loads((tmp_path / "latency.json").read_text())["trained"] is False
+    assert all(0.5 * OCCUPIED_CELLS["debug"] < cells <= 1.3 * OCCUPIED_CELLS["debug"] for cells in seen)
+
+
+def test_what_cannot_be_timed_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="phase=lrs_forecast learns none"):
+        main(["suite=latency", "model=lrs4fusion", "phase=lrs_forecast", f"out={tmp_path}"])
     with pytest.raises(CheckpointError, match="does not exist"):
         main(["suite=latency", f"checkpoint={tmp_path / 'no.ckpt'}", f"out={tmp_path}"])
     assert not list(tmp_path.iterdir())

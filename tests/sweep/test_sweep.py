@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -15,6 +16,7 @@ from src.errors import ConfigError, HorizonError
 from src.report.sweep_record import read_record
 from src.sweep import __main__ as sweep
 from src.sweep import compose as sweep_config
+from src.sweep import latency_runs
 from src.sweep.latency_runs import measure_latencies
 from src.training.handoff import find_source
 from src.training.identity import run_identity
@@ -144,7 +146,7 @@ def test_latency_is_measured_once_per_row_and_a_failure_is_told(tmp_path, monkey
     outputs = tmp_path / "outputs"
     bad = record.rows["b"][0]
 
-    def command(folder):
+    def command(outputs, spec, folder, trained):
         code = (
             "raise SystemExit('DataError: no frames')"
             if folder.name == bad
@@ -152,13 +154,41 @@ def test_latency_is_measured_once_per_row_and_a_failure_is_told(tmp_path, monkey
         )
         return [sys.executable, "-c", code, str(folder / "latency.json")]
 
+    monkeypatch.setattr(latency_runs, "latency_command", command)
     published.clear()
     with caplog.at_level(logging.WARNING):
-        assert measure_latencies(record, outputs, command, runner) == 1
+        assert measure_latencies(record, outputs, tmp_path / "reports", runner) == 1
     assert (
         published == [outputs / record.rows["a"][0]] and "[b]: no latency" in caplog.text and "no frames" in caplog.text
     )
-    assert measure_latencies(record, outputs, command, runner) == 0
+    assert measure_latencies(record, outputs, tmp_path / "reports", runner) == 0
+    assert measure_latencies(record, outputs, tmp_path / "reports", runner, every=True) == 1  # again, b fails again
+
+
+@pytest.mark.slow
+def test_results_of_other_machines_are_given_a_latency_of_fresh_weights(sweeps, places, tmp_path, capsys):
+    """Their weights are not here; the table says so."""
+    words = ["+sweep=timed", "scale=debug", "phase.epochs=1", "trainer.num_pictures=0", "trainer=cpu", *places]
+    (sweeps / "timed.yaml").write_text(
+        "title: t\nquestion: q\nlatency: true\ntables: [{name: t, title: T, columns: [mAP, latency.total]}]\n"
+        "rows: [{label: radar, overrides: [model.kggi=null, model.ocsf=null]}]\n"
+    )
+    sweep.main(words)
+    trained = capsys.readouterr().out
+    assert "fresh weights" not in trained
+    (path,) = (tmp_path / "reports" / "results").glob("*.json")
+    before = json.loads(path.read_text())
+    shutil.rmtree(tmp_path / "outputs")
+    sweep.main([*words, "published=true", "workers=0"])
+    assert json.loads(path.read_text()) == before and "fresh weights" not in capsys.readouterr().out
+    sweep.main([*words, "published=true", "workers=0", "latency=true"])
+    after = json.loads(path.read_text())
+    assert "Latency on" in (out := capsys.readouterr().out) and "of fresh weights that are as busy" in out
+    assert after["latency"]["trained"] is False and after["latency"] != before["latency"]
+    assert after | {"latency": None} == before | {"latency": None}
+    assert not list((tmp_path / "outputs").glob("horizon3d-*"))
+    with pytest.raises(ConfigError, match=r"latency=true: no table of sweeps/two.yaml shows a latency"):
+        sweep.main(["+sweep=two", "scale=debug", "latency=true", *places])
 
 
 @pytest.mark.slow
