@@ -87,7 +87,7 @@ def build_case(config: Config, batch: FrameBatch, device: torch.device) -> Case:
     return Case(model.train(), prepared, batch, None, device, config.precision, learns_boxes)
 
 
-def fresh_detector(config: Config, settings: ReaderSettings, frame: FrameBatch) -> StreamingDetector:
+def measured_detector(config: Config, settings: ReaderSettings, frame: FrameBatch) -> StreamingDetector:
     """The configured model with fresh weights or those of `checkpoint=PATH`, as prediction prepares it. Fresh weights
     find as many boxes in `frame` as trained ones."""
     torch.manual_seed(config.seed)
@@ -149,7 +149,7 @@ def expect_trained_scores(case: Case) -> tuple[Any, Any]:
 
 def expect_trained_occupancy(case: Case, num_cells: int) -> None:
     """Make as many Gaussians of the prepared model opaque as occupy about `num_cells` cells, evenly among all, and the
-    rest transparent; nothing of a model without Gaussians.
+    rest transparent, and set the score threshold anew; nothing of a model without Gaussians.
 
     Of fresh weights every Gaussian is faintly opaque, and together they fill the map to its limit.
     """
@@ -177,3 +177,4 @@ def expect_trained_occupancy(case: Case, num_cells: int) -> None:
         opaque = (number + 1) * middle // len(number) > number * middle // len(number)
         low, high = (middle, high) if len(output().splat.cells.occupied) <= num_cells else (low, middle)
     opaque = (number + 1) * low // len(number) > number * low // len(number)
+    expect_trained_scores(case)

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from src.benchmark.cases import KEY_FRAME_S, OCCUPIED_CELLS, Case, expect_trained_occupancy
+from src.benchmark.cases import KEY_FRAME_S, OCCUPIED_CELLS, Case, expect_trained_occupancy, fill_memory
 from src.benchmark.scenes import ROADS
 from src.benchmark.suite_launches import count, made_batch, make_case
 from src.benchmark.timing import clock, median_iqr, milliseconds, seconds_of, timed_parts
@@ -44,13 +44,17 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     counting = make_case(replace(config, precision=Precision.FULL))  # the simulated device has no autocast
     counted, _ = count(counting, counting.prepared, counting.infer)
     case = full_case(config, device)
+    expect_trained_occupancy(case, OCCUPIED_CELLS[config.scale])
+    fill_memory(case, config.model.memory_frames)
     waits = waits_of(case.infer)
     return {
         "notes": [
             f"{config.model.name}, scale {config.scale}, {config.phase.name}, {config.precision} on "
-            f"{torch.cuda.get_device_name(device)}. Fresh weights; Gaussians, where there are any, occupy what trained "
-            f"ones do. Frames of {DRAWS} draws in turn, from the host to their boxes there, each remembered by the "
-            "next. Busy is how long the GPU computes and copies; a step is forward, losses and backward.",
+            f"{torch.cuda.get_device_name(device)}, fresh weights. Busy is how long the GPU computes and copies.",
+            "In frames Gaussians, where there are any, occupy what trained ones do. A frame: "
+            f"{DRAWS} draws in turn, from the host to their boxes there, each remembered by the next. A frame on the "
+            "GPU, and its parts: one draw that lies there, with a full memory; `counted` in float32 on a small road, "
+            "as suite=launches counts. A step is forward, losses and backward; its Gaussians fill the map.",
         ],
         "a frame": frame_rows(case, config.scale),
         "a frame on the GPU": [
@@ -67,15 +71,13 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def full_case(config: Config, device: torch.device) -> Case:
-    """The configured model, its images in full size, on the road of the scale, occupied as by trained weights."""
-    case = make_case(config, device, ROADS[config.scale], tuple(config.backbone.image_size_px))
-    expect_trained_occupancy(case, OCCUPIED_CELLS[config.scale])
-    return case
+    """The configured model, its images in full size, on the road of the scale."""
+    return make_case(config, device, ROADS[config.scale], tuple(config.backbone.image_size_px))
 
 
 def frame_rows(case: Case, scale: str) -> list[dict[str, Any]]:
     """A row for each way to run a frame."""
-    size = tuple(case.batch.images.shape[-2:]) if case.batch.images is not None else (8, 8)
+    size = tuple(case.batch.images.shape[-2:])
     draws = [made_batch(1, ROADS[scale], size, seed=draw) for draw in range(DRAWS)]
     ways: dict[str, Step] = {LAUNCHED: launched(case)}
     form = case.prepared.fixed_form() if backend.chosen() == backend.TRITON else None
@@ -88,9 +90,8 @@ def frame_rows(case: Case, scale: str) -> list[dict[str, Any]]:
             frames = following(draws)
             seconds = frame_seconds(step, frames, clock(case.device))
             busy_ms = 1e3 * busy_seconds(lambda step=step, frames=frames: step(next(frames)))
-        p99 = statistics.quantiles(seconds, n=100)[98]
-        rows.append({"way": name, **milliseconds(seconds), "p99 ms": 1e3 * p99, "busy ms": busy_ms})
-        rows[-1]["frames"] = len(seconds)
+        p99 = 1e3 * statistics.quantiles(seconds, n=100)[98] if len(seconds) >= 100 else None
+        rows.append({"way": name, **milliseconds(seconds), "p99 ms": p99, "busy ms": busy_ms, "frames": len(seconds)})
         if name == GRAPH:
             rows[-1]["beyond a capacity"] = whole.refused
     return rows

@@ -14,15 +14,14 @@ from src.benchmark.cases import (
     OCCUPIED_CELLS,
     detector_case,
     expect_trained_occupancy,
-    expect_trained_scores,
     fill_memory,
-    fresh_detector,
+    measured_detector,
     remembering,
 )
 from src.benchmark.counting import counted_work
 from src.benchmark.machine import busy_cores, describe_machine, processor
 from src.benchmark.page import page_of
-from src.benchmark.timing import clock, median_iqr, peak_bytes, timed_parts
+from src.benchmark.timing import clock, forget_peak, median_iqr, peak_bytes, timed_parts
 from src.config import Config, restore_config
 from src.data.clips import scenes_of
 from src.data.datamodule import DetectionDataModule
@@ -66,11 +65,10 @@ def measure_latency(command: Config, overrides: list[str]) -> dict[str, Any]:
 def busy_detector(config: Config, settings: ReaderSettings, frame: FrameBatch) -> StreamingDetector:
     """Fresh weights with as much to do as trained ones: candidates for boxes, cells that Gaussians occupy, cells that
     are remembered. What else a model computes hardly follows its weights."""
-    detector = fresh_detector(remembering(config), settings, frame)
+    detector = measured_detector(remembering(config), settings, frame)
     case = detector_case(detector, frame)
     fill_memory(case, config.model.memory_frames)
     expect_trained_occupancy(case, OCCUPIED_CELLS[config.scale])
-    expect_trained_scores(case)
     return detector
 
 
@@ -91,13 +89,12 @@ def benchmark_latency(
 
     The spread is the interquartile range. Frames count once the memory is full, or as full as scenes are long.
     `load` is how many of the `cores` were at work when this began.
-    `memory_gb` is the largest that torch held on a GPU, or the process with its libraries on a CPU, in 1e9 bytes.
+    `memory_gb` is the largest that torch held on a GPU, or the process with its libraries on a CPU, in 1e9 bytes, once
+    warm.
     `gflop` are those of one more frame, as `counted_work` sees them.
     """
     device, now, load = detector.device, clock(detector.device), busy_cores()
     parts = detector.model.latency_parts
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats()
     scenes = scenes_of(datamodule.index, split_samples(datamodule.index, datamodule.config.split))
     full = min(memory_frames, max(map(len, scenes)) - 1)
     measured, number = [], 0  # the frame's place in its scene
@@ -113,6 +110,8 @@ def benchmark_latency(
             begin = now()
             detector.run(frame)
             whole = now() - begin
+        if seen + 1 == WARM_UP_FRAMES:
+            forget_peak(device)
         if seen >= WARM_UP_FRAMES and memory_is_full and len(measured) < MEASURED_FRAMES:
             measured.append({name: 1e3 * value for name, value in (seconds | {"total": whole}).items()})
     columns = {name: [row[name] for row in measured] for name in (*parts, "total") if name in measured[0]}

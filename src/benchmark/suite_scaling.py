@@ -255,7 +255,6 @@ def make_case(config: Config, point: Point, device: torch.device) -> tuple[Case,
         fill_from_behind(case, memory, settings.memory_frames)
     if point.occupied_cells is not None:
         expect_trained_occupancy(case, point.occupied_cells)
-        expect_trained_scores(case)
     gaussians = case.prepared.evidence(output).gaussians
     return case, 0 if gaussians is None else int(gaussians.valid.sum())
 

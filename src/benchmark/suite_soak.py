@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from src.assembly import build_datamodule, build_module, data_root
-from src.benchmark.cases import KEY_FRAME_S, fresh_detector, measured_model, remembering
+from src.benchmark.cases import KEY_FRAME_S, measured_detector, measured_model, remembering
 from src.benchmark.page import page_name
 from src.benchmark.parts import tensors_in, wrapped_parts
 from src.benchmark.plots import draw_soak
@@ -60,7 +60,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     datamodule = build_datamodule(config, data_root(config))
     frames, curves = FRAMES[config.scale], {}
     for name in (DRIVE, CLIPS):
-        detector = fresh_detector(config, datamodule.settings, next(datamodule.stream()))
+        detector = measured_detector(config, datamodule.settings, next(datamodule.stream()))
         curves[name] = soak_inference(detector, datamodule, frames, one_drive=name == DRIVE)
         del detector
     curves[TRAINING] = soak_training(config, tree, datamodule, frames, device)

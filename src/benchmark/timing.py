@@ -128,22 +128,31 @@ def added_mib(function: Callable[[], Any], device: torch.device) -> float | None
     """
     gc.collect()
     release_scratch()
+    if not forget_peak(device):
+        return None
     if device.type == "cuda":
-        torch.cuda.synchronize()
-        torch.cuda.reset_peak_memory_stats()
         before = torch.cuda.memory_allocated()
         function()
         torch.cuda.synchronize()
         return (torch.cuda.max_memory_allocated() - before) / 2**20
-    if not trim_heap():
-        return None
-    try:
-        Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
-    except OSError:
-        return None
     before = status_bytes("VmRSS")
     function()
     return max(0, status_bytes("VmHWM") - before) / 2**20
+
+
+def forget_peak(device: torch.device) -> bool:
+    """Let `peak_bytes` begin anew from what is held now; False where the system does not do that (Linux does)."""
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        return True
+    if not trim_heap():
+        return False
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return False
+    return True
 
 
 def trim_heap() -> bool:

@@ -85,10 +85,11 @@ def _latency(table: SweepTable, timed: list[Latency]) -> str:
         for latency in timed
     }
     text = f" Latency on {_listed(sorted(places))}"
+    if not all(latency.get("trained", True) for latency in timed):
+        some = "" if not any(latency.get("trained", True) for latency in timed) else ", of some rows"
+        text += f"{some} of fresh weights that are as busy as trained ones"
     if any(is_busy(latency.get("load"), latency.get("cores")) for latency in timed):
         text += ", measured on a busy machine, so rows may differ by what else ran"
-    if not all(latency.get("trained", True) for latency in timed):
-        text += ", of fresh weights that are as busy as trained ones"
     if all(cell.frames is None for row in table.rows for cell in row.cells):
         return f"{text}."
     return (

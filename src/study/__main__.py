@@ -38,7 +38,7 @@ def main(overrides: list[str]) -> None:
         hide_in_process_list(override)
         if key_of(override) in SET_BY_THE_RULE:
             raise ConfigError(
-                f"{override}: the claims say which sweeps and seeds are run; leave {key_of(override)}= out"
+                f"{override}: the claims say which sweeps and seeds are run and measured; leave {key_of(override)}= out"
             )
     study = read_study(overrides)
     if study.options.dry_run:

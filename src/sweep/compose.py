@@ -159,7 +159,7 @@ def _compose(sweep: SweepConfig, overrides: list[str]) -> SweepCommand:
     if command.trials is not None and not sweep.is_search:
         raise ConfigError(f"trials={command.trials} is for searches; a sweep of rows trains each of them")
     if command.latency and not sweep.latency:
-        raise ConfigError(f"latency=true: no table of sweeps/{sweep.name}.yaml shows a latency; leave it out")
+        raise ConfigError(f"latency=true: sweeps/{sweep.name}.yaml does not say latency: true; leave it out")
     if command.published and sweep.is_search:
         raise ConfigError("published=true is for sweeps of rows; a search goes on from its own trials")
     command.sweep = sweep if command.trials is None else dataclasses.replace(sweep, trials=command.trials)

@@ -80,7 +80,7 @@ class Launcher:
         own = {"OMP_NUM_THREADS": str(max(1, _cores() // self.workers))} if self.workers > 1 else {}
         result = own | os.environ
         if self.gpus:
-            share = self.gpus[worker :: self.workers] or [self.gpus[worker % len(self.gpus)]]
+            share = self.gpus[worker :: max(1, self.workers)] or [self.gpus[worker % len(self.gpus)]]
             result["CUDA_VISIBLE_DEVICES"] = ",".join(share)
         return result
 

@@ -120,10 +120,10 @@ def run_plan(
     if runner.stop.requested:
         print(progress_line(record, command.workers, time.time()))
         raise InterruptedRunError(f"the sweep was stopped; nothing finished is lost, resume it with\n    {again}")
+    missed: list[str] = []
     if plan.sweep.latency and (command.workers or command.latency):
-        measured = measure_latencies(record, outputs, reports, runner, command.latency)
-        logger.info("latency measured of %d runs", measured)
-    finish(record, runner, outputs, reports, again)
+        missed = measure_latencies(record, outputs, reports, runner, command.latency)
+    finish(record, runner, outputs, reports, again, missed if command.latency else [])
 
 
 def check_data_of_finished(plan: Plan, identify: Identifier, outputs: Path) -> None:
@@ -152,12 +152,11 @@ def check_data_of_finished(plan: Plan, identify: Identifier, outputs: Path) -> N
         check_data(config, outputs / spec.run_id, RunFolder(outputs, spec.run_id).read_result()[0], find)
 
 
-def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, again: str) -> None:
-    """Write and show the tables. Raises HorizonError listing what failed."""
-    problems = []
+def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, again: str, problems: list[str]) -> None:
+    """Write and show the tables. Raises HorizonError listing what failed, `problems` among it."""
     failed = [run for run in record.runs.values() if run.state == "failed"]
     if failed:
-        problems = [f"{len(failed)} of {len(record.runs)} runs failed:"]
+        problems = [*problems, f"{len(failed)} of {len(record.runs)} runs failed:"]
         for run in failed:
             log = str(outputs / run.log) if run.log is not None else "none"
             problems.append(f"  {run.label}, seed {run.seed} ({run.run_id}): {run.reason}; log: {log}")

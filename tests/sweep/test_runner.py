@@ -345,6 +345,8 @@ def test_cores_and_gpus_are_divided(tmp_path, monkeypatch):
     assert shares[0]["OMP_NUM_THREADS"] == "2"
     monkeypatch.setenv("OMP_NUM_THREADS", "5")
     assert launcher.environment(0)["OMP_NUM_THREADS"] == "5"
+    alone = Launcher([], tmp_path, 0, ["0", "1"])  # trains nothing, measures
+    assert alone.environment(0)["CUDA_VISIBLE_DEVICES"] == "0,1"
     few = Launcher([], tmp_path, 3, ["GPU-a"])
     assert {few.environment(worker)["CUDA_VISIBLE_DEVICES"] for worker in range(3)} == {"GPU-a"}
     assert os.environ["OMP_NUM_THREADS"] == "5"

@@ -146,7 +146,12 @@ def test_latency_is_measured_once_per_row_and_a_failure_is_told(tmp_path, monkey
     outputs = tmp_path / "outputs"
     bad = record.rows["b"][0]
 
-    def command(outputs, spec, folder, trained):
+    for run_id in record.runs:  # weights are here
+        (outputs / run_id / "checkpoints").mkdir()
+        (outputs / run_id / "checkpoints" / "last.ckpt").write_text("")
+
+    def command(outputs, folder, words):
+        assert words[:1] == [f"checkpoint={folder / 'checkpoints' / 'last.ckpt'}"]
         code = (
             "raise SystemExit('DataError: no frames')"
             if folder.name == bad
@@ -156,17 +161,17 @@ def test_latency_is_measured_once_per_row_and_a_failure_is_told(tmp_path, monkey
 
     monkeypatch.setattr(latency_runs, "latency_command", command)
     published.clear()
+    places = outputs, tmp_path / "reports", runner
     with caplog.at_level(logging.WARNING):
-        assert measure_latencies(record, outputs, tmp_path / "reports", runner) == 1
-    assert (
-        published == [outputs / record.rows["a"][0]] and "[b]: no latency" in caplog.text and "no frames" in caplog.text
-    )
-    assert measure_latencies(record, outputs, tmp_path / "reports", runner) == 0
-    assert measure_latencies(record, outputs, tmp_path / "reports", runner, every=True) == 1  # again, b fails again
+        (problem,) = measure_latencies(record, *places)
+    assert "[b]: no latency" in problem and "no frames" in problem and problem in caplog.text
+    assert published == [outputs / record.rows["a"][0]]
+    assert len(measure_latencies(record, *places)) == 1 and len(published) == 1  # b fails again, a has its own
+    assert len(measure_latencies(record, *places, every=True)) == 1 and len(published) == 2
 
 
 @pytest.mark.slow
-def test_results_of_other_machines_are_given_a_latency_of_fresh_weights(sweeps, places, tmp_path, capsys):
+def test_results_of_other_machines_are_given_a_latency_of_fresh_weights(sweeps, places, tmp_path, capsys, monkeypatch):
     """Their weights are not here; the table says so."""
     words = ["+sweep=timed", "scale=debug", "phase.epochs=1", "trainer.num_pictures=0", "trainer=cpu", *places]
     (sweeps / "timed.yaml").write_text(
@@ -178,6 +183,11 @@ def test_results_of_other_machines_are_given_a_latency_of_fresh_weights(sweeps, 
     assert "fresh weights" not in trained
     (path,) = (tmp_path / "reports" / "results").glob("*.json")
     before = json.loads(path.read_text())
+    sweep.main([*words, "workers=0", "seed=1", "latency=true"])  # seed 0 is of an earlier command
+    again = json.loads(path.read_text())
+    assert again["latency"]["trained"] is True and again["latency"] != before["latency"], "its weights are here"
+    assert "fresh weights" not in capsys.readouterr().out
+    before = again
     shutil.rmtree(tmp_path / "outputs")
     sweep.main([*words, "published=true", "workers=0"])
     assert json.loads(path.read_text()) == before and "fresh weights" not in capsys.readouterr().out
@@ -187,7 +197,10 @@ def test_results_of_other_machines_are_given_a_latency_of_fresh_weights(sweeps, 
     assert after["latency"]["trained"] is False and after["latency"] != before["latency"]
     assert after | {"latency": None} == before | {"latency": None}
     assert not list((tmp_path / "outputs").glob("horizon3d-*"))
-    with pytest.raises(ConfigError, match=r"latency=true: no table of sweeps/two.yaml shows a latency"):
+    monkeypatch.setattr(latency_runs, "latency_command", lambda *_: [sys.executable, "-c", "raise SystemExit('no')"])
+    with pytest.raises(HorizonError, match=r"\[radar\]: no latency of .*: no .exit code 1.; log: "):
+        sweep.main([*words, "published=true", "workers=0", "latency=true"])
+    with pytest.raises(ConfigError, match=r"latency=true: sweeps/two.yaml does not say latency: true"):
         sweep.main(["+sweep=two", "scale=debug", "latency=true", *places])
 
 
