@@ -25,8 +25,9 @@ from src.training.phases import EVALUATORS
 
 KEY_FRAME_S = 0.5
 CANDIDATES = 300  # cells above the score threshold: what traffic lights up in a trained model, within its 500 boxes
-CELLS_PER_VEHICLE = {"paper": 17, "mini": 6, "debug": 2}
-"""Remembered in each frame, where fresh weights would call no cell occupied; paper: 8000 cells in eight frames."""
+CELLS_PER_VEHICLE = {"paper": 17, "mini": 38, "debug": 2}
+"""Remembered in each frame, where fresh weights would call no cell occupied; paper: 8000 cells in eight frames; mini:
+`remembered_cells` of a trained phase 2, 2,280 in the median frame."""
 
 OCCUPIED_CELLS = {"paper": 6104, "mini": 8600, "debug": 600}
 """What trained Gaussians occupy in a frame, of 147,456. paper: the 450 that the authors show of one (project page,
