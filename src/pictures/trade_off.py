@@ -7,12 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from matplotlib.axes import Axes
+from matplotlib.transforms import Bbox
 
 from src.pictures.canvas import SHEET_PX, Canvas
 from src.pictures.contents import MUTED
 from src.pictures.learning_curves import LINE_COLOURS
 
 HEIGHT_PX = 560
+LABEL_PLACES = ((9, 5), (9, -14), (-9, 5), (-9, -14), (9, 20), (-9, 20), (9, -28), (-9, -28))
+"""Where a point's label may begin, or end where the first is negative, in points from it."""
+MARKER_PX = 6.0
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,21 @@ def paint_points(axes: Axes, points: Sequence[TradeOff]) -> None:
         axes.annotate(point.label, (point.cost, point.score), **place, fontsize=10, color=colour, parse_math=False)
 
 
+def spread_labels(axes: Axes) -> None:
+    """Put every label at the first of its places where it covers no point and no label before it, else at the first."""
+    renderer = axes.figure.canvas.get_renderer()
+    centres = [axes.transData.transform(label.xy) for label in axes.texts]
+    taken = [Bbox.from_extents(x - MARKER_PX, y - MARKER_PX, x + MARKER_PX, y + MARKER_PX) for x, y in centres]
+    for label in axes.texts:
+        for place in (*LABEL_PLACES, LABEL_PLACES[0]):
+            label.xyann = place
+            label.set_horizontalalignment("left" if place[0] > 0 else "right")
+            box = label.get_window_extent(renderer)
+            if not any(box.overlaps(other) for other in taken):
+                break
+        taken.append(box)
+
+
 def draw_trade_off(path: Path | str, points: Sequence[TradeOff], title: str, cost: str, score: str) -> None:
     """Write a PNG of all points; `cost` and `score` name the axes, which begin at zero."""
     canvas = Canvas(SHEET_PX, HEIGHT_PX)
@@ -55,6 +74,7 @@ def draw_trade_off(path: Path | str, points: Sequence[TradeOff], title: str, cos
     axes = canvas.axes(80, 80, SHEET_PX - 120, HEIGHT_PX - 150)
     paint_points(axes, points)
     axes.set(xlim=(0, 1.15 * max(p.cost for p in points)), ylim=(0, 1.08 * max(p.high for p in points)))
+    spread_labels(axes)
     axes.grid(color="#E3E6EA", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.tick_params(colors="#495057", labelsize=10, length=0)

@@ -173,7 +173,9 @@ def draw_claims(path: Path, findings: list[tuple[Claim, list[Finding]]], scale: 
 
 
 def write_trade_off(reports: Path, record: SweepRecord, results: dict[str, RunResult]) -> list[Path]:
-    """mAP over the milliseconds of a frame, where at least two rows of a sweep were timed."""
+    """mAP over the milliseconds of a frame, where at least two rows of a sweep that times them were timed."""
+    if not record.sweep.latency:
+        return []
     score, cost = (find_metric(name, record.name) for name in ("mAP", "latency.total"))
     points = []
     for label, runs in record.rows.items():

@@ -5,7 +5,14 @@ from pathlib import Path
 from PIL import Image
 
 from src.pictures.canvas import Canvas
-from src.pictures.trade_off import TradeOff, draw_trade_off, efficient, paint_points
+from src.pictures.trade_off import (
+    LABEL_PLACES,
+    TradeOff,
+    draw_trade_off,
+    efficient,
+    paint_points,
+    spread_labels,
+)
 
 
 def point(label: str, cost: float, score: float) -> TradeOff:
@@ -33,6 +40,16 @@ def test_every_point_is_drawn_with_its_interval_and_name() -> None:
     assert [(mark.get_xdata()[0], mark.get_ydata()[0]) for mark in marks] == [(p.cost, p.score) for p in POINTS]
     assert [bar.get_segments()[0].tolist() for bar in axes.collections][0] == [[90.0, 29.0], [90.0, 32.0]]
     assert [text.get_text() for text in axes.texts] == [p.label for p in POINTS]
+
+
+def test_labels_of_close_points_stand_apart() -> None:
+    axes = Canvas(800, 300).axes(30, 30, 740, 240)
+    paint_points(axes, [point("Horizon3D", 283.0, 29.9), point("BEVFusion", 287.0, 31.4), point("far", 100.0, 5.0)])
+    axes.set(xlim=(0, 400), ylim=(0, 40))
+    spread_labels(axes)
+    boxes = [text.get_window_extent(axes.figure.canvas.get_renderer()) for text in axes.texts]
+    assert not boxes[0].overlaps(boxes[1])
+    assert axes.texts[2].xyann == LABEL_PLACES[0]
 
 
 def test_a_picture_is_written(tmp_path: Path) -> None:

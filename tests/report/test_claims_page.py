@@ -26,9 +26,10 @@ def report(tmp_path, monkeypatch, capsys):
 def write_sweep(write_run, make_record, tmp_path):
     """Writes the record of a sweep and a run for each row and seed; every score is the row's value for that seed."""
 
-    def write(name, rows, changes=(), scale="mini", overrides=()):
+    def write(name, rows, changes=(), scale="mini", overrides=(), latency=False):
         record = make_record(dict.fromkeys(rows, {}), seeds=max(map(len, rows.values())), name=name, scale=scale)
         record.changes, record.sweep.overrides = list(changes), list(overrides)
+        record.sweep.latency = latency
         for label, values in rows.items():
             for seed, value in enumerate(values):
                 end = record.rows[label][seed].rpartition("-")[2]
@@ -88,8 +89,9 @@ def test_another_scale_has_a_page_of_its_own(report, write_sweep):
 
 
 def test_rows_of_a_sweep_that_were_timed_become_a_picture(report, write_sweep, tmp_path):
-    """One timed row alone is no picture; the claims beside are those of this sweep."""
-    write_sweep("layers", {"1 layer": [0.10], "2 layers": [0.12], "4 layers": [0.11]})
+    """One timed row alone is no picture, nor rows that another sweep timed; the claims beside are those of this one."""
+    for name, latency in (("layers", True), ("epsilon", False)):  # they share their runs
+        write_sweep(name, {"1 layer": [0.10], "2 layers": [0.12], "4 layers": [0.11]}, latency=latency)
     folders = sorted(path.parent for path in tmp_path.glob("*/run.json"))
     picture = tmp_path / "reports" / "pictures" / "layers_latency_mini.png"
     for folder, drawn in zip(folders[:2], (False, True), strict=True):
@@ -98,3 +100,4 @@ def test_rows_of_a_sweep_that_were_timed_become_a_picture(report, write_sweep, t
         _, said = report()
         assert picture.is_file() == (f"written: {picture}" in said) == drawn
     assert Image.open(picture).width == 1600
+    assert [path.name for path in picture.parent.glob("*_latency_*")] == [picture.name]
