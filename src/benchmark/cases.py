@@ -27,7 +27,7 @@ KEY_FRAME_S = 0.5
 CANDIDATES = 300  # cells above the score threshold: what traffic lights up in a trained model, within its 500 boxes
 CELLS_PER_VEHICLE = {"paper": 17, "mini": 38, "debug": 2}
 """Remembered in each frame, where fresh weights would call no cell occupied; paper: 8000 cells in eight frames; mini:
-`remembered_cells` of a trained phase 2, 2,280 in the median frame."""
+of a trained phase 2 with a neck, 2,280 in the median frame."""
 
 OCCUPIED_CELLS = {"paper": 6104, "mini": 8600, "debug": 600}
 """What trained Gaussians occupy in a frame, of 147,456. paper: the 450 that the authors show of one (project page,

@@ -150,8 +150,7 @@ def busy_seconds(function: Callable[[], Any]) -> float:
     """How long kernels and copies of a call take on the GPU."""
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
         function()
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
+        torch.cuda.synchronize()
     return 1e-6 * sum(event.self_device_time_total for event in profile.key_averages())
 
 

@@ -51,7 +51,10 @@ def measure_latencies(
                 reason = status.reason
                 if not status.code:
                     try:
-                        runner.publish(folder) if trained else publish_latency(folder, reports, run_id)
+                        if trained:
+                            runner.publish(folder)
+                        else:
+                            publish_latency(folder, reports, run_id)
                     except (HorizonError, OSError) as error:
                         reason = str(error)
             if reason:
