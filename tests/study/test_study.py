@@ -205,5 +205,6 @@ def test_another_experiment_has_records_of_its_own(places, trained, tmp_path):
 
 @pytest.mark.parametrize("override", ["+sweep=margin", "seed=3", "seeds=12", "trials=3", "latency=true"])
 def test_what_the_rule_sets_is_refused(places, override):
-    with pytest.raises(ConfigError, match=r"the claims say which sweeps and seeds are run and measured; leave \w+= out"):
+    message = r"the claims say which sweeps and seeds are run and measured; leave \w+= out"
+    with pytest.raises(ConfigError, match=message):
         study.main([*places, override])
