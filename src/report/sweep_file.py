@@ -108,6 +108,7 @@ class SweepConfig:
     scale_overrides: dict[str, Many[str]] = field(default_factory=dict)  # of every row at a scale, by its name
     baseline: str | None = None  # label of the row that differences are taken to
     latency: bool = False  # measure the latency of every finished row, one after the other
+    note: str | None = None  # stands under every table: what a reader of it must know
     tables: Many[TableConfig] = field(default_factory=list)
     plots: Many[PlotConfig] = field(default_factory=list)
     rows: Many[RowConfig] = field(default_factory=list)

@@ -155,6 +155,15 @@ def test_the_caption_names_what_was_run(make_record, results_of):
     assert table.caption.endswith("every other row. Latency on Fast CPU, 1 thread.")
 
 
+def test_a_note_stands_under_every_table_whatever_has_run(make_record, results_of):
+    record = make_record({"a": {}, "b": {}})
+    record.sweep.note = "Half of the *rate* for a"
+    for results in (results_of(THREE), {}):
+        (table,) = sweep_tables(record, results)
+        assert table.text[0] == record.sweep.note and len(table.text) > 1
+        assert "Half of the \\*rate\\* for a" in table.to_markdown() and "Half of the *rate* for a" in table.to_latex()
+
+
 def test_rows_without_numbers_say_why(make_record, results_of):
     states = {
         "a1": {"state": "failed", "reason": "loss is nan", "log": "logs/a1.txt"},
