@@ -9,15 +9,15 @@ to end. (Where predictions have equal scores, those of a scene's copies stand to
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from src.metrics.curves import FIRST_POINT, RECALLS, average_precision
+from src.metrics.curves import FIRST_POINT, RECALLS, average_precision, normalized_precision
 from src.metrics.detection import UNDEFINED_ERRORS, DetectionScores, MatchedParts, score_detections
 from src.metrics.diagnostics import ratios
 from src.metrics.protocol import Protocol
-from src.metrics.ranking import Part, RankedList
+from src.metrics.ranking import Part, RankedList, SpeedPart
 from src.metrics.scores import ERRORS, PartScores
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import CLASSES
@@ -65,7 +65,7 @@ def with_intervals(scores: DetectionScores) -> dict[str, object]:
         drawn = score_draws(scores.parts, draws)
         tree = drawn.overall.as_dict(interval) | {
             "ranges": {name: part.as_dict(interval) for name, part in drawn.ranges.items()},
-            "speeds": {name: part.as_dict(interval, True) for name, part in drawn.speeds.items()},
+            "speeds": {name: part.as_dict(interval) for name, part in drawn.speeds.items()},
             "measures": {name: interval(values) for name, values in drawn.measures.items()},
         }
         return dict(_paths(tree))
@@ -131,7 +131,7 @@ def score_draws(
     return DrawnScores(
         overall=_score_part(parts.overall, scenes, draws),
         ranges={name: _score_part(part, scenes, draws) for name, part in parts.ranges.items()},
-        speeds={name: _score_part(part, scenes, draws) for name, part in parts.speeds.items()},
+        speeds={name: _score_speed(parts, part, scenes, draws) for name, part in parts.speeds.items()},
         measures=measures | ratios(parts.sums, draws[:, scenes]),
     )
 
@@ -140,6 +140,7 @@ def _score_part(
     part: Part,
     scenes: Array,  # [S] of each sample
     draws: Array,  # [R, C]
+    totals: Array | None = None,  # [R, 12] objects of each class that precision is normalised to
 ) -> PartScores:
     thresholds_m = part.ranking.protocol.thresholds_m
     num_gt = draws @ _count_by_scene(part, scenes, draws.shape[1])  # [R, 12]
@@ -151,10 +152,23 @@ def _score_part(
         for begin in range(0, len(draws), steps):
             some = slice(begin, begin + steps)
             precision, confidence = _curves(part, listed, scenes, draws[some], num_gt[some, c])
+            if totals is not None:
+                precision = normalized_precision(precision, num_gt[some, c], totals[some, c])
             ap[some, c, listed.threshold] = average_precision(precision)
             if listed.errors is not None:
                 errors[some, c] = _errors(part, listed, scenes, draws[some], confidence)
     return PartScores(thresholds_m, num_gt, ap, np.where(UNDEFINED_ERRORS, np.nan, errors))
+
+
+def _score_speed(
+    parts: MatchedParts,
+    part: SpeedPart,
+    scenes: Array,  # [S] of each sample
+    draws: Array,  # [R, C]
+) -> PartScores:
+    totals = draws @ _count_by_scene(parts.overall, scenes, draws.shape[1])  # [R, 12]
+    normalized = _score_part(part.with_all_unmatched, scenes, draws, totals)
+    return replace(_score_part(part, scenes, draws), normalized_ap=normalized.ap)
 
 
 def _count_by_scene(part: Part, scenes: Array, num_scenes: int) -> Array:  # [C, 12]

@@ -58,6 +58,20 @@ def average_precision(
     return np.maximum(precision[..., FIRST_POINT:] - MIN_PRECISION, 0).mean(axis=-1) / (1 - MIN_PRECISION)
 
 
+def normalized_precision(
+    precision: Array,  # [..., 101], 0 beyond the recall that is reached
+    count: Array | int,  # [...] ground truth of the part
+    total: Array | int,  # [...] that it is taken as
+) -> Array:
+    """Precision at the same recalls and false positives if the part had `total` objects (Hoiem et al., ECCV 2012).
+
+    TP / (TP + FP) of a part falls with its share of the objects, whatever is detected; this does not.
+    """
+    found = precision * np.asarray(total)[..., None]
+    every = found + (1 - precision) * np.asarray(count)[..., None]
+    return np.divide(found, every, out=np.zeros_like(found), where=found > 0)
+
+
 def mean_error(
     errors: Array,  # [101]
     confidence: Array,  # [101]

@@ -9,7 +9,7 @@ averaged over four thresholds; errors are running means over the matches at 2 m.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,12 +19,21 @@ from src.metrics.curves import (
     average_precision,
     error_curve,
     mean_error,
+    normalized_precision,
     precision_and_confidence,
 )
 from src.metrics.diagnostics import FAST_MPS, FrameDiagnosis, ratios, sums_by_sample
 from src.metrics.filtering import SPEED_CLASSES_MPS, speed_classes
 from src.metrics.protocol import OFFICIAL, Protocol
-from src.metrics.ranking import Matching, Part, Ranking, find_candidates, match_predictions, rank_predictions
+from src.metrics.ranking import (
+    Matching,
+    Part,
+    Ranking,
+    SpeedPart,
+    find_candidates,
+    match_predictions,
+    rank_predictions,
+)
 from src.metrics.scores import ERRORS, SubsetScores, plain_number
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.structures.taxonomy import CLASS_WITHOUT_ERRORS, CLASSES, SCENE_TAGS, TAGS_WITHOUT_SCORE
@@ -44,7 +53,7 @@ class MatchedParts:
     matching: Matching
     overall: Part
     ranges: dict[str, Part]
-    speeds: dict[str, Part]
+    speeds: dict[str, SpeedPart]
     moving: Part | None  # None where speeds are not asked for
     sums: dict[str, Array]  # [S, 2] see `_motion_sums` and `sums_by_sample`
     truth_kept: Array  # [k] bool, ground truth that survives the official filters
@@ -70,7 +79,7 @@ class DetectionScores:
         return self.overall.as_dict(plain_number) | {
             "ranges": {name: scores.as_dict(plain_number) for name, scores in self.ranges.items()},
             "tags": {name: scores.as_dict(plain_number) for name, scores in self.tags.items()},
-            "speeds": {name: scores.as_dict(plain_number, True) for name, scores in self.speeds.items()},
+            "speeds": {name: scores.as_dict(plain_number) for name, scores in self.speeds.items()},
             "measures": self.measures,
         }
 
@@ -100,7 +109,7 @@ def score_detections(
         overall=_score(parts.overall),
         ranges={name: _score(part) for name, part in parts.ranges.items()},
         tags={tag: _score_tag(parts, tag) for tag in SCENE_TAGS} if by_tag else {},
-        speeds={name: _score(part) for name, part in parts.speeds.items()},
+        speeds={name: _score_speed(parts, part) for name, part in parts.speeds.items()},
         measures=measure_parts(parts),
         parts=parts,
     )
@@ -123,7 +132,7 @@ def match_parts(
     matching = match_predictions(ranking, pairs)
     everyone, every_truth = np.ones(len(ranking.rows), bool), np.ones(len(ranking.truth), bool)
     ranges: dict[str, Part] = {}
-    speeds: dict[str, Part] = {}
+    speeds: dict[str, SpeedPart] = {}
     moving = None
     if by_range:
         bins = protocol.bins(evaluation_set, predictions)[ranking.rows]
@@ -172,7 +181,10 @@ def measure_parts(parts: MatchedParts) -> dict[str, float | None]:
     return measures
 
 
-def _score(part: Part) -> SubsetScores:
+def _score(
+    part: Part,
+    totals: Array | None = None,  # [12] objects of each class that precision is normalised to
+) -> SubsetScores:
     num_classes, thresholds_m = len(CLASSES), part.ranking.protocol.thresholds_m
     num_gt = np.bincount(part.ranking.truth.labels[part.truth_members], minlength=num_classes)
     precision = np.zeros((num_classes, len(thresholds_m), len(RECALLS)))
@@ -180,6 +192,8 @@ def _score(part: Part) -> SubsetScores:
     for listed in part.lists():
         c, t, scores = listed.label, listed.threshold, part.ranking.scores[listed.places]
         precision[c, t], confidence = precision_and_confidence(listed.matched, scores, int(num_gt[c]))
+        if totals is not None:
+            precision[c, t] = normalized_precision(precision[c, t], num_gt[c], totals[c])
         if listed.errors is None:
             continue
         match_scores = scores[listed.matched]
@@ -193,6 +207,13 @@ def _score(part: Part) -> SubsetScores:
     )
 
 
+def _score_speed(parts: MatchedParts, part: SpeedPart) -> SubsetScores:
+    """Of a speed class, with the AP that does not ask which speeds false positives state, `normalized_ap`: all of a
+    class count, and precision is that of as many objects as the class has at all speeds."""
+    totals = np.bincount(parts.ranking.truth.labels, minlength=len(CLASSES))
+    return replace(_score(part), normalized_ap=_score(part.with_all_unmatched, totals).ap)
+
+
 def _score_tag(parts: MatchedParts, tag: str) -> SubsetScores:
     """Scores over the samples whose scene carries `tag`; samples do not meet, so the matches stay what they are."""
     ranking = parts.ranking
@@ -203,22 +224,25 @@ def _score_tag(parts: MatchedParts, tag: str) -> SubsetScores:
     return scores
 
 
-def _speed_parts(ranking: Ranking, matching: Matching) -> tuple[dict[str, Part], Part]:
+def _speed_parts(ranking: Ranking, matching: Matching) -> tuple[dict[str, SpeedPart], Part]:
     """Parts by speed class, and the moving vehicles, with the matches of the overall score.
 
     A ground truth belongs to the class of its own speed, one of unknown velocity (NaN) to none. A prediction follows
     the ground truth it matches at that threshold, whatever speed it states: matched within the class it is a true
     positive there, matched elsewhere it is left out, so a wrong speed costs velocity error and no precision. One
     that matches nothing is a false positive in the class of the speed it states; stating none (NaN) it belongs to no
-    class, as ground truth of unknown velocity does, and lowers the overall score alone.
+    class, as ground truth of unknown velocity does, and lowers the overall score alone. So a detector that states
+    wrong speeds moves its false positives elsewhere: between detectors compare `normalized_ap`.
     """
     truth = speed_classes(ranking.truth.velocities)
     stated = speed_classes(ranking.predictions.velocities)[ranking.rows]
     followed = np.tile(stated, (len(ranking.protocol.thresholds_m), 1))
+    unmatched = np.ones_like(followed, dtype=bool)
     for t, places in enumerate(matching.places):
-        followed[t, places] = truth[matching.ground_truth[t]]
+        followed[t, places], unmatched[t, places] = truth[matching.ground_truth[t]], False
     speeds = {
-        name: Part(ranking, matching, followed == place, truth == place) for place, name in enumerate(SPEED_CLASSES_MPS)
+        name: SpeedPart(ranking, matching, followed == place, truth == place, unmatched)
+        for place, name in enumerate(SPEED_CLASSES_MPS)
     }
     fast = list(SPEED_CLASSES_MPS.values()).index(FAST_MPS)
     labels = ranking.predictions.labels[ranking.rows]

@@ -108,6 +108,18 @@ class Part:
             yield RankedList(-1, t, places, np.flatnonzero(np.isin(places, matched_places)), None)
 
 
+@dataclass
+class SpeedPart(Part):
+    """The boxes of a speed class; a prediction that matches nothing is a member if it states such a speed."""
+
+    unmatched: Array  # [T, n] bool: matches nothing at that threshold
+
+    @property
+    def with_all_unmatched(self) -> Part:
+        """The same with every prediction that matches nothing, whatever speed it states."""
+        return Part(self.ranking, self.matching, self.members | self.unmatched, self.truth_members)
+
+
 def rank_predictions(
     evaluation_set: EvaluationSet,
     protocol: Protocol,

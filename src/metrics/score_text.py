@@ -71,12 +71,14 @@ def _intervals(intervals: Mapping[str, Any]) -> list[str]:
 
 
 def _speeds(parts: Mapping[str, Any]) -> list[list[str]]:
-    rows = [["speed (m/s)", "mAP", *(f"m{name}" for name in ERRORS), "car AP", "car AVE", "classes", "boxes"]]
+    heads = ["speed (m/s)", "mAP", "mAP_N", *(f"m{name}" for name in ERRORS), "car AP", "car AVE"]
+    rows = [[*heads, "classes", "boxes"]]
     for name, part in parts.items():
         errors = [plain(part[f"m{error}_present"]) for error in ERRORS]
         car, there = part["classes"]["car"], sum(values["num_gt"] > 0 for values in part["classes"].values())
         cars = [_percent(car["AP"]), plain(car["AVE"])] if car["num_gt"] else ["-", "-"]
-        rows.append([name, _percent(part["mAP_present"]), *errors, *cars, str(there), _boxes(part)])
+        means = [_percent(part.get(f"mAP_{of}")) for of in ("present", "normalized")]  # older files lack the second
+        rows.append([name, *means, *errors, *cars, str(there), _boxes(part)])
     return rows
 
 

@@ -34,6 +34,7 @@ class PartScores:
     num_gt: Array  # [..., 12] int64, ground-truth boxes after the filters
     ap: Array  # [..., 12, T] by class and distance threshold
     errors: Array  # [..., 12, 5] by class and error, NaN where undefined for the class
+    normalized_ap: Array | None = None  # [..., 12, T] of a speed class: see `_score_speed`
 
     @property
     def class_ap(self) -> Array:
@@ -68,23 +69,27 @@ class PartScores:
         above 0.5 m/s they take the mAP over all 12 classes down whatever the detector does, and their errors of 1
         take the mean errors towards 1. NaN where no such class is there. A class that is there but never reaches
         recall 0.1 keeps the official error of 1, which for velocity (1 m/s) may flatter: read it beside the AP.
+        `mAP_normalized` is over the same classes.
         """
-        values = np.concatenate([self.class_ap[..., None], self.errors], axis=-1)  # [..., 12, 6]
-        means = _mean_defined(np.where(self.num_gt[..., None] > 0, values, np.nan))
-        names = ("AP", *ERRORS)
-        return {f"m{name}_present": mean for name, mean in zip(names, np.moveaxis(means, -1, 0), strict=True)}
+        values = [self.class_ap[..., None], self.errors, self.normalized_ap.mean(axis=-1)[..., None]]
+        means = _mean_defined(np.where(self.num_gt[..., None] > 0, np.concatenate(values, axis=-1), np.nan))
+        names = (*(f"m{name}_present" for name in ("AP", *ERRORS)), "mAP_normalized")
+        return dict(zip(names, np.moveaxis(means, -1, 0), strict=True))
 
     def by_class(self) -> dict[str, dict[str, Array]]:
         """AP, its parts by threshold and the errors of each class."""
         names = ("AP", *(f"AP@{threshold}" for threshold in self.thresholds_m), *ERRORS)
         values = np.concatenate([self.class_ap[..., None], self.ap, self.errors], axis=-1)  # [..., 12, 6 + T]
+        if self.normalized_ap is not None:
+            names = (*names, "AP_normalized")
+            values = np.concatenate([values, self.normalized_ap.mean(axis=-1)[..., None]], axis=-1)
         rows = zip(CLASSES, np.moveaxis(values, (-2, -1), (0, 1)), strict=True)
         return {label: dict(zip(names, of_class, strict=True)) for label, of_class in rows}
 
-    def as_dict(self, number: Callable[[Array], object], by_speed: bool = False) -> dict[str, object]:
+    def as_dict(self, number: Callable[[Array], object]) -> dict[str, object]:
         """For JSON: mAP, NDS, the mean errors and `classes`, each as `number` says it; of a speed class also the means
         over the classes that are there."""
-        values = self.headline() | (self.present_means() if by_speed else {})
+        values = self.headline() | (self.present_means() if self.normalized_ap is not None else {})
         classes = {label: _each(of_class, number) for label, of_class in self.by_class().items()}
         return _each(values, number) | {"classes": classes}
 
@@ -92,9 +97,9 @@ class PartScores:
 class SubsetScores(PartScores):
     """The scores of one evaluation."""
 
-    def as_dict(self, number: Callable[[Array], object], by_speed: bool = False) -> dict[str, object]:
+    def as_dict(self, number: Callable[[Array], object]) -> dict[str, object]:
         """As the base, with the number of boxes of each class."""
-        content = super().as_dict(number, by_speed)
+        content = super().as_dict(number)
         for row, values in enumerate(content["classes"].values()):
             values["num_gt"] = int(self.num_gt[row])
         return content

@@ -59,7 +59,12 @@ for _speed in SPEEDS:
     for _key, _words, *_rest in (
         ("mAP_present", "mAP", "%", 100.0, 1, True),
         ("mAVE_present", "mAVE", "m/s", 1.0, 2, False),
+        ("mAP_normalized", "normalised mAP", "%", 100.0, 1, True),
         *((f"{name}.AP", f"{name} AP".replace("_", " "), "%", 100.0, 1, True) for name in CLASSES),
+        *(
+            (f"{name}.AP_normalized", f"normalised {name} AP".replace("_", " "), "%", 100.0, 1, True)
+            for name in CLASSES
+        ),
         ("car.AVE", "car AVE", "m/s", 1.0, 2, False),
     ):
         METRICS[f"speeds.{_speed}.{_key}"] = Metric(f"speeds.{_speed}.{_key}", f"{_words} {_speed} m/s", *_rest)

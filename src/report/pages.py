@@ -21,6 +21,7 @@ from src.report.score_tables import (
     CAR_BY_SPEED,
     CAR_ERROR_BY_SPEED,
     ERROR_BY_SPEED,
+    NORMALIZED_BY_SPEED,
     OF_HISTORY,
     OF_MEMORY,
     SUMMARY,
@@ -76,7 +77,8 @@ SCORES = (
 METRIC = f"official TruckScenes metric on the validation split; {SCORES}"
 
 BY_SPEED_TEXT = """By speed of the ground truth (a match follows its ground truth whatever speed it states, a false
-positive the speed it states). Means over the classes that occur at that speed; the velocity error (m/s, at 2 m) of a
+positive the speed it states; in normalised mAP all count at every speed, see docs/scores.md). Means over the classes
+that occur at that speed; the velocity error (m/s, at 2 m) of a
 class that does not reach a recall of 0.1 counts as 1, the official rule, so read it beside the AP. Some classes have
 few boxes at a speed; the car's numbers stand on the most."""
 
@@ -248,7 +250,8 @@ def comparison_page(experiments: list[Experiment], scale: str, picture: str) -> 
     dropout = [experiment for experiment in experiments if experiment not in without_dropout(experiments)]
     experiments = without_dropout(experiments)
     text = _page("phase2", scale, "rows of phase 2 and of phase 1 continued start from their seed's phase 1", runs)
-    summary, by_speed = (SUMMARY, BY_RANGE), (BY_SPEED, CAR_BY_SPEED, ERROR_BY_SPEED, CAR_ERROR_BY_SPEED)
+    summary = (SUMMARY, BY_RANGE)
+    by_speed = (BY_SPEED, NORMALIZED_BY_SPEED, CAR_BY_SPEED, ERROR_BY_SPEED, CAR_ERROR_BY_SPEED)
     text += f"![Scores by distance and by speed]({picture})\n\n{_tables(experiments, summary)}\n\n"
     if memory := score_table(experiments, OF_MEMORY + OF_HISTORY):
         text += f"## What is remembered\n\n{MEMORY_TEXT}\n\n{memory}\n\n"

@@ -42,6 +42,7 @@ class ClassCount(TypedDict):
     """One class within a speed class."""
 
     num_gt: Count
+    AP_normalized: NotRequired[Share]  # older runs lack it
 
 
 class ClassAP(ClassCount):
@@ -68,6 +69,7 @@ class SpeedClasses(TypedDict, extra_items=ClassAP):
 class SpeedScores(TypedDict):
     mAP_present: Share | None
     mAVE_present: Score | None
+    mAP_normalized: NotRequired[Share | None]  # older runs lack it, as its classes do
     classes: SpeedClasses
 
 

@@ -35,7 +35,7 @@ NOT_A_SETTING = ("seed", "scale", "phase")
 LOCAL_PATH = re.compile(r"""["']*(/|~|\$|\.\./|file:|[A-Za-z]:[\\/])""")
 """How a value begins that is a path of one machine."""
 
-KEPT_OF_A_CLASS = ("AP", "AVE", "num_gt")
+KEPT_OF_A_CLASS = ("AP", "AP_normalized", "AVE", "num_gt")
 """Within a range or a speed class; the run's metrics.json has the rest."""
 
 Point = tuple[int, float]  # step, value
@@ -240,14 +240,16 @@ def _flat_scores(scores: Scores) -> dict[str, float | None]:
     values = {name: value for name, value in values.items() if name in METRICS}
     for name, part in scores.get("speeds", {}).items():
         classes, prefix = part["classes"], f"speeds.{name}."
-        values |= {prefix + key: part[key] for key in ("mAP_present", "mAVE_present")}
+        means = ("mAP_present", "mAVE_present", "mAP_normalized")
+        values |= {prefix + key: part[key] for key in means if key in part}
         values[prefix + "boxes"] = sum(of_class["num_gt"] for of_class in classes.values())
         values[prefix + "car.boxes"] = classes["car"]["num_gt"]
         # The official numbers of a class without ground truth are 0 and 1, and say nothing; nor does the error of one
         # of which hardly anything is found, officially 1.
         for word, of_class in classes.items():
-            if "AP" in of_class:
-                values[f"{prefix}{word}.AP"] = of_class["AP"] if of_class["num_gt"] else None
+            for key in ("AP", "AP_normalized"):
+                if key in of_class:
+                    values[f"{prefix}{word}.{key}"] = of_class[key] if of_class["num_gt"] else None
         car = classes["car"]
         values[prefix + "car.AVE"] = car["AVE"] if car["num_gt"] and car["AVE"] != 1.0 else None
     return values

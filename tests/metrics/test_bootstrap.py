@@ -114,6 +114,9 @@ def test_draws_agree_with_the_plain_metric(problem):
             np.testing.assert_allclose(part.ap[row], expected.ap, rtol=0, atol=1e-12)
             np.testing.assert_allclose(part.errors[row], expected.errors, rtol=0, atol=1e-9)
             np.testing.assert_allclose(part.nds[row], expected.nds, rtol=0, atol=1e-9)
+        for name, part in drawn.speeds.items():
+            expected = plain.speeds[name]
+            np.testing.assert_allclose(part.normalized_ap[row], expected.normalized_ap, rtol=0, atol=1e-12)
             means = {name: plain_number(values[row]) for name, values in part.present_means().items()}
             assert means == pytest.approx({name: plain_number(v) for name, v in expected.present_means().items()})
         measures = {name: plain_number(values[row]) for name, values in drawn.measures.items()}

@@ -79,6 +79,32 @@ def test_a_match_outside_is_ignored_at_that_threshold_only():
     assert speeds["0.5-10"].ap[0].tolist() == pytest.approx([0, 0, 0, 1.0])
 
 
+def test_normalised_precision_asks_no_speed_of_false_positives_and_no_share_of_the_objects():
+    truth = boxes([(10, 5, 0), (40, 30, 0), (60, 30, 0), (90, 30, 0)])
+    found = [(10, 5, 0.8), (40, 30, 0.7), (60, 30, 0.6), (90, 30, 0.5)]
+    for stated in (5, 30, NAN):
+        speeds = speeds_of(truth, boxes([(25, stated, 0.9), *found]))
+        # At recall r of the one slow car, r TP beside 1 FP: as 4 r of 4 cars, hence 4 r / (4 r + 1). The same at 30 m/s
+        # of the three, but that the curve begins with their first match, with a third of the recall.
+        rs = np.arange(11, 101) / 100
+        slow = np.interp(rs, [0, 1], [0, 1 / 2])  # of plain precision
+        slow = 4 * slow / (4 * slow + 1 - slow)
+        fast = np.interp(rs, [0, 1 / 3, 2 / 3, 1], [0, 1 / 2, 2 / 3, 3 / 4])
+        fast = 4 * fast / (4 * fast + 3 * (1 - fast))
+        for name, precision in (("0.5-10", slow), ("25+", fast)):
+            content = speeds[name].as_dict(float)["classes"]["car"]
+            assert content["AP_normalized"] == pytest.approx(np.maximum(precision - 0.1, 0).mean() / 0.9), stated
+    assert speeds["0.5-10"].class_ap[0] == pytest.approx(1.0), "stating no speed, it counts nowhere"
+
+
+def test_what_matches_another_speed_is_no_false_positive():
+    truth = boxes([(10, 5, 0), (40, 30, 0)])
+    speeds = speeds_of(truth, boxes([(40, 5, 0.9), (10, 30, 0.8)]))
+    for name in ("0.5-10", "25+"):
+        assert speeds[name].normalized_ap[0].tolist() == pytest.approx([1.0] * 4)
+    assert speeds["0-0.5"].normalized_ap.sum() == 0
+
+
 def test_matching_is_done_once_over_all_speeds():
     # The better prediction takes the standing car; the second one is left with nothing and is a false positive,
     # though it would match within its class were classes matched apart.
@@ -143,8 +169,10 @@ def test_means_over_the_classes_that_are_there():
     truth = DetectionTable.concatenate([boxes([(10, 5, 0)]), boxes([(40, 5, 0)], label="truck")])
     part = speeds_of(truth, boxes([(10.5, 7, 0.9)]))["0.5-10"]
     means = part.present_means()
-    assert list(means) == ["mAP_present", *(f"m{error}_present" for error in ("ATE", "ASE", "AOE", "AVE", "AAE"))]
+    errors = (f"m{error}_present" for error in ("ATE", "ASE", "AOE", "AVE", "AAE"))
+    assert list(means) == ["mAP_present", *errors, "mAP_normalized"]
     assert part.mean_ap == pytest.approx(0.75 / 12) and means["mAP_present"] == pytest.approx(0.75 / 2)
+    assert means["mAP_normalized"] == pytest.approx(0.75 / 2), "there is no false positive, and no other speed"
     assert means["mATE_present"] == pytest.approx((0.5 + 1) / 2), "the truck is missed: error 1"
     assert means["mAVE_present"] == pytest.approx((2 + 1) / 2)
 
@@ -154,7 +182,8 @@ def test_means_where_nothing_is_there_are_undefined():
     evaluation_set = set_of(cones)
     content = score_detections(evaluation_set, cones).as_dict()
     assert set(content["speeds"]["25+"].keys() - content["ranges"]["0-25"].keys()) == {
-        f"m{name}_present" for name in ("AP", "ATE", "ASE", "AOE", "AVE", "AAE")
+        *(f"m{name}_present" for name in ("AP", "ATE", "ASE", "AOE", "AVE", "AAE")),
+        "mAP_normalized",
     }
     assert content["speeds"]["25+"]["mAP_present"] is None and content["speeds"]["25+"]["mAP"] == 0
     standing = content["speeds"]["0-0.5"]
@@ -167,8 +196,9 @@ def test_table_for_the_terminal():
     evaluation_set = set_of(truth)
     content = score_detections(evaluation_set, boxes([(10, 7, 0.9)])).as_dict()
     table = [line.split() for line in format_scores(content).split("\n\n")[2].splitlines()]
-    assert table[3] == ["0.5-10", "100.0", "0.000", "0.000", "0.000", "2.000", "0.000", "100.0", "2.000", "1", "1"]
-    assert table[4] == ["10-25", *["-"] * 8, "0", "0"]
+    numbers = ["100.0", "100.0", "0.000", "0.000", "0.000", "2.000", "0.000", "100.0", "2.000", "1", "1"]
+    assert table[3] == ["0.5-10", *numbers]
+    assert table[4] == ["10-25", *["-"] * 9, "0", "0"]
     assert format_scores(content).splitlines()[-1].split() == ["AP", "of", "moving", "vehicles", "-", "0"]
     del content["speeds"], content["measures"]
     assert len(format_scores(content).split("\n\n")) == 2, "files written before there were such tables can be shown"
@@ -178,7 +208,8 @@ def test_table_for_the_terminal():
 
 
 def slow_scores(truth, predictions, label, low, high):
-    """AP by threshold and (translation, velocity) error of one class and speed class, box after box."""
+    """AP and normalised AP by threshold and (translation, velocity) error of one class and speed class, box after
+    box."""
 
     def inside(velocity):
         return low <= float(np.hypot(*velocity)) < high  # False for NaN
@@ -187,9 +218,9 @@ def slow_scores(truth, predictions, label, low, high):
     rows.sort(key=lambda row: (-predictions.scores[row], -row))
     candidates = [row for row in range(len(truth)) if truth.labels[row] == label]
     count = sum(inside(truth.velocities[row]) for row in candidates)
-    aps, errors = [], (1.0, 1.0)
+    aps, normalized, errors = [], [], (1.0, 1.0)
     for threshold in DISTANCE_THRESHOLDS_M:
-        taken, listed = set(), []  # listed: (score, hit, translation error, velocity error)
+        taken, listed, every = set(), [], []  # listed: (score, hit, translation error, velocity error); every: hit
         for row in rows:
             best, nearest = np.inf, None
             for other in candidates:
@@ -203,13 +234,21 @@ def slow_scores(truth, predictions, label, low, high):
                 if inside(truth.velocities[nearest]):
                     difference = float(np.hypot(*(truth.velocities[nearest] - predictions.velocities[row])))
                     listed.append((predictions.scores[row], True, best, difference))
-            elif inside(predictions.velocities[row]):
+                    every.append(True)
+                continue
+            every.append(False)
+            if inside(predictions.velocities[row]):
                 listed.append((predictions.scores[row], False, NAN, NAN))
         hits = [entry for entry in listed if entry[1]]
         if not hits:
             aps.append(0.0)
+            normalized.append(0.0)
             continue
         grid = np.linspace(0, 1, 101)
+        found = np.cumsum(every).astype(float)
+        precision = np.interp(grid, found / count, found / np.arange(1, len(every) + 1), right=0)
+        right, wrong = precision / count, (1 - precision) / len(candidates)  # in shares of their objects
+        normalized.append(np.clip((right / (right + wrong))[11:] - 0.1, 0, None).mean() / 0.9)
         found = np.cumsum([entry[1] for entry in listed]).astype(float)
         recall = found / count
         precision = np.interp(grid, recall, found / np.arange(1, len(listed) + 1), right=0)
@@ -217,7 +256,7 @@ def slow_scores(truth, predictions, label, low, high):
         aps.append(np.clip(precision[11:] - 0.1, 0, None).mean() / 0.9)
         if threshold == 2.0:
             errors = tuple(slow_error([(entry[0], entry[k]) for entry in hits], confidence) for k in (2, 3))
-    return count, aps, errors
+    return count, aps, normalized, errors
 
 
 def slow_error(hits, confidence):
@@ -251,9 +290,10 @@ def test_agrees_with_the_evaluation_written_again(seed):
         [(0, 0.5), (0.5, 10), (10, 25), (25, np.inf)], (scores.speeds[name] for name in NAMES), strict=True
     ):
         for label in range(len(CLASSES)):
-            count, aps, (translation, velocity) = slow_scores(truth, predictions, label, low, high)
+            count, aps, normalized, (translation, velocity) = slow_scores(truth, predictions, label, low, high)
             assert part.num_gt[label] == count
             np.testing.assert_allclose(part.ap[label], aps, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(part.normalized_ap[label], normalized, rtol=0, atol=1e-12)
             np.testing.assert_allclose(part.errors[label, 0], translation, rtol=0, atol=1e-9)
             if not np.isnan(part.errors[label, 3]):
                 np.testing.assert_allclose(part.errors[label, 3], velocity, rtol=0, atol=1e-9)
