@@ -31,7 +31,7 @@ CLAIMS = Path(__file__).with_name("claims.yaml")
 @with_config(CLOSED)
 @dataclass(kw_only=True)
 class ComparisonConfig:
-    """Two rows of one sweep, the first of which is claimed to be better."""
+    """Two rows of one sweep, the first of which is claimed to be better, or which tell why a claim is as it is."""
 
     sweep: str
     row: str
@@ -39,6 +39,7 @@ class ComparisonConfig:
     metrics: Many[str]  # that decide, each by itself
     beside: Many[str] = field(default_factory=list)  # that are shown
     half_width: float | None = None  # precise enough, in the metrics' unit; null: the file's, in percentage points
+    asks: str | None = None  # the question that the two rows answer; none of their metrics decides the claim then
 
     @property
     def text(self) -> str:
@@ -145,6 +146,8 @@ def load_claims(load_sweep: Callable[[str], SweepConfig], path: Path = CLAIMS) -
         claims.append(Claim(config, []))
         if not config.comparisons:
             raise ConfigError(f"{where}, claim {config.name}: comparisons is empty; name two rows of a sweep")
+        if all(comparison.asks for comparison in config.comparisons):
+            raise ConfigError(f"{where}, claim {config.name}: all of comparisons ask why; name one that decides")
         for comparison in config.comparisons:
             here = f"{where}, claim {config.name}, {comparison.text}"
             try:
@@ -168,20 +171,20 @@ def _measures(comparison: ComparisonConfig, sweep: SweepConfig, half_width: floa
         raise ConfigError(f"{where}: metrics is empty; name at least one that decides")
     measures = []
     for name in [*comparison.metrics, *comparison.beside]:
-        metric = find_metric(name, where, sweep.task)
+        metric, decides = find_metric(name, where, sweep.task), name in comparison.metrics and not comparison.asks
         width = half_width if comparison.half_width is None else comparison.half_width
-        if comparison.half_width is None and metric.unit != "%":
+        if not comparison.asks and comparison.half_width is None and metric.unit != "%":
             raise ConfigError(f"{where}: {name} is in {metric.unit}; give the half_width that is precise enough in it")
         if width <= 0:
             raise ConfigError(f"{where}: half_width must be above 0, but is {width}")
         ours, others = (rows[label].paper.get(name) for label in (comparison.row, comparison.over))
         paper = None if ours is None or others is None else round(ours - others, 6)
-        if paper is not None and (paper > 0) != metric.higher_is_better:
+        if not comparison.asks and paper is not None and (paper > 0) != metric.higher_is_better:
             raise ConfigError(
                 f"{where}: the paper's {name} is {ours:g} against {others:g}, so it does not claim that; exchange the "
                 "rows"
             )
-        measures.append(Measure(comparison, metric, width, paper, name in comparison.metrics))
+        measures.append(Measure(comparison, metric, width, paper, decides))
     return measures
 
 

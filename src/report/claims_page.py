@@ -13,6 +13,7 @@ from src.report.sweep_table import MISSING, format_paper
 from src.report.sweep_text import SYNTHETIC, describe_epochs, describe_machines, sweep_settings
 
 HEADS = ("claim", "measure", "paper", "here", "seeds", "verdict", "command")
+REASON_HEADS = ("claim", "question", "rows", "here", "seeds", "command")
 
 _FEW, _MOST = ", ".join(map(str, sorted(LOOKS)[:-1])), max(LOOKS)
 RULE = f"""Rows are compared by runs of the same seed: the mean difference, tested with {_FEW} and {_MOST}
@@ -21,6 +22,10 @@ look that decides keeps the error at 5 %. *Shows*: the interval is beyond zero o
 is beyond zero on the other side, or contains zero and is as narrow as [claims.yaml](../src/report/claims.yaml) asks;
 else *undecided*. A claim shows where all its measures do. What is in italics decides nothing.
 More of it: [docs/scores.md](../docs/scores.md#when-a-claim-holds)."""
+
+
+WHY = """Experiments that look for the cause, on the same terms; the number of the claim stands before each. They decide
+nothing about a claim."""
 
 
 def claims_page(
@@ -37,6 +42,8 @@ def claims_page(
         f"## What was run\n\n{_what_was_run(findings, records, scale)}",
         f"## The claims\n\n{RULE}\n\n{_table(findings, scale)}",
     ]
+    reasons = _reasons(findings, scale)
+    parts += [f"## Why\n\n{WHY}\n\n{reasons}"] if reasons else []
     return "\n\n".join(parts) + "\n"
 
 
@@ -83,7 +90,7 @@ def _table(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
         title = f"**{number}. {escape_markdown(claim.config.sentence)}** ({escape_markdown(claim.config.source)})"
         lines.append([title, "", "", "", "", f"**{verdict_of(found)}**", ""])
         before = ""
-        for finding in found:
+        for finding in (one for one in found if not one.measure.comparison.asks):
             measure, metric = finding.measure, finding.measure.metric
             text, command = measure.comparison.text, command_of(measure.comparison.sweep, found, scale)
             first, before = text != before, text
@@ -98,4 +105,31 @@ def _table(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
                     as_code([command]) if first else "",
                 ]
             )
+    return _markdown(lines)
+
+
+def _reasons(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
+    """The comparisons that ask why, with what has been found; empty where nothing has."""
+    lines = []
+    for number, (_, found) in enumerate(findings, start=1):
+        asked: dict[str, list[Finding]] = {}
+        for finding in found:
+            if finding.measure.comparison.asks and finding.found is not None:
+                asked.setdefault(finding.measure.comparison.text, []).append(finding)
+        for text, answers in asked.items():
+            comparison = answers[0].measure.comparison
+            lines.append(
+                [
+                    str(number),
+                    escape_markdown(comparison.asks),
+                    escape_markdown(text),
+                    "; ".join(f"{one.measure.metric.heading}: {one.found.text}" for one in answers),
+                    ", ".join(map(str, sorted({one.found.pairs for one in answers}))),
+                    as_code([command_of(comparison.sweep, answers, scale)]),
+                ]
+            )
+    return _markdown([REASON_HEADS, ["---"] * len(REASON_HEADS), *lines]) if lines else ""
+
+
+def _markdown(lines: Iterable[Iterable[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

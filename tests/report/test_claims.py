@@ -146,6 +146,18 @@ def test_a_claim_holds_where_all_that_decides_does(judged):
     assert second.verdict is Verdict.NOT and not second.is_open and verdict_of([first, second]) is Verdict.SHOWS
 
 
+def test_what_asks_why_decides_nothing(judged, claims_of):
+    """Nor does it claim what the paper's numbers must agree with, or want a width that is precise enough."""
+    values = {"large": [12.0, 12.1, 11.9], "small": [10.0] * 3}
+    asks = {"row": "small", "over": "large", "metrics": ["mAP", "mAVE"], "asks": "Where is it lost?"}
+    first, *answers = judged(values, {}, asks)
+    assert [one.verdict for one in answers] == [Verdict.NOT, Verdict.SHOWS] and verdict_of([first, *answers]) == "shows"
+    first, *answers = judged({"large": [12.0, 10.0, 14.0], "small": [10.0] * 3}, {}, asks)
+    assert first.is_open and not any(one.is_open for one in answers)
+    with pytest.raises(ConfigError, match="claim margin: all of comparisons ask why; name one that decides"):
+        claims_of(asks)
+
+
 def test_pairs_are_of_finished_runs_of_one_seed(judged):
     values = {"large": [12.0, 12.1, 11.9, 12.0], "small": [10.0, None, 10.0, 10.0]}
     (finding,) = judged(values)

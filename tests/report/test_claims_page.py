@@ -56,6 +56,18 @@ def test_claims_with_results_stand_beside_those_that_are_not_run(report, write_s
     assert Image.open(reports / "pictures" / "claims_mini.png").width == 1600
 
 
+def test_what_tells_why_stands_behind_the_claims_as_far_as_it_has_run(report, write_sweep):
+    values = [0.12, 0.121, 0.119]
+    write_sweep("comparison", {"Horizon3D, neck (ours)": values, "BEVFusion": [0.10] * 3})
+    text = (report()[0] / "README.md").read_text()
+    answer = "mAP, %: +2.0 [+1.6, +2.4]; mAP 0-25 m, %: +2.0 [+1.6, +2.4]; mAP 50-100 m, %: +2.0 [+1.6, +2.4]"
+    claims, why = text.split("## Why")
+    command = "`python -m src.sweep +sweep=comparison scale=mini seeds=3`"
+    row = r"| 10 | Does the lead come with a head that sees more than 3 x 3 cells? | Horizon3D, neck (ours) over BEVFusion"
+    assert f"{row} | {answer} | 3 | {command} |" in why and "neck" not in claims
+    assert "Of 10 claims: not run 10." in text and len(why.split("| 10 |")) == 2
+
+
 @pytest.mark.parametrize("settings", [[], ["optim.rise_fraction=0.4", "model.kggi.num_radar_keypoints=256"]])
 def test_the_page_says_which_sweeps_have_settings_of_their_own(report, write_sweep, settings):
     write_sweep("layers", {"1 layer": [0.1] * 3, "2 layers": [0.2] * 3}, overrides=["phase=phase1", *settings])
