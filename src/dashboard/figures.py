@@ -128,6 +128,7 @@ def distance_figures(results: dict[str, list[RunResult]]) -> list[Markup]:
     for title, parts, name, axis in (
         ("mAP by distance", RANGES, "ranges.{}.mAP", "distance, m"),
         ("mAP by speed", SPEEDS, "speeds.{}.mAP_present", "speed of the ground truth, m/s"),
+        ("Normalised mAP by speed", SPEEDS, "speeds.{}.mAP_normalized", "speed of the ground truth, m/s"),
     ):
         lines = []
         for style, (label, runs) in enumerate(results.items()):

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from src.metrics.curves import FIRST_POINT, RECALLS, average_precision, normalized_precision
-from src.metrics.detection import UNDEFINED_ERRORS, DetectionScores, MatchedParts, score_detections
+from src.metrics.detection import MOVING, UNDEFINED_ERRORS, DetectionScores, MatchedParts, score_detections
 from src.metrics.diagnostics import ratios
 from src.metrics.protocol import Protocol
 from src.metrics.ranking import Part, RankedList, SpeedPart
@@ -124,10 +124,14 @@ def score_draws(
     measures = {}
     if parts.moving is not None:
         boxes = draws @ _count_by_scene(parts.moving, scenes, draws.shape[1]).sum(axis=1)
-        precision = np.zeros((len(draws), len(parts.ranking.protocol.thresholds_m), len(RECALLS)))
-        for listed in parts.moving.pooled_lists():
-            precision[:, listed.threshold], _ = _curves(parts.moving, listed, scenes, draws, boxes)
-        measures["moving_AP"] = np.where(boxes > 0, average_precision(precision).mean(axis=1), np.nan)
+        every = draws @ _count_by_scene(parts.overall, scenes, draws.shape[1])[:, MOVING].sum(axis=1)
+        for name, part in (("moving_AP", parts.moving), ("moving_AP_normalized", parts.moving.by_place)):
+            precision = np.zeros((len(draws), len(parts.ranking.protocol.thresholds_m), len(RECALLS)))
+            for listed in part.pooled_lists():
+                precision[:, listed.threshold], _ = _curves(part, listed, scenes, draws, boxes)
+            if part is not parts.moving:
+                precision = normalized_precision(precision, boxes[:, None], every[:, None])
+            measures[name] = np.where(boxes > 0, average_precision(precision).mean(axis=1), np.nan)
     return DrawnScores(
         overall=_score_part(parts.overall, scenes, draws),
         ranges={name: _score_part(part, scenes, draws) for name, part in parts.ranges.items()},
@@ -140,7 +144,7 @@ def _score_part(
     part: Part,
     scenes: Array,  # [S] of each sample
     draws: Array,  # [R, C]
-    totals: Array | None = None,  # [R, 12] objects of each class that precision is normalised to
+    totals: Array | None = None,  # [R, 12] objects of each class that precision is normalised to, without errors then
 ) -> PartScores:
     thresholds_m = part.ranking.protocol.thresholds_m
     num_gt = draws @ _count_by_scene(part, scenes, draws.shape[1])  # [R, 12]
@@ -155,7 +159,7 @@ def _score_part(
             if totals is not None:
                 precision = normalized_precision(precision, num_gt[some, c], totals[some, c])
             ap[some, c, listed.threshold] = average_precision(precision)
-            if listed.errors is not None:
+            if listed.errors is not None and totals is None:
                 errors[some, c] = _errors(part, listed, scenes, draws[some], confidence)
     return PartScores(thresholds_m, num_gt, ap, np.where(UNDEFINED_ERRORS, np.nan, errors))
 
@@ -167,7 +171,7 @@ def _score_speed(
     draws: Array,  # [R, C]
 ) -> PartScores:
     totals = draws @ _count_by_scene(parts.overall, scenes, draws.shape[1])  # [R, 12]
-    normalized = _score_part(part.with_all_unmatched, scenes, draws, totals)
+    normalized = _score_part(part.by_place, scenes, draws, totals)
     return replace(_score_part(part, scenes, draws), normalized_ap=normalized.ap)
 
 

@@ -24,6 +24,7 @@ from src.metrics.curves import (
 )
 from src.metrics.diagnostics import FAST_MPS, FrameDiagnosis, ratios, sums_by_sample
 from src.metrics.filtering import SPEED_CLASSES_MPS, speed_classes
+from src.metrics.matching import CandidatePairs
 from src.metrics.protocol import OFFICIAL, Protocol
 from src.metrics.ranking import (
     Matching,
@@ -43,6 +44,8 @@ Array = np.ndarray
 UNDEFINED_ERRORS = np.array([[error in CLASS_WITHOUT_ERRORS[name] for error in ERRORS] for name in CLASSES])
 MOVING = [CLASSES.index(name) for name in ("car", "truck", "bus", "trailer", "motorcycle")]
 """Classes whose boxes above FAST_MPS are the moving vehicles."""
+EVERY_SPEED = -2
+"""In place of a speed class: a false positive far from all ground truth."""
 
 
 @dataclass
@@ -54,7 +57,7 @@ class MatchedParts:
     overall: Part
     ranges: dict[str, Part]
     speeds: dict[str, SpeedPart]
-    moving: Part | None  # None where speeds are not asked for
+    moving: SpeedPart | None  # None where speeds are not asked for
     sums: dict[str, Array]  # [S, 2] see `_motion_sums` and `sums_by_sample`
     truth_kept: Array  # [k] bool, ground truth that survives the official filters
 
@@ -143,7 +146,7 @@ def match_parts(
             name: Part(ranking, in_bins, bins == i, truth_bins == i) for i, name in enumerate(protocol.range_names)
         }
     if by_speed:
-        speeds, moving = _speed_parts(ranking, matching)
+        speeds, moving = _speed_parts(ranking, matching, pairs)
     found = np.zeros(len(truth), bool)
     with_errors = matching.ground_truth[protocol.thresholds_m.index(protocol.error_threshold_m)]
     found[np.flatnonzero(truth_kept)[with_errors]] = True
@@ -164,16 +167,21 @@ def measure_parts(parts: MatchedParts) -> dict[str, float | None]:
     """What sees the claim of a memory, beside the official scores; each with the number of boxes it stands on.
 
     `moving_AP`: AP of MOVING above FAST_MPS as one class, so that every box weighs the same; each is matched within its
-    own, and predictions follow the rule of `_speed_parts`. The others: see `_motion_sums` and `sums_by_sample`.
+    own, and predictions follow the rule of `_speed_parts`; `moving_AP_normalized` is to it as `normalized_ap` is to the
+    AP of a speed class. The others: see `_motion_sums` and `sums_by_sample`.
     """
     measures: dict[str, float | None] = {}
     if parts.moving is not None:
-        boxes = int(parts.moving.truth_members.sum())
-        precision = np.zeros((len(parts.ranking.protocol.thresholds_m), len(RECALLS)))
-        for listed in parts.moving.pooled_lists():
-            scores = parts.ranking.scores[listed.places]
-            precision[listed.threshold], _ = precision_and_confidence(listed.matched, scores, boxes)
-        measures = {"moving_AP": float(average_precision(precision).mean()) if boxes else None, "moving_boxes": boxes}
+        boxes, every = int(parts.moving.truth_members.sum()), int(np.isin(parts.ranking.truth.labels, MOVING).sum())
+        for name, part in (("moving_AP", parts.moving), ("moving_AP_normalized", parts.moving.by_place)):
+            precision = np.zeros((len(parts.ranking.protocol.thresholds_m), len(RECALLS)))
+            for listed in part.pooled_lists():
+                scores = parts.ranking.scores[listed.places]
+                precision[listed.threshold], _ = precision_and_confidence(listed.matched, scores, boxes)
+            if part is not parts.moving:
+                precision = normalized_precision(precision, boxes, every)
+            measures[name] = float(average_precision(precision).mean()) if boxes else None
+        measures["moving_boxes"] = boxes
     for name, ratio in ratios(parts.sums, np.ones((1, len(parts.ranking.evaluation_set.tokens)))).items():
         measures[name] = plain_number(ratio[0])
         if name.endswith("_recall"):
@@ -183,7 +191,7 @@ def measure_parts(parts: MatchedParts) -> dict[str, float | None]:
 
 def _score(
     part: Part,
-    totals: Array | None = None,  # [12] objects of each class that precision is normalised to
+    totals: Array | None = None,  # [12] objects of each class that precision is normalised to, without errors then
 ) -> SubsetScores:
     num_classes, thresholds_m = len(CLASSES), part.ranking.protocol.thresholds_m
     num_gt = np.bincount(part.ranking.truth.labels[part.truth_members], minlength=num_classes)
@@ -194,7 +202,7 @@ def _score(
         precision[c, t], confidence = precision_and_confidence(listed.matched, scores, int(num_gt[c]))
         if totals is not None:
             precision[c, t] = normalized_precision(precision[c, t], num_gt[c], totals[c])
-        if listed.errors is None:
+        if listed.errors is None or totals is not None:
             continue
         match_scores = scores[listed.matched]
         for e, values in enumerate(listed.errors.T):
@@ -208,10 +216,10 @@ def _score(
 
 
 def _score_speed(parts: MatchedParts, part: SpeedPart) -> SubsetScores:
-    """Of a speed class, with the AP that does not ask which speeds false positives state, `normalized_ap`: all of a
-    class count, and precision is that of as many objects as the class has at all speeds."""
+    """Of a speed class; `normalized_ap` asks for no stated speed, and precision is that of as many objects as the class
+    (car, truck ...) has at all speeds."""
     totals = np.bincount(parts.ranking.truth.labels, minlength=len(CLASSES))
-    return replace(_score(part), normalized_ap=_score(part.with_all_unmatched, totals).ap)
+    return replace(_score(part), normalized_ap=_score(part.by_place, totals).ap)
 
 
 def _score_tag(parts: MatchedParts, tag: str) -> SubsetScores:
@@ -224,30 +232,40 @@ def _score_tag(parts: MatchedParts, tag: str) -> SubsetScores:
     return scores
 
 
-def _speed_parts(ranking: Ranking, matching: Matching) -> tuple[dict[str, SpeedPart], Part]:
+def _speed_parts(ranking: Ranking, matching: Matching, pairs: CandidatePairs) -> tuple[dict[str, SpeedPart], SpeedPart]:
     """Parts by speed class, and the moving vehicles, with the matches of the overall score.
 
     A ground truth belongs to the class of its own speed, one of unknown velocity (NaN) to none. A prediction follows
     the ground truth it matches at that threshold, whatever speed it states: matched within the class it is a true
     positive there, matched elsewhere it is left out, so a wrong speed costs velocity error and no precision. One
     that matches nothing is a false positive in the class of the speed it states; stating none (NaN) it belongs to no
-    class, as ground truth of unknown velocity does, and lowers the overall score alone. So a detector that states
-    wrong speeds moves its false positives elsewhere: between detectors compare `normalized_ap`.
+    class, as ground truth of unknown velocity does, and lowers the overall score alone. A detector that states wrong
+    speeds so moves its false positives elsewhere. `members_by_place` do not ask what is stated: what matches nothing
+    has the speed of the nearest ground truth of its class within the largest threshold (a near miss, or a second box
+    of an object), and is a false positive at every speed where there is none.
     """
     truth = speed_classes(ranking.truth.velocities)
     stated = speed_classes(ranking.predictions.velocities)[ranking.rows]
-    followed = np.tile(stated, (len(ranking.protocol.thresholds_m), 1))
-    unmatched = np.ones_like(followed, dtype=bool)
+    near = np.full_like(stated, EVERY_SPEED)
+    first, nearest = np.unique(pairs.predictions, return_index=True)
+    near[first] = truth[pairs.ground_truth[nearest]]
+    followed, placed = (np.tile(speeds, (len(ranking.protocol.thresholds_m), 1)) for speeds in (stated, near))
     for t, places in enumerate(matching.places):
-        followed[t, places], unmatched[t, places] = truth[matching.ground_truth[t]], False
+        followed[t, places] = placed[t, places] = truth[matching.ground_truth[t]]
+    anywhere = placed == EVERY_SPEED
     speeds = {
-        name: SpeedPart(ranking, matching, followed == place, truth == place, unmatched)
+        name: SpeedPart(ranking, matching, followed == place, truth == place, (placed == place) | anywhere)
         for place, name in enumerate(SPEED_CLASSES_MPS)
     }
     fast = list(SPEED_CLASSES_MPS.values()).index(FAST_MPS)
-    labels = ranking.predictions.labels[ranking.rows]
-    moving = (followed >= fast) & np.isin(labels, MOVING), (truth >= fast) & np.isin(ranking.truth.labels, MOVING)
-    return speeds, Part(ranking, matching, *moving)
+    vehicles = np.isin(ranking.predictions.labels[ranking.rows], MOVING)
+    return speeds, SpeedPart(
+        ranking,
+        matching,
+        (followed >= fast) & vehicles,
+        (truth >= fast) & np.isin(ranking.truth.labels, MOVING),
+        ((placed >= fast) | anywhere) & vehicles,
+    )
 
 
 def _motion_sums(ranking: Ranking, matching: Matching) -> dict[str, Array]:  # [S, 2] each

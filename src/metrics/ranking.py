@@ -110,14 +110,14 @@ class Part:
 
 @dataclass
 class SpeedPart(Part):
-    """The boxes of a speed class; a prediction that matches nothing is a member if it states such a speed."""
+    """The boxes of some speeds; a prediction that matches nothing is a member if it states such a speed."""
 
-    unmatched: Array  # [T, n] bool: matches nothing at that threshold
+    members_by_place: Array  # [T, n] bool: the members that ask for no stated speed, see `_speed_parts`
 
     @property
-    def with_all_unmatched(self) -> Part:
-        """The same with every prediction that matches nothing, whatever speed it states."""
-        return Part(self.ranking, self.matching, self.members | self.unmatched, self.truth_members)
+    def by_place(self) -> Part:
+        """The same ground truth with these members."""
+        return Part(self.ranking, self.matching, self.members_by_place, self.truth_members)
 
 
 def rank_predictions(

@@ -10,6 +10,7 @@ from src.metrics.scores import ERRORS
 
 MEASURES = {
     "moving_AP": "AP of moving vehicles",
+    "moving_AP_normalized": "normalised AP of moving vehicles",
     "hidden_recall": "recall of hidden objects, seen before",
     "unoccupied_recall": "recall of objects without an occupied cell",
     "radar_covers": "objects that radar Gaussians cover",
@@ -34,7 +35,8 @@ def format_scores(metrics: Mapping[str, Any]) -> str:
 
     `metrics` is `DetectionScores.as_dict()`, fresh or read back; a file written before there were speed classes or
     measures has no table of them. mAP, NDS and AP in percent, errors in their own units (m, 1 - IoU, rad, m/s,
-    1 - accuracy); "-" where a number is undefined. By speed, means are over the classes that have ground truth there.
+    1 - accuracy); "-" where a number is undefined. By speed, means are over the classes that have ground truth there;
+    mAP_N is `mAP_normalized`.
     """
     parts = {"all": metrics} | metrics["ranges"]
     classes = [["class", "AP", *(f"AP {name}" for name in metrics["ranges"]), *ERRORS, "boxes"]]
@@ -86,7 +88,7 @@ def _measures(measures: Mapping[str, float | None]) -> list[list[str]]:
     rows = [["measure", "%", "boxes"]]
     for name, words in MEASURES.items():
         if name in measures:
-            boxes = measures.get(f"{name.rpartition('_')[0]}_boxes")
+            boxes = measures.get(f"{name.partition('_')[0]}_boxes")
             rows.append([words, _percent(measures[name]), "" if boxes is None else str(boxes)])
     return rows
 

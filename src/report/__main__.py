@@ -158,7 +158,7 @@ def draw_claims(path: Path, findings: list[tuple[Claim, list[Finding]]], scale: 
         rows, before = [], ""
         for finding in found:
             measure, effect = finding.measure, finding.found
-            if measure.metric.unit != "%" or measure.comparison.asks:
+            if measure.metric.unit != "%" or measure.comparison.asks is not None:
                 continue
             text = measure.comparison.text
             label, before = "" if text == before else text, text

@@ -39,7 +39,7 @@ class ComparisonConfig:
     metrics: Many[str]  # that decide, each by itself
     beside: Many[str] = field(default_factory=list)  # that are shown
     half_width: float | None = None  # precise enough, in the metrics' unit; null: the file's, in percentage points
-    asks: str | None = None  # the question that the two rows answer; none of their metrics decides the claim then
+    asks: str | None = None  # a question that the two rows answer; none of their metrics decides the claim then
 
     @property
     def text(self) -> str:
@@ -85,7 +85,7 @@ class Measure:
 
     comparison: ComparisonConfig
     metric: Metric
-    half_width: float  # in the metric's unit
+    half_width: float  # in the metric's unit; 0 of what asks: no interval is precise enough for a question
     paper: float | None  # difference of the paper's numbers; None where it has none
     decides: bool
 
@@ -146,8 +146,6 @@ def load_claims(load_sweep: Callable[[str], SweepConfig], path: Path = CLAIMS) -
         claims.append(Claim(config, []))
         if not config.comparisons:
             raise ConfigError(f"{where}, claim {config.name}: comparisons is empty; name two rows of a sweep")
-        if all(comparison.asks for comparison in config.comparisons):
-            raise ConfigError(f"{where}, claim {config.name}: all of comparisons ask why; name one that decides")
         for comparison in config.comparisons:
             here = f"{where}, claim {config.name}, {comparison.text}"
             try:
@@ -155,6 +153,8 @@ def load_claims(load_sweep: Callable[[str], SweepConfig], path: Path = CLAIMS) -
             except ConfigError as error:
                 raise ConfigError(f"{here}: {error}") from error
             claims[-1].measures.extend(_measures(comparison, sweep, file.half_width, here))
+        if not any(measure.decides for measure in claims[-1].measures):
+            raise ConfigError(f"{where}, claim {config.name}: all of comparisons ask why; name one that decides")
     return claims
 
 
@@ -168,23 +168,29 @@ def _measures(comparison: ComparisonConfig, sweep: SweepConfig, half_width: floa
     if comparison.row == comparison.over:
         raise ConfigError(f"{where}: a row is compared with itself; name two rows of sweeps/{sweep.name}.yaml")
     if not comparison.metrics:
-        raise ConfigError(f"{where}: metrics is empty; name at least one that decides")
+        raise ConfigError(f"{where}: metrics is empty; name at least one")
+    asks = comparison.asks is not None
+    if asks and not comparison.asks.strip():
+        raise ConfigError(f"{where}: asks is empty; say what the rows answer, or leave it out where they decide")
+    if asks and (comparison.beside or comparison.half_width is not None):
+        raise ConfigError(f"{where}: beside and half_width are of what decides; what asks has metrics alone")
     measures = []
     for name in [*comparison.metrics, *comparison.beside]:
-        metric, decides = find_metric(name, where, sweep.task), name in comparison.metrics and not comparison.asks
+        metric = find_metric(name, where, sweep.task)
         width = half_width if comparison.half_width is None else comparison.half_width
-        if not comparison.asks and comparison.half_width is None and metric.unit != "%":
+        if not asks and comparison.half_width is None and metric.unit != "%":
             raise ConfigError(f"{where}: {name} is in {metric.unit}; give the half_width that is precise enough in it")
-        if width <= 0:
+        if not asks and width <= 0:
             raise ConfigError(f"{where}: half_width must be above 0, but is {width}")
         ours, others = (rows[label].paper.get(name) for label in (comparison.row, comparison.over))
         paper = None if ours is None or others is None else round(ours - others, 6)
-        if not comparison.asks and paper is not None and (paper > 0) != metric.higher_is_better:
+        if not asks and paper is not None and (paper > 0) != metric.higher_is_better:
             raise ConfigError(
                 f"{where}: the paper's {name} is {ours:g} against {others:g}, so it does not claim that; exchange the "
                 "rows"
             )
-        measures.append(Measure(comparison, metric, width, paper, decides))
+        decides = not asks and name in comparison.metrics
+        measures.append(Measure(comparison, metric, 0.0 if asks else width, paper, decides))
     return measures
 
 

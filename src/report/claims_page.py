@@ -13,7 +13,7 @@ from src.report.sweep_table import MISSING, format_paper
 from src.report.sweep_text import SYNTHETIC, describe_epochs, describe_machines, sweep_settings
 
 HEADS = ("claim", "measure", "paper", "here", "seeds", "verdict", "command")
-REASON_HEADS = ("claim", "question", "rows", "here", "seeds", "command")
+REASON_HEADS = ("claim", "question", "rows", "here", "command")
 
 _FEW, _MOST = ", ".join(map(str, sorted(LOOKS)[:-1])), max(LOOKS)
 RULE = f"""Rows are compared by runs of the same seed: the mean difference, tested with {_FEW} and {_MOST}
@@ -24,8 +24,9 @@ else *undecided*. A claim shows where all its measures do. What is in italics de
 More of it: [docs/scores.md](../docs/scores.md#when-a-claim-holds)."""
 
 
-WHY = """Experiments that look for the cause, on the same terms; the number of the claim stands before each. They decide
-nothing about a claim."""
+WHY = f"""Further measures of these rows, and further rows, that tell what lies behind a claim; its number stands
+before each. They were chosen after results were seen and decide nothing: each interval is of 1 - 0.05/{len(LOOKS)}
+by itself."""
 
 
 def claims_page(
@@ -58,7 +59,7 @@ def _what_was_run(findings: list[tuple[Claim, list[Finding]]], records: Mapping[
     worlds: dict[str, set[str]] = {}
     runs: dict[str, RunResult] = {}
     for _, found in findings:
-        for finding in found:
+        for finding in _of_claims(found):
             for result in finding.results:
                 data = f"{result.dataset}, split {result.data.get('split', 'unknown')}"
                 worlds.setdefault(data, set()).add(finding.measure.comparison.sweep)
@@ -90,9 +91,9 @@ def _table(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
         title = f"**{number}. {escape_markdown(claim.config.sentence)}** ({escape_markdown(claim.config.source)})"
         lines.append([title, "", "", "", "", f"**{verdict_of(found)}**", ""])
         before = ""
-        for finding in (one for one in found if not one.measure.comparison.asks):
+        for finding in _of_claims(found):
             measure, metric = finding.measure, finding.measure.metric
-            text, command = measure.comparison.text, command_of(measure.comparison.sweep, found, scale)
+            text, command = measure.comparison.text, command_of(measure.comparison.sweep, _of_claims(found), scale)
             first, before = text != before, text
             lines.append(
                 [
@@ -108,27 +109,32 @@ def _table(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
     return _markdown(lines)
 
 
+def _of_claims(found: list[Finding]) -> list[Finding]:
+    """Those that are claimed or shown beside, without what asks why."""
+    return [one for one in found if one.measure.comparison.asks is None]
+
+
 def _reasons(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
     """The comparisons that ask why, with what has been found; empty where nothing has."""
     lines = []
-    for number, (_, found) in enumerate(findings, start=1):
-        asked: dict[str, list[Finding]] = {}
-        for finding in found:
-            if finding.measure.comparison.asks and finding.found is not None:
-                asked.setdefault(finding.measure.comparison.text, []).append(finding)
-        for text, answers in asked.items():
-            comparison = answers[0].measure.comparison
-            lines.append(
-                [
-                    str(number),
-                    escape_markdown(comparison.asks),
-                    escape_markdown(text),
-                    "; ".join(f"{one.measure.metric.heading}: {one.found.text}" for one in answers),
-                    ", ".join(map(str, sorted({one.found.pairs for one in answers}))),
-                    as_code([command_of(comparison.sweep, answers, scale)]),
-                ]
-            )
+    for number, (claim, found) in enumerate(findings, start=1):
+        for comparison in (one for one in claim.config.comparisons if one.asks is not None):
+            answers = [one for one in found if one.measure.comparison is comparison and one.found is not None]
+            if answers:
+                command = as_code([command_of(comparison.sweep, answers, scale)])
+                told = "; ".join(map(_answer, answers))
+                lines.append(
+                    [str(number), escape_markdown(comparison.asks), escape_markdown(comparison.text), told, command]
+                )
     return _markdown([REASON_HEADS, ["---"] * len(REASON_HEADS), *lines]) if lines else ""
+
+
+def _answer(finding: Finding) -> str:
+    """One measure of a question: what less of is better is marked, and what the paper has for it is told."""
+    metric, paper = finding.measure.metric, finding.measure.paper
+    less = "" if metric.higher_is_better else ", less is better"
+    told = "" if paper is None else f" (paper {format_paper(paper, metric, signed=True)})"
+    return f"{metric.heading}{less}: {finding.found.text}{told}, {finding.found.pairs} seeds"
 
 
 def _markdown(lines: Iterable[Iterable[str]]) -> str:

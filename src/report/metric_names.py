@@ -70,6 +70,7 @@ for _speed in SPEEDS:
         METRICS[f"speeds.{_speed}.{_key}"] = Metric(f"speeds.{_speed}.{_key}", f"{_words} {_speed} m/s", *_rest)
 for _key, _words, *_rest in (
     ("moving_AP", "AP of moving vehicles", "%", 100.0, 1, True),
+    ("moving_AP_normalized", "normalised AP of moving vehicles", "%", 100.0, 1, True),
     ("moving_velocity_error", "velocity error of moving vehicles", "m/s", 1.0, 2, False),
     ("moving_radial_error", "radial velocity error of moving vehicles", "m/s", 1.0, 2, False),
     ("moving_heading_error", "heading error of moving vehicles", "deg", 1.0, 2, False),

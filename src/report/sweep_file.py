@@ -137,6 +137,8 @@ class SweepConfig:
             given += itertools.chain(part.overrides, *part.scale_overrides.values())
         if any(key_of(override) == "seed" for override in given):
             raise ConfigError(f"{where}: seed=... is no part of a sweep; seed= and seeds= of its command say them")
+        if self.note is not None and not self.note.strip():
+            raise ConfigError(f"{where}: note is empty; leave it out, or say what a reader of the tables must know")
         labels = [row.label for row in self.rows] + [row.label for row in self.paper_rows]
         twice = sorted({label for label in labels if labels.count(label) > 1})
         if not all(label.strip() for label in labels):

@@ -126,7 +126,8 @@ def _table(record: SweepRecord, results: dict[str, RunResult], config: TableConf
         table.text = describe_search([row.state for row in rows], sweep.trials, objective, best)
     else:
         table.text = findings(columns, trained, next(iter(results.values()), None), complete)
-    table.text = [*([sweep.note] if sweep.note else []), *table.text]
+    if sweep.note is not None:
+        table.text = [sweep.note, *table.text]
     return table
 
 

@@ -68,6 +68,9 @@ def test_the_ten_claims_and_the_effects_that_the_paper_gives_them():
         ({"half_width": 0.0}, "half_width must be above 0, but is 0"),
         ({"row": "small", "over": "large"}, "the paper's mAP is 18.6 against 20.3, so it does not claim that"),
         ({"row": "small", "over": "large", "metrics": ["mAVE"], "half_width": 0.1}, "mAVE is 0.7 against 0.5"),
+        ({"asks": " "}, "asks is empty; say what the rows answer"),
+        ({"asks": "why?", "beside": ["NDS"]}, "what asks has metrics alone"),
+        ({"asks": "why?", "half_width": 0.1}, "what asks has metrics alone"),
     ],
 )
 def test_a_mistake_is_named_with_its_claim(claims_of, change, message):
@@ -152,6 +155,8 @@ def test_what_asks_why_decides_nothing(judged, claims_of):
     asks = {"row": "small", "over": "large", "metrics": ["mAP", "mAVE"], "asks": "Where is it lost?"}
     first, *answers = judged(values, {}, asks)
     assert [one.verdict for one in answers] == [Verdict.NOT, Verdict.SHOWS] and verdict_of([first, *answers]) == "shows"
+    _, answer = judged({"large": [10.0, 10.1, 9.9] * 2, "small": [10.0] * 6}, {}, {"asks": "Is it so?"})
+    assert answer.found.pairs == 6, "no interval is precise enough"
     first, *answers = judged({"large": [12.0, 10.0, 14.0], "small": [10.0] * 3}, {}, asks)
     assert first.is_open and not any(one.is_open for one in answers)
     with pytest.raises(ConfigError, match="claim margin: all of comparisons ask why; name one that decides"):

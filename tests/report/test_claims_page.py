@@ -60,11 +60,12 @@ def test_what_tells_why_stands_behind_the_claims_as_far_as_it_has_run(report, wr
     values = [0.12, 0.121, 0.119]
     write_sweep("comparison", {"Horizon3D, neck (ours)": values, "BEVFusion": [0.10] * 3})
     text = (report()[0] / "README.md").read_text()
-    answer = "mAP, %: +2.0 [+1.6, +2.4]; mAP 0-25 m, %: +2.0 [+1.6, +2.4]; mAP 50-100 m, %: +2.0 [+1.6, +2.4]"
+    found = "%: +2.0 [+1.6, +2.4], 3 seeds"
+    answer = f"mAP, {found}; mAP 0-25 m, {found}; mAP 50-100 m, {found}"
     claims, why = text.split("## Why")
     command = "`python -m src.sweep +sweep=comparison scale=mini seeds=3`"
-    row = r"| 10 | Does the lead come with a head that sees more than 3 x 3 cells? | Horizon3D, neck (ours) over BEVFusion"
-    assert f"{row} | {answer} | 3 | {command} |" in why and "neck" not in claims
+    row = "| 10 | Is it ahead with a head that sees more than 3 x 3 cells? | Horizon3D, neck (ours) over BEVFusion"
+    assert f"{row} | {answer} | {command} |" in why and "neck" not in claims
     assert "Of 10 claims: not run 10." in text and len(why.split("| 10 |")) == 2
 
 

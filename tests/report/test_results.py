@@ -86,6 +86,24 @@ def test_intervals_and_measures_are_read_by_name(write_run, reports):
     assert "tags.rain.mAP" not in path.read_text() and "classes.car.ATE" not in path.read_text(), "nobody reads them"
 
 
+def test_normalised_scores_by_speed_are_read_where_a_run_has_them(write_run, reports):
+    older = read_result(publish_result(write_run("a", [], 0, 0.3, speeds=True), reports))
+    assert "speeds.25+.mAP_normalized" not in older.metrics and "speeds.25+.bus.AP_normalized" not in older.metrics
+    bounds = {"speeds.25+.mAP_normalized": [0.1, 0.3], "speeds.25+.classes.car.AP_normalized": [0.4, 0.6]}
+    folder = with_intervals(write_run("b", [], 1, 0.3, speeds=True), bounds)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    part = metrics["speeds"]["25+"]
+    part["mAP_normalized"], part["classes"]["car"]["AP_normalized"] = 0.2, 0.5
+    part["classes"]["bus"] = {"AP": 0.0, "AP_normalized": 0.0, "num_gt": 0}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    result = read_result(publish_result(folder, reports))
+    found = {name: value for name, value in result.metrics.items() if name.endswith("_normalized")}
+    assert found == {
+        "speeds.25+.mAP_normalized": 0.2, "speeds.25+.car.AP_normalized": 0.5, "speeds.25+.bus.AP_normalized": None
+    }  # fmt: skip
+    assert result.intervals == {"speeds.25+.mAP_normalized": [0.1, 0.3], "speeds.25+.car.AP_normalized": [0.4, 0.6]}
+
+
 @pytest.mark.parametrize(
     ("bounds", "message"),
     [
