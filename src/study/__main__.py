@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -49,8 +48,8 @@ def main(overrides: list[str]) -> None:
     for look in LOOKS:
         plans = study.plans(look, study.results())
         for plan in plans:
-            if not study.options.workers and not any(study.finished(plan)):
-                continue  # nothing to record
+            if not study.options.workers and not study.has_look(plan, look):
+                continue
             logger.info("%s", study.progress(plans, look, study.results()))
             command = study.commands[plan.sweep.name]
             try:
@@ -59,8 +58,6 @@ def main(overrides: list[str]) -> None:
                 raise
             except HorizonError as error:  # costs no other sweep
                 problems.append(f"{plan.study}: {error}")
-        if not study.options.workers and not all(chain.from_iterable(map(study.finished, plans))):
-            break  # a look is taken at all its pairs
     print(study.verdicts())
     if problems:
         raise HorizonError("\n".join(problems))
@@ -111,9 +108,12 @@ class Study:
             plans.append(without_published(plan, results, command.workers > 0) if command.published else plan)
         return plans
 
-    def finished(self, plan: Plan) -> Iterator[bool]:
-        """Of each run whether it is finished, here or by its result."""
-        return (run_id in plan.published or is_done(self.outputs / run_id) for run_id in plan.specs)
+    def has_look(self, plan: Plan, look: int) -> bool:
+        """Whether the runs there are, here or by their results, are worth recording: any at the first look; at a later
+        one, which is taken at all its pairs, all runs of the rows that it adds seeds to."""
+        rows = (runs.values() for runs in plan.rows.values() if len(runs) == look)
+        finished = (run in plan.published or is_done(self.outputs / run) for run in chain.from_iterable(rows))
+        return any(finished) if look == min(LOOKS) else all(finished)
 
     def progress(self, plans: list[Plan], look: int, results: dict[str, RunResult]) -> str:
         """How far a look is, over all its sweeps, and the time left as far as runs finished here tell it."""

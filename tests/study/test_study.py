@@ -190,6 +190,10 @@ def test_without_workers_no_look_follows_an_incomplete_one(places, trained, tmp_
     study.main(of_results)
     assert calls == [("margin", {}), ("layers", {}), ("layers", {})] and capsys.readouterr().out == before
     margin = {run for runs in record_of(tmp_path, "margin").rows.values() for run in runs.values()}
+    del results[record_of(tmp_path, "margin").rows["none"][2]]  # it keeps no other sweep from its next look
+    calls.clear()
+    study.main(of_results)
+    assert calls == [("margin", {}), ("layers", {}), ("layers", {})] and capsys.readouterr().out == before
     for run_id in [run_id for run_id, result in results.items() if result.seed == 2 or run_id not in margin]:
         del results[run_id]
     calls.clear()
