@@ -81,8 +81,8 @@ def sums_by_sample(
     """Total and count of every measure in each sample; the measure is the ratio of their sums, see `ratios`.
 
     `hidden_recall`: share that is found, at whatever score, of the objects that hide but were seen before (`hidden`);
-    `unoccupied_recall`: of those without an occupied cell inside. `<source>_covers`, of history
-    `remembered_share`: share of the objects that a Gaussian covers. Of all these only ground truth that counts.
+    `occupied_share`: share of the objects with an occupied cell inside; `<source>_covers`, of history
+    `remembered_share`: that a Gaussian covers. Of all these only ground truth that counts.
     `<source>_gaussians`: how many a frame has; `<source>_near`: share of them near an object; `<source>_faint`: share
     below FAINT_OPACITY; `<source>_velocity_error`: m/s, of those inside a box that moves at FAST_MPS or faster, to its
     velocity, and `<source>_radial_error` what of it lies along the ray from the vehicle, which a radar measures; the
@@ -110,7 +110,7 @@ def sums_by_sample(
     if diagnoses:
         sums["hidden_recall"] = of_objects(found, hidden(points, evaluation_set))
     if not np.isnan(occupied).all():
-        sums["unoccupied_recall"] = of_objects(found, occupied == 0)
+        sums["occupied_share"] = of_objects(occupied == 1, ~np.isnan(occupied))
     for source, name in COVERS.items():
         how_many = of_gaussians.get(f"{source.name.lower()}_gaussians")
         if how_many is not None and how_many[:, 0].any():

@@ -12,7 +12,7 @@ MEASURES = {
     "moving_AP": "AP of moving vehicles",
     "moving_AP_normalized": "normalised AP of moving vehicles",
     "hidden_recall": "recall of hidden objects, seen before",
-    "unoccupied_recall": "recall of objects without an occupied cell",
+    "occupied_share": "objects with an occupied cell",
     "radar_covers": "objects that radar Gaussians cover",
     "camera_covers": "objects that camera Gaussians cover",
     "random_covers": "objects that random Gaussians cover",

@@ -75,7 +75,7 @@ for _key, _words, *_rest in (
     ("moving_radial_error", "radial velocity error of moving vehicles", "m/s", 1.0, 2, False),
     ("moving_heading_error", "heading error of moving vehicles", "deg", 1.0, 2, False),
     ("hidden_recall", "recall of hidden objects", "%", 100.0, 1, True),
-    ("unoccupied_recall", "recall of objects without an occupied cell", "%", 100.0, 1, True),
+    ("occupied_share", "objects with an occupied cell", "%", 100.0, 1, True),
     ("radar_covers", "objects that radar Gaussians cover", "%", 100.0, 1, True),
     ("camera_covers", "objects that camera Gaussians cover", "%", 100.0, 1, True),
     ("random_covers", "objects that random Gaussians cover", "%", 100.0, 1, True),

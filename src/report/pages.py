@@ -91,9 +91,9 @@ and so is one seed; rows that agree in every pair are equal. Percentage points, 
 is better."""
 
 MEMORY_TEXT = """Recall at 2 m, whatever the score, of objects with fewer than 3 returns in the accumulated input that
-had 3 or more at most eight key frames before (hidden), and of objects without an occupied cell inside; the share of
-objects within 2.4 m of a remembered Gaussian. Of remembered Gaussians: the share within 2.4 m of an object, the share
-of opacity below 0.1, and the error of their velocity beside objects of 10 m/s and more."""
+had 3 or more at most eight key frames before (hidden); the shares of objects with an occupied cell inside and within
+2.4 m of a remembered Gaussian. Of remembered Gaussians: the share within 2.4 m of an object, the share of opacity below
+0.1, and the error of their velocity beside objects of 10 m/s and more."""
 
 
 def called_by_changes(results: Iterable[RunResult], defaults: dict[str, dict[str, Any]]) -> list[RunResult]:

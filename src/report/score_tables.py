@@ -24,7 +24,7 @@ CAR_BY_SPEED = [METRICS[f"speeds.{name}.car.AP"] for name in SPEEDS]
 ERROR_BY_SPEED = [METRICS[f"speeds.{name}.mAVE_present"] for name in SPEEDS]
 CAR_ERROR_BY_SPEED = [METRICS[f"speeds.{name}.car.AVE"] for name in SPEEDS]
 SUMMARY = [METRICS["mAP"], METRICS["NDS"], METRICS["mAVE"], CAR_AP, METRICS["measures.moving_AP"]]
-OF_MEMORY = [METRICS[f"measures.{name}"] for name in ("hidden_recall", "unoccupied_recall", "remembered_share")]
+OF_MEMORY = [METRICS[f"measures.{name}"] for name in ("hidden_recall", "occupied_share", "remembered_share")]
 OF_HISTORY = [METRICS[f"measures.history_{name}"] for name in ("near", "faint", "velocity_error")]
 
 

@@ -190,7 +190,7 @@ def test_hidden_objects_have_been_seen_within_four_seconds():
     assert (hidden(points[shuffled], mixed) == hidden(points, evaluation_set)[shuffled]).all()
 
 
-def test_recall_of_hidden_and_of_unoccupied_objects():
+def test_recall_of_hidden_objects_and_share_of_occupied_ones():
     # Frame 0: three returns in each of three objects; frame 1: none, and a cell in the first alone.
     points = np.full(3, 3)
     diagnoses = {
@@ -202,6 +202,6 @@ def test_recall_of_hidden_and_of_unoccupied_objects():
     found = np.array([1, 1, 1, 1, 1, 0], bool)
     sums = sums_by_sample(diagnoses, evaluation_set, np.ones(6, bool), found)
     assert sums["hidden_recall"].tolist() == [[0, 0], [2, 3]]
-    assert sums["unoccupied_recall"].tolist() == [[0, 0], [1, 2]]
+    assert sums["occupied_share"].tolist() == [[3, 3], [1, 3]]
     kept = np.array([1, 1, 1, 1, 1, 0], bool)
     assert measures_of(sums_by_sample(diagnoses, evaluation_set, kept, found))["hidden_recall"] == 1.0
