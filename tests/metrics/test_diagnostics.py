@@ -204,4 +204,5 @@ def test_recall_of_hidden_objects_and_share_of_occupied_ones():
     assert sums["hidden_recall"].tolist() == [[0, 0], [2, 3]]
     assert sums["occupied_share"].tolist() == [[3, 3], [1, 3]]
     kept = np.array([1, 1, 1, 1, 1, 0], bool)
-    assert measures_of(sums_by_sample(diagnoses, evaluation_set, kept, found))["hidden_recall"] == 1.0
+    sums = sums_by_sample(diagnoses, evaluation_set, kept, found)
+    assert measures_of(sums)["hidden_recall"] == 1.0 and sums["occupied_share"].tolist() == [[3, 3], [1, 2]]
