@@ -52,6 +52,7 @@ COMMANDS_OF_OPTIONS = {
     "preview": ("world",),
     "compare": ("world",),
     "oracle": ("evaluate",),
+    "suite": ("benchmark",),
 }
 """Options of single commands, and the commands that read them."""
 FILES_AND_NAMES = (
@@ -123,6 +124,10 @@ class BenchmarkSuite(Enum):
     reader = "reader"
     launches = "launches"
     gpu = "gpu"
+
+
+NOT_GIVEN = (None, False, Oracle.none, BenchmarkSuite.model)
+"""Values of options of single commands that say nothing to the others."""
 
 
 @dataclass(kw_only=True)
@@ -200,7 +205,7 @@ def _register() -> None:
 def refuse_options_of_others(config: Config, command: str) -> None:
     """Raises ConfigError for an option of single commands that this one, `train` for instance, would ignore."""
     for option, users in COMMANDS_OF_OPTIONS.items():
-        if command not in users and (value := getattr(config, option)) not in (None, False, Oracle.none):
+        if command not in users and (value := getattr(config, option)) not in NOT_GIVEN:
             names = " or ".join(f"python -m src.{user}" for user in users)
             said = "true" if value is True else getattr(value, "value", value)
             raise ConfigError(f"{option}={said}: an option of {names}; leave it out")

@@ -270,6 +270,8 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["model=petr", "model.num_queries=0"], "model.num_queries=0"),
         (["phase=phase2", "phase.name=phase1"], "phase.name=phase1.*phase=\\.\\.\\."),
         (["phase.options.velocity_code_weight=-1"], "velocity_code_weight"),
+        (["phase.options.velocity_code_weight=abc"], "phase.options.velocity_code_weight='abc': .*number"),
+        (["phase.options.velocity_code_weight=null"], "phase.options.velocity_code_weight=None: .*number"),
         (["optim.final_lr_ratio=-1"], "final_lr_ratio"),
         (["trainer.accelerator=cuda9"], "accelerator.*gpu"),
         (["trainer.num_pictures=-1"], "num_pictures"),
@@ -467,6 +469,7 @@ def test_exit_code_of_a_configuration_error():
         ("report", "scene=x", "predict"),
         ("evaluate", "preview=true", "world"),
         ("predict", "oracle=velocity", "evaluate"),
+        ("train", "suite=ops", "benchmark"),
     ],
 )
 def test_an_option_that_a_command_would_ignore_is_refused(command, option, users):

@@ -22,7 +22,7 @@ from src.ops.frame_motion import relative_motion_reference, warp_gaussians_refer
 from src.ops.gather_cells import gather_cells_reference
 from src.ops.gaussian_cells import cell_distances, gaussian_windows
 from src.ops.gaussian_shapes import AttributeLimits, refined_attributes_reference, sampling_points_reference
-from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians_reference
+from src.ops.initial_gaussians import Attributes, Keypoints, Slots, initial_gaussians_reference
 from src.ops.moved_keys import moved_keys_reference
 from src.ops.neighbour_table import neighbour_table_reference, stacked_table_reference, transposed_table_reference
 from src.ops.radial_correction import radial_correction_reference, radial_votes_reference
@@ -278,10 +278,9 @@ def _initialise(
     found = [(first, first_valid, first_change), (second, second_valid, second_change)] if num_first > 0 else []
     keypoints = [Keypoints(x, valid > 0, change if change.dim() == 3 else None) for x, valid, change in found]
     limits = AttributeLimits((low, low + span), 0.0, max_speed, unit * max_speed)
-    wanted = initial_gaussians_reference(
-        Slots(values, sources, learnt, shift), keypoints, (*past, past_valid > 0) if kept > 0 else None, centre,
-        limits, all_rows // (num + kept),
-    )  # fmt: skip
+    slots, history = Slots(values, sources, learnt, shift), Attributes(*past, past_valid > 0) if kept > 0 else None
+    batch_size = all_rows // (num + kept)
+    wanted = initial_gaussians_reference(slots, keypoints, history, centre, limits, batch_size)
     means, scales, directions, logits, velocities, features, sources, ages, valid = wanted
     made = (torch.stack([means, scales, directions, velocities]), features, torch.stack([logits, ages]), sources, valid)
     for out, own in zip(rest[9:14], made, strict=True):

@@ -1,6 +1,6 @@
 """`python -m src.gallery runs=A,B`: what finished runs found and missed, chosen by rule, into `paths.reports`.
 
-Six frames by condition, the worst misses and the worst false positives of the last run, each as every run sees it, and
+Frames by condition, the worst misses and the worst false positives of the last run, each as every run sees it, and
 a film of the first frame's scene.
 """
 
@@ -48,7 +48,7 @@ taste; what is drawn has a score of at least {score}.
 Of the tags of weather, daytime and lighting, the rarest first, each gives the first scene that stands for none yet; of
 that the middle key frame. Images show the boxes of `{last}`.
 
-![Six frames by condition](pictures/{conditions})
+![Frames by condition](pictures/{conditions})
 
 ## Worst misses
 

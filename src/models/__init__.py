@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping
 from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
@@ -51,7 +54,7 @@ def build_model(
 
 
 def read_phase_options(name: str, options: Mapping[str, Any]) -> Any:
-    """`phase.options` as a family's own dataclass. Raises ConfigError for others than it takes."""
+    """`phase.options` as a family's own dataclass. Raises ConfigError for others than it takes, and of another type."""
     _, family = FAMILIES[name]
     known = [field.name for field in dataclasses.fields(family.phase_options)]
     if set(options) != set(known):
@@ -59,4 +62,8 @@ def read_phase_options(name: str, options: Mapping[str, Any]) -> Any:
             f"phase.options has {', '.join(sorted(options)) or 'nothing'}, but model={name} takes "
             f"{', '.join(known) or 'nothing'}"
         )
-    return family.phase_options(**options)
+    try:
+        return TypeAdapter(family.phase_options).validate_json(json.dumps(dict(options)), strict=True)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        raise ConfigError(f"phase.options.{fault['loc'][0]}={fault['input']!r}: {fault['msg']}") from None

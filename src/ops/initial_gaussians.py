@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,8 +15,19 @@ from src.ops.gaussian_shapes import AttributeLimits, activated_attributes
 NUM_RAW = 7
 """Raw scale 2, rotation 2, opacity 1, velocity 2."""
 
-Attributes = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Means, scales, directions, opacity logits, velocities, features, sources, ages and valid, [B, G, ...] each."""
+
+class Attributes(NamedTuple):
+    """Of B x G Gaussians, by the names and with the meaning that they have in `structures.gaussians.GaussianSet`."""
+
+    means: Tensor  # [B, G, 2] m
+    scales: Tensor  # [B, G, 2] m
+    directions: Tensor  # [B, G, 2]
+    opacity_logits: Tensor  # [B, G]
+    velocities: Tensor  # [B, G, 2] m/s
+    features: Tensor  # [B, G, C]
+    sources: Tensor  # [B, G] int64
+    elapsed_s: Tensor  # [B, G]
+    valid: Tensor  # [B, G] bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,12 +89,18 @@ def initial_gaussians_reference(
     features = [part[..., :-NUM_RAW] for part in parts]
     raw = torch.cat([part[..., -NUM_RAW:] for part in parts], dim=1)
     scales, directions, velocities = activated_attributes(raw, limits)
-    sources, ages = slots.sources.expand_as(valid), torch.zeros_like(valid, dtype=torch.float32)
-    means = torch.where(valid[..., None], means, centre_m)
-    before = (means, scales, directions, raw[..., 4], velocities)
+    now = Attributes(
+        means=torch.where(valid[..., None], means, centre_m),
+        scales=scales,
+        directions=directions,
+        opacity_logits=raw[..., 4],
+        velocities=velocities,
+        features=torch.cat(features, dim=1),
+        sources=slots.sources.expand_as(valid),
+        elapsed_s=torch.zeros_like(valid, dtype=torch.float32),
+        valid=valid,
+    )
     if history is None:
-        return *before, torch.cat(features, dim=1), sources, ages, valid
-    features = torch.cat([*features, history[5] + slots.history_shift], dim=1)
-    before = (torch.cat(pair, dim=1) for pair in zip(before, history[:5], strict=True))
-    behind = (torch.cat(pair, dim=1) for pair in zip((sources, ages, valid), history[6:], strict=True))
-    return *before, features, *behind
+        return now
+    history = history._replace(features=history.features + slots.history_shift)
+    return Attributes(*(torch.cat(pair, dim=1) for pair in zip(now, history, strict=True)))

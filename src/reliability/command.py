@@ -24,6 +24,11 @@ INTERRUPT_GRACE_S = 2.0
 """Signals this soon after the first repeat it: launchers and a shared terminal send it again within milliseconds."""
 
 
+def signal_name(number: int) -> str:
+    """`SIGKILL` and so on, for a message; `signal N` where the system has no name for it."""
+    return signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
+
+
 def run_command(main: Callable[[list[str]], None]) -> None:
     """Run an entry point on the command line's `key=value`s; known errors end with one message and their exit code.
 

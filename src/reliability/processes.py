@@ -36,7 +36,7 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
 from src.errors import ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
-from src.reliability.command import INTERRUPT_GRACE_S
+from src.reliability.command import INTERRUPT_GRACE_S, signal_name
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -195,8 +195,8 @@ def _wait_for_all(ranks: list[subprocess.Popen], stops: list[float]) -> int:
 def _how_it_ended(code: int) -> str:
     if code >= 0:
         return f"ended with exit code {code}"
-    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-    return f"was killed by {name}" + (", as the system does when memory is short" if -code == signal.SIGKILL else "")
+    why = ", as the system does when memory is short" if -code == signal.SIGKILL else ""
+    return f"was killed by {signal_name(-code)}{why}"
 
 
 def _end_within(seconds: float, ranks: list[subprocess.Popen]) -> None:

@@ -21,7 +21,7 @@ from src.report.plain_yaml import load_plain_yaml
 from src.report.results import RunResult
 from src.report.sweep_file import SweepConfig
 from src.report.sweep_record import SweepRecord
-from src.report.table_builder import is_done
+from src.report.table_builder import is_current
 
 logger = logging.getLogger(__name__)
 
@@ -234,4 +234,4 @@ def _runs(record: SweepRecord | None, label: str, results: Mapping[str, RunResul
             *(record.name, record.scale, label, record.name, record.scale),
         )
     runs = {} if record is None else record.rows.get(label, {})
-    return {seed: results[run_id] for seed, run_id in runs.items() if is_done(record, run_id, results)}
+    return {seed: results[run_id] for seed, run_id in runs.items() if is_current(record, run_id, results)}

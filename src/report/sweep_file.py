@@ -121,35 +121,59 @@ class SweepConfig:
         where = f"sweeps/{self.name or '?'}.yaml"
         if bool(self.rows) == bool(self.space):
             raise ConfigError(f"{where}: give either rows or space, and at least one entry")
-        for name in (self.name, *(table.name for table in self.tables)):
-            if not NAME.fullmatch(name):
-                raise ConfigError(
-                    f"{where}: the name {name!r} must be of letters, digits, _ and -, and begin with a letter or digit"
-                )
         if self.task == DETECTION:
             self.objective = self.objective or "NDS"
         elif self.rows and not self.tables:
             raise ConfigError(f"{where}: give tables with the columns of task {self.task}")
         elif self.space and self.objective is None:
             raise ConfigError(f"{where}: give the objective of task {self.task}")
+        if self.note is not None and not self.note.strip():
+            raise ConfigError(f"{where}: note is empty; leave it out, or say what a reader of the tables must know")
+        self._check_names(where)
+        self._check_overrides(where)
+        self._check_references(where)
+        self._check_metrics(where)
+        self._check_tables(where)
+        self._check_search(where)
+
+    def _check_names(self, where: str) -> None:
+        """Of the sweep, its tables and its rows."""
+        tables = [table.name for table in self.tables]
+        for name in (self.name, *tables):
+            if not NAME.fullmatch(name):
+                raise ConfigError(
+                    f"{where}: the name {name!r} must be of letters, digits, _ and -, and begin with a letter or digit"
+                )
+        if len(set(tables)) < len(tables):
+            raise ConfigError(f"{where}: two tables have one name ({', '.join(tables)})")
+        labels = self._labels
+        if not all(label.strip() for label in labels):
+            raise ConfigError(f"{where}: a label is empty; each row needs its own")
+        twice = sorted({label for label in labels if labels.count(label) > 1})
+        if twice:
+            raise ConfigError(f"{where}: label {', '.join(twice)} stands more than once; each row needs its own")
+
+    def _check_overrides(self, where: str) -> None:
         given = [*self.space]
         for part in (self, *self.rows):
             given += itertools.chain(part.overrides, *part.scale_overrides.values())
         if any(key_of(override) == "seed" for override in given):
             raise ConfigError(f"{where}: seed=... is no part of a sweep; seed= and seeds= of its command say them")
-        if self.note is not None and not self.note.strip():
-            raise ConfigError(f"{where}: note is empty; leave it out, or say what a reader of the tables must know")
-        labels = [row.label for row in self.rows] + [row.label for row in self.paper_rows]
-        twice = sorted({label for label in labels if labels.count(label) > 1})
-        if not all(label.strip() for label in labels):
-            raise ConfigError(f"{where}: a label is empty; each row needs its own")
-        if twice:
-            raise ConfigError(f"{where}: label {', '.join(twice)} stands more than once; each row needs its own")
-        own = [row.label for row in self.rows]
+        for row in self.rows:
+            trains = [change for change in row.overrides if is_of(change, OF_TRAINING) or key_of(change) == "model"]
+            if row.weights is not None and trains:
+                raise ConfigError(
+                    f"{where}, row {row.label!r}: {', '.join(trains)} changes nothing of weights {row.weights!r}, "
+                    "which are scored as they are; leave it out, or leave weights out to train the row"
+                )
+
+    def _check_references(self, where: str) -> None:
+        """Rows that are named as baseline or weights of others."""
+        own = {row.label: row for row in self.rows}
         for baseline in (self.baseline, *(row.baseline for row in self.rows)):
             if baseline is not None and baseline not in own:
                 raise ConfigError(f"{where}: baseline {baseline!r} is not the label of a row ({', '.join(own)})")
-            if any(row.label == baseline and row.scales is not None for row in self.rows):
+            if baseline is not None and own[baseline].scales is not None:
                 raise ConfigError(f"{where}: baseline {baseline!r} must be for every scale; leave its scales out")
         trained = [row.label for row in self.rows if row.weights is None and row.scales is None]
         for row in self.rows:
@@ -158,42 +182,42 @@ class SweepConfig:
                     f"{where}, row {row.label!r}: weights {row.weights!r} must be the label of a row that is trained "
                     f"at every scale ({', '.join(trained) or 'there is none'})"
                 )
-            trains = [
-                override for override in row.overrides if is_of(override, OF_TRAINING) or key_of(override) == "model"
-            ]
-            if row.weights is not None and trains:
-                raise ConfigError(
-                    f"{where}, row {row.label!r}: {', '.join(trains)} changes nothing of weights {row.weights!r}, "
-                    "which are scored as they are; leave it out, or leave weights out to train the row"
-                )
+
+    def _check_metrics(self, where: str) -> None:
         for row in [*self.rows, *self.paper_rows]:
             for metric in row.paper:
                 find_metric(metric, f"{where}, row {row.label!r}, paper", self.task)
-        names = [table.name for table in self.tables]
-        if len(set(names)) < len(names):
-            raise ConfigError(f"{where}: two tables have one name ({', '.join(names)})")
         for table in self.tables:
             for column in table.columns:
                 find_metric(column, f"{where}, table {table.name}, columns", self.task)
-            unknown = [label for label in table.rows or () if label not in labels]
+        for plot in self.plots:
+            find_metric(plot.metric, f"{where}, plots", self.task)
+
+    def _check_tables(self, where: str) -> None:
+        for table in self.tables:
+            unknown = [label for label in table.rows or () if label not in self._labels]
             if unknown:
                 raise ConfigError(f"{where}, table {table.name}: there is no row {', '.join(unknown)}")
             if not table.columns:
                 raise ConfigError(f"{where}, table {table.name}: columns is empty; name at least one metric")
-            num_rows = len(table.rows or labels)
+            num_rows = len(table.rows or self._labels)
             if len(table.columns) >= MAX_COLUMNS and (num_rows >= MAX_COLUMNS or self.space):
                 raise ConfigError(
                     f"{where}, table {table.name}: {len(table.columns)} metrics of {num_rows} rows fit no table of "
                     f"{MAX_COLUMNS} columns, heads included, either way round; name fewer columns or rows"
                 )
-        for plot in self.plots:
-            find_metric(plot.metric, f"{where}, plots", self.task)
+
+    def _check_search(self, where: str) -> None:
         for key, dimension in self.space.items():
             dimension.check(f"{where}, space, {key}")
         if self.space:
             find_metric(self.objective, f"{where}, objective", self.task)
             if self.trials < 1:
                 raise ConfigError(f"{where}: trials must be at least 1, but got {self.trials}")
+
+    @property
+    def _labels(self) -> list[str]:
+        return [row.label for row in [*self.rows, *self.paper_rows]]
 
     @property
     def is_search(self) -> bool:

@@ -141,7 +141,7 @@ def _rows(
         runs = record.rows.get(row.label, {})
         own = {seed: results.get(run_id) for seed, run_id in runs.items()}
         cells = [_cell(own, column, row.paper.get(column.name)) for column in columns]
-        done = sum(is_done(record, run_id, results) for run_id in runs.values())
+        done = sum(is_current(record, run_id, results) for run_id in runs.values())
         state, note = _state(record, runs, results)
         baseline = sweep.baseline_of(row.label)
         rows[row.label] = SweepRow(row.label, cells, state, note, len(runs), done, baseline, dict(runs))
@@ -166,7 +166,7 @@ def _trials(
             note = f"pruned at {objective.title} {run.value * objective.scale:.{objective.digits}f}"
             note += EARLIER if result is not None else ""
         chosen = [override for override in run.overrides if key_of(override) in record.sweep.space]
-        done = int(is_done(record, run_id, results))
+        done = int(is_current(record, run_id, results))
         row = SweepRow(run.label, cells, state, note, 1, done, None, {run.seed: run_id}, chosen)
         scored.append((row, run.value if result is None else result.metrics.get(objective.name)))
     order = ("done", "pruned", "failed", "running", "waiting")
@@ -217,14 +217,14 @@ def _frames(result: RunResult, metric: str) -> float | None:
     return 0.5 * spreads[part] if part in spreads else None
 
 
-def is_done(record: SweepRecord, run_id: str, results: dict[str, RunResult]) -> bool:
+def is_current(record: SweepRecord, run_id: str, results: dict[str, RunResult]) -> bool:
     """Whether there is a result and the record does not say that it is of an earlier training."""
     return run_id in results and (run_id not in record.runs or record.runs[run_id].state == "done")
 
 
 def _state(record: SweepRecord, runs: dict[int, str], results: dict[str, RunResult]) -> tuple[str, str]:
     """State of a row, and what is to be said of the runs that have not finished, or have no result."""
-    open_runs = {seed: run_id for seed, run_id in runs.items() if not is_done(record, run_id, results)}
+    open_runs = {seed: run_id for seed, run_id in runs.items() if not is_current(record, run_id, results)}
     if not open_runs and runs:
         return "done", ""
     states, notes = set(), []

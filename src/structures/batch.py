@@ -21,7 +21,7 @@ LIDAR_POINT_FIELDS = ("x", "y", "z", "intensity", "dt")
 class FrameBatch(TensorFields):
     """B key frames with the sensors that were read, calibration and, where known, annotations.
 
-    Frames: `ego` is the vehicle at the LIDAR_LEFT key frame, `aug` the same after BEV augmentation A_t (spec 9).
+    Frames: `ego` is the vehicle at the LIDAR_LEFT key frame, `aug` the same after BEV augmentation A_t (method 9).
     Global coordinates are float64; only ego-relative ones are float32. Images are raw RGB bytes: each model
     normalises as its backbone was trained. A sensor that was not read is None; one without returns has no points. `dt`
     is the key frame's time less the point's, above 0 for older points.

@@ -23,7 +23,7 @@ from src.report.time_left import progress_line
 from src.sweep.compose import SweepCommand, compose_sweep, load_sweep
 from src.sweep.plan import Plan, changes_of, compose_file, join_overrides, make_plan, without_published
 from src.sweep.run_plan import Identifier, resume_command, run_plan
-from src.sweep.run_status import is_done
+from src.sweep.run_status import is_scored
 from src.training.identity import key_of
 
 logger = logging.getLogger(__name__)
@@ -112,14 +112,14 @@ class Study:
         """Whether the runs there are, here or by their results, are worth recording: any at the first look; at a later
         one, which is taken at all its pairs, all runs of the rows that it adds seeds to."""
         rows = (runs.values() for runs in plan.rows.values() if len(runs) == look)
-        finished = (run in plan.published or is_done(self.outputs / run) for run in chain.from_iterable(rows))
+        finished = (run in plan.published or is_scored(self.outputs / run) for run in chain.from_iterable(rows))
         return any(finished) if look == min(LOOKS) else all(finished)
 
     def progress(self, plans: list[Plan], look: int, results: dict[str, RunResult]) -> str:
         """How far a look is, over all its sweeps, and the time left as far as runs finished here tell it."""
         runs = {}
         for spec in (spec for plan in plans for spec in plan.specs.values()):
-            done = is_done(self.outputs / spec.run_id)
+            done = is_scored(self.outputs / spec.run_id)
             took = results[spec.run_id].seconds["all"] if done and spec.run_id in results else None
             counts = done or any(spec.run_id in plan.published for plan in plans)
             state = "done" if counts else "waiting"

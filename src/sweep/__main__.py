@@ -12,7 +12,7 @@ from src.report.sweep_file import DimensionConfig
 from src.sweep.compose import compose_sweep
 from src.sweep.plan import Plan, compose_file, join_overrides, make_plan, without_published
 from src.sweep.run_plan import Identifier, resume_command, run_plan
-from src.sweep.run_status import is_done
+from src.sweep.run_status import is_scored
 from src.training.identity import key_of
 
 
@@ -47,7 +47,7 @@ def describe(plan: Plan, outputs: Path) -> str:
         return "\n".join(
             [*lines, f"# a search of {plan.sweep.trials} trials for the best {plan.sweep.objective}:", *space]
         )
-    finished = sum(run_id in plan.published or is_done(outputs / run_id) for run_id in plan.specs)
+    finished = sum(run_id in plan.published or is_scored(outputs / run_id) for run_id in plan.specs)
     results = len(plan.rows) * len(plan.seeds)
     lines.append(
         f"# {len(plan.rows)} rows x {len(plan.seeds)} seeds = {results} results of {len(plan.specs)} runs, "
@@ -57,7 +57,7 @@ def describe(plan: Plan, outputs: Path) -> str:
         state = "to train"
         if spec.run_id in plan.published:
             state = "has its result"
-        elif is_done(outputs / spec.run_id):
+        elif is_scored(outputs / spec.run_id):
             state = "finished"
         rows = plan.labels(spec.run_id) or [spec.label]
         same = f" ({len(rows)} rows that coincide share it)" if len(rows) > 1 else ""

@@ -37,7 +37,11 @@ def measure_latencies(
             for run_id in done
             if (outputs / run_id / "latency.json").is_file() or (run_id in results and results[run_id].latency)
         ]
-        for run_id in (timed or here[:1] or done[:1]) if every else here[:1] if not timed else ():
+        if every:
+            chosen = timed or here[:1] or done[:1]
+        else:
+            chosen = [] if timed else here[:1]
+        for run_id in chosen:
             trained = run_id in here
             folder = outputs / run_id if trained else outputs / "sweeps" / "latency" / run_id
             with file_lock(outputs / "sweeps" / ".latency.lock"):

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from src.errors import BusyError, ConfigError, DataError, DivergedError, InterruptedRunError
+from src.reliability.command import signal_name
 from src.sweep.plan import RunSpec
 from src.training.identity import key_of
 
@@ -157,8 +158,7 @@ def quoted(value: str) -> str:
 def explain(code: int, output: str) -> str:
     """Why a process failed, in a line: its last words that look like an error, and what the exit code means."""
     if code < 0:
-        name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-        return f"killed by {name}" + (" (out of memory?)" if code == -signal.SIGKILL else "")
+        return f"killed by {signal_name(-code)}" + (" (out of memory?)" if code == -signal.SIGKILL else "")
     lines = [line.strip() for line in re.split(r"[\r\n]+", output) if line.strip()]
     errors = [line for line in lines if _ERROR_LINE.match(line)]
     words = (errors or lines or ["it printed nothing"])[-1]

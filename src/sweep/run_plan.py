@@ -30,7 +30,7 @@ from src.sweep.latency_runs import measure_latencies
 from src.sweep.launcher import Launcher
 from src.sweep.plan import Plan, RunIdentity, join_overrides, split_machine
 from src.sweep.record_writer import RecordWriter
-from src.sweep.run_status import is_done
+from src.sweep.run_status import is_scored
 from src.sweep.runner import Runner
 from src.sweep.search import Search
 from src.sweep.sweep_study import FORMAT, SweepStudy, default_storage
@@ -133,7 +133,7 @@ def check_data_of_finished(plan: Plan, identify: Identifier, outputs: Path) -> N
         for spec in plan.specs.values()
         if any(key_of(override) == "data.root" for override in spec.machine)
         and spec.run_id not in plan.published
-        and is_done(outputs / spec.run_id)
+        and is_scored(outputs / spec.run_id)
     ]
     if not finished:
         return

@@ -14,7 +14,7 @@ LARGEST = 1e9
 """Of a score: a number beyond it, or one that is not finite, is damage."""
 
 
-def is_done(folder: Path) -> bool:
+def is_scored(folder: Path) -> bool:
     """Whether the run is finished and has a score."""
     return is_finished(folder) and read_score(folder, read_headline(folder)) is not None
 
@@ -51,7 +51,7 @@ def _find(node: Any, name: str) -> Any:
     return None
 
 
-def is_busy(folder: Path) -> bool:
+def is_locked(folder: Path) -> bool:
     """Whether a process is training in the folder (it holds `.lock`)."""
     try:
         with (folder / ".lock").open() as file:

@@ -26,7 +26,7 @@ from src.report.time_left import progress_line
 from src.sweep.launcher import ExitStatus, Launcher, StopRequest
 from src.sweep.plan import Plan, RunSpec
 from src.sweep.record_writer import RecordWriter
-from src.sweep.run_status import is_busy, read_headline, read_score
+from src.sweep.run_status import is_locked, read_headline, read_score
 from src.sweep.sweep_study import DatabaseError, SweepStudy, SweepTrial, TrialEndedError
 
 logger = logging.getLogger(__name__)
@@ -193,7 +193,10 @@ class Runner:
                 self.study.set_attr(trial, "reason", status.reason)
             raise TrialEndedError(status.reason)
         folder = self.outputs / spec.run_id
-        return read_score(folder, read_headline(folder)) or 0.0
+        score = read_score(folder, read_headline(folder))
+        if score is None:  # its files are gone since
+            raise TrialEndedError(f"{folder} holds no score")
+        return score
 
     def train(self, spec: RunSpec, worker: int, watch: Callable[[], bool] | None = None) -> ExitStatus | None:
         """Train one run, or wait for whoever trains it: None when it is done, else the exit status.
@@ -238,7 +241,7 @@ class Runner:
     def _wait_for_others(self, spec: RunSpec, folder: Path) -> None:
         """Wait while a process outside the study trains the run."""
         logged = False
-        while is_busy(folder) and not self.stop.requested:
+        while is_locked(folder) and not self.stop.requested:
             if not logged:
                 logger.info("%s: another process is training %s; waiting for it", name_of(spec), spec.run_id)
                 logged = True

@@ -91,7 +91,7 @@ class RunFolder:
             self._lock = None
 
     def check_held(self) -> None:
-        """Whether this is the folder that was opened.
+        """Make sure that this is still the folder that was opened.
 
         Raises FileNotFoundError while it is away, and CheckpointError when another process has made it anew.
         """

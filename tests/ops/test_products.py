@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from src.ops import products
-from src.ops.products import bfloat16_products, matmul, matmul_tn, multiplies_bfloat16, product_type, row_steps
+from src.ops.products import bfloat16_products, matmul, matmul_tn, product_type, row_steps
 
 
 @pytest.fixture(params=[False, True], ids=["torch", "oneDNN"])
@@ -80,6 +80,5 @@ def test_large_products_of_float32_take_bfloat16_in_its_context(monkeypatch):
         assert product_type(large, 64) == torch.float32
 
 
-def test_the_processor_is_asked():
-    assert isinstance(multiplies_bfloat16(), bool) and isinstance(products.prefers_onednn(), bool)
+def test_rows_are_padded_to_steps():
     assert [row_steps(rows) for rows in (0, 1, 256, 257)] == [0, 256, 256, 512]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import torch
@@ -15,7 +15,7 @@ from src.models.horizon3d.gaussian_encoder import RAW_ATTRIBUTES, GaussianBounds
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.views import CameraViews
 from src.ops.gather_cells import gather_cells
-from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians
+from src.ops.initial_gaussians import Attributes, Keypoints, Slots, initial_gaussians
 from src.ops.nms import maxpool_peaks
 from src.ops.segment_reduce import topk_per_sample
 from src.structures.gaussians import GaussianSet
@@ -219,8 +219,9 @@ class KGGI(nn.Module):
         keypoints = [
             Keypoints(means, valid, self._change(source.name.lower(), local)) for source, means, valid, local in found
         ]
-        past = None if history is None else tuple(getattr(history, field.name) for field in fields(history))
-        return GaussianSet(*initial_gaussians(slots, keypoints, past, self.centre_m, self.bounds, batch_size))
+        past = None if history is None else Attributes(**{name: getattr(history, name) for name in Attributes._fields})
+        made = initial_gaussians(slots, keypoints, past, self.centre_m, self.bounds, batch_size)
+        return GaussianSet(**made._asdict())
 
     def _change(
         self,

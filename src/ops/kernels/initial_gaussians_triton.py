@@ -29,7 +29,7 @@ def initial_gaussians_triton(
         return initial_gaussians_reference(slots, keypoints, history, centre_m, limits, batch_size)
     num, channels = len(values), slots.channels
     found = [one.valid.shape[1] for one in keypoints] or [0, 0]
-    kept = 0 if history is None else history[8].shape[1]
+    kept = 0 if history is None else history.valid.shape[1]
     size = (batch_size, num + kept)
     vectors, features = values.new_empty(4, *size, 2), values.new_empty(*size, channels)
     numbers, sources = values.new_empty(2, *size), slots.sources.new_empty(size)
@@ -38,8 +38,8 @@ def initial_gaussians_triton(
         # Where there is nothing to read any tensor stands for it.
         read = [x for one in keypoints for x in (*_rows(one.means), one.valid.contiguous().view(torch.uint8))]
         changes = [one.change for one in keypoints if one.change is not None]
-        past = [values] * 8 if history is None else [x.contiguous() for x in history[:8]]
-        past_valid = valid if history is None else history[8].contiguous().view(torch.uint8)
+        past = [values] * 8 if history is None else [x.contiguous() for x in history[:-1]]
+        past_valid = valid if history is None else history.valid.contiguous().view(torch.uint8)
         (low, high), unit = limits.scale_range_m, limits.velocity_unit_mps / limits.max_speed_mps
         with torch.cuda.device_of(values):
             _initialise[(valid.numel(),)](
@@ -56,7 +56,7 @@ def initial_gaussians_triton(
             )
     means, scales, directions, velocities = vectors.unbind(0)
     logits, ages = numbers.unbind(0)
-    return means, scales, directions, logits, velocities, features, sources, ages, valid.view(torch.bool)
+    return Attributes(means, scales, directions, logits, velocities, features, sources, ages, valid.view(torch.bool))
 
 
 def _rows(

@@ -17,7 +17,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.ops.distinct_keys import Groups
 from src.ops.gaussian_cells import gaussian_cells
 from src.ops.gaussian_shapes import AttributeLimits
-from src.ops.initial_gaussians import Keypoints, Slots
+from src.ops.initial_gaussians import Attributes, Keypoints, Slots
 from src.ops.kernel_maps import submanifold_map
 from src.ops.kernels import (
     add_layer_norm_triton,
@@ -174,7 +174,7 @@ def main():
     slots = Slots(torch.zeros(9, 135), torch.zeros(9).long(), torch.zeros(2, 2), torch.zeros(128))
     found = [Keypoints(torch.zeros(1, n, 2), torch.ones(1, n) > 0, torch.zeros(1, n, 135)) for n in (4, 3)]
     past = (*pairs, torch.zeros(1, 7), pairs[0], torch.zeros(1, 7, 128), torch.zeros(1, 7).long())
-    past = (*past, torch.zeros(1, 7), torch.ones(1, 7) > 0)
+    past = Attributes(*past, torch.zeros(1, 7), torch.ones(1, 7) > 0)
     for keypoints, history in ((found, past), ([], None)):
         initial_gaussians_triton.initial_gaussians_triton(slots, keypoints, history, torch.zeros(2), limits, 1)
     direction = torch.tensor([[1.0, 0.0]])

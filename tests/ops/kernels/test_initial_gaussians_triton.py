@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from src.ops.gaussian_shapes import AttributeLimits
-from src.ops.initial_gaussians import Keypoints, Slots, initial_gaussians, initial_gaussians_reference
+from src.ops.initial_gaussians import Attributes, Keypoints, Slots, initial_gaussians, initial_gaussians_reference
 
 LIMITS = AttributeLimits((0.2, 3.0), 4.0, 30.0, 10.0)
 
@@ -30,7 +30,7 @@ def test_gaussians_of_all_sources(device, channels, kept, found, learnt, changed
     if kept is not None:
         pairs, singles = [normal(2, kept, 2) for _ in range(4)], [normal(2, kept) for _ in range(2)]
         sources, features = torch.full((2, kept), 3), normal(2, kept, channels).bfloat16()
-        history = (*pairs[:3], singles[0], pairs[3], features, sources, singles[1], mask(2, kept))
+        history = Attributes(*pairs[:3], singles[0], pairs[3], features, sources, singles[1], mask(2, kept))
     centre = torch.tensor([1.0, -2.0])
     wanted = initial_gaussians_reference(slots, keypoints, history, centre, LIMITS, 2)
 
@@ -40,7 +40,7 @@ def test_gaussians_of_all_sources(device, channels, kept, found, learnt, changed
     result = initial_gaussians(
         Slots(*(placed(x) for x in (slots.values, slots.sources, slots.learnt_means, slots.history_shift))),
         [Keypoints(placed(one.means), placed(one.valid), placed(one.change)) for one in keypoints],
-        None if history is None else tuple(placed(x) for x in history),
+        None if history is None else Attributes(*(placed(x) for x in history)),
         placed(centre), LIMITS, 2,
     )  # fmt: skip
     for value, expected in zip(result, wanted, strict=True):
