@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import arange
+from src.models.horizon3d.anchor_embeddings import JoinedEmbeddings, MergedEmbeddings
 from src.models.horizon3d.cross_attention import RadarCrossAttention
 from src.models.horizon3d.temporal_attention import TemporalSelfAttention, attention_mask
 from src.models.layers.dense import Conv2d
@@ -19,11 +19,10 @@ from src.models.layers.doppler import Doppler
 from src.models.layers.feed_forward import attention_linear, linear_relu_norm
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.image_attention import ImageCrossAttention
-from src.models.layers.merging import LinearReLU, block_diagonal, joined_linear, with_relu
 from src.models.layers.norm import layer_norm
 from src.models.layers.sparse import SubmanifoldConv
 from src.models.layers.views import CameraViews
-from src.ops.add_layer_norm import add_layer_norm, relu_norm_columns
+from src.ops.add_layer_norm import add_layer_norm
 from src.ops.cell_keys import cell_keys
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.gaussian_shapes import AttributeLimits, activated_attributes, refined_attributes, sampling_points
@@ -60,7 +59,8 @@ class GaussianBounds(AttributeLimits):
 class AnchorEncoder(nn.Module):
     """Embed the attributes of each Gaussian: a sum of small MLPs, one per attribute, and one more on top.
 
-    Runs in float32: a position of 150 m has steps of half a metre in bfloat16.
+    Runs in float32: a position of 150 m has steps of half a metre in bfloat16. Training takes `joined`, inference
+    `merged`, both of which do the same with fewer launches.
     """
 
     full_precision_parts = static_parts = ("",)
@@ -103,69 +103,6 @@ class AnchorEncoder(nn.Module):
             if self.merged is None:
                 return self.output(sum(self.embed[name](value) for name, value in inputs.items()))
             return self.output(self.merged(torch.cat(list(inputs.values()), dim=-1)))
-
-
-@dataclass
-class JoinedEmbeddings:
-    """K `linear_relu_norm` of inputs side by side, for few launches: their weights, through which gradients pass."""
-
-    eps: float
-    first: tuple[Tensor, Tensor]  # [K * C, widths], [K * C]
-    inner: tuple[Tensor, Tensor]  # scale and shift of the first norm, [K, C] each
-    second: tuple[Tensor, Tensor]  # [K, C, C] in, out; [K, 1, C]
-    outer: tuple[Tensor, Tensor]  # scale and shift of the second norm, [K, 1, C] each
-
-    @classmethod
-    def of(cls, parts: Sequence[nn.Sequential]) -> JoinedEmbeddings:
-        """Of these networks, in the order of their inputs."""
-
-        def stacked(number: int, name: str) -> Tensor:
-            return torch.stack([getattr(part[number], name) for part in parts])
-
-        return cls(
-            parts[0][2].eps,
-            (torch.block_diag(*(part[0].weight for part in parts)), stacked(0, "bias").flatten()),
-            (stacked(2, "weight"), stacked(2, "bias")),
-            (stacked(3, "weight").transpose(1, 2), stacked(3, "bias")[:, None]),
-            (stacked(5, "weight")[:, None], stacked(5, "bias")[:, None]),
-        )
-
-    def __call__(
-        self,
-        x: Tensor,  # [B, G, widths]
-    ) -> Tensor:  # [B, G, C]
-        """Sum of what all make of their inputs."""
-        parts, _, channels = self.second[0].shape
-        hidden = F.linear(x.flatten(0, 1), *self.first).relu().view(-1, parts, channels)
-        hidden = torch.addcmul(self.inner[1], F.layer_norm(hidden, (channels,), eps=self.eps), self.inner[0])
-        hidden = torch.baddbmm(self.second[1], hidden.transpose(0, 1), self.second[0]).relu()  # [K, B * G, C]
-        hidden = torch.addcmul(self.outer[1], F.layer_norm(hidden, (channels,), eps=self.eps), self.outer[0])
-        return hidden.sum(0).view(*x.shape[:2], channels)
-
-
-class MergedEmbeddings(nn.Module):
-    """The sum of several `linear_relu_norm` of inputs side by side, through the linear layer and the ReLU behind it."""
-
-    def __init__(self, parts: Sequence[nn.Sequential], behind: nn.Linear) -> None:
-        super().__init__()
-        self.eps = parts[0][2].eps
-        self.first = with_relu(block_diagonal([part[0] for part in parts]))
-        # A norm's scale and shift go into the layer behind it.
-        weights = torch.stack([(part[3].weight * part[2].weight).t() for part in parts])  # [K, C, C]
-        biases = torch.stack([part[3].bias + part[3].weight @ part[2].bias for part in parts])
-        self.weights, self.biases = (nn.Parameter(x, requires_grad=False) for x in (weights, biases[:, None]))
-        bias = behind.bias + sum(behind.weight @ part[5].bias for part in parts)
-        self.behind = joined_linear(torch.cat([behind.weight * part[5].weight for part in parts], 1), bias, LinearReLU)
-
-    def forward(
-        self,
-        x: Tensor,  # [B, G, widths]
-    ) -> Tensor:  # [B, G, C]
-        """Products over all parts at once."""
-        parts, channels = self.weights.shape[:2]
-        hidden = F.layer_norm(self.first(x).view(-1, parts, channels), (channels,), eps=self.eps)
-        hidden = torch.baddbmm(self.biases, hidden.transpose(0, 1), self.weights)  # [K, B * G, C]
-        return self.behind(relu_norm_columns(hidden, self.eps).unflatten(0, x.shape[:2]))
 
 
 class SelfEncoding(nn.Module):
