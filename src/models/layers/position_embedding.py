@@ -32,15 +32,16 @@ class PositionEmbeddingConfig(DepthBinsConfig):
 
 
 class PositionEmbedding(nn.Module):
-    """MLP(logit(normalised D places of the pixel's ray)) (PETR, Sec. 3.2 and 3.3).
+    """MLP(normalised D places of the pixel's ray), their logits by default (PETR, Sec. 3.2 and 3.3).
 
     Runs in float32 also under autocast: places of 150 m would be rounded to half a metre.
     """
 
     full_precision_parts = ("",)
 
-    def __init__(self, config: PositionEmbeddingConfig, channels: int, grid: BEVGrid) -> None:
+    def __init__(self, config: PositionEmbeddingConfig, channels: int, grid: BEVGrid, logits: bool = True) -> None:
         super().__init__()
+        self.logits = logits
         (x, y), (half_x, half_y) = grid.centre_m, grid.half_extent_m
         low, high = config.z_range_m
         self.low, self.size = (x - half_x, y - half_y, low), (2 * half_x, 2 * half_y, high - low)
@@ -64,10 +65,11 @@ class PositionEmbedding(nn.Module):
         return torch.where(visible, seen, 0.0).sum(2)
 
     def embed(self, places: Tensor) -> Tensor:  # [..., D, 3] aug metres -> [..., C]
-        """The network on logits of normalised coordinates."""
+        """The network on normalised coordinates, or their logits."""
         with torch.autocast(places.device.type, enabled=False):
             low, size = constant((self.low, self.size), torch.float32, places.device)
-            return self.mlp(((places - low) / size).logit(EDGE).flatten(-2))
+            shares = (places - low) / size
+            return self.mlp((shares.logit(EDGE) if self.logits else shares).flatten(-2))
 
     def places(self, views: CameraViews) -> Tensor:  # [B, N, h, w, D, 3] aug metres
         """The places at every depth on the ray of each pixel of the finest level."""

@@ -71,7 +71,7 @@ class SequentialDecoder(nn.Module):
             token_layers(image_channels, channels),
         )
         self.plane = SinePositionEmbedding(channels, grid, coordinates=2)
-        self.perspective = PositionEmbedding(position, channels, grid)
+        self.perspective = PositionEmbedding(position, channels, grid, logits=False)
         places = torch.cartesian_prod(torch.arange(grid.rows), torch.arange(grid.cols))
         self.register_buffer("places_m", grid.centre_of(places), persistent=False)
         self.layers = nn.ModuleList(SequentialLayer(channels, config.num_heads) for _ in range(config.num_layers))

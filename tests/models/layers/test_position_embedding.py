@@ -13,9 +13,9 @@ from tests.models.frames import GRID, SIZE, make_batch
 DEPTHS, NEAR, FAR, LOW, HIGH = 5, 2.0, 32.0, -10.0, 10.0
 
 
-def embedding():
+def embedding(**options):
     config = PositionEmbeddingConfig(num_depth_bins=DEPTHS, depth_range_m=[NEAR, FAR], z_range_m=[LOW, HIGH])
-    return PositionEmbedding(config, 8, GRID)
+    return PositionEmbedding(config, 8, GRID, **options)
 
 
 def views_of(batch, stride=16):
@@ -39,15 +39,17 @@ def test_places_lie_on_the_pixels_ray_at_depths_that_grow_linearly_wider():
     torch.testing.assert_close(pixels[..., 1], rows[:, None, None].expand_as(pixels[..., 1]), atol=1e-2, rtol=1e-3)
 
 
-def test_the_network_reads_logits_of_coordinates_normalised_by_the_range():
-    part, views = embedding(), views_of(make_batch())
+@pytest.mark.parametrize("logits", [True, False])
+def test_the_network_reads_coordinates_normalised_by_the_range_or_their_logits(logits):
+    part, views = embedding(logits=logits), views_of(make_batch())
     x, y, z = part.places(views)[1, 2, 3, 4, 1].tolist()
     part.mlp = nn.Identity()
     found = part(views)[1, 2, 3, 4].view(DEPTHS, 3)[1].tolist()
     low, size = (2.0 - 0.8 * 64 / 2, -1.0 - 0.8 * 48 / 2, LOW), (0.8 * 64, 0.8 * 48, HIGH - LOW)
     for value, place, start, extent in zip(found, (x, y, z), low, size, strict=True):
-        share = min(max((place - start) / extent, EDGE), 1 - EDGE)
-        assert value == pytest.approx(math.log(share / (1 - share)), abs=1e-4)
+        share = (place - start) / extent
+        kept = min(max(share, EDGE), 1 - EDGE)
+        assert value == pytest.approx(math.log(kept / (1 - kept)) if logits else share, abs=1e-4)
 
 
 def test_a_missing_camera_has_a_finite_embedding():
