@@ -112,10 +112,11 @@ def run_plan(
         in_child=partial(die_with_parent, signal.SIGTERM),  # a killed runner leaves checkpoints, no orphans
         group=plan.study,
     )
-    parts = (plan, study, RecordWriter(plan, study, again, outputs, reports), launcher)
-    publish = partial(publish_result, reports=reports)
-    is_search = plan.sweep.is_search
-    runner = Search(*parts, publish, common=common, identify=identify) if is_search else Runner(*parts, publish)
+    writer, publish = RecordWriter(plan, study, again, outputs, reports), partial(publish_result, reports=reports)
+    if plan.sweep.is_search:
+        runner = Search(plan, study, writer, launcher, publish, common, identify)
+    else:
+        runner = Runner(plan, study, writer, launcher, publish)
     record = runner.run()
     if runner.stop.requested:
         print(progress_line(record, command.workers, time.time()))

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 import optuna
 from optuna.trial import Trial
 
 from src.errors import DivergedError, HorizonError
 from src.report.sweep_file import DimensionConfig
-from src.sweep.plan import Identify, RunSpec, join_overrides, run_specs_of, split_machine
+from src.sweep.launcher import Launcher
+from src.sweep.plan import Identify, Plan, RunSpec, join_overrides, run_specs_of, split_machine
+from src.sweep.record_writer import RecordWriter
 from src.sweep.run_status import read_score, read_validations
 from src.sweep.runner import Runner, name_of
 from src.sweep.sweep_study import SweepStudy, SweepTrial, TrialEndedError, trials_begun
@@ -26,8 +29,17 @@ STARTUP_TRIALS = 5
 class Search(Runner):
     """A runner whose runs are chosen by TPE and pruned by the median of the earlier runs' validations."""
 
-    def __init__(self, *runner: Any, common: list[str], identify: Identify) -> None:
-        super().__init__(*runner)
+    def __init__(
+        self,
+        plan: Plan,
+        study: SweepStudy,
+        writer: RecordWriter,
+        launcher: Launcher,
+        publish: Callable[[Path], object],
+        common: list[str],  # overrides of every run
+        identify: Identify,
+    ) -> None:
+        super().__init__(plan, study, writer, launcher, publish)
         self._common, self._identify = common, identify
         self.sweep = self.plan.sweep
 
