@@ -150,10 +150,7 @@ def run(
         return
 
     module.to(trainer.strategy.root_device)  # Lightning leaves it on the CPU
-    scores = module.evaluator.as_dict()
-    write_json(folder.metrics_json, scores)  # what took long is safe; run.json, the last file, marks the run finished
-    draw_pictures(config, module, datamodule, folder)
-    module.evaluator.write(folder.path, partial(save_submission, config))
+    scores = leave_scores(config, folder, module, datamodule)
     record = run_record(
         config,
         module,
@@ -173,6 +170,17 @@ def run(
     print_result(folder, record, scores)
     for tracked in [own for own in loggers if isinstance(own, WandbRun)]:
         print(f"W&B: {tracked.finish(scores, folder.pictures) or 'not complete, see the warning above'}")
+
+
+def leave_scores(
+    config: Config, folder: RunFolder, module: TrainingModule, datamodule: DetectionDataModule
+) -> dict[str, Any]:
+    """Write all but run.json, the last file, which marks a run finished: scores first, since they took long."""
+    scores = module.evaluator.as_dict()
+    write_json(folder.metrics_json, scores)
+    draw_pictures(config, module, datamodule, folder)
+    module.evaluator.write(folder.path, partial(save_submission, config))
+    return scores
 
 
 def draw_pictures(config: Config, module: TrainingModule, datamodule: DetectionDataModule, folder: RunFolder) -> None:
