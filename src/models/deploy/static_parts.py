@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -10,8 +12,28 @@ from torch import Tensor, nn
 from src.models.backbones.image import ImageEncoder
 from src.models.deploy.inference import declared_parts
 
+T = TypeVar("T")
 WARM_UP_RUNS = 3
 """Before a capture, so that libraries have chosen their kernels and taken their memory."""
+
+
+def capture_graph(step: Callable[[], T], restore: Callable[[], None] = lambda: None) -> tuple[torch.cuda.CUDAGraph, T]:
+    """What `step` launches as a CUDA graph, and its result, which every replay fills anew.
+
+    `step` runs a few times before; `restore` undoes what these runs have changed, also where one of them fails.
+    """
+    stream, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
+    stream.wait_stream(torch.cuda.current_stream())
+    try:
+        with torch.cuda.stream(stream):
+            for _ in range(WARM_UP_RUNS):
+                step()
+    finally:
+        torch.cuda.current_stream().wait_stream(stream)
+        restore()
+    with torch.cuda.graph(graph):
+        result = step()
+    return graph, result
 
 
 class ImageNetwork(nn.Module):
@@ -67,15 +89,7 @@ class GraphReplay(nn.Module):
 
     def _capture(self, x: Tensor) -> _Capture:
         static = x.clone()
-        stream = torch.cuda.Stream()
-        stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
-            for _ in range(WARM_UP_RUNS):
-                self.network(static)
-        torch.cuda.current_stream().wait_stream(stream)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
-            outputs = self.network(static)
+        graph, outputs = capture_graph(lambda: self.network(static))
         return _Capture(graph, static, outputs)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from src.models.deploy.static_parts import WARM_UP_RUNS
+from src.models.deploy.static_parts import capture_graph
 from src.models.detector import FixedForm
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
@@ -83,19 +83,12 @@ class WholeFrames:
     def _capture(self) -> None:
         """Record `_step`; the memory is afterwards as it was before."""
         before = [tensor.clone() for tensor in self._memory]
-        stream, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
-        stream.wait_stream(torch.cuda.current_stream())
-        try:
-            with torch.cuda.stream(stream):
-                for _ in range(WARM_UP_RUNS):
-                    self._step()
-        finally:
-            torch.cuda.current_stream().wait_stream(stream)
+
+        def restore() -> None:
             for kept, old in zip(self._memory, before, strict=True):
                 kept.copy_(old)
-        with torch.cuda.graph(graph):
-            result = self._step()
-        self._graph, self._result = graph, result
+
+        self._graph, self._result = capture_graph(self._step, restore)
 
 
 class PackedFrame:
