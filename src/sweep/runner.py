@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -44,19 +44,18 @@ MOST_INTERRUPTIONS = 3
 """A run that ends this often as if interrupted, while nobody stopped the sweep, has failed."""
 
 
+@dataclass(eq=False)
 class Runner:
     """One call of `python -m src.sweep` over a planned sweep; others may work on the same study."""
 
-    def __init__(
-        self,
-        plan: Plan,
-        study: SweepStudy,
-        writer: RecordWriter,
-        launcher: Launcher,
-        publish: Callable[[Path], object],
-    ) -> None:
-        self.plan, self.study, self.writer, self.launcher, self.publish = plan, study, writer, launcher, publish
-        self.outputs = writer.outputs
+    plan: Plan
+    study: SweepStudy
+    writer: RecordWriter
+    launcher: Launcher
+    publish: Callable[[Path], object]  # a finished run's folder
+
+    def __post_init__(self) -> None:
+        self.outputs = self.writer.outputs
         self.stop = StopRequest()
         self._published: set[str] = set()
         self._interruptions: Counter[str] = Counter()

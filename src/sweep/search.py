@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
@@ -13,9 +13,7 @@ from optuna.trial import Trial
 
 from src.errors import DivergedError, HorizonError
 from src.report.sweep_file import DimensionConfig
-from src.sweep.launcher import Launcher
-from src.sweep.plan import Identify, Plan, RunSpec, join_overrides, run_specs_of, split_machine
-from src.sweep.record_writer import RecordWriter
+from src.sweep.plan import Identify, RunSpec, join_overrides, run_specs_of, split_machine
 from src.sweep.run_status import read_score, read_validations
 from src.sweep.runner import Runner, name_of
 from src.sweep.sweep_study import SweepStudy, SweepTrial, TrialEndedError, trials_begun
@@ -26,21 +24,15 @@ STARTUP_TRIALS = 5
 """Complete runs before any is pruned or chosen by the model of the sampler."""
 
 
+@dataclass(eq=False)
 class Search(Runner):
     """A runner whose runs are chosen by TPE and pruned by the median of the earlier runs' validations."""
 
-    def __init__(
-        self,
-        plan: Plan,
-        study: SweepStudy,
-        writer: RecordWriter,
-        launcher: Launcher,
-        publish: Callable[[Path], object],
-        common: list[str],  # overrides of every run
-        identify: Identify,
-    ) -> None:
-        super().__init__(plan, study, writer, launcher, publish)
-        self._common, self._identify = common, identify
+    common: list[str]  # overrides of every run
+    identify: Identify
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self.sweep = self.plan.sweep
 
     def specs(self) -> list[RunSpec]:
@@ -91,10 +83,10 @@ class Search(Runner):
         """Draw the values and store the runs they resolve to; the lock is held."""
         chosen = [f"{key}={_draw(trial, key, space)}" for key, space in self.sweep.space.items()]
         seed = self.plan.seeds[0]
-        overrides = join_overrides(self.sweep.overrides, self._common, chosen, [f"seed={seed}"])
+        overrides = join_overrides(self.sweep.overrides, self.common, chosen, [f"seed={seed}"])
         label = f"trial {trial.user_attrs.get('first', trial.number)}"
         try:
-            specs = run_specs_of(overrides, seed, label, self._identify)
+            specs = run_specs_of(overrides, seed, label, self.identify)
         except HorizonError as error:
             specs = [RunSpec(f"invalid-{trial.number}", overrides, seed, label)]
             trial.set_user_attr("invalid", str(error))
@@ -108,7 +100,7 @@ class Search(Runner):
         if "invalid" in attrs:
             self._fail(trial, attrs["invalid"], conclusive=True)
         self._logging_errors(self.writer.write)
-        machine = split_machine(join_overrides(self.sweep.overrides, self._common))[1]
+        machine = split_machine(join_overrides(self.sweep.overrides, self.common))[1]
         *sources, spec = [RunSpec(**content, machine=machine) for content in attrs["run_specs"]]
         for source in sources:
             status = self.train(source, worker)
