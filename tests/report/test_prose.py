@@ -54,7 +54,7 @@ def scores_of(page: Path, label: str) -> dict[str, str]:
     for head, *rows in tables_of(page):
         across = head[0].startswith("metric")
         for row in zip(*[head, *rows], strict=True) if across else [head, *rows]:
-            if re.sub(r" \(\d+ seeds?\)", "", row[0]) == label:
+            if re.sub(r" \(\d+( of \d+)? seeds?[^)]*\)", "", row[0]) == label:
                 metrics = [other[0] for other in rows] if across else head[1:]
                 for metric, cell in zip(metrics, row[1:], strict=True):
                     scores.setdefault(metric.split(",")[0], cell.split("|")[-1].split("[")[0].strip())
