@@ -69,6 +69,12 @@ def test_the_first_screen_has_the_scores_of_the_pages():
         assert shown[label] == [known[column] for column in COLUMNS], label
 
 
+def test_the_first_screen_counts_the_claims_as_their_page_does():
+    page = (ROOT / "reports" / "README.md").read_text()
+    counts = re.search(r"shows \d+, does not show \d+, undecided \d+, not run \d+", page)[0]
+    assert counts in (ROOT / "README.md").read_text()
+
+
 def effects_of(text: str) -> set[tuple[str, ...]]:
     """Value, low and high of every `1.6 mAP [0.4, 2.7]`."""
     return {tuple(number.lstrip("+") for number in found) for found in EFFECT.findall(text.replace("\\", ""))}
