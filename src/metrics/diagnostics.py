@@ -14,12 +14,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import cells_in_boxes
 from src.geometry.box_distance import count_points_in_boxes, footprint_distances
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import EvaluationSet
-from src.structures.evidence import Evidence, SplattedCells
+from src.structures.evidence import Evidence
 from src.structures.gaussians import GaussianSet
 from src.structures.taxonomy import Source
 
@@ -52,6 +53,7 @@ class FrameDiagnosis:
 
     points: Array  # [k] int64, returns inside each box of all that the model reads, accumulated sweeps included
     occupied: Array | None  # [k] bool, an occupied cell lies inside the box
+    head: Array | None  # [k] bool, a cell that the head sees does
     covered: Array | None  # [k, 4] bool, a Gaussian of each `Source` covers it
     sums: dict[str, tuple[float, float]]  # total and count of each mean over Gaussians
 
@@ -64,11 +66,16 @@ def diagnose(
     """Compare what a batch's samples were made of with their annotations."""
     found = []
     for sample, boxes in enumerate(boxes.to(batch.device) for boxes in truth):
-        occupied = None if evidence.cells is None else _hold_occupied_cells(evidence.cells, sample, boxes)
-        covered, sums = None, {}
+        occupied = head = covered = None
+        sums: dict[str, tuple[float, float]] = {}
+        if evidence.cells is not None:
+            splatted = evidence.cells
+            occupied = _hold_cells(splatted.indices[splatted.occupied], splatted.grid, sample, boxes)
+        if evidence.head_cells is not None:
+            head = _hold_cells(evidence.head_cells.indices, evidence.head_cells.grid, sample, boxes)
         if evidence.gaussians is not None:
             covered, sums = _compare_gaussians(evidence.gaussians, sample, boxes)
-        found.append(FrameDiagnosis(count_returns(batch, sample, boxes), occupied, covered, sums))
+        found.append(FrameDiagnosis(count_returns(batch, sample, boxes), occupied, head, covered, sums))
     return found
 
 
@@ -81,8 +88,9 @@ def sums_by_sample(
     """Total and count of every measure in each sample; the measure is the ratio of their sums, see `ratios`.
 
     `hidden_recall`: share that is found, at whatever score, of the objects that hide but were seen before (`hidden`);
-    `occupied_share`: share of the objects with an occupied cell inside; `<source>_covers`, of history
-    `remembered_share`: that a Gaussian covers. Of all these only ground truth that counts.
+    `occupied_share`: share of the objects with an occupied cell inside; `head_share`: with a cell that the head sees,
+    those of the radar and of memory among them; `<source>_covers`, of history `remembered_share`: that a Gaussian
+    covers. Of all these only ground truth that counts.
     `<source>_gaussians`: how many a frame has; `<source>_near`: share of them near an object; `<source>_faint`: share
     below FAINT_OPACITY; `<source>_velocity_error`: m/s, of those inside a box that moves at FAST_MPS or faster, to its
     velocity, and `<source>_radial_error` what of it lies along the ray from the vehicle, which a radar measures; the
@@ -90,13 +98,14 @@ def sums_by_sample(
     """
     truth, num_samples = evaluation_set.ground_truth, len(evaluation_set.tokens)
     points = np.full(len(truth), UNKNOWN_POINTS)
-    occupied = np.full(len(truth), np.nan)  # 0 or 1, NaN where not known, as `covered`
+    occupied = np.full(len(truth), np.nan)  # 0 or 1, NaN where not known, as the next two
+    head = np.full(len(truth), np.nan)
     covered = np.full((len(truth), len(COVERS)), np.nan)
     of_gaussians: dict[str, Array] = {}
     for sample, diagnosis in diagnoses.items():
         rows = np.flatnonzero(truth.samples == sample)
         points[rows] = diagnosis.points
-        for column, values in ((occupied, diagnosis.occupied), (covered, diagnosis.covered)):
+        for column, values in ((occupied, diagnosis.occupied), (head, diagnosis.head), (covered, diagnosis.covered)):
             if values is not None:
                 column[rows] = values
         for name, sums in diagnosis.sums.items():
@@ -109,8 +118,9 @@ def sums_by_sample(
     sums: dict[str, Array] = {}
     if diagnoses:
         sums["hidden_recall"] = of_objects(found, hidden(points, evaluation_set))
-    if not np.isnan(occupied).all():
-        sums["occupied_share"] = of_objects(occupied == 1, ~np.isnan(occupied))
+    for name, held in (("occupied_share", occupied), ("head_share", head)):
+        if not np.isnan(held).all():
+            sums[name] = of_objects(held == 1, ~np.isnan(held))
     for source, name in COVERS.items():
         how_many = of_gaussians.get(f"{source.name.lower()}_gaussians")
         if how_many is not None and how_many[:, 0].any():
@@ -161,11 +171,16 @@ def count_returns(batch: FrameBatch, sample: int, boxes: Boxes3D) -> Array:  # [
     return counts.cpu().numpy()
 
 
-def _hold_occupied_cells(cells: SplattedCells, sample: int, boxes: Boxes3D) -> Array:  # [k] bool
-    row, col = cells.indices[cells.occupied & (cells.indices[:, 0] == sample), 1:].unbind(1)
-    box, cell, _ = cells_in_boxes(boxes.bev(), cells.grid)
+def _hold_cells(
+    indices: Tensor,  # [n, 3] int64 (sample, row, col)
+    grid: BEVGrid,
+    sample: int,
+    boxes: Boxes3D,
+) -> Array:  # [k] bool
+    row, col = indices[indices[:, 0] == sample, 1:].unbind(1)
+    box, cell, _ = cells_in_boxes(boxes.bev(), grid)
     held = torch.zeros(len(boxes), dtype=torch.bool, device=box.device)
-    held[box[torch.isin(cell, row * cells.grid.cols + col)]] = True
+    held[box[torch.isin(cell, row * grid.cols + col)]] = True
     return held.cpu().numpy()
 
 

@@ -13,6 +13,7 @@ MEASURES = {
     "moving_AP_normalized": "normalised AP of moving vehicles",
     "hidden_recall": "recall of hidden objects, seen before",
     "occupied_share": "objects with an occupied cell",
+    "head_share": "objects with a cell that the head sees",
     "radar_covers": "objects that radar Gaussians cover",
     "camera_covers": "objects that camera Gaussians cover",
     "random_covers": "objects that random Gaussians cover",

@@ -76,6 +76,7 @@ for _key, _words, *_rest in (
     ("moving_heading_error", "heading error of moving vehicles", "deg", 1.0, 2, False),
     ("hidden_recall", "recall of hidden objects", "%", 100.0, 1, True),
     ("occupied_share", "objects with an occupied cell", "%", 100.0, 1, True),
+    ("head_share", "objects with a cell that the head sees", "%", 100.0, 1, True),
     ("radar_covers", "objects that radar Gaussians cover", "%", 100.0, 1, True),
     ("camera_covers", "objects that camera Gaussians cover", "%", 100.0, 1, True),
     ("random_covers", "objects that random Gaussians cover", "%", 100.0, 1, True),

@@ -32,10 +32,19 @@ class SplattedCells:
 
 
 @dataclass
+class HeadCells:
+    """The cells that a sparse head sees; a box begins at one of them."""
+
+    grid: BEVGrid
+    indices: Tensor  # [n, 3] int64 (sample, row, col)
+
+
+@dataclass
 class Evidence:
     """Of a batch, the warped memory of its first sample; None for what a model does not have."""
 
     gaussians: GaussianSet | None = None  # refined, history among them
     cells: SplattedCells | None = None
+    head_cells: HeadCells | None = None
     warped_gaussians: WarpedPoints | None = None  # empty where nothing is remembered yet
     warped_cells: WarpedPoints | None = None  # empty where nothing is remembered yet

@@ -59,7 +59,7 @@ def problem():
     sums = {"radar_near": (1.0, 3), "history_gaussians": (5.0, 1)}
     diagnoses = {
         s: FrameDiagnosis(
-            *(rng.integers(0, high, size) for high, size in ((5, 40), (2, 40), (2, (40, 4)))),
+            *(rng.integers(0, high, size) for high, size in ((5, 40), (2, 40), (2, 40), (2, (40, 4)))),
             {k: (v[0] + s, v[1]) for k, v in sums.items()},
         )
         for s in range(18)

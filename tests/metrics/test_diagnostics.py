@@ -13,7 +13,7 @@ from src.metrics.diagnostics import FrameDiagnosis, diagnose, hidden, ratios, su
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
-from src.structures.evidence import Evidence, SplattedCells
+from src.structures.evidence import Evidence, HeadCells, SplattedCells
 from src.structures.gaussians import GaussianSet
 from src.structures.taxonomy import Source
 from tests.evaluation_sets import set_of
@@ -129,9 +129,11 @@ def test_padding_says_nothing_and_no_memory_has_no_share():
 def test_cells_and_points_in_boxes():
     indices = torch.tensor([[0, 10, 24], [0, 18, 15], [1, 1, 1]])  # (24.5 - 15, 0.5): in the fast car; (0.5, 8.5)
     cells = SplattedCells(GRID, indices, torch.ones(3), torch.tensor([True, False, True]))
+    seen = HeadCells(GRID, torch.tensor([[0, 18, 15], [0, 5, 5], [1, 10, 24]]))
     points = [(10, 0, 1), (12, 1, 1.5), (10, 0, 2), (0, 8, 1)]
-    (found,) = diagnose(Evidence(cells=cells), batch_of(points), [BOXES])
+    (found,) = diagnose(Evidence(cells=cells, head_cells=seen), batch_of(points), [BOXES])
     assert found.occupied.tolist() == [True, False, False], "the second is only reached, the third is another sample's"
+    assert found.head.tolist() == [False, True, False]
     assert found.points.tolist() == [2, 1, 0] and found.covered is None
 
 
@@ -194,8 +196,8 @@ def test_recall_of_hidden_objects_and_share_of_occupied_ones():
     # Frame 0: three returns in each of three objects; frame 1: none, and a cell in the first alone.
     points = np.full(3, 3)
     diagnoses = {
-        0: FrameDiagnosis(points, np.ones(3, bool), None, {}),
-        1: FrameDiagnosis(points - 3, np.array([True, False, False]), None, {}),
+        0: FrameDiagnosis(points, np.ones(3, bool), None, None, {}),
+        1: FrameDiagnosis(points - 3, np.array([True, False, False]), np.array([True, True, False]), None, {}),
     }
     truth = table_of(boxes_of(*[(0, 0, 1, 1, 0, 0, 0)] * 6), [0, 0, 0, 1, 1, 1])
     evaluation_set = set_of(truth, "ab", instances=np.array([0, 1, 2, 0, 1, 2]))
@@ -203,6 +205,7 @@ def test_recall_of_hidden_objects_and_share_of_occupied_ones():
     sums = sums_by_sample(diagnoses, evaluation_set, np.ones(6, bool), found)
     assert sums["hidden_recall"].tolist() == [[0, 0], [2, 3]]
     assert sums["occupied_share"].tolist() == [[3, 3], [1, 3]]
+    assert sums["head_share"].tolist() == [[0, 0], [2, 3]], "of frame 0 it is not known"
     kept = np.array([1, 1, 1, 1, 1, 0], bool)
     sums = sums_by_sample(diagnoses, evaluation_set, kept, found)
     assert measures_of(sums)["hidden_recall"] == 1.0 and sums["occupied_share"].tolist() == [[3, 3], [1, 2]]

@@ -38,7 +38,7 @@ def same(left, right):
 
 def diagnoses_of(evaluation_set, samples):
     counts = np.bincount(evaluation_set.ground_truth.samples, minlength=SAMPLES)
-    return {s: FrameDiagnosis(np.zeros(counts[s]), None, None, {"radar_near": (s, 10)}) for s in samples}
+    return {s: FrameDiagnosis(np.zeros(counts[s]), None, None, None, {"radar_near": (s, 10)}) for s in samples}
 
 
 def compute_as(rank, port, folder, evaluation_set, shards):

@@ -14,7 +14,7 @@ from src.models.horizon3d.kggi import KGGIOutput
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.layers.views import CameraViews
-from src.structures.evidence import Evidence, SplattedCells
+from src.structures.evidence import Evidence, HeadCells, SplattedCells
 from src.structures.sparse_bev import SparseBEV
 
 
@@ -30,9 +30,14 @@ class Horizon3DOutput:
     dptf: DPTFOutput | None  # warped memory and F_out; None in phase 1
     head: HeadOutput
 
+    @property
+    def head_bev(self) -> SparseBEV:
+        """F_out, in phase 1 F_fuse."""
+        return self.fused_bev if self.dptf is None else self.dptf.bev
+
     def evidence(self, config: Horizon3DConfig, grid: BEVGrid) -> Evidence:
-        """Refined Gaussians, the cells of their splat, and the warped memory."""
-        evidence = Evidence()
+        """Refined Gaussians, the cells of their splat and of the head, and the warped memory."""
+        evidence = Evidence(head_cells=HeadCells(grid, self.head_bev.indices))
         if self.ocsf is not None:
             cells = self.ocsf.splat.cells
             sample, cell = cells.support // (grid.rows * grid.cols), cells.support % (grid.rows * grid.cols)
@@ -64,7 +69,7 @@ class Horizon3DOutput:
             if self.dptf.cells is not None:
                 kept = self.dptf.cells.occupancy_logits.sigmoid() > config.dptf.bev_path.memory_threshold
                 values["remembered_cells"] = kept.sum() / frames
-                values["head_cells"] = len(self.dptf.bev) / frames
+                values["head_cells"] = len(self.head_bev) / frames
             if self.dptf.history is not None:
                 values["gaussians_history"] = self.dptf.history.valid.sum() / frames
         return values
