@@ -11,6 +11,7 @@ import difflib
 import math
 from dataclasses import dataclass
 from enum import Enum
+from functools import cache
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 from src.data.data_config import DataConfig
 from src.errors import CheckpointError, ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models import FAMILIES, read_phase_options
+from src.models import FAMILIES, phase_option_names, read_phase_options
 from src.models.backbones.image import ImageEncoderConfig
 from src.ops.precision import Precision
 from src.reliability.passwords import masked, shown_key
@@ -166,6 +167,11 @@ class Config:
         if self.phase.name not in PHASES:
             known = ", ".join(PHASES)
             raise ConfigError(f"phase.name={self.phase.name}: must be one of {known}; choose with phase=...")
+        fitting = [phase for phase in PHASES if _options_of(phase) == phase_option_names(self.model.name)]
+        if self.phase.name not in fitting:
+            raise ConfigError(
+                f"phase={self.phase.name} is no phase of model={self.model.name}; use phase={' or '.join(fitting)}"
+            )
         read_phase_options(self.model.name, self.phase.options)
         self.grid.build()
         if self.phase.temporal and not self.model.temporal_part:
@@ -192,6 +198,12 @@ class Config:
     def image_size_px(self) -> tuple[int, int] | None:
         """(height, width) of the images that the model uses, None for a model without."""
         return tuple(self.backbone.image_size_px) if "camera" in self.model.sensors else None
+
+
+@cache
+def _options_of(phase: str) -> set[str]:
+    """Keys of the phase's options, by its file."""
+    return set(OmegaConf.load(CONF / "phase" / f"{phase}.yaml").options)
 
 
 def _register() -> None:

@@ -270,6 +270,8 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["model=petr", "model.num_queries=0"], "model.num_queries=0"),
         (["phase=phase2", "phase.name=phase1"], "phase.name=phase1.*phase=\\.\\.\\."),
         (["phase.options.velocity_code_weight=-1"], "velocity_code_weight"),
+        (["model=lrs4fusion"], "phase=phase1 is no phase of model=lrs4fusion; use phase=lrs_detection or"),
+        (["phase=lrs_forecast"], "phase=lrs_forecast is no phase of model=horizon3d; use phase=phase1 or"),
         (["phase.options.velocity_code_weight=abc"], "phase.options.velocity_code_weight='abc': .*number"),
         (["phase.options.velocity_code_weight=null"], "phase.options.velocity_code_weight=None: .*number"),
         (["optim.final_lr_ratio=-1"], "final_lr_ratio"),

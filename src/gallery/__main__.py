@@ -79,23 +79,34 @@ def main(overrides: list[str]) -> None:
     config, _ = compose_config([override for override in overrides if key_of(override) != "runs"])
     refuse_options_of_others(config, "gallery")
     reports = Path(config.paths.reports)
+    folders = [finished_run(Path(config.paths.outputs), run) for run in runs]  # before a world is written for them
     make_writable(reports, "paths.reports")
     datamodule = build_datamodule(config, data_root(config, write=False))
-    gallery = Gallery(config, datamodule, {run: read_boxes(config, datamodule, run) for run in runs})
+    gallery = Gallery(config, datamodule, {folder.run_id: read_boxes(folder, datamodule) for folder in folders})
     said = [override for override in overrides if key_of(override) not in ("paths.outputs", "paths.reports")]
     print(f"written: {gallery.write(reports, shlex.join(['python', '-m', 'src.gallery', *said]))}")
 
 
-def read_boxes(config: Config, datamodule: DetectionDataModule, run_id: str) -> DetectionTable:
-    """What a finished run detects. Raises ConfigError when it is not there, DataError when its data are others."""
-    folder = RunFolder(Path(config.paths.outputs), run_id)
+def finished_run(outputs: Path, run_id: str) -> RunFolder:
+    """The folder of a run with boxes. Raises ConfigError when there is none."""
+    folder = RunFolder(outputs, run_id)
     if not folder.finished:
         raise ConfigError(f"runs={run_id}: {folder.path} holds no finished run; train it first")
-    data, _ = folder.read_result()
-    if data.get("data") != datamodule.identity():
+    if not (folder.path / "submission.json").is_file():
+        raise ConfigError(
+            f"runs={run_id}: {folder.path} has no submission.json: the run learns no boxes, or none reached the score "
+            "threshold; leave it out"
+        )
+    return folder
+
+
+def read_boxes(folder: RunFolder, datamodule: DetectionDataModule) -> DetectionTable:
+    """What a finished run detects. Raises DataError when its data are others."""
+    record, _ = folder.read_result()
+    if record.get("data") != datamodule.identity():
         raise DataError(
-            f"runs={run_id}: it was scored on {data.get('data')}, but this command reads {datamodule.identity()}; give "
-            "the scale and the data of the run"
+            f"runs={folder.run_id}: it was scored on {record.get('data')}, but this command reads "
+            f"{datamodule.identity()}; give the scale and the data of the run"
         )
     return load_submission(folder.path / "submission.json", datamodule.evaluation_set().tokens)
 

@@ -53,14 +53,20 @@ def build_model(
     return family(config, grid, backbone, read_phase_options(config.name, options))
 
 
+def phase_option_names(name: str) -> set[str]:
+    """Keys of `phase.options` that a family takes."""
+    _, family = FAMILIES[name]
+    return {field.name for field in dataclasses.fields(family.phase_options)}
+
+
 def read_phase_options(name: str, options: Mapping[str, Any]) -> Any:
     """`phase.options` as a family's own dataclass. Raises ConfigError for others than it takes, and of another type."""
     _, family = FAMILIES[name]
-    known = [field.name for field in dataclasses.fields(family.phase_options)]
-    if set(options) != set(known):
+    known = phase_option_names(name)
+    if set(options) != known:
         raise ConfigError(
             f"phase.options has {', '.join(sorted(options)) or 'nothing'}, but model={name} takes "
-            f"{', '.join(known) or 'nothing'}"
+            f"{', '.join(sorted(known)) or 'nothing'}"
         )
     try:
         return TypeAdapter(family.phase_options).validate_json(json.dumps(dict(options)), strict=True)

@@ -194,7 +194,10 @@ def _write_result(path: Path, content: dict[str, Any]) -> Path:
 
 def read_result(path: Path) -> RunResult:
     """Read one result. Raises DataError naming file, key, what was expected and found, and the remedy."""
-    remedy = "delete it and run python -m src.report, which writes it anew from the run's folder"
+    remedy = (
+        "restore it (git checkout), or delete it and run python -m src.report, which writes it anew where the run's "
+        "folder is"
+    )
     content = from_json(read_json(path, remedy))
     is_detection = not isinstance(content, dict) or content.get("task", DETECTION) == DETECTION
     fields = vars(read_as(ResultFile if is_detection else OtherResultFile, path, remedy))
@@ -298,7 +301,10 @@ def _read_config(path: Path) -> dict[str, Any]:
         json.dumps(content, allow_nan=False)  # a result holds it: no dates, and no number that is not finite
     except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError) as error:
         what = " ".join(str(error).split())
-        raise DataError(f"{path}: not a run's configuration ({type(error).__name__}: {what})") from error
+        raise DataError(
+            f"{path}: not a run's configuration ({type(error).__name__}: {what}); give the run's command again with "
+            "resume=restart, or remove its folder"
+        ) from error
     return content
 
 

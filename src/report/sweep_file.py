@@ -15,7 +15,7 @@ from pydantic import with_config
 from src.errors import ConfigError
 from src.report.json_format import CLOSED, Count, Many
 from src.report.metric_names import DETECTION, find_metric
-from src.training.identity import is_of, key_of
+from src.training.identity import OF_A_CALL, is_of, key_of
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """Of sweeps and tables: they are file names, parts of addresses and names of studies."""
@@ -159,6 +159,9 @@ class SweepConfig:
             given += itertools.chain(part.overrides, *part.scale_overrides.values())
         if any(key_of(override) == "seed" for override in given):
             raise ConfigError(f"{where}: seed=... is no part of a sweep; seed= and seeds= of its command say them")
+        of_a_call = [override for override in given if is_of(override, OF_A_CALL)]
+        if of_a_call:
+            raise ConfigError(f"{where}: {', '.join(of_a_call)} is of a single call, no setting of a run; leave it out")
         for row in self.rows:
             trains = [change for change in row.overrides if is_of(change, OF_TRAINING) or key_of(change) == "model"]
             if row.weights is not None and trains:

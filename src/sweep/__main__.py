@@ -33,6 +33,9 @@ def main(overrides: list[str]) -> None:
     plan = make_plan(sweep, common, seeds, identify)
     if command.published:
         plan = without_published(plan, read_results(reports, plan.scale)[0], command.workers > 0)
+    elif not command.workers and not sweep.is_search:  # what is finished here is published anew
+        elsewhere = [run for run in read_results(reports, plan.scale)[0] if not is_scored(outputs / run)]
+        plan = without_published(plan, elsewhere, training=False)
     if command.dry_run:
         print(describe(plan, outputs))
         return

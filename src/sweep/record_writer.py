@@ -9,6 +9,7 @@ from pathlib import Path
 
 from src.errors import DataError
 from src.reliability.passwords import masked
+from src.report.results import result_path
 from src.report.sweep_record import RunState, SweepRecord, read_record, record_path, write_record
 from src.sweep.plan import Plan, RunSpec
 from src.sweep.run_status import is_scored
@@ -23,7 +24,7 @@ class RecordWriter:
 
     def __init__(self, plan: Plan, study: SweepStudy, command: str, outputs: Path, reports: Path) -> None:
         self.plan, self.study, self.command, self.outputs = plan, study, command, outputs
-        self.path = record_path(reports, plan.sweep.name, plan.scale, plan.changes)
+        self.reports, self.path = reports, record_path(reports, plan.sweep.name, plan.scale, plan.changes)
         self._done: set[str] = set()
 
     def is_done(self, run_id: str) -> bool:
@@ -85,7 +86,10 @@ class RecordWriter:
         return state
 
     def _keep_earlier_seeds(self, record: SweepRecord, latest: dict[str | None, SweepTrial]) -> None:
-        """Keep trained seeds of an earlier command in the tables, where the rows are the same."""
+        """Keep trained seeds of an earlier command in the tables, where the rows are the same.
+
+        Trained are those that are finished here, and those of the earlier record whose result is in `reports`.
+        """
         try:
             earlier = read_record(self.path)
         except DataError:
@@ -111,7 +115,10 @@ class RecordWriter:
     def _current_state(self, known: RunState, latest: dict[str | None, SweepTrial]) -> RunState:
         """The present state of a run of an earlier record."""
         spec = RunSpec(known.run_id, known.overrides, known.seed, known.label, known.needs)
-        return self._state(spec, latest.get(known.run_id))
+        state = self._state(spec, latest.get(known.run_id))
+        if state.state == "waiting" and known.state == "done" and result_path(self.reports, known.run_id).is_file():
+            return known
+        return state
 
 
 def _settings(run: RunState) -> set[str]:

@@ -18,11 +18,11 @@ from typing import Any
 import torch
 
 from src.config import PHASES, Config, compose_config
-from src.errors import HorizonError, InterruptedRunError
+from src.errors import ConfigError, HorizonError, InterruptedRunError
 from src.reliability.passwords import masked
 from src.reliability.processes import die_with_parent
 from src.report.results import publish_result, read_results
-from src.report.sweep_record import SweepRecord
+from src.report.sweep_record import SweepRecord, read_records, suffix_of
 from src.report.table_builder import write_sweep_tables
 from src.report.time_left import progress_line
 from src.sweep.compose import SweepCommand
@@ -98,10 +98,12 @@ def run_plan(
 ) -> None:
     """Train what is missing, measure latencies, write and show the tables; `again` is the command that resumes it.
 
-    Raises InterruptedRunError when it was stopped, HorizonError when a run has failed.
+    Raises InterruptedRunError when it was stopped, HorizonError when a run has failed, ConfigError before anything is
+    trained for tables that are another sweep's.
     """
     make_writable(outputs / "sweeps", "paths.outputs")
     make_writable(reports / "sweeps", "paths.reports")
+    check_table_names(plan, reports)
     check_data_of_finished(plan, identify, outputs)
     study = SweepStudy(outputs, plan.study, command.storage or default_storage(outputs), definition(plan, common))
     launcher = Launcher(
@@ -125,6 +127,18 @@ def run_plan(
     if plan.sweep.latency and (command.workers or command.latency):
         missed = measure_latencies(record, outputs, reports, runner, command.latency)
     finish(record, runner, outputs, reports, again, missed if command.latency else [])
+
+
+def check_table_names(plan: Plan, reports: Path) -> None:
+    """Raises ConfigError where a table would replace one of another sweep."""
+    own = {table.name for table in plan.sweep.tables}
+    for record in read_records(reports, plan.scale)[0]:
+        same = own & {table.name for table in record.sweep.tables}
+        if same and record.name != plan.sweep.name and record.suffix == suffix_of(plan.changes):
+            raise ConfigError(
+                f"sweeps/{plan.sweep.name}.yaml: sweep {record.name} has tables of the same name, which it would "
+                f"replace: {', '.join(sorted(same))}; name them otherwise"
+            )
 
 
 def check_data_of_finished(plan: Plan, identify: Identifier, outputs: Path) -> None:

@@ -9,19 +9,13 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
+OF_A_CALL = ("paths", "resume", "checkpoint", "predictions", "out", "scene", "preview", "compare", "suite", "oracle")
+"""Keys of one call of a command: where it reads and writes, how it begins, and options of other commands."""
+
 OUTSIDE_IDENTITY = (
-    "paths",
+    *OF_A_CALL,
     "logger",
     "trainer",
-    "resume",
-    "checkpoint",
-    "predictions",
-    "out",
-    "scene",
-    "preview",
-    "compare",
-    "suite",
-    "oracle",
     "phase.train_missing",
     "data.num_workers",
     "data.root",

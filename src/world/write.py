@@ -72,6 +72,11 @@ def _check_stored(config: WorldConfig, root: Path) -> None:
 def _read_stored(root: Path) -> dict[str, object]:
     try:
         stored = json.loads((root / CONFIG_FILE).read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise DataError(
+            f"{root}: not a complete synthetic world: it has no {CONFIG_FILE}; for recorded data give data=truckscenes "
+            "(or data.world=null), for a new world a folder that does not exist yet"
+        ) from None
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(
             f"{root}: not a complete synthetic world ({CONFIG_FILE}: {error}); remove the folder or choose another"

@@ -59,6 +59,7 @@ def test_what_it_refuses(trained, tmp_path):
     (other / "run.json").write_text(json.dumps(record | {"data": record["data"] | {"root": "0123"}}))
     assert "runs=other: it was scored on" in refused(outputs, "runs=other", expect=4)
     (other / "run.json").write_text(json.dumps(record))
-    (other / "submission.json").unlink()
-    assert "submission.json" in refused(outputs, "runs=other", f"paths.reports={tmp_path}", expect=4)
+    (other / "submission.json").unlink()  # as a run without any box leaves none
+    said = refused(outputs, "runs=other", f"paths.reports={tmp_path}", expect=3)
+    assert "has no submission.json" in said and "leave it out" in said
     assert not list(tmp_path.glob("*.md"))

@@ -271,7 +271,9 @@ def test_and_with_its_result(published, change, message):
 )
 def test_a_result_that_is_not_one_is_named(published, change, message):
     damage(published, change)
-    with pytest.raises(DataError, match=rf"mini-a\.json: {message}.*; delete it and run python -m src\.report"):
+    with pytest.raises(
+        DataError, match=rf"mini-a\.json: {message}.*; restore it .* or delete it and run python -m src\.report"
+    ):
         read_result(published)
 
 
@@ -304,7 +306,7 @@ def test_a_file_beyond_every_real_one_is_not_parsed(published, monkeypatch):
 
 def test_millions_of_wrong_values_are_counted_and_not_listed(published):
     damage(published, lambda c: c.update(versions=dict.fromkeys(map(str, range(10_000)), 0)))
-    with pytest.raises(DataError, match=r"mini-a\.json: 10000 values are wrong; delete it"):
+    with pytest.raises(DataError, match=r"mini-a\.json: 10000 values are wrong; restore it .* or delete it"):
         read_result(published)
     damage(published, lambda c: c.update(versions={}, overrides=[0] * 10_000))
     with pytest.raises(DataError, match=r"mini-a\.json: overrides\.0 must be a valid string"):

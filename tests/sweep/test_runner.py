@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from src.errors import ConfigError
+from src.report.results import result_path
 from src.report.sweep_file import TableConfig
 from src.report.sweep_record import read_record, record_path, write_record
 from src.sweep.launcher import ExitStatus
@@ -165,6 +167,19 @@ def test_rows_and_seeds_extend_a_sweep_and_earlier_seeds_stay(tmp_path):
     rows["b"] = ["model.x=4"]  # another definition: only what it says
     changed = make_runner(tmp_path, make_sweep(rows)).run()
     assert changed.seeds == [0] and len(changed.runs) == 3
+
+
+def test_earlier_seeds_that_were_trained_elsewhere_stay_by_their_results(tmp_path):
+    sweep = make_sweep({"a": ["model.x=1"]})
+    before = make_runner(tmp_path, sweep, seeds=(0, 1, 2)).run()
+    shutil.rmtree(tmp_path / "outputs")
+    for seed in (0, 1):  # the result of seed 2 is gone
+        path = result_path(tmp_path / "reports", before.rows["a"][seed])
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("{}")
+    record = make_runner(tmp_path, sweep, seeds=(3,)).run()
+    assert record.rows == {"a": {3: record.rows["a"][3], **{seed: before.rows["a"][seed] for seed in (0, 1)}}}
+    assert record.count("done") == 3 and record.seeds == [0, 1, 3]
 
 
 def test_another_command_line_is_another_sweep_beside_the_first(tmp_path):

@@ -189,6 +189,8 @@ def test_results_of_other_machines_are_given_a_latency_of_fresh_weights(sweeps, 
     assert "fresh weights" not in capsys.readouterr().out
     before = again
     shutil.rmtree(tmp_path / "outputs")
+    sweep.main([*words, "workers=0"])
+    assert "1 of 1 done" in capsys.readouterr().out, "its result lies in reports"
     sweep.main([*words, "published=true", "workers=0"])
     assert json.loads(path.read_text()) == before and "fresh weights" not in capsys.readouterr().out
     sweep.main([*words, "published=true", "workers=0", "latency=true"])
@@ -240,3 +242,14 @@ def test_a_real_sweep_ends_with_its_table_and_goes_on_from_there(sweeps, places,
     said = str(caught.value)
     assert "damaged, seed 0" in said and "damaged.ckpt is truncated" in said and caught.value.exit_code == 1
     assert "damaged" in (tmp_path / "reports" / "tables" / f"{record.stem}.md").read_text()
+
+
+def test_a_table_of_another_sweep_is_not_replaced(sweeps, places, tmp_path):
+    content = "title: t\nquestion: q\ntables: [{name: same, title: T, columns: [mAP]}]\nrows: [{label: a}]\n"
+    for name in ("first", "second"):
+        (sweeps / f"{name}.yaml").write_text(content)
+    sweep.main(["+sweep=first", "scale=debug", "workers=0", *places])
+    before = {path.name: path.read_bytes() for path in (tmp_path / "reports").rglob("*.*") if path.is_file()}
+    with pytest.raises(ConfigError, match=r"sweeps/second.yaml: sweep first has tables of the same name.*: same"):
+        sweep.main(["+sweep=second", "scale=debug", "workers=0", *places])
+    assert before == {path.name: path.read_bytes() for path in (tmp_path / "reports").rglob("*.*") if path.is_file()}

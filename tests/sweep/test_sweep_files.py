@@ -346,6 +346,8 @@ def test_what_the_mistakes_are_made_from_is_right(written):
         (GOOD | {"rows": [{"label": "a", "scales": ["paper"]}]}, "baseline 'a' must be for every scale"),
         (GOOD | {"tables": [{"name": "t", "title": "T", "columns": ["mAP"], "rows": ["z"]}]}, "t: there is no row z"),
         (GOOD | {"tables": GOOD["tables"] * 2}, r"two tables have one name \(t, t\)"),
+        (GOOD | {"overrides": ["paths.outputs=/tmp/x"]}, "paths.outputs=/tmp/x is of a single call"),
+        (GOOD | {"rows": [{"label": "a", "overrides": ["checkpoint=x"]}]}, "checkpoint=x is of a single call"),
         (GOOD | {"rows": []}, "either rows or space"),
         (SPACE | {"rows": GOOD["rows"]}, "either rows or space"),
         (SPACE | {"space": {"optim.lr": {"low": 1e-3, "high": 1e-4}}}, "space, optim.lr: low must be below high"),
