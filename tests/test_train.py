@@ -99,6 +99,13 @@ def test_a_killed_run_does_not_resume_on_other_data(outputs, worlds, tmp_path):
     assert "resuming from" in train(outputs, moved).stderr
 
 
+def test_a_recording_whose_only_sensor_saw_nothing_teaches_nothing(tmp_path):
+    config, _ = compose_config(["scale=debug", *WORLD, "data.world.lidar=false"])  # its LiDAR key frames hold no point
+    ensure_world(config.data.world, tmp_path / "dark", progress=False)
+    said = train(tmp_path / "outputs", tmp_path / "dark", expect=DataError.exit_code).stderr
+    assert "DataError: the loss of the whole epoch is 0" in said and "reads lidar" in said
+
+
 def test_what_starts_from_a_checkpoint_needs_no_pretrained_file(worlds, tmp_path):
     """Neither a run that resumes nor the phase after it."""
     weights = tmp_path / "resnet50.pth"

@@ -9,6 +9,7 @@ import lightning as L
 import torch
 from torch import Tensor, nn
 
+from src.errors import DataError
 from src.models.detector import Detector, Objective
 from src.reliability.nonfinite import StepGuard, finite_everywhere, gradient_norm, step_seed
 from src.reliability.processes import gather_by_rank, running_statistics, several_processes
@@ -135,8 +136,15 @@ class TrainingModule(L.LightningModule):
         """Drop what a skipped step has left to be remembered."""
 
     def on_train_epoch_end(self) -> None:
-        """Log the epoch's means over all ranks and frames."""
-        for name, value in self.means.compute().items():
+        """Log the epoch's means over all ranks and frames. Raises DataError for an epoch that taught nothing."""
+        means = self.means.compute()
+        if means.get("loss/total") == 0:
+            sensors = " and ".join(sorted(self.model.config.sensors))
+            raise DataError(
+                f"the loss of the whole epoch is 0: no frame held anything to learn from. The model reads {sensors}; "
+                "are there points in the files of data.root?"
+            )
+        for name, value in means.items():
             self.log(name, value)
         self.log("lr", self.trainer.optimizers[0].param_groups[0]["lr"])
 
