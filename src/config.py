@@ -337,7 +337,8 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
         schema.model = OmegaConf.structured(FAMILIES[model][0])
         return build_config(OmegaConf.merge(schema, {"trainer": fresh.trainer}, tree))
     except (OmegaConfBaseException, ConfigError, OverflowError) as error:  # the last: a whole number beyond every float
-        raise CheckpointError(f"the checkpoint's configuration does not fit this code: {error}") from None
+        changed = "".join(f" with {masked(override)}" for override in overrides)
+        raise CheckpointError(f"the checkpoint's configuration{changed} does not fit this code: {error}") from None
 
 
 def hydra_message(error: Exception, known: list[str] | None = None) -> str:

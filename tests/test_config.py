@@ -479,3 +479,9 @@ def test_an_option_that_a_command_would_ignore_is_refused(command, option, users
     with pytest.raises(ConfigError, match=rf"{option}: an option of python -m src.{users}.*; leave it out"):
         refuse_options_of_others(config, command)
     refuse_options_of_others(compose_config(["scale=debug"])[0], command)
+
+
+def test_an_override_that_does_not_fit_a_checkpoint_is_named():
+    _, tree = compose_config(["model=centerpoint", "scale=debug", "data.world.lidar=true"])
+    with pytest.raises(CheckpointError, match="configuration with data.world.lidar=false does not fit .*reads LiDAR"):
+        restore_config(tree, ["data.world.lidar=false"])
