@@ -167,11 +167,7 @@ class Config:
         if self.phase.name not in PHASES:
             known = ", ".join(PHASES)
             raise ConfigError(f"phase.name={self.phase.name}: must be one of {known}; choose with phase=...")
-        fitting = [phase for phase in PHASES if _options_of(phase) == phase_option_names(self.model.name)]
-        if self.phase.name not in fitting:
-            raise ConfigError(
-                f"phase={self.phase.name} is no phase of model={self.model.name}; use phase={' or '.join(fitting)}"
-            )
+        check_phase(self.model.name, self.phase.name)
         read_phase_options(self.model.name, self.phase.options)
         self.grid.build()
         if self.phase.temporal and not self.model.temporal_part:
@@ -198,6 +194,13 @@ class Config:
     def image_size_px(self) -> tuple[int, int] | None:
         """(height, width) of the images that the model uses, None for a model without."""
         return tuple(self.backbone.image_size_px) if "camera" in self.model.sensors else None
+
+
+def check_phase(model: str, phase: str) -> None:
+    """Raises ConfigError for a phase of another kind of model; both names are known ones."""
+    fitting = [name for name in PHASES if _options_of(name) == phase_option_names(model)]
+    if phase not in fitting:
+        raise ConfigError(f"phase={phase} is no phase of model={model}; use phase={' or '.join(fitting)}")
 
 
 @cache
@@ -256,12 +259,22 @@ def _compose(overrides: list[str]) -> DictConfig:
                 OmegaConf.update(tree.model, switch, False)
         return tree
     except (HydraException, OmegaConfBaseException, OverflowError) as error:  # the last: beyond every float
+        chosen = _choices(overrides)
+        if chosen["model"] in FAMILIES and chosen["phase"] in PHASES:
+            check_phase(chosen["model"], chosen["phase"])  # what a phase sets at a scale another model may not have
         raise ConfigError(hydra_message(error)) from error
     except (ValueError, AssertionError) as error:  # Hydra's own words for these name neither the key nor the remedy
         raise ConfigError(
             f"{' '.join(overrides)}: a choice of conf/ ({', '.join(GROUPS)}) needs one of its names, and a key below a "
             f"part that is null needs the part first, as in logger=wandb logger.wandb.project=... ({error})"
         ) from error
+
+
+def _choices(overrides: list[str]) -> dict[str, str]:
+    """Name by group, as conf/config.yaml and the command line choose them."""
+    defaults = OmegaConf.to_container(OmegaConf.load(CONF / "config.yaml").defaults, resolve=False)
+    chosen = {group: name for entry in defaults if isinstance(entry, dict) for group, name in entry.items()}
+    return chosen | {key_of(override): override.partition("=")[2] for override in overrides}
 
 
 def _refuse_hidden(override: str) -> None:
