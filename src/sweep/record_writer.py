@@ -122,5 +122,5 @@ class RecordWriter:
 
 
 def _settings(run: RunState) -> set[str]:
-    """Overrides of a run without its seed; all are of one scale."""
-    return {override for override in run.overrides if not is_of(override, ("seed", "scale"))}
+    """Overrides of a run without what differs by seed: the seed, and the run whose weights it scores."""
+    return {o for o in run.overrides if not is_of(o, ("seed", "scale")) and o != f"phase.init_from={run.needs}"}

@@ -182,6 +182,14 @@ def test_earlier_seeds_that_were_trained_elsewhere_stay_by_their_results(tmp_pat
     assert record.count("done") == 3 and record.seeds == [0, 1, 3]
 
 
+def test_earlier_seeds_of_a_row_that_scores_weights_stay(tmp_path):
+    sweep = make_sweep({"a": ["model.x=1"], "scored": ["model.x=2"]})
+    sweep.rows[1].weights = "a"
+    make_runner(tmp_path, sweep, seeds=(0, 1)).run()
+    record = make_runner(tmp_path, sweep, seeds=(0,)).run()
+    assert sorted(record.rows["scored"]) == [0, 1] and record.count("done") == 4
+
+
 def test_another_command_line_is_another_sweep_beside_the_first(tmp_path):
     sweep = make_sweep({"a": ["model.x=1"]})
     plain = make_runner(tmp_path, sweep).run()
