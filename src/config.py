@@ -167,7 +167,6 @@ class Config:
         if self.phase.name not in PHASES:
             known = ", ".join(PHASES)
             raise ConfigError(f"phase.name={self.phase.name}: must be one of {known}; choose with phase=...")
-        check_phase(self.model.name, self.phase.name)
         read_phase_options(self.model.name, self.phase.options)
         self.grid.build()
         if self.phase.temporal and not self.model.temporal_part:
@@ -194,19 +193,6 @@ class Config:
     def image_size_px(self) -> tuple[int, int] | None:
         """(height, width) of the images that the model uses, None for a model without."""
         return tuple(self.backbone.image_size_px) if "camera" in self.model.sensors else None
-
-
-def check_phase(model: str, phase: str) -> None:
-    """Raises ConfigError for a phase of another kind of model; both names are known ones."""
-    fitting = [name for name in PHASES if _options_of(name) == phase_option_names(model)]
-    if phase not in fitting:
-        raise ConfigError(f"phase={phase} is no phase of model={model}; use phase={' or '.join(fitting)}")
-
-
-@cache
-def _options_of(phase: str) -> set[str]:
-    """Keys of the phase's options, by its file."""
-    return set(OmegaConf.load(CONF / "phase" / f"{phase}.yaml").options)
 
 
 def _register() -> None:
@@ -247,6 +233,7 @@ def _compose(overrides: list[str]) -> DictConfig:
         _refuse_hidden(override)
         if override.startswith("phase.name="):
             raise ConfigError(f"{override}: runs are told apart by this name; choose a phase with phase=...")
+    _check_phase(overrides)
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             tree = compose("config", overrides=overrides)
@@ -259,9 +246,6 @@ def _compose(overrides: list[str]) -> DictConfig:
                 OmegaConf.update(tree.model, switch, False)
         return tree
     except (HydraException, OmegaConfBaseException, OverflowError) as error:  # the last: beyond every float
-        chosen = _choices(overrides)
-        if chosen["model"] in FAMILIES and chosen["phase"] in PHASES:
-            check_phase(chosen["model"], chosen["phase"])  # what a phase sets at a scale another model may not have
         raise ConfigError(hydra_message(error)) from error
     except (ValueError, AssertionError) as error:  # Hydra's own words for these name neither the key nor the remedy
         raise ConfigError(
@@ -270,11 +254,27 @@ def _compose(overrides: list[str]) -> DictConfig:
         ) from error
 
 
-def _choices(overrides: list[str]) -> dict[str, str]:
-    """Name by group, as conf/config.yaml and the command line choose them."""
+def _check_phase(overrides: list[str]) -> None:
+    """Raises ConfigError for a phase of another model, before what it sets at a scale is missed in this one."""
+    chosen = _default_choices() | {key_of(override): override.partition("=")[2] for override in overrides}
+    model, phase = chosen["model"], chosen["phase"]
+    if model in FAMILIES and phase in PHASES:
+        fitting = [name for name in PHASES if _options_of(name) == phase_option_names(model)]
+        if phase not in fitting:
+            raise ConfigError(f"phase={phase} is no phase of model={model}; use phase={' or '.join(fitting)}")
+
+
+@cache
+def _default_choices() -> dict[str, str]:
+    """Name by group, by conf/config.yaml."""
     defaults = OmegaConf.to_container(OmegaConf.load(CONF / "config.yaml").defaults, resolve=False)
-    chosen = {group: name for entry in defaults if isinstance(entry, dict) for group, name in entry.items()}
-    return chosen | {key_of(override): override.partition("=")[2] for override in overrides}
+    return {group: name for entry in defaults if isinstance(entry, dict) for group, name in entry.items()}
+
+
+@cache
+def _options_of(phase: str) -> set[str]:
+    """Keys of the phase's options, by its file."""
+    return set(OmegaConf.load(CONF / "phase" / f"{phase}.yaml").options)
 
 
 def _refuse_hidden(override: str) -> None:
