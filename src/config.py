@@ -6,9 +6,6 @@ import it: everything below receives plain values or its own small dataclass.
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
-import math
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
@@ -29,6 +26,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models import FAMILIES, phase_option_names, read_phase_options
 from src.models.backbones.image import ImageEncoderConfig
 from src.ops.precision import Precision
+from src.reliability.config_faults import check_tree, hydra_message
 from src.reliability.passwords import masked, shown_key
 from src.reliability.untrusted import fault_of_tree
 from src.training.identity import YOUNGER_KEYS, key_of
@@ -61,19 +59,8 @@ FILES_AND_NAMES = (
     *("paths.outputs", "paths.reports"),
 )
 """What a shell variable that is not set leaves empty."""
-
-# Lines of Hydra's messages that tell a user nothing, or to do what is refused here (`+key`).
-HYDRA_INTERNALS = (
-    "full_key:",
-    "object_type=",
-    "reference_type=",
-    "schema_",
-    "Config search path",
-    "provider=",
-    "To append to your",
-    "See https",
-    "3. To sweep",
-)
+NO_DATA = "none"
+"""Root of recorded data in a command that reads none."""
 
 
 @dataclass(kw_only=True)
@@ -212,13 +199,18 @@ def refuse_options_of_others(config: Config, command: str) -> None:
             raise ConfigError(f"{option}={said}: an option of {names}; leave it out")
 
 
-def compose_config(overrides: list[str]) -> tuple[Config, dict[str, Any]]:
+def compose_config(
+    overrides: list[str],
+    reads_data: bool = True,  # else data.root may be missing
+) -> tuple[Config, dict[str, Any]]:
     """Compose conf/ with command-line overrides into checked dataclasses.
 
     Returns the configuration and the same as a plain tree (what a checkpoint and `config.yaml` keep).
     Raises ConfigError naming the key for anything unknown, mistyped, missing or impossible.
     """
     tree = _compose(overrides)
+    if not reads_data and OmegaConf.is_missing(tree.data, "root"):
+        tree.data.root = NO_DATA
     return build_config(tree), OmegaConf.to_container(tree, resolve=True, enum_to_str=True)
 
 
@@ -231,6 +223,9 @@ def _compose(overrides: list[str]) -> DictConfig:
         if override.startswith("~"):
             raise ConfigError(f"{override}: keys cannot be removed; a part is switched off with {override[1:]}=null")
         _refuse_hidden(override)
+        group, _, name = override.partition("=")
+        if group in GROUPS and name.startswith("["):
+            raise ConfigError(f"{override}: {group} is one file of conf/{group}/, not a list of them")
         if override.startswith("phase.name="):
             raise ConfigError(f"{override}: runs are told apart by this name; choose a phase with phase=...")
     _check_phase(overrides)
@@ -246,7 +241,7 @@ def _compose(overrides: list[str]) -> DictConfig:
                 OmegaConf.update(tree.model, switch, False)
         return tree
     except (HydraException, OmegaConfBaseException, OverflowError) as error:  # the last: beyond every float
-        raise ConfigError(hydra_message(error)) from error
+        raise ConfigError(hydra_message(error, _known_keys)) from error
     except (ValueError, AssertionError) as error:  # Hydra's own words for these name neither the key nor the remedy
         raise ConfigError(
             f"{' '.join(overrides)}: a choice of conf/ ({', '.join(GROUPS)}) needs one of its names, and a key below a "
@@ -301,8 +296,8 @@ def build_config(tree: DictConfig) -> Config:
             raise ConfigError(f"{min(missing)} has no value; give {min(missing)}=... on the command line")
         config = OmegaConf.to_object(tree)
     except OmegaConfBaseException as error:
-        raise ConfigError(hydra_message(error)) from error
-    _check_tree(config, tree, "")
+        raise ConfigError(hydra_message(error, _known_keys)) from error
+    check_tree(config, tree)
     return config
 
 
@@ -354,26 +349,6 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
         raise CheckpointError(f"the checkpoint's configuration{changed} does not fit this code: {error}") from None
 
 
-def hydra_message(error: Exception, known: list[str] | None = None) -> str:
-    """Hydra's message in one paragraph, with the nearest key there is, of `known` or of a run's configuration."""
-    cause = error.__cause__
-    lines = [line.strip() for line in [*str(error).splitlines(), *str(cause or "").splitlines()]]
-    lines = [line for line in dict.fromkeys(lines) if line.strip("^") and not line.startswith(HYDRA_INTERNALS)]
-    text = " | ".join(lines)
-    if "/override_grammar/" in str(error):
-        text += (
-            " | options are key=value; a value with characters like = , ~ { or a blank is quoted twice, "
-            """key='"value"', and ~ is written as $HOME"""
-        )
-    unknown = getattr(cause or error, "full_key", None)
-    if unknown:
-        known = _known_keys() if known is None else known
-        near = difflib.get_close_matches(str(unknown), known, n=1, cutoff=0.6) if str(unknown) not in known else []
-        if near:
-            text += f" | did you mean {near[0]}?"
-    return text
-
-
 def _known_keys() -> list[str]:
     """Every key of the default tree, dotted."""
     _register()
@@ -387,24 +362,3 @@ def _known_keys() -> list[str]:
         return ([prefix] if prefix else []) + inner
 
     return walk(OmegaConf.to_container(tree, resolve=False), "")
-
-
-def _check_tree(value: Any, node: Any, path: str) -> None:
-    """Refuse what OmegaConf lets pass: keys added with `+` and numbers that are not finite."""
-    if dataclasses.is_dataclass(value):
-        known = [f.name for f in dataclasses.fields(value)]
-        for key in node:
-            name = f"{path}.{key}" if path else str(key)
-            if key not in known:
-                near = difflib.get_close_matches(str(key), known, n=1)
-                hint = f"; did you mean {near[0]}?" if near else f"; known here: {', '.join(known)}"
-                raise ConfigError(f"{name} is not a configuration key{hint}")
-            _check_tree(getattr(value, key), node[key], name)
-    elif isinstance(value, list):
-        for index, item in enumerate(value):
-            _check_tree(item, node[index], f"{path}[{index}]")
-    elif isinstance(value, dict):
-        for key, item in value.items():
-            _check_tree(item, node[key], f"{path}.{key}")
-    elif isinstance(value, float) and not math.isfinite(value):
-        raise ConfigError(f"{path} must be a finite number, but got {value}")

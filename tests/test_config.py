@@ -294,6 +294,8 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["data.stream_sets=0"], "stream_sets"),
         (["data.past_frames=-1"], "past_frames"),
         (["phase.init_from="], "phase.init_from is empty"),
+        (["scale=[debug,mini]"], r"scale=\[debug,mini\]: scale is one file of conf/scale/"),
+        (["model=[]"], r"model=\[\]: model is one file of conf/model/"),
     ],
 )
 def test_mistakes_are_named(overrides, message):

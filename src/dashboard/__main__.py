@@ -28,6 +28,8 @@ def main(arguments: list[str]) -> None:
     options = read_options(arguments)
     reports, outputs = Path(options["paths.reports"]), Path(options["paths.outputs"])
     if options["export"]:
+        if not (reports.is_dir() or outputs.is_dir()):
+            raise ConfigError(f"paths.reports={reports}, paths.outputs={outputs}: neither folder is there to export")
         start, path = time.perf_counter(), Path(options["export"])
         try:
             export_dashboard(reports, outputs, path)

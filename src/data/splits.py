@@ -27,6 +27,8 @@ def split_samples(index: DatasetIndex, split: str) -> np.ndarray:  # [n] int64
     if split not in splits:
         raise DataError(f"split {split!r}: {source} has the splits {sorted(splits)} for {index.version}")
     names = set(splits[split])
+    if not names:
+        raise DataError(f"split {split!r} of {source} has no scene; choose another split, or make data that have one")
     found = names.intersection(index.scene_names.tolist())
     if not found:
         raise DataError(

@@ -47,7 +47,7 @@ def main(overrides: list[str]) -> None:
 
     Raises DataError for run folders, results, records and claims that are broken, once the rest is done.
     """
-    config, _ = compose_config(overrides)
+    config, _ = compose_config(overrides, reads_data=False)
     refuse_options_of_others(config, "report")
     outputs, reports = Path(config.paths.outputs), Path(config.paths.reports)
     make_writable(reports, "paths.reports")
@@ -112,9 +112,9 @@ def defaults_of(scale: str, phase: str, model: str) -> dict[str, Any]:
     """Of a run without settings; where the default model lacks the phase, of `model`, whose name stays a setting."""
     choices = [f"scale={scale}", f"phase={phase}"]
     try:
-        return compose_config(choices)[1]
+        return compose_config(choices, reads_data=False)[1]
     except ConfigError:
-        tree = compose_config([*choices, f"model={model}"])[1]
+        tree = compose_config([*choices, f"model={model}"], reads_data=False)[1]
         return tree | {"model": {key: value for key, value in tree["model"].items() if key != "name"}}
 
 

@@ -19,8 +19,9 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from src.config import CONF, GROUPS, SCALES, Config, hydra_message
+from src.config import CONF, GROUPS, SCALES, Config
 from src.errors import ConfigError
+from src.reliability.config_faults import hydra_message
 from src.reliability.passwords import masked, shown_key
 from src.report.json_format import parse_as
 from src.report.plain_yaml import check_plain_yaml
@@ -86,7 +87,7 @@ def compose_sweep(overrides: list[str]) -> tuple[SweepCommand, list[str]]:
     try:
         command = _compose(load_sweep(chosen[0]), own)
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(hydra_message(error, known=list(OWN_KEYS))) from error
+        raise ConfigError(hydra_message(error, lambda: OWN_KEYS)) from error
     if storages and storages[-1] != "null":
         check_address(storages[-1])
         command.storage = storages[-1]
@@ -128,7 +129,7 @@ def load_sweep(name: str) -> SweepConfig:
     except ConfigError as error:
         raise ConfigError(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
     except OmegaConfBaseException as error:
-        raise ConfigError(f"{where}: {hydra_message(error, FILE_KEYS)}") from error
+        raise ConfigError(f"{where}: {hydra_message(error, lambda: FILE_KEYS)}") from error
     except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, OSError) as error:
         words = " ".join(str(error).split())
         hint = "; write on, off, yes and no in quotes" if words.endswith(("is True", "is False")) else ""

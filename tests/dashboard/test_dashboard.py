@@ -80,6 +80,13 @@ def test_export_to_where_nothing_can_be_written(tmp_path):
     assert ended.returncode == 3 and "Traceback" not in ended.stderr and "file" in ended.stderr
 
 
+def test_export_of_folders_that_are_not_there(tmp_path):
+    target = tmp_path / "x.html"
+    ended = run(f"export={target}", f"paths.reports={tmp_path / 'a'}", f"paths.outputs={tmp_path / 'b'}")
+    assert ended.returncode == 3 and "neither folder is there" in ended.stderr
+    assert not target.exists()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_it_serves_until_it_is_told_to_stop(tmp_path, number):

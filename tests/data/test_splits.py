@@ -23,6 +23,7 @@ def test_bad_split_files(broken_tables):
         ("{", "JSON"),
         ("[" * 100_000, "JSON"),
         ('["train"]', "scene names"),
+        ('{"train": []}', "'train' of .*splits.json has no scene"),
         ('{"train": ["no-such-scene"]}', "none of its 1"),
     ):
         path.write_text(text)

@@ -30,10 +30,10 @@ def exported(monkeypatch):
 
 @pytest.fixture
 def report(tmp_path, capsys, exported):
-    def run(phase):
-        main([f"phase={phase}", "scale=mini", f"paths.outputs={tmp_path}", f"paths.reports={tmp_path / 'reports'}"])
-        assert f"{phase}_mini.md" in capsys.readouterr().out
-        return (tmp_path / "reports" / f"{phase}_mini.md").read_text()
+    def run(phase, scale="mini"):
+        main([f"phase={phase}", f"scale={scale}", f"paths.outputs={tmp_path}", f"paths.reports={tmp_path / 'reports'}"])
+        assert f"{phase}_{scale}.md" in capsys.readouterr().out
+        return (tmp_path / "reports" / f"{phase}_{scale}.md").read_text()
 
     return run
 
@@ -132,6 +132,15 @@ def test_runs_with_sensor_dropout_have_tables_of_their_own(both_phases, write_ru
 def test_phase_2_without_its_plain_run_has_no_gains(write_run, report):
     write_run("a", NO_VELOCITY, 0, 0.3, phase="phase2")
     assert "Gain" not in report("phase2")
+
+
+@pytest.mark.slow
+def test_runs_on_recorded_data_are_reported_without_the_data(write_run, report):
+    for seed in (0, 1):
+        write_run(
+            f"s{seed}", ["scale=paper", "data.root=/data/man", f"seed={seed}"], seed, 0.2 + 0.1 * seed, scale="paper"
+        )
+    assert "25.0" in rows(report("phase1", "paper"), "| experiment | mAP, % |")["KGGI + OCSF"]
 
 
 @pytest.mark.slow
