@@ -16,7 +16,7 @@ from src.assembly import build_datamodule, build_model, build_module, check_data
 from src.config import PHASES, Config, compose_config, refuse_options_of_others
 from src.data.datamodule import DetectionDataModule
 from src.pictures.learning_curves import draw_curves
-from src.reliability.checkpoints import OpenCheckpoint, open_checkpoint
+from src.reliability.checkpoints import LAST, OpenCheckpoint, open_checkpoint, stated_digest
 from src.reliability.command import run_command
 from src.reliability.cpu import tune_cpu
 from src.reliability.processes import (
@@ -131,6 +131,7 @@ def run(
         logger.info("resuming from %s", start.resume.path)
     elif start.weights is not None:
         hand_over(module.model, start.weights, tree)
+        module.initial_weights = stated_digest(start.weights.path)
     loggers = build_loggers(folder, start.resume, config.logger.wandb, tree) if is_main_process() else []
     trainer = build_trainer(
         folder,
@@ -158,6 +159,8 @@ def run(
         overrides=overrides,
         **data,
         initialized_from=source.identity if source is not None else None,
+        initial_weights=module.initial_weights,
+        weights=stated_digest(folder.checkpoints / LAST),
         resumed=start.resume is not None,
         seconds={"fit": round(seconds, 1), "all": round(time.monotonic() - started, 1)},
         skipped_files=dict(skipped.channels),

@@ -295,6 +295,16 @@ def _digests(file: BinaryIO) -> tuple[str, str] | None:
     return comment[len(_MARK) :].decode("ascii", "replace"), digest.hexdigest()
 
 
+def stated_digest(path: Path) -> str | None:
+    """The start of the SHA-256 that a checkpoint states at its end; None where it states none, or is not there."""
+    if not path.is_file():
+        return None
+    with open(path, "rb") as file:
+        file.seek(-min(_COMMENT_BYTES, path.stat().st_size), os.SEEK_END)
+        comment = file.read()
+    return comment[len(_MARK) :][:16].decode("ascii", "replace") if comment.startswith(_MARK) else None
+
+
 def _is_ours(content: object) -> bool:
     """Whether a file holds what `TrainingModule` and Lightning write: weights by name and the run's configuration."""
     if not isinstance(content, dict):

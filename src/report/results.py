@@ -66,6 +66,8 @@ class RunRecord:
     seconds: Seconds
     peak_memory_mib: PeakMemory
     skipped_files: dict[str, Count]
+    weights: str | None = None  # digest of the run's checkpoint, and ...
+    initial_weights: str | None = None  # ... of the one it began from; older records have neither
 
 
 @dataclass(kw_only=True)

@@ -23,11 +23,12 @@ def sweep_tables(record: SweepRecord, results: dict[str, RunResult]) -> list[Swe
     """The tables of one sweep at one scale, from the results of its runs by run id; other results do not matter.
 
     Raises DataError naming the runs when they are of different scales or data, are not of the seed that they stand
-    for, or differ in more than their seed within a row.
+    for, differ in more than their seed within a row, or began from different trainings of one run.
     """
     used = {run_id: results[run_id] for run_id in _run_ids(record) if run_id in results}
     check_same_data(record, used)
     check_rows(record, used)
+    check_starts(record, used)
     return [_table(record, used, table) for table in _table_configs(record)]
 
 
@@ -86,6 +87,27 @@ def check_rows(record: SweepRecord, results: dict[str, RunResult]) -> None:
                     f"{where}, row {label}: a row never mixes configurations, but {first.run_id} and {other.run_id} "
                     f"differ in more than their seed; {remedy}"
                 )
+
+
+def check_starts(record: SweepRecord, results: dict[str, RunResult]) -> None:
+    """Raises DataError naming the runs when they began from the weights of one run, which was trained again meanwhile.
+
+    Their difference would hold that of the two trainings. Results from before there were digests are of one training.
+    """
+    begun: dict[str, dict[str | None, list[str]]] = {}  # runs by the run and the weights that they began from
+    for run_id, result in results.items():
+        if result.initialized_from is not None:
+            begun.setdefault(result.initialized_from, {}).setdefault(result.initial_weights, []).append(run_id)
+    for source, groups in begun.items():
+        if source in results:
+            groups.setdefault(results[source].weights, []).append(source)
+        if len(groups) > 1:
+            found = "; ".join(f"{' '.join(runs)} ({digest or 'no digest'})" for digest, runs in groups.items())
+            raise DataError(
+                f"sweep {record.name}, scale {record.scale}: {source} was trained again between runs that begin from "
+                f"its weights: {found}; delete those of one training under results/ in the reports folder and give the "
+                "sweep's command again"
+            )
 
 
 def _experiment(result: RunResult) -> tuple[object, ...]:

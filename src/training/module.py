@@ -57,6 +57,7 @@ class TrainingModule(L.LightningModule):
         self.skipped = SkippedFiles()
         self.guard = StepGuard(skip_nonfinite)
         self.frozen_norms = frozen_norms
+        self.initial_weights: str | None = None  # digest of the checkpoint that the run began from
         self.own_statistics: dict[str, Tensor] = {}  # of this rank, from the checkpoint of an unfinished epoch
 
     def train(self, mode: bool = True) -> Self:
@@ -180,13 +181,18 @@ class TrainingModule(L.LightningModule):
 
         Plain values and tensors, so that the file loads without executing code. All ranks take part.
         """
-        checkpoint["horizon3d"] = {"config": self.config, "ranks": gather_by_rank(self.rank_state())}
+        checkpoint["horizon3d"] = {
+            "config": self.config,
+            "initial_weights": self.initial_weights,
+            "ranks": gather_by_rank(self.rank_state()),
+        }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Resume the own rank's part of an unfinished epoch; with another number of ranks, what can be moved.
 
         A checkpoint from the end of an epoch has nothing to resume.
         """
+        self.initial_weights = checkpoint["horizon3d"].get("initial_weights")
         states = checkpoint["horizon3d"].get("ranks", [])
         same = len(states) == self.trainer.world_size
         mine = states[self.trainer.global_rank :][:1] if same else states if self.trainer.global_rank == 0 else []

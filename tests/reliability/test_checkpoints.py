@@ -13,7 +13,15 @@ from torch import nn
 
 from src.errors import CheckpointError
 from src.reliability import checkpoints
-from src.reliability.checkpoints import LAST, PREVIOUS, WAIT_S, AtomicCheckpointIO, load_model_weights, read_checkpoint
+from src.reliability.checkpoints import (
+    LAST,
+    PREVIOUS,
+    WAIT_S,
+    AtomicCheckpointIO,
+    load_model_weights,
+    read_checkpoint,
+    stated_digest,
+)
 
 
 def content(model):
@@ -150,13 +158,14 @@ def test_the_digest_is_that_of_what_torch_wrote(tmp_path):
     data = (tmp_path / LAST).read_bytes()
     plain = data[: -len(f"{name} {kind} {digest}") - 2] + b"\0\0"
     assert (name, kind) == ("horizon3d", "sha256") and hashlib.sha256(plain).hexdigest() == digest
+    assert stated_digest(tmp_path / LAST) == digest[:16]
     assert torch.load(tmp_path / LAST, weights_only=True)["state_dict"]["w"][0] == 1.0  # others read it as ever
 
 
 def test_files_from_before_there_were_digests_are_read_and_checked(tmp_path):
     path = tmp_path / LAST
     torch.save(numbered(7), path)
-    assert number_of(path) == 7
+    assert number_of(path) == 7 and stated_digest(path) is None
     data = bytearray(path.read_bytes())
     data[data.index(torch.full((50,), 7.0).numpy().tobytes())] ^= 1
     path.write_bytes(data)

@@ -333,6 +333,32 @@ def test_different_data_or_scales_are_refused_by_name(make_record, results_of, c
     assert sweep_tables(record, results | {"of-no-row": other})
 
 
+def test_runs_of_two_trainings_of_their_source_are_refused_by_name(make_record, results_of):
+    record = make_record({"a": {}, "b": {}}, seeds=1)
+
+    def results(before, after):
+        begun = {"initialized_from": "horizon3d-phase1-mini-00000000"}
+        return results_of({"a0": 0.1}, **begun, initial_weights=before) | results_of(
+            {"b0": 0.2}, **begun, initial_weights=after
+        )
+
+    for before, after in (("1" * 16, "2" * 16), (None, "2" * 16)):
+        words = rf"00000000 was trained again.*{PREFIX}a0 \({before or 'no digest'}\).*{PREFIX}b0 \({after}\); delete"
+        with pytest.raises(DataError, match=words):
+            sweep_tables(record, results(before, after))
+    for same in ("1" * 16, None):
+        assert sweep_tables(record, results(same, same))
+
+
+def test_weights_scored_once_more_are_those_of_their_row(make_record, results_of):
+    record = make_record({"a": {}, "b": {}}, seeds=1)
+    trained = results_of({"a0": 0.1}, weights="1" * 16)
+    again = {"initialized_from": f"{PREFIX}a0", "weights": "3" * 16}
+    assert sweep_tables(record, trained | results_of({"b0": 0.2}, **again, initial_weights="1" * 16))
+    with pytest.raises(DataError, match=rf"{PREFIX}a0 was trained again.*{PREFIX}b0 \(2+\); {PREFIX}a0 \(1+\)"):
+        sweep_tables(record, trained | results_of({"b0": 0.2}, **again, initial_weights="2" * 16))
+
+
 def test_results_of_another_scale_alone_are_refused(make_record, results_of):
     with pytest.raises(DataError, match="sweep epsilon, scale mini: .*scale debug"):
         sweep_tables(make_record({"a": {}}, seeds=1), results_of({"a0": 0.1}, scale="debug"))

@@ -5,6 +5,7 @@ import logging
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -489,6 +490,17 @@ def test_restarting_phase_2_leaves_phase_1_alone(handed_over):
     assert (second / "run.json").stat().st_mtime_ns > record_of
     assert len(list(outputs.glob(f"{second.name}.before-*"))) == 1
     assert (second / "metrics.json").read_text() == scores  # from the same weights, with the same seed
+
+
+@pytest.mark.slow
+def test_a_run_says_which_weights_it_began_from_after_a_resumption_too(handed_over, tmp_path):
+    outputs, first, second, _ = handed_over
+    copied = shutil.copytree(outputs, tmp_path / "outputs")
+    (copied / second.name / "run.json").unlink()
+    (copied / first.name / "checkpoints" / "last.ckpt").write_bytes(b"of another training")
+    call("train", "phase=phase2", "scale=debug", f"paths.outputs={copied}", "trainer.num_pictures=0")
+    assert record(first)["weights"] == record(second)["initial_weights"] != record(second)["weights"]
+    assert record(copied / second.name)["initial_weights"] == record(first)["weights"]
 
 
 @pytest.mark.slow
