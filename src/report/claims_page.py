@@ -10,7 +10,7 @@ from src.report.escaping import as_code, escape_markdown
 from src.report.results import RunResult
 from src.report.sweep_record import SweepRecord
 from src.report.sweep_table import MISSING, format_paper
-from src.report.sweep_text import SYNTHETIC, describe_epochs, describe_machines, sweep_settings
+from src.report.sweep_text import SYNTHETIC, describe_epochs, describe_machines, describe_starts, sweep_settings
 
 HEADS = ("claim", "measure", "paper", "here", "seeds", "verdict", "command")
 REASON_HEADS = ("claim", "question", "rows", "here", "command")
@@ -74,6 +74,8 @@ def _what_was_run(findings: list[tuple[Claim, list[Finding]]], records: Mapping[
     text = f"{'; '.join(parts)}."
     if any(run.data["name"] == SYNTHETIC for run in runs.values()):
         text += " Data and scale are not the paper's: compare signs and order, not sizes."
+    if starts := describe_starts(runs.values()):
+        text += f" {starts}"
     own: dict[str, list[str]] = {}
     for sweep in sorted({sweep for sweeps in worlds.values() for sweep in sweeps}):
         own.setdefault(" ".join(sweep_settings(records[sweep])), []).append(f"`{sweep}`")

@@ -60,6 +60,32 @@ def describe_epochs(results: Iterable[RunResult]) -> list[str]:
     ]
 
 
+def describe_starts(runs: Iterable[RunResult]) -> str:
+    """Which runs began from one run's weights, but from different trainings of it; empty where none did.
+
+    Their pairs share less than their seed says. Results without digests are of one training.
+    """
+    runs = {run.run_id: run for run in runs}
+    begun: dict[str, dict[str | None, list[str]]] = {}  # runs by the run and the weights that they began from
+    for run in runs.values():
+        if run.initialized_from is not None:
+            begun.setdefault(run.initialized_from, {}).setdefault(run.initial_weights, []).append(run.run_id)
+    for source, groups in begun.items():
+        if source in runs:
+            groups.setdefault(runs[source].weights, []).append(source)
+    mixed = [
+        f"{source} ({' apart from '.join(', '.join(group) for group in groups.values())})"
+        for source, groups in begun.items()
+        if len(groups) > 1
+    ]
+    if not mixed:
+        return ""
+    return (
+        "Some runs begin from different trainings of one run, whose noise is in their differences and intervals: "
+        f"{'; '.join(mixed)}."
+    )
+
+
 def describe_machines(results: Iterable[RunResult]) -> list[str]:
     """The code that trained, and where."""
     code, devices = set(), set()

@@ -12,7 +12,7 @@ from src.report.score_tables import mean_bounds
 from src.report.sweep_file import TableConfig
 from src.report.sweep_record import RunState, SweepRecord
 from src.report.sweep_table import PAPER, SweepRow, SweepTable, TableCell
-from src.report.sweep_text import describe_search, describe_table, findings
+from src.report.sweep_text import describe_search, describe_starts, describe_table, findings
 from src.training.identity import RUN_ID, as_before_younger_keys, key_of, without_keys
 
 EARLIER = "; the number is of an earlier training"
@@ -23,12 +23,11 @@ def sweep_tables(record: SweepRecord, results: dict[str, RunResult]) -> list[Swe
     """The tables of one sweep at one scale, from the results of its runs by run id; other results do not matter.
 
     Raises DataError naming the runs when they are of different scales or data, are not of the seed that they stand
-    for, differ in more than their seed within a row, or began from different trainings of one run.
+    for, or differ in more than their seed within a row.
     """
     used = {run_id: results[run_id] for run_id in _run_ids(record) if run_id in results}
     check_same_data(record, used)
     check_rows(record, used)
-    check_starts(record, used)
     return [_table(record, used, table) for table in _table_configs(record)]
 
 
@@ -89,27 +88,6 @@ def check_rows(record: SweepRecord, results: dict[str, RunResult]) -> None:
                 )
 
 
-def check_starts(record: SweepRecord, results: dict[str, RunResult]) -> None:
-    """Raises DataError naming the runs when they began from the weights of one run, which was trained again meanwhile.
-
-    Their difference would hold that of the two trainings. Results from before there were digests are of one training.
-    """
-    begun: dict[str, dict[str | None, list[str]]] = {}  # runs by the run and the weights that they began from
-    for run_id, result in results.items():
-        if result.initialized_from is not None:
-            begun.setdefault(result.initialized_from, {}).setdefault(result.initial_weights, []).append(run_id)
-    for source, groups in begun.items():
-        if source in results:
-            groups.setdefault(results[source].weights, []).append(source)
-        if len(groups) > 1:
-            found = "; ".join(f"{' '.join(runs)} ({digest or 'no digest'})" for digest, runs in groups.items())
-            raise DataError(
-                f"sweep {record.name}, scale {record.scale}: {source} was trained again between runs that begin from "
-                f"its weights: {found}; delete those of one training under results/ in the reports folder and give the "
-                "sweep's command again"
-            )
-
-
 def _experiment(result: RunResult) -> tuple[object, ...]:
     """What the runs of a row have in common; the run whose weights each begins with is of its seed, named or not."""
     source = result.config.get("phase", {}).get("init_from")
@@ -150,6 +128,8 @@ def _table(record: SweepRecord, results: dict[str, RunResult], config: TableConf
         table.text = findings(columns, trained, next(iter(results.values()), None), complete)
     if sweep.note is not None:
         table.text = [sweep.note, *table.text]
+    if starts := describe_starts(results.values()):
+        table.text.append(starts)
     return table
 
 
