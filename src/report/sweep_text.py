@@ -61,7 +61,7 @@ def describe_epochs(results: Iterable[RunResult]) -> list[str]:
 
 
 def describe_starts(runs: Iterable[RunResult]) -> str:
-    """Which runs began from one run's weights, but from different trainings of it; empty where none did.
+    """Which runs began from another training of one run than most that begin from its weights; empty where none did.
 
     Their pairs share less than their seed says. Results without digests are of one training.
     """
@@ -73,16 +73,15 @@ def describe_starts(runs: Iterable[RunResult]) -> str:
     for source, groups in begun.items():
         if source in runs:
             groups.setdefault(runs[source].weights, []).append(source)
-    mixed = [
-        f"{source} ({' apart from '.join(', '.join(group) for group in groups.values())})"
-        for source, groups in begun.items()
-        if len(groups) > 1
-    ]
-    if not mixed:
+    apart = []
+    for groups in begun.values():
+        most = max(groups.values(), key=len)
+        apart += [run_id for group in groups.values() if group is not most for run_id in group]
+    if not apart:
         return ""
     return (
-        "Some runs begin from different trainings of one run, whose noise is in their differences and intervals: "
-        f"{'; '.join(mixed)}."
+        "Of runs that begin from one run's weights, these began from another training of it than the others, whose "
+        f"noise is in their differences and intervals: {', '.join(apart)}."
     )
 
 
