@@ -199,7 +199,7 @@ def bar_panels(experiments: list[Experiment]) -> list[BarPanel]:
         ("mAP by speed, %, over the classes that occur there", BY_SPEED, SPEEDS, "m/s"),
         ("mAVE by speed, m/s, over the classes that occur there (less is better)", ERROR_BY_SPEED, SPEEDS, "m/s"),
     ):
-        bars = {e.label: [estimate(e.runs, c) for c in columns] for e in experiments}
+        bars = {e.label.replace("`", ""): [estimate(e.runs, c) for c in columns] for e in experiments}
         panels.append(BarPanel(title, [f"{name} {unit}" for name in names], bars, columns[0].digits))
     return panels
 

@@ -215,7 +215,7 @@ def test_every_row_composes_and_differs_from_the_others(scale):
         for row in sweep.rows:
             tree = tree_of(scale, overrides_of(sweep, row))
             build_config(tree)
-            trees[row.label] = OmegaConf.to_container(tree, resolve=True, enum_to_str=True)
+            trees[row.label] = row.weights, OmegaConf.to_container(tree, resolve=True, enum_to_str=True)
         same = [(a, b) for a in trees for b in trees if a < b and trees[a] == trees[b]]
         assert not same, f"sweeps/{name}.yaml at scale={scale}: rows {same} train the same"
 
