@@ -52,7 +52,7 @@ def wrapped_parts(
 ) -> Iterator[None]:
     """Within the context every method and function that is a part is wrapped, for each part that it belongs to.
 
-    A method that the model lacks is left out.
+    A method of a module that the model lacks is left out.
     """
     modules = dict(model.named_modules())
     with ExitStack() as stack:
@@ -60,7 +60,7 @@ def wrapped_parts(
             for path in paths:
                 place, colon, function = path.rpartition(":" if ":" in path else ".")
                 owner = importlib.import_module(place) if colon == ":" else modules.get(place)
-                if colon == ":" or hasattr(owner, function):
+                if owner is not None:
                     stack.enter_context(patch.object(owner, function, wrap(name, getattr(owner, function))))
         yield
 

@@ -33,7 +33,7 @@ from src.report.score_tables import (
     metrics_of,
     score_table,
 )
-from src.training.identity import OUTSIDE_IDENTITY, TEMPORAL_DATA_KEYS, YOUNGER_KEYS, is_of, key_of, leaves
+from src.training.identity import OUTSIDE_IDENTITY, TEMPORAL_DATA_KEYS, YOUNGER_KEYS, canonical, is_of, key_of, leaves
 
 FURTHER = "phase1_further"
 """What phase 2 is compared with; it stands on that page alone."""
@@ -200,7 +200,7 @@ def _is_default(key: str, override: str, defaults: dict[str, Any]) -> bool:
             return False
         value = value[name]
     try:
-        said = load_plain_yaml(override.partition("=")[2])
+        said = load_plain_yaml(canonical(override).partition("=")[2])
     except yaml.YAMLError:
         return False
     if isinstance(value, dict):  # a part is chosen by its name

@@ -21,7 +21,7 @@ from src.report.json_format import OPEN, Count, Many, Measure, read_all, read_as
 from src.report.metric_names import DETECTION, METRICS
 from src.report.plain_yaml import load_plain_yaml
 from src.report.result_schema import Bounds, DataNames, Latency, OtherScores, PeakMemory, Scores, Seconds
-from src.training.identity import OUTSIDE_IDENTITY, is_of, key_of, without_keys
+from src.training.identity import OUTSIDE_IDENTITY, canonical, is_of, key_of, without_keys
 
 FORMAT = 1
 FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
@@ -115,8 +115,8 @@ class OtherResultFile(ResultFile):
 
 
 def settings_of(overrides: Iterable[str]) -> tuple[str, ...]:
-    """Overrides that define the experiment within its phase, sorted."""
-    return tuple(sorted(override for override in overrides if key_of(override) not in NOT_A_SETTING))
+    """Overrides that define the experiment within its phase, in one spelling, sorted."""
+    return tuple(sorted(canonical(override) for override in overrides if key_of(override) not in NOT_A_SETTING))
 
 
 def result_path(reports: Path, run_id: str) -> Path:

@@ -23,6 +23,9 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 MAX_COLUMNS = 8
 """Of a table, its heads included."""
 
+NOT_OF_VALIDATION = ("cost.", "latency.")
+"""How metrics begin that no search can have for an objective: metrics.json has none of them."""
+
 OF_TRAINING = ("phase.epochs", "phase.init_from", "optim")
 """Keys that change nothing of weights that are there."""
 
@@ -215,6 +218,8 @@ class SweepConfig:
             dimension.check(f"{where}, space, {key}")
         if self.space:
             find_metric(self.objective, f"{where}, objective", self.task)
+            if self.objective.startswith(NOT_OF_VALIDATION):
+                raise ConfigError(f"{where}, objective: {self.objective} is no score of a validation; name one, as mAP")
             if self.trials < 1:
                 raise ConfigError(f"{where}: trials must be at least 1, but got {self.trials}")
 

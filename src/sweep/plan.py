@@ -12,7 +12,7 @@ from src.errors import ConfigError, HorizonError
 from src.report.metric_names import DETECTION
 from src.report.sweep_file import RowConfig, SweepConfig
 from src.report.sweep_record import suffix_of
-from src.training.identity import OUTSIDE_IDENTITY, is_of, key_of
+from src.training.identity import OUTSIDE_IDENTITY, canonical, is_of, key_of
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,8 @@ def changes_of(sweep: SweepConfig, common: list[str]) -> list[str]:
                     "leave it out or change the file"
                 )
     outside = (*OUTSIDE_IDENTITY, "seed", "scale")
-    return sorted(change for change in common if not is_of(change, outside) and change not in sweep.overrides)
+    own = {canonical(override) for override in sweep.overrides}
+    return sorted(change for change in common if not is_of(change, outside) and canonical(change) not in own)
 
 
 def _value_of(override: str) -> str:

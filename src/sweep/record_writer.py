@@ -14,7 +14,7 @@ from src.report.sweep_record import RunState, SweepRecord, read_record, record_p
 from src.sweep.plan import Plan, RunSpec
 from src.sweep.run_status import is_scored
 from src.sweep.sweep_study import SweepStudy, SweepTrial, trials_begun
-from src.training.identity import is_of
+from src.training.identity import canonical, is_of
 
 logger = logging.getLogger(__name__)
 
@@ -123,4 +123,4 @@ class RecordWriter:
 
 def _settings(run: RunState) -> set[str]:
     """Overrides of a run without what differs by seed: the seed, and the run whose weights it scores."""
-    return {o for o in run.overrides if not is_of(o, ("seed", "scale")) and o != f"phase.init_from={run.needs}"}
+    return {canonical(o) for o in run.overrides if not is_of(o, ("seed", "scale")) and o != f"phase.init_from={run.needs}"}

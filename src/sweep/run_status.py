@@ -40,7 +40,7 @@ def _read(path: Path, name: str) -> Any:
 
 
 def _find(node: Any, name: str) -> Any:
-    """Follow a dotted name through nested objects; keys such as `0-0.5` hold dots themselves."""
+    """Follow a dotted name through nested objects: keys such as `0-0.5` hold dots, and names leave `classes` out."""
     if not isinstance(node, dict):
         return None
     if name in node:
@@ -48,7 +48,7 @@ def _find(node: Any, name: str) -> Any:
     for key in node:
         if name.startswith(f"{key}."):
             return _find(node[key], name.removeprefix(f"{key}."))
-    return None
+    return _find(node.get("classes"), name)
 
 
 def is_locked(folder: Path) -> bool:

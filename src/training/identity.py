@@ -50,6 +50,9 @@ At this value a key is no part of an identity, and a checkpoint without the key 
 """
 
 
+_NUMBER = re.compile(r"(?<![\w.+-])[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?(?![\w.+-])")
+"""No part of a word, as of a run id."""
+
 RUN_ID = re.compile(r"[a-z0-9_]+-[a-z0-9_]+-[a-z0-9_]+-[0-9a-f]{8}")
 """What `run_identity` returns."""
 
@@ -57,6 +60,20 @@ RUN_ID = re.compile(r"[a-z0-9_]+-[a-z0-9_]+-[a-z0-9_]+-[0-9a-f]{8}")
 def key_of(override: str) -> str:
     """The dotted key that an override sets."""
     return override.lstrip("+").partition("=")[0]
+
+
+def canonical(override: str) -> str:
+    """An override with its numbers spelled in one way: `1e-4`, `1.0e-4` and `0.0001` are one setting."""
+    _, equals, value = override.partition("=")
+    return f"{key_of(override)}{equals}{_NUMBER.sub(_spelled, value)}"
+
+
+def _spelled(number: re.Match[str]) -> str:
+    value = float(number[0])
+    if value.is_integer() and abs(value) < 1e15:
+        return str(int(value))
+    text = repr(value)
+    return text if "." in text else text.replace("e", ".0e")  # YAML 1.1 takes no 6e-05 for a number
 
 
 def is_of(override: str, keys: Iterable[str]) -> bool:
@@ -107,9 +124,9 @@ def as_before_younger_keys(tree: dict[str, Any]) -> dict[str, Any]:
 def digest_of_changes(overrides: list[str]) -> str:
     """`-` and 8 hex digits of what the command line changes of a checkpoint's configuration; empty for no change.
 
-    Paths and where it computes do not count.
+    What cannot change a result does not count, but other data and an oracle do.
     """
-    besides = ("checkpoint", "predictions", "out", "scene", "paths", "trainer", "logger", "data.num_workers")
+    besides = set(OUTSIDE_IDENTITY) - {"data.root", "oracle"}
     changes = [change for change in overrides if not is_of(change, besides)]
     return f"-{digest_of(changes)}" if changes else ""
 

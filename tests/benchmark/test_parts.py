@@ -65,6 +65,11 @@ def test_a_recorded_call_is_made_again_with_the_caches_of_the_first_time():
     assert model.first.weight.grad is None  # no history beyond the part's inputs
 
 
+def test_a_part_whose_method_is_gone_is_not_left_out_silently():
+    with pytest.raises(AttributeError, match="decoded"):
+        record_calls(Whole(), {"second": ("second.decoded",)}, lambda: None)
+
+
 def test_a_result_without_history_has_no_backward():
     assert not backward_from([torch.zeros(2), "text", None])
 

@@ -37,9 +37,15 @@ def test_order_is_seed_by_seed_and_first_what_others_start_from():
     assert labels == [("a", 3), ("b", 3), ("c", 3), ("a", 4), ("b", 4), ("c", 4)]
     first, second, *_ = plan.specs.values()
     assert first.overrides == ["phase=phase1", "model.x=2", "seed=3"] and first.needs is None
-    assert second.overrides == ["model.x=2", "phase=phase2", "seed=3"] or second.needs == first.run_id
+    assert second.overrides == ["phase=phase2", "model.x=2", "seed=3"] and second.needs == first.run_id
     assert plan.rows["b"] == plan.rows["b again"] and plan.labels(second.run_id) == ["b", "b again"]
     assert plan.changes == ["model.x=2"] and plan.study == f"fake-debug{suffix_of(plan.changes)}"
+
+
+def test_a_setting_of_the_file_spelled_otherwise_is_no_change():
+    sweep = make_sweep({"a": []}, overrides=["optim.lr=1.0e-4", "model.x=[1.0,2]"])
+    assert make_plan(sweep, ["optim.lr=0.0001", "model.x=[1,2.0]"], [0], identify).changes == []
+    assert make_plan(sweep, ["optim.lr=1e-3"], [0], identify).changes == ["optim.lr=1e-3"]
 
 
 def test_rows_may_have_seeds_of_their_own():

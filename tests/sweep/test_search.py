@@ -7,6 +7,8 @@ import sys
 import pytest
 
 from src.errors import ConfigError
+from src.report.metric_names import METRICS
+from src.sweep.run_status import read_score
 from src.sweep.search import _PruningWatch
 from tests.running import wait_for
 from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep, trained
@@ -61,6 +63,14 @@ def test_trials_that_promise_little_are_pruned(tmp_path):
     (pruned,) = [run for run in record.runs.values() if run.state == "pruned"]
     assert 0.1 <= pruned.value <= 0.2 and trained(tmp_path, "interrupted") == {pruned.run_id: 1}
     assert max(trial.value or 0.0 for trial in runner.study.trials()) >= 0.8
+
+
+@pytest.mark.parametrize("name", ["NDS", "measures.moving_AP", "speeds.25+.car.AP", "ranges.0-25.mAP", "classes.car.AP"])
+def test_an_objective_is_read_by_the_name_that_tables_give_it(tmp_path, name):
+    of_class = {"classes": {"car": {"AP": 0.5}}}
+    scores = {"NDS": 0.5, "measures": {"moving_AP": 0.5}, "ranges": {"0-25": {"mAP": 0.5}}, "speeds": {"25+": of_class}}
+    (tmp_path / "metrics.json").write_text(json.dumps(scores | of_class))
+    assert name in METRICS and read_score(tmp_path, name) == 0.5 and read_score(tmp_path, f"{name}s") is None
 
 
 def test_an_objective_that_is_no_number_is_a_failed_trial_and_not_tried_again(tmp_path):

@@ -356,6 +356,7 @@ def test_what_the_mistakes_are_made_from_is_right(written):
         (SPACE | {"space": {"optim.lr": {"choices": [1]}}}, "at least two"),
         (SPACE | {"trials": 0}, "trials must be at least 1"),
         (SPACE | {"objective": "NSD"}, "objective: NSD is not a metric"),
+        (SPACE | {"objective": "latency.total"}, "objective: latency.total is no score of a validation"),
         ("title: [", ""),
         ("", ""),
         ("- a\n- b\n", ""),

@@ -3,7 +3,7 @@
 import pytest
 
 from src.config import compose_config
-from src.training.identity import digest_of_changes, is_of, key_of, run_identity, without_keys
+from src.training.identity import canonical, digest_of_changes, is_of, key_of, run_identity, without_keys
 
 
 @pytest.mark.slow
@@ -62,15 +62,36 @@ def test_what_changes_no_result_of_a_checkpoint_makes_no_other_place():
         "trainer.num_pictures=0",
         "trainer=cpu",
         "data.num_workers=0",
+        "data.world.num_workers=2",
+        "resume=auto",
+        "phase.train_missing=false",
     ]
     assert digest_of_changes(where) == digest_of_changes(["scene=x"]) == ""
     changed = [
         digest_of_changes([*where, change])
-        for change in ("data.root=d", "model.dptf.max_age_s=0.55", "data.split=test")
+        for change in ("data.root=d", "model.dptf.max_age_s=0.55", "data.split=test", "oracle=motion")
     ]
-    assert len({"", *changed}) == 4
+    assert len({"", *changed}) == 5
     pair = ["data.split=test", "data.root=d"]
     assert digest_of_changes(pair) == digest_of_changes(pair[::-1]) != ""
+
+
+@pytest.mark.parametrize(
+    ("spellings", "one"),
+    [
+        (("+a.b=1e-4", "a.b=1.0e-4", "a.b=.0001", "a.b=1E-4"), "a.b=0.0001"),
+        (("a=6e-5", "a=0.00006"), "a=6.0e-05"),
+        (("a=[-1.0,7]", "a=[-1,7.0]"), "a=[-1,7]"),
+        (("a=1", "a=1.0", "a=1e0"), "a=1"),
+    ],
+)
+def test_a_number_has_one_spelling(spellings, one):
+    assert {canonical(spelling) for spelling in spellings} == {one}
+
+
+@pytest.mark.parametrize("text", ["a=horizon3d-phase2-mini-6e546620", "a=0-0.5", "a=v1.0-trainval", "a=1.2.3", "a=x1e5"])
+def test_digits_of_a_word_stay(text):
+    assert canonical(text) == text
 
 
 @pytest.mark.parametrize(
