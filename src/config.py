@@ -32,7 +32,7 @@ from src.reliability.untrusted import fault_of_tree
 from src.training.identity import YOUNGER_KEYS, key_of
 from src.training.optim import OptimConfig
 from src.training.phases import PhaseConfig
-from src.training.run_folder import Resume
+from src.training.run_folder import PathsConfig, Resume
 from src.training.trainer_config import TrainerConfig
 from src.training.true_motion import Oracle
 from src.training.wandb import WandbConfig
@@ -89,14 +89,6 @@ class LoggerConfig:
     """Loggers beside metrics.csv."""
 
     wandb: WandbConfig | None
-
-
-@dataclass(kw_only=True)
-class PathsConfig:
-    """Folders, relative to where the command is run."""
-
-    outputs: str  # runs, worlds, caches
-    reports: str
 
 
 class BenchmarkSuite(Enum):

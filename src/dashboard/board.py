@@ -63,7 +63,7 @@ class Sweep:
     @property
     def left_s(self) -> float | None:
         """Time left, with as many runs side by side as now; None before the first has finished, and when none runs."""
-        return seconds_left(self.record, 1, self.now) if self.state == "running" else None
+        return seconds_left(self.record.runs.values(), 1, self.now) if self.state == "running" else None
 
 
 @dataclass(kw_only=True)

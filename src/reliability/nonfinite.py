@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import lightning as L
 import torch
@@ -32,6 +33,21 @@ beyond that it is the weights or the settings, and since a skipped step changes 
 MAX_DUMPS = 3
 """Dumps kept per rank: each is as large as a checkpoint, and the newest are about the code and settings of now."""
 MAX_NAMES = 5
+
+
+class GuardedModule(Protocol):
+    """What a `StepGuard` asks of the Lightning module whose steps it guards."""
+
+    model: nn.Module
+    config: dict[str, Any]  # of the run, plain
+    seed: int
+    trainer: L.Trainer
+
+    def memories_before_step(self) -> list[dict[str, Any]]:
+        """What the model remembered before the step, one entry per stream."""
+
+    def forget_step(self, batch: FrameBatch) -> None:
+        """Drop what the step has left to be remembered."""
 
 
 class StepGuard:
@@ -70,38 +86,22 @@ class StepGuard:
         for before, now in zip(self._before, self._statistics, strict=True):
             torch._foreach_copy_(now, before)
 
-    def refuse(self, module: L.LightningModule, batch: FrameBatch, terms: dict[str, Tensor]) -> None:
-        """Take back what the step of a `TrainingModule` did, keep it for a replay, and skip it where that is wanted.
+    def accept(self) -> None:
+        """The step's numbers are finite."""
+        self.in_a_row = 0
+
+    def refuse(self, module: GuardedModule, batch: FrameBatch, terms: dict[str, Tensor]) -> None:
+        """Take back what the step did, keep it for a replay, and skip it where that is wanted.
 
         The weights have not changed yet; gradients are dropped, so that the optimiser does nothing. All ranks come here
         together. Raises DivergedError on all of them, with the same words, or when too many steps were skipped.
         """
-        terms = {name: value.detach() for name, value in terms.items()}
-        bad = {name: float(value) for name, value in terms.items() if not torch.isfinite(value)}
-        ranks = gather_by_rank({"bad": bad, "total": float(terms["total"]), "tokens": batch.tokens})
-        failing_ranks = [rank for rank, own in enumerate(ranks) if own["bad"]]
-        # Gradients are means over the ranks by now: where every loss is finite, none can be singled out.
-        named_ranks = failing_ranks or range(len(ranks))
-        if failing_ranks:
-            found = "; ".join(
-                f"loss terms {ranks[rank]['bad']} of rank {rank} are not finite" for rank in failing_ranks
-            )
-        else:
-            totals = ", ".join(f"{own['total']:.4g}" for own in ranks)
-            found = f"the loss ({totals}) is finite, but {describe_gradients(module.model)}"
-        samples = "; ".join(f"rank {rank}: {', '.join(ranks[rank]['tokens'])}" for rank in named_ranks)
+        found, failing = _describe(module.model, batch, terms)
         trainer = module.trainer
-        text = f"step {trainer.global_step}, epoch {trainer.current_epoch}: {found}; samples of {samples}"
-
+        text = f"step {trainer.global_step}, epoch {trainer.current_epoch}: {found}"
         self.restore()
         if self.in_a_row == 0:  # the next ones in a row have the same weights
-            path = None
-            if trainer.global_rank in named_ranks:
-                number, rank = trainer.global_step, trainer.global_rank
-                step = {"global_step": number, "epoch": trainer.current_epoch, "rank": rank, "found": text}
-                step |= {"world_size": trainer.world_size, "seed": step_seed(module.seed, number, rank)}
-                step["memories"] = module.memories_before_step()
-                path = write_dump(Path(trainer.default_root_dir), module.model, module.config, batch, **step)
+            path = _dump(module, batch, text) if trainer.global_rank in failing else None
             kept = [path for path in gather_by_rank(path and str(path)) if path]
             text += f"; run it again with: python -m src.replay checkpoint={kept[0]}" if kept else ""
         module.forget_step(batch)
@@ -129,6 +129,32 @@ class StepGuard:
     def restore_counts(self, state: list[int]) -> None:
         """Restore what `state` gave."""
         self.skipped_steps, self.in_a_row = state
+
+
+def _describe(model: nn.Module, batch: FrameBatch, terms: dict[str, Tensor]) -> tuple[str, Sequence[int]]:
+    """What is not finite and the samples of it, the same on every rank, and the ranks whose samples those are."""
+    terms = {name: value.detach() for name, value in terms.items()}
+    bad = {name: float(value) for name, value in terms.items() if not torch.isfinite(value)}
+    ranks = gather_by_rank({"bad": bad, "total": float(terms["total"]), "tokens": batch.tokens})
+    failing: Sequence[int] = [rank for rank, own in enumerate(ranks) if own["bad"]]
+    if failing:
+        found = "; ".join(f"loss terms {ranks[rank]['bad']} of rank {rank} are not finite" for rank in failing)
+    else:
+        failing = range(len(ranks))  # gradients are means over the ranks by now: none can be singled out
+        totals = ", ".join(f"{own['total']:.4g}" for own in ranks)
+        found = f"the loss ({totals}) is finite, but {describe_gradients(model)}"
+    samples = "; ".join(f"rank {rank}: {', '.join(ranks[rank]['tokens'])}" for rank in failing)
+    return f"{found}; samples of {samples}", failing
+
+
+def _dump(module: GuardedModule, batch: FrameBatch, found: str) -> Path | None:
+    """Keep the step of this rank as `write_dump` does."""
+    trainer = module.trainer
+    number, rank = trainer.global_step, trainer.global_rank
+    step = {"global_step": number, "epoch": trainer.current_epoch, "rank": rank, "found": found}
+    step |= {"world_size": trainer.world_size, "seed": step_seed(module.seed, number, rank)}
+    step["memories"] = module.memories_before_step()
+    return write_dump(Path(trainer.default_root_dir), module.model, module.config, batch, **step)
 
 
 def step_seed(seed: int, step: int, rank: int) -> int:

@@ -2,35 +2,45 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
+from collections.abc import Collection
 
 from src.report.sweep_record import RunState, SweepRecord
 
 
-def progress_line(record: SweepRecord, workers: int, now: float) -> str:
-    """Done, running, left, failed, and the time left as far as finished runs of the same phase tell it."""
-    left = record.count("waiting") + record.unchosen
-    words = [f"{record.count('done')} of {record.planned} done", f"{record.count('running')} running", f"{left} left"]
-    words += [f"{record.count(state)} {state}" for state in ("failed", "pruned") if record.count(state)]
-    if left or record.count("running"):
-        seconds = seconds_left(record, workers, now)
+def progress_of(record: SweepRecord, workers: int, now: float) -> str:
+    """`progress_line` of a sweep."""
+    return progress_line(record.study, record.runs.values(), workers, now, record.unchosen)
+
+
+def progress_line(name: str, runs: Collection[RunState], workers: int, now: float, unchosen: int = 0) -> str:
+    """Done, running, left, failed, and the time left as far as finished runs of the same phase tell it.
+
+    `unchosen` are trials of a search that are no runs yet.
+    """
+    count = Counter(run.state for run in runs)
+    left = count["waiting"] + unchosen
+    words = [f"{count['done']} of {len(runs) + unchosen} done", f"{count['running']} running", f"{left} left"]
+    words += [f"{count[state]} {state}" for state in ("failed", "pruned") if count[state]]
+    if left or count["running"]:
+        seconds = seconds_left(runs, workers, now, unchosen)
         words.append("time left unknown yet" if seconds is None else f"about {duration(seconds)} left")
-    return f"{record.study}: {', '.join(words)}"
+    return f"{name}: {', '.join(words)}"
 
 
-def seconds_left(record: SweepRecord, workers: int, now: float) -> float | None:
+def seconds_left(runs: Collection[RunState], workers: int, now: float, unchosen: int = 0) -> float | None:
     """Mean duration of each phase's finished runs, over the runs that are not; None when none has finished yet."""
     of_phase: dict[str, list[float]] = defaultdict(list)
-    for run in record.runs.values():
+    for run in runs:
         if run.state == "done" and run.started is not None and run.ended is not None:
             of_phase[_phase(run)].append(max(0.0, run.ended - run.started))
     if not of_phase:
         return None
     means = {phase: sum(values) / len(values) for phase, values in of_phase.items()}
     overall = sum(means.values()) / len(means)
-    running = [run for run in record.runs.values() if run.state == "running"]
-    waiting = [run for run in record.runs.values() if run.state == "waiting"]
-    work = sum(means.get(_phase(run), overall) for run in waiting) + overall * record.unchosen
+    running = [run for run in runs if run.state == "running"]
+    waiting = [run for run in runs if run.state == "waiting"]
+    work = sum(means.get(_phase(run), overall) for run in waiting) + overall * unchosen
     for run in running:
         elapsed = max(0.0, now - (run.started or now))  # a clock that was set back says less than nothing
         work += max(0.0, means.get(_phase(run), overall) - elapsed)

@@ -10,7 +10,6 @@ import logging
 import time
 from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path
 
 from src.errors import ConfigError, DataError, HorizonError, InterruptedRunError
 from src.reliability.command import run_command
@@ -21,8 +20,8 @@ from src.report.results import RunResult, read_results
 from src.report.sweep_record import RunState, SweepRecord, read_record, record_path
 from src.report.time_left import progress_line
 from src.sweep.compose import SweepCommand, compose_sweep, load_sweep
-from src.sweep.plan import Plan, changes_of, compose_file, join_overrides, make_plan, without_published
-from src.sweep.run_plan import Identifier, resume_command, run_plan
+from src.sweep.plan import Plan, changes_of, make_plan, without_published
+from src.sweep.run_plan import SweepCall, resume_command, run_plan
 from src.sweep.run_status import is_scored
 from src.training.identity import key_of
 
@@ -43,7 +42,6 @@ def main(overrides: list[str]) -> None:
     if study.options.dry_run:
         print(study.describe())
         return
-    again = resume_command("src.study", overrides)
     problems = []
     for look in LOOKS:
         plans = study.plans(look, study.results())
@@ -53,7 +51,7 @@ def main(overrides: list[str]) -> None:
             logger.info("%s", study.progress(plans, look, study.results()))
             command = study.commands[plan.sweep.name]
             try:
-                run_plan(plan, command, study.common, study.identify, study.outputs, study.reports, again)
+                run_plan(plan, command, study.call)
             except InterruptedRunError:
                 raise
             except HorizonError as error:  # costs no other sweep
@@ -69,11 +67,8 @@ class Study:
 
     claims: list[Claim]
     commands: dict[str, SweepCommand]  # by the sweep's name, in the order of the claims
-    common: list[str]  # overrides of every run
+    call: SweepCall
     scale: str
-    outputs: Path
-    reports: Path
-    identify: Identifier
 
     @property
     def options(self) -> SweepCommand:
@@ -82,13 +77,13 @@ class Study:
 
     def results(self) -> dict[str, RunResult]:
         """What has finished so far, by run id."""
-        return read_results(self.reports, self.scale)[0]
+        return read_results(self.call.reports, self.scale)[0]
 
     def findings(self, results: dict[str, RunResult]) -> list[tuple[Claim, list[Finding]]]:
         """What they say of each claim."""
         records: dict[str, SweepRecord] = {}
         for name, command in self.commands.items():
-            path = record_path(self.reports, name, self.scale, changes_of(command.sweep, self.common))
+            path = record_path(self.call.reports, name, self.scale, changes_of(command.sweep, self.call.common))
             try:
                 records[name] = read_record(path)
             except DataError:  # none yet, or one that the runner will replace
@@ -104,7 +99,7 @@ class Study:
             if look > first and not rows:
                 continue
             seeds = {row.label: range(look if row.label in rows else first) for row in command.sweep.rows}
-            plan = make_plan(command.sweep, self.common, seeds, self.identify)
+            plan = make_plan(command.sweep, self.call.common, seeds, self.call.identify)
             plans.append(without_published(plan, results, command.workers > 0) if command.published else plan)
         return plans
 
@@ -112,23 +107,20 @@ class Study:
         """Whether the runs there are, here or by their results, are worth recording: any at the first look; at a later
         one, which is taken at all its pairs, all runs of the rows that it adds seeds to."""
         rows = (runs.values() for runs in plan.rows.values() if len(runs) == look)
-        finished = (run in plan.published or is_scored(self.outputs / run) for run in chain.from_iterable(rows))
+        finished = (run in plan.published or is_scored(self.call.outputs / run) for run in chain.from_iterable(rows))
         return any(finished) if look == min(LOOKS) else all(finished)
 
     def progress(self, plans: list[Plan], look: int, results: dict[str, RunResult]) -> str:
         """How far a look is, over all its sweeps, and the time left as far as runs finished here tell it."""
         runs = {}
         for spec in (spec for plan in plans for spec in plan.specs.values()):
-            done = is_scored(self.outputs / spec.run_id)
+            done = is_scored(self.call.outputs / spec.run_id)
             took = results[spec.run_id].seconds["all"] if done and spec.run_id in results else None
             counts = done or any(spec.run_id in plan.published for plan in plans)
             state = "done" if counts else "waiting"
             runs[spec.run_id] = RunState(**spec.stored, state=state, started=None if took is None else 0.0, ended=took)
-        record = SweepRecord(
-            sweep=plans[0].sweep, scale=self.scale, command="", seeds=[], rows={}, runs=runs,
-            study=f"study at scale {self.scale}, {look} seeds", storage="",
-        )  # fmt: skip
-        return progress_line(record, self.options.workers, time.time())
+        name = f"study at scale {self.scale}, {look} seeds"
+        return progress_line(name, runs.values(), self.options.workers, time.time())
 
     def describe(self) -> str:
         """The plan as text: what each look trains, later ones if what is open now stays so; then the verdicts."""
@@ -157,12 +149,9 @@ def read_study(overrides: list[str]) -> Study:
     names = dict.fromkeys(measure.comparison.sweep for claim in claims for measure in claim.measures)
     composed = {name: compose_sweep([f"+sweep={name}", *overrides]) for name in names}
     commands = {name: command for name, (command, _) in composed.items()}
-    (_, common), identify = next(iter(composed.values())), Identifier()
-    sweep = next(iter(commands.values())).sweep
-    compose_file(sweep, common, identify)
-    config, _ = identify.compose(join_overrides(sweep.overrides, common))
-    outputs, reports = Path(config.paths.outputs), Path(config.paths.reports)
-    return Study(claims, commands, common, config.scale, outputs, reports, identify)
+    command, common = next(iter(composed.values()))
+    call, config = SweepCall.of(command.sweep, common, resume_command("src.study", overrides))
+    return Study(claims, commands, call, config.scale)
 
 
 if __name__ == "__main__":

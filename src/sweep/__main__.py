@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from src.errors import ConfigError
@@ -10,8 +11,8 @@ from src.reliability.passwords import hide_in_process_list
 from src.report.results import read_results
 from src.report.sweep_file import DimensionConfig
 from src.sweep.compose import compose_sweep
-from src.sweep.plan import Plan, compose_file, join_overrides, make_plan, without_published
-from src.sweep.run_plan import Identifier, resume_command, run_plan
+from src.sweep.plan import Plan, make_plan, without_published
+from src.sweep.run_plan import SweepCall, resume_command, run_plan
 from src.sweep.run_status import is_scored
 from src.training.identity import key_of
 
@@ -22,24 +23,22 @@ def main(overrides: list[str]) -> None:
         hide_in_process_list(override)
     command, common = compose_sweep(overrides)
     sweep = command.sweep
-    identify = Identifier()
-    compose_file(sweep, common, identify)
-    config, _ = identify.compose(join_overrides(sweep.overrides, common))
-    outputs, reports = Path(config.paths.outputs), Path(config.paths.reports)
+    call, config = SweepCall.of(sweep, common, resume_command("src.sweep", overrides))
     if sweep.is_search and command.seeds > 1:
         raise ConfigError(f"seeds={command.seeds}: a search compares single runs; leave seeds= out")
     seeds = list(range(config.seed, config.seed + command.seeds))
-    common = [override for override in common if key_of(override) != "seed"]
-    plan = make_plan(sweep, common, seeds, identify)
+    call = replace(call, common=[override for override in common if key_of(override) != "seed"])
+    plan = make_plan(sweep, call.common, seeds, call.identify)
     if command.published:
-        plan = without_published(plan, read_results(reports, plan.scale)[0], command.workers > 0)
+        plan = without_published(plan, read_results(call.reports, plan.scale)[0], command.workers > 0)
     elif not command.workers and not sweep.is_search:  # what is finished here is published anew
-        elsewhere = [run for run in read_results(reports, plan.scale)[0] if not is_scored(outputs / run)]
+        results = read_results(call.reports, plan.scale)[0]
+        elsewhere = [run for run in results if not is_scored(call.outputs / run)]
         plan = without_published(plan, elsewhere, training=False)
     if command.dry_run:
-        print(describe(plan, outputs))
+        print(describe(plan, call.outputs))
         return
-    run_plan(plan, command, common, identify, outputs, reports, resume_command("src.sweep", overrides))
+    run_plan(plan, command, call)
 
 
 def describe(plan: Plan, outputs: Path) -> str:

@@ -123,4 +123,5 @@ class RecordWriter:
 
 def _settings(run: RunState) -> set[str]:
     """Overrides of a run without what differs by seed: the seed, and the run whose weights it scores."""
-    return {canonical(o) for o in run.overrides if not is_of(o, ("seed", "scale")) and o != f"phase.init_from={run.needs}"}
+    by_seed = f"phase.init_from={run.needs}"
+    return {canonical(o) for o in run.overrides if not is_of(o, ("seed", "scale")) and o != by_seed}

@@ -11,9 +11,10 @@ import shlex
 import signal
 import sys
 import time
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import torch
 
@@ -22,13 +23,14 @@ from src.errors import ConfigError, HorizonError, InterruptedRunError
 from src.reliability.passwords import masked
 from src.reliability.processes import die_with_parent
 from src.report.results import publish_result, read_results
+from src.report.sweep_file import SweepConfig
 from src.report.sweep_record import SweepRecord, read_records, suffix_of
 from src.report.table_builder import write_sweep_tables
-from src.report.time_left import progress_line
+from src.report.time_left import progress_of
 from src.sweep.compose import SweepCommand
 from src.sweep.latency_runs import measure_latencies
 from src.sweep.launcher import Launcher
-from src.sweep.plan import Plan, RunIdentity, join_overrides, split_machine
+from src.sweep.plan import Plan, RunIdentity, compose_file, join_overrides, split_machine
 from src.sweep.record_writer import RecordWriter
 from src.sweep.run_status import is_scored
 from src.sweep.runner import Runner
@@ -87,25 +89,41 @@ def resume_command(module: str, overrides: list[str]) -> str:
     return shlex.join(["python", "-m", module, *[masked(override) for override in overrides]])
 
 
-def run_plan(
-    plan: Plan,
-    command: SweepCommand,
-    common: list[str],
-    identify: Identifier,
-    outputs: Path,
-    reports: Path,
-    again: str,
-) -> None:
-    """Train what is missing, measure latencies, write and show the tables; `again` is the command that resumes it.
+@dataclass(frozen=True)
+class SweepCall:
+    """What all sweeps of one command line share."""
+
+    common: list[str]  # overrides of every run
+    identify: Identifier
+    outputs: Path
+    reports: Path
+    again: str  # the command that resumes it
+
+    @classmethod
+    def of(cls, sweep: SweepConfig, common: list[str], again: str) -> tuple[Self, Config]:
+        """It, and the configuration that `sweep`, one of them, has in common for its rows.
+
+        Raises ConfigError naming the sweep's file for what it says wrongly.
+        """
+        identify = Identifier()
+        compose_file(sweep, common, identify)
+        config, _ = identify.compose(join_overrides(sweep.overrides, common))
+        return cls(common, identify, Path(config.paths.outputs), Path(config.paths.reports), again), config
+
+
+def run_plan(plan: Plan, command: SweepCommand, call: SweepCall) -> None:
+    """Train what is missing, measure latencies, write and show the tables.
 
     Raises InterruptedRunError when it was stopped, HorizonError when a run has failed, ConfigError before anything is
     trained for tables that are another sweep's.
     """
+    outputs, reports = call.outputs, call.reports
     make_writable(outputs / "sweeps", "paths.outputs")
     make_writable(reports / "sweeps", "paths.reports")
     check_table_names(plan, reports)
-    check_data_of_finished(plan, identify, outputs)
-    study = SweepStudy(outputs, plan.study, command.storage or default_storage(outputs), definition(plan, common))
+    check_data_of_finished(plan, call.identify, outputs)
+    storage = command.storage or default_storage(outputs)
+    study = SweepStudy(outputs, plan.study, storage, definition(plan, call.common))
     launcher = Launcher(
         [sys.executable, "-m", "src.train"],
         study.folder,
@@ -114,19 +132,20 @@ def run_plan(
         in_child=partial(die_with_parent, signal.SIGTERM),  # a killed runner leaves checkpoints, no orphans
         group=plan.study,
     )
-    writer, publish = RecordWriter(plan, study, again, outputs, reports), partial(publish_result, reports=reports)
+    writer, publish = RecordWriter(plan, study, call.again, outputs, reports), partial(publish_result, reports=reports)
     if plan.sweep.is_search:
-        runner = Search(plan, study, writer, launcher, publish, common, identify)
+        runner = Search(plan, study, writer, launcher, publish, call.common, call.identify)
     else:
         runner = Runner(plan, study, writer, launcher, publish)
     record = runner.run()
     if runner.stop.requested:
-        print(progress_line(record, command.workers, time.time()))
-        raise InterruptedRunError(f"the sweep was stopped; nothing finished is lost, resume it with\n    {again}")
+        print(progress_of(record, command.workers, time.time()))
+        raise InterruptedRunError(f"the sweep was stopped; nothing finished is lost, resume it with\n    {call.again}")
     missed: list[str] = []
     if plan.sweep.latency and (command.workers or command.latency):
         missed = measure_latencies(record, outputs, reports, runner, command.latency)
-    finish(record, runner, outputs, reports, again, missed if command.latency else [])
+    runner.publish_done(strictly=True)
+    write_and_show_tables(record, call, missed if command.latency else [])
 
 
 def check_table_names(plan: Plan, reports: Path) -> None:
@@ -167,18 +186,17 @@ def check_data_of_finished(plan: Plan, identify: Identifier, outputs: Path) -> N
         check_data(config, outputs / spec.run_id, RunFolder(outputs, spec.run_id).read_result()[0], find)
 
 
-def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, again: str, problems: list[str]) -> None:
-    """Write and show the tables. Raises HorizonError listing what failed, `problems` among it."""
+def write_and_show_tables(record: SweepRecord, call: SweepCall, problems: list[str]) -> None:
+    """Write and show the tables of the published results. Raises HorizonError listing what failed, `problems` first."""
     failed = [run for run in record.runs.values() if run.state == "failed"]
     if failed:
         problems = [*problems, f"{len(failed)} of {len(record.runs)} runs failed:"]
         for run in failed:
-            log = str(outputs / run.log) if run.log is not None else "none"
+            log = str(call.outputs / run.log) if run.log is not None else "none"
             problems.append(f"  {run.label}, seed {run.seed} ({run.run_id}): {run.reason}; log: {log}")
-        problems.append(f"the same command retries them:\n    {again}")
-    runner.publish_done(strictly=True)
+        problems.append(f"the same command retries them:\n    {call.again}")
     try:
-        paths = write_sweep_tables(reports, record, read_results(reports, record.scale)[0])
+        paths = write_sweep_tables(call.reports, record, read_results(call.reports, record.scale)[0])
     except HorizonError as error:
         if not problems:
             raise
@@ -189,7 +207,7 @@ def finish(record: SweepRecord, runner: Runner, outputs: Path, reports: Path, ag
             print(f"\n{path.read_text()}")
     for path in paths:
         print(f"table: {path}")
-    print(progress_line(record, 1, time.time()))
+    print(progress_of(record, 1, time.time()))
     if problems:
         raise HorizonError("\n".join(problems))
 

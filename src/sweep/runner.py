@@ -22,7 +22,7 @@ from src.reliability.command import INTERRUPT_GRACE_S
 from src.report.metric_names import METRICS, Metric
 from src.report.results import is_finished
 from src.report.sweep_record import SweepRecord
-from src.report.time_left import progress_line
+from src.report.time_left import progress_of
 from src.sweep.launcher import ExitStatus, Launcher, StopRequest
 from src.sweep.plan import Plan, RunSpec
 from src.sweep.record_writer import RecordWriter
@@ -257,7 +257,7 @@ class Runner:
             return None
 
     def _show(self, record: SweepRecord) -> None:
-        logger.info("%s", progress_line(record, self.launcher.workers, time.time()))
+        logger.info("%s", progress_of(record, self.launcher.workers, time.time()))
 
     @contextmanager
     def _handling_signals(self) -> Iterator[None]:

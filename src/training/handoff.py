@@ -24,6 +24,7 @@ from src.models.detector import Detector
 from src.reliability.checkpoints import LAST, OpenCheckpoint, load_model_weights, open_checkpoint
 from src.reliability.processes import die_with_parent
 from src.training.identity import RUN_ID, TEMPORAL_DATA_KEYS, is_of, leaves, run_identity
+from src.training.run_config import RunConfig
 from src.training.run_folder import RunFolder
 
 logger = logging.getLogger(__name__)
@@ -38,7 +39,7 @@ INPUT_SETTINGS = (
 )
 """What the weights have learnt to see of data."""
 
-Compose = Callable[[list[str]], tuple[Any, dict[str, Any]]]
+Compose = Callable[[list[str]], tuple[RunConfig, dict[str, Any]]]
 """Overrides to a run's configuration, as dataclasses and as plain values (`compose_config`)."""
 
 
@@ -63,7 +64,7 @@ class WeightSource:
 
 
 def find_source(
-    config: Any,  # of the run, as `compose` gives it
+    config: RunConfig,  # as `compose` gives it
     overrides: list[str],
     compose: Compose,
     phases: Sequence[str],  # names that `phase.init_from` may have

@@ -121,7 +121,7 @@ class TrainingModule(L.LightningModule):
         if not finite_everywhere(total, norm):
             self.guard.refuse(self, batch, objective.terms)
             return
-        self.guard.in_a_row = 0
+        self.guard.accept()
         nn.utils.clip_grads_with_norm_(self.model.parameters(), self.optim.clip_norm, norm)
         for name, value in objective.terms.items():
             self.means.update(f"loss/{name}", value.detach(), len(batch))

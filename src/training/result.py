@@ -18,6 +18,7 @@ from src.ops.products import describe_products
 from src.structures.skipped import SHOWN_NAMES
 from src.training.module import TrainingModule
 from src.training.phases import EVALUATORS
+from src.training.run_config import RunConfig
 from src.training.run_folder import RunFolder, current_commit
 
 logger = logging.getLogger(__name__)
@@ -27,7 +28,7 @@ FILES = ("metrics.json", "metrics.csv", "config.yaml", "log.txt", "pictures", "s
 
 
 def run_record(
-    config: Any,  # of the run
+    config: RunConfig,
     module: TrainingModule,  # trained, still with its trainer
     **known: Any,  # by its name in run.json
 ) -> dict[str, Any]:

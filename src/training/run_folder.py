@@ -9,6 +9,7 @@ import os
 import subprocess
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 from enum import Enum
 from itertools import count
 from pathlib import Path
@@ -21,6 +22,14 @@ from src.files.atomic_write import replacing
 from src.reliability.checkpoints import BEST, LAST, PREVIOUS, OpenCheckpoint, open_checkpoint, sync_folder
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(kw_only=True)
+class PathsConfig:
+    """Folders, relative to where the command is run."""
+
+    outputs: str  # runs, worlds, caches
+    reports: str
 
 
 class Resume(Enum):

@@ -4,7 +4,7 @@ import pytest
 
 from src.report.sweep_file import DimensionConfig, RowConfig, SweepConfig
 from src.report.sweep_record import RunState, SweepRecord
-from src.report.time_left import duration, progress_line, seconds_left
+from src.report.time_left import duration, progress_of, seconds_left
 
 NOW = 10_000.0
 
@@ -25,20 +25,21 @@ STATES = {"phase1_0": "done", "phase1_1": "done", "phase2_0": "done", "phase1_2"
 
 
 def test_each_phase_takes_what_its_finished_runs_took():
-    record = record_of(took=(100.0, 200.0, 600.0), **STATES)
-    assert seconds_left(record, 1, NOW) == pytest.approx(130.0 + 600.0)
-    assert seconds_left(record, 2, NOW) == pytest.approx(365.0)
-    assert seconds_left(record, 1, NOW + 1000.0) == pytest.approx(600.0)  # it takes longer than the others did
-    assert seconds_left(record_of(**STATES), 1, NOW) is None
-    assert seconds_left(record_of(took=(100.0,), **STATES), 1, NOW) == pytest.approx(80.0 + 100.0)  # of any phase
+    runs = record_of(took=(100.0, 200.0, 600.0), **STATES).runs.values()
+    assert seconds_left(runs, 1, NOW) == pytest.approx(130.0 + 600.0)
+    assert seconds_left(runs, 2, NOW) == pytest.approx(365.0)
+    assert seconds_left(runs, 1, NOW + 1000.0) == pytest.approx(600.0)  # it takes longer than the others did
+    assert seconds_left(record_of(**STATES).runs.values(), 1, NOW) is None
+    runs = record_of(took=(100.0,), **STATES).runs.values()
+    assert seconds_left(runs, 1, NOW) == pytest.approx(80.0 + 100.0)  # of any phase
 
 
 def test_progress_is_told_in_a_line():
-    line = progress_line(record_of(**STATES, phase1_3="failed"), 1, NOW)
+    line = progress_of(record_of(**STATES, phase1_3="failed"), 1, NOW)
     assert line == "a: 3 of 6 done, 1 running, 1 left, 1 failed, time left unknown yet"
     record = record_of(took=(100.0, 200.0, 600.0), **STATES)
-    assert progress_line(record, 1, NOW).endswith("about 12 min left")
-    assert progress_line(record, 2, NOW).endswith("about 6 min left")
+    assert progress_of(record, 1, NOW).endswith("about 12 min left")
+    assert progress_of(record, 2, NOW).endswith("about 6 min left")
 
 
 def test_a_search_counts_the_trials_to_come():
@@ -46,7 +47,7 @@ def test_a_search_counts_the_trials_to_come():
     sweep = SweepConfig(name="a", title="t", question="q", space=space, trials=10)
     record = record_of(sweep, phase1_0="done", phase1_1="pruned", phase1_2="running")
     record.trials = 3
-    assert "1 of 10 done, 1 running, 7 left, 1 pruned" in progress_line(record, 1, NOW)
+    assert "1 of 10 done, 1 running, 7 left, 1 pruned" in progress_of(record, 1, NOW)
 
 
 @pytest.mark.parametrize(
@@ -59,5 +60,5 @@ def test_durations(seconds, expected):
 
 def test_a_clock_that_was_set_back_adds_nothing():
     record = record_of(took=(100.0,), phase1_0="done", phase1_1="running")
-    assert seconds_left(record, 1, NOW - 86_400.0) == pytest.approx(100.0)
-    assert seconds_left(record, 1, NOW + 86_400.0) == 0.0
+    assert seconds_left(record.runs.values(), 1, NOW - 86_400.0) == pytest.approx(100.0)
+    assert seconds_left(record.runs.values(), 1, NOW + 86_400.0) == 0.0

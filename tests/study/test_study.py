@@ -10,6 +10,7 @@ from src.report.results import RunResult
 from src.report.sweep_record import read_record
 from src.study import __main__ as study
 from src.sweep import compose as sweep_config
+from src.sweep import run_plan
 from src.sweep.record_writer import RecordWriter
 from src.sweep.run_plan import Identifier, definition
 from src.sweep.sweep_study import SweepStudy, default_storage
@@ -56,7 +57,7 @@ def places(tmp_path, monkeypatch):
     (tmp_path / "claims.yaml").write_text(json.dumps(CLAIMS))
     monkeypatch.setattr(sweep_config, "SWEEPS", folder)
     monkeypatch.setattr(study, "load_claims", lambda load: load_claims(load, tmp_path / "claims.yaml"))
-    monkeypatch.setattr(study, "Identifier", FakeIdentifier)
+    monkeypatch.setattr(run_plan, "Identifier", FakeIdentifier)
     return ["scale=debug", f"paths.outputs={tmp_path / 'outputs'}", f"paths.reports={tmp_path / 'reports'}"]
 
 
@@ -65,14 +66,14 @@ def trained(monkeypatch):
     """Stands for the runner: finishes every run of a plan. Returns (sweep, runs that were not there, by row) a call."""
     results, calls = {}, []
 
-    def run_plan(plan, command, common, identify, outputs, reports, again):
+    def finish_all(plan, command, call):
         new = {}
         for spec in plan.specs.values():
             if spec.run_id in results or spec.run_id in plan.published or not command.workers:
                 continue
             new.setdefault(spec.label, []).append(spec.seed)
             value = 0.1 + GAIN.get(spec.label, [0.0] * 12)[spec.seed] / 100
-            folder = outputs / spec.run_id
+            folder = call.outputs / spec.run_id
             folder.mkdir(parents=True)
             (folder / "run.json").write_text("{}")
             (folder / "metrics.json").write_text(json.dumps({"mAP": value}))
@@ -83,11 +84,11 @@ def trained(monkeypatch):
                 peak_memory_mib={"process": 1}, skipped_files={}, config={}, metrics={"mAP": value}, curves={},
                 latency=None,
             )  # fmt: skip
-        shared = SweepStudy(outputs, plan.study, default_storage(outputs), definition(plan, common))
-        RecordWriter(plan, shared, again, outputs, reports).write()
+        shared = SweepStudy(call.outputs, plan.study, default_storage(call.outputs), definition(plan, call.common))
+        RecordWriter(plan, shared, call.again, call.outputs, call.reports).write()
         calls.append((plan.sweep.name, new))
 
-    monkeypatch.setattr(study, "run_plan", run_plan)
+    monkeypatch.setattr(study, "run_plan", finish_all)
     monkeypatch.setattr(study.Study, "results", lambda self: dict(results))
     return calls, results
 

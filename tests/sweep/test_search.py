@@ -65,7 +65,9 @@ def test_trials_that_promise_little_are_pruned(tmp_path):
     assert max(trial.value or 0.0 for trial in runner.study.trials()) >= 0.8
 
 
-@pytest.mark.parametrize("name", ["NDS", "measures.moving_AP", "speeds.25+.car.AP", "ranges.0-25.mAP", "classes.car.AP"])
+@pytest.mark.parametrize(
+    "name", ["NDS", "measures.moving_AP", "speeds.25+.car.AP", "ranges.0-25.mAP", "classes.car.AP"]
+)
 def test_an_objective_is_read_by_the_name_that_tables_give_it(tmp_path, name):
     of_class = {"classes": {"car": {"AP": 0.5}}}
     scores = {"NDS": 0.5, "measures": {"moving_AP": 0.5}, "ranges": {"0-25": {"mAP": 0.5}}, "speeds": {"25+": of_class}}

@@ -18,6 +18,7 @@ from src.sweep import __main__ as sweep
 from src.sweep import compose as sweep_config
 from src.sweep import latency_runs
 from src.sweep.latency_runs import measure_latencies
+from src.sweep.run_plan import Identifier
 from src.training.handoff import find_source
 from src.training.identity import run_identity
 from tests.sweep.fake_sweep import make_runner, make_sweep
@@ -52,7 +53,7 @@ def places(tmp_path):
 
 @pytest.mark.slow
 def test_run_ids_are_those_of_the_training_command():
-    identify = sweep.Identifier()
+    identify = Identifier()
     for overrides in (
         ["scale=debug", "phase=phase1", "seed=7"],
         [

@@ -89,7 +89,9 @@ def test_a_number_has_one_spelling(spellings, one):
     assert {canonical(spelling) for spelling in spellings} == {one}
 
 
-@pytest.mark.parametrize("text", ["a=horizon3d-phase2-mini-6e546620", "a=0-0.5", "a=v1.0-trainval", "a=1.2.3", "a=x1e5"])
+@pytest.mark.parametrize(
+    "text", ["a=horizon3d-phase2-mini-6e546620", "a=0-0.5", "a=v1.0-trainval", "a=1.2.3", "a=x1e5"]
+)
 def test_digits_of_a_word_stay(text):
     assert canonical(text) == text
 
