@@ -12,21 +12,16 @@ a fixed number of places, and nothing records gradients. What only a module know
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from src.models.detector import Detector
-from src.models.heads.branches import Branches
-from src.models.heads.center_head import CenterHead
-from src.models.layers.merging import LinearReLU, block_diagonal, joined_linear, with_relu
+from src.models.layers.merging import with_relu
 from src.models.layers.sparse import SparseKernel
 from src.ops.precision import Precision
-
-CPU_CHUNK = 512
-"""Rows at a time through a wide hidden layer, so that it stays in the cache."""
 
 Linear = nn.Conv2d | nn.ConvTranspose2d | nn.Linear | SparseKernel
 """Layers that a norm behind them can go into."""
@@ -47,9 +42,7 @@ def prepare_for_inference(model: Detector, precision: str = Precision.FULL) -> D
         model.requires_grad_(False)
         _fold_norms(model)
         for module in list(model.modules()):
-            if isinstance(module, CenterHead):
-                _merge_head(module)
-            elif hasattr(module, "merge_for_inference"):
+            if hasattr(module, "merge_for_inference"):
                 module.merge_for_inference()
         _merge_relus(model)
         if precision == Precision.MIXED:
@@ -75,27 +68,6 @@ def fold_norm(layer: Linear, norm: _BatchNorm) -> None:
     layer.bias = nn.Parameter(shift.to(layer.weight.dtype), requires_grad=False)
 
 
-class MergedBranches(nn.Module):
-    """All branches of several `Branches` on the same input: one product to all hidden layers, one from them."""
-
-    def __init__(self, branches: Sequence[Branches]) -> None:
-        super().__init__()
-        hidden = [part.hidden for part in branches]
-        outputs = [output for part in branches for output in part.outputs]
-        weight, bias = (torch.cat([getattr(x, name) for x in hidden]) for name in ("weight", "bias"))
-        self.hidden = joined_linear(weight, bias, LinearReLU)
-        self.outputs = block_diagonal(outputs)
-
-    def forward(
-        self,
-        x: Tensor,  # [n, C]
-    ) -> Tensor:  # [n, sum of widths] float32
-        """Outputs of all branches side by side."""
-        parts = [x] if x.device.type != "cpu" else x.split(CPU_CHUNK)
-        found = [self.outputs(self.hidden(part)) for part in parts]
-        return found[0] if len(found) == 1 else torch.cat(found)
-
-
 def _fold_norms(model: nn.Module) -> None:
     for module in model.modules():
         for layer, norm in getattr(module, "norm_pairs", ()):
@@ -115,13 +87,6 @@ def _merge_relus(model: nn.Module) -> None:
             for number, (layer, behind) in enumerate(zip(module[:-1], module[1:], strict=True)):
                 if type(layer) is nn.Linear and layer.bias is not None and isinstance(behind, nn.ReLU):
                     module[number], module[number + 1] = with_relu(layer), nn.Identity()
-
-
-def _merge_head(head: CenterHead) -> None:
-    """Heat maps of all groups are asked for in every cell, codes of one group where it has candidates."""
-    if all(isinstance(part, Branches) for part in (*head.heatmaps, *head.regressions)):
-        head.heatmaps = nn.ModuleList([MergedBranches(list(head.heatmaps))])
-        head.regressions = nn.ModuleList(MergedBranches([part]) for part in head.regressions)
 
 
 def _round_weights(model: nn.Module) -> None:

@@ -11,8 +11,12 @@ from torch import Tensor, nn
 from src.geometry.constants import constant
 from src.losses.normalizers import full_precision
 from src.models.layers.full_precision import FullPrecisionLinear
+from src.models.layers.merging import LinearReLU, block_diagonal, joined_linear
 from src.models.layers.sparse import RowBatchNorm
 from src.ops.checkpointed_mlp import checkpointed_mlp, projected_statistics
+
+CPU_CHUNK = 512
+"""Rows at a time through a wide hidden layer, so that it stays in the cache."""
 
 
 class Branches(nn.Module):
@@ -79,3 +83,24 @@ def _norm_statistics(
             part.norm.running_mean.lerp_(its_mean, part.norm.momentum)
             part.norm.running_var.lerp_(its_variance, part.norm.momentum)
     return mean, variance
+
+
+class MergedBranches(nn.Module):
+    """All branches of several `Branches` on the same input: one product to all hidden layers, one from them."""
+
+    def __init__(self, branches: Sequence[Branches]) -> None:
+        super().__init__()
+        hidden = [part.hidden for part in branches]
+        outputs = [output for part in branches for output in part.outputs]
+        weight, bias = (torch.cat([getattr(x, name) for x in hidden]) for name in ("weight", "bias"))
+        self.hidden = joined_linear(weight, bias, LinearReLU)
+        self.outputs = block_diagonal(outputs)
+
+    def forward(
+        self,
+        x: Tensor,  # [n, C]
+    ) -> Tensor:  # [n, sum of widths] float32
+        """Outputs of all branches side by side."""
+        parts = [x] if x.device.type != "cpu" else x.split(CPU_CHUNK)
+        found = [self.outputs(self.hidden(part)) for part in parts]
+        return found[0] if len(found) == 1 else torch.cat(found)

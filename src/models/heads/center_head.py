@@ -16,7 +16,7 @@ from src.losses.classification import penalty_reduced_focal
 from src.losses.normalizers import full_precision, mean_over_ranks
 from src.losses.regression import masked_l1
 from src.models.detector import Objective
-from src.models.heads.branches import Branches, checkpointed_branches
+from src.models.heads.branches import Branches, MergedBranches, checkpointed_branches
 from src.models.heads.decode import (
     ATTRIBUTE_RULES,
     AttributeSource,
@@ -127,7 +127,14 @@ class CenterHead(nn.Module):
         widths = (*CODE_WIDTHS, len(ATTRIBUTES)) if self.learned else CODE_WIDTHS
         self.regressions = nn.ModuleList(Branches(channels, widths) for _ in HEAD_GROUPS)
         in_group_order = [CLASSES.index(name) for group in HEAD_GROUPS for name in group]
+        self.merged = False  # for inference
         self.class_columns = tuple(in_group_order.index(label) for label in range(len(CLASSES)))
+
+    def merge_for_inference(self) -> None:
+        """Heat maps of all groups are asked for in every cell, codes of one group where it has candidates."""
+        self.heatmaps = nn.ModuleList([MergedBranches(list(self.heatmaps))])
+        self.regressions = nn.ModuleList(MergedBranches([part]) for part in self.regressions)
+        self.merged = True
 
     def forward(
         self,
@@ -137,10 +144,10 @@ class CenterHead(nn.Module):
     ) -> HeadOutput:
         """Heat maps of all cells; box codes only where training needs them everywhere."""
         bev = self.shared(bev)
-        if isinstance(self.heatmaps[0], Branches):
-            logits = checkpointed_branches(list(self.heatmaps), bev.features)
-        else:  # prepared for inference
+        if self.merged:
             logits = self.heatmaps[0](bev.features)
+        else:
+            logits = checkpointed_branches(list(self.heatmaps), bev.features)
         logits = logits.index_select(1, constant(self.class_columns, torch.int64, logits.device))
         codes = None
         if self.training and self.config.train_regression is TrainRegression.all:
@@ -228,7 +235,7 @@ class CenterHead(nn.Module):
         if box_weight is None and not self.learned:
             return Objective(terms, diagnostics)
         predicted = _on_motion(output, self.regress(output, targets.rows, targets.groups), targets.rows)
-        if output.doppler is not None and output.doppler.in_losses:
+        if output.doppler is not None and output.doppler.config.in_losses:
             predicted = measured_codes(output, predicted, targets.rows)
         if box_weight is not None:
             code_weights = constant(self.code_weights, zeros.dtype, zeros.device)
@@ -271,7 +278,7 @@ class CenterHead(nn.Module):
         """
         doppler, threshold = output.doppler, self.config.score_threshold
         radar = None if doppler is None else (doppler.keys, doppler.velocities)
-        turned = doppler is not None and doppler.along_heading
+        turned = doppler is not None and doppler.config.along_heading
         cells = (rows, output.bev.indices, labels, scores)
         moving = _on_motion(output, codes, rows)
         found = decoded_boxes(moving, *cells, threshold, self.grid, ATTRIBUTE_RULES, radar, turned)

@@ -128,7 +128,7 @@ class BEVPath(nn.Module):
             values = list(values[0].split([1, 2], dim=1))
         regressed = SPEED_UNIT_MPS * values[1]
         velocities = regressed if doppler is None else doppler.correct(regressed, fused.sites.linear())
-        in_losses = doppler is None or doppler.in_losses
+        in_losses = doppler is None or doppler.config.in_losses
         return CellPrediction(values[0].squeeze(1), velocities, velocities if in_losses else regressed)
 
     @torch.no_grad()

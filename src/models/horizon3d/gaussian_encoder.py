@@ -310,7 +310,7 @@ class GaussianEncoder(nn.Module):
             embedding = self.anchor(gaussians) if joined is None else self.anchor(gaussians, joined)
             regressed = layer(gaussians, embedding, radar_bev, views, values, mask, picks)
             gaussians = _measured(regressed, doppler)
-        in_losses = doppler is None or doppler.in_losses
+        in_losses = doppler is None or doppler.config.in_losses
         return gaussians, (gaussians if in_losses else regressed).velocities
 
 

@@ -119,7 +119,7 @@ class Horizon3D(Detector):
         wanted = {name: getattr(config, name) for name in ("gaussians", "cells", "boxes")}
         if any(wanted.values()):
             points, owners = batch.radar_points, batch.radar_batch
-            measured = Doppler.measure(points, owners, self.grid, config.in_losses, config.along_heading)
+            measured = Doppler.measure(points, owners, self.grid, config)
         return {name: measured if its else None for name, its in wanted.items()}
 
     def fixed_form(self, capacities: Capacities | None = None) -> FixedHorizon3D | None:

@@ -40,8 +40,7 @@ class Doppler:
     grid: BEVGrid
     keys: Tensor  # [n] int64 ((b * rows + row) * cols + col) * NUM_BINS + bin, sorted, unique; padding has the largest
     velocities: Tensor  # [n, 2] m/s over ground, augmented axes
-    in_losses: bool = True  # see `DopplerConfig`
-    along_heading: bool = False  # see `DopplerConfig`
+    config: DopplerConfig
 
     @classmethod
     @torch.no_grad()
@@ -50,20 +49,19 @@ class Doppler:
         radar_points: Tensor,  # [P, 7] x, y, z (m, aug frame), rcs (dB), vx, vy (m/s), dt (s)
         radar_batch: Tensor,  # [P] int64
         grid: BEVGrid,
-        in_losses: bool = True,
-        along_heading: bool = False,
+        config: DopplerConfig,
     ) -> Self:
         """Of all points inside the grid."""
         given, weighted = radial_votes(radar_points, radar_batch, grid)
         if (fixed := fixed_shapes()) is not None:
             keys, _, groups = fixed.grouped(given, NONE, len(given))
             sums = group_sum(weighted, groups)
-            return cls(grid, keys, sums[:, 1:] / sums[:, :1].clamp(min=1.0), in_losses, along_heading)
+            return cls(grid, keys, sums[:, 1:] / sums[:, :1].clamp(min=1.0), config)
         chosen = (given < NONE).nonzero().squeeze(1)
         keys, order = torch.sort(given.index_select(0, chosen), stable=True)
         keys, counts = torch.unique_consecutive(keys, return_counts=True)
         sums = gather_segment_sum(weighted, chosen.index_select(0, order), F.pad(counts.cumsum(0), (1, 0)))
-        return cls(grid, keys, sums[:, 1:] / sums[:, :1], in_losses, along_heading)
+        return cls(grid, keys, sums[:, 1:] / sums[:, :1], config)
 
     def correct(
         self,

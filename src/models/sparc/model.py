@@ -12,10 +12,10 @@ from src.losses.normalizers import mean_over_ranks
 from src.models.backbones.point_transformer import PointTransformer, PointTransformerConfig, RadarPoints
 from src.models.detector import Objective
 from src.models.heads.query_proposals import ProposalConfig, Proposals, QueryProposals
-from src.models.layers.query_decoder import QueryDecoder, QueryDecoderConfig
 from src.models.layers.views import CameraViews
 from src.models.query_detector import CameraQueryLossConfig, QueryDetector, QueryDetectorConfig, QueryOutput
 from src.models.query_memory import QueryMemory
+from src.models.sparc.decoder import SpaRCDecoder, SpaRCDecoderConfig
 from src.models.sparc.frustum_fusion import FrustumFusionConfig, SparseFrustumFusion
 from src.structures.batch import FrameBatch
 from src.structures.taxonomy import CAMERAS
@@ -36,7 +36,7 @@ class SpaRCConfig(QueryDetectorConfig):
     radar_encoder: PointTransformerConfig
     fusion: FrustumFusionConfig
     queries: ProposalConfig
-    decoder: QueryDecoderConfig
+    decoder: SpaRCDecoderConfig
     loss: SpaRCLossConfig
 
     def __post_init__(self) -> None:
@@ -70,7 +70,7 @@ class SpaRC(QueryDetector):
         sizes = (self.radar_encoder.channels, width, channels)
         self.fusion = SparseFrustumFusion(config.fusion, *sizes, strides, grid)
         self.proposals = QueryProposals(config.queries, channels, width, grid)
-        self.decoder = QueryDecoder(config.decoder, channels, width, len(CAMERAS), len(strides), grid)
+        self.decoder = SpaRCDecoder(config.decoder, channels, width, len(CAMERAS), len(strides), grid)
 
     def forward(self, batch: FrameBatch, memory: QueryMemory | None = None) -> tuple[SpaRCOutput, QueryMemory | None]:
         """Detect in the frames of B streams, given what is remembered of them; the new memory is detached.

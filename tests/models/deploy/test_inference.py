@@ -10,9 +10,9 @@ from torch import nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.deploy.inference import MergedBranches, fold_norm, prepare_for_inference
+from src.models.deploy.inference import fold_norm, prepare_for_inference
 from src.models.deploy.static_parts import GraphReplay, ImageNetwork
-from src.models.heads.branches import Branches
+from src.models.heads.branches import Branches, MergedBranches
 from src.models.horizon3d.gaussian_encoder import AnchorEncoder, GaussianBounds
 from src.models.horizon3d.sparse_fusion import SparseFusion
 from src.models.layers.sparse import RowBatchNorm, SparseConv, SubmanifoldConv

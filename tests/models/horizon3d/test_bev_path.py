@@ -17,6 +17,7 @@ from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
 from src.models.layers.doppler import Doppler
 from tests.models.horizon3d.cells import FULL, GRID, TINY, C, bev_of, make_path, random_cells
 from tests.models.moving import UTM, bare_frame, bda, pose
+from tests.models.radial import MEASURED
 
 PAGE = Path(__file__).resolve().parents[4] / "shared/real/horizon3d_page/dptf_demo.json"
 SQUARE = BEVGrid(cells=(64, 64), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
@@ -373,12 +374,13 @@ def test_a_cells_velocity_takes_its_radial_part_from_the_radar():
     """A point of 5 m/s along x near the first cell; what the head says across it stays."""
     fused, _ = bev_of(torch.tensor([[0, 2, 2], [0, 90, 4]]), GRID)
     point = torch.cat([GRID.centre_of(torch.tensor([[2, 2]])), torch.tensor([[1.0, 0.0, 5.0, 0.0, 0.1]])], dim=1)
-    doppler, path = Doppler.measure(point, torch.tensor([0]), GRID), make_path().eval()
+    doppler, path = Doppler.measure(point, torch.tensor([0]), GRID, MEASURED), make_path().eval()
     plain, found = path.predict(fused).velocities, path.predict(fused, doppler).velocities
     torch.testing.assert_close(found[0], torch.tensor([5.0, float(plain[0, 1].detach())]))
     assert torch.equal(found[1], plain[1])
     for in_losses, wanted in ((True, found), (False, plain)):
-        assert torch.equal(path.predict(fused, replace(doppler, in_losses=in_losses)).supervised, wanted)
+        measured = replace(doppler, config=replace(MEASURED, in_losses=in_losses))
+        assert torch.equal(path.predict(fused, measured).supervised, wanted)
 
 
 def test_a_path_without_frames_or_with_an_impossible_threshold_is_refused():

@@ -28,6 +28,7 @@ from tests.models.learning import (
     parameters_that_stay,
     train_step,
 )
+from tests.models.radial import MEASURED
 
 CONF = Path(__file__).parents[3] / "conf"
 ALL_TERMS = {"heatmap", "box", "keypoint", "depth", "radar_objectness", "occupancy_focal", "occupancy_dice", "total"}
@@ -198,7 +199,7 @@ def test_velocities_are_those_that_the_radar_measures_along_the_line_of_sight(ma
         output, _ = model.eval()(batch)
         every = torch.arange(len(output.head.bev))
         boxes = boxes_of(model, output.head, model.head.regress(output.head, every, 0 * every))
-    doppler = Doppler.measure(batch.radar_points, batch.radar_batch, model.grid)
+    doppler = Doppler.measure(batch.radar_points, batch.radar_batch, model.grid, MEASURED)
     gaussians = output.ocsf.gaussians
     sample, _ = gaussians.valid.nonzero().unbind(1)
     row, col = model.grid.cell_of(gaussians.means[gaussians.valid]).unbind(1)
@@ -236,7 +237,7 @@ def test_boxes_may_move_along_their_heading(make_model, make_batch):
         codes = model.head.regress(output.head, every, 0 * every)
         codes[:, 6:8], codes[:, 8:10] = torch.tensor([0.0, 2.0]), torch.tensor([3.0, 20.0])
         kept = boxes_of(model, output.head, codes).velocities
-        output.head.doppler.along_heading = True
+        model.config.doppler.along_heading = True
         turned = boxes_of(model, output.head, codes).velocities
     assert (kept[:, 0] != 0).all()
     positions = model.grid.centre_of(output.head.bev.indices[:, 1:])

@@ -8,6 +8,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.layers.doppler import Doppler
 from src.ops.radial_correction import NUM_BINS
 from tests.models.moving import bda
+from tests.models.radial import MEASURED
 
 GRID = BEVGrid(cells=(12, 16), cell_m=0.8, centre_m=(8.0, 0.0), z_range_m=(-3.0, 5.0))
 
@@ -25,7 +26,7 @@ def cell(sample: int, row: int, col: int) -> int:
 def test_by_hand() -> None:
     """A cell sees standing points of its own and one mover two cells on, apart from each other."""
     points = points_at((5, 7, 0.2, 0.0), (5, 8, 0.0, 0.1), (5, 9, 30.0, -4.0), (5, 7, -7.0, 1.0), (99, 0, 50.0, 0.0))
-    doppler = Doppler.measure(points, torch.tensor([0, 0, 0, 1, 1]), GRID)
+    doppler = Doppler.measure(points, torch.tensor([0, 0, 0, 1, 1]), GRID, MEASURED)
 
     def found(*place: int) -> list[list[float]]:
         rows = (doppler.keys // NUM_BINS == cell(*place)).nonzero().squeeze(1)
@@ -41,7 +42,7 @@ def test_by_hand() -> None:
 def test_only_the_radial_part_is_imposed_and_only_what_is_near() -> None:
     """Moving: along the measured velocity. Standing: along the line of sight from the origin."""
     points = points_at((2, 2, 20.0, -20.0), (2, 2, 1e-3, 1e-3), (2, 3, -40.0, 40.0), (9, 14, 0.2, 0.1))
-    doppler = Doppler.measure(points, torch.zeros(4).long(), GRID)
+    doppler = Doppler.measure(points, torch.zeros(4).long(), GRID, MEASURED)
     here, there, nowhere = cell(0, 2, 2), cell(0, 9, 14), cell(0, 5, 8)
     said = torch.tensor([[19.0, -17.0], [2.0, -1.0], [-20.0, 19.0], [3.0, -5.0], [4.0, 4.0]], requires_grad=True)
     found = doppler.correct(said, torch.tensor([here, here, here, there, nowhere]))
@@ -59,14 +60,14 @@ def test_only_the_radial_part_is_imposed_and_only_what_is_near() -> None:
 
 @pytest.mark.parametrize("points", [points_at(), points_at((99, 0, 5.0, 5.0))], ids=["none", "outside the grid"])
 def test_without_points_nothing_changes(points: torch.Tensor) -> None:
-    doppler = Doppler.measure(points, torch.zeros(len(points)).long(), GRID)
+    doppler = Doppler.measure(points, torch.zeros(len(points)).long(), GRID, MEASURED)
     said = torch.randn(9, 2)
     assert torch.equal(doppler.correct(said, torch.arange(9)), said) and len(doppler.keys) == 0
     assert doppler.correct(said[:0], torch.arange(0)).shape == (0, 2)
 
 
 def test_speeds_beyond_the_bins_are_taken_together() -> None:
-    doppler = Doppler.measure(points_at((5, 9, 300.0, 0.0)), torch.zeros(1).long(), GRID)
+    doppler = Doppler.measure(points_at((5, 9, 300.0, 0.0)), torch.zeros(1).long(), GRID, MEASURED)
     assert doppler.correct(torch.tensor([[110.0, 0.0]]), torch.tensor([cell(0, 5, 9)])).tolist() == [[300.0, 0.0]]
 
 
@@ -80,7 +81,8 @@ def test_it_turns_with_the_augmentation() -> None:
     turned = torch.cat([points[:, :2] @ linear.T, points[:, 2:4], points[:, 4:6] @ linear.T, points[:, 6:]], dim=1)
     row, col = torch.arange(144) // 12, torch.arange(144) % 12
     said = 20 * torch.randn(144, 2, generator=generator)
-    before = Doppler.measure(points, torch.zeros(40).long(), grid).correct(said, torch.arange(144))
-    after = Doppler.measure(turned, torch.zeros(40).long(), grid).correct(said @ linear.T, col * 12 + 11 - row)
+    owners = torch.zeros(40).long()
+    before = Doppler.measure(points, owners, grid, MEASURED).correct(said, torch.arange(144))
+    after = Doppler.measure(turned, owners, grid, MEASURED).correct(said @ linear.T, col * 12 + 11 - row)
     torch.testing.assert_close(after, before @ linear.T, atol=1e-3, rtol=1e-4)
     assert (before != said).any(dim=1).float().mean() > 0.5

@@ -5,6 +5,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.heads.decode import ATTRIBUTE_RULES
 from src.models.layers.doppler import Doppler
 from src.ops.box_codes import decoded_boxes, decoded_boxes_reference
+from tests.models.radial import MEASURED
 
 GRID = BEVGrid(cells=(12, 16), cell_m=0.8, centre_m=(8.0, 0.0), z_range_m=(-3.0, 5.0))
 
@@ -14,7 +15,8 @@ GRID = BEVGrid(cells=(12, 16), cell_m=0.8, centre_m=(8.0, 0.0), z_range_m=(-3.0,
 def test_boxes(device, count, points, radar, turned):
     draw = torch.Generator().manual_seed(count + points)
     seen = torch.rand(points, 7, generator=draw) * torch.tensor([12.8, 9.6, 1, 1, 80, 80, 1])
-    doppler = Doppler.measure(seen - torch.tensor([-1.6, 4.8, 0, 0, 40, 40, 0]), torch.arange(points) % 2, GRID)
+    moved = seen - torch.tensor([-1.6, 4.8, 0, 0, 40, 40, 0])
+    doppler = Doppler.measure(moved, torch.arange(points) % 2, GRID, MEASURED)
     codes = 2 * torch.randn(count, 12, generator=draw)  # wider than a box code
     codes[:, 8:10] *= torch.tensor([0.1, 1.0, 20.0])[torch.arange(count) % 3, None]
     codes[::5, 6:8] = codes[::5, 8:10]  # ahead, and not at all

@@ -10,6 +10,7 @@ from src.ops.radial_correction import (
     radial_votes,
     radial_votes_reference,
 )
+from tests.models.radial import MEASURED
 
 GRID = BEVGrid(cells=(12, 16), cell_m=0.8, centre_m=(8.0, 0.0), z_range_m=(-3.0, 5.0))
 
@@ -33,7 +34,7 @@ def test_changes(device, points, count):
     rows = torch.rand(points, 7, generator=draw) * torch.tensor([12.8, 9.6, 1, 1, 80, 80, 1])
     rows -= torch.tensor([-1.6, 4.8, 0, 0, 40, 40, 0])
     rows[::2, 4:6] *= 1e-2  # standing
-    doppler = Doppler.measure(rows, torch.arange(points) % 2, GRID)
+    doppler = Doppler.measure(rows, torch.arange(points) % 2, GRID, MEASURED)
     velocities = 15 * torch.randn(count, 2, generator=draw)
     cells = torch.randint(0, 2 * 12 * 16, (count,), generator=draw)
     inputs = (velocities, cells, doppler.keys, doppler.velocities)
@@ -47,7 +48,7 @@ def test_changes_at_positions(device, added):
     draw = torch.Generator().manual_seed(2)
     rows = torch.rand(60, 7, generator=draw) * torch.tensor([12.8, 9.6, 1, 1, 80, 80, 1])
     rows -= torch.tensor([-1.6, 4.8, 0, 0, 40, 40, 0])
-    doppler = Doppler.measure(rows, torch.arange(60) % 2, GRID)
+    doppler = Doppler.measure(rows, torch.arange(60) % 2, GRID, MEASURED)
     positions = torch.rand(2, 150, 2, generator=draw) * torch.tensor([12.8, 9.6]) - torch.tensor([-1.6, 4.8])
     inputs = (15 * torch.randn(300, 2, generator=draw), positions, doppler.keys, doppler.velocities)
     found = radial_correction(*(x.to(device) for x in inputs), GRID, added).cpu()

@@ -24,7 +24,7 @@ INITIAL_REACH_M = 1.5
 
 
 @dataclass(kw_only=True)
-class QueryDecoderConfig:
+class SpaRCDecoderConfig:
     """Settings of the decoder (`model.decoder`). Raises ConfigError for values that cannot work."""
 
     num_layers: int
@@ -38,10 +38,10 @@ class QueryDecoderConfig:
         require_least(self, "model.decoder", least)
 
 
-class QueryDecoderLayer(nn.Module):
+class SpaRCDecoderLayer(nn.Module):
     """Local self-attention, range-adaptive radar aggregation, image attention and an MLP, each added."""
 
-    def __init__(self, config: QueryDecoderConfig, channels: int, num_views: int, num_levels: int) -> None:
+    def __init__(self, config: SpaRCDecoderConfig, channels: int, num_views: int, num_levels: int) -> None:
         super().__init__()
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(4))
         self.self_attention = DistanceAttention(channels, config.num_heads, config.num_neighbours)
@@ -76,7 +76,7 @@ class QueryDecoderLayer(nn.Module):
         return x + self.mlp(self.norms[3](x))
 
 
-class QueryDecoder(nn.Module):
+class SpaRCDecoder(nn.Module):
     """Layers each of which predicts relative to where its query began, and looks where the one before it predicted.
 
     Gradients do not pass from place to place. Changes of changes would ask one head for another answer in every layer.
@@ -84,7 +84,7 @@ class QueryDecoder(nn.Module):
 
     def __init__(
         self,
-        config: QueryDecoderConfig,
+        config: SpaRCDecoderConfig,
         channels: int,
         image_channels: int,
         num_views: int,
@@ -97,7 +97,7 @@ class QueryDecoder(nn.Module):
         self.embedding = QueryEmbedding(channels, grid)
         self.image_value = Conv2d(image_channels, channels, 1)
         sizes = (channels, num_views, num_levels)
-        self.layers = nn.ModuleList(QueryDecoderLayer(config, *sizes) for _ in range(config.num_layers))
+        self.layers = nn.ModuleList(SpaRCDecoderLayer(config, *sizes) for _ in range(config.num_layers))
         self.norm = nn.LayerNorm(channels)
 
     def forward(
