@@ -38,7 +38,7 @@ HEAVY = {"torch", "lightning", "hydra", "omegaconf", "matplotlib"}
 FRAMEWORKS = {
     "lightning": ("training/", "reliability/", "data/datamodule.py", "train.py"),
     "hydra": ("config.py", "sweep/compose.py"),
-    "omegaconf": ("config.py", "sweep/compose.py"),
+    "omegaconf": ("config.py", "sweep/compose.py", "sweep/sweep_files.py"),
     "truckscenes": ("benchmark/suite_metric.py",),
 }
 """Where a framework may be imported."""

@@ -12,7 +12,7 @@ from src.dashboard.render import Renderer
 from src.report import __main__ as report
 from src.report.results import read_result, result_path
 from src.sweep import __main__ as sweep
-from src.sweep import compose as sweep_config
+from src.sweep import sweep_files
 from src.training.evaluator import Evaluator
 from src.training.phases import EVALUATORS
 
@@ -66,9 +66,9 @@ def root_logger():
 @pytest.mark.usefixtures("root_logger")
 def test_a_run_without_map_is_finished_tabled_and_shown(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(EVALUATORS, "counting", FrameCount)
-    shutil.copytree(sweep_config.SWEEPS, tmp_path / "sweeps")  # claims name them
+    shutil.copytree(sweep_files.SWEEPS, tmp_path / "sweeps")  # claims name them
     (tmp_path / "sweeps" / "frames.yaml").write_text(SWEEP)
-    monkeypatch.setattr(sweep_config, "SWEEPS", tmp_path / "sweeps")
+    monkeypatch.setattr(sweep_files, "SWEEPS", tmp_path / "sweeps")
     outputs, reports = tmp_path / "outputs", tmp_path / "reports"
     places = ["scale=debug", f"paths.outputs={outputs}", f"paths.reports={reports}"]
 

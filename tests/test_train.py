@@ -11,7 +11,7 @@ from src.config import compose_config
 from src.errors import DataError
 from src.models.backbones.resnet import Bottleneck, ResNet
 from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
-from src.sweep import compose
+from src.sweep import sweep_files
 from src.sweep.__main__ import main as run_sweep
 from src.world.write import ensure_world
 from tests.running import call
@@ -84,7 +84,7 @@ def test_a_sweep_does_not_count_a_run_on_other_data(outputs, worlds, tmp_path, m
       rows: [{label: a}],
       tables: [{name: one, title: One, columns: [mAP]}]}"""
     (tmp_path / "one.yaml").write_text(sweep)
-    monkeypatch.setattr(compose, "SWEEPS", tmp_path)
+    monkeypatch.setattr(sweep_files, "SWEEPS", tmp_path)
     command = ["+sweep=one", "scale=debug", "data.world=null", "trainer.num_pictures=0", "workers=0"]
     command += [f"paths.outputs={outputs}", f"paths.reports={tmp_path / 'reports'}"]
     run_sweep([*command, f"data.root={worlds / 'here'}"])

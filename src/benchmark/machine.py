@@ -13,7 +13,7 @@ from torch import Tensor
 
 from src.benchmark.timing import clock, interleaved
 from src.ops.precision import Precision
-from src.report.sweep_text import is_busy
+from src.report.result_schema import is_busy
 
 # Square products large enough to reach the highest rate, small enough for seconds on two cores.
 GEMM_SIZE = {"cpu": 2048, "cuda": 8192}

@@ -38,7 +38,7 @@ from src.report.score_tables import BY_RANGE, BY_SPEED, ERROR_BY_SPEED, Experime
 from src.report.sweep_record import SweepRecord, read_records
 from src.report.sweep_table import MISSING
 from src.report.table_builder import write_sweep_tables
-from src.sweep.compose import load_sweep
+from src.sweep.sweep_files import load_sweep
 from src.training.run_folder import make_writable
 
 

@@ -126,6 +126,11 @@ class Latency(TypedDict):
     trained: NotRequired[bool]  # False of fresh weights
 
 
+def is_busy(load: float | None, cores: int | None) -> bool:
+    """Whether more than half of the processor was taken when a measurement began; not known of older files."""
+    return load is not None and cores is not None and load > 0.5 * cores
+
+
 class DataNames(TypedDict, extra_items=str):
     """What a run was trained and scored on: also version, train_split, split."""
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from src.report.comparisons import EQUAL, UNDECIDED, Comparison
 from src.report.metric_names import Metric
-from src.report.result_schema import Latency
+from src.report.result_schema import Latency, is_busy
 from src.report.results import RunResult
 from src.report.sweep_record import SweepRecord
 from src.report.sweep_table import SweepRow, SweepTable
@@ -121,11 +121,6 @@ def _latency(table: SweepTable, timed: list[Latency]) -> str:
         f"{text}; after ± of a latency that one run has stands half the range of the middle half of its frames, and "
         "two rows no further apart than the sum of theirs are undecided."
     )
-
-
-def is_busy(load: float | None, cores: int | None) -> bool:
-    """Whether more than half of the processor was taken when a measurement began; not known of older files."""
-    return load is not None and cores is not None and load > 0.5 * cores
 
 
 def findings(columns: list[Metric], rows: list[SweepRow], result: RunResult | None, complete: bool) -> list[str]:

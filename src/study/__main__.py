@@ -19,10 +19,11 @@ from src.report.comparisons import LOOKS
 from src.report.results import RunResult, read_results
 from src.report.sweep_record import RunState, SweepRecord, read_record, record_path
 from src.report.time_left import progress_line
-from src.sweep.compose import SweepCommand, compose_sweep, load_sweep
+from src.sweep.compose import SweepCommand, compose_sweep
 from src.sweep.plan import Plan, changes_of, make_plan, without_published
 from src.sweep.run_plan import SweepCall, resume_command, run_plan
 from src.sweep.run_status import is_scored
+from src.sweep.sweep_files import load_sweep
 from src.training.identity import key_of
 
 logger = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""The command line of `python -m src.sweep`, and the files of sweeps/ that it names, checked.
+"""The command line of `python -m src.sweep`, checked.
 
 A run's configuration knows nothing of sweeps: what concerns the runner is composed apart, from conf/sweep.yaml.
 """
@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import json
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
@@ -17,30 +15,18 @@ from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
-from src.config import CONF, GROUPS, SCALES, Config
+from src.config import CONF, GROUPS, Config
 from src.errors import ConfigError
 from src.reliability.config_faults import hydra_message
 from src.reliability.passwords import masked, shown_key
-from src.report.json_format import parse_as
-from src.report.plain_yaml import check_plain_yaml
-from src.report.sweep_file import (
-    DimensionConfig,
-    PaperRowConfig,
-    PlotConfig,
-    RowConfig,
-    SweepConfig,
-    TableConfig,
-)
+from src.report.sweep_file import SweepConfig
+from src.sweep.sweep_files import load_sweep, sweep_files
 from src.sweep.sweep_study import check_address
 from src.training.identity import key_of
 
-SWEEPS = CONF.parent / "sweeps"
 OWN_KEYS = ("sweep", "seeds", "workers", "storage", "dry_run", "trials", "published", "latency")
 MOST_SEEDS = 1000
-FILE_PARTS = (SweepConfig, RowConfig, TableConfig, PlotConfig, PaperRowConfig, DimensionConfig)
-FILE_KEYS = [field.name for part in FILE_PARTS for field in dataclasses.fields(part)]
 
 
 @dataclass(kw_only=True)
@@ -62,11 +48,6 @@ class SweepCommand:
                 raise ConfigError(f"{name} must be at least {least}, but got {getattr(self, name)}")
         if self.seeds > MOST_SEEDS:
             raise ConfigError(f"seeds must be at most {MOST_SEEDS}, but got {self.seeds}; seed=... says the first one")
-
-
-def sweep_files() -> dict[str, Path]:
-    """Every file of sweeps/ by its name."""
-    return {path.stem: path for path in sorted(SWEEPS.glob("*.yaml"))}
 
 
 def compose_sweep(overrides: list[str]) -> tuple[SweepCommand, list[str]]:
@@ -110,43 +91,6 @@ def _check_places(overrides: list[str]) -> None:
             raise ConfigError(
                 f"{shown_key(name)}: holds what looks like a password; a database's address is given as storage=..."
             )
-
-
-def load_sweep(name: str) -> SweepConfig:
-    """One file of sweeps/. Raises ConfigError naming the file and what is wrong with it."""
-    files = sweep_files()
-    if name not in files:
-        near = difflib.get_close_matches(name, files, n=1)
-        hint = f"did you mean {near[0]}? " if near else ""
-        raise ConfigError(f"sweep={name}: there is no sweeps/{name}.yaml; {hint}there are {', '.join(files)}")
-    where = f"sweeps/{name}.yaml"
-    try:
-        check_plain_yaml(files[name].read_text(encoding="utf-8"))
-        content = OmegaConf.to_container(OmegaConf.load(files[name]), resolve=False)  # reads 1e-3 as YAML 1.2 does
-        _refuse_interpolation(content)
-        content = content | {"name": name} if isinstance(content, dict) else content
-        sweep = parse_as(SweepConfig, json.dumps(content), known=FILE_KEYS)
-    except ConfigError as error:
-        raise ConfigError(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
-    except OmegaConfBaseException as error:
-        raise ConfigError(f"{where}: {hydra_message(error, lambda: FILE_KEYS)}") from error
-    except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, OSError) as error:
-        words = " ".join(str(error).split())
-        hint = "; write on, off, yes and no in quotes" if words.endswith(("is True", "is False")) else ""
-        raise ConfigError(f"{where}: {words}{hint}") from error
-    unknown = sorted({scale for row in sweep.rows for scale in row.scales or ()} - set(SCALES))
-    if unknown:
-        raise ConfigError(f"{where}: scales: there is no scale {', '.join(unknown)}; there are {', '.join(SCALES)}")
-    return sweep
-
-
-def _refuse_interpolation(content: Any, where: str = "") -> None:
-    """Raises ConfigError for `${`: labels go on to Hydra as they stand, and a file has nothing to refer to."""
-    if isinstance(content, dict | list):
-        for key, value in content.items() if isinstance(content, dict) else enumerate(content):
-            _refuse_interpolation(value, f"{where}.{key}" if where else str(key))
-    elif isinstance(content, str) and "${" in content:
-        raise ConfigError(f"{where}: must not hold ${{, but is {content!r}")
 
 
 def _compose(sweep: SweepConfig, overrides: list[str]) -> SweepCommand:

@@ -21,7 +21,7 @@ from PIL import Image, ImageDraw
 from torch import nn
 
 import src.config
-import src.sweep.compose
+import src.sweep.sweep_files
 from src.config import compose_config, restore_config
 from src.dashboard.folders import Picture, RunFolders
 from src.dashboard.single_file import _data_address
@@ -42,8 +42,8 @@ from src.reliability.metrics_csv import MetricsCSV
 from src.report.results import publish_result, read_result
 from src.report.sweep_file import RowConfig, SweepConfig, TableConfig
 from src.report.sweep_record import RunState, SweepRecord, read_record, write_record
-from src.sweep.compose import load_sweep
 from src.sweep.run_status import read_score, read_validations
+from src.sweep.sweep_files import load_sweep
 from src.training.run_folder import RunFolder
 from src.world.pcd_writer import LIDAR_TYPE, lidar_pcd
 from src.world.write import _read_stored
@@ -468,7 +468,7 @@ def sweep_examples() -> list[bytes]:
 
 
 def use_sweeps_of(folder: Path) -> None:
-    src.sweep.compose.SWEEPS = folder
+    src.sweep.sweep_files.SWEEPS = folder
 
 
 def read_sweep_file(path: Path) -> None:

@@ -25,7 +25,7 @@ from src.report import plain_yaml
 from src.report.results import publish_result, read_result
 from src.report.sweep_record import read_record
 from src.streaming import StreamingDetector
-from src.sweep.compose import load_sweep
+from src.sweep.sweep_files import load_sweep
 
 SRC = Path(train.__file__).parent
 SECRET = "wk-5ecret-0123456789"
@@ -376,7 +376,7 @@ def test_an_override_brings_in_nothing_but_values(secret, override):
 )
 def test_a_sweep_file_brings_in_nothing_but_values(tmp_path, monkeypatch, secret, content):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("src.sweep.compose.SWEEPS", tmp_path)
+    monkeypatch.setattr("src.sweep.sweep_files.SWEEPS", tmp_path)
     (tmp_path / "bad.yaml").write_text(content)
     with pytest.raises(ConfigError, match="sweeps/bad.yaml") as caught:
         load_sweep("bad")

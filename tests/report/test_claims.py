@@ -10,7 +10,7 @@ from src.errors import ConfigError
 from src.report.claims import Verdict, judge, load_claims, verdict_of
 from src.report.sweep_file import RowConfig, SweepConfig
 from src.report.sweep_record import read_records
-from src.sweep.compose import load_sweep
+from src.sweep.sweep_files import load_sweep
 
 COMPARISON = {"sweep": "margin", "row": "large", "over": "small", "metrics": ["mAP"]}
 PAPER = {"large": {"mAP": 20.3, "mAVE": 0.5}, "small": {"mAP": 18.6, "mAVE": 0.7}, "silent": {}}

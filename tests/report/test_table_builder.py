@@ -14,7 +14,7 @@ from src.report.results import read_results, result_path
 from src.report.sweep_file import MAX_COLUMNS, DimensionConfig, SweepConfig
 from src.report.sweep_record import RunState, SweepRecord
 from src.report.table_builder import sweep_tables, write_sweep_tables
-from src.sweep.compose import load_sweep, sweep_files
+from src.sweep.sweep_files import load_sweep, sweep_files
 
 PREFIX = "horizon3d-phase1-mini-"
 

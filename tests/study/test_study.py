@@ -9,8 +9,7 @@ from src.report.claims import load_claims
 from src.report.results import RunResult
 from src.report.sweep_record import read_record
 from src.study import __main__ as study
-from src.sweep import compose as sweep_config
-from src.sweep import run_plan
+from src.sweep import run_plan, sweep_files
 from src.sweep.record_writer import RecordWriter
 from src.sweep.run_plan import Identifier, definition
 from src.sweep.sweep_study import SweepStudy, default_storage
@@ -55,7 +54,7 @@ def places(tmp_path, monkeypatch):
         rows = [{"label": label, "overrides": [f"model.{name}={label}"]} for label in labels]
         (folder / f"{name}.yaml").write_text(json.dumps({"title": "t", "question": "q?", "rows": rows}))
     (tmp_path / "claims.yaml").write_text(json.dumps(CLAIMS))
-    monkeypatch.setattr(sweep_config, "SWEEPS", folder)
+    monkeypatch.setattr(sweep_files, "SWEEPS", folder)
     monkeypatch.setattr(study, "load_claims", lambda load: load_claims(load, tmp_path / "claims.yaml"))
     monkeypatch.setattr(run_plan, "Identifier", FakeIdentifier)
     return ["scale=debug", f"paths.outputs={tmp_path / 'outputs'}", f"paths.reports={tmp_path / 'reports'}"]

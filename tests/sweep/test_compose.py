@@ -3,15 +3,16 @@
 import pytest
 
 from src.errors import ConfigError
-from src.sweep import compose as sweep_config
-from src.sweep.compose import compose_sweep, load_sweep
+from src.sweep import sweep_files
+from src.sweep.compose import compose_sweep
+from src.sweep.sweep_files import load_sweep
 
 GOOD = "title: t\nquestion: q\nrows: [{label: a}]\n"
 
 
 @pytest.fixture
 def sweeps(tmp_path, monkeypatch):
-    monkeypatch.setattr(sweep_config, "SWEEPS", tmp_path)
+    monkeypatch.setattr(sweep_files, "SWEEPS", tmp_path)
     (tmp_path / "good.yaml").write_text(GOOD)
     return tmp_path
 

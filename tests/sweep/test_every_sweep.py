@@ -9,7 +9,7 @@ import pytest
 from src.report.results import read_results
 from src.report.sweep_record import read_record, record_path
 from src.report.table_builder import sweep_tables
-from src.sweep.compose import sweep_files
+from src.sweep.sweep_files import sweep_files
 
 ROOT = Path(__file__).resolve().parents[2]
 PARTS_OF_SOME = ("image_encoder", "kggi", "ocsf", "gaussian_encoder", "dptf", "view_transform", "temporal_fusion")

@@ -15,8 +15,7 @@ from src.config import PHASES, compose_config
 from src.errors import ConfigError, HorizonError
 from src.report.sweep_record import read_record
 from src.sweep import __main__ as sweep
-from src.sweep import compose as sweep_config
-from src.sweep import latency_runs
+from src.sweep import latency_runs, sweep_files
 from src.sweep.latency_runs import measure_latencies
 from src.sweep.run_plan import Identifier
 from src.training.handoff import find_source
@@ -41,7 +40,7 @@ def sweeps(tmp_path, monkeypatch):
     folder = tmp_path / "sweeps"
     folder.mkdir()
     (folder / "two.yaml").write_text(FILE)
-    monkeypatch.setattr(sweep_config, "SWEEPS", folder)
+    monkeypatch.setattr(sweep_files, "SWEEPS", folder)
     monkeypatch.chdir(ROOT)
     return folder
 

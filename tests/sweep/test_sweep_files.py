@@ -12,11 +12,12 @@ from omegaconf import OmegaConf
 from src.config import CONF, GROUPS, _compose, build_config, compose_config
 from src.errors import ConfigError
 from src.report.metric_names import METRICS
-from src.sweep import compose as sweep_config
-from src.sweep.compose import compose_sweep, load_sweep, sweep_files
+from src.sweep import sweep_files
+from src.sweep.compose import compose_sweep
+from src.sweep.sweep_files import load_sweep
 
 SCALES = sorted(path.stem for path in (CONF / "scale").glob("*.yaml"))
-FILES = list(sweep_files())
+FILES = list(sweep_files.sweep_files())
 QUESTIONS = [name for name in FILES if not load_sweep(name).is_search]
 REPORTED = CONF.parent.parent / "shared" / "spec" / "reported_numbers.json"
 LRS, LRS_REPORTED = "LRS4Fusion, ", REPORTED.with_name("lrs4fusion_reported.json")
@@ -304,7 +305,7 @@ SPACE = {key: value for key, value in GOOD.items() if key not in ("rows", "basel
 @pytest.fixture
 def written(tmp_path, monkeypatch):
     """Writes a file into a folder of sweeps that takes the place of ours."""
-    monkeypatch.setattr(sweep_config, "SWEEPS", tmp_path)
+    monkeypatch.setattr(sweep_files, "SWEEPS", tmp_path)
 
     def write(content):
         text = content if isinstance(content, str) else json.dumps(content)  # JSON is YAML

@@ -15,8 +15,8 @@ from src.models.heads.query_proposals import ProposalConfig, Proposals, QueryPro
 from src.models.layers.views import CameraViews
 from src.models.query_detector import CameraQueryLossConfig, QueryDetector, QueryDetectorConfig, QueryOutput
 from src.models.query_memory import QueryMemory
-from src.models.sparc.decoder import SpaRCDecoder, SpaRCDecoderConfig
 from src.models.sparc.frustum_fusion import FrustumFusionConfig, SparseFrustumFusion
+from src.models.sparc.sparc_decoder import SpaRCDecoder, SpaRCDecoderConfig
 from src.structures.batch import FrameBatch
 from src.structures.taxonomy import CAMERAS
 from src.targets.heatmap import head_targets
