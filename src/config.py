@@ -29,7 +29,7 @@ from src.ops.precision import Precision
 from src.reliability.config_faults import check_tree, hydra_message
 from src.reliability.passwords import masked, shown_key
 from src.reliability.untrusted import fault_of_tree
-from src.training.identity import YOUNGER_KEYS, key_of
+from src.training.identity import LEGACY_DEFAULTS, key_of
 from src.training.optim import OptimConfig
 from src.training.phases import PhaseConfig
 from src.training.run_folder import PathsConfig, Resume
@@ -298,8 +298,8 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
 
     A group choice (`data=truckscenes`) replaces that whole group, at the checkpoint's scale and phase; `model=` only
     says whose keys may follow. A key of `trainer` that is younger than the checkpoint has today's value, one of
-    YOUNGER_KEYS the value stated there. `paths` are the command's own: where it reads and writes is not for a file to
-    say, least of all a stranger's; so is `oracle`.
+    LEGACY_DEFAULTS the value stated there. `paths` are the command's own: where it reads and writes is not for a file
+    to say, least of all a stranger's; so is `oracle`.
     Raises CheckpointError when the stored tree does not fit this version of the code, ConfigError for another model,
     scale or phase and for a key below a part that the checkpoint does not have.
     """
@@ -321,7 +321,7 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
     own = [f"{key}={fixed[key]}" for key in ("scale", "model", "phase")]
     tree, fresh = OmegaConf.create(stored), _compose([*own, *overrides])
     tree.paths, tree.oracle = fresh.paths, fresh.oracle
-    for key, before in YOUNGER_KEYS.items():
+    for key, before in LEGACY_DEFAULTS.items():
         part, leaf = key.rpartition(".")[::2]
         if all(isinstance(OmegaConf.select(whole, part), DictConfig) for whole in (tree, fresh)):
             if leaf in OmegaConf.select(fresh, part) and leaf not in OmegaConf.select(tree, part):

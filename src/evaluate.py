@@ -21,7 +21,7 @@ from src.reliability.cpu import tune_cpu
 from src.training.evaluator import Evaluator
 from src.training.fit import build_evaluation_trainer
 from src.training.identity import digest_of_changes
-from src.training.run_folder import make_writable, name_of, write_json
+from src.training.run_folder import make_writable, name_of_checkpoint, write_json
 from src.training.temporal_module import TemporalModule
 from src.training.true_motion import Oracle, TrueMotion
 
@@ -37,7 +37,7 @@ def main(overrides: list[str]) -> None:
     source = Path(config.checkpoint or config.predictions)
     if config.predictions and not source.is_file():  # before a world is written for it
         raise DataError(f"predictions={source}: there is no such file")
-    name = f"{name_of(source)}{digest_of_changes(overrides)}"
+    name = f"{name_of_checkpoint(source)}{digest_of_changes(overrides)}"
     out = Path(config.out) if config.out else Path(config.paths.outputs) / "evaluations" / name
     make_writable(out, "out")
     written = ["metrics.json"]

@@ -16,7 +16,7 @@ from src.models.deploy.inference import prepare_for_inference
 from src.reliability.checkpoints import read_checkpoint
 from src.reliability.command import run_command
 from src.structures.taxonomy import CAMERAS
-from src.training.run_folder import make_writable, name_of
+from src.training.run_folder import make_writable, name_of_checkpoint
 
 EXAMPLE_FRAMES = 2
 """One frame would be taken for a constant; the program takes any number."""
@@ -34,7 +34,8 @@ def main(overrides: list[str]) -> None:
     if command.checkpoint is None:
         raise ConfigError("give checkpoint=PATH of the trained model whose image encoder is to be exported")
     path = Path(command.checkpoint)
-    out = Path(command.out) if command.out else Path(command.paths.outputs) / "exports" / f"{name_of(path)}.pt2"
+    exports = Path(command.paths.outputs) / "exports"
+    out = Path(command.out) if command.out else exports / f"{name_of_checkpoint(path)}.pt2"
     if out.suffix != ".pt2" or out.is_dir():
         raise ConfigError(f"out={out}: must be a file that ends in .pt2")
     checkpoint = read_checkpoint(path)

@@ -25,7 +25,7 @@ from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
 from src.structures.skipped import SkippedFiles
 from src.training.identity import digest_of_changes
-from src.training.run_folder import make_writable, name_of
+from src.training.run_folder import make_writable, name_of_checkpoint
 from src.training.snapshots import SHOWN_SCORE, scene_of, views_of
 
 # The boxes of one frame and its global_from_ego.
@@ -79,7 +79,7 @@ def output_folder(checkpoint: Path, command: Config, config: Config, overrides: 
     """`out`, or a folder named by the checkpoint and its run, by what is predicted and by what is changed."""
     if command.out is not None:
         return Path(command.out)
-    name = name_of(checkpoint) + digest_of_changes(overrides)
+    name = name_of_checkpoint(checkpoint) + digest_of_changes(overrides)
     return Path(command.paths.outputs) / "predictions" / name / (command.scene or config.data.split)
 
 

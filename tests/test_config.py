@@ -11,7 +11,7 @@ import pytest
 from src.config import CONF, compose_config, refuse_options_of_others, restore_config
 from src.errors import CheckpointError, ConfigError
 from src.reliability.command import run_command
-from src.training.identity import YOUNGER_KEYS, run_identity, without_keys
+from src.training.identity import LEGACY_DEFAULTS, run_identity, without_keys
 from src.training.optim import cycle_value
 from tests.running import command
 
@@ -391,7 +391,7 @@ def test_a_second_score_of_detections_composes_and_an_older_checkpoint_has_none(
                         "phase.monitor=val/iou"])  # fmt: skip
 
 
-@pytest.mark.parametrize(("key", "before"), YOUNGER_KEYS.items())
+@pytest.mark.parametrize(("key", "before"), LEGACY_DEFAULTS.items())
 def test_what_was_made_before_there_was_a_key_is_what_it_was(key, before):
     of_world_model = key in (
         "model.loss.ray_range_power", "model.measured_motion", "model.neck.finest_scale"

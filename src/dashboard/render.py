@@ -25,7 +25,7 @@ from src.dashboard.folders import Picture
 from src.report.metric_names import METRICS, Metric
 from src.report.score_tables import metrics_of
 from src.report.time_left import duration
-from src.training.identity import leaves
+from src.training.identity import leaves, train_command
 
 TEMPLATES = Path(__file__).parent / "templates"
 SUMMARY = tuple(METRICS[name] for name in ("mAP", "NDS", "mAVE"))
@@ -176,7 +176,7 @@ class Renderer:
             "run.html", board=board, run=run, against=against, other=other, other_name=other_name, config=config,
             difference=difference, pictures=pictures, pairs=pairs, metrics=metric_rows(run, other), log=log,
             figures=run_figures(board, shown),
-            choices=_other_runs(board, run) if self.live else [], command=train_command(run),
+            choices=_other_runs(board, run) if self.live else [], command=command_of(run),
             progress=_progress(board, run),
             idle=max(0.0, board.now - (board.folders.written(run.run_id) or board.now)),
         )  # fmt: skip
@@ -228,10 +228,10 @@ def run_name(run: Run) -> str:
     return f"{sweep}{title}{seed} ({run.phase} {run.run_id[-8:]})"
 
 
-def train_command(run: Run) -> str | None:
+def command_of(run: Run) -> str | None:
     """What trains this run."""
     overrides = run.result.overrides if run.result else run.planned.overrides if run.planned else None
-    return " ".join(["python -m src.train", *overrides]) if overrides is not None else None
+    return train_command(overrides) if overrides is not None else None
 
 
 def flat_config(tree: dict[str, Any]) -> list[tuple[str, str]]:

@@ -95,7 +95,7 @@ class FixedForm(Protocol):
 class Objective(NamedTuple):
     """What a training step minimises, and what it shows besides."""
 
-    terms: dict[str, Tensor]  # weighted, each a scalar; `total` is their sum
+    terms: dict[str, Tensor]  # weighted, each a scalar; `Detector.loss` adds `total`, their sum
     diagnostics: dict[str, Tensor]  # scalars worth a curve that are no losses
 
 

@@ -13,6 +13,7 @@ from src.errors import require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.tensor_transforms import transform_points, transform_vectors_xy
 from src.models.heads.query_head import QueryPrediction
+from src.models.layers.feed_forward import scale_shift_linear
 from src.models.memory import FrameMemory, RememberedFrame, TemporalConfig, motions
 from src.ops.frame_motion import zero_slow_velocities
 from src.ops.take_rows import take_rows
@@ -106,10 +107,7 @@ class MotionNorm(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.motion = nn.Linear(MOTION_NUMBERS, channels)
-        self.scale_shift = nn.Linear(channels, 2 * channels)
-        nn.init.zeros_(self.scale_shift.weight)  # untrained, it is a plain layer norm
-        with torch.no_grad():
-            self.scale_shift.bias.copy_(torch.cat([torch.ones(channels), torch.zeros(channels)]))
+        self.scale_shift = scale_shift_linear(channels)  # untrained, it is a plain layer norm
 
     def forward(
         self,

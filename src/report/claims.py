@@ -80,7 +80,7 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True)
-class Measure:
+class ClaimMeasure:
     """One number by which two rows are compared."""
 
     comparison: ComparisonConfig
@@ -95,14 +95,14 @@ class Claim:
     """A claim with its measures, checked against the sweeps that it names."""
 
     config: ClaimConfig
-    measures: list[Measure]
+    measures: list[ClaimMeasure]
 
 
 @dataclass(frozen=True)
 class Finding:
     """What finished runs say of one measure."""
 
-    measure: Measure
+    measure: ClaimMeasure
     found: Comparison | None  # at the look it stands at
     pairs: int  # seeds that both rows have
     results: list[RunResult]  # behind it
@@ -158,7 +158,7 @@ def load_claims(load_sweep: Callable[[str], SweepConfig], path: Path = CLAIMS) -
     return claims
 
 
-def _measures(comparison: ComparisonConfig, sweep: SweepConfig, half_width: float, where: str) -> list[Measure]:
+def _measures(comparison: ComparisonConfig, sweep: SweepConfig, half_width: float, where: str) -> list[ClaimMeasure]:
     rows = {row.label: row for row in sweep.rows}
     for label in (comparison.row, comparison.over):
         if label not in rows:
@@ -190,7 +190,7 @@ def _measures(comparison: ComparisonConfig, sweep: SweepConfig, half_width: floa
                 "rows"
             )
         decides = not asks and name in comparison.metrics
-        measures.append(Measure(comparison, metric, 0.0 if asks else width, paper, decides))
+        measures.append(ClaimMeasure(comparison, metric, 0.0 if asks else width, paper, decides))
     return measures
 
 

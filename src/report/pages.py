@@ -33,7 +33,16 @@ from src.report.score_tables import (
     metrics_of,
     score_table,
 )
-from src.training.identity import OUTSIDE_IDENTITY, TEMPORAL_DATA_KEYS, YOUNGER_KEYS, canonical, is_of, key_of, leaves
+from src.training.identity import (
+    LEGACY_DEFAULTS,
+    OUTSIDE_IDENTITY,
+    TEMPORAL_DATA_KEYS,
+    canonical,
+    is_of,
+    key_of,
+    leaves,
+    train_command,
+)
 
 FURTHER = "phase1_further"
 """What phase 2 is compared with; it stands on that page alone."""
@@ -185,7 +194,7 @@ def changed_since(run: RunResult, defaults: dict[str, Any]) -> list[str]:
         free = [key for key in free if key != "model"]  # else the choice of another model frees all of it
     if not run.config["phase"].get("temporal", True):
         free += [f"data.{key}" for key in TEMPORAL_DATA_KEYS]
-    had = YOUNGER_KEYS | leaves(run.config)
+    had = LEGACY_DEFAULTS | leaves(run.config)
     return [
         f"{key}={json.dumps(had[key]) if not isinstance(had[key], str) else had[key]}"
         for key, today in leaves(defaults).items()
@@ -298,14 +307,13 @@ def _settings_without_dropout(run: RunResult) -> tuple[str, ...]:
     return tuple(setting for setting in run.settings if not setting.startswith(DROPOUT))
 
 
-def _page(phase: str, scale: str, epochs: str, runs: list[RunResult]) -> str:
+def _page(phase: str, scale: str, what: str, runs: list[RunResult]) -> str:
     """Title, conventions and the commands of the runs."""
     text = (
         f"# {phase}, scale {scale}\n\n"
-        f"Data: {runs[0].dataset}; {epochs}; {METRIC if runs[0].task == DETECTION else SCORES} Written by "
+        f"Data: {runs[0].dataset}; {what}; {METRIC if runs[0].task == DETECTION else SCORES} Written by "
         f"`python -m src.report phase={phase} scale={scale}` from the runs\n\n```\n"
     )
     for run in sorted(runs, key=lambda run: (run.phase, run.settings, run.seed)):
-        changes = " ".join([*run.settings, f"seed={run.seed}"])
-        text += f"python -m src.train phase={run.phase} scale={scale} {changes}\n"
+        text += f"{train_command([f'phase={run.phase}', f'scale={scale}', *run.settings, f'seed={run.seed}'])}\n"
     return f"{text}```\n\n"

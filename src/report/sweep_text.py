@@ -123,7 +123,9 @@ def _latency(table: SweepTable, timed: list[Latency]) -> str:
     )
 
 
-def findings(columns: list[Metric], rows: list[SweepRow], result: RunResult | None, complete: bool) -> list[str]:
+def describe_orderings(
+    columns: list[Metric], rows: list[SweepRow], result: RunResult | None, complete: bool
+) -> list[str]:
     """What trained rows were checked for, and in one sentence what was found. `result` is any of the table's."""
     if result is None:
         return ["No run has finished yet."]

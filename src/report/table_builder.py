@@ -12,8 +12,8 @@ from src.report.score_tables import mean_bounds
 from src.report.sweep_file import TableConfig
 from src.report.sweep_record import RunState, SweepRecord
 from src.report.sweep_table import PAPER, SweepRow, SweepTable, TableCell
-from src.report.sweep_text import describe_search, describe_starts, describe_table, findings
-from src.training.identity import RUN_ID, as_before_younger_keys, key_of, without_keys
+from src.report.sweep_text import describe_orderings, describe_search, describe_starts, describe_table
+from src.training.identity import RUN_ID, key_of, without_keys, without_legacy_defaults
 
 EARLIER = "; the number is of an earlier training"
 """Of a run that has a result, though it is to be trained, trains, or failed."""
@@ -92,7 +92,7 @@ def _experiment(result: RunResult) -> tuple[object, ...]:
     """What the runs of a row have in common; the run whose weights each begins with is of its seed, named or not."""
     source = result.config.get("phase", {}).get("init_from")
     phase = source.split("-")[1] if RUN_ID.fullmatch(str(source)) else source
-    config = without_keys(as_before_younger_keys(result.config), ["seed", "phase.init_from"])
+    config = without_keys(without_legacy_defaults(result.config), ["seed", "phase.init_from"])
     return result.model, result.phase, phase, config or result.settings
 
 
@@ -125,7 +125,7 @@ def _table(record: SweepRecord, results: dict[str, RunResult], config: TableConf
     if is_search:
         table.text = describe_search([row.state for row in rows], sweep.trials, objective, best)
     else:
-        table.text = findings(columns, trained, next(iter(results.values()), None), complete)
+        table.text = describe_orderings(columns, trained, next(iter(results.values()), None), complete)
     if sweep.note is not None:
         table.text = [sweep.note, *table.text]
     if starts := describe_starts(results.values()):

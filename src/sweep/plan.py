@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -12,7 +11,7 @@ from src.errors import ConfigError, HorizonError
 from src.report.metric_names import DETECTION
 from src.report.sweep_file import RowConfig, SweepConfig
 from src.report.sweep_record import suffix_of
-from src.training.identity import OUTSIDE_IDENTITY, canonical, is_of, key_of
+from src.training.identity import OUTSIDE_IDENTITY, canonical, is_of, key_of, train_command
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class RunSpec:
     @property
     def command(self) -> str:
         """The shell command that trains it."""
-        return shlex.join(["python", "-m", "src.train", *self.overrides, *self.machine])
+        return train_command([*self.overrides, *self.machine])
 
 
 @dataclass(frozen=True)

@@ -209,7 +209,7 @@ class Runner:
                 return None
             if self.stop.requested:
                 return ExitStatus(0, "", stop_requested=True)
-            logger.info("%s: started %s", name_of(spec), spec.run_id)
+            logger.info("%s: started %s", title_of(spec), spec.run_id)
             began = time.monotonic()
             status = self.launcher.run(spec, worker, self.stop, watch)
             if not status.busy:
@@ -218,7 +218,7 @@ class Runner:
         if status.interrupted and not self.writer.is_done(spec.run_id):
             self._interruptions[spec.run_id] += not status.stop_requested
             if self._interruptions[spec.run_id] < MOST_INTERRUPTIONS:
-                logger.info("%s: interrupted after %.0f s; it can be resumed", name_of(spec), seconds)
+                logger.info("%s: interrupted after %.0f s; it can be resumed", title_of(spec), seconds)
                 return replace(status, reason="")
         # A signal may come when everything is written, as to a search's run that is ended early in its last moment.
         reason = "" if status.interrupted and self.writer.is_done(spec.run_id) else status.reason
@@ -228,12 +228,12 @@ class Runner:
             reason = f"{folder / 'metrics.json'} has no finite {read_headline(folder)}"
         if reason:
             log = self.launcher.log_of(spec.run_id)
-            logger.warning("%s: FAILED after %.0f s: %s; log: %s", name_of(spec), seconds, reason, log)
+            logger.warning("%s: FAILED after %.0f s: %s; log: %s", title_of(spec), seconds, reason, log)
             return replace(status, reason=reason)
         name = read_headline(folder)
         metric = METRICS.get(name, Metric(name, name))
         score = f"{metric.scale * (read_score(folder, name) or 0.0):.{metric.digits}f} {metric.unit}".rstrip()
-        logger.info("%s: done after %.0f s, %s %s", name_of(spec), seconds, metric.title, score)
+        logger.info("%s: done after %.0f s, %s %s", title_of(spec), seconds, metric.title, score)
         self._publish(spec.run_id)
         return None
 
@@ -242,7 +242,7 @@ class Runner:
         logged = False
         while is_locked(folder) and not self.stop.requested:
             if not logged:
-                logger.info("%s: another process is training %s; waiting for it", name_of(spec), spec.run_id)
+                logger.info("%s: another process is training %s; waiting for it", title_of(spec), spec.run_id)
                 logged = True
             time.sleep(POLL_S)
 
@@ -287,6 +287,6 @@ class Runner:
                 signal.signal(number, handler)
 
 
-def name_of(spec: RunSpec) -> str:
+def title_of(spec: RunSpec) -> str:
     """A run's name in messages."""
     return f"[{spec.label}, seed {spec.seed}]"

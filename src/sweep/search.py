@@ -15,7 +15,7 @@ from src.errors import DivergedError, HorizonError
 from src.report.sweep_file import DimensionConfig
 from src.sweep.plan import Identify, RunSpec, join_overrides, run_specs_of, split_machine
 from src.sweep.run_status import read_score, read_validations
-from src.sweep.runner import Runner, name_of
+from src.sweep.runner import Runner, title_of
 from src.sweep.sweep_study import SweepStudy, SweepTrial, TrialEndedError, trials_begun
 
 logger = logging.getLogger(__name__)
@@ -111,7 +111,7 @@ class Search(Runner):
         watch()  # validations since the last poll: later trials are compared with all of them
         if watch.pruned and not self.writer.is_done(spec.run_id):
             self.study.set_attr(trial, "value", watch.last)
-            logger.info("%s: pruned, val/%s %.4f", name_of(spec), self.sweep.objective, watch.last)
+            logger.info("%s: pruned, val/%s %.4f", title_of(spec), self.sweep.objective, watch.last)
             raise optuna.TrialPruned
         if status is not None:
             self._fail(trial, status.reason, conclusive=status.code == DivergedError.exit_code)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
-import shlex
 import signal
 import subprocess
 import sys
@@ -23,7 +22,7 @@ from src.errors import CheckpointError, ConfigError, DataError, DivergedError, H
 from src.models.detector import Detector
 from src.reliability.checkpoints import LAST, OpenCheckpoint, load_model_weights, open_checkpoint
 from src.reliability.processes import die_with_parent
-from src.training.identity import RUN_ID, TEMPORAL_DATA_KEYS, is_of, leaves, run_identity
+from src.training.identity import RUN_ID, TEMPORAL_DATA_KEYS, is_of, leaves, run_identity, train_command
 from src.training.run_config import RunConfig
 from src.training.run_folder import RunFolder
 
@@ -60,7 +59,7 @@ class WeightSource:
     @property
     def command(self) -> str:
         """What makes it."""
-        return shlex.join(["python", "-m", "src.train", *(self.overrides or [])])
+        return train_command(self.overrides or [])
 
 
 def find_source(

@@ -6,6 +6,7 @@ import copy
 import hashlib
 import json
 import re
+import shlex
 from collections.abc import Iterable
 from typing import Any
 
@@ -30,7 +31,7 @@ They are left out of its identity, of its result, and of what a sweep records of
 TEMPORAL_DATA_KEYS = ("groups_per_scene", "stream_sets", "past_frames", "sensor_dropout")
 """Of `data`: what changes nothing of a phase without memory."""
 
-YOUNGER_KEYS = {
+LEGACY_DEFAULTS = {
     "data.timeline": None,
     "data.train_scenes": None,
     "phase.long_range": None,
@@ -76,6 +77,11 @@ def _spelled(number: re.Match[str]) -> str:
     return text if "." in text else text.replace("e", ".0e")  # YAML 1.1 takes no 6e-05 for a number
 
 
+def train_command(overrides: Iterable[str]) -> str:
+    """The command line of a shell that trains with them."""
+    return shlex.join(["python", "-m", "src.train", *overrides])
+
+
 def is_of(override: str, keys: Iterable[str]) -> bool:
     """Whether an override sets one of these keys or something below it."""
     name = key_of(override)
@@ -116,9 +122,9 @@ def _value_at(tree: dict[str, Any], key: str) -> Any:
     return node
 
 
-def as_before_younger_keys(tree: dict[str, Any]) -> dict[str, Any]:
+def without_legacy_defaults(tree: dict[str, Any]) -> dict[str, Any]:
     """A copy of a configuration without the younger keys that have their value of before."""
-    return without_keys(tree, [key for key, before in YOUNGER_KEYS.items() if _value_at(tree, key) == before])
+    return without_keys(tree, [key for key, before in LEGACY_DEFAULTS.items() if _value_at(tree, key) == before])
 
 
 def digest_of_changes(overrides: list[str]) -> str:
@@ -142,6 +148,6 @@ def run_identity(tree: dict[str, Any], source: str | None = None) -> str:
     if not tree["phase"]["temporal"]:
         for key in TEMPORAL_DATA_KEYS:
             tree["data"].pop(key)
-    tree = as_before_younger_keys(tree)
+    tree = without_legacy_defaults(tree)
     digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:8]
     return f"{tree['model']['name']}-{tree['phase']['name']}-{tree['scale']}-{digest}"

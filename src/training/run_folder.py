@@ -174,7 +174,7 @@ class RunFolder:
         return contents[0], contents[1]
 
 
-def name_of(source: Path) -> str:
+def name_of_checkpoint(source: Path) -> str:
     """The file's name, with its run's before it: every run has a last.ckpt, and one must not replace the other's."""
     folder = source.resolve().parent
     run = folder.parent.name if folder.name == "checkpoints" else folder.name

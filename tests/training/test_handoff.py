@@ -33,7 +33,7 @@ from src.training import handoff
 from src.training.handoff import differing_settings, find_source, hand_over, norms_handed_over, train_source
 from src.training.identity import run_identity
 from src.training.module import TrainingModule
-from src.training.run_folder import RunFolder, name_of
+from src.training.run_folder import RunFolder, name_of_checkpoint
 from tests.running import call, fork, run_module
 from tests.untrained import write_checkpoint
 
@@ -471,7 +471,7 @@ def test_evaluate_gives_the_scores_of_the_training(handed_over, tmp_path):
     checkpoint = f"checkpoint={second / 'checkpoints' / 'last.ckpt'}"
     evaluate.main([checkpoint, f"out={tmp_path / 'same'}", f"paths.outputs={outputs}"])
     assert (tmp_path / "same" / "metrics.json").read_text() == (second / "metrics.json").read_text()
-    assert name_of(second / "checkpoints" / "last.ckpt") == f"{second.name}-last"
+    assert name_of_checkpoint(second / "checkpoints" / "last.ckpt") == f"{second.name}-last"
     short = (checkpoint, "model.dptf.max_age_s=0.55", f"out={tmp_path / 'short'}", f"paths.outputs={outputs}")
     call("evaluate", *short)
     assert (

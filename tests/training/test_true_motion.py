@@ -9,7 +9,7 @@ import torch
 from src.errors import ConfigError
 from src.geometry.transforms import pose_matrix
 from src.models.crt_fusion.motion_fusion import StackFrame, StackMemory, StoredCellStack
-from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
+from src.models.horizon3d.dptf_memory import DPTFFrame, DPTFMemory, StoredCells
 from src.models.memory import FrameMemory, RememberedFrame
 from src.structures.batch import FrameBatch
 from src.structures.detections import DetectionTable
@@ -61,7 +61,7 @@ PREDICTED = torch.full((6, 2), 9.0)
 
 
 def frame(**parts):
-    return MemoryFrame(
+    return DPTFFrame(
         timestamps_s=torch.tensor([7.0]).double(),
         global_from_ego=torch.from_numpy(NORTH)[None],
         present=torch.tensor([True]),
@@ -84,7 +84,7 @@ def cells(rows=None):
 
 
 def corrected(oracle, *frames, truth=SET):
-    return TrueMotion(truth, oracle).correct(Memory(frames), batch()).frames
+    return TrueMotion(truth, oracle).correct(DPTFMemory(frames), batch()).frames
 
 
 def test_true_velocities():
@@ -139,7 +139,7 @@ def test_streams_do_not_mix_and_another_scene_is_not_known():
         global_from_ego=torch.from_numpy(LATER).repeat(2, 1, 1),
         aug_from_ego=torch.eye(4).repeat(2, 1, 1),
     )
-    (found,) = TrueMotion(SET, Oracle.velocity).correct(Memory((two,)), both).frames
+    (found,) = TrueMotion(SET, Oracle.velocity).correct(DPTFMemory((two,)), both).frames
     assert (found.cells.velocities[3:] == 9).all(), "padding: there is no such frame"
     torch.testing.assert_close(found.cells.velocities[0], torch.tensor([30.0, 0.0]), atol=1e-4, rtol=0)
     elsewhere = replace(SET, scenes=np.array([4, 5]))

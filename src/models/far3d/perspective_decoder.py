@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import ConfigError, require_least
+from src.errors import require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.heads.query_head import QueryPrediction, SetPredictionHead
 from src.models.layers.dense import Conv2d
-from src.models.layers.feed_forward import feed_forward
+from src.models.layers.feed_forward import feed_forward, scale_shift_linear
 from src.models.layers.global_attention import FFN_RATIO, GlobalAttention
 from src.models.layers.image_attention import ImageCrossAttention, PointOffsets
-from src.models.layers.query_attention import QueryEmbedding
+from src.models.layers.query_attention import QueryEmbedding, check_decoder_heads
 from src.models.layers.views import CameraViews
 from src.structures.queries import Queries
 
@@ -42,10 +42,7 @@ class CameraScaling(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.hidden, self.scale_shift = nn.Linear(12, channels), nn.Linear(channels, 2 * channels)
-        nn.init.zeros_(self.scale_shift.weight)
-        with torch.no_grad():
-            self.scale_shift.bias.copy_(torch.cat([torch.ones(channels), torch.zeros(channels)]))
+        self.hidden, self.scale_shift = nn.Linear(12, channels), scale_shift_linear(channels)
 
     def forward(
         self,
@@ -103,8 +100,7 @@ class PerspectiveDecoder(nn.Module):
         grid: BEVGrid,
     ) -> None:
         super().__init__()
-        if channels % config.num_heads:
-            raise ConfigError(f"model.decoder.num_heads={config.num_heads}: must divide model.channels={channels}")
+        check_decoder_heads(config.num_heads, channels)
         self.embedding = QueryEmbedding(channels, grid)
         self.scaling = CameraScaling(image_channels)
         self.image_value = Conv2d(image_channels, channels, 1)
@@ -121,12 +117,5 @@ class PerspectiveDecoder(nn.Module):
         """What every layer predicts, and the features that it predicts from."""
         scaled = [self.scaling(level, views.pix_from_aug) for level in views.levels]
         values = [self.image_value(x.flatten(0, 1)).unflatten(0, x.shape[:2]) for x in scaled]
-        embedding, remembered = self.embedding(queries), None
-        if past is not None:
-            remembered = (past.features + self.embedding(past), past.features, past.valid)
-        predictions, features = [], []
-        for layer in self.layers:
-            features.append(layer(queries, embedding, remembered, views, values))
-            queries = replace(queries, features=features[-1])
-            predictions.append(head(features[-1], queries))
-        return predictions, features
+        embeddings = (self.embedding(queries), None if past is None else self.embedding(past))
+        return head.of_layers(self.layers, queries, past, embeddings, views, values)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -77,6 +79,24 @@ class SetPredictionHead(nn.Module):
         centers, shape, velocities = self.box(features).split([3, CODE_SIZE - 5, 2], dim=-1)
         centers, velocities = queries.centers + centers, queries.velocities + SPEED_UNIT_MPS * velocities
         return QueryPrediction(logits, torch.cat([centers, shape, velocities], dim=-1), queries.valid)
+
+    def of_layers(
+        self,
+        layers: Iterable[nn.Module],  # of a decoder: queries, embedding, remembered keys, then `sources`
+        queries: Queries,
+        past: Queries | None,  # further ones to look at
+        embeddings: tuple[Tensor, Tensor | None],  # [B, Q, C] of the queries, [B, P, C] of the past
+        *sources: Any,  # what else every layer looks at
+    ) -> tuple[list[QueryPrediction], list[Tensor]]:  # of each layer, and [B, Q, C]
+        """What every layer predicts relative to the queries' own start, and the features that it predicts from."""
+        own, others = embeddings
+        remembered = None if past is None else (past.features + others, past.features, past.valid)
+        predictions, features = [], []
+        for layer in layers:
+            features.append(layer(queries, own, remembered, *sources))
+            queries = replace(queries, features=features[-1])
+            predictions.append(self(features[-1], queries))
+        return predictions, features
 
     def loss(
         self,

@@ -12,7 +12,7 @@ from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import repeat_interleave
 from src.geometry.tensor_transforms import transform_points_xy, transform_vectors_xy
-from src.models.horizon3d.dptf_memory import Memory, StoredCells, stored_features
+from src.models.horizon3d.dptf_memory import DPTFMemory, StoredCells, stored_features
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.layers.doppler import Doppler
 from src.models.layers.full_precision import FullPrecisionLinear
@@ -58,7 +58,7 @@ class CellPrediction:
 
     occupancy_logits: Tensor  # [M] float32, delta before its sigmoid
     velocities: Tensor  # [M, 2] float32, u in m/s over ground, augmented axes
-    supervised: Tensor  # [M, 2] those that losses see, see `DopplerConfig`
+    loss_velocities: Tensor  # [M, 2] those that losses see, see `DopplerConfig`
 
 
 @dataclass
@@ -150,7 +150,7 @@ class BEVPath(nn.Module):
 
     @torch.no_grad()
     def recall(
-        self, memory: Memory, batch: FrameBatch, max_age_s: float, min_speed_mps: float = 0.0
+        self, memory: DPTFMemory, batch: FrameBatch, max_age_s: float, min_speed_mps: float = 0.0
     ) -> WarpedCells | None:
         """Remembered cells in the batch's augmented frame (Eq. 8); None when nothing is remembered.
 

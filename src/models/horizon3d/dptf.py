@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.horizon3d.bev_path import BEVPath, BEVPathConfig, CellPrediction, PaddedWarpedCells, WarpedCells
-from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
+from src.models.horizon3d.dptf_memory import DPTFFrame, DPTFMemory
 from src.models.horizon3d.gaussian_path import GaussianPath, GaussianPathConfig, VelocityFrom
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.layers.doppler import Doppler
@@ -55,7 +55,7 @@ class DPTFConfig:
 class WarpedMemory:
     """The memory warped into the current frame."""
 
-    past: Memory  # less what is not in the frame's past (`Memory.before`)
+    past: DPTFMemory  # less what is not in the frame's past (`DPTFMemory.before`)
     history: GaussianSet | None  # None: nothing remembered, or the path is off
     warped: WarpedCells | PaddedWarpedCells | None
 
@@ -81,11 +81,11 @@ class DPTF(nn.Module):
             GaussianPath(config.gaussian_path, channels, grid) if config.gaussian_path is not None else None
         )
 
-    def recall(self, memory: Memory | None, batch: FrameBatch) -> WarpedMemory:
+    def recall(self, memory: DPTFMemory | None, batch: FrameBatch) -> WarpedMemory:
         """Bring the memory to the batch's time and frame."""
         history = warped = None
         limits = (self.config.max_age_s, self.config.min_speed_mps)
-        memory = Memory(()) if memory is None else memory.before(batch)
+        memory = DPTFMemory(()) if memory is None else memory.before(batch)
         if self.gaussian_path is not None:
             history = self.gaussian_path.recall(memory, batch, *limits)
         if self.bev_path is not None:
@@ -102,12 +102,12 @@ class DPTF(nn.Module):
 
     def remember(
         self,
-        past: Memory,  # of the batch, see `WarpedMemory`
+        past: DPTFMemory,  # of the batch, see `WarpedMemory`
         batch: FrameBatch,
         fused: SparseBEV,
         output: DPTFOutput,
         ocsf: OCSFOutput | None,  # None for radar only, which has no Gaussians
-    ) -> Memory:
+    ) -> DPTFMemory:
         """The memory with the current frame added."""
         cells = gaussians = None
         if self.bev_path is not None:
@@ -117,7 +117,7 @@ class DPTF(nn.Module):
             gaussians = self.gaussian_path.store(found, active, batch)
             if self.config.gaussian_path.forget_refuted and output.history is not None:
                 past = self.gaussian_path.without_refuted(past, output.history, active)
-        frame = MemoryFrame(
+        frame = DPTFFrame(
             batch.timestamps_s,
             batch.global_from_ego,
             torch.ones_like(batch.timestamps_s, dtype=torch.bool),

@@ -30,7 +30,7 @@ class StoredCells(StoredRows):
 
 
 @dataclass
-class MemoryFrame(RememberedFrame):
+class DPTFFrame(RememberedFrame):
     """One remembered key frame of each of B streams, detached, in unaugmented ego coordinates of its own time."""
 
     cells: StoredCells | None
@@ -40,14 +40,14 @@ class MemoryFrame(RememberedFrame):
         self,
         rows: Tensor,  # [B'] int64, distinct where kept
         keep: Tensor,  # [B'] bool
-    ) -> MemoryFrame:
+    ) -> DPTFFrame:
         """The streams at `rows`, those without `keep` forgotten."""
         frame = super().select(rows, keep)
         if frame.gaussians is None:
             return frame
         return replace(frame, gaussians=replace(frame.gaussians, valid=frame.gaussians.valid & keep[:, None]))
 
-    def with_velocities(self, velocities: Callable[[int, Tensor, Tensor], Tensor]) -> MemoryFrame:
+    def with_velocities(self, velocities: Callable[[int, Tensor, Tensor], Tensor]) -> DPTFFrame:
         """Of cells and of Gaussians."""
         cells, gaussians = self.cells, self.gaussians
         if cells is not None:
@@ -61,15 +61,15 @@ class MemoryFrame(RememberedFrame):
 
 
 @dataclass(frozen=True)
-class Memory(FrameMemory[MemoryFrame]):
+class DPTFMemory(FrameMemory[DPTFFrame]):
     """The last key frames of each of B streams, newest first. A value: pushing makes a new one."""
 
-    frame_type = MemoryFrame
+    frame_type = DPTFFrame
 
-    def push(self, frame: MemoryFrame, num_cell_frames: int, num_gaussian_frames: int) -> Memory:
+    def push(self, frame: DPTFFrame, num_cell_frames: int, num_gaussian_frames: int) -> DPTFMemory:
         """Put the current frame first and drop what no path reads any more, so that memory stays bounded."""
         frames = [frame, *self.frames][: max(num_cell_frames, num_gaussian_frames)]
-        return Memory(
+        return DPTFMemory(
             tuple(
                 replace(
                     old,

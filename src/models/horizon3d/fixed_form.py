@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.models.heads.fixed_decode import FixedDecode
-from src.models.horizon3d.dptf_memory import Memory
+from src.models.horizon3d.dptf_memory import DPTFMemory
 from src.models.horizon3d.fixed_memory import FixedMemory
 from src.models.horizon3d.gaussian_path import Sampling
 from src.models.horizon3d.splatting import FAR_M
@@ -82,16 +82,16 @@ class FixedHorizon3D(nn.Module):
             return None
         return self.head.boxes(result[:-1].view(len(HEAD_GROUPS), -1, sum(WIDTHS)))
 
-    def pack_memory(self, memory: Memory | None, device: torch.device) -> tuple[Tensor, ...]:
+    def pack_memory(self, memory: DPTFMemory | None, device: torch.device) -> tuple[Tensor, ...]:
         """The memory of one stream as `forward` takes it. Raises ValueError for one of several."""
         if self.model.dptf is None:
             return ()
-        found = Memory(()) if memory is None else memory
+        found = DPTFMemory(()) if memory is None else memory
         if found.batch_size > 1:
             raise ValueError(f"the memory holds {found.batch_size} streams, but fixed shapes are for one")
         return FixedMemory.of(found, self.model.dptf, self.model.config.channels, device).tensors
 
-    def unpack_memory(self, memory: tuple[Tensor, ...]) -> Memory | None:
+    def unpack_memory(self, memory: tuple[Tensor, ...]) -> DPTFMemory | None:
         """And back, in float32; what is never read again is lost. Waits for a GPU."""
         return FixedMemory(*(tensor.clone() for tensor in memory)).to_memory() if memory else None
 

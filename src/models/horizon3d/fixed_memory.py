@@ -12,7 +12,7 @@ from src.geometry.constants import constant, where_scalar
 from src.geometry.tensor_transforms import transform_points_xy
 from src.models.horizon3d.bev_path import BEVPath, CellPrediction, PaddedWarpedCells
 from src.models.horizon3d.dptf import DPTF, WarpedMemory
-from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells, stored_features
+from src.models.horizon3d.dptf_memory import DPTFFrame, DPTFMemory, StoredCells, stored_features
 from src.models.horizon3d.gaussian_path import GaussianPath
 from src.models.horizon3d.output import Horizon3DOutput
 from src.models.memory import Motion, RememberedFrame
@@ -33,7 +33,7 @@ direction, velocity 2 each, opacity logit, whether there is one."""
 
 @dataclass(frozen=True)
 class FixedMemory:
-    """What `Memory` holds of one stream, newest first; a frame that is not there is zeros."""
+    """What `DPTFMemory` holds of one stream, newest first; a frame that is not there is zeros."""
 
     frames: Tensor  # [T, FRAME_WIDTH] float64
     cells: Tensor  # [T_c, K, CELL_WIDTH + C] float32; T_c is 0 without the BEV path
@@ -59,7 +59,7 @@ class FixedMemory:
         )
 
     @classmethod
-    def of(cls, memory: Memory, dptf: DPTF, channels: int, device: torch.device) -> FixedMemory:
+    def of(cls, memory: DPTFMemory, dptf: DPTF, channels: int, device: torch.device) -> FixedMemory:
         """The same memory; it is of one stream."""
         fixed = cls.empty(dptf, channels, device)
         for age, frame in enumerate(memory.frames):
@@ -73,7 +73,7 @@ class FixedMemory:
                 fixed.gaussians[age] = _gaussian_rows(frame.gaussians)[0]
         return fixed
 
-    def to_memory(self) -> Memory:
+    def to_memory(self) -> DPTFMemory:
         """The same in tensors as large as what is remembered, in float32. Waits for a GPU."""
         frames = []
         for age, row in enumerate(self.frames.unbind(0)):
@@ -88,11 +88,11 @@ class FixedMemory:
             if has_gaussians:
                 gaussians = _gaussians_of(self.gaussians[age : age + 1])
             pose = row[1:17].view(1, 4, 4)
-            frames.append(MemoryFrame(row[:1], pose, torch.ones_like(row[:1], dtype=torch.bool), cells, gaussians))
-        return Memory(tuple(frames))
+            frames.append(DPTFFrame(row[:1], pose, torch.ones_like(row[:1], dtype=torch.bool), cells, gaussians))
+        return DPTFMemory(tuple(frames))
 
     def recall(self, dptf: DPTF, batch: FrameBatch) -> tuple[WarpedMemory, Tensor]:  # and [T] bool
-        """As `DPTF.recall`, less the memory itself: instead, which frames stay in it (`Memory.before`)."""
+        """As `DPTF.recall`, less the memory itself: instead, which frames stay in it (`DPTFMemory.before`)."""
         held = self.frames[:, 17:] > 0  # [T, 3]
         stored = RememberedFrame(self.frames[:, :1], self.frames[:, 1:17].view(-1, 1, 4, 4), held[:, :1])
         kept, motion = stored.stacked_motion(batch, dptf.config.max_age_s)
@@ -101,7 +101,7 @@ class FixedMemory:
             history = self._history(dptf.gaussian_path, held[:, 2:], motion, dptf.config.min_speed_mps)
         if dptf.bev_path is not None:
             warped = self._warped(dptf.bev_path, kept, held[:, 1:2], motion, dptf.config.min_speed_mps)
-        return WarpedMemory(Memory(()), history, warped), kept.squeeze(1)
+        return WarpedMemory(DPTFMemory(()), history, warped), kept.squeeze(1)
 
     def _history(self, path: GaussianPath, held: Tensor, motion: Motion, min_speed_mps: float) -> GaussianSet:
         num, past = len(self.gaussians), _gaussians_of(self.gaussians)

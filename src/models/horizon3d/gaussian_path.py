@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant, where_scalar
-from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, stored_features
+from src.models.horizon3d.dptf_memory import DPTFFrame, DPTFMemory, stored_features
 from src.models.horizon3d.time_embedding import TimeEmbedding
 from src.models.memory import Motion, motions
 from src.ops.farthest_point import farthest_points
@@ -92,7 +92,7 @@ class GaussianPath(nn.Module):
         self.fixed_capacity = True
 
     def recall(
-        self, memory: Memory, batch: FrameBatch, max_age_s: float, min_speed_mps: float = 0.0
+        self, memory: DPTFMemory, batch: FrameBatch, max_age_s: float, min_speed_mps: float = 0.0
     ) -> GaussianSet | None:
         """History Gaussians in the batch's augmented frame, newest first; None when nothing is remembered, unless the
         capacity is fixed.
@@ -107,9 +107,7 @@ class GaussianPath(nn.Module):
             parts.append(self._padding(len(batch), missing))
         return GaussianSet.concatenate(parts, dim=1) if parts else None
 
-    def _warp(
-        self, frames: list[MemoryFrame], batch: FrameBatch, max_age_s: float, min_speed_mps: float
-    ) -> GaussianSet:
+    def _warp(self, frames: list[DPTFFrame], batch: FrameBatch, max_age_s: float, min_speed_mps: float) -> GaussianSet:
         """The Gaussians of T frames in one batch: launches cost more than the arithmetic."""
         sets = [frame.gaussians for frame in frames]
         return self.move(GaussianSet.concatenate(sets, dim=0), motions(frames, batch, max_age_s), min_speed_mps)
@@ -160,15 +158,15 @@ class GaussianPath(nn.Module):
 
     def without_refuted(
         self,
-        memory: Memory,  # that `recall` read
+        memory: DPTFMemory,  # that `recall` read
         history: GaussianSet,  # what it gave, K_hist of each sample
         active: Tensor,  # [B, G] bool, of all refined Gaussians, history last
-    ) -> Memory:
+    ) -> DPTFMemory:
         """The memory less the Gaussians that returned as history and are not active any more."""
         refuted = (history.valid & ~active[:, -history.valid.shape[1] :]).split(self.config.gaussians_per_frame, dim=1)
         refuted = iter(refuted)
 
-        def confirmed(frame: MemoryFrame) -> MemoryFrame:
+        def confirmed(frame: DPTFFrame) -> DPTFFrame:
             if frame.gaussians is None:
                 return frame
             return replace(frame, gaussians=replace(frame.gaussians, valid=frame.gaussians.valid & ~next(refuted)))

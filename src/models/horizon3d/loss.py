@@ -115,7 +115,7 @@ def gaussian_velocity_loss(
     cells = ocsf.splat.peak_cells.flatten()
     target = raster.velocities_in_margins(cells)  # [B*G, 2]
     target, group = _velocity_groups(target, cells, raster, config.velocity_groups)
-    errors = masked_smooth_l1(ocsf.supervised.flatten(0, 1), target)
+    errors = masked_smooth_l1(ocsf.loss_velocities.flatten(0, 1), target)
     value = config.gaussian_velocity_weight * _sum_of_means(errors, target, group)
     return _times({"gaussian_velocity": value}, config.dptf_weight)
 
@@ -141,7 +141,7 @@ def cell_losses(
     if config.cell_velocity_weight is not None:
         wanted = raster.velocities_in_boxes(keys)  # [M, 2]
         wanted, group = _velocity_groups(wanted, keys, raster, config.velocity_groups)
-        errors = masked_l1(cells.supervised, wanted)
+        errors = masked_l1(cells.loss_velocities, wanted)
         terms["cell_velocity"] = config.cell_velocity_weight * _sum_of_means(errors, wanted, group)
     return _times(terms, config.dptf_weight)
 

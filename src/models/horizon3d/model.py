@@ -11,7 +11,7 @@ from src.models.backbones.sparse_voxel import RadarEncoder
 from src.models.detector import Detector, Objective
 from src.models.heads.center_head import BoxOptions, CenterHead, HeadOutput
 from src.models.horizon3d.dptf import DPTF, WarpedMemory
-from src.models.horizon3d.dptf_memory import Memory
+from src.models.horizon3d.dptf_memory import DPTFMemory
 from src.models.horizon3d.fixed_form import FixedHorizon3D
 from src.models.horizon3d.kggi import KGGI
 from src.models.horizon3d.loss import cell_losses, gaussian_velocity_loss, kggi_losses, ocsf_losses
@@ -37,7 +37,7 @@ class Horizon3D(Detector):
     """
 
     phase_options = BoxOptions
-    memory_type = Memory
+    memory_type = DPTFMemory
     benchmark_parts = {
         "ocsf: gaussian encoder": ("ocsf.encoder.forward",),
         "ocsf: splat": ("src.models.horizon3d.ocsf:splat_set",),
@@ -79,7 +79,7 @@ class Horizon3D(Detector):
         self.neck = SparseNeck(channels, config.neck_channels) if config.neck_channels else None
         self.head = CenterHead(config.head, channels, grid, options.velocity_code_weight)
 
-    def forward(self, batch: FrameBatch, memory: Memory | None = None) -> tuple[Horizon3DOutput, Memory | None]:
+    def forward(self, batch: FrameBatch, memory: DPTFMemory | None = None) -> tuple[Horizon3DOutput, DPTFMemory | None]:
         """Detect in the frames of B streams, given what is remembered of them; the new memory is detached.
 
         Raises ValueError when images are needed and absent, or when the memory is of another number of streams.

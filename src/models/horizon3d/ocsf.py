@@ -88,7 +88,7 @@ class OCSFOutput:
     gaussians: GaussianSet  # G_L
     splat: GaussianSplat
     fused_bev: SparseBEV  # F_fuse
-    supervised: Tensor  # [B, G, 2] velocities that losses see, see `DopplerConfig`
+    loss_velocities: Tensor  # [B, G, 2] velocities that losses see, see `DopplerConfig`
 
 
 class OCSF(nn.Module):
@@ -131,7 +131,7 @@ class OCSF(nn.Module):
         """G_0 to F_fuse."""
         config = self.config
         picks = gaussians.valid_rows() if fixed_shapes() is None else None  # once, since a GPU has to wait
-        gaussians, supervised = self.encoder(gaussians, radar_bev, views, doppler, picks)
+        gaussians, loss_velocities = self.encoder(gaussians, radar_bev, views, doppler, picks)
         limits = (config.occupancy_threshold, config.max_occupied_cells, config.support_sigmas)
         splat = splat_set(gaussians, self.grid, *limits, picks)
-        return OCSFOutput(gaussians, splat, self.fusion(splat.bev, radar_bev), supervised)
+        return OCSFOutput(gaussians, splat, self.fusion(splat.bev, radar_bev), loss_velocities)

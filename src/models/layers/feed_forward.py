@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import nn
 
 NUM_HEADS = 4
@@ -28,4 +29,13 @@ def attention_linear(in_channels: int, out_channels: int, zero: bool = False) ->
         nn.init.zeros_(layer.weight)
     else:
         nn.init.xavier_uniform_(layer.weight)
+    return layer
+
+
+def scale_shift_linear(channels: int) -> nn.Linear:
+    """Linear layer to a scale and a shift per channel: ones and zeros as long as it is untrained."""
+    layer = nn.Linear(channels, 2 * channels)
+    nn.init.zeros_(layer.weight)
+    with torch.no_grad():
+        layer.bias.copy_(torch.cat([torch.ones(channels), torch.zeros(channels)]))
     return layer

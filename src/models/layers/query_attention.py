@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.constants import constant
 from src.models.layers.feed_forward import attention_linear
@@ -19,6 +20,12 @@ FREQUENCIES = 7
 """Of the sine embedding: the shortest period is 1/64 of the range, 4.8 m of 307 m."""
 PENALTY_RANGE = (-2.0, 1.0)
 """Heads start with penalties of softplus(-2) = 0.13 to softplus(1) = 1.3 per metre."""
+
+
+def check_decoder_heads(num_heads: int, channels: int) -> None:
+    """Raises ConfigError for heads (`model.decoder.num_heads`) that do not divide the channels."""
+    if channels % num_heads:
+        raise ConfigError(f"model.decoder.num_heads={num_heads}: must divide model.channels={channels}")
 
 
 class SinePositionEmbedding(nn.Module):

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from src.errors import ConfigError, require_least
+from src.errors import require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.heads.query_head import QueryPrediction, SetPredictionHead
 from src.models.layers.global_attention import GlobalDecoderLayer
-from src.models.layers.query_attention import QueryEmbedding
+from src.models.layers.query_attention import QueryEmbedding, check_decoder_heads
 from src.structures.queries import Queries
 
 
@@ -30,8 +30,7 @@ class PETRDecoder(nn.Module):
 
     def __init__(self, config: PETRDecoderConfig, channels: int, grid: BEVGrid) -> None:
         super().__init__()
-        if channels % config.num_heads:
-            raise ConfigError(f"model.decoder.num_heads={config.num_heads}: must divide model.channels={channels}")
+        check_decoder_heads(config.num_heads, channels)
         self.embedding = QueryEmbedding(channels, grid)
         self.layers = nn.ModuleList(GlobalDecoderLayer(channels, config.num_heads) for _ in range(config.num_layers))
 
@@ -43,13 +42,5 @@ class PETRDecoder(nn.Module):
         head: SetPredictionHead,
     ) -> tuple[list[QueryPrediction], list[Tensor]]:  # of each layer, and [B, Q, C]
         """What every layer predicts, and the features that it predicts from."""
-        embedding = self.embedding(queries)
-        remembered = None
-        if past is not None:
-            remembered = (past.features + self.embedding(past), past.features, past.valid)
-        predictions, features = [], []
-        for layer in self.layers:
-            features.append(layer(queries, embedding, remembered, images))
-            queries = replace(queries, features=features[-1])
-            predictions.append(head(features[-1], queries))
-        return predictions, features
+        embeddings = (self.embedding(queries), None if past is None else self.embedding(past))
+        return head.of_layers(self.layers, queries, past, embeddings, images)

@@ -13,7 +13,7 @@ from src.models.heads.query_head import QueryPrediction, SetPredictionHead
 from src.models.layers.dense import Conv2d
 from src.models.layers.global_attention import GlobalDecoderLayer
 from src.models.layers.position_embedding import PositionEmbedding, PositionEmbeddingConfig
-from src.models.layers.query_attention import SinePositionEmbedding
+from src.models.layers.query_attention import SinePositionEmbedding, check_decoder_heads
 from src.models.layers.views import CameraViews
 from src.structures.queries import Queries
 
@@ -63,8 +63,7 @@ class SequentialDecoder(nn.Module):
         grid: BEVGrid,  # of the radar's tokens
     ) -> None:
         super().__init__()
-        if channels % config.num_heads:
-            raise ConfigError(f"model.decoder.num_heads={config.num_heads}: must divide model.channels={channels}")
+        check_decoder_heads(config.num_heads, channels)
         self.config = config
         self.radar_value, self.image_value = (
             token_layers(radar_channels, channels),

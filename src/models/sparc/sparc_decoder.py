@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from src.errors import ConfigError, require_least
+from src.errors import require_least
 from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.point_transformer import PaddedPoints
 from src.models.heads.query_head import QueryPrediction, SetPredictionHead
 from src.models.layers.dense import Conv2d
 from src.models.layers.feed_forward import feed_forward
 from src.models.layers.image_attention import ImageCrossAttention, PointOffsets
-from src.models.layers.query_attention import DistanceAttention, QueryEmbedding
+from src.models.layers.query_attention import DistanceAttention, QueryEmbedding, check_decoder_heads
 from src.models.layers.views import CameraViews
 from src.structures.queries import Queries
 
@@ -92,8 +92,7 @@ class SpaRCDecoder(nn.Module):
         grid: BEVGrid,
     ) -> None:
         super().__init__()
-        if channels % config.num_heads:
-            raise ConfigError(f"model.decoder.num_heads={config.num_heads}: must divide model.channels={channels}")
+        check_decoder_heads(config.num_heads, channels)
         self.embedding = QueryEmbedding(channels, grid)
         self.image_value = Conv2d(image_channels, channels, 1)
         sizes = (channels, num_views, num_levels)

@@ -13,7 +13,7 @@ from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.geometry.box_cells import cells_in_boxes
 from src.models.horizon3d.bev_path import CellPrediction
-from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
+from src.models.horizon3d.dptf_memory import DPTFFrame, DPTFMemory, StoredCells
 from src.models.layers.doppler import Doppler
 from tests.models.horizon3d.cells import FULL, GRID, TINY, C, bev_of, make_path, random_cells
 from tests.models.moving import UTM, bare_frame, bda, pose
@@ -29,11 +29,11 @@ BDAS = {
 
 
 def remember(path, batch, cells, velocities, scores=0.9):
-    """Memory frame of occupied cells [n, 3] whose features tell their row in `cells`."""
+    """DPTFMemory frame of occupied cells [n, 3] whose features tell their row in `cells`."""
     fused, order = bev_of(cells, path.grid, batch_size=len(batch))
     logits = torch.logit(torch.as_tensor(scores).expand(len(cells)))
     stored = path.store(fused, CellPrediction(logits[order], velocities[order], velocities[order]), batch)
-    return MemoryFrame(batch.timestamps_s, batch.global_from_ego, torch.ones(len(batch)).bool(), stored, None)
+    return DPTFFrame(batch.timestamps_s, batch.global_from_ego, torch.ones(len(batch)).bool(), stored, None)
 
 
 def with_batch(cells):
@@ -73,7 +73,7 @@ def test_a_static_world_stays_where_it_is(drive, origin, augs):
     now = bare_frame(100.5, [pose(5.0 + x, 6.0 + y, 0.8 + turn, origin)], [augs[1]])
     points, cells = distinct_world_points(before, GRID)
     frame = remember(path, before, with_batch(cells), torch.zeros(len(cells), 2))
-    warped = path.recall(Memory((frame,)), now, 6.0)
+    warped = path.recall(DPTFMemory((frame,)), now, 6.0)
 
     which = warped.features[:, 0].long()
     expected = GRID.cell_of(world_to_aug(now, points[which]))
@@ -116,7 +116,7 @@ def test_a_moving_box_coincides_with_its_cells_at_the_new_time(augs, steps):
     cells, seen = raster(before, start)
     wanted, seen_now = raster(now, start + velocity * dt)
     frame = remember(path, before, with_batch(cells), seen.expand(len(cells), 2))
-    warped = path.recall(Memory((frame,)), now, 6.0)
+    warped = path.recall(DPTFMemory((frame,)), now, 6.0)
     gaps = (warped.indices[:, None, 2:] - wanted[None]).abs().amax(2)  # [warped, wanted]
     assert len(warped.indices) == len(cells) and len(wanted) > 40
     assert gaps.amin(1).max() <= 1 and gaps.amin(0).max() <= 1
@@ -125,7 +125,7 @@ def test_a_moving_box_coincides_with_its_cells_at_the_new_time(augs, steps):
 
     behind = replace(path.config, velocity_compensation=False)
     path.config = behind
-    late = path.recall(Memory((frame,)), now, 6.0)
+    late = path.recall(DPTFMemory((frame,)), now, 6.0)
     moved = warped.xy - late.xy  # all the difference is what the box has driven
     torch.testing.assert_close(moved, (seen_now * dt).expand(len(cells), 2), rtol=0, atol=1e-3)
 
@@ -139,10 +139,10 @@ def test_moves_by_whole_cells_give_the_very_set_of_cells():
     now = bare_frame(0.5, [pose(2.0 + 3.2, 3.0)])
     shift = torch.tensor([[10, -4]] * 3 + [[0, -4]])
     expected = {tuple(cell) for cell in (cells + shift).tolist() if min(cell) >= 0}
-    assert {tuple(cell) for cell in path.recall(Memory((frame,)), now, 6.0).indices[:, 2:].tolist()} == expected
+    assert {tuple(cell) for cell in path.recall(DPTFMemory((frame,)), now, 6.0).indices[:, 2:].tolist()} == expected
     assert len(expected) == 3  # the standing cell has left the grid
     path.config = replace(path.config, velocity_compensation=False)
-    left = path.recall(Memory((frame,)), now, 6.0)
+    left = path.recall(DPTFMemory((frame,)), now, 6.0)
     assert {tuple(cell) for cell in left.indices[:, 2:].tolist()} == {
         tuple(cell) for cell in (cells + torch.tensor([0, -4])).tolist() if min(cell) >= 0
     }
@@ -167,7 +167,7 @@ def test_augmentation_on_and_off_give_the_same_set_where_cells_map_to_cells(befo
             with_batch(SQUARE.cell_of(xy)),
             velocities @ first[:2, :2].T,
         )
-        warped = path.recall(Memory((frame,)), bare_frame(3.0, [poses[1]], [second]), 6.0)
+        warped = path.recall(DPTFMemory((frame,)), bare_frame(3.0, [poses[1]], [second]), 6.0)
         back = torch.linalg.inv(second[:2, :2])
         places = SQUARE.centre_of(warped.indices[:, 2:]) @ back.T
         table = torch.cat([warped.features[:, :1], places, warped.velocities @ back.T], 1)
@@ -192,7 +192,7 @@ def test_augmentation_on_and_off_agree_within_quantisation(augs):
             frame = remember(
                 path, before, with_batch(cells[point : point + 1]), speeds[point : point + 1] @ first[:2, :2].T
             )
-            warped = path.recall(Memory((frame,)), now, 6.0)
+            warped = path.recall(DPTFMemory((frame,)), now, 6.0)
             back += [(warped.xy @ kept.T, warped.velocities @ kept.T)]
         return back
 
@@ -210,7 +210,7 @@ def test_augmentation_on_and_off_agree_within_quantisation(augs):
 
 
 def test_slots_run_from_the_oldest_to_the_newest_and_ages_come_from_time_stamps():
-    path, memory = make_path(num_frames=4), Memory(())
+    path, memory = make_path(num_frames=4), DPTFMemory(())
     stamps = [0.0, 0.5, 1.0, 2.5, 3.0]  # two frames were dropped before 2.5
     for number, stamp in enumerate(stamps):
         cell = torch.tensor([[0, 40 + number, 50]])
@@ -227,7 +227,7 @@ def test_slots_run_from_the_oldest_to_the_newest_and_ages_come_from_time_stamps(
 def test_a_short_memory_fills_the_newest_slots():
     path = make_path()
     frame = remember(path, bare_frame(0.0, [pose()]), torch.tensor([[0, 40, 50]]), torch.zeros(1, 2))
-    assert path.recall(Memory((frame,)), bare_frame(0.5, [pose()]), 6.0).indices.tolist() == [[0, 7, 40, 50]]
+    assert path.recall(DPTFMemory((frame,)), bare_frame(0.5, [pose()]), 6.0).indices.tolist() == [[0, 7, 40, 50]]
     assert path.num_slots == 9
 
 
@@ -236,7 +236,7 @@ def test_nothing_comes_back_from_an_unusable_frame(elapsed_s, x):
     path = make_path()
     cells, velocities = torch.tensor([[0, 40, 50], [1, 41, 50]]), torch.zeros(2, 2)
     frame = remember(path, bare_frame(0.0, [pose(), pose()]), cells, velocities)
-    warped = path.recall(Memory((frame,)), bare_frame([elapsed_s, 0.5], [pose(x), pose()]), 6.0)
+    warped = path.recall(DPTFMemory((frame,)), bare_frame([elapsed_s, 0.5], [pose(x), pose()]), 6.0)
     assert warped.indices.tolist() == [[1, 7, 41, 50]]
     assert warped.xy.isfinite().all()
 
@@ -244,7 +244,7 @@ def test_nothing_comes_back_from_an_unusable_frame(elapsed_s, x):
 def test_what_is_slower_than_the_least_speed_stays():
     path, cells = make_path(), torch.tensor([[0, 40, 40], [0, 40, 60], [0, 60, 40]])
     velocities = torch.tensor([[0.6, 0.7], [0.8, 0.7], [0.0, -20.0]])
-    memory = Memory((remember(path, bare_frame(5.0, [pose()]), cells, velocities),))
+    memory = DPTFMemory((remember(path, bare_frame(5.0, [pose()]), cells, velocities),))
     found = path.recall(memory, bare_frame(7.0, [pose()]), 6.0, min_speed_mps=1.0)
     moved = found.xy - path.grid.centre_of(cells[:, 1:])
     torch.testing.assert_close(moved, torch.tensor([[0.0, 0.0], [1.6, 1.4], [0.0, -40.0]]), atol=1e-4, rtol=0)
@@ -255,18 +255,18 @@ def test_cells_that_leave_the_grid_vanish():
     edge = torch.tensor([[0, 0, 0], [0, 95, 127], [0, 0, 127], [0, 95, 0]])
     frame = remember(path, bare_frame(0.0, [pose()]), edge, torch.zeros(4, 2))
     for x, y, kept in ((0.8, 0.0, [1, 2]), (0.0, 0.8, [1, 3]), (-0.8, 0.8, [3]), (0.0, 0.0, [0, 1, 2, 3])):
-        warped = path.recall(Memory((frame,)), bare_frame(0.5, [pose(x, y)]), 6.0)
+        warped = path.recall(DPTFMemory((frame,)), bare_frame(0.5, [pose(x, y)]), 6.0)
         assert sorted(warped.features[:, 0].long().tolist()) == kept
     broken = remember(path, bare_frame(0.0, [pose()]), edge, torch.full((4, 2), torch.nan))
-    assert len(path.recall(Memory((broken,)), bare_frame(0.5, [pose()]), 6.0).indices) == 0
+    assert len(path.recall(DPTFMemory((broken,)), bare_frame(0.5, [pose()]), 6.0).indices) == 0
 
 
 def test_nothing_remembered_is_none_and_a_frame_without_cells_is_empty():
     path, now = make_path(), bare_frame(0.5, [pose()])
-    assert path.recall(Memory(()), now, 6.0) is None
+    assert path.recall(DPTFMemory(()), now, 6.0) is None
     frame = remember(path, bare_frame(0.0, [pose()]), torch.zeros(0, 3, dtype=torch.int64), torch.zeros(0, 2))
-    assert path.recall(Memory((replace(frame, cells=None),)), now, 6.0) is None
-    assert len(path.recall(Memory((frame,)), now, 6.0).indices) == 0
+    assert path.recall(DPTFMemory((replace(frame, cells=None),)), now, 6.0) is None
+    assert len(path.recall(DPTFMemory((frame,)), now, 6.0).indices) == 0
 
 
 def test_streams_with_different_motions_equal_single_streams():
@@ -277,7 +277,7 @@ def test_streams_with_different_motions_equal_single_streams():
     stamps, augs = [[0.0, 100.0], [0.5, 101.0], [1.0, 101.5]], [bda(0.2), bda(flip_x=True)]
 
     def run(streams):
-        memory = Memory(())
+        memory = DPTFMemory(())
         for step in range(3):
             batch = bare_frame(
                 torch.tensor(stamps[step])[streams], [poses[step][i] for i in streams], [augs[i] for i in streams]
@@ -291,7 +291,7 @@ def test_streams_with_different_motions_equal_single_streams():
             output = path.aggregate(fused, warped)
             stored = path.store(fused, CellPrediction(torch.ones(len(cells)), velocities, velocities), batch)
             present = torch.ones(len(streams)).bool()
-            memory = memory.push(MemoryFrame(batch.timestamps_s, batch.global_from_ego, present, stored, None), 8, 0)
+            memory = memory.push(DPTFFrame(batch.timestamps_s, batch.global_from_ego, present, stored, None), 8, 0)
         return warped, output
 
     both_warped, both = run([0, 1])
@@ -346,11 +346,11 @@ def test_autocast_halves_stored_features_and_leaves_positions_alone():
     fused, _ = bev_of(cells)
     prediction = CellPrediction(torch.ones(3), velocities, velocities)
     plain = path.store(fused, prediction, batch)
-    frame = MemoryFrame(batch.timestamps_s, batch.global_from_ego, torch.ones(1).bool(), plain, None)
-    warped = path.recall(Memory((frame,)), now, 6.0)
+    frame = DPTFFrame(batch.timestamps_s, batch.global_from_ego, torch.ones(1).bool(), plain, None)
+    warped = path.recall(DPTFMemory((frame,)), now, 6.0)
     with torch.autocast("cpu", torch.bfloat16):
         halved = path.store(fused, prediction, batch)
-        again = path.recall(Memory((replace(frame, cells=halved),)), now, 6.0)
+        again = path.recall(DPTFMemory((replace(frame, cells=halved),)), now, 6.0)
     assert plain.features.dtype == torch.float32 and halved.features.dtype == torch.bfloat16
     assert torch.equal(halved.xy, plain.xy) and torch.equal(halved.velocities, plain.velocities)
     for name in ("indices", "xy", "velocities", "elapsed_s"):
@@ -380,7 +380,7 @@ def test_a_cells_velocity_takes_its_radial_part_from_the_radar():
     assert torch.equal(found[1], plain[1])
     for in_losses, wanted in ((True, found), (False, plain)):
         measured = replace(doppler, config=replace(MEASURED, in_losses=in_losses))
-        assert torch.equal(path.predict(fused, measured).supervised, wanted)
+        assert torch.equal(path.predict(fused, measured).loss_velocities, wanted)
 
 
 def test_a_path_without_frames_or_with_an_impossible_threshold_is_refused():
@@ -422,11 +422,11 @@ def test_real_tracked_boxes_land_on_their_next_place():
         )
         before = bare_frame(0.0, [pose(origin=UTM)])
         now = bare_frame(0.5, [pose(-0.5 * first["ego_speed_kmh"] / 3.6, origin=UTM)])
-        frame = MemoryFrame(before.timestamps_s, before.global_from_ego, torch.ones(1).bool(), stored, None)
+        frame = DPTFFrame(before.timestamps_s, before.global_from_ego, torch.ones(1).bool(), stored, None)
         wanted = torch.tensor([later[track["tid"]] for track in tracks])
         for compensated, found in ((True, errors), (False, behind)):
             path.config = replace(path.config, velocity_compensation=compensated)
-            warped = path.recall(Memory((frame,)), now, 6.0)
+            warped = path.recall(DPTFMemory((frame,)), now, 6.0)
             assert len(warped.xy) == len(xy)
             found += (warped.xy - wanted[warped.features[:, 0].long()]).norm(dim=1).tolist()
     errors, behind = torch.tensor(errors), torch.tensor(behind)

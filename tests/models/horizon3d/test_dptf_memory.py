@@ -5,7 +5,7 @@ import io
 import pytest
 import torch
 
-from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
+from src.models.horizon3d.dptf_memory import DPTFFrame, DPTFMemory, StoredCells
 from src.structures.gaussians import GaussianSet
 from tests.models.moving import UTM, bare_frame, bda, pose, tensors_of
 
@@ -39,12 +39,12 @@ def cells_for(counts, value=0.0):
 
 def remembered(batch, cells=None, gaussians=None, present=True):
     present = torch.as_tensor(present).expand(len(batch)).clone()
-    return MemoryFrame(batch.timestamps_s, batch.global_from_ego, present, cells, gaussians)
+    return DPTFFrame(batch.timestamps_s, batch.global_from_ego, present, cells, gaussians)
 
 
 def frames_of(b, steps, counts=None):
-    """Memory after `steps` frames of `b` streams, half a second apart; frame k holds the value 10 k."""
-    memory = Memory(())
+    """DPTFMemory after `steps` frames of `b` streams, half a second apart; frame k holds the value 10 k."""
+    memory = DPTFMemory(())
     for k in range(steps):
         batch = bare_frame(0.5 * k, [pose(10.0 * k + i) for i in range(b)])
         frame = remembered(batch, cells_for(counts or [2] * b, 10.0 * k), gaussians_for(b, value=10.0 * k))
@@ -130,7 +130,7 @@ def test_no_jump_where_the_vehicle_drove_or_stood():
     for elapsed, distance in ((0.5, 12.0), (0.5, 0.0), (2.0, 150.0)):
         batch = bare_frame(1.0 + elapsed, [pose(20.0 + distance)])
         assert memory.before(batch) == memory
-    assert Memory(()).before(bare_frame(0.0, [pose()])) == Memory(())
+    assert DPTFMemory(()).before(bare_frame(0.0, [pose()])) == DPTFMemory(())
 
 
 def test_frames_that_are_not_in_the_past_give_up_their_places():
@@ -181,7 +181,7 @@ def test_frames_that_no_lane_has_any_more_are_dropped_oldest_first():
 
 @pytest.mark.parametrize(("cell_frames", "gaussian_frames"), [(8, 4), (2, 4), (3, 0), (0, 2)])
 def test_push_keeps_no_more_than_either_path_looks_at(cell_frames, gaussian_frames):
-    memory, sizes = Memory(()), []
+    memory, sizes = DPTFMemory(()), []
     for k in range(30):
         batch = bare_frame(0.5 * k, [pose(10.0 * k), pose()])
         memory = memory.push(remembered(batch, cells_for([3, 2]), gaussians_for(2)), cell_frames, gaussian_frames)
@@ -201,12 +201,12 @@ def test_state_survives_a_checkpoint_file():
     file = io.BytesIO()
     torch.save({"memory": memory.state()}, file)
     file.seek(0)
-    again = Memory.from_state(torch.load(file, weights_only=True)["memory"])
+    again = DPTFMemory.from_state(torch.load(file, weights_only=True)["memory"])
     pairs = list(zip(tensors_of(memory), tensors_of(again), strict=True))
     assert len(pairs) == 5 * (3 + 4) + 4 * 9
     assert all(torch.equal(a, b) and a.dtype == b.dtype for a, b in pairs)
     assert again.frames[4].gaussians is None and again.frames[0].cells.features.dtype == torch.bfloat16
-    assert Memory.from_state(Memory(()).state()) == Memory(())
+    assert DPTFMemory.from_state(DPTFMemory(()).state()) == DPTFMemory(())
 
 
 def test_to_takes_every_tensor_along():

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from src.models.horizon3d.dptf_memory import Memory, MemoryFrame, StoredCells
+from src.models.horizon3d.dptf_memory import DPTFFrame, DPTFMemory, StoredCells
 from src.models.horizon3d.fixed_memory import FixedMemory
 from src.structures.gaussians import GaussianSet
 from src.structures.taxonomy import Source
@@ -41,11 +41,11 @@ def frame(time_s, num_cells, with_gaussians):
             torch.full((1, 2), int(Source.HISTORY)), torch.zeros(1, 2), valid,
         )  # fmt: skip
     pose = torch.eye(4, dtype=torch.float64)[None] * time_s
-    return MemoryFrame(torch.tensor([time_s], dtype=torch.float64), pose, torch.tensor([True]), cells, gaussians)
+    return DPTFFrame(torch.tensor([time_s], dtype=torch.float64), pose, torch.tensor([True]), cells, gaussians)
 
 
 def test_there_and_back(dptf):
-    memory = Memory((frame(2.0, 5, True), frame(1.0, 0, False)))
+    memory = DPTFMemory((frame(2.0, 5, True), frame(1.0, 0, False)))
     fixed = FixedMemory.of(memory, dptf, 4, torch.device("cpu"))
     assert [tuple(tensor.shape) for tensor in fixed.tensors] == [(3, 20), (3, 6, 9), (1, 2, 14)]
     back = fixed.to_memory()
@@ -59,5 +59,5 @@ def test_nothing_is_nothing(dptf):
     empty = FixedMemory.empty(dptf, 4, torch.device("cpu"))
     assert not empty.to_memory().frames
     assert all(torch.equal(*pair) for pair in zip(
-        empty.tensors, FixedMemory.of(Memory(()), dptf, 4, torch.device("cpu")).tensors, strict=True
+        empty.tensors, FixedMemory.of(DPTFMemory(()), dptf, 4, torch.device("cpu")).tensors, strict=True
     ))  # fmt: skip

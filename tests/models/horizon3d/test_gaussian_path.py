@@ -8,7 +8,7 @@ import torch
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.horizon3d.dptf_memory import Memory, MemoryFrame
+from src.models.horizon3d.dptf_memory import DPTFFrame, DPTFMemory
 from src.models.horizon3d.gaussian_path import (
     GaussianPath,
     GaussianPathConfig,
@@ -68,7 +68,7 @@ def make_frame(times, poses=None, augs=None):
 def remembered(frame, gaussians, present=None):
     """A memory of one frame that holds these Gaussians, in ego coordinates."""
     present = torch.ones(len(frame), dtype=torch.bool) if present is None else torch.tensor(present)
-    return Memory((MemoryFrame(frame.timestamps_s, frame.global_from_ego, present, None, gaussians),))
+    return DPTFMemory((DPTFFrame(frame.timestamps_s, frame.global_from_ego, present, None, gaussians),))
 
 
 def active_rows(path, gaussians, active, frame):
@@ -329,16 +329,16 @@ def test_what_must_not_be_used_is_padding_and_finite(elapsed, metres, present, u
 
 def test_the_rule_of_the_benchmark_leaves_one_frame():
     frames = [make_frame([t]) for t in (9.5, 9.0, 8.5)]
-    memory = Memory(tuple(remembered(frame, make_gaussians(spread_m=20.0)).frames[0] for frame in frames))
+    memory = DPTFMemory(tuple(remembered(frame, make_gaussians(spread_m=20.0)).frames[0] for frame in frames))
     found = make_path().recall(memory, make_frame([10.0]), 0.55)
     assert found.valid.tolist() == [[True] * 12 + [False] * 24]
 
 
 def test_nothing_remembered():
     path = make_path()
-    assert path.recall(Memory(()), make_frame([1.0]), 6.0) is None
-    cells_only = MemoryFrame(torch.zeros(1).double(), torch.eye(4)[None].double(), torch.ones(1).bool(), None, None)
-    assert path.recall(Memory((cells_only,)), make_frame([1.0]), 6.0) is None
+    assert path.recall(DPTFMemory(()), make_frame([1.0]), 6.0) is None
+    cells_only = DPTFFrame(torch.zeros(1).double(), torch.eye(4)[None].double(), torch.ones(1).bool(), None, None)
+    assert path.recall(DPTFMemory((cells_only,)), make_frame([1.0]), 6.0) is None
 
 
 def test_streams_do_not_mix():
@@ -366,7 +366,7 @@ def test_what_returned_and_is_not_active_any_more_does_not_return_again(fixed_ca
     newer, older = (make_gaussians(b=2, g=5, seed=seed, speed_mps=0.0) for seed in (1, 2))
     older.means[1, 3] = torch.tensor([400.0, 0.0])  # outside the grid: not asked, so not refuted
     older.valid[1, 0] = False
-    memory = Memory((*remembered(earlier, newer).frames, *remembered(earlier, older).frames))
+    memory = DPTFMemory((*remembered(earlier, newer).frames, *remembered(earlier, older).frames))
     history = path.recall(memory, now, max_age_s=6.0)
     active = torch.zeros(2, 7 + history.valid.shape[1], dtype=torch.bool)
     active[:, :7] = True  # of the frame itself
@@ -380,12 +380,12 @@ def test_what_returned_and_is_not_active_any_more_does_not_return_again(fixed_ca
 def test_four_frames_of_256_are_the_papers_1024_newest_first():
     path = make_path(gaussians_per_frame=256)
     assert path.config.num_history_gaussians == 1024
-    memory, active = Memory(()), torch.ones(1, 300, dtype=torch.bool)
+    memory, active = DPTFMemory(()), torch.ones(1, 300, dtype=torch.bool)
     for step in range(6):
         frame = make_frame([0.5 * step], [pose(10.0 * step)])
         stored = path.store(make_gaussians(g=300, seed=step, spread_m=60.0, speed_mps=5.0), active, frame)
         present = torch.ones(1, dtype=torch.bool)
-        memory = memory.push(MemoryFrame(frame.timestamps_s, frame.global_from_ego, present, None, stored), 0, 4)
+        memory = memory.push(DPTFFrame(frame.timestamps_s, frame.global_from_ego, present, None, stored), 0, 4)
     found = path.recall(memory, make_frame([3.0], [pose(60.0)]), 6.0)
     assert len(found) == 1024 and found.valid.all()
     assert found.elapsed_s[0, ::256].tolist() == [0.5, 1.0, 1.5, 2.0]

@@ -80,9 +80,9 @@ def test_inner_and_outer_weights_multiply_and_null_switches_off(settings, scene)
 
 def test_velocity_is_supervised_only_in_boxes_of_known_velocity(settings, scene):
     prediction, fused, raster = scene
-    prediction.supervised.requires_grad_()
+    prediction.loss_velocities.requires_grad_()
     cell_losses(prediction, fused, raster, settings())["cell_velocity"].backward()
-    assert prediction.supervised.grad.tolist() == [[0, 0], [-0.5, 0.5], [0, 0], [0, 0]]
+    assert prediction.loss_velocities.grad.tolist() == [[0, 0], [-0.5, 0.5], [0, 0], [0, 0]]
     unknown = BoxRaster([boxes_of((0.0, 0.0, 2.0, 1.0, NAN, NAN)), boxes_of()], TINY, 0.0)
     assert not cell_losses(prediction, fused, unknown, settings())["cell_velocity"].any()
 
@@ -104,11 +104,11 @@ def test_nothing_to_supervise_is_finite_with_finite_gradients(settings, scene, e
     if empty != "cells":
         raster = BoxRaster([boxes_of(), boxes_of()], TINY, 0.0)
     prediction.occupancy_logits.requires_grad_()
-    prediction.supervised.requires_grad_()
+    prediction.loss_velocities.requires_grad_()
     found = cell_losses(prediction, fused, raster, settings())
     assert list(found) == NAMES and all(value.isfinite() for value in found.values())
     sum(found.values()).backward()
-    assert prediction.occupancy_logits.grad.isfinite().all() and not prediction.supervised.grad.any()
+    assert prediction.occupancy_logits.grad.isfinite().all() and not prediction.loss_velocities.grad.any()
     assert not found["cell_velocity"].any() and not found["cell_lovasz"].any()
 
 

@@ -225,8 +225,8 @@ def test_losses_may_see_velocities_as_the_network_states_them(make_model, make_b
             terms.append(float(model.loss_terms(output, batch).terms["box"]))
     assert (terms[1] == pytest.approx(terms[0], rel=1e-4)) != in_losses
     valid, gaussians = output.ocsf.gaussians.valid, output.ocsf.gaussians
-    assert (output.ocsf.supervised is gaussians.velocities) == in_losses
-    assert ((output.ocsf.supervised - gaussians.velocities).norm(dim=-1)[valid].max() > 0.1) != in_losses
+    assert (output.ocsf.loss_velocities is gaussians.velocities) == in_losses
+    assert ((output.ocsf.loss_velocities - gaussians.velocities).norm(dim=-1)[valid].max() > 0.1) != in_losses
 
 
 def test_boxes_may_move_along_their_heading(make_model, make_batch):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from src.models.horizon3d.dptf_memory import Memory
+from src.models.horizon3d.dptf_memory import DPTFMemory
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.reliability.checkpoints import load_model_weights
 from tests.models import frames
@@ -63,7 +63,7 @@ def same(first, second):
 
 
 def fill(model, drive, steps, **changes):
-    """Memory after some frames, and the frame that follows."""
+    """DPTFMemory after some frames, and the frame that follows."""
     frame = partial(drive, **changes)
     return frames.fill(model, steps, frame), frame(steps)
 
@@ -78,7 +78,7 @@ def test_the_first_frame_is_phase_1_to_the_last_bit(pair, drive, name, training)
     """
     first, second = (model.train(training) for model in pair(*VARIANTS[name]))
     batch = drive(0)
-    for memory in (None, Memory(())):
+    for memory in (None, DPTFMemory(())):
         outputs = []
         for model in (first, second):
             torch.manual_seed(9)

@@ -7,7 +7,7 @@ import torch
 
 from src.geometry.bev_grid import BEVGrid
 from src.models.heads.center_head import BoxOptions
-from src.models.horizon3d.dptf_memory import Memory
+from src.models.horizon3d.dptf_memory import DPTFMemory
 from src.models.horizon3d.model import Horizon3D
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
@@ -112,7 +112,7 @@ def traffic(seed, streams, steps):
 
 def stream(model, seed, streams, steps):
     """Batches and the model's output for them, each clip with its own memory."""
-    memory = Memory(())
+    memory = DPTFMemory(())
     for batch in traffic(seed, streams, steps):
         output, memory = model(batch, memory.select(batch.streams, ~batch.starts))
         yield batch, output
