@@ -200,13 +200,13 @@ def compose_config(
     Returns the configuration and the same as a plain tree (what a checkpoint and `config.yaml` keep).
     Raises ConfigError naming the key for anything unknown, mistyped, missing or impossible.
     """
-    tree = _compose(overrides)
+    tree = compose_tree(overrides)
     if not reads_data and OmegaConf.is_missing(tree.data, "root"):
         tree.data.root = NO_DATA
     return build_config(tree), OmegaConf.to_container(tree, resolve=True, enum_to_str=True)
 
 
-def _compose(overrides: list[str]) -> DictConfig:
+def compose_tree(overrides: list[str]) -> DictConfig:
     """conf/ with the overrides, types checked but values not yet; see `compose_config`."""
     _register()
     for override in overrides:
@@ -319,7 +319,7 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
         if key in changes and changes[key].value() != own:
             raise ConfigError(f"{key}={changes[key].value()}: the checkpoint is of {key}={own}; leave {key}= out")
     own = [f"{key}={fixed[key]}" for key in ("scale", "model", "phase")]
-    tree, fresh = OmegaConf.create(stored), _compose([*own, *overrides])
+    tree, fresh = OmegaConf.create(stored), compose_tree([*own, *overrides])
     tree.paths, tree.oracle = fresh.paths, fresh.oracle
     for key, before in LEGACY_DEFAULTS.items():
         part, leaf = key.rpartition(".")[::2]

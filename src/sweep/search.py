@@ -106,7 +106,7 @@ class Search(Runner):
             status = self.train(source, worker)
             if status is not None:
                 self._fail(trial, status.reason and f"{source.run_id}, which it starts from, failed: {status.reason}")
-        watch = _PruningWatch(self.study, trial, self.outputs / spec.run_id, self.sweep.objective)
+        watch = PruningWatch(self.study, trial, self.outputs / spec.run_id, self.sweep.objective)
         status = self.train(spec, worker, watch)
         watch()  # validations since the last poll: later trials are compared with all of them
         if watch.pruned and not self.writer.is_done(spec.run_id):
@@ -128,7 +128,7 @@ class Search(Runner):
         raise TrialEndedError(reason)
 
 
-class _PruningWatch:
+class PruningWatch:
     """Reports the validations of a run to the pruner as they come; returns whether to end the run."""
 
     def __init__(self, study: SweepStudy, trial: Trial, folder: Path, metric: str) -> None:

@@ -307,9 +307,9 @@ def backbone_examples() -> list[bytes]:
 
 def compose_once() -> None:
     """Composing conf/ takes a third of a second; the same choices always give the same tree."""
-    plain = src.config._compose
+    plain = src.config.compose_tree
     known: dict[tuple[str, ...], Any] = {}
-    src.config._compose = lambda overrides: (
+    src.config.compose_tree = lambda overrides: (
         known.setdefault(tuple(overrides), plain(overrides))
         if tuple(overrides) not in known
         else known[tuple(overrides)]

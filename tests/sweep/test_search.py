@@ -9,7 +9,7 @@ import pytest
 from src.errors import ConfigError
 from src.report.metric_names import METRICS
 from src.sweep.run_status import read_score
-from src.sweep.search import _PruningWatch
+from src.sweep.search import PruningWatch
 from tests.running import wait_for
 from tests.sweep.fake_sweep import ROOT, make_runner, make_sweep, trained
 from tests.sweep.test_runner import fault, finish, record_of, start
@@ -106,7 +106,7 @@ def test_a_database_that_is_away_for_a_moment_ends_no_run(tmp_path):
                 raise answer
             return answer
 
-    watch = _PruningWatch(Study(), None, tmp_path, "NDS")
+    watch = PruningWatch(Study(), None, tmp_path, "NDS")
     assert watch() is False and watch.last == 0.0  # tried again at the next look, with the same numbers
     assert watch() is True and watch.last == 0.5 and not answers
     assert watch() is True and watch.pruned  # nothing has changed since; what was said stays said

@@ -9,7 +9,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from src.config import CONF, GROUPS, _compose, build_config, compose_config
+from src.config import CONF, GROUPS, build_config, compose_config, compose_tree
 from src.errors import ConfigError
 from src.report.metric_names import METRICS
 from src.sweep import sweep_files
@@ -53,7 +53,7 @@ ALL_TABLES = {*(int(name[5:]) for name in ROW_OF), 1, 8, 9, 11, 15}
 @cache
 def base(scale, choices):
     """conf/ composed with group choices only; Hydra takes long for that, and rows share it."""
-    return _compose([f"scale={scale}", "data.root=x", *choices])
+    return compose_tree([f"scale={scale}", "data.root=x", *choices])
 
 
 def tree_of(scale, overrides):
