@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -18,10 +19,10 @@ from src.metrics.submission import load_submission
 from src.reliability.checkpoints import read_checkpoint
 from src.reliability.command import run_command
 from src.reliability.cpu import tune_cpu
-from src.training.evaluator import Evaluator
 from src.training.fit import build_evaluation_trainer
 from src.training.identity import digest_of_changes
-from src.training.run_folder import make_writable, name_of_checkpoint, write_json
+from src.training.module import TrainingModule
+from src.training.run_folder import check_no_run, make_writable, name_of_checkpoint, write_json
 from src.training.temporal_module import TemporalModule
 from src.training.true_motion import Oracle, TrueMotion
 
@@ -39,27 +40,33 @@ def main(overrides: list[str]) -> None:
         raise DataError(f"predictions={source}: there is no such file")
     name = f"{name_of_checkpoint(source)}{digest_of_changes(overrides)}"
     out = Path(config.out) if config.out else Path(config.paths.outputs) / "evaluations" / name
+    check_no_run(out)
     make_writable(out, "out")
-    written = ["metrics.json"]
+    written, write_more = ["metrics.json"], None
     if config.checkpoint:
-        evaluator, files = score_checkpoint(source, overrides, out)
-        written += files
-        metrics, text = evaluator.as_dict(), evaluator.describe(evaluator.as_dict())
+        module, write_more = score_checkpoint(source, overrides)
+        metrics = module.evaluator.as_dict()
+        text = module.evaluator.describe(metrics)
+        if module.skipped:
+            text += f"\nskipped sensor files: {module.skipped.text()}"
     else:
         evaluation_set = build_datamodule(config, data_root(config, write=False)).evaluation_set()
         boxes = load_submission(source, evaluation_set.tokens)
         scores = score_detections(evaluation_set, boxes)
         metrics = score_report(evaluation_set, boxes, scores, config.phase.long_range)
         text = format_scores(metrics)
-    write_json(out / "metrics.json", metrics)
     print(text)
+    write_json(out / "metrics.json", metrics)
+    if write_more is not None:
+        written += write_more(out)
     print(f"\nwritten into {out}: {', '.join(written)}")
 
 
-def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[Evaluator, list[str]]:
+def score_checkpoint(path: Path, overrides: list[str]) -> tuple[TrainingModule, Callable[[Path], list[str]]]:
     """Rebuild the checkpoint's own model, run it over the split and score it; the command line may change its data.
 
-    Also the names of the files that it left in `out`, a submission where there was any box.
+    The module with its evaluator, and what leaves further files in a folder and names them: a submission where there
+    was any box.
     """
     tune_cpu()
     checkpoint = read_checkpoint(path)
@@ -75,10 +82,7 @@ def score_checkpoint(path: Path, overrides: list[str], out: Path) -> tuple[Evalu
     build_evaluation_trainer(config.precision, config.trainer.accelerator.value).validate(
         module, datamodule=datamodule, verbose=False
     )
-    written = module.evaluator.write(out, partial(save_submission, config))
-    if module.skipped:
-        print(f"skipped sensor files: {module.skipped.text()}")
-    return module.evaluator, written
+    return module, partial(module.evaluator.write, save=partial(save_submission, config))
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
 from src.structures.skipped import SkippedFiles
 from src.training.identity import digest_of_changes
-from src.training.run_folder import make_writable, name_of_checkpoint
+from src.training.run_folder import check_no_run, make_writable, name_of_checkpoint
 from src.training.snapshots import SHOWN_SCORE, scene_of, views_of
 
 # The boxes of one frame and its global_from_ego.
@@ -49,6 +49,7 @@ def main(overrides: list[str]) -> None:
     datamodule = build_datamodule(config, data_root(config, write=False))
     frames = datamodule.stream(None if command.scene is None else [command.scene])
     out = output_folder(path, command, config, overrides)  # named by the scene, which is known by now
+    check_no_run(out)
     make_writable(out, "out")
     index, split = datamodule.index, split_samples(datamodule.index, config.data.split)
     wanted = split if command.scene is None else index.samples_of({command.scene})

@@ -162,17 +162,24 @@ def run(
         initial_weights=module.initial_weights,
         weights=stated_digest(folder.checkpoints / LAST),
         resumed=start.resume is not None,
-        seconds={"fit": round(seconds, 1), "all": round(time.monotonic() - started, 1)},
+        seconds=durations(seconds, time.monotonic() - started, module.earlier_s),
         skipped_files=dict(skipped.channels),
         skipped_names=skipped.names(),
     )
     folder.finish(record)
     if skipped:
         logger.warning("skipped sensor files: %s", skipped.text())
-    logger.info("finished in %.0f s", record["seconds"]["all"])
+    logger.info("finished in %.0f s", time.monotonic() - started)
     print_result(folder, record, scores)
     for tracked in [own for own in loggers if isinstance(own, WandbRun)]:
         print(f"W&B: {tracked.finish(scores, folder.pictures) or 'not complete, see the warning above'}")
+
+
+def durations(fit_s: float, all_s: float, earlier_s: float | None) -> dict[str, float]:
+    """Of run.json: `fit` and `all` with what the run took before it was resumed, `earlier`, where that is known."""
+    if earlier_s is None:
+        return {"fit": round(fit_s, 1), "all": round(all_s, 1)}
+    return {"fit": round(earlier_s + fit_s, 1), "all": round(earlier_s + all_s, 1), "earlier": round(earlier_s, 1)}
 
 
 def leave_scores(

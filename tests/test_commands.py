@@ -57,6 +57,8 @@ def test_evaluate_agrees_with_training_from_checkpoint_and_from_file(trained, ou
     checkpoint = folder / "checkpoints" / "last.ckpt"
     call("evaluate", f"checkpoint={checkpoint}", f"out={tmp_path / 'a'}", f"paths.outputs={outputs}")
     assert json.loads((tmp_path / "a" / "metrics.json").read_text()) == expected
+    refused = call("evaluate", f"checkpoint={checkpoint}", f"out={folder}", f"paths.outputs={outputs}", expect=3)
+    assert f"out={folder}: is the folder of a run" in refused.stderr
     (world,) = (outputs / "worlds").iterdir()
     call(
         "evaluate", f"predictions={tmp_path / 'a' / 'submission.json'}", f"data.root={world}",

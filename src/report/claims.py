@@ -138,6 +138,8 @@ def load_claims(load_sweep: Callable[[str], SweepConfig], path: Path = CLAIMS) -
     except (OSError, ValueError, TypeError) as error:
         raise ConfigError(f"{where}: {error}") from error
     names = [claim.name for claim in file.claims]
+    if not names:
+        raise ConfigError(f"{where}: claims is empty; name at least one")
     for name in names:
         if names.count(name) > 1:
             raise ConfigError(f"{where}: claim {name} stands more than once; each needs a name of its own")

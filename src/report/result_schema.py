@@ -142,6 +142,7 @@ class Seconds(TypedDict, extra_items=Measure):
     """Durations: also fit."""
 
     all: Measure
+    earlier: NotRequired[Measure]  # of the others, before the run was resumed; older files count the last session alone
 
 
 class PeakMemory(TypedDict, extra_items=Count):

@@ -6,7 +6,7 @@ import csv
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -92,6 +92,11 @@ class RunResult(RunRecord):
     def settings(self) -> tuple[str, ...]:
         """As `settings_of` its overrides."""
         return settings_of(self.overrides)
+
+    @property
+    def training_s(self) -> float | None:
+        """How long it trained and validated; None of an older run that was resumed: only its last session is known."""
+        return None if self.resumed and "earlier" not in self.seconds else self.seconds["all"]
 
     @property
     def dataset(self) -> str:
@@ -216,14 +221,24 @@ def read_result(path: Path) -> RunResult:
     if (latency := fields["latency"]) is not None:
         numbers |= {f"latency.{part}": value for part, value in latency["ms"].items()}
         numbers |= {f"latency.{name}": latency[name] for name in ("fps", "memory_gb", "gflop") if name in latency}
-    numbers |= {"cost.parameters": fields["parameters"], "cost.training": fields["seconds"]["all"]}
-    return RunResult(**fields | {"metrics": numbers})
+    result = RunResult(**fields | {"metrics": numbers})
+    numbers |= {"cost.parameters": result.parameters, "cost.training": result.training_s}
+    return result
 
 
 def read_results(reports: Path, scale: str | None = None) -> tuple[dict[str, RunResult], dict[Path, DataError]]:
     """Every result under reports/results, by run id, and what could not be read, by file."""
     results, broken = read_all(reports / "results", read_result, "*.json" if scale is None else f"*-{scale}-*.json")
     return {result.run_id: result for result in results}, broken
+
+
+def sound_results(reports: Path, scale: str, wanted: Collection[str] | None = None) -> dict[str, RunResult]:
+    """As `read_results`; raises DataError naming what could not be read of the `wanted` runs, None: of all."""
+    results, broken = read_results(reports, scale)
+    faults = [str(error) for path, error in broken.items() if wanted is None or path.stem in wanted]
+    if faults:
+        raise DataError("\n".join(faults))
+    return results
 
 
 def _numbers(scores: OtherScores, headline: str, path: Path, remedy: str) -> dict[str, float | None]:

@@ -12,7 +12,7 @@ from src.report.escaping import as_code
 from src.report.metric_names import DETECTION, FORECASTS, LONG_RANGES, METRICS, RANGES, SPEEDS, Metric
 from src.report.results import RunResult
 from src.report.sweep_file import MAX_COLUMNS
-from src.report.sweep_table import format_score
+from src.report.sweep_table import MISSING, format_score
 
 CAR_AP = METRICS["classes.car.AP"]
 BY_RANGE = [METRICS[f"ranges.{name}.mAP"] for name in RANGES]
@@ -145,14 +145,16 @@ def class_table(experiments: list[Experiment]) -> str:
 
 
 def cost_table(experiments: list[Experiment], epochs: bool = False) -> str:
-    """What the runs cost: of their own phase, the slowest run's time and the largest run's memory."""
+    """What the runs cost: of their own phase, the slowest run's time as far as known and the largest run's memory."""
     titles = ["seeds", *(["epochs"] if epochs else []), "parameters", "time, s", "peak memory, MiB"]
     cells = []
     for experiment in experiments:
         runs = experiment.runs
-        slowest, largest = max(run.seconds["all"] for run in runs), max(run.peak_memory_mib["process"] for run in runs)
+        times = [run.training_s for run in runs if run.training_s is not None]
+        largest = max(run.peak_memory_mib["process"] for run in runs)
         row = [", ".join(str(run.seed) for run in runs), *([str(runs[0].epochs)] if epochs else [])]
-        cells.append([*row, f"{runs[0].parameters / 1e6:.2f} M", f"{slowest:.0f}", str(largest)])
+        slowest = f"{max(times):.0f}" if times else MISSING
+        cells.append([*row, f"{runs[0].parameters / 1e6:.2f} M", slowest, str(largest)])
     return _markdown("experiment", titles, [experiment.label for experiment in experiments], cells)
 
 

@@ -204,6 +204,10 @@ class SweepConfig:
             unknown = [label for label in table.rows or () if label not in self._labels]
             if unknown:
                 raise ConfigError(f"{where}, table {table.name}: there is no row {', '.join(unknown)}")
+            for key, names in (("rows", table.rows or ()), ("columns", table.columns)):
+                twice = sorted({name for name in names if list(names).count(name) > 1})
+                if twice:
+                    raise ConfigError(f"{where}, table {table.name}: {key} names {', '.join(twice)} more than once")
             if not table.columns:
                 raise ConfigError(f"{where}, table {table.name}: columns is empty; name at least one metric")
             num_rows = len(table.rows or self._labels)

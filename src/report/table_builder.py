@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from src.errors import DataError
@@ -22,12 +23,9 @@ EARLIER = "; the number is of an earlier training"
 def sweep_tables(record: SweepRecord, results: dict[str, RunResult]) -> list[SweepTable]:
     """The tables of one sweep at one scale, from the results of its runs by run id; other results do not matter.
 
-    Raises DataError naming the runs when they are of different scales or data, are not of the seed that they stand
-    for, or differ in more than their seed within a row.
+    Raises DataError as `check_results`.
     """
-    used = {run_id: results[run_id] for run_id in _run_ids(record) if run_id in results}
-    check_same_data(record, used)
-    check_rows(record, used)
+    used = check_results(record, results)
     return [_table(record, used, table) for table in _table_configs(record)]
 
 
@@ -45,6 +43,18 @@ def write_sweep_tables(reports: Path, record: SweepRecord, results: dict[str, Ru
             write_whole(path, text)
             written.append(path)
     return written
+
+
+def check_results(record: SweepRecord, results: Mapping[str, RunResult]) -> dict[str, RunResult]:
+    """The results of a sweep's runs among all.
+
+    Raises DataError naming the runs when they are of different scales or data, are not of the seed that they stand
+    for, or differ in more than their seed within a row.
+    """
+    used = {run_id: results[run_id] for run_id in _run_ids(record) if run_id in results}
+    check_same_data(record, used)
+    check_rows(record, used)
+    return used
 
 
 def check_same_data(record: SweepRecord, results: dict[str, RunResult]) -> None:

@@ -16,8 +16,9 @@ from src.reliability.command import run_command
 from src.reliability.passwords import hide_in_process_list
 from src.report.claims import Claim, Finding, judge, load_claims, verdict_of
 from src.report.comparisons import LOOKS
-from src.report.results import RunResult, read_results
+from src.report.results import RunResult, sound_results
 from src.report.sweep_record import RunState, SweepRecord, read_record, record_path
+from src.report.table_builder import check_results
 from src.report.time_left import progress_line
 from src.sweep.compose import SweepCommand, compose_sweep
 from src.sweep.plan import Plan, changes_of, make_plan, without_published
@@ -77,11 +78,11 @@ class Study:
         return next(iter(self.commands.values()))
 
     def results(self) -> dict[str, RunResult]:
-        """What has finished so far, by run id."""
-        return read_results(self.call.reports, self.scale)[0]
+        """What has finished so far, by run id. Raises DataError naming what cannot be read."""
+        return sound_results(self.call.reports, self.scale)
 
     def findings(self, results: dict[str, RunResult]) -> list[tuple[Claim, list[Finding]]]:
-        """What they say of each claim."""
+        """What they say of each claim. Raises DataError for results that no table takes."""
         records: dict[str, SweepRecord] = {}
         for name, command in self.commands.items():
             path = record_path(self.call.reports, name, self.scale, changes_of(command.sweep, self.call.common))
@@ -89,6 +90,7 @@ class Study:
                 records[name] = read_record(path)
             except DataError:  # none yet, or one that the runner will replace
                 continue
+            check_results(records[name], results)
         return [(claim, judge(claim, records, results)) for claim in self.claims]
 
     def plans(self, look: int, results: dict[str, RunResult]) -> list[Plan]:
@@ -116,7 +118,7 @@ class Study:
         runs = {}
         for spec in (spec for plan in plans for spec in plan.specs.values()):
             done = is_scored(self.call.outputs / spec.run_id)
-            took = results[spec.run_id].seconds["all"] if done and spec.run_id in results else None
+            took = results[spec.run_id].training_s if done and spec.run_id in results else None
             counts = done or any(spec.run_id in plan.published for plan in plans)
             state = "done" if counts else "waiting"
             runs[spec.run_id] = RunState(**spec.stored, state=state, started=None if took is None else 0.0, ended=took)

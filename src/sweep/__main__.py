@@ -8,7 +8,7 @@ from pathlib import Path
 from src.errors import ConfigError
 from src.reliability.command import run_command
 from src.reliability.passwords import hide_in_process_list
-from src.report.results import read_results
+from src.report.results import sound_results
 from src.report.sweep_file import DimensionConfig
 from src.sweep.compose import compose_sweep
 from src.sweep.plan import Plan, make_plan, without_published
@@ -30,9 +30,9 @@ def main(overrides: list[str]) -> None:
     call = replace(call, common=[override for override in common if key_of(override) != "seed"])
     plan = make_plan(sweep, call.common, seeds, call.identify)
     if command.published:
-        plan = without_published(plan, read_results(call.reports, plan.scale)[0], command.workers > 0)
+        plan = without_published(plan, sound_results(call.reports, plan.scale, plan.specs), command.workers > 0)
     elif not command.workers and not sweep.is_search:  # what is finished here is published anew
-        results = read_results(call.reports, plan.scale)[0]
+        results = sound_results(call.reports, plan.scale, plan.specs)
         elsewhere = [run for run in results if not is_scored(call.outputs / run)]
         plan = without_published(plan, elsewhere, training=False)
     if command.dry_run:

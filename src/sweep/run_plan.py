@@ -22,7 +22,7 @@ from src.config import PHASES, Config, compose_config
 from src.errors import ConfigError, HorizonError, InterruptedRunError
 from src.reliability.passwords import masked
 from src.reliability.processes import die_with_parent
-from src.report.results import publish_result, read_results
+from src.report.results import publish_result, sound_results
 from src.report.sweep_file import SweepConfig
 from src.report.sweep_record import SweepRecord, read_records, suffix_of
 from src.report.table_builder import write_sweep_tables
@@ -144,8 +144,8 @@ def run_plan(plan: Plan, command: SweepCommand, call: SweepCall) -> None:
     missed: list[str] = []
     if plan.sweep.latency and (command.workers or command.latency):
         missed = measure_latencies(record, outputs, reports, runner, command.latency)
-    runner.publish_done(strictly=True)
-    write_and_show_tables(record, call, missed if command.latency else [])
+    problems = [*(missed if command.latency else []), *runner.publish_done(strictly=True)]
+    write_and_show_tables(record, call, problems)
 
 
 def check_table_names(plan: Plan, reports: Path) -> None:
@@ -196,7 +196,7 @@ def write_and_show_tables(record: SweepRecord, call: SweepCall, problems: list[s
             problems.append(f"  {run.label}, seed {run.seed} ({run.run_id}): {run.reason}; log: {log}")
         problems.append(f"the same command retries them:\n    {call.again}")
     try:
-        paths = write_sweep_tables(call.reports, record, read_results(call.reports, record.scale)[0])
+        paths = write_sweep_tables(call.reports, record, sound_results(call.reports, record.scale, record.runs))
     except HorizonError as error:
         if not problems:
             raise

@@ -91,28 +91,32 @@ class Runner:
             self._with_retries(self.publish_done)
             return self._with_retries(self.writer.write)
 
-    def publish_done(self, strictly: bool = False) -> None:
+    def publish_done(self, strictly: bool = False) -> list[str]:
         """Write the results of finished runs, whoever trained them, to where tables find them.
 
-        What cannot be written is logged, and with `strictly` raises OSError.
+        Runs whose files are broken are logged and returned, in a line each; so is a disk that does not take a result,
+        which with `strictly` raises OSError.
         """
-        for spec in self.specs():
-            if self.writer.is_done(spec.run_id) and spec.run_id not in self._published | self.plan.published:
-                self._publish(spec.run_id, strictly)
+        due = [spec.run_id for spec in self.specs() if self.writer.is_done(spec.run_id)]
+        due = [run_id for run_id in due if run_id not in self._published | self.plan.published]
+        return [fault for run_id in due if (fault := self._publish(run_id, strictly)) is not None]
 
     def specs(self) -> list[RunSpec]:
         """The runs of the sweep known so far."""
         return list(self.plan.specs.values())
 
-    def _publish(self, run_id: str, strictly: bool = False) -> None:
-        """Publish one result; a broken file or a full disk costs that result only, not the sweep."""
+    def _publish(self, run_id: str, strictly: bool = False) -> str | None:
+        """Publish one result; a broken file or a full disk costs that result only, not the sweep, and is returned."""
         try:
             self.publish(self.outputs / run_id)
-            self._published.add(run_id)
         except (HorizonError, OSError) as error:
-            logger.warning("the result of %s could not be published: %s", run_id, error)
+            fault = f"the result of {run_id} could not be published: {error}"
+            logger.warning("%s", fault)
             if strictly and isinstance(error, OSError):
                 raise
+            return fault
+        self._published.add(run_id)
+        return None
 
     # ---------------------------------------------------------------- a worker
 

@@ -48,7 +48,10 @@ def load_sweep(name: str) -> SweepConfig:
         check_plain_yaml(files[name].read_text(encoding="utf-8"))
         content = OmegaConf.to_container(OmegaConf.load(files[name]), resolve=False)  # reads 1e-3 as YAML 1.2 does
         _refuse_interpolation(content)
-        content = content | {"name": name} if isinstance(content, dict) else content
+        if isinstance(content, dict):
+            if "name" in content:
+                raise ConfigError(f"name={content['name']}: a sweep has its file's name; leave it out")
+            content |= {"name": name}
         sweep = parse_as(SweepConfig, json.dumps(content), known=FILE_KEYS)
     except ConfigError as error:
         raise ConfigError(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
@@ -58,9 +61,14 @@ def load_sweep(name: str) -> SweepConfig:
         words = " ".join(str(error).split())
         hint = "; write on, off, yes and no in quotes" if words.endswith(("is True", "is False")) else ""
         raise ConfigError(f"{where}: {words}{hint}") from error
-    unknown = sorted({scale for row in sweep.rows for scale in row.scales or ()} - set(SCALES))
-    if unknown:
-        raise ConfigError(f"{where}: scales: there is no scale {', '.join(unknown)}; there are {', '.join(SCALES)}")
+    for row in sweep.rows:
+        if row.scales is not None and not row.scales:
+            raise ConfigError(f"{where}, row {row.label!r}: scales is empty; name one, or leave it out for all")
+    named = {"scales": {scale for row in sweep.rows for scale in row.scales or ()}}
+    named["scale_overrides"] = {scale for part in (sweep, *sweep.rows) for scale in part.scale_overrides}
+    for key, scales in named.items():
+        if unknown := sorted(scales - set(SCALES)):
+            raise ConfigError(f"{where}: {key}: there is no scale {', '.join(unknown)}; there are {', '.join(SCALES)}")
     return sweep
 
 

@@ -65,8 +65,8 @@ def key_of(override: str) -> str:
 
 def canonical(override: str) -> str:
     """An override with its numbers spelled in one way: `1e-4`, `1.0e-4` and `0.0001` are one setting."""
-    _, equals, value = override.partition("=")
-    return f"{key_of(override)}{equals}{_NUMBER.sub(_spelled, value)}"
+    key, equals, value = override.partition("=")
+    return f"{key}{equals}{_NUMBER.sub(_spelled, value)}"
 
 
 def _spelled(number: re.Match[str]) -> str:

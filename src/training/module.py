@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -57,6 +58,8 @@ class TrainingModule(L.LightningModule):
         self.skipped = SkippedFiles()
         self.guard = StepGuard(skip_nonfinite)
         self.frozen_norms = frozen_norms
+        self.created_at = time.monotonic()
+        self.earlier_s: float | None = 0.0  # the training before it was resumed; None: an older checkpoint did not say
         self.initial_weights: str | None = None  # digest of the checkpoint that the run began from
         self.own_statistics: dict[str, Tensor] = {}  # of this rank, from the checkpoint of an unfinished epoch
 
@@ -184,6 +187,7 @@ class TrainingModule(L.LightningModule):
         checkpoint["horizon3d"] = {
             "config": self.config,
             "initial_weights": self.initial_weights,
+            "seconds": None if self.earlier_s is None else self.earlier_s + time.monotonic() - self.created_at,
             "ranks": gather_by_rank(self.rank_state()),
         }
 
@@ -193,6 +197,7 @@ class TrainingModule(L.LightningModule):
         A checkpoint from the end of an epoch has nothing to resume.
         """
         self.initial_weights = checkpoint["horizon3d"].get("initial_weights")
+        self.earlier_s = checkpoint["horizon3d"].get("seconds")
         states = checkpoint["horizon3d"].get("ranks", [])
         same = len(states) == self.trainer.world_size
         mine = states[self.trainer.global_rank :][:1] if same else states if self.trainer.global_rank == 0 else []

@@ -18,7 +18,7 @@ from typing import Any
 import yaml
 
 from src.errors import BusyError, CheckpointError, ConfigError, DataError
-from src.files.atomic_write import replacing
+from src.files.atomic_write import replacing, write_whole
 from src.reliability.checkpoints import BEST, LAST, PREVIOUS, OpenCheckpoint, open_checkpoint, sync_folder
 
 logger = logging.getLogger(__name__)
@@ -76,6 +76,8 @@ class RunFolder:
             self.path.rename(aside)
             self.close()
             logger.info("moved the old run to %s", aside)
+        if self.finished:
+            return  # it is shown, wherever it lies
         make_writable(self.checkpoints, "paths.outputs")
         self._acquire()
         self._tidy()
@@ -85,7 +87,7 @@ class RunFolder:
         log = logging.FileHandler(self.log)
         log.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         logging.getLogger().addHandler(log)
-        self.config.write_text(yaml.safe_dump(tree, sort_keys=False))
+        write_whole(self.config, yaml.safe_dump(tree, sort_keys=False))
         logger.info("run %s in %s", self.run_id, self.path)
 
     def finish(self, record: dict[str, Any]) -> None:
@@ -179,6 +181,12 @@ def name_of_checkpoint(source: Path) -> str:
     folder = source.resolve().parent
     run = folder.parent.name if folder.name == "checkpoints" else folder.name
     return f"{run}-{source.stem}"
+
+
+def check_no_run(folder: Path) -> None:
+    """Raises ConfigError where a run's own folder is given as `out`: its scores would be replaced."""
+    if (folder / "run.json").exists() or (folder / "checkpoints").is_dir():
+        raise ConfigError(f"out={folder}: is the folder of a run, whose files would be replaced; choose another one")
 
 
 def make_writable(folder: Path, key: str) -> None:

@@ -27,7 +27,7 @@ def main(overrides: list[str]) -> None:
     """Write the configured world unless it is there.
 
     With preview=true draw one picture per scene into out=DIR; with compare=true print its figures beside those of MAN
-    TruckScenes and write them as a page into out=DIR (default: the folder world of paths.reports). The comparison also
+    TruckScenes and write them as a page into out=DIR (default: world_<scale> of paths.reports). The comparison also
     takes recorded data.
     """
     config, _ = compose_config(overrides)
@@ -37,7 +37,7 @@ def main(overrides: list[str]) -> None:
     root = data_root(config)
     print(f"world: {root}")
     if config.compare:
-        folder = Path(config.out) if config.out else Path(config.paths.reports) / "world"
+        folder = Path(config.out) if config.out else Path(config.paths.reports) / f"world_{config.scale}"
         make_writable(folder, "out")
         compare_with_real(config, root, folder, overrides)
     if config.preview:

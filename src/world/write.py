@@ -24,6 +24,7 @@ from src.world.world_config import WorldConfig, stored_config
 
 VERSION = "v1.2-trainval"
 CONFIG_FILE = "world.json"
+SPLITS_FILE = "splits.json"
 
 
 def ensure_world(config: WorldConfig, root: Path, progress: bool = True) -> Path:
@@ -86,6 +87,7 @@ def _read_stored(root: Path) -> dict[str, object]:
             f"{root / CONFIG_FILE}: expected an object, but found {type(stored).__name__}; remove the folder"
         )
     missing = [name for name in TABLES if not (root / VERSION / f"{name}.json").is_file()]
+    missing += [] if (root / SPLITS_FILE).is_file() else [SPLITS_FILE.removesuffix(".json")]
     if missing:
         raise DataError(f"{root}: a synthetic world without its tables {missing}; remove the folder to make it again")
     return stored
@@ -112,7 +114,7 @@ def _fill(config: WorldConfig, folder: Path, progress: bool) -> None:
     for name, table in tables.items():
         (folder / VERSION / f"{name}.json").write_text(json.dumps(table, separators=(",", ":")), encoding="utf-8")
     splits = {"train": names[: config.num_train_scenes], "val": names[config.num_train_scenes :]}
-    (folder / "splits.json").write_text(json.dumps(splits, indent=1), encoding="utf-8")
+    (folder / SPLITS_FILE).write_text(json.dumps(splits, indent=1), encoding="utf-8")
     (folder / CONFIG_FILE).write_text(json.dumps(stored_config(config), indent=1), encoding="utf-8")
 
 

@@ -78,6 +78,13 @@ def test_a_mistake_is_named_with_its_claim(claims_of, change, message):
         claims_of(change)
 
 
+def test_a_file_without_claims_is_refused(tmp_path):
+    path = tmp_path / "claims.yaml"
+    path.write_text("{half_width: 0.5, claims: []}")
+    with pytest.raises(ConfigError, match="claims.yaml: claims is empty"):
+        load_claims(load_sweep, path)
+
+
 def test_a_file_that_is_none_is_named(claims_of, tmp_path):
     for file, message in (
         ({"half_widht": 1.0}, "half_widht is not a known key; did you mean half_width"),

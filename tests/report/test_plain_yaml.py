@@ -27,6 +27,8 @@ def test_plain_values_are_as_yaml_reads_them():
         ("a: &a [*a]", "references"),
         ("<<: *x\n", "references"),
         ("a: {", "expected"),
+        ("a: 1\nb: {c: 1}\na: 2", "line 3: a stands twice"),
+        ("- {a: [{b: 1}, {b: 1, c: b, b: 2}]}", "b stands twice"),
         ("a: \0", "control characters"),
         ("a: !!python/object/apply:os.system ['true']", "python/object"),
         ("a: !!int ''", "IndexError"),

@@ -10,7 +10,15 @@ import pytest
 
 from src.errors import DataError
 from src.report import json_format
-from src.report.results import MAX_POINTS, finished_runs, publish_result, read_result, read_results, result_path
+from src.report.results import (
+    MAX_POINTS,
+    finished_runs,
+    publish_result,
+    read_result,
+    read_results,
+    result_path,
+    sound_results,
+)
 
 
 def damage(path, change):
@@ -287,6 +295,23 @@ def test_truncated_and_foreign_files_are_named_and_the_rest_is_read(published, w
     assert {path.name.split("-")[-1]: str(error).removeprefix(f"{path}: ")[:20] for path, error in broken.items()} == {
         "a.json": "not readable as JSON", "bytes.json": "not readable as JSON", "list.json": "the file must be an "
     }  # fmt: skip
+
+
+def test_what_cannot_be_read_is_an_error_to_those_who_want_it(published, write_run, reports):
+    other = publish_result(write_run("b", [], 0, 0.4), reports)
+    published.write_text("{")
+    assert list(sound_results(reports, "mini", [other.stem])) == [other.stem]
+    for wanted in (None, [published.stem]):
+        with pytest.raises(DataError, match=r"mini-a\.json: not readable.*restore it"):
+            sound_results(reports, "mini", wanted)
+
+
+def test_an_older_run_that_was_resumed_says_nothing_of_its_time(published):
+    assert read_result(published).metrics["cost.training"] == 12.0
+    damage(published, lambda content: content.update(resumed=True))
+    assert read_result(published).metrics["cost.training"] is None
+    damage(published, lambda content: content["seconds"].update(earlier=5.0))
+    assert read_result(published).metrics["cost.training"] == 12.0
 
 
 @pytest.mark.parametrize("depth", [100_000, 940])  # the second is read, but hardly walked through

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from src.errors import ConfigError, HorizonError, InterruptedRunError
+from src.errors import ConfigError, DataError, HorizonError, InterruptedRunError
 from src.report.claims import load_claims
 from src.report.results import RunResult
 from src.report.sweep_record import read_record
@@ -146,6 +146,15 @@ def test_time_left_is_that_of_runs_finished_here(places, trained):
         "study at scale debug, 12 seeds: 21 of 51 done, 0 running, 30 left, about 15 min left"
     )
     assert here.progress(plans, 12, {}).endswith("30 left, time left unknown yet")
+
+
+def test_results_that_no_table_takes_are_refused(places, trained):
+    _, results = trained
+    study.main(places)
+    first = next(iter(results.values()))
+    first.data["root"] = "another"
+    with pytest.raises(DataError, match=f"never mixes scales or data.*{first.run_id}"):
+        study.main([*places, "dry_run=true"])
 
 
 def test_a_sweep_that_fails_costs_no_other(places, trained, monkeypatch, capsys):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from src.errors import ConfigError
+from src.errors import ConfigError, DataError
 from src.report.results import result_path
 from src.report.sweep_file import TableConfig
 from src.report.sweep_record import read_record, record_path, write_record
@@ -341,6 +341,19 @@ def test_a_result_that_cannot_be_published_costs_no_other(tmp_path):
     assert runner.run().count("done") == 2
     with pytest.raises(OSError, match="No space"):
         runner.publish_done(strictly=True)
+
+
+def test_a_run_whose_files_are_broken_is_named_and_costs_no_other(tmp_path):
+    def publish(path):
+        if path.name == runner.specs()[0].run_id:
+            raise DataError(f"{path}/run.json: not readable as JSON")
+        published.append(path.name)
+
+    published = []
+    runner = make_runner(tmp_path, make_sweep({"a": [], "b": ["model.x=2"]}), publish=publish)
+    assert runner.run().count("done") == 2 and published == [runner.specs()[1].run_id]
+    (fault,) = runner.publish_done(strictly=True)
+    assert fault.startswith(f"the result of {runner.specs()[0].run_id}") and "run.json: not readable" in fault
 
 
 def test_a_study_of_another_definition_is_refused(tmp_path):

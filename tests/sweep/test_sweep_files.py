@@ -349,6 +349,18 @@ def test_what_the_mistakes_are_made_from_is_right(written):
         (GOOD | {"tables": GOOD["tables"] * 2}, r"two tables have one name \(t, t\)"),
         (GOOD | {"overrides": ["paths.outputs=/tmp/x"]}, "paths.outputs=/tmp/x is of a single call"),
         (GOOD | {"rows": [{"label": "a", "overrides": ["checkpoint=x"]}]}, "checkpoint=x is of a single call"),
+        (GOOD | {"name": "other"}, "name=other: a sweep has its file's name"),
+        (GOOD | {"scale_overrides": {"minni": []}}, "scale_overrides: there is no scale minni; there are .*mini"),
+        (GOOD | {"rows": [{"label": "a", "scale_overrides": {"x": []}}]}, "scale_overrides: there is no scale x"),
+        (GOOD | {"rows": [{"label": "a"}, {"label": "b", "scales": []}]}, "row 'b': scales is empty"),
+        (
+            GOOD | {"tables": [{"name": "t", "title": "T", "columns": ["mAP", "NDS", "mAP"]}]},
+            "table t: columns names mAP more than once",
+        ),
+        (
+            GOOD | {"tables": [{"name": "t", "title": "T", "columns": ["mAP"], "rows": ["a", "a"]}]},
+            "table t: rows names a more than once",
+        ),
         (GOOD | {"rows": []}, "either rows or space"),
         (SPACE | {"rows": GOOD["rows"]}, "either rows or space"),
         (SPACE | {"space": {"optim.lr": {"low": 1e-3, "high": 1e-4}}}, "space, optim.lr: low must be below high"),

@@ -79,7 +79,7 @@ def test_what_changes_no_result_of_a_checkpoint_makes_no_other_place():
 @pytest.mark.parametrize(
     ("spellings", "one"),
     [
-        (("+a.b=1e-4", "a.b=1.0e-4", "a.b=.0001", "a.b=1E-4"), "a.b=0.0001"),
+        (("a.b=1e-4", "a.b=1.0e-4", "a.b=.0001", "a.b=1E-4"), "a.b=0.0001"),
         (("a=6e-5", "a=0.00006"), "a=6.0e-05"),
         (("a=[-1.0,7]", "a=[-1,7.0]"), "a=[-1,7]"),
         (("a=1", "a=1.0", "a=1e0"), "a=1"),
