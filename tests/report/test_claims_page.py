@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 
 from src.dashboard import single_file as export
+from src.errors import DataError
 from src.report.__main__ import main
 from src.report.sweep_record import record_path, write_record
 
@@ -89,6 +90,20 @@ def test_without_a_result_of_any_claim_there_is_no_page(report, write_sweep):
     write_sweep("layers", {"1 layer": [0.10], "2 layers": [0.2]}, changes=["phase.epochs=1"])
     reports, said = report()
     assert "README" not in said and not (reports / "README.md").exists()
+
+
+def test_a_damaged_result_leaves_the_page_as_it_was(report, write_sweep, tmp_path):
+    write_sweep("layers", {"1 layer": [0.10] * 3, "2 layers": [0.20, 0.21, 0.19]})
+    page = report()[0] / "README.md"
+    before = page.read_text()
+    first, *_ = sorted((tmp_path / "reports" / "results").iterdir())
+    first.write_text("{")
+    (tmp_path / first.stem / "run.json").unlink()  # or it would be written anew
+    with pytest.raises(
+        DataError, match=rf"all else is written, but\n.*{first.name}.*\n.*page of the claims is as it was"
+    ):
+        report()
+    assert page.read_text() == before and "2 layers over 1 layer" in before
 
 
 def test_another_scale_has_a_page_of_its_own(report, write_sweep):
