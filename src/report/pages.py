@@ -49,7 +49,7 @@ FURTHER = "phase1_further"
 PHASES_OF = {"phase2": ("phase1", FURTHER, "phase2")}
 """Whose runs a phase's page reads; other phases' pages read their own."""
 
-ANNEALED = ("optim.final_lr_ratio=0.0001", "optim.rise_fraction=0.4")
+ANNEALED = ("optim.final_lr_ratio=1.0e-4", "optim.rise_fraction=0.4")
 """The full one-cycle schedule that phase 1 takes at mini where no phase follows."""
 
 NAMES = {

@@ -5,9 +5,11 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import math
 import re
 import shlex
 from collections.abc import Iterable
+from decimal import Decimal
 from typing import Any
 
 OF_A_CALL = ("paths", "resume", "checkpoint", "predictions", "out", "scene", "preview", "compare", "suite", "oracle")
@@ -73,8 +75,10 @@ def _spelled(number: re.Match[str]) -> str:
     value = float(number[0])
     if value.is_integer() and abs(value) < 1e15:
         return str(int(value))
-    text = repr(value)
-    return text if "." in text else text.replace("e", ".0e")  # YAML 1.1 takes no 6e-05 for a number
+    if abs(value) >= 1e-3:
+        return repr(value) if math.isfinite(value) else number[0]
+    digits, exponent = f"{Decimal(repr(value)).normalize():E}".split("E")
+    return f"{digits if '.' in digits else f'{digits}.0'}e{int(exponent):+d}"  # YAML 1.1 takes no 6e-5 for a number
 
 
 def train_command(overrides: Iterable[str]) -> str:

@@ -79,8 +79,10 @@ def test_what_changes_no_result_of_a_checkpoint_makes_no_other_place():
 @pytest.mark.parametrize(
     ("spellings", "one"),
     [
-        (("a.b=1e-4", "a.b=1.0e-4", "a.b=.0001", "a.b=1E-4"), "a.b=0.0001"),
-        (("a=6e-5", "a=0.00006"), "a=6.0e-05"),
+        (("a.b=1e-4", "a.b=1.0e-4", "a.b=.0001", "a.b=1E-4"), "a.b=1.0e-4"),
+        (("a=6e-5", "a=0.00006"), "a=6.0e-5"),
+        (("a=1.5e-7", "a=0.00000015"), "a=1.5e-7"),
+        (("a=0.00123", "a=1.23e-3"), "a=0.00123"),
         (("a=[-1.0,7]", "a=[-1,7.0]"), "a=[-1,7]"),
         (("a=1", "a=1.0", "a=1e0"), "a=1"),
     ],
@@ -90,7 +92,7 @@ def test_a_number_has_one_spelling(spellings, one):
 
 
 @pytest.mark.parametrize(
-    "text", ["a=horizon3d-phase2-mini-6e546620", "a=0-0.5", "a=v1.0-trainval", "a=1.2.3", "a=x1e5"]
+    "text", ["a=horizon3d-phase2-mini-6e546620", "a=0-0.5", "a=v1.0-trainval", "a=1.2.3", "a=x1e5", "a=1e999"]
 )
 def test_digits_of_a_word_stay(text):
     assert canonical(text) == text
