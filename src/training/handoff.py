@@ -152,11 +152,18 @@ def open_source(source: WeightSource) -> OpenCheckpoint:
 def hand_over(model: Detector, weights: OpenCheckpoint, tree: dict[str, Any]) -> None:
     """Take the earlier phase's `weights` into `model`; what the new phase adds keeps its own.
 
-    Settings that differ are logged. Raises CheckpointError naming every key that does not fit.
+    Weights that are scored as they are, in a temporal phase, may hold parts of it that this run switches off. These and
+    settings that differ are logged. Raises CheckpointError naming every key that does not fit.
     """
     checkpoint = weights.take()
-    added = model.config.new_in_temporal_phase
-    new = load_model_weights(model, checkpoint, weights.path, re.compile(added) if added else None)
+    added = re.compile(model.config.new_in_temporal_phase) if model.config.new_in_temporal_phase else None
+    if added and tree["phase"]["temporal"] and tree["phase"]["epochs"] == 0:
+        state, wanted = checkpoint["state_dict"], {f"model.{key}" for key in model.state_dict()}
+        off = [key for key in state if key not in wanted and added.match(key.removeprefix("model."))]
+        checkpoint["state_dict"] = {key: value for key, value in state.items() if key not in off}
+        if off:
+            logger.info("switched off: %d tensors of %s", len(off), weights.path)
+    new = load_model_weights(model, checkpoint, weights.path, added)
     parts = sorted({key.partition(".")[0] for key in new})
     logger.info("weights from %s; new: %d tensors in %s", weights.path, len(new), ", ".join(parts) or "nothing")
     stored = checkpoint["horizon3d"]["config"]

@@ -375,6 +375,21 @@ def test_weights_of_another_architecture_are_refused_by_name(tmp_path, stored, w
         give(path, *wanted)
 
 
+@pytest.mark.parametrize("off", ["gaussian_path.self_attention", "gaussian_path", "bev_path"])
+def test_trained_weights_are_scored_with_a_part_of_the_memory_switched_off(tmp_path, off, caplog):
+    path = write_checkpoint(tmp_path / "two.ckpt", "phase=phase2")
+    given = torch.load(path, weights_only=True)["state_dict"]
+    part = (f"model.dptf.{off}=null", f"phase.init_from={path}")
+    with caplog.at_level(logging.INFO):
+        _, _, after = give(path, "phase=phase2", *part, "phase.epochs=0")
+    assert all(torch.equal(value, given[f"model.{key}"]) for key, value in after.items())
+    left = [key for key in given if key.removeprefix("model.") not in after]
+    assert left and all(ADDED.match(key.removeprefix("model.")) for key in left)
+    assert f"switched off: {len(left)} tensors of {path}" in caplog.text
+    with pytest.raises(CheckpointError, match="unexpected"):
+        give(path, "phase=phase2", *part)  # to train on, it is another model
+
+
 def test_a_checkpoint_of_phase_2_into_phase_1_names_the_memory(tmp_path):
     path = write_checkpoint(tmp_path / "two.ckpt", "phase=phase2", "model.dptf.gaussian_path.self_attention=null")
     with pytest.raises(CheckpointError, match=r"unexpected dptf\.bev_path.*more"):
