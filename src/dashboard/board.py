@@ -63,7 +63,9 @@ class Sweep:
     @property
     def left_s(self) -> float | None:
         """Time left, with as many runs side by side as now; None before the first has finished, and when none runs."""
-        return seconds_left(self.record.runs.values(), 1, self.now) if self.state == "running" else None
+        if self.state != "running":
+            return None
+        return seconds_left(self.record.runs.values(), 1, self.now, self.record.unchosen)
 
 
 @dataclass(kw_only=True)
