@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from src.models.detector import Detector
+from src.train import durations
 from src.training.module import TrainingModule
 from tests.training.toys import ToyMemory, toy_batch, toy_module
 
@@ -163,6 +164,28 @@ def load(module, states, rank, world_size):
     module._trainer = Trainer(rank, world_size)
     module.on_load_checkpoint({"horizon3d": {"config": {}, "ranks": states}})
     return module
+
+
+def test_the_time_of_a_resumed_run_adds_up(monkeypatch):
+    def saved(module):
+        checkpoint = {}
+        module.on_save_checkpoint(checkpoint)
+        return checkpoint
+
+    now = 100.0
+    monkeypatch.setattr("src.training.module.time.monotonic", lambda: now)
+    first, now = toy_module(), 107.0
+    checkpoint = saved(first)
+    second = toy_module()  # at 107
+    second._trainer = Trainer(0, 1)
+    second.on_load_checkpoint(checkpoint)
+    assert second.earlier_s == 7.0
+    now = 110.0
+    assert saved(second)["horizon3d"]["seconds"] == 10.0
+    assert durations(1.5, 2.5, second.earlier_s) == {"fit": 8.5, "all": 9.5, "earlier": 7.0}
+    older = load(toy_module(), [], 0, 1)  # its checkpoint does not say
+    assert older.earlier_s is None and saved(older)["horizon3d"]["seconds"] is None
+    assert durations(1.5, 2.5, None) == {"fit": 1.5, "all": 2.5}
 
 
 def test_a_restored_memory_follows_the_module_to_its_device(module):
