@@ -86,10 +86,10 @@ def _read_stored(root: Path) -> dict[str, object]:
         raise DataError(
             f"{root / CONFIG_FILE}: expected an object, but found {type(stored).__name__}; remove the folder"
         )
-    missing = [name for name in TABLES if not (root / VERSION / f"{name}.json").is_file()]
-    missing += [] if (root / SPLITS_FILE).is_file() else [SPLITS_FILE.removesuffix(".json")]
+    files = [*(f"{VERSION}/{name}.json" for name in TABLES), SPLITS_FILE]
+    missing = [name for name in files if not (root / name).is_file()]
     if missing:
-        raise DataError(f"{root}: a synthetic world without its tables {missing}; remove the folder to make it again")
+        raise DataError(f"{root}: a synthetic world without {', '.join(missing)}; remove the folder to make it again")
     return stored
 
 

@@ -210,7 +210,8 @@ def test_ensure_reuses_the_same_world_and_refuses_another(tmp_path, make_config)
     with pytest.raises(ConfigError, match="seed"):
         ensure_world(make_config(**TINY, seed=99), root)
     (root / VERSION / "sample.json").unlink()
-    with pytest.raises(DataError, match="sample"):
+    (root / "splits.json").unlink()
+    with pytest.raises(DataError, match=f"without {VERSION}/sample.json, splits.json;"):
         ensure_world(config, root)
     (root / "world.json").unlink()
     with pytest.raises(DataError, match="not a complete"):
