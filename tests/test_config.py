@@ -107,11 +107,18 @@ def test_memory_is_switched_by_configuration_values(scale, overrides, off):
     assert {name for name, part in parts.items() if part is None} == off
 
 
+CHOICES = [(group, path.stem) for group in ("backbone", "data", "trainer", "logger")
+           for path in sorted((CONF / group).glob("*.yaml"))]  # fmt: skip
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("group", ["backbone", "data", "trainer", "logger"])
-def test_every_choice_composes(group):
-    for path in (CONF / group).glob("*.yaml"):
-        compose_config([f"{group}={path.stem}", "data.root=x"])
+@pytest.mark.parametrize(("group", "name"), CHOICES)
+def test_every_choice_composes(group, name):
+    compose_config([f"{group}={name}", "data.root=x"])
+
+
+def test_there_are_choices():
+    assert {group for group, _ in CHOICES} == {"backbone", "data", "trainer", "logger"} and len(CHOICES) > 8
 
 
 def test_paper_values():

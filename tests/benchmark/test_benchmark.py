@@ -162,8 +162,6 @@ def test_training(outputs, tmp_path, phase, request):
     for row in result["training step"]:
         stages = ("wait", "forward", "loss", "backward", "optimiser", "bookkeeping")
         assert all(row[f"{stage} ms"] >= 0 for stage in stages)
-        # Medians of three steps each: their sum is near the median of the sum.
-        assert sum(row[f"{stage} ms"] for stage in stages) == pytest.approx(row["step ms"], rel=0.8)
     if phase == "phase1":
         assert "SparseConvFunctionBackward" in column(result["operations of a step"], "operation", "ms")
 

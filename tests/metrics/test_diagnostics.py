@@ -17,6 +17,7 @@ from src.structures.evidence import Evidence, HeadCells, SplattedCells
 from src.structures.gaussians import GaussianSet
 from src.structures.taxonomy import Source
 from tests.evaluation_sets import set_of
+from tests.gaussian_sets import gaussians_at
 from tests.targets.box_rows import GRID, boxes_of
 
 AUTHORS = Path(__file__).resolve().parents[3] / "shared/real/horizon3d_page/dptf_demo.json"
@@ -29,17 +30,11 @@ MATCHED = np.array([True, False, False])
 def gaussians_of(*rows) -> GaussianSet:
     """One sample of rows (source, x, y, vx, opacity)."""
     columns = torch.tensor([row[1:] for row in rows], dtype=torch.float32)[None]
-    pair = torch.zeros(1, len(rows), 2)
-    return GaussianSet(
-        means=columns[..., :2],
-        scales=pair + 1,
-        directions=pair,
+    return gaussians_at(
+        columns[..., :2],
         opacity_logits=torch.logit(columns[..., 3]),
         velocities=torch.stack([columns[..., 2], torch.zeros(1, len(rows))], -1),
-        features=torch.zeros(1, len(rows), 1),
         sources=torch.tensor([[int(row[0]) for row in rows]]),
-        elapsed_s=torch.zeros(1, len(rows)),
-        valid=torch.ones(1, len(rows), dtype=torch.bool),
     )
 
 

@@ -14,6 +14,7 @@ from src.structures.batch import FrameBatch
 from src.structures.ray_bundle import RayBundle
 from src.world.write import VERSION, ensure_world
 from tests.data.tiny_set import FIVE_HERTZ, reader_settings
+from tests.models.moving import bda
 from tests.world.conftest import small_config
 
 BOUNDS = ((-100.0, 250.0), (-100.0, 100.0), (-12.0, 12.0))
@@ -85,6 +86,37 @@ def test_past_scans_are_moved_by_the_ego():
     with pytest.raises(ValueError, match="FrameBatch.rays"):
         static_world(past, 300.0)
     assert static_world(replace(frame(np.zeros((0, 3))), rays=batch.rays), 300.0).tolist() == [300.0, 300.0]
+
+
+def test_samples_do_not_mix_and_augmentation_changes_no_range():
+    """A truck that came 2 m and one that came 3 m; the second is mirrored, its past frame as well."""
+    clouds = [[[30.0, 5.0, 0.0], [50.0, 0, 0]], [[31.0, -6.0, 0.0]]]
+    ends = [[[28.0, 5.0, 0.0], [48.0, 0, 0], [60, -9, 0]], [[28.0, -6.0, 0.0], [28.0, 5.0, 0.0]]]
+    mirror = bda(flip_y=True)
+    alone, pairs = [], []
+    for cloud, own, at in zip(clouds, ends, (12.0, 13.0), strict=True):
+        past = frame(cloud, at=10.0)
+        alone.append(frame(np.zeros((0, 3)), at=at, past=(past,), rays=rays_to(own)))
+        pairs.append((past, alone[-1]))
+    expected = [static_world(one, 300.0).tolist() for one in alone]
+    assert expected == [pytest.approx([np.hypot(28, 5), 48, 300]), pytest.approx([np.hypot(28, 6), 300])]
+
+    def both(first, second, **rest):
+        augs = torch.stack([torch.eye(4), mirror])
+        points = torch.cat([first.lidar_points, second.lidar_points * torch.tensor([1.0, -1, 1, 1, 1])])
+        owners = torch.tensor([0] * len(first.lidar_points) + [1] * len(second.lidar_points), dtype=torch.int64)
+        return replace(
+            first, tokens=["a", "b"], timestamps_s=torch.cat([first.timestamps_s, second.timestamps_s]),
+            global_from_ego=torch.cat([first.global_from_ego, second.global_from_ego]), aug_from_ego=augs,
+            lidar_points=points, lidar_batch=owners, lidar_origins=torch.zeros(len(points), 3), **rest,
+        )  # fmt: skip
+
+    first, second = (one.rays for one in alone)
+    rays = RayBundle(*(torch.cat(values) for values in zip(vars(first).values(), vars(second).values(), strict=True)))
+    rays.directions[3:, 1] *= -1
+    rays.batch[3:] = 1
+    batch = both(alone[0], alone[1], past=(both(pairs[0][0], pairs[1][0]),), rays=rays)
+    assert static_world(batch, 300.0).tolist() == pytest.approx(sum(expected, []))
 
 
 def test_unseen_is_what_no_ray_of_the_input_reached():

@@ -9,7 +9,7 @@ from src.models.backbones.image import ImageEncoderConfig, NeckName
 from src.models.backbones.weights import BackboneName
 from src.structures.batch import FrameBatch
 from tests.models import moving
-from tests.models.surroundings import AXES, camera_matrices, random_boxes
+from tests.models.surroundings import AXES, random_boxes, rigs
 
 SIZE = (64, 96)  # image height, width
 GRID = BEVGrid(cells=(48, 64), cell_m=0.8, centre_m=(2.0, -1.0), z_range_m=(-3.0, 5.0))
@@ -39,7 +39,7 @@ def make_batch(points=(150, 120), boxes=(6, 4), seed=0, images=True, headings=AX
         radar_batch=torch.repeat_interleave(torch.arange(b), torch.tensor(points)),
         images=torch.randint(0, 256, (b, 4, 3, *SIZE), generator=generator, dtype=torch.uint8) if images else None,
         image_valid=torch.ones(b, 4, dtype=torch.bool) if images else None,
-        pix_from_aug=camera_matrices(SIZE, headings).repeat(b, 1, 1, 1) if images else None,
+        pix_from_aug=rigs(b, SIZE, headings) if images else None,
         boxes=[random_boxes(count, generator) for count in boxes],
     )
 

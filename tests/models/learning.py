@@ -61,7 +61,7 @@ def samples_do_not_mix(model, pair, make_batch):
             rows = pair.radar_batch == sample
             single = make_batch(points=(0,), boxes=(0,))
             single.radar_points, single.radar_batch = pair.radar_points[rows], pair.radar_batch[rows] * 0
-            single.images = pair.images[sample][None]
+            single.images, single.pix_from_aug = pair.images[sample][None], pair.pix_from_aug[sample][None]
             logits = model(single)[0].head.logits.view(-1, 12)
             torch.testing.assert_close(logits, both[sample], atol=1e-4, rtol=1e-4)
 

@@ -27,6 +27,17 @@ def camera_matrices(size, headings_deg):
     return torch.stack(matrices)
 
 
+def rigs(count, size, headings_deg):
+    """`camera_matrices` for each of some samples, [B, N, 4, 4]: each rig is turned by 0.07 further than the one before
+    and stands a metre aside, so that one sample's calibration is wrong for another."""
+    found = []
+    for number in range(count):
+        c, s = math.cos(0.07 * number), math.sin(0.07 * number)
+        moved = torch.tensor([[c, -s, 0, 0], [s, c, 0, number], [0, 0, 1, 0], [0, 0, 0, 1]])
+        found.append(camera_matrices(size, headings_deg) @ moved)
+    return torch.stack(found)
+
+
 def random_boxes(count, generator):
     spread, corner = torch.tensor([40.0, 30.0, 1.0]), torch.tensor([-18.0, -16.0, 0.0])
     centers = torch.rand(count, 3, generator=generator) * spread + corner

@@ -12,7 +12,9 @@ def make_case(queries=11, points=5):
     xy[:, :1] = 1e6
     heights = torch.randn(2, queries, points, generator=draw)
     forward = torch.tensor([[32.0, -30.0, 0.0, 5.0], [16.0, 0.0, -30.0, 4.0], [1.0, 0.0, 0.0, 0.3], [0, 0, 0, 1.0]])
-    matrices = torch.stack([forward, forward * torch.tensor([-1.0, -1.0, 1.0, 1.0]), forward]).repeat(2, 1, 1, 1)
+    turned = torch.tensor([-1.0, -1.0, 1.0, 1.0])
+    matrices = torch.stack([forward, forward * turned, forward]).repeat(2, 1, 1, 1)
+    matrices[1] = matrices[1] @ torch.tensor([[0.8, -0.6, 0, 1], [0.6, 0.8, 0, 0], [0, 0, 1.1, 0], [0, 0, 0, 1]])
     valid = torch.tensor([[True, True, True], [True, True, False]])
     visible = torch.rand(2, queries, 3, points, generator=draw) < 0.4
     visible[:, :1] = False

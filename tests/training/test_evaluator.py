@@ -1,5 +1,6 @@
 """Collecting boxes over batches and processes."""
 
+import math
 import pickle
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from src.benchmark.suite_metric import random_problem
+from src.geometry.bev_grid import BEVGrid
 from src.metrics.bootstrap import with_intervals
 from src.metrics.detection import score_detections
 from src.metrics.diagnostics import FrameDiagnosis
@@ -15,8 +17,11 @@ from src.reliability.processes import process_group
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
-from src.structures.evidence import Evidence
+from src.structures.evidence import Evidence, HeadCells, SplattedCells
 from src.training.evaluator import DetectionEvaluator
+from tests.evaluation_sets import set_of
+from tests.gaussian_sets import gaussians_at
+from tests.models.moving import UTM, bda, pose
 from tests.training.two_ranks import become, spawn_two
 
 SAMPLES = 6
@@ -95,3 +100,66 @@ def test_a_batch_goes_to_its_samples_and_a_repeated_one_counts_once(problem):
         evaluator.update(model, [box, Boxes3D.empty()], batch)
     evaluator.compute()
     assert evaluator.detections.samples.tolist() == [4] and evaluator.boxes.keys() == {1, 4}
+
+
+GRID = BEVGrid(cells=(60, 60), cell_m=1.0, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
+
+
+def test_evidence_is_compared_with_the_truth_of_its_sample_in_the_augmented_frame():
+    """Two vehicles that head elsewhere, each augmented in its own way, with trucks of 6 x 2 m along their headings."""
+    yaws, places = (math.pi / 2, -0.3), [[[10.0, 0, 1], [-8.0, 6, 1]], [[6.0, 7, 1]]]  # in the vehicles' frames
+    poses = torch.stack([pose(yaw=yaws[0], origin=UTM), pose(5.0, 2.0, yaws[1], UTM)])
+    augs = torch.stack([bda(0.4, 1.1, flip_y=True), bda(-0.2, 0.9, flip_x=True)])
+
+    def in_aug(sample, *point):
+        return (augs[sample] @ torch.tensor([*point, 1.0]))[:3]
+
+    def cell_at(sample, *point):
+        return [sample, *GRID.cell_of(in_aug(sample, *point)[:2]).tolist()]
+
+    # The evaluation set has the second of the batch first.
+    rows = [(0, yaws[1], poses[1], places[1][0]), *((1, yaws[0], poses[0], place) for place in places[0])]
+    truth = DetectionTable(
+        samples=np.array([sample for sample, *_ in rows]),
+        labels=np.zeros(3, np.int64),
+        centers=np.stack([(p @ torch.tensor([*place, 1.0], dtype=p.dtype))[:3].numpy() for *_, p, place in rows]),
+        sizes=np.tile([2.0, 6.0, 2.0], (3, 1)),
+        rotations=np.array([[math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)] for _, yaw, *_ in rows]),
+        velocities=np.zeros((3, 2)),
+        attributes=np.full(3, -1),
+        scores=np.zeros(3),
+        num_points=np.ones(3, np.int64),
+    )
+    ends = [
+        (0, 12.7, 0, 1.9),
+        (0, 10, 1.3, 1),
+        (1, 8.7, 7.8, 0.2),
+        (1, 3.3, 7, 1),
+        (1, 6, 7, 2.2),
+    ]  # two of them beside
+    evidence = Evidence(
+        gaussians=gaussians_at(torch.stack([in_aug(0, -8, 6, 1)[:2], in_aug(1, -8, 6, 1)[:2]])[:, None]),
+        cells=SplattedCells(
+            GRID,
+            torch.tensor([cell_at(0, 10, 0, 0), cell_at(0, 6, 7, 0), cell_at(1, 6, 7, 0)]),
+            torch.ones(3),
+            torch.tensor([False, True, True]),
+        ),
+        head_cells=HeadCells(GRID, torch.tensor([cell_at(0, 7.5, 0, 0), cell_at(1, 10, 0, 0)])),
+    )
+    batch = FrameBatch(
+        tokens=["b", "a"],
+        timestamps_s=torch.zeros(2).double(),
+        global_from_ego=poses,
+        aug_from_ego=augs,
+        radar_points=torch.stack([torch.cat([in_aug(*end), torch.zeros(4)]) for end in ends]),
+        radar_batch=torch.tensor([sample for sample, *_ in ends]),
+    )
+    evaluator = DetectionEvaluator(set_of(truth, "ab"))
+    model = SimpleNamespace(decode=lambda output: [Boxes3D.empty()] * 2, evidence=lambda output: evidence)
+    evaluator.update(model, None, batch)
+    first, second = evaluator.diagnoses[0], evaluator.diagnoses[1]
+    assert second.points.tolist() == [1, 0] and first.points.tolist() == [2]
+    assert second.occupied.tolist() == [False, False] and first.occupied.tolist() == [True]
+    assert second.head.tolist() == [True, False] and first.head.tolist() == [False]
+    assert second.covered[:, 0].tolist() == [False, True] and not first.covered.any()

@@ -1,7 +1,10 @@
 """From one phase to the next: which run or file the weights come from, strictness, and the commands themselves."""
 
+import copy
+import functools
 import json
 import logging
+import operator
 import os
 import re
 import shlex
@@ -30,7 +33,14 @@ from src.errors import (
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.reliability.checkpoints import open_checkpoint
 from src.training import handoff
-from src.training.handoff import differing_settings, find_source, hand_over, norms_handed_over, train_source
+from src.training.handoff import (
+    INPUT_SETTINGS,
+    differing_settings,
+    find_source,
+    hand_over,
+    norms_handed_over,
+    train_source,
+)
 from src.training.identity import run_identity
 from src.training.module import TrainingModule
 from src.training.run_folder import RunFolder, name_of_checkpoint
@@ -448,6 +458,19 @@ def test_a_phase_that_gives_the_network_other_inputs_says_so():
     )
     assert differing_settings(before, after, ()) == {"data.timeline.radial_speeds": ("radar", "none")}
     assert differing_settings(before, {"data": {"num_sweeps": 6, "timeline": None}}, ()) == {"data.num_sweeps": (5, 6)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", INPUT_SETTINGS)
+def test_every_setting_of_the_inputs_is_there_and_is_compared(key):
+    """A field that was renamed would otherwise end its warning in silence."""
+    _, before = compose_config(["scale=debug", "model=lrs4fusion", "phase=lrs_forecast"])
+    after = copy.deepcopy(before)
+    *path, name = key.split(".")
+    part = functools.reduce(operator.getitem, path, after)
+    assert name in part
+    part[name] = "another"
+    assert differing_settings(before, after, ()).keys() == {key}
 
 
 # ---------------------------------------------------------------- the commands

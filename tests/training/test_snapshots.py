@@ -22,6 +22,7 @@ from src.structures.boxes import Boxes3D
 from src.structures.evidence import Evidence
 from src.structures.gaussians import GaussianSet
 from src.training.snapshots import draw_frames, memory_of, scene_of
+from tests.gaussian_sets import gaussians_at
 
 GRID = BEVGrid(cells=(64, 64), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
 VELOCITY = torch.tensor([6.0, -2.0])
@@ -59,11 +60,8 @@ def recollection(compensated: bool) -> tuple[GaussianSet, WarpedCells]:
     """One thing 1.5 s old of each kind, and a Gaussian that is padding; last seen at (-4, 5)."""
     xy = torch.tensor([[-4.0, 5.0]]) + (VELOCITY * 1.5 if compensated else 0)
     g = 2
-    history = GaussianSet(
-        means=xy.expand(1, g, 2).clone(),
-        scales=torch.ones(1, g, 2),
-        directions=torch.tensor([1.0, 0.0]).expand(1, g, 2),
-        opacity_logits=torch.zeros(1, g),
+    history = gaussians_at(
+        xy.expand(1, g, 2).clone(),
         velocities=VELOCITY.expand(1, g, 2),
         features=torch.zeros(1, g, 4),
         sources=torch.full((1, g), 3),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
@@ -146,8 +147,8 @@ def _with_cell_velocities(
 ) -> GaussianSet:
     """Each Gaussian with the velocity of the cell where it contributes most, whose target it shares (Eq. 9)."""
     rows = rows_of_keys(fused.sites.linear(), peak_cells)
-    known = rows[..., None] >= 0
-    return replace(gaussians, velocities=torch.where(known, cells.velocities[rows], gaussians.velocities))
+    found = F.pad(cells.velocities, (0, 0, 0, 1))[rows]  # row -1, none, is the last: there may be no cell at all
+    return replace(gaussians, velocities=torch.where(rows[..., None] >= 0, found, gaussians.velocities))
 
 
 def warped_evidence(config: DPTFConfig, output: DPTFOutput) -> dict[str, WarpedPoints | None]:

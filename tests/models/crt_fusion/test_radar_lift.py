@@ -9,7 +9,7 @@ from src.models.layers.azimuth_attention import AzimuthAttention
 from src.models.layers.views import CameraViews
 from tests.models.camera_radar_frames import crt_model, radar_map
 from tests.models.frames import GRID, SIZE, make_batch
-from tests.models.surroundings import AXES, camera_matrices
+from tests.models.surroundings import AXES, camera_matrices, rigs
 
 
 def make_attention(count=3):
@@ -62,7 +62,7 @@ def by_hand(module, level, bev, matrices, valid):
 def test_a_column_attends_to_the_pillars_nearest_in_azimuth(cells):
     """Fewer than K pillars in a sample, none in it, none at all; a camera is missing."""
     module, bev = make_attention(), radar_map(cells)
-    level, matrices = torch.randn(2, 4, 6, 3, 5), camera_matrices(SIZE, AXES).repeat(2, 1, 1, 1)
+    level, matrices = torch.randn(2, 4, 6, 3, 5), rigs(2, SIZE, AXES)
     valid = torch.ones(2, 4, dtype=torch.bool)
     valid[0, 1], matrices[0, 1] = False, torch.nan
     with torch.no_grad():

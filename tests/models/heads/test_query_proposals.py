@@ -10,7 +10,7 @@ from src.ops.sites import Sites
 from src.structures.queries import UNKNOWN_LOGIT
 from src.structures.sparse_bev import SparseBEV
 from tests.models.frames import GRID, SIZE
-from tests.models.surroundings import AXES, camera_matrices
+from tests.models.surroundings import AXES, rigs
 
 CELLS = ((0, 10, 10), (0, 10, 11), (0, 10, 30), (1, 20, 20))
 """Two neighbours and one apart in the first sample, one in the second."""
@@ -37,7 +37,7 @@ def make_scene(num_radar=3):
     sites, _ = Sites.from_indices(torch.tensor(CELLS), (2, *GRID.cells))
     means = torch.arange(28.0).view(4, 7)
     radar = RadarPoints(SparseBEV(sites, torch.randn(4, 8)), means)
-    matrices, valid = camera_matrices(SIZE, AXES).repeat(2, 1, 1, 1), torch.ones(2, 4, dtype=torch.bool)
+    matrices, valid = rigs(2, SIZE, AXES), torch.ones(2, 4, dtype=torch.bool)
     views = CameraViews([torch.randn(2, 4, 16, 8, 12)], matrices, valid, SIZE)
     return proposals, radar, views
 

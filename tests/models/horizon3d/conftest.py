@@ -9,7 +9,7 @@ from src.models.layers.views import CameraViews
 from tests.models import frames
 from tests.models.frames import GRID, SIZE
 from tests.models.horizon3d import small_model
-from tests.models.surroundings import DIAGONALS, camera_matrices
+from tests.models.surroundings import DIAGONALS, rigs
 
 
 @pytest.fixture
@@ -29,9 +29,7 @@ def make_views():
 
     def build(b=1, strides=(8, 16, 32), channels=16):
         levels = [torch.randn(b, 4, channels, SIZE[0] // stride, SIZE[1] // stride) for stride in strides]
-        return CameraViews(
-            levels, camera_matrices(SIZE, DIAGONALS).repeat(b, 1, 1, 1), torch.ones(b, 4, dtype=torch.bool), SIZE
-        )
+        return CameraViews(levels, rigs(b, SIZE, DIAGONALS), torch.ones(b, 4, dtype=torch.bool), SIZE)
 
     return build
 

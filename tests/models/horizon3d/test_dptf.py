@@ -9,7 +9,7 @@ from src.models.horizon3d.dptf import DPTF, DPTFOutput
 from src.models.horizon3d.gaussian_path import VelocityFrom
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.horizon3d.splatting import GaussianSplat
-from src.structures.gaussians import GaussianSet
+from tests.gaussian_sets import gaussians_at
 from tests.models.horizon3d.cells import GRID, C, bev_of
 from tests.models.horizon3d.small_model import dptf_config
 from tests.models.moving import bare_frame, bda, pose
@@ -27,20 +27,10 @@ def make_parts():
             b = len(batch)
             cells = torch.stack([torch.arange(b), torch.full((b,), 40), torch.full((b,), 120)], 1)  # 47 m ahead
             fused, _ = bev_of(cells, GRID, batch_size=b)
-            zeros = torch.zeros(b, 1)
-            gaussians = GaussianSet(
-                means=torch.tensor([47.0, 0.0]).expand(b, 1, 2),
-                scales=torch.ones(b, 1, 2),
-                directions=torch.tensor([1.0, 0.0]).expand(b, 1, 2),
-                opacity_logits=zeros,
-                velocities=torch.zeros(b, 1, 2),
-                features=torch.zeros(b, 1, C),
-                sources=zeros.long(),
-                elapsed_s=zeros,
-                valid=torch.ones(b, 1, dtype=torch.bool),
-            )
+            gaussians = gaussians_at(torch.tensor([47.0, 0.0]).expand(b, 1, 2), features=torch.zeros(b, 1, C))
             peaks = fused.sites.linear()[:, None]
-            ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, peaks, zeros + 0.2), fused, gaussians.velocities)
+            splat = GaussianSplat(None, None, peaks, torch.full((b, 1), 0.2))
+            ocsf = OCSFOutput(gaussians, splat, fused, gaussians.velocities)
             velocities = torch.tensor([[0.0, -4.0]]).expand(b, 2)
             predicted = CellPrediction(torch.ones(b), velocities, velocities) if dptf.bev_path is not None else None
             past = dptf.recall(memory, batch).past
@@ -109,6 +99,17 @@ def test_a_remembered_gaussian_may_move_as_the_cell_under_it(make_parts):
         torch.testing.assert_close(stored.velocities[stored.valid], torch.tensor([expected]), atol=1e-5, rtol=0)
     with pytest.raises(ConfigError, match="velocity_from=cells.*bev_path=null"):
         make_parts(bev_path=False, velocity_from=VelocityFrom.cells)
+
+
+def test_a_frame_without_cells_remembers_what_it_has(make_parts):
+    dptf, _ = make_parts(velocity_from=VelocityFrom.cells)
+    fused, _ = bev_of(torch.zeros(0, 3, dtype=torch.int64), GRID)
+    moving = torch.tensor([[[3.0, 1.0]]])
+    gaussians = gaussians_at(torch.zeros(1, 1, 2), velocities=moving, features=torch.zeros(1, 1, C))
+    ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, torch.tensor([[-1]]), torch.zeros(1, 1)), fused, moving)
+    cells = CellPrediction(torch.zeros(0), torch.zeros(0, 2), torch.zeros(0, 2))
+    found, active = dptf.candidates(fused, DPTFOutput(None, None, cells, fused), ocsf)
+    assert torch.equal(found.velocities, moving) and not active.any()
 
 
 def test_neither_path_looks_past_the_age_limit(make_parts):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from src.models.horizon3d.dptf_memory import DPTFFrame, DPTFMemory, StoredCells
-from src.structures.gaussians import GaussianSet
+from tests.gaussian_sets import gaussians_at
 from tests.models.moving import UTM, bare_frame, bda, pose, tensors_of
 
 DIM = 3
@@ -15,18 +15,7 @@ DIM = 3
 def gaussians_for(b, count=4, value=0.0):
     """A set whose means tell stream and value."""
     means = torch.arange(b, dtype=torch.float32)[:, None, None] + torch.full((b, count, 2), value)
-    zeros = torch.zeros(b, count)
-    return GaussianSet(
-        means=means,
-        scales=torch.ones(b, count, 2),
-        directions=torch.tensor([1.0, 0.0]).expand(b, count, 2),
-        opacity_logits=zeros,
-        velocities=torch.zeros(b, count, 2),
-        features=torch.zeros(b, count, DIM),
-        sources=zeros.long(),
-        elapsed_s=zeros,
-        valid=torch.ones(b, count, dtype=torch.bool),
-    )
+    return gaussians_at(means, features=torch.zeros(b, count, DIM))
 
 
 def cells_for(counts, value=0.0):

@@ -6,9 +6,11 @@ from functools import partial
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from src.models.horizon3d.cross_attention import RadarCrossAttention
 from src.models.horizon3d.gaussian_encoder import (
+    AnchorEncoder,
     EncoderLayer,
     GaussianBounds,
     GaussianEncoder,
@@ -49,9 +51,9 @@ def make_radar(grid, count=300, b=1, seed=1):
     return SparseBEV(sites, torch.randn(count, C, generator=generator))
 
 
-def make_encoder(grid, layers=2, chained=False, early=False, learnable=3):
+def make_encoder(grid, layers=2, chained=False, early=False, learnable=3, heads=None):
     torch.manual_seed(3)
-    layer = partial(EncoderLayer, C, learnable, 4, 3, grid, BOUNDS, chained, early, None)
+    layer = partial(EncoderLayer, C, learnable, 4, 3, grid, BOUNDS, chained, early, heads)
     return GaussianEncoder(C, 16, grid, BOUNDS, layers, layer).eval()
 
 
@@ -207,6 +209,77 @@ def test_padding_changes_nothing(grid, make_views, chained, early):
     (a, _), (b, _) = encoder(first, radar, views), encoder(padded, radar, views)
     torch.testing.assert_close(b.means[:, :8], a.means)
     torch.testing.assert_close(b.features[:, :8], a.features)
+
+
+class Recorded(torch.nn.Module):
+    """Keeps what it is given and passes on its first number."""
+
+    def forward(self, x):
+        self.seen = x
+        return x[..., :1].expand(*x.shape[:-1], C)
+
+
+def test_the_anchor_encoder_sees_attributes_in_their_units(grid):
+    """The middle of the grid lies at (2, -1), 25.6 and 19.2 m from its edges; scales end at 3.2 m, speeds at 60 m/s."""
+    anchor = AnchorEncoder(C, grid, BOUNDS)
+    for name in anchor.embed:
+        anchor.embed[name] = Recorded()
+    anchor.output = torch.nn.Identity()
+    gaussians = replace(
+        make_gaussians(torch.tensor([[[14.8, -10.6], [2.0, -1.0]]])),
+        scales=torch.tensor([[[1.6, 0.8], [3.2, 0.2]]]),
+        directions=torch.tensor([[[0.6, 0.8], [0.0, -1.0]]]),
+        opacity_logits=torch.tensor([[0.0, math.log(3.0)]]),
+        velocities=torch.tensor([[[30.0, -15.0], [0.0, 6.0]]]),
+    )
+    found = anchor(gaussians)
+    expected = {
+        "mean": [[0.5, -0.5], [0, 0]],
+        "scale": [[0.5, 0.25], [1, 0.0625]],
+        "direction": [[0.6, 0.8], [0, -1]],
+        "opacity": [[0.5], [0.75]],
+        "velocity": [[0.5, -0.25], [0, 0.1]],
+    }
+    for name, values in expected.items():
+        torch.testing.assert_close(
+            anchor.embed[name].seen, torch.tensor([values]), msg=lambda text, n=name: f"{n}: {text}"
+        )
+    torch.testing.assert_close(found[0, :, 0], torch.tensor([0.5 + 0.5 + 0.6 + 0.5 + 0.5, 0 + 1 + 0 + 0.75 + 0]))
+
+
+@pytest.mark.parametrize("chained", [False, True])
+@pytest.mark.parametrize("early", [False, True])
+@pytest.mark.parametrize("heads", [None, 4])
+def test_layers_are_those_of_method_5_1(grid, make_views, chained, early, heads):
+    """Written out line by line with the parts of each layer."""
+    encoder, radar, views = make_encoder(grid, 2, chained, early, heads=heads), make_radar(grid), make_views()
+    for parameter in encoder.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    g = given = make_gaussians(places(8))
+
+    def norm(layer, number, x):
+        return F.layer_norm(x, (C,), layer.norms[number].weight, layer.norms[number].bias)
+
+    def ffn(layer, number, x):
+        widen, _, _, narrow, _ = layer.feed_forward[number]
+        return narrow(widen(x).relu())
+
+    values = [torch.stack([encoder.image_value(view) for view in level.unbind(1)], 1) for level in views.levels]
+    for layer in encoder.layers:
+        f, e = g.features, encoder.anchor(g)
+        f = f if heads is None else f + layer.temporal_attention(f, e, g, None)
+        points = layer.sampling_points(f + e, g)
+        after_radar = f + layer.radar_attention(f + e, points, radar)
+        first, query = (after_radar, after_radar + e) if chained else (f, f + e)
+        hat = norm(layer, 0, after_radar + layer.image_attention(first, query, points, views, values))
+        hat = norm(layer, 1, hat + ffn(layer, 0, hat))
+        new = norm(layer, 2, hat + layer.self_encoding(hat, g))
+        new = norm(layer, 3, new + ffn(layer, 1, new))
+        g = replace(layer.refinement((hat if early else new) + e, g), features=new)
+    found, velocities = encoder(given, radar, views)
+    for name in ("features", "means", "scales", "directions", "opacity_logits", "velocities"):
+        torch.testing.assert_close(getattr(found, name), getattr(g, name), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(velocities, found.velocities)
 
 
 def test_order_of_attention_and_source_of_refinement_matter(grid, make_views):

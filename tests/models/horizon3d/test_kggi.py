@@ -192,6 +192,29 @@ def test_attributes_are_float32_numbers_under_autocast(make_config, grid):
         assert torch.equal(getattr(halved, name), getattr(plain, name)), name
 
 
+def test_keypoints_carry_the_features_of_their_pixel_and_of_their_cell(make_config, grid, make_views):
+    kggi, views, maps = make_kggi(make_config, grid), make_views(2), flat_maps(2)
+    for head in kggi.property_heads.values():
+        with torch.no_grad():
+            head.weight[:16] = torch.eye(16)
+    pixels = [(0, 3, 2, 9), (1, 2, 3, 6)]  # sample, view, row, column
+    for pixel in pixels:
+        maps.keypoint_logits[pixel] = 3.0
+    maps.depth_logits[:, :, 5] = 60.0
+    kggi.camera_head = FixedHead(maps)
+    radar = make_radar(grid, cells=((0, 5, 7), (1, 3, 4), (1, 20, 30)), b=2)
+    out = kggi(radar, views)
+    best = [0, 1 + int(out.objectness_logits[1:].argmax())]  # of each sample
+    expected = {
+        Source.CAMERA: [maps.features[sample, view, :, row, col] for sample, view, row, col in pixels],
+        Source.RADAR: [radar.features[row] for row in best],
+    }
+    for source, features in expected.items():
+        own = kggi.slots[source.name.lower()].features[0] + kggi.source_embedding.weight[source]
+        found = out.gaussians.features[:, out.gaussians.sources[0] == source][:, 0] - own
+        torch.testing.assert_close(found, torch.stack(features), rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("mode", "counts"),
     [(Initialization.both, (24, 12, 8)), (Initialization.keypoint, (24, 12, 0)), (Initialization.random, (0, 0, 44))],

@@ -6,12 +6,14 @@ import pytest
 import torch
 
 from src.models.horizon3d.bev_path import CellPrediction
-from src.models.horizon3d.loss import VelocityGroups, cell_losses, gaussian_velocity_loss
+from src.models.horizon3d.kggi import KGGIOutput
+from src.models.horizon3d.loss import VelocityGroups, cell_losses, gaussian_velocity_loss, kggi_losses, ocsf_losses
 from src.models.horizon3d.ocsf import OCSFOutput
 from src.models.horizon3d.splatting import GaussianSplat
+from src.ops.splat import Splat
 from src.structures.boxes import Boxes3D
-from src.structures.gaussians import GaussianSet
 from src.targets.box_raster import BoxRaster
+from tests.gaussian_sets import gaussians_at
 from tests.models.horizon3d.cells import TINY, bev_of
 
 NAMES = ["cell_focal", "cell_dice", "cell_lovasz", "cell_velocity"]
@@ -112,23 +114,55 @@ def test_nothing_to_supervise_is_finite_with_finite_gradients(settings, scene, e
     assert not found["cell_velocity"].any() and not found["cell_lovasz"].any()
 
 
+def key(sample, row, col):
+    return (sample * 5 + row) * 6 + col
+
+
+def test_radar_objectness_by_hand(make_config):
+    """Two cells in the box, one in its margin and one of the other sample, both of which are background."""
+    radar, _ = bev_of(torch.tensor([[0, 2, 2], [0, 2, 3], [0, 3, 2], [1, 2, 2]]), TINY, batch_size=2)
+    raster = BoxRaster([boxes_of((0.0, 0.0, 2.0, 1.0, 7.0, -2.0)), boxes_of()], TINY, 2.0)
+    kggi = KGGIOutput(None, torch.logit(torch.tensor([0.3, 0.9, 0.6, 0.1])), camera=object())
+    weights = {"kggi_weight": 2.0, "radar_objectness_weight": 3.0, "keypoint_weight": None, "depth_weight": None}
+    config = make_config(**weights)
+    found = kggi_losses(kggi, radar, None, raster, config.kggi, config.loss)
+    focal = -0.25 * (0.7**2 * math.log(0.3) + 0.1**2 * math.log(0.9))
+    focal -= 0.75 * (0.6**2 * math.log(0.4) + 0.1**2 * math.log(0.9))
+    assert {name: float(value) for name, value in found.items()} == {
+        "radar_objectness": pytest.approx(2 * 3 * focal / 2)
+    }
+    config = make_config(**weights | {"radar_objectness_weight": None})
+    assert kggi_losses(kggi, radar, None, raster, config.kggi, config.loss) == {}
+
+
+def test_occupancy_of_the_splat_by_hand(make_config):
+    """The margin of 2 m makes 3 x 4 cells of the box's two; Gaussians reach two of them, a third cell, and sample 1."""
+    support = torch.tensor([key(0, 0, 0), key(0, 1, 1), key(0, 2, 2), key(1, 1, 1)])
+    occupancy = torch.tensor([0.6, 0.3, 0.8, 0.1])
+    occupied = bev_of(torch.tensor([[0, 2, 2]]), TINY, batch_size=2)[0].sites
+    splat = Splat(support, torch.log1p(-occupancy), occupied, *[None] * 4, 0)
+    raster = BoxRaster([boxes_of((0.0, 0.0, 2.0, 1.0, 7.0, -2.0)), boxes_of()], TINY, 2.0)
+    weights = {"ocsf_weight": 5.0, "occupancy_focal_weight": 2.0, "occupancy_dice_weight": 3.0}
+    ocsf = OCSFOutput(None, GaussianSplat(splat, None, None, None), None, None)
+    found = ocsf_losses(ocsf, raster, make_config(**weights).loss)
+    focal = -0.25 * (0.7**2 * math.log(0.3) + 0.2**2 * math.log(0.8) + 10 * (1 - 1e-4) ** 2 * math.log(1e-4))
+    focal -= 0.75 * (0.6**2 * math.log(0.4) + 0.1**2 * math.log(0.9))
+    dice = (1 - (2 * 1.1 + 1) / (1.7 + 12 + 1)) / 2 + (1 - 1 / (0.1 + 0 + 1)) / 2
+    assert {name: float(value) for name, value in found.items()} == {
+        "occupancy_focal": pytest.approx(5 * 2 * focal / 12, rel=1e-5),
+        "occupancy_dice": pytest.approx(5 * 3 * dice, rel=1e-5),
+    }
+    for name in ("focal", "dice"):
+        one_less = ocsf_losses(ocsf, raster, make_config(**weights | {f"occupancy_{name}_weight": None}).loss)
+        assert one_less.keys() == {"occupancy_focal", "occupancy_dice"} - {f"occupancy_{name}"}
+
+
 def test_gaussian_velocity_by_hand(settings):
     """Smooth L1 at the peak cells: in the box, in its margin, beside it, in a box of unknown velocity, nowhere."""
     velocities = torch.tensor([[7.5, -2.0], [7.0, 1.0], [9.0, 9.0], [9.0, 9.0], [9.0, 9.0]])[None].requires_grad_()
-    zeros = torch.zeros(1, 5)
-    gaussians = GaussianSet(
-        means=torch.zeros(1, 5, 2),
-        scales=torch.ones(1, 5, 2),
-        directions=torch.ones(1, 5, 2),
-        opacity_logits=zeros,
-        velocities=velocities,
-        features=torch.zeros(1, 5, 1),
-        sources=zeros.long(),
-        elapsed_s=zeros,
-        valid=torch.ones(1, 5, dtype=torch.bool),
-    )
+    gaussians = gaussians_at(torch.zeros(1, 5, 2), velocities=velocities)
     peaks = torch.tensor([[2 * 6 + 2, 1 * 6 + 2, 4 * 6 + 3, 0, -1]])
-    ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, peaks, zeros), None, gaussians.velocities)
+    ocsf = OCSFOutput(gaussians, GaussianSplat(None, None, peaks, torch.zeros(1, 5)), None, gaussians.velocities)
     boxes = [boxes_of((0.0, 0.0, 2.0, 1.0, 7.0, -2.0), (-2.5, -2.0, 1.0, 1.0, NAN, NAN))]
     wide, narrow = (BoxRaster(boxes, TINY, margin_m) for margin_m in (2.0, 0.0))
     # Margin 2 m in total: rows 1..3 around the first box, rows and columns 0..1 around the second.

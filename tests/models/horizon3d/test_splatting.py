@@ -3,23 +3,14 @@
 import torch
 
 from src.models.horizon3d.splatting import splat_set
-from src.structures.gaussians import GaussianSet
+from tests.gaussian_sets import gaussians_at
 from tests.models.horizon3d.cells import rows_at
 
 
 def make_set(means, opacity_logits, valid):
     b, g, _ = means.shape
-    return GaussianSet(
-        means=means,
-        scales=torch.full((b, g, 2), 0.5),
-        directions=torch.tensor([1.0, 0.0]).expand(b, g, 2),
-        opacity_logits=opacity_logits,
-        velocities=torch.zeros(b, g, 2),
-        features=torch.ones(b, g, 3),
-        sources=torch.zeros(b, g, dtype=torch.int64),
-        elapsed_s=torch.zeros(b, g),
-        valid=valid,
-    )
+    columns = {"scales": torch.full((b, g, 2), 0.5), "features": torch.ones(b, g, 3)}
+    return gaussians_at(means, opacity_logits=opacity_logits, valid=valid, **columns)
 
 
 def test_padding_is_not_splatted_and_results_return_to_their_gaussians(grid):

@@ -8,7 +8,7 @@ from src.models.hydra.depth_consistency import DepthConsistency, DepthConsistenc
 from src.models.layers.views import CameraViews
 from src.targets.depth import lid_edges
 from tests.models.frames import GRID, SIZE
-from tests.models.surroundings import AXES, camera_matrices
+from tests.models.surroundings import AXES, camera_matrices, rigs
 
 LEVEL, BINS, RANGE_M = (4, 6), 16, (1.0, 40.0)
 EDGES = lid_edges(RANGE_M, BINS).tolist()
@@ -32,7 +32,7 @@ def make_inputs(seed=1):
     radar[:, :, torch.arange(GRID.rows) % 3 != 0] = 0.0
     valid = torch.ones(2, 4, dtype=torch.bool)
     valid[1, 2] = False
-    matrices = camera_matrices(SIZE, AXES).repeat(2, 1, 1, 1)
+    matrices = rigs(2, SIZE, AXES)
     matrices[1, 2] = 0.0
     views = CameraViews([torch.randn(2, 4, 5, *LEVEL)], matrices, valid, SIZE)
     return fused, radar, views, 3 * torch.randn(2, 4, BINS, *LEVEL)

@@ -11,7 +11,7 @@ from src.models.layers.views import CameraViews
 from src.targets.depth import lid_centres
 from tests.models.dense_bev.dense_frames import lift_config
 from tests.models.frames import GRID, SIZE
-from tests.models.surroundings import AXES, camera_matrices
+from tests.models.surroundings import AXES, camera_matrices, rigs
 
 CHANNELS = 6
 
@@ -50,7 +50,7 @@ def test_it_is_the_published_frustum_pooled(missing):
     """Values and gradients, through depth and through context; the cameras are tilted a little against the grid."""
     module = make_module(num_depth_bins=6, z_range_m=[-1.0, 3.0])
     generator = torch.Generator().manual_seed(1)
-    matrices = camera_matrices(SIZE, AXES)[:2].repeat(2, 1, 1, 1)
+    matrices = rigs(2, SIZE, AXES)[:, :2]
     tilt = 0.05 * torch.randn(matrices.shape, generator=generator)
     matrices[:, :, :3] += tilt[:, :, :3]
     valid = torch.ones(2, 2, dtype=torch.bool)
@@ -97,7 +97,7 @@ def test_a_pixel_lands_where_its_depth_says():
 
 def test_views_of_other_samples_and_missing_views_stay_out():
     module = make_module().eval()
-    level, matrices = torch.randn(2, 4, CHANNELS, 4, 6), camera_matrices(SIZE, AXES).repeat(2, 1, 1, 1)
+    level, matrices = torch.randn(2, 4, CHANNELS, 4, 6), rigs(2, SIZE, AXES)
     valid = torch.ones(2, 4, dtype=torch.bool)
     both = module(CameraViews([level], matrices, valid, SIZE)).bev
     for sample in range(2):

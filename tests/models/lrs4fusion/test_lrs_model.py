@@ -68,7 +68,8 @@ def test_frames_without_points_inside_teach_finite_steps_and_are_remembered_as_n
         terms = model.loss(out, replace(lidar_frame(clouds), rays=rays)).terms
         assert term in terms and terms["total"].isfinite()
     terms["total"].backward()
-    assert all(p.grad.isfinite().all() for p in model.parameters() if p.grad is not None)
+    learning = [p.grad for p in model.parameters() if p.grad is not None]
+    assert learning and all(grad.isfinite().all() for grad in learning)
     probability, _ = model.look_up(later, *some_queries(50))
     assert probability.isfinite().all()
 

@@ -12,7 +12,7 @@ from src.models.sparc.frustum_fusion import FrustumFusionConfig, SparseFrustumFu
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV
 from tests.models.frames import GRID, SIZE
-from tests.models.surroundings import AXES, camera_matrices
+from tests.models.surroundings import AXES, rigs
 
 STRIDES = (8, 16, 32)
 
@@ -29,7 +29,7 @@ def make_views(seed=0):
     generator = torch.Generator().manual_seed(seed)
     sizes = [(SIZE[0] // stride, SIZE[1] // stride) for stride in STRIDES]
     levels = [torch.randn(2, 4, 10, *size, generator=generator) for size in sizes]
-    matrices = camera_matrices(SIZE, AXES).repeat(2, 1, 1, 1)
+    matrices = rigs(2, SIZE, AXES)
     return CameraViews(levels, matrices, torch.ones(2, 4, dtype=torch.bool), SIZE)
 
 
