@@ -113,19 +113,23 @@ class QueryDetector(Detector):
         """Make `decoder`, called with queries, further ones to look at, what is seen and the head, and what lies
         before it."""
 
-    def add_anchors(self, count: int) -> None:
-        """Make the learnt places that `anchor_queries` start at."""
+    def add_anchors(self, count: int, learnt_features: bool = False) -> None:
+        """Make the learnt places that `anchor_queries` start at, with features of their own or with zeros."""
         # In units of the half extent, so that one step of Adam is of the order of a metre; uniform at first (PETR 3.4).
         self.anchors = nn.Parameter(torch.empty(count, 3).uniform_(-1.0, 1.0))
         (low, high), z = self.grid.z_range_m, sum(self.grid.z_range_m) / 2
         extent = torch.tensor([(*self.grid.centre_m, z), (*self.grid.half_extent_m, (high - low) / 2)])
         self.register_buffer("extent_m", extent, persistent=False)
+        self.anchor_features = nn.Parameter(torch.randn(count, self.config.channels)) if learnt_features else None
 
     def anchor_queries(self, batch_size: int) -> Queries:
-        """Queries at the learnt anchors, whose features begin at zero."""
+        """Queries at the learnt anchors."""
         middle, half = self.extent_m.unbind(0)
         centers = (middle + half * self.anchors).expand(batch_size, -1, -1)
-        features = centers.new_zeros(*centers.shape[:2], self.config.channels)
+        if self.anchor_features is None:
+            features = centers.new_zeros(*centers.shape[:2], self.config.channels)
+        else:
+            features = self.anchor_features.expand(batch_size, -1, -1)
         return Queries.unknown(features, centers, torch.ones_like(centers[..., 0], dtype=torch.bool))
 
     @property
@@ -183,8 +187,15 @@ class QueryDetector(Detector):
         return camera_losses(maps, views, seen, depth_range_m, *wanted)
 
     def diagnostics(self, output: QueryOutput) -> dict[str, Tensor | float]:
-        """Queries and what is remembered, per frame."""
-        values = {"queries": output.head.valid.sum() / len(output.head.valid)}
+        """Queries and what is remembered, per frame; by how much the queries of a frame differ in their logits.
+
+        Where that is next to nothing the decoder has collapsed: all say the same, wherever they look.
+        """
+        logits = output.head.logits.detach()
+        values = {
+            "queries": output.head.valid.sum() / len(output.head.valid),
+            "logit_spread": logits.std(dim=1, correction=0).mean(),
+        }
         return values if output.recalled is None else values | output.recalled.diagnostics()
 
     def evidence(self, output: QueryOutput) -> Evidence:

@@ -87,14 +87,16 @@ class SetPredictionHead(nn.Module):
         past: Queries | None,  # further ones to look at
         embeddings: tuple[Tensor, Tensor | None],  # [B, Q, C] of the queries, [B, P, C] of the past
         *sources: Any,  # what else every layer looks at
+        norm: nn.Module | None = None,  # of the features that boxes are predicted from
     ) -> tuple[list[QueryPrediction], list[Tensor]]:  # of each layer, and [B, Q, C]
         """What every layer predicts relative to the queries' own start, and the features that it predicts from."""
         own, others = embeddings
         remembered = None if past is None else (past.features + others, past.features, past.valid)
         predictions, features = [], []
         for layer in layers:
-            features.append(layer(queries, own, remembered, *sources))
-            queries = replace(queries, features=features[-1])
+            x = layer(queries, own, remembered, *sources)
+            queries = replace(queries, features=x)
+            features.append(x if norm is None else norm(x))
             predictions.append(self(features[-1], queries))
         return predictions, features
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -55,13 +57,16 @@ class GlobalAttention(nn.Module):
 
 
 class GlobalDecoderLayer(nn.Module):
-    """Self-attention, attention to the tokens of a sensor and an MLP, each added and normalised (DETR's order)."""
+    """Self-attention, attention to the tokens of a sensor and an MLP, each of normalised features, and added to them.
+
+    DETR normalises the sums instead; what all queries gather alike can then outgrow what tells them apart.
+    """
 
     def __init__(self, channels: int, num_heads: int) -> None:
         super().__init__()
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
         self.self_attention = GlobalAttention(channels, num_heads)
-        self.image_attention = GlobalAttention(channels, num_heads)  # or radar's; checkpoints know the name
+        self.cross_attention = GlobalAttention(channels, num_heads)
         self.mlp = feed_forward(channels, FFN_RATIO)
 
     def forward(
@@ -71,8 +76,8 @@ class GlobalDecoderLayer(nn.Module):
         past: tuple[Tensor, Tensor, Tensor] | None,  # further keys [B, n, C], values [B, n, C], valid [B, n]
         tokens: tuple[Tensor, Tensor, Tensor],  # keys [B, G, C], values [B, G, C], valid [B, G]
     ) -> Tensor:  # [B, Q, C]
-        """The queries' features after this layer."""
+        """The queries' features after this layer, not normalised."""
         x = queries.features
-        x = self.norms[0](x + self.self_attention.among(queries, embedding, past))
-        x = self.norms[1](x + self.image_attention(x + embedding, *tokens))
-        return self.norms[2](x + self.mlp(x))
+        x = x + self.self_attention.among(replace(queries, features=self.norms[0](x)), embedding, past)
+        x = x + self.cross_attention(self.norms[1](x) + embedding, *tokens)
+        return x + self.mlp(self.norms[2](x))

@@ -33,6 +33,7 @@ class PETRDecoder(nn.Module):
         check_decoder_heads(config.num_heads, channels)
         self.embedding = QueryEmbedding(channels, grid)
         self.layers = nn.ModuleList(GlobalDecoderLayer(channels, config.num_heads) for _ in range(config.num_layers))
+        self.norm = nn.LayerNorm(channels)
 
     def forward(
         self,
@@ -43,4 +44,4 @@ class PETRDecoder(nn.Module):
     ) -> tuple[list[QueryPrediction], list[Tensor]]:  # of each layer, and [B, Q, C]
         """What every layer predicts, and the features that it predicts from."""
         embeddings = (self.embedding(queries), None if past is None else self.embedding(past))
-        return head.of_layers(self.layers, queries, past, embeddings, images)
+        return head.of_layers(self.layers, queries, past, embeddings, images, norm=self.norm)

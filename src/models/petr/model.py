@@ -48,9 +48,9 @@ class PETR(QueryDetector):
     def build(self) -> None:
         """What images are told of places, the anchors, and the decoder."""
         config, grid, channels = self.config, self.grid, self.config.channels
-        self.image_value = nn.Linear(self.image_encoder.channels, channels)
+        self.image_value = nn.Sequential(nn.Linear(self.image_encoder.channels, channels), nn.LayerNorm(channels))
         self.position = PositionEmbedding(config.position, channels, grid)
-        self.add_anchors(config.num_queries)
+        self.add_anchors(config.num_queries, learnt_features=True)
         self.decoder = PETRDecoder(config.decoder, channels, grid)
 
     def forward(self, batch: FrameBatch, memory: QueryMemory | None = None) -> tuple[QueryOutput, QueryMemory | None]:

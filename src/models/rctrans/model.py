@@ -62,7 +62,7 @@ class RCTrans(QueryDetector):
         grid = BEVGrid((grid.rows // size, grid.cols // size), size * grid.cell_m, grid.centre_m, grid.z_range_m)
         self.radar_encoder = PillarEncoder(config.radar_encoder, grid)
         self.densifier = RadarDensifier(config.densifier, config.radar_encoder.channels, grid)
-        self.add_anchors(config.num_queries)
+        self.add_anchors(config.num_queries, learnt_features=True)
         widths = (config.channels, config.densifier.channels, self.image_encoder.channels)
         self.decoder = SequentialDecoder(config.decoder, config.position, *widths, grid)
 

@@ -69,6 +69,7 @@ class SequentialDecoder(nn.Module):
             token_layers(radar_channels, channels),
             token_layers(image_channels, channels),
         )
+        self.radar_norm, self.image_norm = nn.LayerNorm(channels), nn.LayerNorm(channels)
         self.plane = SinePositionEmbedding(channels, grid, coordinates=2)
         self.perspective = PositionEmbedding(position, channels, grid, logits=False)
         places = torch.cartesian_prod(torch.arange(grid.rows), torch.arange(grid.cols))
@@ -102,13 +103,14 @@ class SequentialDecoder(nn.Module):
 
     def radar_tokens(self, radar: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Keys, values and validity of every cell, empty ones too."""
-        value = self.radar_value(radar).flatten(2).transpose(1, 2)  # [B, cells, C]
+        value = self.radar_norm(self.radar_value(radar).flatten(2).transpose(1, 2))  # [B, cells, C]
         return value + self.plane(self.places_m), value, torch.ones_like(value[..., 0], dtype=torch.bool)
 
     def image_tokens(self, views: CameraViews) -> tuple[Tensor, Tensor, Tensor]:
         """Keys, values and validity of every pixel of the finest level of all cameras."""
         level = views.levels[0]
-        value = self.image_value(level.flatten(0, 1)).unflatten(0, level.shape[:2]).movedim(2, -1)  # [B, N, h, w, C]
+        value = self.image_value(level.flatten(0, 1)).unflatten(0, level.shape[:2])
+        value = self.image_norm(value.movedim(2, -1))  # [B, N, h, w, C]
         valid = views.valid[:, :, None, None].expand(value.shape[:-1])
         return (value + self.perspective(views)).flatten(1, 3), value.flatten(1, 3), valid.flatten(1)
 

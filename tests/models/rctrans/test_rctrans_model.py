@@ -10,12 +10,7 @@ from tests.models.query_frames import small_model
 
 
 def test_every_parameter_learns():
-    """But for the first self-attention: features begin at zero, so there is nothing yet to tell one another."""
-    stay = parameters_that_stay(small_model("rctrans"), make_batch(boxes=(12, 12)), lr=1e-3)
-    first = "decoder.layers.0.radar.self_attention."
-    assert set(stay) <= {
-        f"{first}{name}" for name in ("query.weight", "query.bias", "key.weight", "key.bias", "value.weight")
-    }
+    assert parameters_that_stay(small_model("rctrans"), make_batch(boxes=(12, 12)), lr=1e-3) == []
 
 
 @torch.no_grad()

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
@@ -79,14 +80,13 @@ def test_a_cells_key_has_the_embedding_of_its_centre_and_a_missing_cameras_pixel
     xy = torch.tensor([GRID.x_min_m + 17.5 * 1.6, GRID.y_min_m + 5.5 * 1.6])
     cell = row * 32 + col
     torch.testing.assert_close(key[1, cell] - value[1, cell], decoder.plane(xy), atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(value[1, cell], decoder.radar_value(radar)[1, :, row, col])
+    torch.testing.assert_close(value[1, cell], F.layer_norm(decoder.radar_value(radar)[1, :, row, col], (C,)))
     assert valid.all() and valid.shape == (2, 24 * 32)
     views.valid[0, 1] = False
     _, value, valid = decoder.image_tokens(views)
     assert valid.view(2, 4, 24).all(2).tolist() == [[True, False, True, True], [True] * 4]
-    torch.testing.assert_close(
-        value.view(2, 4, 4, 6, C)[1, 2, 3, 4], decoder.image_value(views.levels[0][1])[2, :, 3, 4]
-    )
+    pixel = F.layer_norm(decoder.image_value(views.levels[0][1])[2, :, 3, 4], (C,))
+    torch.testing.assert_close(value.view(2, 4, 4, 6, C)[1, 2, 3, 4], pixel)
 
 
 def test_gradients_do_not_pass_from_place_to_place():
