@@ -14,6 +14,7 @@ from src.data.datamodule import DetectionDataModule
 from src.errors import ConfigError, DataError
 from src.metrics.submission import write_submission
 from src.models import build_model as build_model_of
+from src.models.backbones.weights import BackboneName
 from src.models.detector import Detector
 from src.reliability.checkpoints import load_model_weights
 from src.structures.detections import DetectionTable
@@ -94,7 +95,13 @@ def build_model(config: Config, pretrained: bool = True) -> Detector:
     """The configured detector with fresh weights (and pretrained backbone weights where given).
 
     With `pretrained` false their file, which may not be on this machine, is not read: a checkpoint brings all weights.
+    Warns of a V2-99 from scratch, whose batch norm would keep to the statistics that pretrained weights bring.
     """
+    if pretrained and config.backbone.name is BackboneName.vovnet99 and config.backbone.weights is None:
+        logger.warning(
+            "backbone=vovnet99 without backbone.weights: its batch norm never learns statistics (method 3), so from "
+            "scratch it is without any; give backbone.weights=FILE (FCOS3D's or DD3D's)"
+        )
     backbone = config.backbone if pretrained else replace(config.backbone, weights=None)
     return build_model_of(config.model, config.grid.build(), backbone, config.phase.options)
 

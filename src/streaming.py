@@ -34,7 +34,8 @@ class StreamingDetector:
     What a frame may use of the past is decided frame by frame, by its time and pose (method 6.4):
 
     - On the first frame, after `reset`, and on a frame that says so (`FrameBatch.starts`) nothing is remembered.
-    - Frames older than `model.dptf.max_age_s` are not used, so a long gap is as a first frame.
+    - Frames older than `model.dptf.max_age_s` (other families: `model.temporal.max_age_s`) are not used, so a long gap
+      is as a first frame.
     - Frames that are not in the past of the present one are forgotten. So a frame given again replaces itself, less
       what lay at the far end of a full memory, and a clock that jumps back continues from there; call `reset` when
       another recording begins.

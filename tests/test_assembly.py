@@ -3,7 +3,7 @@
 import pytest
 
 from src import assembly
-from src.assembly import build_datamodule, data_root, save_submission
+from src.assembly import build_datamodule, build_model, data_root, save_submission
 from src.config import compose_config
 from src.errors import ConfigError, DataError
 from src.reliability.processes import check_devices
@@ -58,3 +58,13 @@ def test_a_world_without_lidar_is_refused_for_a_model_that_reads_it(monkeypatch)
         compose_config(["scale=debug"])
     compose_config(["scale=debug", "data.world.lidar=true"])
     compose_config(["scale=debug", "data=truckscenes", "data.root=x"])
+
+
+@pytest.mark.slow
+def test_a_backbone_whose_norm_needs_pretrained_weights_says_so_where_it_gets_none(caplog):
+    config, _ = compose_config(["scale=debug", "phase=phase1", "backbone=vovnet99", "backbone.image_size_px=[64,96]"])
+    build_model(config, pretrained=False)  # a checkpoint brings them
+    assert not caplog.records
+    build_model(config)
+    (record,) = caplog.records
+    assert record.getMessage().startswith("backbone=vovnet99 without backbone.weights")

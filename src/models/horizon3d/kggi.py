@@ -191,7 +191,9 @@ class KGGI(nn.Module):
         return KGGIOutput(GaussianSet.concatenate(parts, dim=1), logits, camera)
 
     def _learnt_means(self) -> Tensor:  # [K, 2] m
-        return self.centre_m + self.half_extent_m * self.random_means.clamp(-INSIDE, INSIDE)
+        means = self.random_means
+        beyond = means.detach() - means.detach().clamp(-INSIDE, INSIDE)
+        return self.centre_m + self.half_extent_m * (means - beyond)  # the gradient passes, so that they can come back
 
     def _radar_keypoints(
         self,
