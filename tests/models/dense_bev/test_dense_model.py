@@ -22,6 +22,7 @@ from tests.models.learning import (
     autocast_step,
     gradients_are_finite,
     little_input_gives_finite_losses,
+    overfitted_precision,
     parameters_that_stay,
     samples_do_not_mix,
     train_step,
@@ -193,24 +194,8 @@ def test_phase_1_has_no_memory(phase):
 
 @pytest.mark.exhaustive
 def test_two_frames_can_be_learnt_by_heart():
-    """Boxes come back where they were, within a cell, and nothing scores as high elsewhere."""
-    model, batch = dense_model(), make_batch(boxes=(5, 4))
-    optimizer = torch.optim.AdamW(model.parameters(), lr=4e-3)
-    for step in range(STEPS):
-        for group in optimizer.param_groups:
-            group["lr"] = 4e-3 * min(1.0, (STEPS - step) / 100)
-        _, terms = train_step(model, batch)
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 35.0)
-        optimizer.step()
-    with torch.no_grad():
-        found = model.decode(model(batch)[0])  # in training mode: two frames are all the statistics there are
-    assert terms["heatmap"] < 0.5 and terms["depth"] < 2.0
-    for boxes, truth in zip(found, batch.boxes, strict=True):
-        sure = boxes[boxes.scores > 0.5]
-        for label, centre in zip(truth.labels, truth.centers, strict=True):
-            mine = sure[sure.labels == label]
-            assert len(mine) and (mine.centers[:, :2] - centre[:2]).norm(dim=1).min() < 0.8
-        assert len(sure) <= len(truth) + 1
+    """Over 0.9 AP at one cell, averaged over the classes present."""
+    assert overfitted_precision(dense_model(), make_batch(boxes=(5, 4)), STEPS, 4e-3, falling=100) > 0.9
 
 
 def test_the_decoder_joins_the_finest_and_the_coarsest_stage():

@@ -25,6 +25,7 @@ from tests.models.learning import (
     autocast_step,
     gradients_are_finite,
     little_input_gives_finite_losses,
+    overfitted_precision,
     parameters_that_stay,
     train_step,
 )
@@ -405,16 +406,6 @@ def test_small_scales_build(scale):
 
 
 @pytest.mark.exhaustive
-def test_overfits_two_frames(make_model, make_batch):
-    model, batch = make_model(), make_batch(boxes=(4, 4))
-    optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3)
-    first = None
-    for _ in range(150):
-        _, terms = train_step(model, batch)
-        optimizer.step()
-        first = first or {name: float(value.detach()) for name, value in terms.items()}
-    last = {name: float(value.detach()) for name, value in terms.items()}
-    assert last["heatmap"] < 0.05 * first["heatmap"]
-    assert last["box"] < 0.3 * first["box"]
-    assert last["occupancy_dice"] < 0.6 * first["occupancy_dice"]
-    assert last["keypoint"] < 0.5 * first["keypoint"]
+def test_two_frames_are_overfitted(make_model, make_batch):
+    """Over 0.9 AP at one cell, averaged over the classes present."""
+    assert overfitted_precision(make_model(), make_batch(boxes=(5, 4)), 240, 3e-3, falling=150) > 0.9
