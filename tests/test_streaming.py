@@ -14,6 +14,7 @@ from src.errors import CheckpointError, ConfigError
 from src.streaming import StreamingDetector
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CAMERAS, RADARS
+from tests.models.moving import tensors_of
 from tests.untrained import write_checkpoint
 
 GUIDE = Path(__file__).resolve().parent.parent / "docs" / "streaming.md"
@@ -58,18 +59,6 @@ def alone(detector, frame):
 def walk(detector, *times_s):
     for time_s in times_s:
         detector.step(make_frame(detector, time_s, seed=int(10 * time_s)))
-
-
-def memory_of(detector):
-    """Tensors held, flat."""
-
-    def leaves(node):
-        if isinstance(node, torch.Tensor):
-            return [node]
-        values = node.values() if isinstance(node, dict) else node or []
-        return [leaf for value in values for leaf in leaves(value)]
-
-    return leaves(detector.memory.state())
 
 
 @pytest.mark.slow
@@ -128,9 +117,9 @@ def test_frames_that_are_not_in_the_past_are_not_used(phase2):
 def test_a_frame_given_again_is_detected_as_the_first_time(phase2):
     walk(phase2, 10.0)
     frame = make_frame(phase2, 10.5, seed=1)
-    first, memory = phase2.step(frame), memory_of(phase2)
+    first, memory = phase2.step(frame), tensors_of(phase2.memory)
     assert same(phase2.step(frame), first) and not same(first, alone(phase2, frame))
-    assert all(torch.equal(*pair) for pair in zip(memory_of(phase2), memory, strict=True))
+    assert all(torch.equal(*pair) for pair in zip(tensors_of(phase2.memory), memory, strict=True))
 
 
 @pytest.mark.slow
@@ -167,8 +156,8 @@ def test_memory_stays_within_its_bounds(phase2):
     config, sizes = phase2.model.config.dptf, []
     for k in range(30):
         phase2.step(make_frame(phase2, 0.5 * k, seed=k))
-        assert not any(tensor.requires_grad for tensor in memory_of(phase2))
-        sizes.append(sum(tensor.numel() for tensor in memory_of(phase2)))
+        assert not any(tensor.requires_grad for tensor in tensors_of(phase2.memory))
+        sizes.append(sum(tensor.numel() for tensor in tensors_of(phase2.memory)))
     assert len(phase2.memory.frames) == max(config.bev_path.num_frames, config.gaussian_path.num_frames)
     for frame in phase2.memory.frames:
         assert 0 < len(frame.cells.xy) <= config.bev_path.max_cells_per_frame

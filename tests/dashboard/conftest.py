@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from src.dashboard.board import Board, BoardReader
 from tests.dashboard.experiments import World, build, serve
 
 
@@ -26,3 +27,9 @@ def shared_world(tmp_path_factory: pytest.TempPathFactory) -> World:
 def served(shared_world: World) -> Iterator[str]:
     """Address of a live dashboard over the shared world."""
     yield from serve(shared_world)
+
+
+@pytest.fixture
+def board(shared_world: World) -> Board:
+    """What it shows."""
+    return BoardReader(shared_world.reports, shared_world.outputs).read()[0]

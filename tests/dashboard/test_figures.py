@@ -3,9 +3,7 @@
 import time
 import xml.etree.ElementTree as ET
 
-import pytest
-
-from src.dashboard.board import BoardReader, Sweep
+from src.dashboard.board import Sweep
 from src.dashboard.figures import (
     curve_figures,
     knob_figures,
@@ -18,11 +16,6 @@ from src.dashboard.figures import (
 from src.report.sweep_file import DimensionConfig, SweepConfig
 from src.report.sweep_record import RunState, SweepRecord
 from tests.dashboard.experiments import EVIL, World
-
-
-@pytest.fixture
-def board(shared_world):
-    return BoardReader(shared_world.reports, shared_world.outputs).read()[0]
 
 
 def notes(figure):

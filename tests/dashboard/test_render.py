@@ -6,7 +6,6 @@ import re
 import pytest
 from markupsafe import escape
 
-from src.dashboard.board import BoardReader
 from src.dashboard.figures import headline
 from src.dashboard.render import (
     Renderer,
@@ -17,11 +16,6 @@ from src.dashboard.render import (
 )
 from src.report.escaping import escape_markdown
 from tests.dashboard.experiments import EVIL
-
-
-@pytest.fixture
-def board(shared_world):
-    return BoardReader(shared_world.reports, shared_world.outputs).read()[0]
 
 
 @pytest.fixture
