@@ -34,7 +34,8 @@ def rigs(count, size, headings_deg):
     for number in range(count):
         c, s = math.cos(0.07 * number), math.sin(0.07 * number)
         moved = torch.tensor([[c, -s, 0, 0], [s, c, 0, number], [0, 0, 1, 0], [0, 0, 0, 1]])
-        found.append(camera_matrices(size, headings_deg) @ moved)
+        with torch.autocast("cpu", enabled=False):  # a test may make its frames within one
+            found.append(camera_matrices(size, headings_deg) @ moved)
     return torch.stack(found)
 
 

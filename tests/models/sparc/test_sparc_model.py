@@ -39,9 +39,8 @@ def test_layers_predict_relative_to_where_queries_began_and_look_where_the_last_
 
 
 def test_autocast_keeps_places_in_float32():
-    batch = make_batch()
     with torch.autocast("cpu", torch.bfloat16):
-        output, _ = small_model("sparc")(batch)
+        output, _ = small_model("sparc")(make_batch())
     assert output.radar.means.dtype == torch.float32
 
 
