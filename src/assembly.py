@@ -100,7 +100,7 @@ def build_model(config: Config, pretrained: bool = True) -> Detector:
     if pretrained and config.backbone.name is BackboneName.vovnet99 and config.backbone.weights is None:
         logger.warning(
             "backbone=vovnet99 without backbone.weights: its batch norm never learns statistics (method 3), so from "
-            "scratch it is without any; give backbone.weights=FILE (FCOS3D's or DD3D's)"
+            "scratch it normalises nothing; give backbone.weights=FILE (FCOS3D's or DD3D's)"
         )
     backbone = config.backbone if pretrained else replace(config.backbone, weights=None)
     return build_model_of(config.model, config.grid.build(), backbone, config.phase.options)

@@ -189,7 +189,7 @@ class QueryDetector(Detector):
     def diagnostics(self, output: QueryOutput) -> dict[str, Tensor | float]:
         """Queries and what is remembered, per frame; by how much the queries of a frame differ in their logits.
 
-        Where that is next to nothing the decoder has collapsed: all say the same, wherever they look.
+        Where that (padding counts) is next to nothing the decoder has collapsed: all say the same, wherever they look.
         """
         logits = output.head.logits.detach()
         values = {
