@@ -5,35 +5,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from src.data.cache import load_index
 from src.data.rays import radar_speeds
 from src.data.reader import FrameReader
 from src.data.timeline import RadialSpeeds
 from src.errors import DataError
-from src.structures.ray_bundle import RayBundle
 from src.world.write import ensure_world
 from tests.data.tiny_set import FIVE_HERTZ, VERSION, reader_settings
+from tests.ray_bundles import rays_to
 from tests.world.conftest import small_config
 
 ONLY_LIDAR = {"image_size_px": None, "num_sweeps": 0, "num_lidar_sweeps": 1}
 
 
-def bundle(points, times_s):
-    count = len(points)
-    points = torch.tensor(points, dtype=torch.float32)
-    ranges = points.norm(dim=1)
-    return RayBundle(
-        origins=torch.zeros(count, 3), directions=points / ranges[:, None], ranges=ranges,
-        times_s=torch.tensor(times_s, dtype=torch.float32), speeds=torch.full((count,), torch.nan),
-        steps=torch.zeros(count, dtype=torch.int64), batch=torch.zeros(count, dtype=torch.int64),
-    )  # fmt: skip
-
-
 def test_a_radar_return_beside_a_ray_tells_its_speed():
     ends = [[30, 0, 1], [30, 0, 1], [30, 3.1, 1], [0, 50, 1], [0, 80, 1], [30, 0, 0.2]]  # the last on the road
-    rays = bundle(ends, [0.0, 0.2, 0.0, 0.0, 0.0, 0.0])
+    rays = rays_to(ends, times_s=[0.0, 0.2, 0.0, 0.0, 0.0, 0.0])
     radar = np.zeros((5, 7))  # x, y, z, rcs, vx, vy, dt
     radar[0, [0, 1, 4]] = [31.5, 0, 12.0]
     radar[1, [0, 1, 4]] = [30, 1.2, -7.0]  # nearer

@@ -6,7 +6,7 @@ import torch
 
 from src.metrics.diagnostics import ratios
 from src.metrics.forecasting import ForecastScores, chamfer_distance, median_errors, score_forecast, sums_by_sample
-from src.structures.ray_bundle import RayBundle
+from tests.ray_bundles import rays_to
 
 BOUNDS = ((-100.0, 250.0), (-100.0, 100.0), (-12.0, 12.0))
 
@@ -29,17 +29,8 @@ def test_chamfer_distance_is_that_of_all_distances(spread):
     assert chamfer_distance(found, found[::-1]) == 0.0
 
 
-def bundle(ends, steps, batch=None):
-    ends = torch.tensor(ends, dtype=torch.float32)
-    ranges, zeros = ends.norm(dim=1), torch.zeros(len(ends))
-    return RayBundle(
-        origins=torch.zeros_like(ends), directions=ends / ranges[:, None], ranges=ranges, times_s=zeros, speeds=zeros,
-        steps=torch.tensor(steps), batch=torch.tensor([0] * len(ends) if batch is None else batch),
-    )  # fmt: skip
-
-
 def test_near_and_long_field_are_those_of_each_clouds_own_points():
-    rays = bundle([[40.0, 0, 0], [60.0, 0.0, 0.0], [0.0, 80.0, 0.0]], [1, 1, 1])
+    rays = rays_to([[40.0, 0, 0], [60.0, 0.0, 0.0], [0.0, 80.0, 0.0]], steps=1)
     found = torch.tensor([44.0, 45.0, 83.0])  # the second comes into the near field
     scores = score_forecast(rays, found, np.array([7]), BOUNDS)
     assert scores.samples.tolist() == [7] and scores.steps.tolist() == [1]
@@ -51,7 +42,7 @@ def test_near_and_long_field_are_those_of_each_clouds_own_points():
 
 
 def test_clouds_are_cut_to_the_bounds_each_by_its_own_points():
-    rays = bundle([[100.0, 0, 0], [240.0, 0, 0], [0.0, 150.0, 0]], [1] * 3)
+    rays = rays_to([[100.0, 0, 0], [240.0, 0, 0], [0.0, 150.0, 0]], steps=1)
     scores = score_forecast(rays, torch.tensor([101.0, 260.0, 150.0]), np.array([0]), BOUNDS)
     assert scores.chamfer["cd"][0] == pytest.approx(0.5 * (1 + (1 + 139**2) / 2), rel=1e-5)
     np.testing.assert_allclose(scores.errors, [1, 20])  # the third return lies outside
@@ -61,7 +52,7 @@ def test_clouds_are_cut_to_the_bounds_each_by_its_own_points():
 
 def scored():
     """Two samples: the first at steps 0, 2, 5 and 15, one metre, 2 m, 3 m and 4 m wrong; the second at 5, 6 m wrong."""
-    rays = bundle([[30.0, 0, 0], [0, 90.0, 0]] * 5, [0, 0, 2, 2, 5, 5, 15, 15, 5, 5], [0] * 8 + [1] * 2)
+    rays = rays_to([[30.0, 0, 0], [0, 90.0, 0]] * 5, steps=[0, 0, 2, 2, 5, 5, 15, 15, 5, 5], batch=[0] * 8 + [1] * 2)
     moving = torch.tensor([True, False] * 4 + [False] * 2)
     off = torch.tensor([1.0, 1, 2, 2, 3, 3, 4, 4, 6, 6])
     return score_forecast(rays, rays.ranges + off, np.array([4, 1]), BOUNDS, {"moving": moving})
@@ -91,5 +82,5 @@ def test_batches_join():
 
 
 def test_a_negative_range_is_a_point_at_the_sensor():
-    scores = score_forecast(bundle([[3.0, 4, 0]], [1]), torch.tensor([-2.0]), np.array([0]), BOUNDS)
+    scores = score_forecast(rays_to([[3.0, 4, 0]], steps=1), torch.tensor([-2.0]), np.array([0]), BOUNDS)
     assert scores.chamfer["cd"][0] == pytest.approx(25) and scores.errors[0] == pytest.approx(7)

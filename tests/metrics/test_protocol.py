@@ -9,7 +9,7 @@ from src.metrics.detection import score_detections
 from src.metrics.protocol import OFFICIAL, Protocol
 from src.structures.detections import DetectionTable
 from tests.evaluation_sets import set_of
-from tests.metrics.test_detection_scores import boxes
+from tests.metrics.test_detection import boxes
 
 LONG = {
     "thresholds_m": [6.0],

@@ -15,6 +15,7 @@ from src.structures.ray_bundle import RayBundle
 from src.world.write import VERSION, ensure_world
 from tests.data.tiny_set import FIVE_HERTZ, reader_settings
 from tests.models.moving import bda
+from tests.ray_bundles import rays_to
 from tests.world.conftest import small_config
 
 BOUNDS = ((-100.0, 250.0), (-100.0, 100.0), (-12.0, 12.0))
@@ -67,14 +68,6 @@ def frame(points, origins=None, at=0.0, **rest):
     )  # fmt: skip
 
 
-def rays_to(ends):
-    ends = torch.tensor(ends, dtype=torch.float32)
-    ranges, zeros = ends.norm(dim=1), torch.zeros(len(ends))
-    integers = torch.zeros(len(ends), dtype=torch.int64)
-    directions = ends / ranges[:, None]
-    return RayBundle(torch.zeros_like(ends), directions, ranges, zeros, zeros, integers, integers)
-
-
 def test_past_scans_are_moved_by_the_ego():
     past = frame([[30.0, 5.0, 0.0]], at=10.0)
     batch = frame([[50.0, 0.0, 0.0]], at=12.0, past=(past,), rays=rays_to([[28.0, 5.0, 0], [60.0, 0, 0]]))
@@ -112,7 +105,7 @@ def test_samples_do_not_mix_and_augmentation_changes_no_range():
         )  # fmt: skip
 
     first, second = (one.rays for one in alone)
-    rays = RayBundle(*(torch.cat(values) for values in zip(vars(first).values(), vars(second).values(), strict=True)))
+    rays = RayBundle.concatenate([first, second], dim=0)
     rays.directions[3:, 1] *= -1
     rays.batch[3:] = 1
     batch = both(alone[0], alone[1], past=(both(pairs[0][0], pairs[1][0]),), rays=rays)

@@ -18,11 +18,11 @@ from src.reliability import nonfinite
 from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
 from src.reliability.nonfinite import describe_gradients, finite_everywhere, gradient_norm, read_dump, write_dump
 from src.reliability.processes import is_main_process, process_group
-from src.structures.ray_bundle import RayBundle
 from src.training.fit import fit
 from src.training.module import TrainingModule
 from src.training.run_folder import Resume, RunFolder
 from src.training.temporal_module import TemporalModule
+from tests.ray_bundles import rays_to
 from tests.training.toys import STEPS, ToyData, toy_batch, toy_module, toy_trainer
 from tests.training.two_ranks import spawn_two
 
@@ -242,8 +242,8 @@ def test_a_dump_keeps_lidar_past_frames_and_rays(tmp_path):
         return {"lidar_points": points, "lidar_batch": owners.sort()[0], **own}
 
     bare = replace(toy_batch([3, 7], [True, False]), radar_points=None, radar_batch=None)
-    past, numbers, two = replace(bare, streams=None, starts=None, **cloud(3)), torch.randn(2), torch.arange(2)
-    rays = RayBundle(torch.randn(2, 3), torch.randn(2, 3), numbers, numbers, numbers, two, two)
+    past, two = replace(bare, streams=None, starts=None, **cloud(3)), torch.arange(2)
+    rays = rays_to(torch.randn(2, 3), steps=two, batch=two)
     batch = replace(bare, **cloud(4), past=(past, replace(past, **cloud(0))), rays=rays)
     named = {"global_step": 1, "rank": 0, "epoch": 0, "world_size": 1, "seed": 1, "memories": [], "found": ""}
     _, found = read_dump(write_dump(tmp_path, toy_module().model, {}, batch, **named))

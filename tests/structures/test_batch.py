@@ -5,7 +5,7 @@ import torch
 
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
-from src.structures.ray_bundle import RayBundle
+from tests.ray_bundles import rays_to
 
 STREAM = ("streams", "starts")
 
@@ -45,12 +45,7 @@ def test_every_sensor_may_be_missing():
 
 
 def rays(owners):
-    count = len(owners)
-    return RayBundle(
-        origins=torch.zeros(count, 3), directions=torch.eye(3)[:1].repeat(count, 1), ranges=torch.ones(count),
-        times_s=torch.zeros(count), speeds=torch.zeros(count), steps=torch.zeros(count, dtype=torch.int64),
-        batch=torch.tensor(owners),
-    )  # fmt: skip
+    return rays_to([[1.0, 0.0, 0.0]] * len(owners), batch=owners)
 
 
 def test_rays_and_past_frames_move_with_the_batch_and_fit_it():

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from src.errors import ConfigError
-from src.structures.ray_bundle import RayBundle
 from src.targets.occupancy_rays import FreePlaces, RaySampling, clip_rays, sample_queries
+from tests.ray_bundles import rays_to
 
 BOUNDS = ((-100.0, 250.0), (-100.0, 100.0), (-12.0, 12.0))  # lrs 2.1
 SAMPLING = RaySampling(
@@ -13,17 +13,9 @@ SAMPLING = RaySampling(
 )
 
 
-def bundle(ends, *, origin=(0.0, 0.0, 2.0), steps=None, batch=None, speeds=None, times=None):
-    ends, origins = torch.tensor(ends, dtype=torch.float32), torch.tensor([origin], dtype=torch.float32)
-    count, away = len(ends), ends - origins
-    ranges = away.norm(dim=1)
-    zeros = torch.zeros(count, dtype=torch.int64)
-    return RayBundle(
-        origins=origins.repeat(count, 1), directions=away / ranges[:, None].clamp(min=1e-9), ranges=ranges,
-        times_s=torch.arange(count) * 0.1 if times is None else torch.tensor(times),
-        speeds=torch.full((count,), torch.nan) if speeds is None else torch.tensor(speeds),
-        steps=zeros if steps is None else torch.tensor(steps), batch=zeros if batch is None else torch.tensor(batch),
-    )  # fmt: skip
+def rays_from_above(ends, times_s=None, origin=(0.0, 0.0, 2.0), **known):
+    """By its time one knows of which ray a query is."""
+    return rays_to(ends, origin=origin, times_s=torch.arange(len(ends)) * 0.1 if times_s is None else times_s, **known)
 
 
 def seeded(number=0):
@@ -40,7 +32,7 @@ def distances(queries, rays, row):
 
 
 def test_free_from_eps_to_the_return_and_occupied_just_behind_it():
-    rays = bundle([[30.0, 10.0, 1.0]], speeds=[7.0], times=[0.43])
+    rays = rays_from_above([[30.0, 10.0, 1.0]], speeds=[7.0], times_s=[0.43])
     queries = sample_queries(rays, BOUNDS, SAMPLING, seeded())
     along, d = distances(queries, rays, 0), float(rays.ranges)
     occupied = along[queries.occupied]
@@ -54,37 +46,37 @@ def test_free_from_eps_to_the_return_and_occupied_just_behind_it():
 
 
 def test_what_is_not_known_has_no_speed():
-    queries = sample_queries(bundle([[30.0, 0, 1]]), BOUNDS, SAMPLING, seeded())
+    queries = sample_queries(rays_from_above([[30.0, 0, 1]]), BOUNDS, SAMPLING, seeded())
     assert queries.speeds[queries.occupied].isnan().all() and (queries.speeds[~queries.occupied] == 0).all()
 
 
 def test_both_are_cut_to_the_bounds():
-    rays = bundle([[400.0, 0.0, 2.0], [50.0, 0.0, 2.0]])
+    rays = rays_from_above([[400.0, 0.0, 2.0], [50.0, 0.0, 2.0]])
     queries = sample_queries(rays, BOUNDS, SAMPLING, seeded())
     assert queries.points[:, 0].max() <= 250 + 1e-3 and queries.occupied.sum() == 1000
     assert (queries.points[queries.occupied, 0] < 50.2).all()  # the return at 400 m lies outside
     assert (queries.points[~queries.occupied, 0] > 60).any()  # but says that the way there is free
-    edge = bundle([[249.95, 0.0, 2.0]])
+    edge = rays_from_above([[249.95, 0.0, 2.0]])
     inside = sample_queries(edge, BOUNDS, SAMPLING, seeded())
     assert inside.points[inside.occupied, 0].max() <= 250 + 1e-3
-    enter, leave = clip_rays(bundle([[0.0, 0.0, 2.0]], origin=(-150.0, 0.0, 2.0)), BOUNDS)
+    enter, leave = clip_rays(rays_from_above([[0.0, 0.0, 2.0]], origin=(-150.0, 0.0, 2.0)), BOUNDS)
     assert (float(enter), float(leave)) == (50.0, 400.0)
-    enter, leave = clip_rays(bundle([[0.0, 0.0, 40.0]], origin=(0.0, 0.0, 20.0)), BOUNDS)
+    enter, leave = clip_rays(rays_from_above([[0.0, 0.0, 40.0]], origin=(0.0, 0.0, 20.0)), BOUNDS)
     assert leave < enter
 
 
 def test_a_return_nearer_than_eps_is_occupied_and_leaves_nothing_free():
-    near = bundle([[1.0, 0.0, 2.0], [20.0, 0.0, 2.0]])
+    near = rays_from_above([[1.0, 0.0, 2.0], [20.0, 0.0, 2.0]])
     queries = sample_queries(near, BOUNDS, SAMPLING, seeded())
     assert (queries.times_s[~queries.occupied] == near.times_s[1]).all()
     assert 400 < (queries.times_s[queries.occupied] == near.times_s[0]).sum() < 600
     for ends in ([[1.0, 0.0, 2.0]], [[400.0, 0.0, 2.0]]):  # nothing free, nothing occupied: no pair, no query
-        assert len(sample_queries(bundle(ends), BOUNDS, SAMPLING, seeded()).points) == 0
+        assert len(sample_queries(rays_from_above(ends), BOUNDS, SAMPLING, seeded()).points) == 0
     assert len(sample_queries(near[torch.tensor([], dtype=torch.int64)], BOUNDS, SAMPLING).points) == 0
 
 
 def test_samples_and_times_have_their_own_share_and_never_mix():
-    rays = bundle(
+    rays = rays_from_above(
         [[10.0, 0, 2], [20.0, 0, 2], [30.0, 0, 2], [1.0, 0, 2], [40.0, 0, 2]],
         steps=[-1, 0, 0, 3, 0], batch=[0, 0, 0, 0, 1],
     )  # fmt: skip
@@ -100,7 +92,7 @@ def test_samples_and_times_have_their_own_share_and_never_mix():
 @pytest.mark.parametrize("balanced, shares", [(False, [0.9, 0.08, 0.02]), (True, [1 / 3] * 3)])
 def test_rays_are_uniform_or_balanced_over_distance(balanced, shares):
     ends = [[10.0 + 0.1 * n, 5.0, 2.0] for n in range(90)] + [[100.0 + n, 5.0, 2.0] for n in range(8)]
-    rays = bundle(ends + [[200.0, 5.0, 2.0], [210.0, 5.0, 2.0]])
+    rays = rays_from_above(ends + [[200.0, 5.0, 2.0], [210.0, 5.0, 2.0]])
     sampling = RaySampling(**(vars(SAMPLING) | {"ray_balance": balanced, "num_queries": 20_000}))
     queries = sample_queries(rays, BOUNDS, sampling, seeded())
     away = (queries.points[queries.occupied] - rays.origins[0]).norm(dim=1)
@@ -114,7 +106,7 @@ def test_free_places_at_the_ranges_of_returns():
     """As many as occupied ones at every range, on rays that go on; the furthest ray itself is free all along."""
     ends = [[10.0, 0, 2]] * 60 + [[40.0, 0, 2]] * 30 + [[0.0, 80.0, 2]] * 10
     ends, batch = ends + [[30.0, 0, 2]] * 2 + [[60.0, 0, 2]], [0] * 100 + [1] * 3
-    rays = bundle(ends, batch=batch, times=[0.01 * row for row in range(103)])
+    rays = rays_from_above(ends, batch=batch, times_s=[0.01 * row for row in range(103)])
     changes = {"free_places": FreePlaces.at_return_ranges, "num_queries": 20_000}
     queries = sample_queries(rays, BOUNDS, RaySampling(**(vars(SAMPLING) | changes)), seeded())
     along = (queries.points - rays.origins[0]).norm(dim=1)
@@ -134,7 +126,7 @@ def test_free_places_at_the_ranges_of_returns():
 
 
 def test_the_seed_decides():
-    rays = bundle([[30.0, 10.0, 1.0], [60.0, 1.0, 2.0]])
+    rays = rays_from_above([[30.0, 10.0, 1.0], [60.0, 1.0, 2.0]])
     one, same, other = (sample_queries(rays, BOUNDS, SAMPLING, seeded(number)).points for number in (1, 1, 2))
     assert torch.equal(one, same) and not torch.equal(one, other)
 

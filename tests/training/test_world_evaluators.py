@@ -15,6 +15,7 @@ from src.structures.ray_bundle import RayBundle
 from src.training.world_evaluators import ForecastEvaluator, OccupancyEvaluator
 from tests.data.tiny_set import FIVE_HERTZ
 from tests.models.moving import bare_frame, bda, pose
+from tests.ray_bundles import rays_to
 
 WALL_M, SPEED_MPS, START_US = 20.0, 5.0, 100_000_000
 
@@ -44,24 +45,11 @@ class Wall(WorldModel):
 
 def rays(times_s, model, samples):
     """Every second from 0 on a fan of rays that end on the wall."""
+    fan = torch.stack([torch.ones(41), torch.linspace(-0.5, 0.5, 41).tan(), torch.zeros(41)], 1)
     parts = []
     for sample in range(samples):
         for step in times_s:
-            bearing = torch.linspace(-0.5, 0.5, 41)
-            directions = torch.stack([bearing.cos(), bearing.sin(), torch.zeros(41)], 1) * model.scale
-            directions = directions / directions.norm(dim=1, keepdim=True)
-            times = torch.full((41,), 0.2 * step)
-            parts.append(
-                RayBundle(
-                    torch.zeros(41, 3),
-                    directions,
-                    model.face(times) / directions[:, 0],
-                    times,
-                    torch.full((41,), torch.nan),
-                    torch.full((41,), step),
-                    torch.full((41,), sample),
-                )  # fmt: skip
-            )
+            parts.append(rays_to(model.face(0.2 * step) * fan, times_s=0.2 * step, steps=step, batch=sample))
     return RayBundle.concatenate(parts, dim=0)
 
 

@@ -7,7 +7,6 @@ from src.errors import ConfigError
 from src.models.heads.keypoint_head import CameraMaps
 from src.models.horizon3d.gaussian_encoder import GaussianBounds
 from src.models.horizon3d.kggi import KGGI, Initialization
-from src.ops.score_and_lift_pixels import most_likely_depth, peak_scores
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV
 from src.structures.taxonomy import Source
@@ -146,24 +145,6 @@ def test_so_many_radar_keypoints_are_peaks(make_config, grid, make_views, peaks,
     torch.testing.assert_close(gaussians.means[0, :3], wanted[order])
     torch.testing.assert_close(gaussians.means[1, 0], wanted[4])
     assert gaussians.valid[:, :3].tolist() == [[True, True, True], [True, False, False]]
-
-
-def test_depth_is_the_mean_over_the_best_bin_and_its_neighbours():
-    centres = torch.tensor([1.0, 2.0, 4.0, 8.0])
-    probabilities = torch.tensor([[0.1, 0.2, 0.4, 0.3], [0.7, 0.1, 0.1, 0.1], [0.1, 0.1, 0.1, 0.7]])
-    logits = probabilities.log().T.reshape(1, 1, 4, 1, 3)
-    depth, confidence = most_likely_depth(logits, centres)
-    expected = [(0.2 * 2 + 0.4 * 4 + 0.3 * 8) / 0.9, (0.7 + 0.2) / 0.8, (0.4 + 5.6) / 0.8]
-    torch.testing.assert_close(depth.flatten(), torch.tensor(expected))
-    torch.testing.assert_close(confidence.flatten(), torch.tensor([0.9, 0.8, 0.8]))
-
-
-def test_keypoint_window_keeps_local_maxima_only():
-    maps = flat_maps()
-    maps.keypoint_logits[0, 0, 2, 2:5] = torch.tensor([1.0, 2.0, 1.5])
-    assert (peak_scores(maps.keypoint_logits, None)[0, 0, 2, 2:5] > 0.5).all()
-    thinned = peak_scores(maps.keypoint_logits, 3)[0, 0, 2, 2:5]
-    assert (thinned > 0).tolist() == [False, True, False]
 
 
 def test_property_head_changes_nothing_at_step_zero(make_config, grid, make_views):

@@ -12,11 +12,11 @@ from src.benchmark.scenes import lidar_frame as made_frame
 from src.errors import ConfigError
 from src.models.deploy.inference import prepare_for_inference
 from src.structures.boxes import Boxes3D
-from src.structures.ray_bundle import RayBundle
 from src.targets.occupancy_rays import sample_queries
 from tests.models.learning import gradients_are_finite, train_step
 from tests.models.lrs4fusion.lrs_frames import cloud, lidar_frame, lrs_config, lrs_model
 from tests.models.moving import bda, pose, tensors_of
+from tests.ray_bundles import rays_to
 
 pytestmark = pytest.mark.slow
 
@@ -45,11 +45,9 @@ def some_queries(count, batch_size=2):
 
 def some_rays():
     directions = F.normalize(torch.randn(6, 3, generator=torch.Generator().manual_seed(0)), dim=1)
-    return RayBundle(
-        origins=torch.tensor([[1.0, 0.0, 2.0]]).repeat(6, 1), directions=directions, ranges=torch.full((6,), 20.0),
-        times_s=torch.linspace(0, 3, 6), speeds=torch.full((6,), torch.nan), steps=torch.arange(6),
-        batch=torch.tensor([0, 0, 0, 1, 1, 1]),
-    )  # fmt: skip
+    ends = 20.0 * directions + torch.tensor([1.0, 0.0, 2.0])
+    times, owners = torch.linspace(0, 3, 6), torch.arange(6) // 3
+    return rays_to(ends, origin=(1.0, 0.0, 2.0), times_s=times, steps=torch.arange(6), batch=owners)
 
 
 @pytest.mark.parametrize(

@@ -7,21 +7,16 @@ import torch
 
 from src.errors import ConfigError
 from src.models.lrs4fusion.ray_loss import occupancy_objective, range_objective
-from src.structures.ray_bundle import RayBundle
 from src.targets.occupancy_rays import draw_rays
 from tests.models.lrs4fusion.lrs_frames import cloud, lidar_frame, lrs_config, lrs_model
+from tests.ray_bundles import rays_to
 
 BOUNDS = ((-50.0, 50.0), (-50.0, 50.0), (-5.0, 5.0))
 
 
 def rays_along_x(ranges, speeds=0.0, steps=0, batch=0):
-    n = len(ranges)
-    filled = (torch.as_tensor(value).expand(n).clone() for value in (speeds, steps, batch))
-    speeds, steps, batch = filled
-    return RayBundle(
-        torch.zeros(n, 3), torch.eye(3)[:1].repeat(n, 1), torch.tensor(ranges), 0.2 * steps.float(), speeds.float(),
-        steps, batch,
-    )  # fmt: skip
+    ends = [[length, 0.0, 0.0] for length in ranges]
+    return rays_to(ends, times_s=0.2 * torch.as_tensor(steps), speeds=speeds, steps=steps, batch=batch)
 
 
 def settings(**changes):
