@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.constants import where_scalar
 from src.losses.loss_weights import LossWeights
 from src.models.backbones.image import ImageEncoder, ImageEncoderConfig
 from src.models.detector import Detector, ModelConfig, Objective
@@ -189,15 +190,26 @@ class QueryDetector(Detector):
     def diagnostics(self, output: QueryOutput) -> dict[str, Tensor | float]:
         """Queries and what is remembered, per frame; by how much the queries of a frame differ in their logits.
 
-        Where that (padding counts) is next to nothing the decoder has collapsed: all say the same, wherever they look.
+        Where that is next to nothing the decoder has collapsed: all say the same, wherever they look.
         """
-        logits = output.head.logits.detach()
+        valid = output.head.valid
         values = {
-            "queries": output.head.valid.sum() / len(output.head.valid),
-            "logit_spread": logits.std(dim=1, correction=0).mean(),
+            "queries": valid.sum() / len(valid),
+            "logit_spread": masked_std(output.head.logits.detach(), valid).mean(),
         }
         return values if output.recalled is None else values | output.recalled.diagnostics()
 
     def evidence(self, output: QueryOutput) -> Evidence:
         """Where remembered queries of the first sample are now."""
         return Evidence() if output.recalled is None else output.recalled.evidence()
+
+
+def masked_std(
+    values: Tensor,  # [B, Q, C]
+    valid: Tensor,  # [B, Q] bool
+) -> Tensor:  # [B, C]
+    """Standard deviation over the valid queries of each sample, 0 where there are none."""
+    kept = valid[..., None]
+    count = kept.sum(dim=1, keepdim=True).clamp(min=1)
+    mean = where_scalar(kept, values, 0.0).sum(dim=1, keepdim=True) / count
+    return (where_scalar(kept, values - mean, 0.0).square().sum(dim=1) / count.squeeze(1)).sqrt()

@@ -89,6 +89,18 @@ def test_what_is_remembered_is_seen_and_old_frames_too(family):
     assert [float(model.diagnostics(output)["remembered_frames"]) for output in outputs] == [0, 1, 2]
 
 
+def test_by_how_much_the_logits_of_a_frame_differ_is_of_its_queries_alone(family):
+    """Of the first sample 1 and 5 are valid, of the second one query is."""
+    model = small_model(family).eval()
+    with torch.no_grad():
+        output, _ = model(make_batch())
+    valid, logits = output.head.valid.zero_(), output.head.logits.fill_(torch.nan)
+    valid[0, :2] = valid[1, 2] = True
+    logits[0, 0], logits[0, 1], logits[1, 2] = 1.0, 5.0, 7.0
+    told = model.diagnostics(output)
+    assert (float(told["logit_spread"]), float(told["queries"])) == (1.0, 1.5)
+
+
 def test_weights_multiply_and_null_switches_a_term_off(family):
     for name in weights_of(family):
         weight_multiplies_or_switches_off(small_model(family).eval(), make_batch(), name, TERMS[family])
