@@ -44,7 +44,8 @@ def main(overrides: list[str]) -> None:
     tune_cpu()
     path = Path(command.checkpoint)
     checkpoint = read_checkpoint(path)
-    config = restore_config(checkpoint["horizon3d"]["config"], overrides)
+    # A run trained or scored with sensor dropout still sees whole frames here, unless the command says otherwise.
+    config = restore_config(checkpoint["horizon3d"]["config"], ["data.sensor_dropout=0.0", *overrides])
     detector = StreamingDetector.restore(config, checkpoint, path, config.trainer.device())
     datamodule = build_datamodule(config, data_root(config, write=False))
     frames = datamodule.stream(None if command.scene is None else [command.scene])

@@ -61,6 +61,15 @@ def test_an_evaluation_needs_the_checkpoint_alone(outputs, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_model_trained_with_sensor_dropout_sees_whole_frames_unless_told_otherwise(whole, outputs, tmp_path):
+    base = ("data.world.num_val_scenes=2", f"paths.outputs={outputs}")
+    path = write_checkpoint(tmp_path / "a.ckpt", "phase=phase2", "data.sensor_dropout=0.9", *base)
+    for name, told in (("plain", []), ("told", ["data.sensor_dropout=0.9"])):
+        run(path, base[1], f"out={tmp_path / name}", *told)
+    assert results(tmp_path / "plain") == results(whole) != results(tmp_path / "told")
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
 def test_boxes_are_those_of_evaluate(checkpoints, outputs, tmp_path, phase):
     base = (f"paths.outputs={outputs}",)

@@ -21,7 +21,7 @@ from src.files.atomic_write import write_whole
 from src.geometry.transforms import quaternion_to_matrix
 from src.metrics.detection import match_parts
 from src.metrics.diagnostics import count_returns
-from src.metrics.extremes import frames_by_condition, worst_false_positives, worst_misses
+from src.metrics.extremes import CONDITIONS, frames_by_condition, worst_false_positives, worst_misses
 from src.metrics.protocol import OFFICIAL
 from src.metrics.submission import load_submission, to_ego
 from src.pictures.film import Film
@@ -52,16 +52,17 @@ that the middle key frame. Images show the boxes of `{last}`.
 
 ## Worst misses
 
-Ground truth that no prediction of its class reaches within {error_m:g} m, whatever the score: with the most returns in
-the input, one of a class.
+Ground truth that the metric matches with no prediction of its class within {error_m:g} m, whatever the score: with the
+most returns in the input, one of a class.
 
 ![What the sensors saw best and the run missed](pictures/{misses})
 
 ## Worst false positives
 
-Predictions without ground truth of their class within {far_m:g} m: of the highest score, one of a class.
+Predictions that the metric matches with no ground truth of their class within {far_m:g} m, second boxes of an object
+among them: of the highest score, one of a class.
 
-![What the run is surest of and is not there](pictures/{false_positives})
+![What the run is surest of and matches nothing](pictures/{false_positives})
 
 ## A scene
 
@@ -125,9 +126,17 @@ class Gallery:
         self.evaluation_set: EvaluationSet = datamodule.evaluation_set()
 
     def write(self, reports: Path, command: str) -> Path:
-        """Pictures and film below `reports/pictures`, and the page that shows them; its path."""
+        """Pictures and film below `reports/pictures`, and the page that shows them; its path.
+
+        Raises DataError for scenes without a tag to choose by.
+        """
         parts = match_parts(self.evaluation_set, list(self.found.values())[-1], {}, by_range=False, by_speed=False)
         frames = frames_by_condition(self.evaluation_set, COUNT)
+        if not frames:
+            raise DataError(
+                f"data.split={self.config.data.split}: none of its scenes has a tag of {', '.join(CONDITIONS)}, by "
+                "which a gallery chooses its frames; choose another split"
+            )
         truth, predictions = self.evaluation_set.ground_truth, parts.ranking.predictions
         returns = self._count_returns()
         misses, false = worst_misses(parts, returns, COUNT), worst_false_positives(parts, COUNT)

@@ -47,14 +47,18 @@ class ForecastScores:
 
     @classmethod
     def join(cls, parts: list[ForecastScores]) -> ForecastScores:
-        """All frames of several batches; at least one part, all with the same subsets."""
+        """All frames of several batches, at least one; NaN for a subset that a batch does not know."""
         counts = np.cumsum([0, *(len(part.samples) for part in parts[:-1])])
         columns = {
             name: np.concatenate([getattr(part, name) for part in parts])
             for name in ("samples", "steps", "errors", "ranges")
         }
         frames = np.concatenate([part.frames + count for part, count in zip(parts, counts, strict=True)])
-        chamfer = {name: np.concatenate([part.chamfer[name] for part in parts]) for name in parts[0].chamfer}
+        unknown = [np.full(len(part.samples), np.nan) for part in parts]
+        chamfer = {
+            name: np.concatenate([part.chamfer.get(name, none) for part, none in zip(parts, unknown, strict=True)])
+            for name in dict.fromkeys(name for part in parts for name in part.chamfer)
+        }
         return cls(**columns, chamfer=chamfer, frames=frames)
 
 
@@ -99,6 +103,18 @@ def score_forecast(
         ranges=rays.ranges.cpu().numpy()[kept],
         frames=frame.ravel()[kept],
     )
+
+
+def count_common_frames(*forecasts: ForecastScores) -> None:
+    """Leave out, of each Chamfer distance, the frames in which one of several forecasts of the same rays has none.
+
+    Else a forecast would gain by losing all points of a frame that the others must answer for.
+    """
+    for name in forecasts[0].chamfer:
+        values = [forecast.chamfer[name] for forecast in forecasts]
+        lost = np.isnan(values).any(axis=0)
+        for own in values:
+            own[lost] = np.nan
 
 
 def sums_by_sample(scores: ForecastScores, num_samples: int, interval_s: float) -> dict[str, Array]:  # [S, 2] each

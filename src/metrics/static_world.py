@@ -8,7 +8,7 @@ from torch import Tensor
 
 from src.geometry.bounds import Bounds
 from src.geometry.neighbours import neighbours_within
-from src.geometry.tensor_transforms import invert_rigid
+from src.geometry.tensor_transforms import invert_rigid, transform_points
 from src.structures.batch import FrameBatch
 
 Array = np.ndarray
@@ -152,4 +152,4 @@ def _cells(points: Tensor, low: Tensor, shape: list[int]) -> tuple[Tensor, Tenso
 
 def _moved(matrices: Tensor, points: Tensor) -> Tensor:  # [n, 3]
     """Points [n, 3], each by a matrix [n, 4, 4] of its own."""
-    return torch.einsum("nij,nj->ni", matrices[:, :3, :3], points) + matrices[:, :3, 3]
+    return transform_points(matrices, points)  # not as a product, whose factors autocast would round

@@ -105,7 +105,7 @@ class Finding:
     measure: ClaimMeasure
     found: Comparison | None  # at the look it stands at
     pairs: int  # seeds that both rows have
-    results: list[RunResult]  # behind it
+    runs: list[tuple[RunResult, RunResult]]  # behind it, of the first row and of the second, by seed
 
     @property
     def verdict(self) -> Verdict:
@@ -212,7 +212,7 @@ def judge(claim: Claim, records: Mapping[str, SweepRecord], results: Mapping[str
         ]
         found = compare_at_looks(*values, measure.half_width, measure.metric.digits)
         common = sorted(values[0].keys() & values[1].keys())
-        used = [runs[seed] for seed in common[: found.pairs if found else 0] for runs in (first, second)]
+        used = [(first[seed], second[seed]) for seed in common[: found.pairs if found else 0]]
         findings.append(Finding(measure, found, len(common), used))
     return findings
 
@@ -232,8 +232,8 @@ def _runs(record: SweepRecord | None, label: str, results: Mapping[str, RunResul
     if record is not None and label not in record.rows:
         logger.warning(
             "the record of sweep %s, scale %s, has no row %r, which claims.yaml names; its runs count once `python -m "
-            "src.sweep +sweep=%s scale=%s workers=0 published=true` has recorded it again",
-            *(record.name, record.scale, label, record.name, record.scale),
+            "src.study scale=%s workers=0 published=true` has recorded it again",
+            *(record.name, record.scale, label, record.scale),
         )
     runs = {} if record is None else record.rows.get(label, {})
     return {seed: results[run_id] for seed, run_id in runs.items() if is_current(record, run_id, results)}

@@ -50,7 +50,7 @@ def claims_page(
 
 def command_of(sweep: str, findings: Iterable[Finding], scale: str) -> str:
     """What trains the rows of a sweep with all seeds that findings on it stand on, at least those of the first look."""
-    used = (run for one in findings if one.measure.comparison.sweep == sweep for run in one.results)
+    used = (run for one in findings if one.measure.comparison.sweep == sweep for pair in one.runs for run in pair)
     seeds = max([min(LOOKS), *(run.seed + 1 for run in used)])
     return f"python -m src.sweep +sweep={sweep} scale={scale} seeds={seeds}"
 
@@ -58,9 +58,11 @@ def command_of(sweep: str, findings: Iterable[Finding], scale: str) -> str:
 def _what_was_run(findings: list[tuple[Claim, list[Finding]]], records: Mapping[str, SweepRecord], scale: str) -> str:
     worlds: dict[str, set[str]] = {}
     runs: dict[str, RunResult] = {}
+    pairs: list[tuple[RunResult, RunResult]] = []
     for _, found in findings:
         for finding in _of_claims(found):
-            for result in finding.results:
+            pairs += finding.runs
+            for result in (run for pair in finding.runs for run in pair):
                 data = f"{result.dataset}, split {result.data.get('split', 'unknown')}"
                 worlds.setdefault(data, set()).add(finding.measure.comparison.sweep)
                 runs[result.run_id] = result
@@ -74,7 +76,7 @@ def _what_was_run(findings: list[tuple[Claim, list[Finding]]], records: Mapping[
     text = f"{'; '.join(parts)}."
     if any(run.data["name"] == SYNTHETIC for run in runs.values()):
         text += " Data and scale are not the paper's: compare signs and order, not sizes."
-    if starts := describe_starts(runs.values()):
+    if starts := describe_starts(pairs):
         text += f" {starts}"
     own: dict[str, list[str]] = {}
     for sweep in sorted({sweep for sweeps in worlds.values() for sweep in sweeps}):

@@ -100,12 +100,13 @@ METRICS["cost.parameters"] = Metric("cost.parameters", "parameters", "M", 1e-6, 
 METRICS["cost.training"] = Metric("cost.training", "training with its validation", "min", 1 / 60, 1, False)
 
 FORECASTS = {"iou": Metric("iou", "occupancy IoU along rays", "%", 100.0, 1)}
-"""Of a world model's tasks, `occupancy` and `forecasting`, whose other numbers have no names here."""
+"""Of a world model's tasks, `occupancy` and `forecasting`."""
+_CHAMFERS = (
+    ("cd", "Chamfer"), ("nfcd", "Chamfer 0-50 m"), ("lfcd", "Chamfer 50-250 m"),
+    ("cd_moving", "Chamfer of moving objects"), ("cd_unseen", "Chamfer of unseen space"),
+)  # fmt: skip
 for _horizon in ("1s", "3s"):
-    for _key, _words in (
-        ("cd", "Chamfer"), ("nfcd", "Chamfer 0-50 m"), ("lfcd", "Chamfer 50-250 m"),
-        ("cd_moving", "Chamfer of moving objects"), ("cd_unseen", "Chamfer of unseen space"),
-    ):  # fmt: skip
+    for _key, _words in _CHAMFERS:
         for _prefix, _of in (("", ""), ("static_", "static-world ")):
             _name = f"{_prefix}{_key}_{_horizon}"
             FORECASTS[_name] = Metric(_name, f"{_of}{_words} {_horizon}", "m^2", 1.0, 2, False)
@@ -125,19 +126,30 @@ for _step in range(4):
         FORECASTS[_name] = Metric(_name, f"{_words} at {_step} s", "%", 100.0, 1)
     _name, _words = f"velocity_median_moving@{_step}.0s", "median radial velocity error of moving objects"
     FORECASTS[_name] = Metric(_name, f"{_words} at {_step} s", "m/s", 1.0, 2, False)
-for _key, _words in (("velocity_error_moving", "mean"), ("velocity_median_moving", "median")):
-    FORECASTS[_key] = Metric(_key, f"{_words} radial velocity error of moving objects", "m/s", 1.0, 2, False)
+for _key, _words in (
+    ("velocity_error_moving", "mean radial velocity error of moving objects"),
+    ("velocity_median_moving", "median radial velocity error of moving objects"),
+    ("velocity_error_standing", "mean radial velocity error of what stands"),
+):
+    FORECASTS[_key] = Metric(_key, _words, "m/s", 1.0, 2, False)
+
+FORECASTS_BY_TIME: dict[str, Metric] = {}
+"""Further numbers of forecasting, of one time each; pages leave them to its picture."""
+for _step in range(1, 4):
+    for _key, _words in (*_CHAMFERS, ("l1", "L1 along rays")):
+        for _prefix, _of in (("", ""), ("static_", "static-world ")):
+            _name, _unit = f"{_prefix}{_key}@{_step}.0s", "m" if _key == "l1" else "m^2"
+            FORECASTS_BY_TIME[_name] = Metric(_name, f"{_of}{_words} at {_step} s", _unit, 1.0, 2, False)
 
 
 def find_metric(name: str, where: str, task: str = DETECTION) -> Metric:
-    """The metric of this name; of another task than detection, an unknown name is a plain number, larger being better.
+    """The metric of this name, among those of a task and what all cost.
 
     Raises ConfigError naming `where` it stands and the nearest names there are.
     """
-    if name in METRICS:
-        return METRICS[name]
-    if task != DETECTION:
-        return FORECASTS.get(name, Metric(name, name))
-    near = difflib.get_close_matches(name, METRICS, n=3, cutoff=0.5)
-    hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(list(METRICS)[:7])}, ..."
+    known = METRICS if task == DETECTION else METRICS | FORECASTS | FORECASTS_BY_TIME
+    if name in known:
+        return known[name]
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(list(known)[:7])}, ..."
     raise ConfigError(f"{where}: {name} is not a metric; {hint}")

@@ -122,16 +122,18 @@ def runs_on_page(results: Iterable[RunResult], phase: str, in_sweeps: Collection
     """Those of `results` that the page of `phase` shows; none when there is none of the phase itself.
 
     Phase 1, and phase 1 continued, stand on phase 2's page without their ablations. Runs of sweeps (their ids are
-    `in_sweeps`) have tables of their own: of them only experiments that have a name here are shown. Weights that were
-    scored once more with other settings are left to the tables of their sweeps.
+    `in_sweeps`) have tables of their own: an experiment of which all runs are such is shown only if it has a name here.
+    Weights that were scored once more with other settings are left to the tables of their sweeps.
     """
     names = NAMES_OF_COMPARISON if phase in PHASES_OF else NAMES
+    results = list(results)
+    beside_sweeps = {(run.phase, run.settings) for run in results if run.run_id not in in_sweeps}
     shown = []
     for run in results:
         belongs = run.phase == phase or (run.phase in PHASES_OF.get(phase, ()) and not run.settings)
         belongs = belongs and run.epochs > 0
         known = (run.phase, *_settings_without_dropout(run)) in names
-        if belongs and (known or run.run_id not in in_sweeps):
+        if belongs and (known or (run.phase, run.settings) in beside_sweeps):
             shown.append(run)
     return shown if any(run.phase == phase for run in shown) else []
 

@@ -160,7 +160,10 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
         scores = _numbers(scores, record.headline, metrics_path, remedy) | intervals
     config = _read_config(run_folder / "config.yaml")
     latency_path = run_folder / "latency.json"
-    latency = read_as(Latency, latency_path, "delete it and measure again") if latency_path.is_file() else None
+    if latency_path.is_file():
+        latency = read_as(Latency, latency_path, "delete it and measure again")
+    else:
+        latency = _of_fresh_weights(result_path(reports, record.run_id))
     if not FOLDER_NAME.fullmatch(record.run_id):
         name = f"{run_folder / 'run.json'}: run_id"
         raise DataError(f"{name} must be the name of a folder, but is {record.run_id!r:.80}; {remedy}")
@@ -177,6 +180,14 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
         "latency": latency,
     }
     return _write_result(result_path(reports, record.run_id), content)
+
+
+def _of_fresh_weights(path: Path) -> Latency | None:
+    """The latency that a result has without its run's weights, if any, so that publishing the run leaves it."""
+    try:
+        return fresh if (fresh := read_result(path).latency) is not None and not fresh.get("trained", True) else None
+    except (DataError, OSError):
+        return None  # none yet, or one that is about to be written anew
 
 
 def publish_latency(folder: Path, reports: Path, run_id: str) -> Path:

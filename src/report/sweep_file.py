@@ -221,9 +221,14 @@ class SweepConfig:
         for key, dimension in self.space.items():
             dimension.check(f"{where}, space, {key}")
         if self.space:
-            find_metric(self.objective, f"{where}, objective", self.task)
+            objective = find_metric(self.objective, f"{where}, objective", self.task)
             if self.objective.startswith(NOT_OF_VALIDATION):
                 raise ConfigError(f"{where}, objective: {self.objective} is no score of a validation; name one, as mAP")
+            if not objective.higher_is_better:
+                raise ConfigError(
+                    f"{where}, objective: less of {self.objective} is better, but a search takes the largest; name a "
+                    "score, as mAP"
+                )
             if self.trials < 1:
                 raise ConfigError(f"{where}: trials must be at least 1, but got {self.trials}")
 

@@ -30,6 +30,7 @@ class TableCell:
     comparison: Comparison | None = None  # to the baseline
     paper_difference: float | None = None
     frames: float | None = None  # of a latency that one run has: half the range of the middle half of its frames
+    place: str | None = None  # where that latency was measured
     best: bool = False  # decided against every other finished row
     paper_best: bool = False
 
@@ -44,12 +45,14 @@ class TableCell:
         return statistics.mean(self.values.values()) if self.values else None
 
     def compared_with(self, other: TableCell, metric: Metric) -> Comparison | None:
-        """What this row has more than the other; None where they share no seed.
+        """What this row has more than the other; None where they share no seed, or were timed on different machines.
 
         Frames decide between latencies of one run each: what is trained does not change them, what else runs does.
         """
         if self.frames is None or other.frames is None:
             return compare(self.values, other.values, metric.digits)
+        if self.place != other.place:
+            return None
         gap, half = self.mean - other.mean, self.frames + other.frames
         return Comparison(gap, gap - half, gap + half, 1, metric.digits)
 

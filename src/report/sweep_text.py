@@ -60,11 +60,22 @@ def describe_epochs(results: Iterable[RunResult]) -> list[str]:
     ]
 
 
-def describe_starts(runs: Iterable[RunResult]) -> str:
-    """Which runs began from another training of one run than most that begin from its weights; empty where none did.
+def describe_starts(compared: Iterable[Iterable[RunResult]]) -> str:
+    """Which runs began from another training of one run than those they are compared with; empty where none did.
 
     Their pairs share less than their seed says. Results without digests are of one training.
     """
+    apart = list(dict.fromkeys(run_id for runs in compared for run_id in _started_apart(runs)))
+    if not apart:
+        return ""
+    return (
+        "Of runs that begin from one run's weights, these began from another training of it than most that they are "
+        f"compared with, whose noise is in those differences and intervals: {', '.join(apart)}."
+    )
+
+
+def _started_apart(runs: Iterable[RunResult]) -> list[str]:
+    """Those that began from another training of a run than most of these that begin from its weights."""
     runs = {run.run_id: run for run in runs}
     begun: dict[str, dict[str | None, list[str]]] = {}  # runs by the run and the weights that they began from
     for run in runs.values():
@@ -77,12 +88,7 @@ def describe_starts(runs: Iterable[RunResult]) -> str:
     for groups in begun.values():
         most = max(groups.values(), key=len)
         apart += [run_id for group in groups.values() if group is not most for run_id in group]
-    if not apart:
-        return ""
-    return (
-        "Of runs that begin from one run's weights, these began from another training of it than the others, whose "
-        f"noise is in their differences and intervals: {', '.join(apart)}."
-    )
+    return apart
 
 
 def describe_machines(results: Iterable[RunResult]) -> list[str]:
@@ -104,12 +110,7 @@ def _latency(table: SweepTable, timed: list[Latency]) -> str:
     """Where a table's latencies were measured and what stands after their ±; empty for a table without any."""
     if not timed or not any(column.name.startswith("latency.") for column in table.columns):
         return ""
-    places = {
-        f"{latency.get('processor') or latency.get('device') or 'an unnamed device'}, "
-        f"{_counted(latency.get('threads', 1), 'thread')}"
-        for latency in timed
-    }
-    text = f" Latency on {_listed(sorted(places))}"
+    text = f" Latency on {_listed(sorted({place_of(latency) for latency in timed}))}"
     if not all(latency.get("trained", True) for latency in timed):
         some = "" if not any(latency.get("trained", True) for latency in timed) else ", of some rows"
         text += f"{some} of fresh weights that are as busy as trained ones"
@@ -121,6 +122,12 @@ def _latency(table: SweepTable, timed: list[Latency]) -> str:
         f"{text}; after ± of a latency that one run has stands half the range of the middle half of its frames, and "
         "two rows no further apart than the sum of theirs are undecided."
     )
+
+
+def place_of(latency: Latency) -> str:
+    """Processor and threads of a measurement."""
+    name = latency.get("processor") or latency.get("device") or "an unnamed device"
+    return f"{name}, {_counted(latency.get('threads', 1), 'thread')}"
 
 
 def describe_orderings(

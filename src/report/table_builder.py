@@ -13,7 +13,13 @@ from src.report.score_tables import mean_bounds
 from src.report.sweep_file import TableConfig
 from src.report.sweep_record import RunState, SweepRecord
 from src.report.sweep_table import PAPER, SweepRow, SweepTable, TableCell
-from src.report.sweep_text import describe_orderings, describe_search, describe_starts, describe_table
+from src.report.sweep_text import (
+    describe_orderings,
+    describe_search,
+    describe_starts,
+    describe_table,
+    place_of,
+)
 from src.training.identity import RUN_ID, key_of, without_keys, without_legacy_defaults
 
 EARLIER = "; the number is of an earlier training"
@@ -138,7 +144,7 @@ def _table(record: SweepRecord, results: dict[str, RunResult], config: TableConf
         table.text = describe_orderings(columns, trained, next(iter(results.values()), None), complete)
     if sweep.note is not None:
         table.text = [sweep.note, *table.text]
-    if starts := describe_starts(results.values()):
+    if starts := describe_starts([results.values()]):
         table.text.append(starts)
     return table
 
@@ -212,9 +218,13 @@ def _mark_best(rows: list[SweepRow], columns: list[Metric]) -> None:
 def _cell(results: dict[int, RunResult | None], metric: Metric, paper: float | None = None) -> TableCell:
     found = {seed: result.metrics.get(metric.name) for seed, result in results.items() if result is not None}
     values = {seed: metric.scale * value for seed, value in found.items() if value is not None}
-    frames = [_frames(results[seed], metric.name) for seed in values]
     bounds = mean_bounds([results[seed] for seed in values], metric)
-    return TableCell(paper=paper, values=values, bounds=bounds, frames=frames[0] if len(frames) == 1 else None)
+    cell = TableCell(paper=paper, values=values, bounds=bounds)
+    if len(values) == 1:
+        (result,) = (results[seed] for seed in values)
+        cell.frames = _frames(result, metric.name)
+        cell.place = None if cell.frames is None else place_of(result.latency)
+    return cell
 
 
 def _frames(result: RunResult, metric: str) -> float | None:

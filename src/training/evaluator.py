@@ -9,6 +9,7 @@ from operator import getitem
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+import torch
 from torch import nn
 
 from src.data.datamodule import DetectionDataModule
@@ -112,7 +113,8 @@ class DetectionEvaluator(Evaluator):
         samples = [self.evaluation_set.index_of[token] for token in batch.tokens]
         poses, truth = batch.global_from_ego.cpu().numpy(), self.evaluation_set.ground_truth
         in_ego = [to_ego(truth[truth.samples == sample], pose) for sample, pose in zip(samples, poses, strict=True)]
-        in_aug = [boxes.to(batch.device).transform(a) for boxes, a in zip(in_ego, batch.aug_from_ego, strict=True)]
+        with torch.autocast(batch.device.type, enabled=False):  # bfloat16 would move a box at 100 m by half a metre
+            in_aug = [boxes.to(batch.device).transform(a) for boxes, a in zip(in_ego, batch.aug_from_ego, strict=True)]
         diagnoses = diagnose(model.evidence(output), batch, in_aug)
         for sample, boxes, pose, diagnosis in zip(samples, model.decode(output), poses, diagnoses, strict=True):
             self.boxes.setdefault(sample, to_global(boxes.to("cpu"), pose, sample))

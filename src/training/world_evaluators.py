@@ -25,7 +25,14 @@ from src.geometry.bounds import farthest_m
 from src.metrics.bootstrap import interval, intervals_of
 from src.metrics.diagnostics import ratios
 from src.metrics.forecast_text import format_forecast, format_occupancy
-from src.metrics.forecasting import HORIZONS_S, ForecastScores, median_errors, score_forecast, sums_by_sample
+from src.metrics.forecasting import (
+    HORIZONS_S,
+    ForecastScores,
+    count_common_frames,
+    median_errors,
+    score_forecast,
+    sums_by_sample,
+)
 from src.metrics.static_world import static_world, unseen
 from src.models.detector import Detector
 from src.models.world_model import WorldModel
@@ -126,14 +133,14 @@ class OccupancyEvaluator(Evaluator):
     ) -> Tensor | None:  # [R] bool, rays that end on moving objects; None where nobody knows
         """Write what is found of each sample of `batch`, whose rays are thinned, into `scores`."""
         moving = torch.zeros(len(batch.rays), dtype=torch.bool)
-        known = True
+        known = False
         for sample, (row, own) in enumerate(zip(rows, scores, strict=True)):
             among = batch.rays.batch == sample
             rays, truth = batch.rays[among], self._truth_of(row)
             self._score_occupancy(model, output, rays, own, row)
             speeds, moves = true_speeds(rays, batch, sample, truth)
-            known &= moves is not None
             if moves is not None:
+                known = True
                 moving[among.cpu()] = moves
                 self._score_velocity(model, output, rays, speeds, moves, own)
         return moving if known else None
@@ -257,7 +264,7 @@ class ForecastEvaluator(OccupancyEvaluator):
 
     Names are those of `sums_by_sample` and `median_errors`; `moving` and `unseen` are rays that end on moving
     objects, and where the input had not seen. A `gain` is the share by which a Chamfer distance lies below the static
-    world's.
+    world's; both are over the frames in which both have points.
     Rays are thinned to `data.timeline.scored_rays`, so distances are larger than between whole clouds.
     """
 
@@ -282,9 +289,12 @@ class ForecastEvaluator(OccupancyEvaluator):
             among = rays.batch == sample
             masks = {name: mask[among.cpu()] for name, mask in subsets.items()}
             zeros = np.zeros(len(batch), np.int64)
-            for prefix, ranges in found.items():
-                forecast = score_forecast(rays[among], ranges[among], zeros, model.bounds, masks)
-                own.forecasts[prefix] = forecast
+            own.forecasts = {
+                prefix: score_forecast(rays[among], ranges[among], zeros, model.bounds, masks)
+                for prefix, ranges in found.items()
+            }
+            count_common_frames(*own.forecasts.values())
+            for prefix, forecast in own.forecasts.items():
                 sums = sums_by_sample(forecast, 1, self.timeline.interval_s)
                 own.sums |= {f"{prefix}{name}": values[0] for name, values in sums.items()}
         return moving

@@ -2,11 +2,16 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import pytest
 from PIL import Image
 
-from src.gallery.__main__ import short_names
+from src.config import compose_config
+from src.errors import DataError
+from src.gallery.__main__ import Gallery, short_names
+from src.structures.detections import DetectionTable
+from tests.evaluation_sets import set_of
 from tests.running import call
 
 SHEETS = ["gallery_conditions_debug.png", "gallery_false_positives_debug.png", "gallery_misses_debug.png"]
@@ -41,6 +46,15 @@ def test_the_page_shows_its_pictures_and_its_command(trained, tmp_path):
     assert all(f"(pictures/{name})" in text for name in [*SHEETS, "gallery_debug.gif"])
     with Image.open(tmp_path / "pictures" / "gallery_debug.gif") as film:
         assert film.n_frames == 3  # of a debug scene
+
+
+def test_scenes_without_a_condition_are_refused_by_the_name_of_their_split(tmp_path):
+    config, _ = compose_config(["scale=debug"])
+    untagged = set_of(DetectionTable.empty(), tags=("area.city",))
+    datamodule = SimpleNamespace(evaluation_set=lambda: untagged)
+    with pytest.raises(DataError, match="data.split=val: none of its scenes has a tag of weather, daytime, lighting"):
+        Gallery(config, datamodule, {"run": DetectionTable.empty()}).write(tmp_path, "python -m src.gallery")
+    assert not list(tmp_path.iterdir())
 
 
 def test_panels_are_named_by_what_tells_the_runs_apart():

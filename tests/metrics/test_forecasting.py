@@ -5,7 +5,14 @@ import pytest
 import torch
 
 from src.metrics.diagnostics import ratios
-from src.metrics.forecasting import ForecastScores, chamfer_distance, median_errors, score_forecast, sums_by_sample
+from src.metrics.forecasting import (
+    ForecastScores,
+    chamfer_distance,
+    count_common_frames,
+    median_errors,
+    score_forecast,
+    sums_by_sample,
+)
 from tests.ray_bundles import rays_to
 
 BOUNDS = ((-100.0, 250.0), (-100.0, 100.0), (-12.0, 12.0))
@@ -79,6 +86,29 @@ def test_batches_join():
     both = ForecastScores.join([one, one])
     alone, twice = (sums_by_sample(scores, 5, 0.2) for scores in (one, both))
     assert alone.keys() == twice.keys() and all(np.array_equal(2 * alone[name], twice[name]) for name in alone)
+
+
+def test_batches_join_where_one_does_not_know_a_subset():
+    rays = rays_to([[3.0, 4, 0], [6.0, 8, 0]], steps=1)
+    known = score_forecast(rays, rays.ranges + 1, np.array([0]), BOUNDS, {"moving": torch.tensor([True, False])})
+    unknown = score_forecast(rays, rays.ranges, np.array([1]), BOUNDS)
+    for parts, defined in (([known, unknown], [True, False]), ([unknown, known], [False, True])):
+        joined = ForecastScores.join(parts)
+        assert (~np.isnan(joined.chamfer["cd_moving"])).tolist() == defined
+        assert joined.chamfer["cd_moving"][defined] == pytest.approx(1.0)
+        assert joined.chamfer["cd"].shape == (2,)
+
+
+def test_forecasts_are_compared_on_the_frames_in_which_both_have_points():
+    """One loses all points of the second frame, the other all of the third."""
+    rays = rays_to([[50.0, 0, 0]] * 3, steps=[1, 2, 3])
+    one, other = (
+        score_forecast(rays, torch.tensor(ranges), np.array([0]), BOUNDS)
+        for ranges in ([51.0, 9e3, 52.0], [51.0, 60.0, 9e3])
+    )
+    count_common_frames(one, other)
+    for scores in (one, other):
+        assert scores.chamfer["cd"].tolist() == pytest.approx([0.5 * 2, np.nan, np.nan], nan_ok=True)
 
 
 def test_a_negative_range_is_a_point_at_the_sensor():

@@ -81,6 +81,14 @@ def test_past_scans_are_moved_by_the_ego():
     assert static_world(replace(frame(np.zeros((0, 3))), rays=batch.rays), 300.0).tolist() == [300.0, 300.0]
 
 
+def test_autocast_rounds_no_scan():
+    past = frame([[187.3, -57.77, 1.03]], at=10.0)
+    batch = frame([[50.3, 0.0, 0.0]], at=12.0, past=(past,))
+    with torch.autocast("cpu", torch.bfloat16):
+        points, _ = aggregated_scan(batch)
+    torch.testing.assert_close(points, torch.tensor([[50.3, 0, 0], [185.3, -57.77, 1.03]]))
+
+
 def test_samples_do_not_mix_and_augmentation_changes_no_range():
     """A truck that came 2 m and one that came 3 m; the second is mirrored, its past frame as well."""
     clouds = [[[30.0, 5.0, 0.0], [50.0, 0, 0]], [[31.0, -6.0, 0.0]]]

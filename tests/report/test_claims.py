@@ -173,7 +173,11 @@ def test_what_asks_why_decides_nothing(judged, claims_of):
 def test_pairs_are_of_finished_runs_of_one_seed(judged):
     values = {"large": [12.0, 12.1, 11.9, 12.0], "small": [10.0, None, 10.0, 10.0]}
     (finding,) = judged(values)
-    assert finding.pairs == finding.found.pairs == 3 and [run.seed for run in finding.results] == [0, 0, 2, 2, 3, 3]
+    assert finding.pairs == finding.found.pairs == 3 and [(one.seed, other.seed) for one, other in finding.runs] == [
+        (0, 0),
+        (2, 2),
+        (3, 3),
+    ]
     (finding,) = judged(values, states={"a3": {"state": "running"}})  # its result is of an earlier training
     assert finding.pairs == 2 and finding.verdict is Verdict.UNDECIDED
 
@@ -182,7 +186,8 @@ def test_a_record_that_does_not_know_a_claims_row_is_named(judged, caplog):
     """As after a row is called something else: its runs would seem not to be there."""
     with caplog.at_level(logging.WARNING):
         (found,) = judged({"large": [30.0, 31.0, 32.0], "huge": [1.0, 2.0, 3.0]})
-    assert found.verdict is Verdict.NOT_RUN and "+sweep=epsilon" in caplog.text and "no row 'small'" in caplog.text
+    assert found.verdict is Verdict.NOT_RUN and "of sweep epsilon, scale mini, has no row 'small'" in caplog.text
+    assert "`python -m src.study scale=mini workers=0 published=true`" in caplog.text
 
 
 def test_committed_records_know_every_row_that_the_claims_name(caplog):

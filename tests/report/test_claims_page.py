@@ -9,6 +9,7 @@ from src.dashboard import single_file as export
 from src.errors import DataError
 from src.report.__main__ import main
 from src.report.sweep_record import record_path, write_record
+from src.report.sweep_text import describe_starts
 
 
 @pytest.fixture
@@ -55,6 +56,18 @@ def test_claims_with_results_stand_beside_those_that_are_not_run(report, write_s
     assert "Data: synthetic highway world, split val; scale mini; 6 runs of up to 3 seeds; phase1: 6 epochs" in text
     assert "code 0123456789" in text and "(pictures/claims_mini.png)" in text
     assert Image.open(reports / "pictures" / "claims_mini.png").width == 1600
+
+
+def test_runs_are_named_that_began_from_other_weights_than_those_they_are_compared_with(make_result):
+    """Two pairs of one source, each of one training of it, and a third whose second began from another."""
+
+    def run(name, weights):
+        return make_result(name, {}, initialized_from="phase1", initial_weights=weights)
+
+    pairs = [(run("a", "x"), run("b", "x")), (run("c", "y"), run("d", "y"))]
+    assert describe_starts(pairs) == ""
+    assert describe_starts([*pairs, (run("e", "x"), run("f", "y"))]).endswith("differences and intervals: f.")
+    assert describe_starts([[one for pair in pairs for one in pair]]).endswith(": c, d.")  # all compared with all
 
 
 def test_what_tells_why_stands_behind_the_claims_as_far_as_it_has_run(report, write_sweep):

@@ -10,7 +10,7 @@ from src.config import compose_config
 from src.dashboard import single_file as export
 from src.errors import DataError
 from src.report.__main__ import main, write_pages
-from src.report.pages import changed_since, without_defaults
+from src.report.pages import changed_since, runs_on_page, without_defaults
 from src.report.results import publish_result, read_result, result_path
 from src.report.sweep_record import record_path, write_record
 
@@ -269,6 +269,17 @@ def test_an_older_default_is_a_setting_today(make_result):
     then["phase"]["temporal"] = False  # what changes nothing there
     assert changed_since(run, today) == ["data.timeline=null", "model.head.nms=per_group"]
     assert changed_since(run, then) == []
+
+
+def test_an_experiment_stands_with_all_its_seeds_or_not_at_all(make_result):
+    """Whether a sweep has run some of them or all."""
+    runs = [
+        make_result(f"horizon3d-phase1-mini-{seed}", {"mAP": 0.1}, seed, overrides=["model=dense_bev"])
+        for seed in range(3)
+    ]
+    names = [run.run_id for run in runs]
+    assert runs_on_page(runs, "phase1", set()) == runs_on_page(iter(runs), "phase1", set(names[:2])) == runs
+    assert runs_on_page(runs, "phase1", set(names)) == []
 
 
 @pytest.mark.slow

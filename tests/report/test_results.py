@@ -13,6 +13,7 @@ from src.report import json_format
 from src.report.results import (
     MAX_POINTS,
     finished_runs,
+    publish_latency,
     publish_result,
     read_result,
     read_results,
@@ -142,6 +143,18 @@ def test_publishing_again_changes_nothing_until_the_run_does(write_run, reports)
     publish_result(folder, reports)
     assert read_result(path) == result
     assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_a_latency_of_fresh_weights_stays_with_its_result(write_run, reports, tmp_path):
+    """It was measured elsewhere; one of the run's own weights is what its folder says, or none."""
+    folder, other = write_run("a", [], 0, 0.3), tmp_path / "latency"
+    other.mkdir()
+    for trained in (False, True):
+        latency = {"ms": {"total": 117.7}, "fps": 8.5, "memory_gb": 3.2, "trained": trained}
+        (other / "latency.json").write_text(json.dumps(latency))
+        path = publish_latency(other, reports, read_result(publish_result(folder, reports)).run_id)
+        assert read_result(path).latency == latency
+        assert (read_result(publish_result(folder, reports)).latency is None) == trained
 
 
 def test_a_digest_of_the_samples_makes_no_other_result(write_run, reports):

@@ -274,6 +274,17 @@ def test_a_latency_of_one_run_shows_the_spread_of_its_frames(make_record, result
     assert not any(cell.best for row in table.rows for cell in row.cells) and "busy" not in table.caption
 
 
+def test_latencies_of_different_machines_are_not_compared(make_record, results_of):
+    record = make_record({"a": {}, "b": {}}, seeds=1, columns=("latency.total",), baseline="a")
+    results = results_of({"a0": 0.1, "b0": 0.1})
+    timed(results[f"{PREFIX}a0"], 250.0, 4.0)
+    for changes, compared in (({}, True), ({"threads": 2}, False), ({"processor": "another CPU"}, False)):
+        timed(results[f"{PREFIX}b0"], 100.0, 4.0, **changes)
+        (table,) = sweep_tables(record, results)
+        assert [row.cells[0].best for row in table.rows] == [False, compared]
+        assert (table.rows[1].cells[0].comparison is not None) == compared
+
+
 def test_a_failed_single_run_stands_as_failed(make_record, results_of):
     states = {"b0": {"state": "failed", "reason": "out of memory", "log": "logs/b.txt"}}
     (table,) = sweep_tables(make_record({"a": {}, "b": {}}, seeds=1, states=states), results_of({"a0": 0.1}))
@@ -342,7 +353,7 @@ def test_a_table_says_which_runs_begin_from_another_training_of_their_source(mak
         return table.to_markdown()
 
     for before in ("1" * 16, None):
-        assert f"whose noise is in their differences and intervals: {PREFIX}a0." in text(before, "2" * 16)
+        assert f"whose noise is in those differences and intervals: {PREFIX}a0." in text(before, "2" * 16)
         assert "another training" not in text(before, before)
 
 

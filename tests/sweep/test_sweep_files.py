@@ -369,6 +369,7 @@ def test_what_the_mistakes_are_made_from_is_right(written):
         (SPACE | {"space": {"optim.lr": {"choices": [1]}}}, "at least two"),
         (SPACE | {"trials": 0}, "trials must be at least 1"),
         (SPACE | {"objective": "NSD"}, "objective: NSD is not a metric"),
+        (SPACE | {"objective": "mAVE"}, "objective: less of mAVE is better, but a search takes the largest"),
         (SPACE | {"objective": "latency.total"}, "objective: latency.total is no score of a validation"),
         ("title: [", ""),
         ("", ""),

@@ -12,7 +12,7 @@ from src.benchmark.suite_metric import random_problem
 from src.geometry.bev_grid import BEVGrid
 from src.metrics.bootstrap import with_intervals
 from src.metrics.detection import score_detections
-from src.metrics.diagnostics import FrameDiagnosis
+from src.metrics.diagnostics import FrameDiagnosis, diagnose
 from src.reliability.processes import process_group
 from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
@@ -105,7 +105,8 @@ def test_a_batch_goes_to_its_samples_and_a_repeated_one_counts_once(problem):
 GRID = BEVGrid(cells=(60, 60), cell_m=1.0, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
 
 
-def test_evidence_is_compared_with_the_truth_of_its_sample_in_the_augmented_frame():
+@pytest.mark.parametrize("autocast", [False, True])
+def test_evidence_is_compared_with_the_truth_of_its_sample_in_the_augmented_frame(autocast, monkeypatch):
     """Two vehicles that head elsewhere, each augmented in its own way, with trucks of 6 x 2 m along their headings."""
     yaws, places = (math.pi / 2, -0.3), [[[10.0, 0, 1], [-8.0, 6, 1]], [[6.0, 7, 1]]]  # in the vehicles' frames
     poses = torch.stack([pose(yaw=yaws[0], origin=UTM), pose(5.0, 2.0, yaws[1], UTM)])
@@ -157,7 +158,12 @@ def test_evidence_is_compared_with_the_truth_of_its_sample_in_the_augmented_fram
     )
     evaluator = DetectionEvaluator(set_of(truth, "ab"))
     model = SimpleNamespace(decode=lambda output: [Boxes3D.empty()] * 2, evidence=lambda output: evidence)
-    evaluator.update(model, None, batch)
+    compared = []
+    monkeypatch.setattr("src.training.evaluator.diagnose", lambda *args: compared.extend(args[2]) or diagnose(*args))
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        evaluator.update(model, None, batch)
+    for sample, boxes in enumerate(compared):
+        torch.testing.assert_close(boxes.centers, torch.stack([in_aug(sample, *place) for place in places[sample]]))
     first, second = evaluator.diagnoses[0], evaluator.diagnoses[1]
     assert second.points.tolist() == [1, 0] and first.points.tolist() == [2]
     assert second.occupied.tolist() == [False, False] and first.occupied.tolist() == [True]

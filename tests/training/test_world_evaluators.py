@@ -11,6 +11,7 @@ from src.data.true_geometry import TRUTH_FOLDER, TrueGeometry
 from src.errors import ConfigError
 from src.metrics.forecast_text import format_occupancy
 from src.models.world_model import WorldModel
+from src.report.metric_names import FORECASTS, FORECASTS_BY_TIME
 from src.structures.ray_bundle import RayBundle
 from src.training.world_evaluators import ForecastEvaluator, OccupancyEvaluator
 from tests.data.tiny_set import FIVE_HERTZ
@@ -104,6 +105,7 @@ def scores_of(kind, model, batch, root):
 def test_a_model_that_knows_is_right_at_every_time(tmp_path):
     found, shown, evaluator = scores_of(ForecastEvaluator, Wall(), frames(Wall()), tmp_path)
     assert found["iou"] == found["iou@0.0s"] == found["iou@1.0s"] == found["iou@3.0s"] == 1
+    assert {*found} - {*FORECASTS, *FORECASTS_BY_TIME} == {"intervals"}  # each has a unit and a better direction
     assert found["cd_1s"] == pytest.approx(0, abs=1e-8) and found["l1_3s"] == pytest.approx(0, abs=1e-5)
     assert found["cd_gain_3s"] == pytest.approx(1) and list(shown)[0] == "cd_gain_3s"
     # The wall of the static world stays 5 m, then 15 m behind: the errors of both frames count alike.

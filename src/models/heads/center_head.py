@@ -110,9 +110,10 @@ class CenterHead(nn.Module):
         velocity_code_weight: float,
         dense: bool = False,
         in_channels: int | None = None,  # of a dense map that is wider than the head; None: C
+        class_ranges: bool = True,  # boxes beyond the official range of their class go
     ) -> None:
         super().__init__()
-        self.config, self.grid, self.dense = config, grid, dense
+        self.config, self.grid, self.dense, self.class_ranges = config, grid, dense, class_ranges
         self.learned = config.attributes is AttributeSource.learned
         self.code_weights = code_weights(velocity_code_weight)
         if dense:
@@ -262,7 +263,7 @@ class CenterHead(nn.Module):
             groups = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts)).to(best.rows.device)
             codes = output.codes[best.rows, groups]
         boxes = boxes_of_columns(self.columns(output, codes, best.rows, best.labels, best.scores))
-        return suppress(boxes, best.counts, self.config.nms, self.config.max_boxes)
+        return suppress(boxes, best.counts, self.config.nms, self.config.max_boxes, self.class_ranges)
 
     def columns(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from enum import Enum
 
@@ -163,11 +164,13 @@ def suppress(
     counts: list[list[int]],  # of each group: boxes of each sample
     method: Suppression,
     max_boxes: int,
+    class_ranges: bool = True,
 ) -> list[Boxes3D]:  # one of each sample, best first
     """Thin out overlapping boxes of a group, of any class, and keep the best MAX_BOXES_PER_GROUP of them.
 
-    Then drop those beyond their class's evaluation range (xy distance to the ego origin) and keep the `max_boxes` best
-    of a sample. `maxpool` has thinned the cells before and only applies the limits.
+    Then drop those beyond their class's official evaluation range (xy distance to the ego origin), unless the model is
+    scored farther away (`class_ranges`), and keep the `max_boxes` best of a sample. `maxpool` has thinned the cells
+    before and only applies the limits.
     """
     blocks = sum(counts, [])
     better = worse = boxes.labels[:0]
@@ -176,7 +179,8 @@ def suppress(
         circle = CIRCLE_GROUPS if method is Suppression.per_group else circle
         radii = [CIRCLE_RADII_M[group] if group in circle else None for group in range(len(counts)) for _ in counts[0]]
         better, worse = conflicting_pairs(boxes.bev(), blocks, radii, ROTATED_IOU)
-    ranges = constant(RANGES_M, boxes.centers.dtype, boxes.centers.device)
+    ranges = RANGES_M if class_ranges else (math.inf,) * len(CLASSES)
+    ranges = constant(ranges, boxes.centers.dtype, boxes.centers.device)
     near = boxes.centers[:, :2].norm(dim=1) < ranges[boxes.labels]
 
     # One transfer of all that the choice depends on, since each synchronises a GPU; float64 holds every value exactly.

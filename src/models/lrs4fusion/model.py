@@ -102,6 +102,7 @@ class LRS4Fusion(Detector, WorldModel):
                 options.velocity_code_weight,
                 dense=True,
                 in_channels=self.neck.out_channels + 2 * config.measured_motion,
+                class_ranges=False,  # `phase.long_range` counts all classes up to 250 m
             ).to(memory_format=torch.channels_last)
 
     def train(self, mode: bool = True) -> Self:

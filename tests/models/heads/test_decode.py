@@ -37,10 +37,12 @@ def make_boxes(*rows: tuple[str, float, float, float, float, float]) -> Boxes3D:
     return Boxes3D(values[:, :3], sizes, values[:, 3] * 0, velocities, labels, labels * 0 - 1, values[:, 4])
 
 
-def thinned(boxes: Boxes3D, group: int, method: Suppression, max_boxes: int = 500) -> Boxes3D:
+def thinned(
+    boxes: Boxes3D, group: int, method: Suppression, max_boxes: int = 500, class_ranges: bool = True
+) -> Boxes3D:
     """What is left of one sample's candidates of one group."""
     counts = [[len(boxes) if number == group else 0] for number in range(len(HEAD_GROUPS))]
-    return suppress(boxes, counts, method, max_boxes)[0]
+    return suppress(boxes, counts, method, max_boxes, class_ranges)[0]
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-9), (torch.float32, 1e-4)])
@@ -164,6 +166,8 @@ def test_ranges_by_class_and_the_best_of_all_groups() -> None:
     kept = thinned(boxes, 0, Suppression.maxpool, max_boxes=2)
     assert kept.scores.tolist() == pytest.approx([0.5, 0.4])
     assert len(thinned(boxes, 0, Suppression.maxpool)) == 3
+    everywhere = thinned(boxes, 0, Suppression.maxpool, max_boxes=3, class_ranges=False)
+    assert everywhere.scores.tolist() == pytest.approx([0.9, 0.9, 0.5])
 
 
 def test_attribute_rule() -> None:

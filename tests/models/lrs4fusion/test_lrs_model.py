@@ -12,6 +12,7 @@ from src.benchmark.scenes import lidar_frame as made_frame
 from src.errors import ConfigError
 from src.models.deploy.inference import prepare_for_inference
 from src.structures.boxes import Boxes3D
+from src.structures.taxonomy import CLASSES
 from src.targets.occupancy_rays import sample_queries
 from tests.models.learning import gradients_are_finite, train_step
 from tests.models.lrs4fusion.lrs_frames import cloud, lidar_frame, lrs_config, lrs_model
@@ -84,6 +85,16 @@ def test_sensors_and_stages_that_there_are():
         lrs_config("data.world.lidar=false")
     with pytest.raises(ValueError, match="FrameBatch.lidar_points is None, but this model uses LiDAR"):
         lrs_model()(replace(frame(), lidar_points=None, lidar_batch=None))
+
+
+def test_boxes_are_found_beyond_the_official_range_of_their_class(monkeypatch):
+    """As `phase.long_range` counts them."""
+    monkeypatch.setattr("src.models.heads.decode.RANGES_M", (5.0,) * len(CLASSES))
+    model = lrs_model().eval()
+    with torch.no_grad():
+        output, _ = model(frame())
+    output.head.logits.zero_()  # boxes everywhere
+    assert all((boxes.centers[:, :2].norm(dim=1) > 5.0).any() for boxes in model.decode(output))
 
 
 @pytest.mark.parametrize("counts", [(400, 300), (60, 0), (0, 0)])
