@@ -97,8 +97,7 @@ class RecordWriter:
         for label, by_seed in record.rows.items():
             before = earlier.rows.get(label, {})
             if any(before.get(seed, run_id) != run_id for seed, run_id in by_seed.items()):
-                return  # the sweep's definition or its command has changed
-        for label, by_seed in record.rows.items():
+                continue  # the row's definition has changed
             settings = [_settings(record.runs[run_id]) for run_id in by_seed.values()]
             for seed, run_id in earlier.rows.get(label, {}).items():
                 known = earlier.runs[run_id]

@@ -164,9 +164,10 @@ def test_rows_and_seeds_extend_a_sweep_and_earlier_seeds_stay(tmp_path):
     assert trained(tmp_path, "begin").total() == 6
     again = make_runner(tmp_path, make_sweep(rows)).run()
     assert again.seeds == [0, 1] and again.count("done") == len(again.runs) == 6
-    rows["b"] = ["model.x=4"]  # another definition: only what it says
+    rows["b"] = ["model.x=4"]  # another definition: of this row only what the command says
     changed = make_runner(tmp_path, make_sweep(rows)).run()
-    assert changed.seeds == [0] and len(changed.runs) == 3
+    assert {label: sorted(runs) for label, runs in changed.rows.items()} == {"a": [0, 1], "b": [0], "c": [0, 1]}
+    assert changed.seeds == [0, 1] and len(changed.runs) == 5
 
 
 def test_earlier_seeds_that_were_trained_elsewhere_stay_by_their_results(tmp_path):
