@@ -23,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from src.data.data_config import DataConfig
 from src.errors import CheckpointError, ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models import FAMILIES, phase_option_names, read_phase_options
+from src.models import FAMILIES, phase_option_names, plain_phase_options, read_phase_options
 from src.models.backbones.image import ImageEncoderConfig
 from src.ops.precision import Precision
 from src.reliability.config_faults import check_tree, hydra_message
@@ -203,7 +203,9 @@ def compose_config(
     tree = compose_tree(overrides)
     if not reads_data and OmegaConf.is_missing(tree.data, "root"):
         tree.data.root = NO_DATA
-    return build_config(tree), OmegaConf.to_container(tree, resolve=True, enum_to_str=True)
+    config, plain = build_config(tree), OmegaConf.to_container(tree, resolve=True, enum_to_str=True)
+    plain["phase"]["options"] = plain_phase_options(config.model.name, config.phase.options)
+    return config, plain
 
 
 def compose_tree(overrides: list[str]) -> DictConfig:
@@ -328,10 +330,11 @@ def restore_config(stored: dict[str, Any], overrides: list[str]) -> Config:
                 OmegaConf.update(tree, key, before)
     changes.pop("model", None)  # only says whose keys may follow: the checkpoint's own values stay
     for key in sorted(changes, key=lambda key: key.count(".")):  # a part before what lies in it
-        part = key.rpartition(".")[0]
+        place = key.replace("/", ".")  # of a choice below a group, as model/roi
+        part = place.rpartition(".")[0]
         if part and OmegaConf.select(tree, part) is None:
             raise ConfigError(f"{key}: the checkpoint has no {part}")
-        OmegaConf.update(tree, key, OmegaConf.select(fresh, key), merge=False)
+        OmegaConf.update(tree, place, OmegaConf.select(fresh, place), merge=False)
     schema = OmegaConf.structured(Config)
     try:
         schema.model = OmegaConf.structured(FAMILIES[model][0])

@@ -11,6 +11,7 @@ import torch
 from src.assembly import restored_model
 from src.config import compose_config, refuse_options_of_others, restore_config
 from src.errors import ConfigError
+from src.files.atomic_write import replacing
 from src.models.backbones.image import ImageEncoder
 from src.models.deploy.inference import prepare_for_inference
 from src.reliability.checkpoints import read_checkpoint
@@ -58,7 +59,8 @@ def main(overrides: list[str]) -> None:
     }
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # torch on its own archive: storages shared by views
-        torch.export.save(export_encoder(encoder), out, extra_files={DESCRIPTION: json.dumps(about, indent=2)})
+        with replacing(out, "wb") as file:
+            torch.export.save(export_encoder(encoder), file, extra_files={DESCRIPTION: json.dumps(about, indent=2)})
     print(f"written: {out}, {out.stat().st_size / 1e6:.1f} MB; torch.export.load({str(out)!r}).module()(images)")
     print(f"images {about['input']} -> " + ", ".join(f"{name} {shape}" for name, shape in about["outputs"].items()))
 

@@ -321,6 +321,27 @@ def test_relations_with_the_grid_are_named():
         build_model(config)
 
 
+def test_an_option_of_the_phase_is_one_setting_however_it_is_written():
+    whole, point = (
+        compose_config(["scale=debug", f"phase.options.velocity_code_weight={one}"])[1] for one in ("1", "1.0")
+    )
+    assert whole == point and isinstance(whole["phase"]["options"]["velocity_code_weight"], float)
+
+
+def test_a_choice_below_a_group_replaces_its_part_of_a_stored_configuration():
+    overrides = ["scale=paper", "data=synthetic", "data.world.lidar=true", "model=lrs4fusion", "phase=lrs_occupancy"]
+    _, tree = compose_config(overrides)
+    found = restore_config(tree, ["model=lrs4fusion", "model/roi=roi_official"]).model.roi
+    assert found == compose_config([*overrides, "model/roi=roi_official"])[0].model.roi
+    assert found != restore_config(tree, []).model.roi
+
+
+def test_whole_numbers_in_a_nested_list_are_told_how_to_be_written():
+    given = ["scale=debug", "model=lrs4fusion", "phase=lrs_detection", "phase.long_range.ranges_m=[[0,50]]"]
+    with pytest.raises(ConfigError, match="with a point, as 50.0$"):
+        compose_config(given)
+
+
 @pytest.mark.slow
 def test_a_stored_phase_2_comes_back_with_its_memory():
     """The command's own default phase drops the memory; the checkpoint's phase counts."""

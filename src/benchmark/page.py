@@ -9,6 +9,7 @@ import torch
 
 from src.benchmark.machine import busy_warning
 from src.config import BenchmarkSuite, Config
+from src.files.atomic_write import write_whole
 from src.training.run_folder import current_commit, write_json
 
 ONE_MODEL = (
@@ -45,7 +46,7 @@ def page_name(config: Config) -> str:
 def write_page(folder: Path, name: str, page: dict[str, Any]) -> None:
     """`name.json` and `name.md` in the folder."""
     write_json(folder / f"{name}.json", page)
-    (folder / f"{name}.md").write_text(markdown(page) + "\n")
+    write_whole(folder / f"{name}.md", markdown(page) + "\n")
 
 
 def markdown(page: dict[str, Any]) -> str:

@@ -69,8 +69,8 @@ class FrameDataset(Dataset[FrameBatch]):
                 frame = self._with_past(frame, key)
         except HorizonError as error:
             return error
-        # Without augmentation the same frames in every run and epoch, so that scores compare.
-        draw = (key.sample,) if self.augmentation is None else (key.sample, self.seed, key.epoch)
+        # In a validation the same frames in every run and epoch, so that scores compare.
+        draw = (key.sample, self.seed, key.epoch) if self.training else (key.sample,)
         if key.stream is None:
             return drop_sensors(frame, self.sensor_dropout, draw) if self.past_frames else frame
         return drop_sensors(in_stream(frame, key.stream, key.starts), self.sensor_dropout, draw)

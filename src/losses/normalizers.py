@@ -23,6 +23,17 @@ def mean_over_ranks(
     return count.clamp_(min=1.0) / dist.get_world_size()
 
 
+@torch.no_grad()
+def any_over_ranks(
+    flag: Tensor,  # [] bool, on the device of the process
+) -> Tensor:  # [] bool
+    """Whether it holds on any rank. Every rank must call it."""
+    value = flag.to(torch.float32)
+    if dist.is_available() and dist.is_initialized():
+        dist.all_reduce(value, dist.ReduceOp.MAX)
+    return value > 0
+
+
 def full_precision(x: Tensor) -> Tensor:
     """The tensor in float32, or as it is in float64: loss arithmetic never runs in half precision."""
     return x if x.dtype == torch.float64 else x.float()

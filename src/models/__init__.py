@@ -73,3 +73,9 @@ def read_phase_options(name: str, options: Mapping[str, Any]) -> Any:
     except ValidationError as error:
         fault = error.errors()[0]
         raise ConfigError(f"phase.options.{fault['loc'][0]}={fault['input']!r}: {fault['msg']}") from None
+
+
+def plain_phase_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """`phase.options` in the types of a family's own dataclass, so that 1 and 1.0 are one run. Raises as above."""
+    kind = TypeAdapter(FAMILIES[name][1].phase_options)
+    return kind.dump_python(read_phase_options(name, options), mode="json")

@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from src.files.atomic_write import replacing
 from src.pictures.contents import INK
 
 DPI = 100
@@ -72,9 +73,11 @@ class Canvas:
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         if photographs:
-            self.figure.savefig(path, format="png", dpi=DPI, metadata={"Software": None})
+            with replacing(path, "wb") as file:
+                self.figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
             return
         self.figure.canvas.draw()
         picture = Image.fromarray(np.asarray(self.figure.canvas.buffer_rgba())).convert("RGB")
         picture = picture.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)  # keeps rare colours
-        picture.save(path, format="PNG", optimize=True)
+        with replacing(path, "wb") as file:
+            picture.save(file, format="PNG", optimize=True)

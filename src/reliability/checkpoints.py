@@ -124,7 +124,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             digest = _write_digested(checkpoint, temporary)
             _verify_written(temporary, digest)
             if target.name == LAST and target in self._verified and target.is_file():
-                _keep(target, target.with_name(PREVIOUS))
+                keep_as(target, target.with_name(PREVIOUS))
             os.replace(temporary, target)
         except BaseException:
             with suppress(OSError):
@@ -182,7 +182,7 @@ def _verify_written(path: Path, digest: str) -> None:
             raise OSError(errno.EIO, "it does not read back as it was written", str(path))
 
 
-def _keep(path: Path, kept: Path) -> None:
+def keep_as(path: Path, kept: Path) -> None:
     """Give a file a second name in place of an older file; at no moment is there neither."""
     link = kept.with_name(kept.name + ".tmp")
     link.unlink(missing_ok=True)

@@ -36,7 +36,9 @@ def hydra_message(error: Exception, known_keys: Callable[[], Collection[str]]) -
             """key='"value"', and ~ is written as $HOME"""
         )
     unknown = getattr(cause or error, "full_key", None)
-    if unknown:
+    if "type hint 'float'" in text:
+        text += " | write whole numbers of a nested list with a point, as 50.0"
+    elif unknown:
         known = known_keys()
         near = difflib.get_close_matches(str(unknown), known, n=1, cutoff=0.6) if str(unknown) not in known else []
         if near:

@@ -85,7 +85,8 @@ class Study:
         """What they say of each claim. Raises DataError for results that no table takes."""
         records: dict[str, SweepRecord] = {}
         for name, command in self.commands.items():
-            path = record_path(self.call.reports, name, self.scale, changes_of(command.sweep, self.call.common))
+            changes = changes_of(command.sweep.at_scale(self.scale), self.call.common)
+            path = record_path(self.call.reports, name, self.scale, changes)
             try:
                 records[name] = read_record(path)
             except DataError:  # none yet, or one that the runner will replace

@@ -101,8 +101,9 @@ def changes_of(sweep: SweepConfig, common: list[str]) -> list[str]:
                     "leave it out or change the file"
                 )
     outside = (*OUTSIDE_IDENTITY, "seed", "scale")
-    own = {canonical(override) for override in sweep.overrides}
-    return sorted(change for change in common if not is_of(change, outside) and canonical(change) not in own)
+    rows = [join_overrides(sweep.overrides, row.overrides) for row in sweep.rows] or [sweep.overrides]
+    said = set.intersection(*({canonical(override) for override in row} for row in rows))
+    return sorted(change for change in common if not is_of(change, outside) and canonical(change) not in said)
 
 
 def _value_of(override: str) -> str:

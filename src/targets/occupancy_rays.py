@@ -153,7 +153,7 @@ def _draw_longer(
     generator: torch.Generator | None,
 ) -> Tensor:  # [n] int64, rows of rays
     """A ray of the group that is free beyond the range, each as likely; the group's longest where none is."""
-    span = float(ends.max()) + 1.0
+    span = (float(ends.max()) if len(ends) else 0.0) + 1.0
     place = group * span + ends.double()
     order = usable.nonzero().squeeze(1)
     order = order[place[order].argsort(stable=True)]

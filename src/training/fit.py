@@ -18,7 +18,7 @@ from src.data.frame_loader import dead_workers_named
 from src.errors import InterruptedRunError
 from src.ops.precision import Precision
 from src.ops.products import bfloat16_products
-from src.reliability.checkpoints import BEST, LAST, AtomicCheckpointIO, OpenCheckpoint
+from src.reliability.checkpoints import BEST, LAST, AtomicCheckpointIO, OpenCheckpoint, keep_as
 from src.reliability.interruption import Interruption
 from src.reliability.metrics_csv import MetricsCSV
 from src.reliability.processes import SharedStatistics, build_strategy
@@ -74,7 +74,7 @@ def build_trainer(
         LossProgressBar(refresh_rate=10),
     ]
     if ema_decay is not None:
-        callbacks.append(EMAWeightAveraging(decay=ema_decay))
+        callbacks.append(MovingAverage(decay=ema_decay))
     callbacks.append(SharedStatistics())  # behind the moving average
     plugins = precision_plugins(precision)
     return L.Trainer(
@@ -126,20 +126,45 @@ def fit(
             trainer.strategy.checkpoint_io.opened = resume
             ckpt_path = None if resume is None else resume.path
             trainer.fit(module, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=True)
+            counted = None
             if not interruption.began:  # only the results were missing
                 for callback in trainer.callbacks:  # Lightning has restored the weights of the last step
                     if isinstance(callback, WeightAveraging):
                         callback.on_train_end(trainer, module)  # puts the moving average in their place
                 if trainer.max_epochs % trainer.check_val_every_n_epoch == 0:
                     trainer.loggers = []  # they have the scores of the last epoch already
+                    counted = module.skipped.state()  # and so are its skipped files
                 if trainer.max_epochs == 0:
                     trainer.save_checkpoint(interruption.last)  # no epoch's end has
             if module.evaluated_step != trainer.global_step:
                 trainer.validate(module, datamodule=datamodule, verbose=False)  # the last epoch was not to be validated
+                _keep_best(trainer, interruption.last)
+            if counted is not None:
+                module.skipped.clear()
+                module.skipped.restore([counted])
     except SystemExit as error:  # Lightning's way to end on a KeyboardInterrupt
         raise InterruptedRunError("training was stopped; the same command resumes from the last checkpoint") from error
     if interruption.requested:
         raise InterruptedRunError("stopped after the last step; the same command scores and writes the results")
+
+
+class MovingAverage(EMAWeightAveraging):
+    """Of the weights after every step that was taken: a skipped one leaves nothing behind."""
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: TrainingModule, *rest: Any) -> None:
+        """After a step."""
+        if not pl_module.guard.in_a_row:
+            super().on_train_batch_end(trainer, pl_module, *rest)
+
+
+def _keep_best(trainer: L.Trainer, last: Path) -> None:
+    """Let `last` be best.ckpt too where the validation after the training has the best score; its callback is over."""
+    best = next(one for one in trainer.callbacks if isinstance(one, ModelCheckpoint) and one.monitor is not None)
+    score = trainer.callback_metrics.get(best.monitor)
+    if score is None or not trainer.max_epochs or not trainer.is_global_zero:
+        return
+    if score.isfinite() and (best.best_model_score is None or score > best.best_model_score.to(score.device)):
+        keep_as(last, last.with_name(BEST))
 
 
 def build_evaluation_trainer(precision: str, accelerator: str) -> L.Trainer:

@@ -8,6 +8,8 @@ import os
 import shutil
 import uuid
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
 
@@ -119,11 +121,22 @@ def _fill(config: WorldConfig, folder: Path, progress: bool) -> None:
 
 
 def _scenes(config: WorldConfig, folder: Path) -> Iterator[Tables]:
-    """Rows of all scenes in order, written by `num_workers` processes."""
+    """Rows of all scenes in order, written by `num_workers` processes.
+
+    Raises DataError when one of them is killed.
+    """
     work = partial(write_scene, config, folder=folder)
     workers = min(config.num_workers, config.num_scenes)
     if workers < 2:
         yield from map(work, range(config.num_scenes))
         return
-    with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        yield from pool.imap(work, range(config.num_scenes))
+    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    try:
+        yield from pool.map(work, range(config.num_scenes))
+    except BrokenProcessPool as error:
+        raise DataError(
+            f"{folder}: a process that writes the world was killed, as Linux does where memory is short; give the "
+            f"command again, with fewer than data.world.num_workers={workers}"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)

@@ -334,6 +334,8 @@ def test_sensor_dropout_spares_a_clips_first_frame_and_is_always_the_same_in_val
     frames = [frame.tokens[0] for frame in made[0].stream() if len(frame.radar_points) == 0]
     assert sorted(frames) == sorted(in_validation[0]) and len(frames) > 0
     assert dropped(made[0].train_dataloader()) and not dropped(module(data_set, **streamed).train_dataloader())
+    plain = [module(data_set, seed=seed, sensor_dropout=0.8, augmentation=None, **streamed) for seed in (0, 1)]
+    assert dropped(plain[0].train_dataloader()) != dropped(plain[1].train_dataloader())
 
 
 def test_shuffled_frames_bring_their_past(drives):

@@ -17,6 +17,7 @@ from src.errors import InterruptedRunError
 from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
 from src.reliability.interruption import Interruption
 from src.reliability.processes import is_main_process, process_group
+from src.training.evaluator import DetectionEvaluator
 from src.training.fit import fit
 from src.training.run_folder import Resume, RunFolder
 from src.training.temporal_module import TemporalModule
@@ -79,6 +80,7 @@ def result(folder, module):
         "weights in memory": digest(module.model.state_dict()),
         "log": folder.metrics_csv.read_text(),
         "scores": module.evaluator.scores.overall.headline(),
+        "skipped files": dict(module.skipped.channels),
     }
 
 
@@ -164,6 +166,15 @@ def test_only_the_results_were_missing(run, validate_every, ema):
     expected, _ = run("run", **options)
     found, module = run("run", **options)
     assert module.seen == [] and found == expected
+
+
+@pytest.mark.parametrize(("scores", "best_step"), [((0.1, 0.9), EPOCHS * STEPS), ((0.9, 0.1), 2 * STEPS)])
+def test_the_validation_after_the_last_epoch_may_be_the_best(run, monkeypatch, tmp_path, scores, best_step):
+    """Of three epochs the second is validated, and the last one at the end."""
+    compute, left = DetectionEvaluator.compute, list(scores)
+    monkeypatch.setattr(DetectionEvaluator, "compute", lambda self: compute(self) | {"mAP": left.pop(0)})
+    run("run", validate_every=2)
+    assert read_checkpoint(tmp_path / "run" / "checkpoints" / "best.ckpt")["global_step"] == best_step and not left
 
 
 @STOPPED_OFTEN

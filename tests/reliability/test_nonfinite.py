@@ -7,6 +7,7 @@ import math
 import os
 import re
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -18,7 +19,7 @@ from src.reliability import nonfinite
 from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
 from src.reliability.nonfinite import describe_gradients, finite_everywhere, gradient_norm, read_dump, write_dump
 from src.reliability.processes import is_main_process, process_group
-from src.training.fit import fit
+from src.training.fit import MovingAverage, fit
 from src.training.module import TrainingModule
 from src.training.run_folder import Resume, RunFolder
 from src.training.temporal_module import TemporalModule
@@ -68,7 +69,7 @@ class Faulty(TemporalModule):
             raise InterruptedRunError("here")
 
 
-def train(path, fault=None, bad_steps=(BAD_STEP,), skip=True, stop_after=None, every_steps=None, ranks=1):
+def train(path, fault=None, bad_steps=(BAD_STEP,), skip=True, stop_after=None, every_steps=None, ranks=1, ema=None):
     """Train in a folder, from its newest checkpoint where there is one; the module, its folder, what it ended with."""
     folder = RunFolder(path.parent, path.name)
     if is_main_process():
@@ -78,7 +79,7 @@ def train(path, fault=None, bad_steps=(BAD_STEP,), skip=True, stop_after=None, e
     module.fault, module.bad_steps, module.stop_after = fault, bad_steps, stop_after
     module.guard.skip = skip
     resume_from = folder.newest_checkpoint()
-    trainer = toy_trainer(folder, resume_from, epochs=EPOCHS, every_steps=every_steps, ranks=ranks)
+    trainer = toy_trainer(folder, resume_from, epochs=EPOCHS, every_steps=every_steps, ranks=ranks, ema=ema)
     try:
         fit(trainer, module, ToyData(), resume_from)
     except (DivergedError, InterruptedRunError) as error:
@@ -152,6 +153,19 @@ def test_the_dump_holds_the_step(tmp_path, fault):
 
 
 @pytest.mark.slow
+def test_a_skipped_step_does_not_move_the_average_of_the_weights(tmp_path, monkeypatch):
+    averages, on_batch_end = [], MovingAverage.on_train_batch_end
+
+    def watched(self, *arguments):
+        on_batch_end(self, *arguments)
+        averages.append({name: value.clone() for name, value in self._average_model.state_dict().items()})
+
+    monkeypatch.setattr(MovingAverage, "on_train_batch_end", watched)
+    train(tmp_path / "run", "weight", ema=0.9)
+    moved = [not same(before, after) for before, after in pairwise(averages)]
+    assert moved == [step != BAD_STEP for step in range(1, EPOCHS * STEPS)]
+
+
 @pytest.mark.parametrize("fault", WORDS)
 def test_a_skipped_step_leaves_nothing_behind(tmp_path, fault, caplog):
     with caplog.at_level(logging.WARNING):

@@ -216,6 +216,13 @@ def test_another_experiment_has_records_of_its_own(places, trained, tmp_path):
     assert not (tmp_path / "reports" / "sweeps" / "margin_debug.json").exists()
 
 
+def test_a_command_that_repeats_what_a_file_says_at_the_scale_finds_its_records(places, trained, tmp_path, capsys):
+    path = tmp_path / "sweeps" / "margin.yaml"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"scale_overrides": {"debug": ["optim.lr=1"]}}))
+    study.main([*places, "optim.lr=1"])
+    assert "margin: not run" not in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("override", ["+sweep=margin", "seed=3", "seeds=12", "trials=3", "latency=true"])
 def test_what_the_rule_sets_is_refused(places, override):
     message = r"the claims say which sweeps and seeds are run and measured; leave \w+= out"

@@ -48,6 +48,15 @@ def test_a_setting_of_the_file_spelled_otherwise_is_no_change():
     assert make_plan(sweep, ["optim.lr=1e-3"], [0], identify).changes == ["optim.lr=1e-3"]
 
 
+def test_a_value_of_the_file_that_a_row_says_otherwise_is_a_change():
+    """The command line counts last, so it changes that row."""
+    sweep = make_sweep({"a": [], "b": ["model.x=2"]}, overrides=["model.x=1"])
+    assert make_plan(sweep, ["model.x=1"], [0], identify).changes == ["model.x=1"]
+    assert (
+        make_plan(make_sweep({"a": [], "b": []}, overrides=["model.x=1"]), ["model.x=1"], [0], identify).changes == []
+    )
+
+
 def test_rows_may_have_seeds_of_their_own():
     sweep = make_sweep({"a": ["phase=phase1"], "b": ["phase=phase2"], "c": ["model.x=1"]})
     plan = make_plan(sweep, [], {"a": [0], "b": range(2), "c": range(3)}, identify)

@@ -1,5 +1,7 @@
 """Places along rays, by hand and by their distribution."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -72,7 +74,9 @@ def test_a_return_nearer_than_eps_is_occupied_and_leaves_nothing_free():
     assert 400 < (queries.times_s[queries.occupied] == near.times_s[0]).sum() < 600
     for ends in ([[1.0, 0.0, 2.0]], [[400.0, 0.0, 2.0]]):  # nothing free, nothing occupied: no pair, no query
         assert len(sample_queries(rays_from_above(ends), BOUNDS, SAMPLING, seeded()).points) == 0
-    assert len(sample_queries(near[torch.tensor([], dtype=torch.int64)], BOUNDS, SAMPLING).points) == 0
+    for places in FreePlaces:
+        sampling = replace(SAMPLING, free_places=places)
+        assert len(sample_queries(near[torch.tensor([], dtype=torch.int64)], BOUNDS, sampling).points) == 0
 
 
 def test_samples_and_times_have_their_own_share_and_never_mix():

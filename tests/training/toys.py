@@ -132,6 +132,8 @@ class ToyData(L.LightningDataModule):
     def val_dataloader(self):
         numbers = (100, 101, 102) if self.trainer.global_rank == 0 else (102,)
         frames = [toy_batch([0, 1], [number == 100] * 2, number) for number in numbers]
+        for frame in frames:
+            frame.skipped["RADAR_LEFT_FRONT"] = 1
         return DataLoader(frames, batch_size=None)
 
 

@@ -228,6 +228,19 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch, make_config):
     assert list(tmp_path.iterdir()) == []
 
 
+def killed(config, index, folder):
+    """Stands for `write_scene` in a process that the system kills."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_killed_writer_ends_the_command(tmp_path, monkeypatch, make_config):
+    monkeypatch.setattr(write, "write_scene", killed)
+    with pytest.raises(DataError, match="was killed.*fewer than data.world.num_workers=2"):
+        ensure_world(make_config(**TINY, num_workers=2), tmp_path / "w", progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.slow
 def test_a_killed_write_leaves_nothing_that_looks_complete(tmp_path, make_config):
     root = tmp_path / "w"

@@ -12,7 +12,7 @@ from torch import Tensor
 from src.errors import require_least
 from src.geometry.bounds import Bounds
 from src.losses.loss_weights import LossWeights
-from src.losses.normalizers import full_precision, mean_over_ranks
+from src.losses.normalizers import any_over_ranks, full_precision, mean_over_ranks
 from src.losses.regression import masked_smooth_l1
 from src.models.detector import Objective
 from src.structures.ray_bundle import RayBundle
@@ -65,7 +65,7 @@ def occupancy_objective(answer: Answer, rays: RayBundle, bounds: Bounds, config:
         weights = 1 + (config.moving_weight - 1) * (queries.speeds.abs() > MOVING_MPS)
         errors = weights * masked_smooth_l1(speeds, queries.speeds, config.velocity_beta_mps)
         valid = mean_over_ranks(weights[~queries.speeds.isnan()].sum())
-        terms["velocity"] = config.velocity_weight * known.any() * errors.sum() / valid
+        terms["velocity"] = config.velocity_weight * any_over_ranks(known.any()) * errors.sum() / valid
     return Objective(terms, counts)
 
 
