@@ -23,6 +23,8 @@ logger = logging.getLogger(__name__)
 STALLED_S = 120.0
 """A runner whose runs write neither log nor metrics for this long has probably been killed."""
 SCALES = ("paper", "mini", "debug")
+STATES = ("running", "done", "failed", "pruned", "stopped", "waiting")
+"""Of a run that several sweeps share, the first of these that one of them says holds."""
 Stamp = tuple[int, int]  # of a file: time of change and size
 
 
@@ -73,7 +75,7 @@ class Run:
     """One run: finished (with a result), of a sweep, or a folder that is being trained in."""
 
     run_id: str
-    state: str  # of a sweep record, or `stopped`: unfinished and idle, not part of a sweep
+    state: str  # of a sweep record, or `stopped`: unfinished and idle, its runner killed or not part of a sweep
     result: RunResult | None = None
     planned: RunState | None = None
     has_folder: bool = False
@@ -212,16 +214,23 @@ class BoardReader:
             else:
                 sweeps.append(sweep)
         runs = {run_id: Run(run_id=run_id, state="done", result=result) for run_id, result in results.items()}
-        for record in (sweep.record for sweep in sweeps):
-            for run_id, planned in record.runs.items():
-                run = runs.setdefault(run_id, Run(run_id=run_id, state=planned.state))
+        for sweep in sweeps:
+            for run_id, planned in sweep.record.runs.items():
+                killed = planned.state == "running" and sweep.state != "running"
+                state = "stopped" if killed else planned.state
+                run = runs.setdefault(run_id, Run(run_id=run_id, state=state))
                 run.planned = run.planned or planned
-            for label, run_id in record.labelled:
-                runs[run_id].rows.append((record.stem, label))
+                if run.result is None and STATES.index(state) < STATES.index(run.state):  # in another sweep
+                    run.state, run.planned = state, planned
+            for label, run_id in sweep.record.labelled:
+                runs[run_id].rows.append((sweep.key, label))
         for name in names:
             alive = now - (unfinished.get(name) or 0.0) < ALIVE_S
             state = "running" if name in unfinished and alive else "stopped" if name in unfinished else "done"
-            runs.setdefault(name, Run(run_id=name, state=state)).has_folder = True
+            run = runs.setdefault(name, Run(run_id=name, state=state))
+            run.has_folder = True
+            if run.state == "waiting" and name in unfinished:  # no runner has begun it, so somebody else has
+                run.state = state
         return Board(
             sweeps=sweeps, runs=runs, broken=broken, folders=folders, has_reports=self.reports.is_dir(), now=now
         )  # fmt: skip

@@ -82,7 +82,19 @@ def test_a_silent_runner_whose_run_still_writes_is_alive(world):
     board = read(world)
     assert board.sweep("epsilon_mini").state == "running" and board.live
     os.utime(world.outputs / running.log, (1, 1))
-    assert read(world).sweep("epsilon_mini").state == "stalled"
+    board = read(world)
+    assert board.sweep("epsilon_mini").state == "stalled"
+    assert board.runs[running.run_id].state == "stopped" and not board.live  # its runner was killed
+
+
+def test_a_run_that_sweeps_share_is_in_the_state_of_the_one_that_trains_it(world):
+    run_id = world.run_id(1, 1)
+    for name, state in (("a_first", "waiting"), ("b_second", "running"), ("c_third", "waiting")):
+        own = RunState(run_id=run_id, overrides=[], seed=1, label=EVIL, state=state, started=1.0)
+        record = epsilon("mini", {(1, 1): own})
+        record.sweep.name, record.updated = name, time.time()
+        write_record(record_path(world.reports, name, "mini"), record)
+    assert read(world).runs[run_id].state == "running"
 
 
 def test_folders_without_a_result_are_running_or_stopped(world):
