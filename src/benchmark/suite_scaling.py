@@ -229,7 +229,10 @@ def measure_cases(cases: dict[str, Case]) -> tuple[dict[str, list[float]], dict[
         return run
 
     candidates = {model: timed(model, case) for model, case in cases.items()}
-    return interleaved(candidates, now, ROUNDS, BUDGET_S), parts
+    seconds = interleaved(candidates, now, ROUNDS, BUDGET_S)
+    for model, found in parts.items():  # without the first call, which warms up and is not in `seconds`
+        parts[model] = {name: values[-len(seconds[model]) :] for name, values in found.items()}
+    return seconds, parts
 
 
 def make_case(config: Config, point: Point, device: torch.device) -> tuple[Case, int]:

@@ -57,7 +57,8 @@ def refined_attributes(
     limits: AttributeLimits,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # [B, G, 2] each
     """Means, scales, directions and velocities, with a gradient where one is wanted."""
-    form = refined_attributes_reference if torch.is_grad_enabled() else implementation(refined_attributes_reference)
+    plain = torch.is_grad_enabled() or torch.compiler.is_compiling()
+    form = refined_attributes_reference if plain else implementation(refined_attributes_reference)
     return form(raw, means, lower_m, upper_m, limits)
 
 

@@ -21,6 +21,8 @@ def conv2d(
     padding: int = 0,
 ) -> Tensor:  # [B, C', H', W'] of x's type
     """F.conv2d, whose operands and result are rounded to the type that `convolution_type` chooses."""
+    if stride > 1 and padding == 0 and weight.shape[2:] == (1, 1) and weight.shape[1] < 16 and x.device.type == "cpu":
+        x, stride = x[:, :, ::stride, ::stride], 1  # oneDNN's backward pass writes beyond its memory there
     dtype = convolution_type(x, weight, stride)
     if dtype == x.dtype:
         return F.conv2d(x, weight, bias, stride, padding)

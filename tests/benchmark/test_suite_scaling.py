@@ -1,10 +1,14 @@
 """Growth ratios by hand, scenes that begin alike, and settings that vary one thing at a time."""
 
+import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
+from torch import nn
 
+from src.benchmark import suite_scaling
 from src.benchmark.cases import CELLS_PER_VEHICLE
 from src.benchmark.scenes import ROADS, Highway, highway_frame, highway_points, lidar_frame
 from src.benchmark.suite_scaling import (
@@ -141,3 +145,29 @@ def test_gaussians_occupy_as_many_cells_as_trained_ones(cells):
         assert abs(found - cells) <= 70  # a Gaussian more or less
     else:
         assert found > 700  # all are opaque
+
+
+class Slow(nn.Module):
+    """Its first call takes longest."""
+
+    called = False
+
+    def forward(self):
+        time.sleep(0.01 if self.called else 0.2)
+        self.called = True
+
+
+class OfOnePart(nn.Module):
+    benchmark_parts = {}
+
+    def __init__(self):
+        super().__init__()
+        self.part = Slow()
+
+
+def test_parts_are_of_the_calls_that_count(monkeypatch):
+    monkeypatch.setattr(suite_scaling, "ROUNDS", 2)
+    model = OfOnePart()
+    case = SimpleNamespace(device=torch.device("cpu"), prepared=model, infer=lambda: model.part())
+    seconds, parts = suite_scaling.measure_cases({"ours": case})
+    assert len(parts["ours"]["part"]) == len(seconds["ours"]) == 2 and max(parts["ours"]["part"]) < 0.15

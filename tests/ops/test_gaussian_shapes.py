@@ -6,6 +6,7 @@ from functools import partial
 import pytest
 import torch
 
+from src.ops import backend
 from src.ops.gaussian_shapes import AttributeLimits, refined_attributes, sampling_points
 
 LIMITS = AttributeLimits(scale_range_m=(0.2, 3.2), max_mean_shift_m=4.0, max_speed_mps=60.0, velocity_unit_mps=10.0)
@@ -50,3 +51,15 @@ def test_gradients(count):
     attributes = partial(refined_attributes, lower_m=LOWER.double(), upper_m=UPPER.double(), limits=LIMITS)
     for op, inputs in ((sampling_points, points), (attributes, (raw, means))):
         assert torch.autograd.gradcheck(op, [value.requires_grad_() for value in inputs])
+
+
+@torch.no_grad()
+def test_attributes_compile_whole_beside_triton(monkeypatch):
+    """A compiled part calls no kernel of ours."""
+    monkeypatch.setattr(backend, "_chosen", "triton")
+    call = partial(refined_attributes, lower_m=LOWER, upper_m=UPPER, limits=LIMITS)
+    inputs = torch.randn(1, 5, 9), torch.randn(1, 5, 2)
+    found = torch.compile(call, backend="eager", fullgraph=True)(*inputs)
+    monkeypatch.undo()
+    for one, other in zip(found, call(*inputs), strict=True):
+        torch.testing.assert_close(one, other)

@@ -1,5 +1,8 @@
 """Convolutions of whole maps against torch's own: values and all gradients."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -8,6 +11,7 @@ from torch.autograd import gradcheck
 from src.ops import map_conv, products
 from src.ops.map_conv import conv2d, map_conv2d, weight_gradient
 from src.ops.products import bfloat16_products
+from tests.running import ROOT
 
 
 @pytest.fixture(params=[False, True], ids=["oneDNN", "products"])
@@ -98,3 +102,25 @@ def test_small_convolutions_stay_in_float32(monkeypatch):
         for channels, size in ((3, 64), (16, 8)):
             x, weight = torch.randn(1, channels, size, size), torch.randn(16, channels, 3, 3)
             assert torch.equal(conv2d(x, weight, None, 1, 1), F.conv2d(x, weight, None, 1, 1))
+
+
+NARROW = """
+import torch
+from src.models.backbones.resnet import BasicBlock, ResNet
+net = ResNet(BasicBlock, {widths}, [1, 1, 1, 1]).to(memory_format=torch.channels_last)
+images = torch.rand(4, 3, 128, 320).contiguous(memory_format=torch.channels_last)
+sum(level.square().sum() for level in net(images)).backward()
+"""
+
+
+@pytest.mark.parametrize("widths", [[8, 16, 32, 64], [12, 16, 16, 16]])
+def test_narrow_stages_have_a_backward_pass(widths):
+    """In a process of its own: oneDNN would end it."""
+    done = subprocess.run([sys.executable, "-c", NARROW.format(widths=widths)], cwd=ROOT, capture_output=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_narrow_strided_layer_is_the_layer():
+    draw = torch.Generator().manual_seed(0)
+    x, weight = torch.randn(2, 8, 9, 7, generator=draw), torch.randn(5, 8, 1, 1, generator=draw)
+    torch.testing.assert_close(conv2d(x, weight, stride=2), F.conv2d(x, weight, stride=2))

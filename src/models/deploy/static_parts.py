@@ -17,22 +17,25 @@ WARM_UP_RUNS = 3
 """Before a capture, so that libraries have chosen their kernels and taken their memory."""
 
 
-def capture_graph(step: Callable[[], T], restore: Callable[[], None] = lambda: None) -> tuple[torch.cuda.CUDAGraph, T]:
-    """What `step` launches as a CUDA graph, and its result, which every replay fills anew.
+def capture_graph(
+    step: Callable[[], T], device: torch.device, restore: Callable[[], None] = lambda: None
+) -> tuple[torch.cuda.CUDAGraph, T]:
+    """What `step` launches on a device as a CUDA graph, and its result, which every replay fills anew.
 
     `step` runs a few times before; `restore` undoes what these runs have changed, also where one of them fails.
     """
-    stream, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
-    stream.wait_stream(torch.cuda.current_stream())
-    try:
-        with torch.cuda.stream(stream):
-            for _ in range(WARM_UP_RUNS):
-                step()
-    finally:
-        torch.cuda.current_stream().wait_stream(stream)
-        restore()
-    with torch.cuda.graph(graph):
-        result = step()
+    with torch.cuda.device(device):  # a stream, and a graph without one of its own, are of the current device
+        stream, graph = torch.cuda.Stream(device), torch.cuda.CUDAGraph()
+        stream.wait_stream(torch.cuda.current_stream(device))
+        try:
+            with torch.cuda.stream(stream):
+                for _ in range(WARM_UP_RUNS):
+                    step()
+        finally:
+            torch.cuda.current_stream(device).wait_stream(stream)
+            restore()
+        with torch.cuda.graph(graph, stream=stream):
+            result = step()
     return graph, result
 
 
@@ -89,7 +92,7 @@ class GraphReplay(nn.Module):
 
     def _capture(self, x: Tensor) -> _Capture:
         static = x.clone()
-        graph, outputs = capture_graph(lambda: self.network(static))
+        graph, outputs = capture_graph(lambda: self.network(static), x.device)
         return _Capture(graph, static, outputs)
 
 

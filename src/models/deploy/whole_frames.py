@@ -88,7 +88,7 @@ class WholeFrames:
             for kept, old in zip(self._memory, before, strict=True):
                 kept.copy_(old)
 
-        self._graph, self._result = capture_graph(self._step, restore)
+        self._graph, self._result = capture_graph(self._step, self.device, restore)
 
 
 class PackedFrame:

@@ -161,8 +161,9 @@ def warped_evidence(config: DPTFConfig, output: DPTFOutput) -> dict[str, WarpedP
         gaussians = WarpedPoints(*columns, config.gaussian_path.velocity_compensation, found)
     if config.bev_path is not None:
         nothing, warped = torch.zeros(0, 2), output.warped
-        columns = (
-            (nothing, nothing, nothing[:, 0]) if warped is None else (warped.xy, warped.velocities, warped.elapsed_s)
-        )
+        columns = (nothing, nothing, nothing[:, 0])
+        if warped is not None:
+            own = warped.indices[:, 0] == 0
+            columns = (warped.xy[own], warped.velocities[own], warped.elapsed_s[own])
         cells = WarpedPoints(*columns, config.bev_path.velocity_compensation)
     return {"warped_gaussians": gaussians, "warped_cells": cells}
