@@ -37,7 +37,7 @@ def test_without_a_name_it_is_named_by_the_checkpoint(tmp_path, monkeypatch):
     folder = tmp_path / "outputs" / "some-run" / "checkpoints"
     folder.mkdir(parents=True)
     path = write_checkpoint(folder / "last.ckpt", "phase=phase1")
-    monkeypatch.setattr(torch.export, "save", lambda program, out, extra_files: out.write_bytes(b"program"))
+    monkeypatch.setattr(torch.export, "save", lambda program, out, extra_files: out.write(b"program"))
     export.main([f"checkpoint={path}", f"paths.outputs={tmp_path / 'outputs'}"])
     assert (tmp_path / "outputs" / "exports" / "some-run-last.pt2").is_file()
 

@@ -100,7 +100,8 @@ METRICS["cost.parameters"] = Metric("cost.parameters", "parameters", "M", 1e-6, 
 METRICS["cost.training"] = Metric("cost.training", "training with its validation", "min", 1 / 60, 1, False)
 
 FORECASTS = {"iou": Metric("iou", "occupancy IoU along rays", "%", 100.0, 1)}
-"""Of a world model's tasks, `occupancy` and `forecasting`."""
+"""Of WORLD_TASKS, those of a world model."""
+WORLD_TASKS = ("occupancy", "forecasting")
 _CHAMFERS = (
     ("cd", "Chamfer"), ("nfcd", "Chamfer 0-50 m"), ("lfcd", "Chamfer 50-250 m"),
     ("cd_moving", "Chamfer of moving objects"), ("cd_unseen", "Chamfer of unseen space"),
@@ -145,11 +146,14 @@ for _step in range(1, 4):
 def find_metric(name: str, where: str, task: str = DETECTION) -> Metric:
     """The metric of this name, among those of a task and what all cost.
 
-    Raises ConfigError naming `where` it stands and the nearest names there are.
+    Of a task that has no names here an unknown one is a plain number, larger being better. Raises ConfigError naming
+    `where` it stands and the nearest names there are.
     """
-    known = METRICS if task == DETECTION else METRICS | FORECASTS | FORECASTS_BY_TIME
+    known = METRICS | FORECASTS | FORECASTS_BY_TIME if task in WORLD_TASKS else METRICS
     if name in known:
         return known[name]
+    if task not in (DETECTION, *WORLD_TASKS):
+        return Metric(name, name)
     near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(list(known)[:7])}, ..."
     raise ConfigError(f"{where}: {name} is not a metric; {hint}")
