@@ -105,8 +105,8 @@ def score_forecast(
     )
 
 
-def count_common_frames(*forecasts: ForecastScores) -> None:
-    """Leave out, of each Chamfer distance, the frames in which one of several forecasts of the same rays has none.
+def keep_common_frames(*forecasts: ForecastScores) -> None:
+    """Keep, of each Chamfer distance, the frames in which every one of several forecasts of the same rays has one.
 
     Else a forecast would gain by losing all points of a frame that the others must answer for.
     """

@@ -185,9 +185,10 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
 def _of_fresh_weights(path: Path) -> Latency | None:
     """The latency that a result has without its run's weights, if any, so that publishing the run leaves it."""
     try:
-        return fresh if (fresh := read_result(path).latency) is not None and not fresh.get("trained", True) else None
-    except (DataError, OSError):
-        return None  # none yet, or one that is about to be written anew
+        latency = read_result(path).latency
+    except DataError:  # there is none yet, or one that is about to be written anew
+        return None
+    return None if latency is None or latency.get("trained", True) else latency
 
 
 def publish_latency(folder: Path, reports: Path, run_id: str) -> Path:

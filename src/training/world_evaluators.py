@@ -28,7 +28,7 @@ from src.metrics.forecast_text import format_forecast, format_occupancy
 from src.metrics.forecasting import (
     HORIZONS_S,
     ForecastScores,
-    count_common_frames,
+    keep_common_frames,
     median_errors,
     score_forecast,
     sums_by_sample,
@@ -293,7 +293,7 @@ class ForecastEvaluator(OccupancyEvaluator):
                 prefix: score_forecast(rays[among], ranges[among], zeros, model.bounds, masks)
                 for prefix, ranges in found.items()
             }
-            count_common_frames(*own.forecasts.values())
+            keep_common_frames(*own.forecasts.values())
             for prefix, forecast in own.forecasts.items():
                 sums = sums_by_sample(forecast, 1, self.timeline.interval_s)
                 own.sums |= {f"{prefix}{name}": values[0] for name, values in sums.items()}

@@ -8,7 +8,7 @@ from src.metrics.diagnostics import ratios
 from src.metrics.forecasting import (
     ForecastScores,
     chamfer_distance,
-    count_common_frames,
+    keep_common_frames,
     median_errors,
     score_forecast,
     sums_by_sample,
@@ -106,7 +106,7 @@ def test_forecasts_are_compared_on_the_frames_in_which_both_have_points():
         score_forecast(rays, torch.tensor(ranges), np.array([0]), BOUNDS)
         for ranges in ([51.0, 9e3, 52.0], [51.0, 60.0, 9e3])
     )
-    count_common_frames(one, other)
+    keep_common_frames(one, other)
     for scores in (one, other):
         assert scores.chamfer["cd"].tolist() == pytest.approx([0.5 * 2, np.nan, np.nan], nan_ok=True)
 

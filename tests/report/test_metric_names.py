@@ -3,7 +3,8 @@
 import pytest
 
 from src.errors import ConfigError
-from src.report.metric_names import find_metric
+from src.report.metric_names import DETECTION, WORLD_TASKS, find_metric
+from src.training.phases import EVALUATORS
 
 
 @pytest.mark.parametrize(
@@ -23,3 +24,7 @@ def test_numbers_know_their_unit_and_which_way_is_better():
 
 def test_a_task_without_names_has_plain_numbers():
     assert find_metric("frames", "a.yaml", "frames").title == "frames"
+
+
+def test_the_tasks_with_names_are_those_that_phases_have():
+    assert {DETECTION, *WORLD_TASKS} == set(EVALUATORS)
