@@ -23,6 +23,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import nn
 
 from src.errors import CheckpointError
+from src.files.atomic_write import replacing
 from src.reliability.untrusted import fault_of_archive
 
 logger = logging.getLogger(__name__)
@@ -189,7 +190,8 @@ def keep_as(path: Path, kept: Path) -> None:
     try:
         os.link(path, link)
     except OSError:  # a file system without hard links
-        os.replace(path, kept)
+        with open(path, "rb") as source, replacing(kept, "wb", sync=True) as file:
+            shutil.copyfileobj(source, file)
         return
     os.replace(link, kept)
     link.unlink(missing_ok=True)  # it stays where both names were of one file already

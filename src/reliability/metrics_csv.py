@@ -44,7 +44,10 @@ class MetricsCSV(Logger):
                 for row in csv.DictReader(file):
                     step = row.get("step") or ""
                     if step.isascii() and step.isdigit() and int(step) < resume_step:
-                        self._add({key: value for key, value in row.items() if key and value})
+                        cells = {key: value for key, value in row.items() if key and value}
+                        for value in cells.values():
+                            float(value)  # ValueError where it is no number
+                        self._add(cells)
         except (OSError, ValueError, csv.Error) as error:
             kept = f"resuming from the {len(self.rows)} rows before that"
             logger.warning("%s: damaged (%s: %s); %s", self._path, type(error).__name__, error, kept)

@@ -67,9 +67,6 @@ def check_devices(accelerator: str, devices: int, num_nodes: int = 1) -> None:
     `devices` counts processes per node: one per GPU, or as many as wanted on the CPU, where more than there are cores
     are only warned of.
     """
-    for name, value in (("devices", devices), ("num_nodes", num_nodes)):
-        if value < 1:
-            raise ConfigError(f"trainer.{name}={value}: must be at least 1")
     gpus = torch.cuda.device_count() or int(torch.backends.mps.is_available())
     if accelerator == "gpu" and not gpus:
         raise ConfigError(

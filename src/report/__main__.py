@@ -78,8 +78,8 @@ def main(overrides: list[str]) -> None:
 
     dashboard = reports / "dashboard.html"
     export_dashboard(reports, outputs, dashboard)
-    if config.phase.name in pages:
-        text = pages[config.phase.name].read_text()
+    if (name := page_name(config.phase.name, config.phase.task)) in pages:
+        text = pages[name].read_text()
         print(text[text.index("\n| ") + 1 :])
     for path in [*pages.values(), *tables, *pictures, *claims, dashboard]:
         print(f"written: {path}")
@@ -97,16 +97,21 @@ def noted_in(faults: list[str]) -> Iterator[None]:
 
 
 def write_pages(config: Config, results: dict[str, RunResult], in_sweeps: Collection[str]) -> dict[str, Path]:
-    """`<phase>_<scale>.md` of every phase that has runs; of another task than detection `<phase>_<task>_<scale>.md`."""
+    """`<page_name>_<scale>.md` of every phase and task that has runs."""
     models = {result.phase: result.model for result in results.values() if result.phase in PHASES}
     defaults = {phase: defaults_of(config.scale, phase, model) for phase, model in models.items()}
     runs = called_by_changes(results.values(), defaults)
     groups = {}
     for task in dict.fromkeys(run.task for run in runs):
-        own, ending = [run for run in runs if run.task == task], "" if task == DETECTION else f"_{task}"
-        groups |= {phase + ending: runs_on_page(own, phase, in_sweeps) for phase in PHASES if phase != FURTHER}
+        own = [run for run in runs if run.task == task]
+        groups |= {page_name(phase, task): runs_on_page(own, phase, in_sweeps) for phase in PHASES if phase != FURTHER}
     reports = Path(config.paths.reports)
     return {name: write_page(reports, name, config.scale, runs) for name, runs in groups.items() if runs}
+
+
+def page_name(phase: str, task: str) -> str:
+    """`<phase>`; of another task than detection `<phase>_<task>`."""
+    return phase if task == DETECTION else f"{phase}_{task}"
 
 
 def defaults_of(scale: str, phase: str, model: str) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from src.report.comparisons import compare
 from src.report.escaping import as_code
-from src.report.metric_names import DETECTION, FORECASTS, LONG_RANGES, METRICS, RANGES, SPEEDS, Metric
+from src.report.metric_names import DETECTION, FORECASTS, LONG_RANGES, METRICS, RANGES, SPEEDS, Metric, metric_of
 from src.report.results import RunResult
 from src.report.sweep_file import MAX_COLUMNS
 from src.report.sweep_table import MISSING, format_score
@@ -51,7 +51,7 @@ def metrics_of(run: RunResult) -> list[Metric]:
     if run.task == DETECTION:
         return list(METRICS.values())
     named = [metric for name, metric in FORECASTS.items() if name in run.metrics]
-    return named or [METRICS.get(name, Metric(name, name)) for name in run.metrics]
+    return named or [metric_of(name) for name in run.metrics]
 
 
 def group_runs(runs: list[RunResult], name_of: Callable[[RunResult], str | None]) -> list[Experiment]:

@@ -19,7 +19,7 @@ from optuna.trial import Trial
 
 from src.errors import HorizonError
 from src.reliability.command import INTERRUPT_GRACE_S
-from src.report.metric_names import METRICS, Metric
+from src.report.metric_names import metric_of
 from src.report.results import is_finished
 from src.report.sweep_record import SweepRecord
 from src.report.time_left import progress_of
@@ -235,7 +235,7 @@ class Runner:
             logger.warning("%s: FAILED after %.0f s: %s; log: %s", title_of(spec), seconds, reason, log)
             return replace(status, reason=reason)
         name = read_headline(folder)
-        metric = METRICS.get(name, Metric(name, name))
+        metric = metric_of(name)
         score = f"{metric.scale * (read_score(folder, name) or 0.0):.{metric.digits}f} {metric.unit}".rstrip()
         logger.info("%s: done after %.0f s, %s %s", title_of(spec), seconds, metric.title, score)
         self._publish(spec.run_id)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
@@ -22,11 +23,11 @@ class EpochMeans(nn.Module):
         """Take a value into the mean of its name."""
         self._metric(name, value.device if isinstance(value, Tensor) else None).update(value, weight)
 
-    def compute(self) -> dict[str, Tensor]:
-        """Means over all ranks by name, after which they begin anew. All ranks must call it."""
+    def compute(self, device: torch.device) -> dict[str, Tensor]:
+        """Means over all ranks by name, on the rank's device, after which they begin anew. All ranks must call it."""
         values = {}
         for name in sorted(set().union(*gather_by_rank(list(self.metrics)))):  # each compute is a meeting of all ranks
-            metric = self._metric(name)
+            metric = self._metric(name, device)
             values[name] = metric.compute()
             metric.reset()
         return values

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import torch
-from torch import nn
 
 from src.data.datamodule import DetectionDataModule
 from src.geometry.bev_grid import BEVGrid
@@ -31,8 +30,8 @@ SaveTable = Callable[[Path, list[str], DetectionTable], bool]
 """Writes the boxes of these samples as a submission; whether there were any."""
 
 
-class Evaluator(nn.Module, ABC):
-    """Collects outputs of a validation and scores them; a module, so that its metrics follow the device."""
+class Evaluator(ABC):
+    """Collects outputs of a validation and scores them."""
 
     headline: ClassVar[str]
     """The number at the top of `as_dict` that sweeps and messages go by; larger is better."""
@@ -67,7 +66,7 @@ class Evaluator(nn.Module, ABC):
     def describe(metrics: Mapping[str, Any]) -> str:
         """Content of metrics.json as a table for the terminal. Raises KeyError or TypeError for another task's."""
 
-    def draw(self, folder: Path, title: str) -> None:
+    def draw(self, folder: Path, title: str) -> None:  # noqa: B027, a task may have none
         """Pictures of the last scores."""
 
     def draw_frames(self, model: Detector, clips: list[list[FrameBatch]], grid: BEVGrid, folder: Path) -> None:
@@ -90,7 +89,6 @@ class DetectionEvaluator(Evaluator):
     monitored = ("mAP", "NDS")
 
     def __init__(self, evaluation_set: EvaluationSet, long_range: Protocol | None = None) -> None:
-        super().__init__()
         self.evaluation_set, self.long_range = evaluation_set, long_range
         self.boxes: dict[int, DetectionTable] = {}  # by sample, a row of the evaluation set's tokens
         self.diagnoses: dict[int, FrameDiagnosis] = {}  # by sample as well

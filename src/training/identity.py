@@ -46,6 +46,7 @@ LEGACY_DEFAULTS = {
     "model.loss.ray_range_power": 0.0,
     "model.measured_motion": False,
     "model.neck.finest_scale": 4,
+    "model.decoder.num_radar_cells": None,
 }
 """Keys that runs were made without, with the value that does what was done then.
 

@@ -141,7 +141,7 @@ class TrainingModule(L.LightningModule):
 
     def on_train_epoch_end(self) -> None:
         """Log the epoch's means over all ranks and frames. Raises DataError for an epoch that taught nothing."""
-        means = self.means.compute()
+        means = self.means.compute(self.device)
         if means.get("loss/total") == 0:
             sensors = " and ".join(sorted(self.model.config.sensors))
             raise DataError(

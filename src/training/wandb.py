@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from lightning.pytorch.loggers.logger import Logger, rank_zero_experiment
 from lightning.pytorch.utilities import rank_zero_only
@@ -23,6 +23,7 @@ FINISH_LIMIT_S = 60.0
 """For the last data to be sent; the rest stays in the run's folder."""
 LONGEST_NAME = 128
 """What the service takes for groups and job types."""
+T = TypeVar("T")
 
 
 @dataclass(kw_only=True)
@@ -83,9 +84,8 @@ class WandbRun(Logger):
 
         Returns where it can be seen, or the command that sends an offline run; None where W&B was dropped.
         """
-        place: list[str] = []
 
-        def send(run: Any) -> None:
+        def send(run: Any) -> str:
             import wandb
 
             tables = {
@@ -97,16 +97,16 @@ class WandbRun(Logger):
             offline = run.settings.mode == "offline"
             where = f"wandb sync {run.settings.sync_dir}" if offline else run.url
             run.finish()
-            place.append(where)
+            return where
 
-        self._attempt(send)
-        return place[0] if place else None
+        return self._attempt(send)
 
-    def _attempt(self, action: Callable[[Any], None]) -> None:
+    def _attempt(self, action: Callable[[Any], T]) -> T | None:
+        """What the action gives; None where W&B was dropped, before or now."""
         if self._run is None:
-            return
+            return None
         try:
-            action(self._run)
+            return action(self._run)
         except Exception as error:  # W&B's own errors and those of a dead helper process; none is worth a training
             self._run = None
             logger.warning(
@@ -116,6 +116,7 @@ class WandbRun(Logger):
                 self._folder.path,
                 self._folder.path / "wandb" / "latest-run",
             )
+            return None
 
 
 def start_wandb(

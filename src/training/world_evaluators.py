@@ -92,7 +92,6 @@ class OccupancyEvaluator(Evaluator):
     logged: ClassVar[tuple[str, ...]] = ("iou", "velocity_error_moving", "velocity_median_moving")
 
     def __init__(self, index: DatasetIndex, timeline: TimelineConfig) -> None:
-        super().__init__()
         self.index, self.timeline = index, timeline
         self.rows = {token: row for row, token in enumerate(index.sample_tokens.tolist())}
         self.found: dict[int, WorldScores] = {}  # by row of the sample

@@ -14,10 +14,12 @@ from torch import nn
 from src.errors import CheckpointError
 from src.reliability import checkpoints
 from src.reliability.checkpoints import (
+    BEST,
     LAST,
     PREVIOUS,
     WAIT_S,
     AtomicCheckpointIO,
+    keep_as,
     load_model_weights,
     read_checkpoint,
     stated_digest,
@@ -213,6 +215,9 @@ def test_without_hard_links_the_one_before_is_kept_too(tmp_path, monkeypatch):
     for number in (1, 2):
         io.save_checkpoint(numbered(number), tmp_path / LAST)
     assert (number_of(tmp_path / PREVIOUS), number_of(tmp_path / LAST)) == (1, 2)
+    keep_as(tmp_path / LAST, tmp_path / BEST)
+    assert (number_of(tmp_path / BEST), number_of(tmp_path / LAST)) == (2, 2), "a second name, not another one"
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_it_is_on_the_disk_before_it_takes_the_name(tmp_path, monkeypatch):

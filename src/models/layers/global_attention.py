@@ -74,7 +74,7 @@ class GlobalDecoderLayer(nn.Module):
         queries: Queries,
         embedding: Tensor,  # [B, Q, C]
         past: tuple[Tensor, Tensor, Tensor] | None,  # further keys [B, n, C], values [B, n, C], valid [B, n]
-        tokens: tuple[Tensor, Tensor, Tensor],  # keys [B, G, C], values [B, G, C], valid [B, G]
+        tokens: tuple[Tensor, ...],  # as `cross_attention` takes them: keys [B, G, C], values [B, G, C], valid [B, G]
     ) -> Tensor:  # [B, Q, C]
         """The queries' features after this layer, not normalised."""
         x = queries.features

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
@@ -13,7 +14,7 @@ from src.models.heads.query_head import QueryPrediction, SetPredictionHead
 from src.models.layers.dense import Conv2d
 from src.models.layers.global_attention import GlobalDecoderLayer
 from src.models.layers.position_embedding import PositionEmbedding, PositionEmbeddingConfig
-from src.models.layers.query_attention import SinePositionEmbedding, check_decoder_heads
+from src.models.layers.query_attention import DistanceAttention, SinePositionEmbedding, check_decoder_heads
 from src.models.layers.views import CameraViews
 from src.structures.queries import Queries
 
@@ -25,9 +26,11 @@ class SequentialDecoderConfig:
     num_layers: int  # in training; each looks at the radar and at the cameras
     num_inference_layers: int  # the first so many give the boxes and what is remembered; the others are pruned
     num_heads: int
+    num_radar_cells: int | None  # nearest cells of the radar's map that a query looks at; null: all, as published
 
     def __post_init__(self) -> None:
-        require_least(self, "model.decoder", {"num_layers": 1, "num_inference_layers": 1, "num_heads": 1})
+        counts = ("num_layers", "num_inference_layers", "num_heads", "num_radar_cells")
+        require_least(self, "model.decoder", dict.fromkeys(counts, 1))
         if self.num_inference_layers > self.num_layers:
             raise ConfigError(
                 f"model.decoder.num_inference_layers={self.num_inference_layers}: must not exceed "
@@ -41,9 +44,11 @@ class SequentialLayer(nn.Module):
     A radar hardly measures elevation: on the plane the query finds where to look in the images.
     """
 
-    def __init__(self, channels: int, num_heads: int) -> None:
+    def __init__(self, channels: int, config: SequentialDecoderConfig) -> None:
         super().__init__()
-        self.radar, self.camera = (GlobalDecoderLayer(channels, num_heads) for _ in range(2))
+        self.radar, self.camera = (GlobalDecoderLayer(channels, config.num_heads) for _ in range(2))
+        if config.num_radar_cells is not None:
+            self.radar.cross_attention = DistanceAttention(channels, config.num_heads, config.num_radar_cells)
 
 
 class SequentialDecoder(nn.Module):
@@ -74,7 +79,7 @@ class SequentialDecoder(nn.Module):
         self.perspective = PositionEmbedding(position, channels, grid, logits=False)
         places = torch.cartesian_prod(torch.arange(grid.rows), torch.arange(grid.cols))
         self.register_buffer("places_m", grid.centre_of(places), persistent=False)
-        self.layers = nn.ModuleList(SequentialLayer(channels, config.num_heads) for _ in range(config.num_layers))
+        self.layers = nn.ModuleList(SequentialLayer(channels, config) for _ in range(config.num_layers))
         self.norm = nn.LayerNorm(channels)
 
     def forward(
@@ -91,9 +96,12 @@ class SequentialDecoder(nn.Module):
         if past is not None:
             embeddings = (self.plane(past.centers), self.perspective.of_points(past.centers, views))
             remembered = tuple((past.features + one, past.features, past.valid) for one in embeddings)
+        near = self.config.num_radar_cells is not None
+        places = F.pad(self.places_m, (0, 1)).expand(len(radar), -1, -1)
         predictions, features = [], []
         for layer in self.layers if self.training else self.layers[: self.config.num_inference_layers]:
-            x = layer.radar(queries, self.plane(queries.centers), remembered[0], cells)
+            seen = (queries.centers, cells[0], places, cells[2]) if near else cells
+            x = layer.radar(queries, self.plane(queries.centers), remembered[0], seen)
             queries = replace(queries, features=x)
             x = layer.camera(queries, self.perspective.of_points(queries.centers, views), remembered[1], pixels)
             features.append(self.norm(x))
