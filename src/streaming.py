@@ -110,13 +110,13 @@ class StreamingDetector:
 
     @property
     def memory(self) -> Any:
-        """What is remembered, as the model takes it; None for nothing."""
+        """What is remembered, as the model takes it, on the detector's device; None for nothing."""
         return self._memory if self.whole_frames is None else self.whole_frames.memory
 
     @memory.setter
     def memory(self, memory: Any) -> None:
         if self.whole_frames is None:
-            self._memory = memory
+            self._memory = memory.to(self.device) if memory is not None else None
         else:
             self.whole_frames.memory = memory
 

@@ -73,7 +73,9 @@ def test_a_repeated_row_is_logged_once(tmp_path):
     assert len(rows(path)) == 4
 
 
-@pytest.mark.parametrize("damage", [b"\xff\xfe\xfa,1\n", b"x" * 200_000 + b"\n", b"9" * 5000 + b",0,1\n", b"2,0,1.2.3\n"])
+@pytest.mark.parametrize(
+    "damage", [b"\xff\xfe\xfa,1\n", b"x" * 200_000 + b"\n", b"9" * 5000 + b",0,1\n", b"2,0,1.2.3\n"]
+)
 def test_a_damaged_log_is_resumed_from_the_rows_before(tmp_path, caplog, damage):
     path = tmp_path / "m.csv"
     path.write_bytes(b"step,epoch,loss\n0,0,1\n1,0,2\n" + damage + b"2,0,3\n")

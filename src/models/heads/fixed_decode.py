@@ -70,7 +70,8 @@ class FixedDecode(nn.Module):
         """What is left of them, best first."""
         counts = [[count] for count in (candidates[..., -1] > 0).sum(1).tolist()]
         found = candidates[candidates[..., -1] > 0]
-        (kept,) = suppress(boxes_of_columns(found), counts, self.head.config.nms, self.head.config.max_boxes)
+        head, boxes = self.head, boxes_of_columns(found)
+        (kept,) = suppress(boxes, counts, head.config.nms, head.config.max_boxes, head.class_ranges)
         return kept
 
 

@@ -62,11 +62,10 @@ class FixedMemory:
     def of(cls, memory: DPTFMemory, dptf: DPTF, channels: int, device: torch.device) -> FixedMemory:
         """The same memory; it is of one stream."""
         fixed = cls.empty(dptf, channels, device)
-        for age, frame in enumerate(memory.frames):
-            held = (frame.present, torch.tensor([frame.cells is not None, frame.gaussians is not None]))
-            fixed.frames[age] = torch.cat(
-                [frame.timestamps_s, frame.global_from_ego.flatten(), *(x.double().to(device) for x in held)]
-            )
+        for age, frame in enumerate(memory.to(device).frames):
+            held = torch.tensor([frame.cells is not None, frame.gaussians is not None], device=device)
+            row = (frame.timestamps_s, frame.global_from_ego.flatten(), frame.present, held)
+            fixed.frames[age] = torch.cat([x.double() for x in row])
             if frame.cells is not None:
                 fixed.cells[age, : len(frame.cells.rows)] = _cell_rows(frame.cells)
             if frame.gaussians is not None:

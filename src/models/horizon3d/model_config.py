@@ -91,7 +91,8 @@ class Horizon3DConfig(ModelConfig):
         settings = copy.deepcopy(self)
         if settings.kggi is not None and gaussians != 1.0:
             for key in ("num_radar_keypoints", "num_camera_keypoints", "num_random_keypoints"):
-                setattr(settings.kggi, key, max(1, round(gaussians * getattr(settings.kggi, key))))
+                count = getattr(settings.kggi, key)
+                setattr(settings.kggi, key, count and max(1, round(gaussians * count)))
         if memory_frames == 0:
             settings.dptf = None
         cells = settings.dptf.bev_path if settings.dptf is not None else None

@@ -55,6 +55,12 @@ def test_there_and_back(dptf):
         assert all(torch.equal(*pair) for pair in zip(mine.tensors(), wanted.tensors(), strict=True))
 
 
+def test_a_memory_from_elsewhere_comes_to_the_device(dptf):
+    there = torch.device("meta")
+    fixed = FixedMemory.of(DPTFMemory((frame(2.0, 5, True),)), dptf, 4, there)
+    assert {tensor.device for tensor in fixed.tensors} == {there}
+
+
 def test_nothing_is_nothing(dptf):
     empty = FixedMemory.empty(dptf, 4, torch.device("cpu"))
     assert not empty.to_memory().frames

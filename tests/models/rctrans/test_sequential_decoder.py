@@ -21,9 +21,11 @@ GRID = BEVGrid(cells=(24, 32), cell_m=1.6, centre_m=FINE.centre_m, z_range_m=FIN
 C, RADAR, IMAGE = 8, 3, 5
 
 
-def make(num_layers=3, num_inference_layers=2):
+def make(num_layers=3, num_inference_layers=2, num_radar_cells=None):
     torch.manual_seed(0)
-    config = SequentialDecoderConfig(num_layers=num_layers, num_inference_layers=num_inference_layers, num_heads=2)
+    config = SequentialDecoderConfig(
+        num_layers=num_layers, num_inference_layers=num_inference_layers, num_heads=2, num_radar_cells=num_radar_cells
+    )
     position = PositionEmbeddingConfig(num_depth_bins=4, depth_range_m=[2.0, 32.0], z_range_m=[-10.0, 10.0])
     head = SetPredictionHead(DecodeConfig(score_threshold=0.0, max_boxes=10), C, FINE, 1.0)
     torch.nn.init.normal_(head.box[-1].weight, std=2.0)  # boxes far from where queries stand
@@ -89,6 +91,29 @@ def test_a_cells_key_has_the_embedding_of_its_centre_and_a_missing_cameras_pixel
     torch.testing.assert_close(value.view(2, 4, 4, 6, C)[1, 2, 3, 4], pixel)
 
 
+@torch.no_grad()
+def test_a_query_told_to_looks_at_the_nearest_cells_alone():
+    (decoder, head), (queries, _, radar, views) = make(num_layers=1, num_inference_layers=1, num_radar_cells=4), scene()
+    layer, x, centers = decoder.layers[0].radar, queries.features, queries.centers
+    codes = decoder(queries, None, radar, views, head)[0][0].codes
+    key, _, _ = decoder.radar_tokens(radar)
+    places = F.pad(decoder.places_m, (0, 1)).expand(2, -1, -1)
+    near = torch.cdist(centers[..., :2], places[..., :2]).topk(4, largest=False).indices  # [B, Q, 4]
+    picked = torch.zeros(2, 6, places.shape[1], dtype=torch.bool).scatter_(2, near, True)
+    x = layer(queries, decoder.plane(centers), None, (centers, key, places, picked))
+    found = replace(queries, features=x)
+    pixels, rays = decoder.image_tokens(views), decoder.perspective.of_points(centers, views)
+    found = replace(found, features=decoder.layers[0].camera(found, rays, None, pixels))
+    torch.testing.assert_close(codes, head(decoder.norm(found.features), found).codes)
+    far = picked.any(1).logical_not().view(2, 1, *GRID.cells)
+    assert far.sum() > 1400, "of 1536"
+    moved = torch.where(F.max_pool2d((~far).float(), 5, 1, 2) > 0, radar, radar + 5.0)  # 5: what two convolutions see
+    torch.testing.assert_close(decoder(queries, None, moved, views, head)[0][0].codes, codes)
+    everywhere, _ = make(num_layers=1, num_inference_layers=1)
+    alike = everywhere(queries, None, radar, views, head)[0][0].codes
+    assert not torch.allclose(everywhere(queries, None, moved, views, head)[0][0].codes, alike)
+
+
 def test_gradients_do_not_pass_from_place_to_place():
     (decoder, head), (queries, _, radar, views) = make(), scene()
     queries.centers.requires_grad_()
@@ -103,3 +128,5 @@ def test_mistakes_are_named():
         make(num_inference_layers=4)
     with pytest.raises(ConfigError, match="num_inference_layers=0"):
         make(num_inference_layers=0)
+    with pytest.raises(ConfigError, match="model.decoder.num_radar_cells=0: must be at least 1"):
+        make(num_radar_cells=0)
