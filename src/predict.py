@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -92,18 +92,17 @@ def predict(
     found: dict[str, Prediction] = {}
     skipped = SkippedFiles()
     scenes = 0
-    with tempfile.TemporaryDirectory() as folder:
-        for frame in frames:
-            scenes += bool(frame.starts[0])
-            boxes, output = detector.run(frame)
-            found[frame.tokens[0]] = boxes.to("cpu"), frame.global_from_ego[0].numpy()
-            skipped.add(frame)
-            if film is not None and scenes == 1 and not film.full:
-                picture, shown = Path(folder) / "frame.png", frame.to(detector.device)
-                title = f"Frame {len(film) + 1}, sample {frame.tokens[0][:12]}"
-                scene = scene_of(shown, boxes, detector.model.evidence(output), detector.grid)
-                draw_frame(picture, scene, views_of(shown), title, SHOWN_SCORE)
-                film.add(picture, float(frame.timestamps_s))
+    for frame in frames:
+        scenes += bool(frame.starts[0])
+        boxes, output = detector.run(frame)
+        found[frame.tokens[0]] = boxes.to("cpu"), frame.global_from_ego[0].numpy()
+        skipped.add(frame)
+        if film is not None and scenes == 1 and not film.full:
+            shown = frame.to(detector.device)
+            title = f"Frame {len(film) + 1}, sample {frame.tokens[0][:12]}"
+            scene = scene_of(shown, boxes, detector.model.evidence(output), detector.grid)
+            draw = partial(draw_frame, scene=scene, views=views_of(shown), title=title, score_threshold=SHOWN_SCORE)
+            film.add(draw, float(frame.timestamps_s))
     return found, skipped
 
 

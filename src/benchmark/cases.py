@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from src.assembly import build_model, restored_model
-from src.benchmark.scenes import ROADS
+from src.benchmark.scenes import ROADS, Highway, made_batch
 from src.config import Config
 from src.data.reader import ReaderSettings
 from src.models.deploy.inference import prepare_for_inference
@@ -86,6 +86,17 @@ def build_case(config: Config, batch: FrameBatch, device: torch.device) -> Case:
     prepared = prepare_for_inference(model, config.precision)
     learns_boxes = EVALUATORS[config.phase.task].labels
     return Case(model.train(), prepared, batch, None, device, config.precision, learns_boxes)
+
+
+def made_case(config: Config, device: torch.device, road: Highway, image_size_px: tuple[int, int]) -> Case:
+    """The configured model on made frames of this road, its memory full."""
+    torch.manual_seed(config.seed)
+    config = replace(config, backbone=replace(config.backbone, image_size_px=list(image_size_px)))
+    batch = made_batch(config.data.batch_size, road, image_size_px).to(device)
+    case = build_case(config, batch, device)
+    fill_memory(case, config.model.memory_frames)
+    expect_trained_scores(case)
+    return case
 
 
 def measured_detector(config: Config, settings: ReaderSettings, frame: FrameBatch) -> StreamingDetector:

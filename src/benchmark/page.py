@@ -10,6 +10,7 @@ import torch
 from src.benchmark.machine import busy_warning
 from src.config import BenchmarkSuite, Config
 from src.files.atomic_write import write_whole
+from src.report.escaping import markdown_table
 from src.training.run_folder import current_commit, write_json
 
 ONE_MODEL = (
@@ -69,7 +70,7 @@ def markdown(page: dict[str, Any]) -> str:
     plain = []
     for name, value in content.items():
         if isinstance(value, list):
-            lines += ["", f"## {name}", "", *table(value)]
+            lines += ["", f"## {name}", "", table(value)]
         elif value is not None:
             plain.append((name, value))
     lines += [""] if plain else []
@@ -80,14 +81,11 @@ def markdown(page: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def table(rows: list[dict[str, Any]]) -> list[str]:
-    """Rows as the lines of a Markdown table; what a row lacks is left blank."""
+def table(rows: list[dict[str, Any]]) -> str:
+    """Rows as a Markdown table; what a row lacks is left blank."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
-    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
-    for row in rows:
-        cells = ("" if row.get(name) is None else number(row[name]) for name in columns)
-        lines.append(f"| {' | '.join(cells)} |")
-    return lines
+    cells = (["" if row.get(name) is None else number(row[name]) for name in columns] for row in rows)
+    return markdown_table(columns, cells)
 
 
 def number(value: Any) -> str:

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
 from src.pictures.canvas import SHEET_PX, Canvas
-from src.pictures.contents import INK
+from src.pictures.contents import AXIS_INK, INK
 from src.pictures.learning_curves import LINE_COLOURS, LINE_DASHES, style_axes
 
 MARKERS = "os^Dv<>Ph"
@@ -94,7 +94,7 @@ def draw_soak(path: Path, curves: dict[str, Rows], title: str) -> None:
         highest = max(max(line.get_ydata()) for axes in panels for line in axes.lines) or 1.0
         keys: dict[str, Any] = {}
         for axes in panels:
-            axes.set_xlabel("frames", color="#495057", fontsize=9)
+            axes.set_xlabel("frames", color=AXIS_INK, fontsize=9)
             axes.set_xlim(0, None)
             axes.set_ylim(0, 1.12 * highest)
             axes.yaxis.set_major_formatter("{x:,.0f}")
@@ -147,7 +147,7 @@ def _log_where_wide(axes: Axes) -> None:
 
 def _label(axes: Axes, name: str) -> None:
     places = sorted({place for line in axes.lines for place in line.get_xdata()})
-    axes.set_xlabel(f"{name}, m" if name.startswith("range") else name, color="#495057", fontsize=9)
+    axes.set_xlabel(f"{name}, m" if name.startswith("range") else name, color=AXIS_INK, fontsize=9)
     if name != "memory frames" and places[0] > 0:
         axes.set_xscale("log", base=2)
         axes.xaxis.set_minor_locator(NullLocator())

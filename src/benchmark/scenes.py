@@ -6,14 +6,16 @@ Nothing here resembles a recording in detail; what matters is how many cells are
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from src.data.frame_loader import collate
 from src.structures.batch import FrameBatch
+from src.structures.boxes import Boxes3D
 from src.structures.ray_bundle import RayBundle
-from src.structures.taxonomy import CAMERAS
+from src.structures.taxonomy import CAMERAS, CLASSES
 
 RINGS_M = ((0.0, 75.0), (75.0, 150.0), (150.0, 300.0), (300.0, 600.0))
 """The road ahead and behind by distance; each ring is drawn by itself, so a longer road begins as a shorter one."""
@@ -33,6 +35,7 @@ RAIL_HEIGHT_M, WALL_HEIGHT_M, CAR_HEIGHT_M, TRUCK_HEIGHT_M = 1.0, 8.0, 1.6, 3.5
 LIDAR_NOISE_M = 0.02
 TARGETS_S = (-0.2, 0.0, 1.0, 2.0)  # what a training frame has: past, present and two future moments
 CAMERA_FOV_RAD, CAMERA_HEIGHT_M = math.radians(110.0), 2.2
+NUM_BOXES = 24  # of a training frame
 
 
 @dataclass(frozen=True)
@@ -158,6 +161,31 @@ def highway_frame(
         images=torch.zeros(1, len(CAMERAS), 3, height, width, dtype=torch.uint8),
         image_valid=torch.ones(1, len(CAMERAS), dtype=torch.bool),
         pix_from_aug=torch.stack([_camera(yaw, height, width) for yaw in CAMERA_YAWS_RAD])[None],
+    )
+
+
+def made_batch(batch_size: int, road: Highway, image_size_px: tuple[int, int], seed: int = 0) -> FrameBatch:
+    """Frames of a made highway with boxes, each sample another draw."""
+    draws = range(seed, seed + batch_size)
+    frames = [highway_frame(highway_points(road, draw), image_size_px) for draw in draws]
+    return collate([replace(frame, boxes=[made_boxes(draw)]) for frame, draw in zip(frames, draws, strict=True)])
+
+
+def made_boxes(seed: int) -> Boxes3D:
+    """Boxes of every class along the road, one without a known velocity."""
+    draw = torch.Generator().manual_seed(seed)
+    number = torch.arange(NUM_BOXES)
+    centers = torch.stack([-100.0 + 8.0 * number, 4.0 * (number % 3) - 4.0, torch.ones(NUM_BOXES)], 1)
+    velocities = 10.0 * torch.rand(NUM_BOXES, 2, generator=draw)
+    velocities[0] = torch.nan
+    return Boxes3D(
+        centers=centers,
+        sizes=torch.tensor([4.5, 1.9, 1.6]).repeat(NUM_BOXES, 1),
+        yaws=torch.rand(NUM_BOXES, generator=draw),
+        velocities=velocities,
+        labels=number % len(CLASSES),
+        attributes=torch.full((NUM_BOXES,), -1),
+        num_points=torch.full((NUM_BOXES,), 5),
     )
 
 

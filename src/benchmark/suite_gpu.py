@@ -12,9 +12,9 @@ from typing import Any
 
 import torch
 
-from src.benchmark.cases import KEY_FRAME_S, OCCUPIED_CELLS, Case, expect_trained_occupancy, fill_memory
-from src.benchmark.scenes import ROADS
-from src.benchmark.suite_launches import count, made_batch, make_case
+from src.benchmark.cases import KEY_FRAME_S, OCCUPIED_CELLS, Case, expect_trained_occupancy, fill_memory, made_case
+from src.benchmark.launches import count, small_case
+from src.benchmark.scenes import ROADS, made_batch
 from src.benchmark.timing import clock, median_iqr, milliseconds, seconds_of, timed_parts
 from src.config import Config
 from src.errors import ConfigError
@@ -41,7 +41,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     device = config.trainer.device()
     if device.type != "cuda":
         raise ConfigError(f"suite=gpu measures on a GPU, but trainer.accelerator gives {device}")
-    counting = make_case(replace(config, precision=Precision.FULL))  # the simulated device has no autocast
+    counting = small_case(replace(config, precision=Precision.FULL))  # the simulated device has no autocast
     counted, _ = count(counting, counting.prepared, counting.infer)
     case = full_case(config, device)
     expect_trained_occupancy(case, OCCUPIED_CELLS[config.scale])
@@ -72,7 +72,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
 
 def full_case(config: Config, device: torch.device) -> Case:
     """The configured model, its images in full size, on the road of the scale."""
-    return make_case(config, device, ROADS[config.scale], tuple(config.backbone.image_size_px))
+    return made_case(config, device, ROADS[config.scale], tuple(config.backbone.image_size_px))
 
 
 def frame_rows(case: Case, scale: str) -> list[dict[str, Any]]:

@@ -41,7 +41,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     """The configured model on the first training batch; see `measure_parts` for the columns."""
     torch.manual_seed(config.seed)
     device = config.trainer.device()
-    case = make_case(config, device)
+    case = first_case(config, device)
     roofline = measure_roofline(device)
     rate = gemm_rate(roofline, config.precision)
     tables = measure_parts(case, rate, roofline["copy_gbps"])
@@ -83,7 +83,7 @@ def asked_of(config: Config, case: Case) -> str:
     return f"{fresh}A made frame; forward also answers where its {len(case.batch.rays)} rays end."
 
 
-def make_case(config: Config, device: torch.device) -> Case:
+def first_case(config: Config, device: torch.device) -> Case:
     """The configured model on its first training batch, or, where it learns from rays alone, on a made frame that needs
     no world; one with a memory sees the truck stand until it is full."""
     if EVALUATORS[config.phase.task].labels:

@@ -191,7 +191,7 @@ def measure_sweep(
     rows = []
     for number, point in enumerate(points, 1):
         logger.info("%s: point %d of %d", name, number, len(points))
-        made = {model: make_case(config, point, device) for model, config in configs.items()}
+        made = {model: case_at(config, point, device) for model, config in configs.items()}
         cases = {model: case for model, (case, _) in made.items()}
         x = max(gaussians for _, gaussians in made.values()) if name == "gaussians" else point.x
         seconds, parts = measure_cases(cases)
@@ -235,7 +235,7 @@ def measure_cases(cases: dict[str, Case]) -> tuple[dict[str, list[float]], dict[
     return seconds, parts
 
 
-def make_case(config: Config, point: Point, device: torch.device) -> tuple[Case, int]:
+def case_at(config: Config, point: Point, device: torch.device) -> tuple[Case, int]:
     """A model on a grid of this range, with a full memory of frames that saw the same road a little behind.
 
     Also how many Gaussians it has without memory.

@@ -7,8 +7,8 @@ a film of the first frame's scene.
 from __future__ import annotations
 
 import shlex
-import tempfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from src.config import Config, compose_config, refuse_options_of_others
 from src.data.datamodule import DetectionDataModule
 from src.errors import ConfigError, DataError
 from src.files.atomic_write import write_whole
-from src.geometry.transforms import quaternion_to_matrix
+from src.geometry.transforms import pose_matrix
 from src.metrics.detection import match_parts
 from src.metrics.diagnostics import count_returns
 from src.metrics.extremes import CONDITIONS, frames_by_condition, worst_false_positives, worst_misses
@@ -203,19 +203,14 @@ class Gallery:
 
     def _pose(self, sample: int) -> np.ndarray:
         """global_from_ego [4, 4] of a sample."""
-        pose = np.eye(4)
-        pose[:3, :3] = quaternion_to_matrix(self.evaluation_set.ego_rotations[sample])
-        pose[:3, 3] = self.evaluation_set.ego_centers[sample]
-        return pose
+        return pose_matrix(self.evaluation_set.ego_rotations[sample], self.evaluation_set.ego_centers[sample])
 
     def _film(self, path: Path, batches: dict[int, FrameBatch], names: list[str]) -> None:
         film = Film()
-        with tempfile.TemporaryDirectory() as folder:
-            for number, (sample, batch) in enumerate(batches.items(), start=1):
-                picture = Path(folder) / "frame.png"
-                frame = self._frame(batch, sample, f"frame {number}")
-                draw_whole_frames(picture, "", [frame], names, SHOWN_SCORE)
-                film.add(picture, float(batch.timestamps_s))
+        for number, (sample, batch) in enumerate(batches.items(), start=1):
+            frame = self._frame(batch, sample, f"frame {number}")
+            draw = partial(draw_whole_frames, title="", frames=[frame], names=names, score=SHOWN_SCORE)
+            film.add(draw, float(batch.timestamps_s))
         film.write_animation(path)
 
     def _page(self, sheets: dict[str, str], film: str, command: str) -> str:
@@ -223,7 +218,7 @@ class Gallery:
         *others, last = self.found
         return PAGE.format(
             scale=self.config.scale, last=last, others=", ".join(f"`{name}`" for name in others) or "no other run",
-            command=command, count=COUNT, error_m=OFFICIAL.error_threshold_m, far_m=OFFICIAL.thresholds_m[-1],
+            command=command, error_m=OFFICIAL.error_threshold_m, far_m=OFFICIAL.thresholds_m[-1],
             score=SHOWN_SCORE, film=film, **sheets,
         )  # fmt: skip
 

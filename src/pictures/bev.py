@@ -16,8 +16,10 @@ from src.pictures.canvas import Canvas
 from src.pictures.contents import (
     CLASS_COLOURS,
     CLASS_MARKERS,
+    FRAME_COLOUR,
     INK,
     OCCUPANCY_COLOUR,
+    PANEL_COLOUR,
     SOURCE_COLOURS,
     PictureBoxes,
     PictureGaussians,
@@ -94,9 +96,9 @@ def frame_ground(axes: Axes, window: Window) -> None:
     axes.set_ylim(*window[1])
     axes.set_xticks([])
     axes.set_yticks([])
-    axes.set_facecolor("#FBFBFC")
+    axes.set_facecolor(PANEL_COLOUR)
     for spine in axes.spines.values():
-        spine.set_color("#C9CED4")
+        spine.set_color(FRAME_COLOUR)
 
 
 def paint_rings(axes: Axes, right_m: tuple[float, float], up_m: tuple[float, float]) -> None:
@@ -114,7 +116,7 @@ def paint_label(axes: Axes, right: float, up: float, text: str, colour: str) -> 
     """A length in metres on the ground, readable over what lies there."""
     axes.text(
         right, up, text, color=colour, fontsize=8.5, ha="center", va="center", zorder=6,
-        bbox={"boxstyle": "square,pad=0.15", "fc": "#FBFBFC", "ec": "none", "alpha": 0.85},
+        bbox={"boxstyle": "square,pad=0.15", "fc": PANEL_COLOUR, "ec": "none", "alpha": 0.85},
     )  # fmt: skip
 
 
@@ -191,7 +193,7 @@ def paint_gaussians(axes: Axes, gaussians: PictureGaussians | None) -> None:
             axes.plot(*upright(gaussians.means[rows]).T, color=SOURCE_COLOURS["history"], **dots)
 
 
-def paint_boxes(axes: Axes, boxes: PictureBoxes, predicted: bool, arrows: bool = True) -> None:
+def paint_footprints(axes: Axes, boxes: PictureBoxes, predicted: bool, arrows: bool = True) -> None:
     """Footprints, with a bar behind the front edge, small classes also as markers, and velocity arrows."""
     if len(boxes) == 0:
         return
@@ -261,12 +263,12 @@ def paint_detections(axes: Axes, scene: BevScene) -> None:
     elif scene.lidar_points is not None:  # a pixel each: they are many
         axes.plot(*upright(scene.lidar_points[:, :2]).T, linestyle="none", marker=",", color=LIDAR_COLOUR, zorder=2)
     ring_missed(axes, scene)
-    paint_boxes(axes, scene.predictions, predicted=True)
-    paint_boxes(axes, scene.ground_truth, predicted=False)
+    paint_footprints(axes, scene.predictions, predicted=True)
+    paint_footprints(axes, scene.ground_truth, predicted=False)
 
 
 def paint_evidence(axes: Axes, scene: BevScene) -> None:
     """Evidence: splatted occupancy and Gaussians by source, with the true boxes."""
     paint_occupancy(axes, scene)
     paint_gaussians(axes, scene.gaussians)
-    paint_boxes(axes, scene.ground_truth, predicted=False, arrows=False)
+    paint_footprints(axes, scene.ground_truth, predicted=False, arrows=False)

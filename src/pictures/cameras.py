@@ -98,7 +98,7 @@ def clip_polygon(
     return polygon[:, :2] / polygon[:, 2:]
 
 
-def paint_boxes(
+def paint_wireframes(
     axes: Axes,
     boxes: PictureBoxes,
     pix_from_ego: Array,  # [4, 4]
@@ -182,8 +182,8 @@ def paint_camera(
     axes.imshow(image, extent=(0, width, height, 0), aspect="auto", interpolation="antialiased")
     axes.set_xlim(0, width)
     axes.set_ylim(height, 0)
-    paint_boxes(axes, predictions, pix_from_ego, (width, height), predicted=True)
-    paint_boxes(axes, ground_truth, pix_from_ego, (width, height), predicted=False)
+    paint_wireframes(axes, predictions, pix_from_ego, (width, height), predicted=True)
+    paint_wireframes(axes, ground_truth, pix_from_ego, (width, height), predicted=False)
     axes.text(
         0.008, 0.975, caption, transform=axes.transAxes, ha="left", va="top", color="white", fontsize=9.5,
         fontweight="bold", parse_math=False,

@@ -48,6 +48,10 @@ SOURCE_COLOURS: dict[str, str] = {
 }
 INK = "#1B1F24"
 MUTED = "#8A929B"
+AXIS_INK = "#495057"
+"""Of the numbers and names of axes."""
+FRAME_COLOUR, GRID_COLOUR, PANEL_COLOUR = "#C9CED4", "#E3E6EA", "#FBFBFC"
+"""Of the frame of a plot, of the lines within it, and of the ground of a view."""
 OCCUPANCY_COLOUR = (0.62, 0.47, 0.82)
 BOX_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 FRONT_FACE = (0, 1, 5, 4)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -31,12 +33,15 @@ class Film:
         """Whether a further picture would be left out."""
         return len(self) >= MAX_FRAMES
 
-    def add(self, path: Path, time_s: float) -> None:
-        """Take a picture file as the next frame; all get the size of the first, narrowed to WIDTH_PX."""
+    def add(self, draw: Callable[[Path], None], time_s: float) -> None:
+        """Take the PNG that `draw` writes as the next frame; all get the size of the first, narrowed to WIDTH_PX."""
         if self.full:
             return
-        with Image.open(path) as file:
-            picture = file.convert("RGB")
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "frame.png"
+            draw(path)
+            with Image.open(path) as file:
+                picture = file.convert("RGB")
         size = (WIDTH_PX, round(picture.height * WIDTH_PX / picture.width))
         picture = picture.resize(size, Image.Resampling.LANCZOS)
         if self._pictures and picture.size != self._pictures[0].size:

@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from src.pictures.canvas import SHEET_PX, Canvas
-from src.pictures.contents import INK, MUTED
+from src.pictures.contents import AXIS_INK, INK, MUTED
+from src.pictures.learning_curves import quiet_axes
 
 ROW_PX = 26
 HEAD_PX = 34
@@ -90,13 +91,9 @@ def draw_forest(path: Path | str, groups: Sequence[ForestGroup], title: str, axi
     left, width = PLOT_PX
     axes = canvas.axes(left, TOP_PX, width, height)
     axes.set(xlim=reach(groups), ylim=(height, 0), yticks=[])
-    axes.grid(axis="x", color="#E3E6EA", linewidth=0.8)
+    quiet_axes(axes, grid="x")
     axes.axvline(0, color="#868E96", linewidth=1.2)
-    axes.set_axisbelow(True)
-    for side in ("top", "right", "left"):
-        axes.spines[side].set_visible(False)
-    axes.tick_params(colors="#495057", labelsize=9, length=0)
-    axes.set_xlabel(axis, color="#495057", fontsize=10, parse_math=False)
+    axes.set_xlabel(axis, color=AXIS_INK, fontsize=10, parse_math=False)
     top = TOP_PX
     for group in groups:
         canvas.text(16, top + 11, group.title, 15, bold=True)

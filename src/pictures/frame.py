@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-
-from matplotlib.artist import Artist
 
 from src.pictures.bev import BevScene, bev_panel, paint_detections, paint_evidence
 from src.pictures.cameras import PictureViews, cameras_height, paint_cameras
@@ -67,21 +64,18 @@ def paint_bev(canvas: Canvas, scene: BevScene, top: float) -> None:
     """
     wide, high = HALF_PX, HALF_PX * scene.grid.cols / scene.grid.rows
     right, top = MARGIN_PX + wide + GAP_PX, top + CAPTION_PX
-
-    def panel(area: tuple[float, float, float, float], window: Window, caption: str, keys: Sequence[Artist]) -> None:
-        paint = paint_detections if caption.startswith("Detections") else paint_evidence
-        paint(bev_panel(canvas, area, window, caption, keys), scene)
-
-    panel((MARGIN_PX, top, wide, high), scene.grid.window, "Detections", point_keys(scene))
+    whole = scene.grid.window
+    paint_detections(bev_panel(canvas, (MARGIN_PX, top, wide, high), whole, "Detections", point_keys(scene)), scene)
     canvas.text(MARGIN_PX + wide, top - CAPTION_PX + 12, "forward is up", 12, colour=MUTED, align="right")
     if not has_evidence(scene):
-        panel((right, top, wide, high), near_window(wide, high), "Detections close up", [])
+        axes = bev_panel(canvas, (right, top, wide, high), near_window(wide, high), "Detections close up")
+        paint_detections(axes, scene)
         return
     name = "Gaussians" if scene.gaussians is not None else "Occupancy"
-    panel((right, top, wide, high), scene.grid.window, name, gaussian_keys(scene))
+    paint_evidence(bev_panel(canvas, (right, top, wide, high), whole, name, gaussian_keys(scene)), scene)
     below, near = top + high + CAPTION_PX, near_window(wide, NEAR_PX)
-    panel((MARGIN_PX, below, wide, NEAR_PX), near, "Detections close up", [])
-    panel((right, below, wide, NEAR_PX), near, f"{name} close up", [])
+    paint_detections(bev_panel(canvas, (MARGIN_PX, below, wide, NEAR_PX), near, "Detections close up"), scene)
+    paint_evidence(bev_panel(canvas, (right, below, wide, NEAR_PX), near, f"{name} close up"), scene)
 
 
 def draw_frame(

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from src.pictures.bev import BevScene, frame_ground, paint_detections, paint_ego, upright
-from src.pictures.cameras import PictureViews, paint_boxes, paint_camera
+from src.pictures.cameras import PictureViews, paint_camera, paint_wireframes
 from src.pictures.canvas import GAP_PX, HALF_PX, MARGIN_PX, SHEET_PX, Canvas
 from src.pictures.contents import INK, MUTED, PictureBoxes, Window, match_boxes
 from src.pictures.legends import class_keys, radar_keys, reading_keys
@@ -151,8 +151,8 @@ def _paint_crop(axes: Axes, frame: GalleryFrame) -> None:
     image, matrix, scene = frame.views.images[index], frame.views.pix_from_ego[index], frame.scenes[-1]
     size, half = (image.shape[1], image.shape[0]), max(CROP_SIZES * height, MIN_CROP_PX)
     axes.imshow(image, extent=(0, size[0], size[1], 0), aspect="auto", interpolation="nearest")
-    paint_boxes(axes, scene.predictions, matrix, size, predicted=True)
-    paint_boxes(axes, scene.ground_truth, matrix, size, predicted=False)
+    paint_wireframes(axes, scene.predictions, matrix, size, predicted=True)
+    paint_wireframes(axes, scene.ground_truth, matrix, size, predicted=False)
     for text in axes.texts:
         text.remove()  # labels are placed for the whole image
     axes.set_xlim(u - half, u + half)

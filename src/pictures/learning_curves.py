@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullLocator
 
 from src.pictures.canvas import SHEET_PX, Canvas
-from src.pictures.contents import INK, MUTED
+from src.pictures.contents import AXIS_INK, FRAME_COLOUR, GRID_COLOUR, INK, MUTED
 
 Curves = Mapping[str, Sequence[tuple[int, float]]]  # name -> step, value
 
@@ -21,12 +22,22 @@ HEIGHT_PX = 520
 def style_axes(axes: Axes, title: str) -> None:
     """Quiet frame: light grid, no box, title at the left."""
     axes.set_title(title, loc="left", fontsize=11, fontweight="bold", color=INK, parse_math=False)
-    axes.grid(axis="y", color="#E3E6EA", linewidth=0.8)
+    quiet_axes(axes)
+    axes.spines["bottom"].set_color(FRAME_COLOUR)
+
+
+def quiet_axes(
+    axes: Axes,
+    grid: Literal["x", "y", "both"] = "y",
+    label_size: float = 9,
+    without: Sequence[str] = ("top", "right", "left"),
+) -> None:
+    """A light grid below what is drawn, labels without ticks, no frame at some sides."""
+    axes.grid(axis=grid, color=GRID_COLOUR, linewidth=0.8)
     axes.set_axisbelow(True)
-    axes.tick_params(colors="#495057", labelsize=9, length=0)
-    for side in ("top", "right", "left"):
+    axes.tick_params(colors=AXIS_INK, labelsize=label_size, length=0)
+    for side in without:
         axes.spines[side].set_visible(False)
-    axes.spines["bottom"].set_color("#C9CED4")
 
 
 def paint_lines(axes: Axes, curves: Curves) -> None:
@@ -38,7 +49,7 @@ def paint_lines(axes: Axes, curves: Curves) -> None:
         colour = LINE_COLOURS[index % len(LINE_COLOURS)]
         style = {"color": colour, "linestyle": dashes, "linewidth": 1.8, "marker": "o", "markersize": 3}
         axes.plot(steps, values, label=label, **style)
-    axes.set_xlabel("step", color="#495057", fontsize=9)
+    axes.set_xlabel("step", color=AXIS_INK, fontsize=9)
     axes.xaxis.get_major_locator().set_params(integer=True)
     if curves:
         axes.legend(

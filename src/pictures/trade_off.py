@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.transforms import Bbox
 
 from src.pictures.canvas import SHEET_PX, Canvas
-from src.pictures.contents import MUTED
-from src.pictures.learning_curves import LINE_COLOURS
+from src.pictures.contents import AXIS_INK, MUTED
+from src.pictures.learning_curves import LINE_COLOURS, quiet_axes
 
 HEIGHT_PX = 560
 LABEL_PLACES = ((9, 5), (9, -14), (-9, 5), (-9, -14), (9, 20), (-9, 20), (9, -28), (-9, -28))
@@ -75,11 +75,7 @@ def draw_trade_off(path: Path | str, points: Sequence[TradeOff], title: str, cos
     paint_points(axes, points)
     axes.set(xlim=(0, 1.15 * max(p.cost for p in points)), ylim=(0, 1.08 * max(p.high for p in points)))
     spread_labels(axes)
-    axes.grid(color="#E3E6EA", linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.tick_params(colors="#495057", labelsize=10, length=0)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    axes.set_xlabel(cost, color="#495057", fontsize=11, parse_math=False)
-    axes.set_ylabel(score, color="#495057", fontsize=11, parse_math=False)
+    quiet_axes(axes, grid="both", label_size=10, without=("top", "right"))
+    axes.set_xlabel(cost, color=AXIS_INK, fontsize=11, parse_math=False)
+    axes.set_ylabel(score, color=AXIS_INK, fontsize=11, parse_math=False)
     canvas.save(path, photographs=False)

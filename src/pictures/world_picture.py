@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 from src.pictures.bev import SPEED_COLOURS, SPEED_LIMIT_MPS, bev_panel, upright
 from src.pictures.canvas import GAP_PX, MARGIN_PX, SHEET_PX, Canvas
 from src.pictures.comparison import BarPanel, draw_comparison
-from src.pictures.contents import INK, MUTED, OCCUPANCY_COLOUR, Window
+from src.pictures.contents import FRAME_COLOUR, INK, MUTED, OCCUPANCY_COLOUR, PANEL_COLOUR, Window
 from src.structures.taxonomy import MOVING_MPS
 
 Array = np.ndarray
@@ -152,9 +152,9 @@ def _paint_views(
         axes.set_xticks([-90, -45, 0, 45, 90], ["left", "", "ahead", "", "right"], fontsize=8, color=MUTED)
         axes.set_yticks([])
         axes.tick_params(length=0, pad=2)
-        axes.set_facecolor("#FBFBFC")
+        axes.set_facecolor(PANEL_COLOUR)
         for spine in axes.spines.values():
-            spine.set_color("#C9CED4")
+            spine.set_color(FRAME_COLOUR)
     bar = canvas.figure.colorbar(painted, cax=canvas.axes(left + width + 12, top, 12, height))
     bar.set_ticks([3, 10, 30, 100, 200], labels=["3 m", "10", "30", "100", "200"], fontsize=8)
     bar.minorticks_off()

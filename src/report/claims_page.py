@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 from src.report.claims import Claim, Finding, Verdict, verdict_of
 from src.report.comparisons import LOOKS
-from src.report.escaping import as_code, escape_markdown
+from src.report.escaping import as_code, escape_markdown, markdown_table
 from src.report.results import RunResult
 from src.report.sweep_record import SweepRecord
 from src.report.sweep_table import MISSING, format_paper
@@ -90,7 +90,7 @@ def _what_was_run(findings: list[tuple[Claim, list[Finding]]], records: Mapping[
 
 
 def _table(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
-    lines = [HEADS, ["---"] * len(HEADS)]
+    lines = []
     for number, (claim, found) in enumerate(findings, start=1):
         title = f"**{number}. {escape_markdown(claim.config.sentence)}** ({escape_markdown(claim.config.source)})"
         lines.append([title, "", "", "", "", f"**{verdict_of(found)}**", ""])
@@ -110,7 +110,7 @@ def _table(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
                     as_code([command]) if first else "",
                 ]
             )
-    return _markdown(lines)
+    return markdown_table(HEADS, lines, rule=" --- ")
 
 
 def _of_claims(found: list[Finding]) -> list[Finding]:
@@ -130,7 +130,7 @@ def _reasons(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
                 lines.append(
                     [str(number), escape_markdown(comparison.asks), escape_markdown(comparison.text), told, command]
                 )
-    return _markdown([REASON_HEADS, ["---"] * len(REASON_HEADS), *lines]) if lines else ""
+    return markdown_table(REASON_HEADS, lines, rule=" --- ") if lines else ""
 
 
 def _answer(finding: Finding) -> str:
@@ -139,7 +139,3 @@ def _answer(finding: Finding) -> str:
     less = "" if metric.higher_is_better else ", less is better"
     told = "" if paper is None else f" (paper {format_paper(paper, metric, signed=True)})"
     return f"{metric.heading}{less}: {finding.found.text}{told}, {finding.found.pairs} seeds"
-
-
-def _markdown(lines: Iterable[Iterable[str]]) -> str:
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -1,8 +1,8 @@
-"""Escaping of labels and notes in markup: whatever people write is shown and never interpreted."""
+"""Escaping of labels and notes in markup, where what people write is shown and never interpreted; Markdown tables."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 MARKDOWN = str.maketrans(
     {"&": "&amp;", "<": "&lt;", ">": "&gt;", "\n": " ", "\r": " "} | {mark: f"\\{mark}" for mark in "\\|*`[]"}
@@ -24,6 +24,12 @@ def escape_markdown(text: str) -> str:
 def as_code(words: Iterable[str]) -> str:
     """Settings as code within a cell of a Markdown table."""
     return f"`{' '.join(words).replace('`', chr(39)).replace('|', chr(92) + '|')}`"
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Iterable[str]], rule: str = "---") -> str:
+    """A table of cells that are Markdown already; `rule` stands below each cell of the head."""
+    first, *others = (f"| {' | '.join(cells)} |" for cells in (head, *rows))
+    return "\n".join([first, f"|{rule}" * len(head) + "|", *others])
 
 
 def escape_latex(text: str) -> str:

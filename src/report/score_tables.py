@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from src.report.comparisons import compare
-from src.report.escaping import as_code
+from src.report.escaping import as_code, markdown_table
 from src.report.metric_names import DETECTION, FORECASTS, LONG_RANGES, METRICS, RANGES, SPEEDS, Metric, metric_of
 from src.report.results import RunResult
 from src.report.sweep_file import MAX_COLUMNS
@@ -115,15 +115,14 @@ def score_table(experiments: list[Experiment], columns: list[Metric]) -> str:
     known = [column for column in columns if any(experiment.values(column) for experiment in experiments)]
     parts = -(-len(known) // (MAX_COLUMNS - 1))
     cut = [known[round(k * len(known) / parts) : round((k + 1) * len(known) / parts)] for k in range(parts)]
-    labels = [experiment.label for experiment in experiments]
     return "\n\n".join(
-        _markdown("experiment", [column.heading for column in some], labels, _score_cells(experiments, some))
+        markdown_table(["experiment", *(column.heading for column in some)], _score_lines(experiments, some))
         for some in cut
     )
 
 
-def _score_cells(experiments: list[Experiment], columns: list[Metric]) -> list[list[str]]:
-    lines: list[list[str]] = [[] for _ in experiments]
+def _score_lines(experiments: list[Experiment], columns: list[Metric]) -> list[list[str]]:
+    lines = [[experiment.label] for experiment in experiments]
     for column in columns:
         values = [experiment.values(column) for experiment in experiments]
         for line, experiment, own in zip(lines, experiments, values, strict=True):
@@ -146,16 +145,16 @@ def class_table(experiments: list[Experiment]) -> str:
 
 def cost_table(experiments: list[Experiment], epochs: bool = False) -> str:
     """What the runs cost: of their own phase, the slowest run's time as far as known and the largest run's memory."""
-    titles = ["seeds", *(["epochs"] if epochs else []), "parameters", "time, s", "peak memory, MiB"]
-    cells = []
+    titles = ["experiment", "seeds", *(["epochs"] if epochs else []), "parameters", "time, s", "peak memory, MiB"]
+    lines = []
     for experiment in experiments:
         runs = experiment.runs
         times = [run.training_s for run in runs if run.training_s is not None]
         largest = max(run.peak_memory_mib["process"] for run in runs)
-        row = [", ".join(str(run.seed) for run in runs), *([str(runs[0].epochs)] if epochs else [])]
+        row = [experiment.label, ", ".join(str(run.seed) for run in runs), *([str(runs[0].epochs)] if epochs else [])]
         slowest = f"{max(times):.0f}" if times else MISSING
-        cells.append([*row, f"{runs[0].parameters / 1e6:.2f} M", slowest, str(largest)])
-    return _markdown("experiment", titles, [experiment.label for experiment in experiments], cells)
+        lines.append([*row, f"{runs[0].parameters / 1e6:.2f} M", slowest, str(largest)])
+    return markdown_table(titles, lines)
 
 
 def gain_table(subject: Experiment, others: list[Experiment], columns: list[Metric]) -> str:
@@ -165,16 +164,10 @@ def gain_table(subject: Experiment, others: list[Experiment], columns: list[Metr
     """
     seeds = {run.seed for run in subject.runs}
     known = [column for column in columns if subject.values(column)]
-    cells = []
+    lines = []
     for other in others:
         found = [compare(subject.values(column), other.values(column), column.digits) for column in known]
         pairs = sum(run.seed in seeds for run in other.runs)
-        cells.append([str(pairs), *("-" if gain is None else gain.text for gain in found)])
-    titles = ["seeds", *(column.heading for column in known)]
-    return _markdown(f"{subject.label} over", titles, [other.label for other in others], cells) if known else ""
-
-
-def _markdown(corner: str, titles: list[str], labels: list[str], cells: list[list[str]]) -> str:
-    lines = [f"| {corner} | {' | '.join(titles)} |", "|---" * (1 + len(titles)) + "|"]
-    lines += [f"| {label} | {' | '.join(row)} |" for label, row in zip(labels, cells, strict=True)]
-    return "\n".join(lines)
+        lines.append([other.label, str(pairs), *("-" if gain is None else gain.text for gain in found)])
+    titles = [f"{subject.label} over", "seeds", *(column.heading for column in known)]
+    return markdown_table(titles, lines) if known else ""

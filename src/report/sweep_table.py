@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from src.report.comparisons import Comparison, compare
-from src.report.escaping import escape_latex, escape_markdown
+from src.report.escaping import escape_latex, escape_markdown, markdown_table
 from src.report.metric_names import Metric
 from src.report.sweep_file import MAX_COLUMNS
 
@@ -196,12 +196,12 @@ class SweepTable:
 
     def to_markdown(self) -> str:
         """Title, table, caption, text."""
-        lines = [[self.corner, *(_headed(head) for head in self.heads)]]
-        lines = [[escape_markdown(cell) for cell in lines[0]], ["---"] * len(lines[0])]
-        for head, cells in self.lines:
-            shown = [cell.text(escape_markdown, "**{}**".format) for cell in cells]
-            lines.append([escape_markdown(_headed(head)), *shown])
-        parts = [f"# {escape_markdown(self.title)}", "\n".join(f"| {' | '.join(line)} |" for line in lines)]
+        heads = [escape_markdown(text) for text in (self.corner, *map(_headed, self.heads))]
+        lines = [
+            [escape_markdown(_headed(head)), *(cell.text(escape_markdown, "**{}**".format) for cell in cells)]
+            for head, cells in self.lines
+        ]
+        parts = [f"# {escape_markdown(self.title)}", markdown_table(heads, lines, rule=" --- ")]
         parts += map(escape_markdown, [self.caption, *self.text])
         return "\n\n".join(part for part in parts if part) + "\n"
 

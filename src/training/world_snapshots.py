@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -101,10 +101,7 @@ def _moments(
 
 def _write_film(path: Path, moments: Iterable[ForecastMoment], title: str) -> None:
     film = Film()
-    with tempfile.TemporaryDirectory() as folder:
-        for moment in moments:
-            picture = Path(folder) / "moment.png"
-            draw_forecast(picture, [moment], title)
-            film.add(picture, moment.time_s)
+    for moment in moments:
+        film.add(partial(draw_forecast, moments=[moment], title=title), moment.time_s)
     if film:
         film.write_animation(path)

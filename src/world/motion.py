@@ -14,6 +14,8 @@ Array = np.ndarray
 
 LEAD_IN_S = 0.7
 """Simulated time before the first key frame, for the sweeps that precede it."""
+HALF_STEP_S = 0.002
+"""Of the central differences that give rates."""
 
 
 @dataclass
@@ -89,12 +91,12 @@ class EgoMotion:
         rotation, translation = self.poses(np.array([time_s]))
         return rotation[0], translation[0]
 
-    def rates(self, times_s: Array, half_step_s: float = 0.002) -> tuple[Array, Array]:
+    def rates(self, times_s: Array) -> tuple[Array, Array]:
         """Velocities [T, 3] and angular rates [T, 3] in the ego frame, by central differences of the pose."""
         now, _ = self.poses(times_s)
-        before, t_before = self.poses(times_s - half_step_s)
-        after, t_after = self.poses(times_s + half_step_s)
-        velocity = np.einsum("tji,tj->ti", now, t_after - t_before) / (2 * half_step_s)
-        skew = np.einsum("tji,tjk->tik", now, after - before) / (4 * half_step_s)
+        before, t_before = self.poses(times_s - HALF_STEP_S)
+        after, t_after = self.poses(times_s + HALF_STEP_S)
+        velocity = np.einsum("tji,tj->ti", now, t_after - t_before) / (2 * HALF_STEP_S)
+        skew = np.einsum("tji,tjk->tik", now, after - before) / (4 * HALF_STEP_S)
         turning = [skew[:, 2, 1] - skew[:, 1, 2], skew[:, 0, 2] - skew[:, 2, 0], skew[:, 1, 0] - skew[:, 0, 1]]
         return velocity, np.stack(turning, 1)

@@ -94,7 +94,7 @@ def compare(counts: DatasetCounts, num_sweeps: int) -> list[FigureTable]:
                 unit=table["unit"],
                 sources=table["source"],
                 trust=table["trust"],
-                world=getattr(ours, name)(list(real), bands),
+                world=ours.rows(name, list(real), bands),
                 real=real,
                 allowed=table.get("allowed"),
                 allowed_heavy=table.get("allowed_heavy"),
@@ -109,37 +109,32 @@ def _cell(value: float | list[float]) -> Cell:
 
 @dataclass
 class _Tables:
-    """The tables of one data set, each a method of the table's name that takes the real rows' and columns' names."""
+    """The tables of one data set. One that is no plain share of boxes is a method of its name, which takes the real
+    rows' and columns' names."""
 
     counts: DatasetCounts
     num_sweeps: int
     everything: str = field(default="this data set", init=False)
 
+    def rows(self, name: str, groups: list[str], columns: list[str]) -> Rows:
+        """A table, with the rows and columns that the real data have."""
+        radar, grown, levels = self.counts.radar, self.counts.radar_grown, self.counts.levels
+        shares: dict[str, tuple[Array, Array | bool]] = {  # which boxes are counted, and among which
+            "support": (radar >= 1, True),
+            "support_of_three": (radar >= 3, True),
+            "support_grown": (grown >= 1, True),
+            "hidden": (levels == 1, True),
+            "clear": (levels == 4, True),
+            "support_of_hidden": (radar >= 1, levels == 1),
+            "support_of_clear": (radar >= 1, levels == 4),
+            "highway": (radar >= 1, True),
+        }
+        if name in shares:
+            hit, among = shares[name]
+            return self._shares(hit, groups, columns, among)
+        return getattr(self, name)(groups, columns)
+
     # ---------------------------------------------------------------- shares of boxes by class and distance
-
-    def support(self, groups: list[str], bands: list[str]) -> Rows:
-        return self._shares(self.counts.radar >= 1, groups, bands)
-
-    def support_of_three(self, groups: list[str], bands: list[str]) -> Rows:
-        return self._shares(self.counts.radar >= 3, groups, bands)
-
-    def support_grown(self, groups: list[str], bands: list[str]) -> Rows:
-        return self._shares(self.counts.radar_grown >= 1, groups, bands)
-
-    def hidden(self, groups: list[str], bands: list[str]) -> Rows:
-        return self._shares(self.counts.levels == 1, groups, bands)
-
-    def clear(self, groups: list[str], bands: list[str]) -> Rows:
-        return self._shares(self.counts.levels == 4, groups, bands)
-
-    def support_of_hidden(self, groups: list[str], bands: list[str]) -> Rows:
-        return self._shares(self.counts.radar >= 1, groups, bands, self.counts.levels == 1)
-
-    def support_of_clear(self, groups: list[str], bands: list[str]) -> Rows:
-        return self._shares(self.counts.radar >= 1, groups, bands, self.counts.levels == 4)
-
-    def highway(self, groups: list[str], bands: list[str]) -> Rows:
-        return self._shares(self.counts.radar >= 1, groups, bands)
 
     def areas(self, groups: list[str], bands: list[str]) -> Rows:
         return {self.everything: self._shares(self.counts.radar >= 1, ["all"], bands)["all"]}

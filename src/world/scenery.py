@@ -92,10 +92,10 @@ def make_scenery(
             ground(far, far + 16, PAINT, 1.009, np.array([slot - 0.08, slot + 0.08]), mottle=0.0)
     for d in (-rail, rail, -0.7, 0.7):
         pieces.append((_strips(road, s, d, d, 0.45, 0.78), np.tile(np.array(RAIL), (len(s) - 1, 1)), 1.0, True))
-        posts = _post_quads(road, s + 2.0, d)
+        posts = _boards(road, s + 2.0, d, 0.08, 0.75)
         pieces.append((posts, np.tile(np.array((120, 122, 124)), (len(posts), 1)), 1.0, True))
     if road.screen_m > 0:
-        slats = _slats(road, np.arange(s[0], s[-1], SLAT_STEP_M))
+        slats = _boards(road, np.arange(s[0], s[-1], SLAT_STEP_M), 0.0, 0.5 * SLAT_M, road.screen_m)
         shade = 1.0 + 0.08 * rng.standard_normal((len(slats), 1))
         pieces.append((slats, np.clip(np.array(HEDGE) * shade, 0, 255), 1.0, True))
     mesh = Mesh(
@@ -127,15 +127,10 @@ def _along(road: Road, points: Array) -> Array:
     return nearest * 20.0 - 800.0
 
 
-def _post_quads(road: Road, s: Array, d: float) -> Array:
-    a, b = np.full_like(s, d - 0.08), np.full_like(s, d + 0.08)
-    return np.stack([road.place(s, a), road.place(s, b), road.place(s, b, 0.75), road.place(s, a, 0.75)], 1)
-
-
-def _slats(road: Road, s: Array) -> Array:
-    a, b = np.full_like(s, -0.5 * SLAT_M), np.full_like(s, 0.5 * SLAT_M)
-    top = road.screen_m
-    return np.stack([road.place(s, a), road.place(s, b), road.place(s, b, top), road.place(s, a, top)], 1)
+def _boards(road: Road, s: Array, d: float, half_width: float, height: float) -> Array:
+    """Quads [len(s), 4, 3] that stand across the road around a lateral position (m)."""
+    a, b = np.full_like(s, d - half_width), np.full_like(s, d + half_width)
+    return np.stack([road.place(s, a), road.place(s, b), road.place(s, b, height), road.place(s, a, height)], 1)
 
 
 def _upright(

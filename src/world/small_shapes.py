@@ -115,11 +115,11 @@ def _pole(m: MeshMaker, y: float, floor: float) -> None:
     m.box(-0.05, 0.05, y - 0.05, y + 0.05, -floor, 0.05, POST)
 
 
-def _disc(m: MeshMaker, x: float, z: float, radius: float, colour: Colour, corners: int = 8) -> None:
-    """A flat polygon that faces forwards."""
-    angles = np.pi / corners + np.arange(corners) * 2 * np.pi / corners
+def _disc(m: MeshMaker, x: float, z: float, radius: float, colour: Colour) -> None:
+    """A flat octagon that faces forwards."""
+    angles = np.pi / 8 + np.arange(8) * np.pi / 4
     ring = [(x, radius * np.cos(a), z + radius * np.sin(a)) for a in angles]
-    for k in range(1, corners - 2, 2):
+    for k in (1, 3, 5):
         m.quad([ring[0], ring[k], ring[k + 1], ring[k + 2]], colour)
 
 

@@ -32,7 +32,7 @@ def test_numbers():
     assert [number(value) for value in (0.01234, 999.4, 1e6, 7, True, "x")] == [
         "0.0123", "999", "1,000,000", "7", "True", "x"
     ]  # fmt: skip
-    assert table([{"a": 1}, {"b": None}]) == ["| a | b |", "|---|---|", "| 1 |  |", "|  |  |"]
+    assert table([{"a": 1}, {"b": None}]) == "| a | b |\n|---|---|\n| 1 |  |\n|  |  |"
 
 
 def test_a_busy_machine_is_warned_of():

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from src.benchmark import suite_gpu
+from src.benchmark.scenes import made_batch
 from src.benchmark.suite_gpu import GRAPH, LAUNCHED, following, frame_rows, frame_seconds, full_case, measure, part_rows
-from src.benchmark.suite_launches import made_batch
 from src.config import compose_config
 from src.errors import ConfigError
 from src.ops import backend

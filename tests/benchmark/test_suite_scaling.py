@@ -15,9 +15,9 @@ from src.benchmark.suite_scaling import (
     NOMINAL_M,
     RANGES_M,
     Point,
+    case_at,
     configs_of,
     growth_rows,
-    make_case,
     settings_at,
     sweeps_of,
 )
@@ -137,8 +137,8 @@ def test_a_point_changes_what_it_names():
 def test_gaussians_occupy_as_many_cells_as_trained_ones(cells):
     config, _ = compose_config(["scale=debug", "phase=phase2"])
     point = Point(1.0, NOMINAL_M, ROAD)
-    fresh, _ = make_case(config, point, torch.device("cpu"))
-    case, _ = make_case(config, replace(point, occupied_cells=cells), torch.device("cpu"))
+    fresh, _ = case_at(config, point, torch.device("cpu"))
+    case, _ = case_at(config, replace(point, occupied_cells=cells), torch.device("cpu"))
     every, found = (len(one.infer()[0].ocsf.splat.bev) for one in (fresh, case))
     assert every > 700
     if cells < every:

@@ -1,22 +1,14 @@
 """Frames into an animation and a strip: order, speed, sizes, bounds."""
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from src.pictures.film import MAX_FRAMES, WIDTH_PX, Film
 
 
-@pytest.fixture
-def picture(tmp_path):
-    """Writes a grey sheet of the given level and height."""
-
-    def write(level, height=40):
-        path = tmp_path / "sheet.png"
-        Image.new("RGB", (1920, height), (level,) * 3).save(path)
-        return path
-
-    return write
+def picture(level, height=40):
+    """Draws a grey sheet of the given level and height."""
+    return Image.new("RGB", (1920, height), (level,) * 3).save
 
 
 def levels(image, count):
@@ -24,7 +16,7 @@ def levels(image, count):
     return columns.reshape(count, -1).mean(axis=1).round().tolist()
 
 
-def test_an_animation_keeps_order_and_time(picture, tmp_path):
+def test_an_animation_keeps_order_and_time(tmp_path):
     film = Film()
     for level, time_s in ((10, 5.0), (90, 5.5), (200, 6.0), (250, 99.0)):
         film.add(picture(level), time_s)
@@ -36,7 +28,7 @@ def test_an_animation_keeps_order_and_time(picture, tmp_path):
             assert levels(animation, 1) == [level] and animation.info["duration"] == duration
 
 
-def test_a_strip_spreads_over_the_film(picture, tmp_path):
+def test_a_strip_spreads_over_the_film(tmp_path):
     film = Film()
     for level in range(0, 250, 50):
         film.add(picture(level), float(level))
@@ -44,10 +36,10 @@ def test_a_strip_spreads_over_the_film(picture, tmp_path):
         film.write_strip(tmp_path / "strip.png", count)
         with Image.open(tmp_path / "strip.png") as strip:
             assert levels(strip, len(expected)) == expected
-    assert {path.name for path in tmp_path.iterdir()} == {"sheet.png", "strip.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {"strip.png"}
 
 
-def test_one_frame_and_frames_of_another_height(picture, tmp_path):
+def test_one_frame_and_frames_of_another_height(tmp_path):
     film = Film()
     film.add(picture(30), 0.0)
     film.write_animation(tmp_path / "film.gif")
@@ -57,8 +49,14 @@ def test_one_frame_and_frames_of_another_height(picture, tmp_path):
         assert strip.size == (2 * WIDTH_PX, 20) and levels(strip, 2) == [30, 60]
 
 
-def test_a_long_scene_is_cut(picture):
-    film, path = Film(), picture(0)
+def test_a_long_scene_is_cut():
+    film, drawn = Film(), []
+
+    def draw(path):
+        drawn.append(path)
+        picture(0)(path)
+
     for number in range(MAX_FRAMES + 5):
-        film.add(path, 0.5 * number)
-    assert len(film) == MAX_FRAMES and film.full
+        film.add(draw, 0.5 * number)
+    assert len(film) == len(drawn) == MAX_FRAMES and film.full
+    assert not any(path.exists() for path in drawn)

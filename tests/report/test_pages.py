@@ -1,6 +1,7 @@
 """Which runs stand on which page and what they are called, through the command's own entry."""
 
 import copy
+import json
 from dataclasses import replace
 
 import pytest
@@ -280,6 +281,18 @@ def test_an_experiment_stands_with_all_its_seeds_or_not_at_all(make_result):
     names = [run.run_id for run in runs]
     assert runs_on_page(runs, "phase1", set()) == runs_on_page(iter(runs), "phase1", set(names[:2])) == runs
     assert runs_on_page(runs, "phase1", set(names)) == []
+
+
+def test_the_page_of_another_task_is_shown(write_run, tmp_path, capsys, exported):
+    folder = write_run("0123abcd", [], 0, 0.3, phase="lrs_occupancy")
+    config = folder / "config.yaml"
+    config.write_text(config.read_text().replace("name: horizon3d", "name: lrs4fusion"))
+    record = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(record | {"task": "occupancy", "headline": "iou"}))
+    (folder / "metrics.json").write_text(json.dumps({"iou": 0.7125}))
+    paths = [f"paths.outputs={tmp_path}", f"paths.reports={tmp_path / 'reports'}"]
+    main(["model=lrs4fusion", "phase=lrs_occupancy", "scale=mini", *paths])
+    assert "| 71.2" in capsys.readouterr().out.split("written:")[0]
 
 
 @pytest.mark.slow
