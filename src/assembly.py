@@ -11,6 +11,7 @@ from typing import Any
 
 from src.config import Config
 from src.data.datamodule import DetectionDataModule
+from src.data.timeline import RadialSpeeds
 from src.errors import ConfigError, DataError
 from src.metrics.submission import write_submission
 from src.models import build_model as build_model_of
@@ -121,8 +122,12 @@ def save_submission(config: Config, path: Path, tokens: list[str], table: Detect
         return False
     max_age_s = config.model.memory_max_age_s  # the benchmark's rules are about how far back a detector looks
     memory = "no memory" if max_age_s is None else f"memory of up to {max_age_s:g} s"
-    meta = {
-        **{f"use_{sensor}": sensor in config.model.sensors for sensor in SENSORS},
+    meta: dict[str, bool | str] = {f"use_{sensor}": sensor in config.model.sensors for sensor in SENSORS}
+    timeline = config.data.timeline
+    if timeline is not None and timeline.radial_speeds is RadialSpeeds.radar:
+        # The speeds of LiDAR returns are an input, and come from radar sweeps up to RADAR_WINDOW_S after them too.
+        meta |= {"use_radar": True, "use_future_frames": True}
+    meta |= {
         "method_name": config.model.name,
         "description": f"scale {config.scale}, seed {config.seed}, {memory}",
     }

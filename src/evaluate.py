@@ -11,6 +11,8 @@ from pathlib import Path
 
 from src.assembly import build_datamodule, build_module, data_root, restored_model, save_submission
 from src.config import compose_config, refuse_options_of_others, restore_config
+from src.data.cache import load_index
+from src.data.evaluation_set import evaluation_set
 from src.errors import ConfigError, DataError
 from src.metrics.bootstrap import score_report
 from src.metrics.detection import score_detections
@@ -50,10 +52,12 @@ def main(overrides: list[str]) -> None:
         if module.skipped:
             text += f"\nskipped sensor files: {module.skipped.text()}"
     else:
-        evaluation_set = build_datamodule(config, data_root(config, write=False)).evaluation_set()
-        boxes = load_submission(source, evaluation_set.tokens)
-        scores = score_detections(evaluation_set, boxes)
-        metrics = score_report(evaluation_set, boxes, scores, config.phase.long_range)
+        # Annotations alone, so that boxes can be scored by the protocol of a model whose sensors the data lack.
+        index = load_index(data_root(config, write=False), config.data.version, Path(config.paths.outputs) / "cache")
+        truth = evaluation_set(index, config.data.split)
+        boxes = load_submission(source, truth.tokens)
+        scores = score_detections(truth, boxes)
+        metrics = score_report(truth, boxes, scores, config.phase.long_range)
         text = format_scores(metrics)
     print(text)
     write_json(out / "metrics.json", metrics)
@@ -78,6 +82,11 @@ def score_checkpoint(path: Path, overrides: list[str]) -> tuple[TrainingModule, 
     if config.oracle is not Oracle.none:
         if not isinstance(module, TemporalModule):
             raise ConfigError(f"oracle={config.oracle.value}: this checkpoint is of single frames and has no memory")
+        if datamodule.brings_past:
+            raise ConfigError(
+                f"oracle={config.oracle.value}: moves the memory of streams, but with data.past_frames="
+                f"{config.data.past_frames} each frame brings a past of data.timeline along; give data.past_frames=0"
+            )
         module.oracle = TrueMotion(datamodule.evaluation_set(), config.oracle)
     build_evaluation_trainer(config.precision, config.trainer.accelerator.value).validate(
         module, datamodule=datamodule, verbose=False

@@ -51,6 +51,17 @@ def test_a_submission_states_the_sensors_that_the_model_reads(tmp_path, monkeypa
     assert stated == set(sensors)
 
 
+@pytest.mark.parametrize(("source", "stated"), [("none", set()), ("radar", {"radar", "future_frames"})])
+def test_a_submission_states_where_the_speeds_of_its_returns_come_from(tmp_path, monkeypatch, source, stated):
+    lidar = ("scale=debug", "model=lrs4fusion", "phase=lrs_detection", f"data.timeline.radial_speeds={source}")
+    config, _ = compose_config([*lidar])
+    written = []
+    monkeypatch.setattr(assembly, "write_submission", lambda path, tokens, table, meta: written.append(meta))
+    assert save_submission(config, tmp_path / "submission.json", ["a"], [None])
+    used = {name.removeprefix("use_") for name, value in written[0].items() if name.startswith("use_") and value}
+    assert used == stated | {"lidar"} and written[0]["method_name"] == "lrs4fusion"
+
+
 def test_a_world_without_lidar_is_refused_for_a_model_that_reads_it(monkeypatch):
     config, _ = compose_config(["scale=debug"])
     monkeypatch.setattr(type(config.model), "sensors", ("lidar",))

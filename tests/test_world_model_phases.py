@@ -8,7 +8,9 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.data.tiny_set import VERSION, write_data_set
 from tests.running import call, killed_training
+from tests.untrained import write_checkpoint
 
 pytestmark = pytest.mark.slow
 MODEL = ("model=lrs4fusion", "scale=debug", "trainer.num_pictures=0")
@@ -173,3 +175,32 @@ def test_a_world_without_lidar_names_the_model_that_needs_it(world, tmp_path):
     arguments = (f"data.root={bare}", f"paths.outputs={tmp_path}")
     said = call("train", *MODEL, "phase=lrs_occupancy", *arguments, expect=4)
     assert "model=lrs4fusion reads lidar" in said.stderr
+
+
+def test_frames_with_a_past_of_the_timeline_have_no_stream_to_predict_or_to_correct(tmp_path):
+    write_data_set(tmp_path / "data", lidar=True)
+    own = ("phase=lrs_detection", "data.past_frames=2", "data.world=null", f"data.root={tmp_path / 'data'}")
+    checkpoint = write_checkpoint(tmp_path / "own.ckpt", "model=lrs4fusion", *own, f"data.version={VERSION}")
+    base = (f"checkpoint={checkpoint}", f"paths.outputs={tmp_path / 'outputs'}")
+    said = call("predict", *base, expect=3).stderr
+    assert "data.past_frames=2: must be 0 to follow scenes frame by frame" in said
+    assert "oracle=motion: moves the memory of streams" in call("evaluate", *base, "oracle=motion", expect=3).stderr
+
+
+def test_any_submission_is_scored_by_the_long_range_protocol(tmp_path):
+    """On data without the LiDAR that the model with this protocol would read."""
+    write_data_set(tmp_path / "data")
+    tables = tmp_path / "data" / VERSION
+    samples = [row["token"] for row in json.loads((tables / "sample.json").read_text())][:3]  # of the scene `train`
+    annotation = next(
+        row for row in json.loads((tables / "sample_annotation.json").read_text()) if row["sample_token"] == samples[0]
+    )
+    box = {"detection_name": "car", "detection_score": 0.5, "attribute_name": "vehicle.moving", "velocity": [14.0, 9.0]}
+    box |= {name: annotation[name] for name in ("sample_token", "translation", "size", "rotation")}
+    results = dict.fromkeys(samples, []) | {samples[0]: [box]}
+    (tmp_path / "boxes.json").write_text(json.dumps({"meta": {}, "results": results}))
+    data = ("data.world=null", f"data.root={tmp_path / 'data'}", f"data.version={VERSION}", "data.split=train")
+    own = (f"predictions={tmp_path / 'boxes.json'}", *MODEL, "phase=lrs_detection", f"out={tmp_path / 'out'}")
+    call("evaluate", *own, *data, f"paths.outputs={tmp_path / 'outputs'}")
+    found = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert found["long_range"]["ranges"]["0-50"]["classes"]["car"]["AP"] > 0

@@ -23,7 +23,7 @@ from src.data.tables import LARGEST, LAST_TIME_US
 from src.files.atomic_write import replacing
 from src.structures.taxonomy import ATTRIBUTES, CLASSES
 
-FORMAT = 5  # raise it when DatasetIndex or a check changes: older caches are then built again
+FORMAT = 6  # raise it when DatasetIndex or a check changes: older caches are then built again
 
 _log = logging.getLogger(__name__)
 _PLAIN = ("root", "version", "annotated")

@@ -71,9 +71,9 @@ class FrameDataset(Dataset[FrameBatch]):
             return error
         # In a validation the same frames in every run and epoch, so that scores compare.
         draw = (key.sample, self.seed, key.epoch) if self.training else (key.sample,)
-        if key.stream is None:
-            return drop_sensors(frame, self.sensor_dropout, draw) if self.past_frames else frame
-        return drop_sensors(in_stream(frame, key.stream, key.starts), self.sensor_dropout, draw)
+        if key.stream is not None:
+            frame = in_stream(frame, key.stream, key.starts)
+        return drop_sensors(frame, self.sensor_dropout, draw)
 
     def _steps(self, key: FrameKey) -> tuple[list[int], list[int]]:
         """Of the timeline: the frames of the past, and those whose rays supervise."""
@@ -104,7 +104,7 @@ def in_stream(frame: FrameBatch, stream: int, starts: bool) -> FrameBatch:
 
 def drop_sensors(frame: FrameBatch, share: float, draw: tuple[int, ...]) -> FrameBatch:
     """The frame, or with the probability `share` the same without points and images, unless nothing came before it."""
-    first = frame.past[-1].tokens == frame.tokens if frame.past else frame.starts[0]
+    first = frame.past[-1].tokens == frame.tokens if frame.past else frame.starts is None or frame.starts[0]
     if first or np.random.default_rng(draw).random() >= share:
         return frame
     return without_sensors(frame)
@@ -124,7 +124,7 @@ class DetectionDataModule(L.LightningDataModule):
 
     Of `taxonomy.SENSORS` those in `sensors` are read. `temporal` streams clips, with `streams` and `starts` in every
     batch; without it training reads shuffled frames and validation reads frames in table order.
-    Raises DataError when tables, split or files are not right.
+    Raises ConfigError for streams with rays, DataError when tables, split or files are not right.
     """
 
     def __init__(
@@ -142,6 +142,12 @@ class DetectionDataModule(L.LightningDataModule):
         read_by: str = "the model",  # in messages
     ) -> None:
         super().__init__()
+        if temporal and config.num_future_frames and not config.past_frames:
+            raise ConfigError(
+                f"data.past_frames=0: must be at least 1 with data.num_future_frames={config.num_future_frames}, found "
+                "streams, of whose key frames validation would read few, too far apart for a memory; give data."
+                "past_frames=1 or more"
+            )
         self.config, self.root, self.seed, self.temporal = config, root, seed, temporal
         self.name = name or root.name
         self.settings = config.reader_settings(sensors, image_size_px)
@@ -195,7 +201,7 @@ class DetectionDataModule(L.LightningDataModule):
         frames of the timeline bring their past along, that past and the frame.
         """
         samples = self._validated()
-        if self.config.timeline is not None and self.temporal and not self._in_streams:
+        if self.brings_past:
             return [[*frame.past, frame] for frame in self._in_order(_evenly_spread(samples, count))]
         scenes = self._scenes_of(samples)
         clips = []
@@ -208,8 +214,14 @@ class DetectionDataModule(L.LightningDataModule):
     def stream(self, scenes: list[str] | None = None) -> Iterator[FrameBatch]:
         """The frames of some or all scenes of the validation split one by one, in stream 0; each scene is a clip.
 
-        Raises ConfigError for a scene that the split does not have.
+        Raises ConfigError for a scene that the split does not have, and where frames bring their past along.
         """
+        if self.brings_past:
+            raise ConfigError(
+                f"data.past_frames={self.config.past_frames}: must be 0 to follow scenes frame by frame, found frames "
+                "that each bring a past of data.timeline along; give data.past_frames=0 for streams of key frames, or "
+                "score such a run by python -m src.evaluate"
+            )
         known = self._scenes()
         for name in scenes or ():
             if name not in known:
@@ -233,7 +245,7 @@ class DetectionDataModule(L.LightningDataModule):
         """One clip in stream 0, without augmentation."""
         frames = self._frames(None)
         for sample in samples:
-            order = (0, int(samples[0])) if self._in_streams or not self.temporal else ()
+            order = () if self.brings_past else (0, int(samples[0]))
             frame = frames[FrameKey(0, int(sample), *order)]
             if isinstance(frame, HorizonError):
                 raise frame
@@ -268,7 +280,7 @@ class DetectionDataModule(L.LightningDataModule):
         """Batches of the validation split, each frame once over all ranks: in table order, or scene by scene."""
         samples = self._validated()
         rank, world_size = self._rank()
-        if self._in_streams:
+        if self.temporal and not self.brings_past:
             schedule = whole_scenes(self._scenes_of(samples), self.config.batch_size, world_size)
         else:
             schedule = frames_in_order(samples, self.config.batch_size)
@@ -293,9 +305,9 @@ class DetectionDataModule(L.LightningDataModule):
         return np.concatenate([_evenly_spread(frames, timeline.config.scored_frames) for frames in own])
 
     @property
-    def _in_streams(self) -> bool:
-        """Whether frames that are looked at in order have their past in the stream, not with them."""
-        return self.temporal and not (self.config.timeline is not None and self.config.past_frames)
+    def brings_past(self) -> bool:
+        """Whether frames that are looked at in order have their past with them, of the timeline, not in a stream."""
+        return self.temporal and self.config.timeline is not None and self.config.past_frames > 0
 
     def _rank(self) -> tuple[int, int]:
         """This process's rank and the number of processes, which must divide the batch."""

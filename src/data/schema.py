@@ -159,6 +159,8 @@ def version_folder(root: Path, version: str) -> Path:
 def _scene_columns(scenes: Table, samples: Table) -> dict[str, Array]:
     """Scenes and the order of their samples."""
     names = scenes.values("name")
+    of_files = np.array([name not in ("", ".", "..") and "/" not in name for name in names], bool)
+    scenes.check(of_files, "name", names, "a name that files can have, without '/' and not '..'")
     first = {name: row for row, name in reversed(list(enumerate(names)))}
     scenes.check(np.array([first[name] == row for row, name in enumerate(names)]), "name", names, "a name of its own")
     scenes.links("first_sample_token", samples)
@@ -211,6 +213,8 @@ def _data_columns(
     sorted_row[order] = np.arange(len(order))
 
     table = Table(folder / "sample_data.json")
+    if not len(table):
+        raise DataError(f"{table.path}: no sensor file at all; unpack the release again")
     data_samples = table.links("sample_token", samples)
     scenes = parts["data_scenes"] = parts["sample_scenes"][data_samples]
     parts["data_poses"] = sorted_row[table.links("ego_pose_token", poses)]
@@ -239,7 +243,7 @@ def _data_columns(
     names = table.values("filename")
     inside = np.array([_stays_inside(name) for name in names], bool)
     table.check(inside, "filename", names, "a relative path without '..'; this one is outside the dataset folder")
-    parts["data_filenames"] = np.array([name.encode() for name in names] or [b""])[: len(names)]
+    parts["data_filenames"] = np.array([name.encode() for name in names])
     return data_samples, np.array(table.values("is_key_frame", bool), bool)
 
 
@@ -269,10 +273,8 @@ def _frame_columns(samples: Table, data_samples: Array, data_key: Array, parts: 
             "%d samples have no %s key frame; their frame is the ego pose closest in time (first: %s)",
             int((~known).sum()), REFERENCE_CHANNEL, samples.tokens[int(np.argmin(known))],
         )  # fmt: skip
-    files = len(parts["data_times_us"])
-    safe = reference if files else np.full(len(reference), -1)
-    parts["frame_times_us"] = np.where(known, parts["data_times_us"][safe] if files else 0, sample_times)
-    parts["frame_poses"] = np.where(known, parts["data_poses"][safe] if files else 0, closest).astype(np.int32)
+    parts["frame_times_us"] = np.where(known, parts["data_times_us"][reference], sample_times)
+    parts["frame_poses"] = np.where(known, parts["data_poses"][reference], closest).astype(np.int32)
     frame_times, scenes = parts["frame_times_us"], parts["sample_scenes"]
     order = np.lexsort((sample_times, scenes))
     advances = np.ones(len(samples), bool)

@@ -39,7 +39,7 @@ class OnBadFile(Enum):
 class Skipped:
     """What a frame does without, and the sweeps that it has read."""
 
-    sweeps: dict[int, LidarCloud | None] = field(default_factory=dict)  # by row; frames of a timeline share them
+    sweeps: dict[int, Array | LidarCloud | None] = field(default_factory=dict)  # by row; what a frame reads shares them
     channels: Counter[str] = field(default_factory=Counter)
     files: list[str] = field(default_factory=list)
     lost: bool = False  # the key frame's own pose is wrong, so that no annotation is where it says
@@ -86,26 +86,21 @@ class SensorFiles:
         read: Callable[[str, int], T],  # of the path and the row of the file
         skipped: Skipped,
     ) -> tuple[Array, list[T]]:  # [S] int64 rows of the files
-        """What could be read of these files of sensors of one kind."""
-        owners = [CHANNELS[channel] for channel in self.index.data_channels[files]]
-        kept, clouds = [], []
-        for row, channel in zip(
-            *self.with_known_poses(sample, np.array(files, np.int64), owners, skipped), strict=True
-        ):
-            cloud = self.guarded(sample, channel, row, partial(read, row=row), skipped)
-            if cloud is not None:
-                kept.append(row)
-                clouds.append(cloud)
-        return np.array(kept, np.int64), clouds
+        """What could be read of these files of sensors of one kind.
 
-    def lidar_clouds(self, sample: int, files: list[int], skipped: Skipped) -> tuple[Array, list[LidarCloud]]:
-        """As `radar_clouds`; a file is read once in a frame, and if it is bad counts once."""
-        fresh = [row for row in files if row not in skipped.sweeps]
-        skipped.sweeps |= dict.fromkeys(fresh)
-        rows, clouds = self._clouds(sample, fresh, self._lidar_cloud, skipped)
-        skipped.sweeps |= zip(rows.tolist(), clouds, strict=True)
+        A file is read once in a frame, and if it is bad counts once.
+        """
+        fresh = np.array([row for row in files if row not in skipped.sweeps], np.int64)
+        skipped.sweeps |= dict.fromkeys(fresh.tolist())
+        owners = [CHANNELS[channel] for channel in self.index.data_channels[fresh]]
+        for row, channel in zip(*self.with_known_poses(sample, fresh, owners, skipped), strict=True):
+            skipped.sweeps[row] = self.guarded(sample, channel, row, partial(read, row=row), skipped)
         kept = [row for row in files if skipped.sweeps[row] is not None]
         return np.array(kept, np.int64), [skipped.sweeps[row] for row in kept]
+
+    def lidar_clouds(self, sample: int, files: list[int], skipped: Skipped) -> tuple[Array, list[LidarCloud]]:
+        """Rows [S] of those files that could be read, and their points, each with its own time."""
+        return self._clouds(sample, files, self._lidar_cloud, skipped)
 
     def _lidar_cloud(self, path: str, row: int) -> LidarCloud:
         """One file, its points' times checked against the table's."""

@@ -58,7 +58,8 @@ def with_intervals(scores: DetectionScores) -> dict[str, object]:
     """The scores as plain values, and `intervals`.
 
     These hold `scenes`, `draws`, `level` and `bounds`, [low, high] of a number by its path, as in `ranges.0-25.mAP`.
-    A number without any is undefined; a single scene says nothing of others, so there are no bounds at all.
+    Scores by tag have none; another number without any is undefined. A single scene says nothing of others, so there
+    are no bounds at all.
     """
 
     def bounds(draws: Array) -> dict[str, list[float]]:
@@ -128,7 +129,8 @@ def score_draws(
         for name, part in (("moving_AP", parts.moving), ("moving_AP_normalized", parts.moving.by_place)):
             precision = np.zeros((len(draws), len(parts.ranking.protocol.thresholds_m), len(RECALLS)))
             for listed in part.pooled_lists():
-                precision[:, listed.threshold], _ = _curves(part, listed, scenes, draws, boxes)
+                for some in _portions(listed, len(draws)):
+                    precision[some, listed.threshold], _ = _curves(part, listed, scenes, draws[some], boxes[some])
             if part is not parts.moving:
                 precision = normalized_precision(precision, boxes[:, None], every[:, None])
             measures[name] = np.where(boxes > 0, average_precision(precision).mean(axis=1), np.nan)
@@ -152,9 +154,7 @@ def _score_part(
     errors = np.ones((len(draws), len(CLASSES), len(ERRORS)))
     for listed in part.lists():
         c = listed.label
-        steps = max(1, CHUNK // max(1, len(listed.matched)))
-        for begin in range(0, len(draws), steps):
-            some = slice(begin, begin + steps)
+        for some in _portions(listed, len(draws)):
             precision, confidence = _curves(part, listed, scenes, draws[some], num_gt[some, c])
             if totals is not None:
                 precision = normalized_precision(precision, num_gt[some, c], totals[some, c])
@@ -173,6 +173,12 @@ def _score_speed(
     totals = draws @ _count_by_scene(parts.overall, scenes, draws.shape[1])  # [R, 12]
     normalized = _score_part(part.by_place, scenes, draws, totals)
     return replace(_score_part(part, scenes, draws), normalized_ap=normalized.ap)
+
+
+def _portions(listed: RankedList, num_draws: int) -> Iterator[slice]:
+    """Parts of the draws, see CHUNK."""
+    steps = max(1, CHUNK // max(1, len(listed.matched)))
+    return (slice(begin, begin + steps) for begin in range(0, num_draws, steps))
 
 
 def _count_by_scene(part: Part, scenes: Array, num_scenes: int) -> Array:  # [C, 12]

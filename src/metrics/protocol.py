@@ -38,10 +38,9 @@ class Protocol:
                 f"error_threshold_m={self.error_threshold_m} must be one of thresholds_m, but these are {thresholds}"
             )
         bins = self.ranges_m
-        if not all(len(ends) == 2 and 0 <= ends[0] < ends[1] for ends in bins) or any(
-            low[1] != high[0] for low, high in itertools.pairwise(bins)
-        ):
-            raise ConfigError(f"ranges_m must be [low, high] each, in order and without gaps, but got {bins}")
+        ordered = all(len(ends) == 2 and 0 <= ends[0] < ends[1] for ends in bins)
+        if not bins or not ordered or any(low[1] != high[0] for low, high in itertools.pairwise(bins)):
+            raise ConfigError(f"ranges_m must be one or more [low, high], in order and without gaps, but got {bins}")
         if self.region_m is not None and (
             len(self.region_m) != 2 or not all(len(ends) == 2 and ends[0] < ends[1] for ends in self.region_m)
         ):

@@ -143,13 +143,15 @@ def test_sensors_that_are_none(data_set, sensors):
 
 
 def test_lidar_is_dropped_with_the_other_sensors(lidar_set):
-    chosen = {"sensor_dropout": 0.99, "timeline": FIVE_HERTZ, "num_future_frames": 1, "lidar_origins": True}
+    chosen = {"sensor_dropout": 0.99, "timeline": FIVE_HERTZ, "lidar_origins": True}
     data = module(lidar_set, ("lidar", "radar"), temporal=True, **chosen)
     first, second, _ = data.stream()
     assert len(first.lidar_points) and len(first.radar_points)
     assert second.lidar_points.shape == (0, 5) and second.radar_points.shape == (0, 7)
     assert second.lidar_origins.shape == (0, 3) and len(second.lidar_batch) == 0
-    assert len(second.rays)  # what is to be predicted stays
+    shuffled = module(lidar_set, ("lidar",), temporal=True, num_future_frames=1, past_frames=1, batch_size=1, **chosen)
+    frame = next(iter(shuffled.train_dataloader()))
+    assert len(frame.lidar_points) == 0 and len(frame.rays)  # what is to be predicted stays
 
 
 @pytest.mark.slow

@@ -9,6 +9,8 @@ import pytest
 from src.data.cache import load_index
 from src.data.rays import radar_speeds
 from src.data.reader import FrameReader
+from src.data.schema import CHANNELS
+from src.data.sensor_files import OnBadFile
 from src.data.timeline import RadialSpeeds
 from src.errors import DataError
 from src.world.write import ensure_world
@@ -44,6 +46,18 @@ def inputs_have_the_speeds_of_their_rays(frame, rays):
     wanted, found = np.array(both).T
     same = np.isclose(wanted, found, atol=1e-3) | (np.isnan(wanted) & np.isnan(found))
     assert len(both) > 0.5 * len(rays) and same.mean() > 0.999  # two points of a centimetre may differ
+
+
+def test_a_damaged_radar_file_is_counted_once_in_a_frame(broken_lidar):
+    """Although it tells the speeds of the input, of the past and of the rays."""
+    timeline = replace(FIVE_HERTZ, radial_speeds=RadialSpeeds.radar)
+    reader = broken_lidar.reader(**ONLY_LIDAR, timeline=timeline, num_future_frames=1, on_bad_file=OnBadFile.skip)
+    row = int(reader.index.key_data[1, CHANNELS.index("RADAR_LEFT_SIDE")])
+    name = reader.index.filename(row)
+    (broken_lidar.root / name).write_bytes(b"junk")
+    frame = reader.read(1, None, history=[-1], targets=[0])
+    assert frame.bad_files == [name] and frame.skipped["RADAR_LEFT_SIDE"] == 1
+    assert frame.lidar_speeds.isfinite().any() and frame.rays.speeds.isfinite().any()
 
 
 @pytest.mark.slow

@@ -89,6 +89,8 @@ def case(table, row, change, *words, name):
         case("sample_data", 30, {"prev": token("sample_data", "CAMERA_LEFT_FRONT", int(START_S * 1e6) + 19_000)},
              "same channel", name="file-chain-of-another"),
         case("scene", 1, {"name": "scene-train-0"}, "of its own", name="same-scene-name"),
+        case("scene", 1, {"name": "../../x"}, "'../../x'", "without '/'", name="scene-name-that-leads-out"),
+        case("scene", 1, {"name": ".."}, "not '..'", name="scene-name-of-a-folder"),
         case("scene", 1, {"name": "x" * 256}, "at most 255 characters", name="long-name"),
         case("scene", 1, {"description": "x" * 10_001}, "at most 10000 characters", name="long-description"),
         case("scene", 1, {"name": "\ud800"}, "hex escape", "line 1", name="half-a-character"),
@@ -209,6 +211,12 @@ def test_missing_table_version_and_root(broken_tables):
         build_index(broken_tables.root / "nowhere", VERSION)
     broken_tables.table("sample_data").unlink()
     with pytest.raises(DataError, match="missing tables.*sample_data"):
+        build(broken_tables)
+
+
+def test_tables_without_records_are_named(broken_tables):
+    broken_tables.table("sample_data").write_text("[]")
+    with pytest.raises(DataError, match="sample_data.json: no sensor file at all; unpack the release again"):
         build(broken_tables)
 
 

@@ -190,8 +190,21 @@ def test_nothing_needs_labels(broken_lidar):
     batches = list(data.train_dataloader())
     assert len(batches) == 3 and all(batch.boxes is None and len(batch.past) == 2 for batch in batches)
     assert all(len(batch.rays) and batch.streams is None for batch in batches)
-    (first, *_), again = list(data.val_dataloader()), next(iter(data.stream()))
-    assert len(first.past) == 2 and torch.equal(first.rays.points, again.rays.points)
+    (first, *_), ((*past, again),) = list(data.val_dataloader()), data.validation_clips(1, 1)
+    assert len(first.past) == len(past) == 2 and torch.equal(first.rays.points, again.rays.points)
+
+
+def test_frames_with_a_past_of_the_timeline_are_no_stream_and_streams_have_no_rays(lidar_set, tmp_path):
+    def data(temporal=True, **changes):
+        settings, place = config(timeline=FIVE_HERTZ, **changes), (lidar_set.root, ("lidar",), None, 0, tmp_path)
+        return DetectionDataModule(settings, *place, temporal=temporal)
+
+    with pytest.raises(ConfigError, match="data.past_frames=2: must be 0 to follow scenes.*src.evaluate"):
+        data(past_frames=2).stream()  # before the first frame is read
+    assert len(list(data().stream())) == 3
+    with pytest.raises(ConfigError, match="data.past_frames=0: must be at least 1 with data.num_future_frames=2"):
+        data(num_future_frames=2)
+    data(temporal=False, num_future_frames=2)
 
 
 def test_draws_follow_seed_and_epoch_alone(lidar_set, tmp_path):

@@ -1,5 +1,8 @@
 """Matter of a scene worked out by hand: a box that drives and turns over a sloped ground."""
 
+import io
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -67,4 +70,36 @@ def test_it_is_stored_whole_or_said_to_be_missing(tmp_path):
         TrueGeometry.read(tmp_path, "scene-b")
     (tmp_path / TRUTH_FOLDER / "scene-a.npz").write_bytes(first[:-100])
     with pytest.raises(DataError, match="write the world again"):
+        TrueGeometry.read(tmp_path, "scene-a")
+
+
+def array_alone(whole):
+    file = io.BytesIO()
+    np.save(file, np.zeros(3))
+    return file.getvalue()
+
+
+def packed_otherwise(whole):
+    """By a method that is none."""
+    method = whole.index(b"PK\x01\x02") + 10
+    return whole[:method] + b"\x63" + whole[method + 1 :]
+
+
+def data_overwritten(whole):
+    """In the middle of the largest array."""
+    with zipfile.ZipFile(io.BytesIO(whole)) as archive:
+        largest = max(archive.infolist(), key=lambda member: member.compress_size)
+    at = largest.header_offset + 60 + len(largest.filename)
+    return whole[:at] + b"\xff" * 40 + whole[at + 40 :]
+
+
+@pytest.mark.parametrize("damage", [array_alone, packed_otherwise, data_overwritten, lambda whole: b""])
+def test_a_damaged_file_is_named(tmp_path, damage):
+    (tmp_path / TRUTH_FOLDER).mkdir()
+    geometry().write(tmp_path, "scene-a")
+    path = tmp_path / TRUTH_FOLDER / "scene-a.npz"
+    whole = path.read_bytes()
+    path.write_bytes(damage(whole))
+    assert path.read_bytes() != whole
+    with pytest.raises(DataError, match="scene-a.npz: not the true geometry of a scene.*write the world again"):
         TrueGeometry.read(tmp_path, "scene-a")

@@ -4,12 +4,16 @@ import json
 import shutil
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from src.config import compose_config
 from src.errors import DataError
 from src.gallery.__main__ import Gallery, short_names
+from src.metrics.submission import to_global
+from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
 from tests.evaluation_sets import set_of
 from tests.running import call
@@ -55,6 +59,22 @@ def test_scenes_without_a_condition_are_refused_by_the_name_of_their_split(tmp_p
     with pytest.raises(DataError, match="data.split=val: none of its scenes has a tag of weather, daytime, lighting"):
         Gallery(config, datamodule, {"run": DetectionTable.empty()}).write(tmp_path, "python -m src.gallery")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_frame_that_lost_its_boxes_counts_returns_in_the_annotations():
+    config, _ = compose_config(["scale=debug"])
+    none, one = torch.zeros(1, 2), torch.zeros(1, dtype=torch.int64)
+    box = Boxes3D(torch.tensor([[10.0, 0.0, 1.0]]), torch.full((1, 3), 2.0), torch.zeros(1), none, one, one)
+    truth = to_global(box, np.eye(4), 1)
+    frames = [
+        SimpleNamespace(
+            tokens=[token], boxes=[], lidar_points=None, lidar_batch=None, radar_batch=torch.zeros(2, dtype=torch.int64),
+            radar_points=torch.tensor([[10.0, 0.0, 1.0], [30.0, 0.0, 1.0]]),
+        )
+        for token in ("a", "b")
+    ]  # fmt: skip
+    datamodule = SimpleNamespace(evaluation_set=lambda: set_of(truth, ("a", "b")), stream=lambda: frames)
+    assert Gallery(config, datamodule, {})._count_returns().tolist() == [1]
 
 
 def test_panels_are_named_by_what_tells_the_runs_apart():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from src.benchmark.suite_metric import random_problem
+from src.metrics import bootstrap
 from src.metrics.bootstrap import interval, score_draws, with_intervals
 from src.metrics.detection import score_detections
 from src.metrics.diagnostics import FrameDiagnosis
@@ -128,11 +129,20 @@ def test_draws_agree_with_the_plain_metric(problem):
 def test_long_lists_are_drawn_in_parts(problem, monkeypatch):
     parts = score_detections(*problem).parts
     draws = np.random.default_rng(1).multinomial(5, [0.2] * 5, 7)
-    whole = score_draws(parts, draws).overall
-    monkeypatch.setattr("src.metrics.bootstrap.CHUNK", 100)
-    cut = score_draws(parts, draws).overall
-    np.testing.assert_array_equal(whole.ap, cut.ap)
-    np.testing.assert_array_equal(whole.errors, cut.errors)
+    whole, curves, held = score_draws(parts, draws), bootstrap._curves, []
+
+    def counted(part, listed, scenes, draws, num_gt):
+        held.append((len(draws), len(draws) * len(listed.matched)))
+        return curves(part, listed, scenes, draws, num_gt)
+
+    monkeypatch.setattr(bootstrap, "CHUNK", 100)
+    monkeypatch.setattr(bootstrap, "_curves", counted)
+    cut = score_draws(parts, draws)
+    assert all(draws == 1 or numbers <= 100 for draws, numbers in held) and max(numbers for _, numbers in held) > 100
+    np.testing.assert_array_equal(whole.overall.ap, cut.overall.ap)
+    np.testing.assert_array_equal(whole.overall.errors, cut.overall.errors)
+    for name, values in whole.measures.items():
+        np.testing.assert_array_equal(values, cut.measures[name])
 
 
 def test_metrics_with_intervals_are_plain_json(problem):
@@ -148,6 +158,7 @@ def test_metrics_with_intervals_are_plain_json(problem):
     for name in ("mAP", "NDS", "mAVE"):
         low, high = bounds[name]
         assert low < content[name] < high
+    assert content["tags"] and not any(name.startswith("tags.") for name in bounds)
     measured = {name for name in content["measures"] if not name.endswith("_boxes")}
     assert {name for name in bounds if name.startswith("measures.")} == {f"measures.{name}" for name in measured}
     assert bounds["ranges.0-25.classes.traffic_cone.AP"] == [0.0, 0.0] and "classes.barrier.AVE" not in bounds

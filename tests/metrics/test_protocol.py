@@ -73,6 +73,7 @@ def test_a_report_holds_both_scores_and_the_intervals_of_both():
         ({"thresholds_m": [6.0, 4.0]}, "positive and ascending, but got"),
         ({"error_threshold_m": 2.0}, "error_threshold_m=2.0 must be one of thresholds_m"),
         ({"ranges_m": [[0.0, 50.0], [60.0, 70.0]]}, "without gaps"),
+        ({"ranges_m": []}, "ranges_m must be one or more"),
         ({"region_m": [[0.0, 1.0]]}, "region_m must be"),
     ],
 )
