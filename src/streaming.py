@@ -182,7 +182,7 @@ class StreamingDetector:
 
     @torch.inference_mode()
     def run(self, frame: FrameBatch) -> tuple[Boxes3D, Any]:
-        """As `step`, never in fixed shapes, with the model's own output beside the boxes, both on the device."""
+        """Boxes of the next frame and the model's own output, both on the device; never in fixed shapes. See `step`."""
         self._begin(frame)
         with computing(self.precision, self.device):
             output, self.memory = self.model(frame.to(self.device), self.memory)

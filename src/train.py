@@ -176,7 +176,7 @@ def run(
 
 
 def durations(fit_s: float, all_s: float, earlier_s: float | None) -> dict[str, float]:
-    """Of run.json: `fit` and `all` with what the run took before it was resumed, `earlier`, where that is known."""
+    """Durations for run.json: `fit` and `all` include `earlier`, the time before a resumption, where that is known."""
     if earlier_s is None:
         return {"fit": round(fit_s, 1), "all": round(all_s, 1)}
     return {"fit": round(earlier_s + fit_s, 1), "all": round(earlier_s + all_s, 1), "earlier": round(earlier_s, 1)}

@@ -64,6 +64,20 @@ def test_all_phases_of_lrs4fusion_give_the_network_the_same_speeds(scale):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("phase", ["lrs_occupancy", "lrs_forecast", "lrs_detection"])
+def test_lrs4fusion_at_full_size_reads_one_cloud_a_frame_and_never_turns_its_region_round(phase):
+    """roi_lrs reaches farther ahead than back. At mini it does not, and boxes are learned from flips of x as well."""
+    config, mini = (
+        compose_config(["model=lrs4fusion", f"phase={phase}", f"scale={scale}", "data.root=x"])[0]
+        for scale in ("paper", "mini")
+    )
+    assert config.model.roi.upper_m[0] > -config.model.roi.lower_m[0] and config.data.num_lidar_sweeps == 1
+    boxes = phase == "lrs_detection"
+    assert config.data.augmentation.bev.flip_probability == ([0.0, 0.5] if boxes else 0.0)
+    assert mini.data.augmentation.bev.flip_probability == (0.5 if boxes else 0.0) and mini.data.num_lidar_sweeps == 1
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("phase", ["phase1", "phase2"])
 @pytest.mark.parametrize("name", ["dense_bev", "crt_fusion", "hydra", "sparc", "petr", "far3d", "rctrans"])

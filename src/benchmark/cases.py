@@ -48,7 +48,7 @@ class Case:
     learns_boxes: bool  # of a phase without, a world model is asked what is where rays end
 
     def computing(self) -> AbstractContextManager[None]:
-        """As training and prediction compute."""
+        """Context in which the model computes as in training and prediction: in its precision, on its device."""
         return computing(self.precision, self.device)
 
     def infer(self) -> tuple[Any, Any]:
@@ -67,7 +67,7 @@ class Case:
             return self.model(self.batch, self.memory)
 
     def losses(self) -> Tensor:
-        """Their sum, for gradients."""
+        """Sum of the weighted loss terms, for gradients."""
         with self.computing():
             output, _ = self.model(self.batch, self.memory)
             return self.model.loss(output, self.batch).terms["total"]

@@ -25,7 +25,7 @@ Shape = tuple[int, ...]
 
 
 def _product(left: Shape, right: Shape, *_: Any, **__: Any) -> int:
-    """Grouped too: rows of `left` meet one matrix each; two matrices are cut along the inner axis."""
+    """FLOPs of a product; of a grouped one too: each row meets one matrix, or both are cut along the inner axis."""
     return 2 * math.prod(left) * right[-1]
 
 

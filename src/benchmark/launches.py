@@ -42,7 +42,7 @@ def count(case: Case, model: torch.nn.Module, run: Callable[[], Any]) -> tuple[T
 def count_parts(
     tally: Tally, model: torch.nn.Module, parts: dict[str, tuple[str, ...]], run: Callable[[], Any]
 ) -> dict[str, Counter[str]]:
-    """The tally of each part of a run, which that of all is afterwards."""
+    """Count each part of a run; `tally` afterwards holds the count of the whole run."""
     found: dict[str, Counter[str]] = {}
 
     def counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -62,5 +62,5 @@ def count_parts(
 
 
 def on_simulated_device(model: torch.nn.Module) -> torch.nn.Module:
-    """A copy of the model there."""
+    """A copy of the model on the simulated device."""
     return copy.deepcopy(model).to(DEVICE)

@@ -108,7 +108,7 @@ def dense_splat(gaussians: Gaussians, occupied: Tensor, grid: BEVGrid, support_s
 
 
 def all_centres(grid: BEVGrid, device: torch.device) -> Tensor:  # [rows * cols, 2] m
-    """Of every cell, row by row."""
+    """Centre of every cell, row by row."""
     cells = torch.cartesian_prod(torch.arange(grid.rows, device=device), torch.arange(grid.cols, device=device))
     return grid.centre_of(cells)
 
@@ -159,7 +159,7 @@ def measure_operations(
 def compare(
     operation: str, naive_name: str, candidates: Candidates, device: torch.device, times: float = 1.0
 ) -> list[dict[str, Any]]:
-    """Both in turns, forward and, where the result has a gradient, with backward; `times` the naive one counts."""
+    """Time both in turns, forward and, where the result has a gradient, with backward; `times` the naive one counts."""
     trained = any(x.requires_grad for x in tensors_in(candidates[0]()))
     rows = []
     for mode, wrap in MODES.items():

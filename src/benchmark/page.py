@@ -24,7 +24,7 @@ GPU_NOTE = "Measured without a GPU. On one: the command above with `trainer.acce
 
 
 def gpu_notes(device: torch.device) -> list[str]:
-    """Of a suite that measures on GPUs too: how, where this was not one."""
+    """For a suite that also measures on GPUs: the note how to, if this device is none; else no note."""
     return [] if device.type == "cuda" else [GPU_NOTE]
 
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from src.models.detector import Detector
 
 Paths = Mapping[str, tuple[str, ...]]
-"""By part the methods that it is, as in `module.method`, or functions, as in `package.module:function`."""
+"""Methods of each part, as `module.method`, or its functions, as `package.module:function`."""
 
 PART_METHODS = ("forward", "recall", "aggregate", "remember", "decode")
 """What a detector calls its parts by; a memory is not a function of one input, so it has no forward."""
@@ -75,7 +75,7 @@ class Call:
     result: Any
 
     def prepare(self) -> Callable[[], Any]:
-        """The same call on fresh inputs: the values and caches of the first time, no history of gradients."""
+        """The recorded call on fresh inputs: with the values and caches of the first time and no gradient history."""
         arguments, named = fresh((self.arguments, self.named))
         return lambda: self.function(*arguments, **named)
 

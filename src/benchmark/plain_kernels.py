@@ -33,11 +33,11 @@ from src.ops.splat import log1mexp
 from src.ops.view_samples import view_attention_weights_reference, view_sampling_locations_reference
 
 KERNELS: dict[str, Callable[..., None] | None] = {"_span_product": None, "_gaussian_gradient": None}
-"""By name; None where a kernel's values are a gradient."""
+"""Plain torch form of each Triton kernel by its name; None where a kernel's values are a gradient."""
 
 
 def _of_kernel(function: Callable[..., None]) -> Callable[..., None]:
-    """Put it into KERNELS."""
+    """Register a function in KERNELS as the plain form of the kernel of its name."""
     KERNELS[function.__name__] = function
     return function
 

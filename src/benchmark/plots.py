@@ -27,14 +27,14 @@ SOAK_PANELS = {
     "Python objects": ("objects",),
     "handles": ("descriptors", "threads"),
 }
-"""By row of the picture the columns of the curves that it shows."""
+"""Columns of the curves that each row of the picture shows, by the row's title."""
 
 Rows = list[dict[str, Any]]
 Line = list[tuple[float, float]]  # places and values
 
 
 def held_mib(point: dict[str, Any]) -> float:
-    """What a frame adds and what is remembered."""
+    """Memory that a frame adds, and that of what is remembered."""
     return (point["added MiB"] or 0.0) + point["remembered MiB"]
 
 

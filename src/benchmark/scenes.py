@@ -78,7 +78,7 @@ def _ring_points(road: Highway, ring: tuple[float, float], seed: int) -> Tensor:
 
 
 def _vehicle_points(road: Highway, ring: tuple[float, float], share: float, draw: torch.Generator) -> Tensor:
-    """On the hulls of vehicles that stand as densely far away as near, with ever fewer returns."""
+    """Points on the hulls of vehicles that stand as densely far away as near, with ever fewer returns."""
     vehicles = round(road.num_vehicles * (ring[1] - ring[0]) / 150.0)
     if not vehicles:
         return torch.zeros(0, 3)
@@ -103,7 +103,7 @@ def _vehicles(count: int, ring: tuple[float, float], draw: torch.Generator) -> t
 
 
 def _vegetation_points(number: int, ring: tuple[float, float], draw: torch.Generator) -> Tensor:
-    """In clumps beside the road."""
+    """Points of vegetation in clumps beside the road."""
     clumps = max(1, round((ring[1] - ring[0]) / 2.5))
     low, high = VEGETATION_M
     away = low + (high - low) * torch.rand(clumps, generator=draw)
@@ -117,7 +117,7 @@ def _placed(x: Tensor, y: Tensor, speed: Tensor | float) -> Tensor:  # [n, 3] x,
 
 
 def _measured(points: Tensor, draw: torch.Generator) -> Tensor:  # [n, 3] x, y, vx -> [n, 7]
-    """With the noise of a radar, whose error across grows with the distance."""
+    """Radar points with the sensor's noise; the error across the line of sight grows with the distance."""
     number = len(points)
     distance = points[:, :2].norm(dim=1, keepdim=True)
     across = torch.stack([-points[:, 1], points[:, 0]], 1) / distance.clamp(min=1.0)
@@ -219,7 +219,7 @@ def lidar_frame(road: Highway) -> FrameBatch:
 
 
 def _lidar_rays(road: Highway, draw: torch.Generator) -> RayBundle:
-    """As many as return, of evenly spread directions, from the ground, rails, walls behind them and vehicles."""
+    """`road.lidar_returns` rays of evenly drawn directions, ending on ground, rails, walls behind them or vehicles."""
     x, y, long = _vehicles(road.num_vehicles, (0.0, road.reach_m), draw)
     sizes = torch.where(long, torch.tensor((*TRUCK_M, TRUCK_HEIGHT_M)), torch.tensor((*CAR_M, CAR_HEIGHT_M)))
     centres = torch.stack([x, y, 0.5 * sizes[:, 2]], 1)

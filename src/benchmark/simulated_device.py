@@ -118,7 +118,7 @@ def host_values(value: Any) -> Any:
 
 
 def count_launch(name: str, *tensors: Any) -> None:
-    """A kernel that torch does not dispatch."""
+    """Count the launch of a kernel that torch does not dispatch."""
     if _active:
         tally = _active[-1]
         tally.launches[(name, caller())] += 1

@@ -1,4 +1,4 @@
-"""The same sparse networks from layers of the public library spconv, where it is installed: an optional baseline."""
+"""Our sparse networks built from layers of the public library spconv: a baseline where it is installed."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class SpconvMap:
 
     @property
     def features(self) -> Tensor:  # [M, C]
-        """In spconv's order."""
+        """Features of the sites, in spconv's order."""
         return self.tensor.features
 
     def with_features(self, features: Tensor) -> SpconvMap:
@@ -109,7 +109,7 @@ def spconv_encoder(spconv: ModuleType, encoder: RadarEncoder) -> RadarEncoder:
 
 
 def largest_difference(ours: list[Tensor], theirs: list[Tensor]) -> float:
-    """Of any two numbers, relative to the largest of ours."""
+    """Largest difference over pairs of tensors, each relative to the largest number in ours."""
     return max(
         float((a.detach() - b.detach()).abs().max() / a.detach().abs().max().clamp(min=1e-30))
         for a, b in zip(ours, theirs, strict=True)

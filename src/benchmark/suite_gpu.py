@@ -33,7 +33,7 @@ BATCH_SIZES = (1, 4, 8)
 LAUNCHED, GRAPH = "launched one by one", "one CUDA graph"
 
 Step = Callable[[FrameBatch], Boxes3D | None]
-"""A frame on the host to its boxes there."""
+"""Takes a frame on the host to its boxes, on the host too."""
 
 
 def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def following(draws: list[FrameBatch]) -> Iterator[FrameBatch]:
 
 
 def frame_seconds(step: Step, frames: Iterator[FrameBatch], now: Callable[[], float]) -> list[float]:
-    """Of frames after some to warm up, as many as fit into the budget."""
+    """Seconds of each frame after WARM_UP others: of FRAMES, or fewer once BUDGET_S is spent."""
     for _ in range(WARM_UP):
         step(next(frames))
     seconds: list[float] = []

@@ -57,7 +57,7 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def count_in_fixed_shapes(case: Case) -> tuple[Tally, dict[str, Counter[str]]] | None:
-    """The same of a frame that lies on the host, to its boxes there; None for a model that has no such form."""
+    """Counts of a frame in fixed shapes, from the host to its boxes there; None for a model without that form."""
     if case.prepared.fixed_form() is None:
         return None
     frame = made_batch(1, SMALL_ROAD, SMALL_IMAGE_PX)

@@ -86,7 +86,7 @@ def spconv_note(device: torch.device) -> str:
 
 
 def bev_sites(points: Tensor, grid: BEVGrid, number: int) -> Sites:
-    """As many cells as asked for, where the points are and around them."""
+    """Sites of at most `number` of the cells that hold points or lie beside one that does, evenly picked."""
     cells = grid.cell_of(points[grid.contains(points[:, :2]), :2])
     near = torch.cat([cells + torch.tensor(shift, device=cells.device) for shift in ((0, 0), (0, 1), (1, 0), (1, 1))])
     limit = torch.tensor(grid.cells, device=cells.device)

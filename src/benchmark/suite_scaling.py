@@ -56,7 +56,7 @@ RANGES_M = {
 
 
 LIDAR_RANGES_M = (100.0, 200.0, 300.0)
-"""Of a model that reads LiDAR, whose one scene ends at the first."""
+"""Ranges for a model that reads LiDAR; its one scene ends at the first."""
 FIXED_SCENE, CALIBRATED_SCENE = "range, fixed scene", "range, calibrated scene"
 PRUNED = (0, 50)  # % of voxels, in the calibrated scene
 
@@ -124,18 +124,18 @@ def notes_of(config: Config, device: torch.device) -> list[str]:
 
 
 def reads_lidar(config: Config) -> bool:
-    """Such a model is measured alone: others read other sensors, and traffic, radar and Gaussians are not its own."""
+    """Whether the model reads LiDAR. It is then measured alone: traffic, radar and Gaussians do not concern it."""
     return "lidar" in config.model.sensors
 
 
 def points_of(batch: FrameBatch) -> dict[str, Tensor]:
-    """By sensor, of those that a made frame has."""
+    """Points of each sensor that a made frame has, by the sensor's name."""
     found = {"radar": batch.radar_points, "lidar": batch.lidar_points}
     return {name: points for name, points in found.items() if points is not None}
 
 
 def configs_of(config: Config) -> dict[str, Config]:
-    """By name the configured model with fresh weights, then the dense baseline at the same scale, grid and backbone.
+    """The configured model with fresh weights, then the dense baseline at its scale, grid and backbone; by name.
 
     All methods side by side, at one range: `suite=latency`, and sweeps/comparison.yaml.
     """

@@ -37,7 +37,7 @@ from src.training.fit import build_loggers, build_trainer, fit
 from src.training.run_folder import Resume, RunFolder
 
 FRAMES = {"paper": 2000, "mini": 960, "debug": 120}
-"""Of each of the three passes; training rounds up to whole epochs. On two cores mini takes a quarter of an hour."""
+"""Frames of each of the three passes, by scale; training rounds up to whole epochs. On two cores mini takes 15 min."""
 POINTS = 32  # of each curve
 SETTLED = 0.25  # growth counts from here on: by then buffers have their size and the allocator its pages
 UNLEARNED = 1e-12  # learning rate: every step is made, but the work of a frame does not follow what is learned
@@ -141,7 +141,7 @@ def joined(
 def made_rigid(
     matrix: Tensor,  # [1, 4, 4] rigid but for rounding
 ) -> Tensor:  # [1, 4, 4]
-    """With the nearest rotation: what one joint adds in rounding, the next would multiply, without end."""
+    """The transform with the nearest rotation, so that rounding errors do not grow from joint to joint."""
     left, _, right = torch.linalg.svd(matrix[:, :3, :3])
     rigid = matrix.clone()
     rigid[:, :3, :3] = left @ right

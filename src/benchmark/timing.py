@@ -58,7 +58,7 @@ def ratio_columns(seconds: Mapping[str, list[float]], times: Mapping[str, float]
 
 
 def seconds_of(function: Callable[[], Any], now: Callable[[], float]) -> float:
-    """Of one call, whose result is freed: its memory would else be fresh instead of reused in the next."""
+    """Seconds of one call. Its result is freed, so that the next call reuses the memory as it would in a loop."""
     begin = now()
     result = function()
     elapsed = now() - begin

@@ -24,7 +24,7 @@ STALLED_S = 120.0
 """A runner whose runs write neither log nor metrics for this long has probably been killed."""
 SCALES = ("paper", "mini", "debug")
 STATES = ("running", "done", "failed", "pruned", "stopped", "waiting")
-"""Of a run that several sweeps share, the first of these that one of them says holds."""
+"""States of a run. Where sweeps that share a run differ, the first of these that one of them states holds."""
 Stamp = tuple[int, int]  # of a file: time of change and size
 
 
@@ -40,7 +40,7 @@ class Sweep:
 
     @property
     def key(self) -> str:
-        """Its part of an address: the record's file name."""
+        """The sweep's part of an address: the record's file name."""
         return self.record.stem
 
     @property
@@ -88,17 +88,17 @@ class Run:
 
     @property
     def phase(self) -> str:
-        """As in `phase1`."""
+        """Name of the phase, such as `phase1`."""
         return self.parts[1]
 
     @property
     def scale(self) -> str:
-        """As in `mini`."""
+        """Name of the scale, such as `mini`."""
         return self.result.scale if self.result else self.parts[2]
 
     @property
     def seed(self) -> int | None:
-        """None where only the folder is known."""
+        """Seed of the run; None where only its folder is known."""
         return self.result.seed if self.result else self.planned.seed if self.planned else None
 
     @property
@@ -132,12 +132,12 @@ class Board:
 
     @property
     def scales(self) -> list[str]:
-        """Those there is something of, the largest first."""
+        """Scales that have a sweep or a run, the largest first."""
         found = {sweep.record.scale for sweep in self.sweeps} | {run.scale for run in self.runs.values()}
         return sorted(found, key=lambda scale: (SCALES.index(scale) if scale in SCALES else len(SCALES), scale))
 
     def sweep(self, key: str) -> Sweep | None:
-        """By its part of an address."""
+        """The sweep with this `key`; None where there is none."""
         return next((sweep for sweep in self.sweeps if sweep.key == key), None)
 
     def baseline_of(self, run: Run) -> tuple[Run, str] | None:

@@ -80,7 +80,7 @@ def knob_figures(sweep: Sweep, plot: PlotConfig, results: dict[str, list[RunResu
 
 
 def search_figures(sweep: Sweep) -> list[Markup]:
-    """Of a search: its objective trial by trial with the best so far, and against every number it chose."""
+    """A search's objective by trial with the best so far, and over every number it chose; none for other sweeps."""
     search = sweep.record.sweep
     tried = [run for run in sweep.record.runs.values() if run.value is not None] if search.is_search else []
     if not tried:

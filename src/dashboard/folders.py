@@ -180,7 +180,7 @@ class RunFolders:
 
 
 def _is_run(name: str) -> bool:
-    """Run ids are `<model>-<phase>-<scale>-<8 hex>`; a restart renames the old folder to `<run_id>.before-<time>`."""
+    """Whether a name is a run id, `<model>-<phase>-<scale>-<8 hex>`; a restart sets `<run_id>.before-<time>` aside."""
     return bool(_NAME.fullmatch(name)) and name.count("-") >= 3 and ".before-" not in name
 
 

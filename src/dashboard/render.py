@@ -121,7 +121,7 @@ class Renderer:
         return Page(id=page_id, title=title, content=content)
 
     def _without_broken(self, board: Board, draw: Callable[[Board], Markup]) -> Markup:
-        """What shows the whole board; without sweeps and runs that make it fail, which are among the broken."""
+        """Draw the whole board; the sweeps and runs that make this fail are left out and listed as broken."""
         try:
             return draw(board)
         except Exception:
@@ -276,12 +276,12 @@ def metric_rows(run: Run, other: Run | None) -> dict[str, list[MetricRow]]:
 
 
 def number(value: float | None, metric: Metric) -> str:
-    """In the table's unit; nothing for None."""
+    """A metric's value in the table's unit; empty for None."""
     return "" if value is None else f"{value * metric.scale:.{metric.digits}f}"
 
 
 def signed(value: float, digits: int) -> str:
-    """With its sign, a true minus."""
+    """A number with its sign, a typographic minus where it is negative."""
     return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
 
 

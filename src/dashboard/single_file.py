@@ -19,7 +19,7 @@ PICTURE_BUDGET = 8_000_000
 PICTURE_WIDTH = 960
 JPEG_QUALITY = 72
 MAX_PIXELS = 64_000_000
-"""Of a picture that is decoded; those of runs have a hundredth of it."""
+"""Largest picture that is decoded; those of runs have a hundredth of it."""
 
 
 def export_dashboard(reports: Path, outputs: Path | None, path: Path) -> None:
@@ -71,7 +71,7 @@ def _data_address(picture: Picture) -> str | None:
 
 
 def _address(kind: str, name: str = "") -> str:
-    """Anchors within the file."""
+    """Address of a page, an anchor within the file."""
     if kind == "overview":
         return f"#{name or 'overview'}"
     return f"#{kind}-{name}"

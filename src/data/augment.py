@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -33,12 +34,16 @@ class BevAugmentationConfig:
 
     scale: list[float]  # [low, high]
     rotation_rad: float  # +-
-    flip_probability: float  # of x and of y, each
+    flip_probability: Any  # of x and of y, each: a number, or [of x, of y]
 
     def __post_init__(self) -> None:
         _check_range("data.augmentation.bev.scale", self.scale, above=0.0)
         _check_not_negative("data.augmentation.bev.rotation_rad", self.rotation_rad)
-        _check_probability("data.augmentation.bev.flip_probability", self.flip_probability)
+        name, given = "data.augmentation.bev.flip_probability", self.flip_probability
+        if isinstance(given, list) and len(given) != 2:
+            raise ConfigError(f"{name}={given}: must be one number, or [of x, of y]")
+        for value in given if isinstance(given, list) else [given]:
+            _check_probability(name, value)
 
 
 @dataclass(kw_only=True)
@@ -95,6 +100,6 @@ def _check_not_negative(name: str, value: float) -> None:
         raise ConfigError(f"{name}={value}: must be a finite number of at least 0")
 
 
-def _check_probability(name: str, value: float) -> None:
-    if not 0 <= value <= 1:
+def _check_probability(name: str, value: Any) -> None:
+    if not (isinstance(value, int | float) and 0 <= value <= 1):
         raise ConfigError(f"{name}={value}: must lie in [0, 1]")

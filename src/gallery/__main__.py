@@ -166,7 +166,7 @@ class Gallery:
         return path
 
     def _scene(self, sample: int) -> list[int]:
-        """All samples of its scene, in order."""
+        """All samples of a sample's scene, in the order of time."""
         of_scene = np.flatnonzero(self.evaluation_set.scenes == self.evaluation_set.scenes[sample])
         return of_scene[np.argsort(self.evaluation_set.times_s[of_scene], kind="stable")].tolist()
 

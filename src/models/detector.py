@@ -89,7 +89,7 @@ class FixedForm(Protocol):
         """What `forward` of the detector remembers of one stream, None for nothing, in fixed shapes."""
 
     def unpack_memory(self, memory: tuple[Tensor, ...]) -> Any:
-        """And back, for `forward`. Waits for a GPU."""
+        """The inverse of `pack_memory`, for `forward`. Waits for a GPU."""
 
 
 class Objective(NamedTuple):
@@ -114,7 +114,7 @@ class Detector(nn.Module, ABC):
     latency_parts: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """The parts of Table 15 by the methods that each is; one within another counts for both."""
     memory_type: ClassVar[type[FrameMemory] | None] = None
-    """Of what `forward` remembers; None for a model of single frames."""
+    """Class of the memory that `forward` takes and returns; None for a model of single frames."""
     trains_last_transition: bool = False
     """Whether a step learns also through the encoding of the frame before, where frames bring their past along."""
     prepared_for: str | None = None

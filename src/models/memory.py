@@ -56,8 +56,9 @@ class RememberedFrame(TensorFields):
         return self._motion(batch, max_age_s, newest=False)[1]
 
     def stacked_motion(self, batch: FrameBatch, max_age_s: float) -> tuple[Tensor, Motion]:
-        """Of T frames in one, newest first, each tensor with a leading axis [T]: which of them `FrameMemory.before`
-        keeps for a stream [T, B] bool, and the `motion` of those.
+        """`motion` of T frames stacked in one, newest first, each tensor with a leading axis [T].
+
+        Returns which of them `FrameMemory.before` keeps for a stream [T, B] bool, and the motion of those.
         """
         return self._motion(batch, max_age_s, newest=True)
 
@@ -128,7 +129,7 @@ class StoredRows(TensorFields):
         xy: Tensor,  # [n, 2] m, places of the rows
         own: Tensor,  # [n, 2] m/s, their velocities as remembered
     ) -> Tensor:  # [n, 2] m/s
-        """The other velocities of all rows, asked for stream by stream."""
+        """What `velocities` gives for all rows, asked stream by stream."""
         streams = [self.rows == stream for stream in range(batch_size)]
         return torch.cat([velocities(stream, xy[at], own[at]) for stream, at in enumerate(streams)])  # the rows ascend
 
@@ -220,7 +221,7 @@ def _plain(value: Any) -> Any:
 
 
 def _restored(kind: type, entry: dict[str, Any]) -> Any:
-    """Of a dataclass, whose fields may be others of `TensorFields`, or None."""
+    """An instance of the dataclass `kind` from its `_plain` form; fields may be other `TensorFields`, or None."""
     hints = get_type_hints(kind)
     values = dict(entry)
     for name, value in entry.items():

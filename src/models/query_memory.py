@@ -50,7 +50,7 @@ class QueryFrame(RememberedFrame):
     valid: Tensor  # [B, K] bool
 
     def with_velocities(self, velocities: Callable[[int, Tensor, Tensor], Tensor]) -> QueryFrame:
-        """Of all queries."""
+        """The frame with other velocities of its queries."""
         streams = enumerate(zip(self.centers[..., :2], self.velocities, strict=True))
         return replace(self, velocities=torch.stack([velocities(row, xy, own) for row, (xy, own) in streams]))
 
@@ -74,12 +74,12 @@ class RecalledQueries:
 
     @property
     def newest(self) -> Queries:
-        """Those of the last frame."""
+        """Queries of the last frame."""
         return self.queries.map(lambda value: value[:, : self.per_frame])
 
     @property
     def older(self) -> Queries:
-        """Those of the frames before."""
+        """Queries of the frames before the last."""
         return self.queries.map(lambda value: value[:, self.per_frame :])
 
     def diagnostics(self) -> dict[str, Tensor | float]:
@@ -91,7 +91,7 @@ class RecalledQueries:
         }
 
     def evidence(self) -> Evidence:
-        """Where those of the first stream are now."""
+        """Where the remembered queries of the first stream are now."""
         known = self.queries.valid[0]
         queries = self.queries.map(lambda value: value[0][known])
         return Evidence(

@@ -12,17 +12,20 @@ from src.structures.ray_bundle import RayBundle
 
 
 class WorldModel(ABC):
-    """A detector may be one as well; `output` is that of its `forward`, and everything is in the batch's frames."""
+    """A model of what is where and when; a detector may be one as well.
+
+    `output` is that of its `forward`, and everything is in the batch's frames.
+    """
 
     @property
     @abstractmethod
     def bounds(self) -> Bounds:
-        """What it knows of."""
+        """The region that the model knows of."""
 
     @property
     @abstractmethod
     def forecasts(self) -> bool:
-        """Whether it has learnt to say `forecast`."""
+        """Whether the model has learnt to `forecast`."""
 
     @abstractmethod
     def look_up(
@@ -39,4 +42,4 @@ class WorldModel(ABC):
         output: Any,
         rays: RayBundle,  # whose origins, directions, times and samples are read
     ) -> Tensor:  # [R] m
-        """Ranges that a LiDAR will measure. Raises ConfigError for a model that has not learnt to say."""
+        """Ranges that a LiDAR will measure. Raises ConfigError for a model that has not learnt this."""

@@ -13,9 +13,9 @@ from src.ops.site_index import SiteIndex, Windows
 from src.ops.sites import Sites
 
 OFFSETS = ((0, 0, 0), (-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
-"""Of a voxel (z, y, x) and its face neighbours."""
+"""Offsets (z, y, x) of a voxel itself and of its six face neighbours."""
 SOFTENING = 0.1
-"""Of a voxel's edge along x, added to distances: at a centre the weight of that voxel stays finite."""
+"""Share of a voxel's edge along x that is added to distances, so that a voxel's weight is finite at its centre."""
 
 
 def ball_query(

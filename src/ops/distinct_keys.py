@@ -37,7 +37,7 @@ def grouped_keys(
     end: int,
     size: int,
 ) -> tuple[Tensor, Tensor, Groups]:  # [size], [n] int64
-    """The same, the place of each given key among them, of padding that of some `end`, and equal keys as groups.
+    """`distinct_keys`; the place of each given key among them, of padding that of some `end`; and equal keys as groups.
 
     Where more keys are distinct than there are places, those behind the last have the last.
     """

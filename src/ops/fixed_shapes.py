@@ -69,7 +69,7 @@ class FixedShapes:
         end: int,
         most: int,
     ) -> tuple[Tensor, Tensor, Groups]:  # [min(n, most + 1)], [n] int64
-        """The same, which of them each of the keys is, padding for padding, and which keys each of them is."""
+        """As `distinct`; the place of each key among the distinct ones, padding for padding; equal keys as groups."""
         found, rows, groups = grouped_keys(keys, end, min(most + 1, len(keys)))
         self.expect(found[-1:], end)
         return found, rows, groups
@@ -87,12 +87,12 @@ class FixedShapes:
         value: Tensor,  # [1] int64
         least: int,
     ) -> None:
-        """What is below that has overflowed."""
+        """Note the last key of a set: a value below `least` means that the set has overflowed."""
         self._lasts.append(value)
         self._ends.append(least)
 
     def overflow(self) -> Tensor:  # [] bool
-        """Whether any set so far did."""
+        """Whether any set so far has overflowed."""
         lasts = torch.cat(self._lasts)
         return (lasts < constant(tuple(self._ends), torch.int64, lasts.device)).any()
 
@@ -101,7 +101,7 @@ _shapes: ContextVar[FixedShapes | None] = ContextVar("fixed shapes", default=Non
 
 
 def fixed_shapes() -> FixedShapes | None:
-    """Those of the context; None where sets are as large as they are."""
+    """The fixed shapes of the context; None outside of one, where sets have the size of their content."""
     return _shapes.get()
 
 

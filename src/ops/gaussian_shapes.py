@@ -13,7 +13,7 @@ from src.ops.backend import implementation
 LEARNABLE_REACH = 6.0
 """Learnable points lie within half of this many standard deviations (method 5.2)."""
 LEAST_LENGTH = 1e-6
-"""Of a raw rotation; a shorter one is only scaled."""
+"""Least length by which a raw rotation is divided; a shorter one stays shorter than 1."""
 
 
 @dataclass(frozen=True)

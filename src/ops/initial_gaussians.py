@@ -17,7 +17,7 @@ NUM_RAW = 7
 
 
 class Attributes(NamedTuple):
-    """Of B x G Gaussians, by the names and with the meaning that they have in `structures.gaussians.GaussianSet`."""
+    """Attributes of B x G Gaussians, with the names and meaning of `structures.gaussians.GaussianSet`."""
 
     means: Tensor  # [B, G, 2] m
     scales: Tensor  # [B, G, 2] m
@@ -50,7 +50,7 @@ class Slots:
 
     @property
     def channels(self) -> int:
-        """C."""
+        """Number of feature channels C."""
         return self.values.shape[1] - NUM_RAW
 
 

@@ -80,7 +80,7 @@ class KernelMap:
 
 
 class TableMap(KernelMap):
-    """The same as a table, which a GPU makes without the host waiting; pairs are taken from it where one asks.
+    """A kernel map held as a table, which a GPU makes without the host waiting; pairs are taken from it when asked for.
 
     Behaves as a `KernelMap` in all else.
     """

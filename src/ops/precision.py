@@ -12,7 +12,7 @@ from src.ops.products import bfloat16_products
 
 
 class Precision(StrEnum):
-    """As the command line writes them; the first two are Lightning's names."""
+    """Precisions as the command line writes them; the first two are Lightning's names."""
 
     FULL = "32-true"
     MIXED = "bf16-mixed"  # autocast

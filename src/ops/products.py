@@ -15,12 +15,12 @@ from torch import Tensor
 ROW_STEP = 256
 """oneDNN makes a program for every shape it meets, about half a millisecond each: rows come in multiples of this."""
 MOST_ROWS = 4096
-"""Of one product: its operands and result fit the cache."""
+"""Most rows of one product, whose operands and result then fit the cache."""
 LEAST_ROWS, LEAST_WIDTHS = 512, (32, 64)
 """Products of fewer rows, or of matrices narrower than this on their narrow and on their wide side, stay as they are:
 the operands' rounding costs what bfloat16 saves."""
 LEAST_CHANNELS = 16
-"""Of a convolution, on either side, likewise; it has the rows of its output."""
+"""Convolutions with fewer input or output channels likewise stay as they are; their rows are those of the output."""
 
 _bfloat16: ContextVar[bool] = ContextVar("bfloat16 products", default=False)
 

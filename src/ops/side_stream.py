@@ -28,5 +28,5 @@ def on_side_stream(device: torch.device) -> Iterator[Callable[[], None]]:
 
 @cache
 def _branch_of(device: torch.device, stream: int) -> torch.cuda.Stream:
-    """One for each stream: it waits for that stream alone before it takes memory of earlier frames again."""
+    """The side stream of one stream: it waits for that one alone before it takes memory of earlier frames again."""
     return torch.cuda.Stream(device)

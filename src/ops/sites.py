@@ -74,7 +74,7 @@ class Sites:
         keys: Tensor,  # [n] int64, any order, repeats allowed; in fixed shapes those from `end` on are padding
         shape: tuple[int, ...],
     ) -> tuple[Sites, Tensor]:
-        """The same of keys, which are trusted."""
+        """As `unique`, from the keys of the cells, which are trusted."""
         sites, fixed = cls(tuple(shape), keys), fixed_shapes()
         if fixed is None:
             sites.keys, rows = torch.unique(keys, return_inverse=True)

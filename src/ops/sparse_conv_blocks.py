@@ -16,7 +16,7 @@ from src.ops.scratch import scratch
 from src.ops.sparse_conv_function import SparseConvFunction
 
 GATHERED_BYTES = 5 << 19
-"""Of the rows gathered for one product. Measured: a quarter or four times as much costs 5 to 15 %."""
+"""Bytes of the rows gathered for one product. Measured: a quarter or four times as much costs 5 to 15 %."""
 LEAST_FILL = 0.47
 """Share of a block's pairs that exist, below which blocks of fewer offsets are better, whose rows are fewer."""
 SMALL = 1 << 15

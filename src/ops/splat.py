@@ -24,7 +24,7 @@ CAP = 1e-4
 LEAST_SURPRISE = -math.log1p(-CAP)
 
 Choice = tuple[Tensor, float, int, int]
-"""Of the occupied cells: the support, threshold, max_cells and the cells of a sample."""
+"""What the choice of occupied cells needs: the support, threshold, max_cells and the number of cells of a sample."""
 
 
 @dataclass(frozen=True, eq=False)

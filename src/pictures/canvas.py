@@ -20,11 +20,11 @@ SHEET_PX = 1600
 """Width of every picture."""
 MARGIN_PX = 10
 GAP_PX = 12
-"""Between panels."""
+"""Gap between panels."""
 HALF_PX = (SHEET_PX - 2 * MARGIN_PX - GAP_PX) / 2
 """Width of one of two panels side by side."""
 CAPTION_PX = 34
-"""Above a panel."""
+"""Height of the caption above a panel."""
 
 
 class Canvas:

@@ -15,7 +15,7 @@ from src.pictures.contents import INK, MUTED
 from src.pictures.learning_curves import LINE_COLOURS, style_axes
 
 HEIGHT_PX = 360
-"""Of one panel with its title and labels."""
+"""Height of one panel with its title and labels."""
 
 KEYS_PER_ROW = 4
 

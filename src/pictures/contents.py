@@ -49,15 +49,15 @@ SOURCE_COLOURS: dict[str, str] = {
 INK = "#1B1F24"
 MUTED = "#8A929B"
 AXIS_INK = "#495057"
-"""Of the numbers and names of axes."""
+"""Colour of the numbers and names of axes."""
 FRAME_COLOUR, GRID_COLOUR, PANEL_COLOUR = "#C9CED4", "#E3E6EA", "#FBFBFC"
-"""Of the frame of a plot, of the lines within it, and of the ground of a view."""
+"""Colours of a plot's frame, of the lines within it, and of the ground of a view."""
 OCCUPANCY_COLOUR = (0.62, 0.47, 0.82)
 BOX_EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 FRONT_FACE = (0, 1, 5, 4)
 MATCH_DISTANCE_M = 2.0
 OUTLINE_CORNERS = 24
-"""Of the polygon that an ellipse is drawn as."""
+"""Corners of the polygon that an ellipse is drawn as."""
 
 
 class Rows:
@@ -196,7 +196,7 @@ class PictureGrid:
 
     @property
     def window(self) -> Window:
-        """The whole of it."""
+        """Plot window of the whole grid."""
         x_max_m, y_max_m = self.x_min_m + self.cols * self.cell_m, self.y_min_m + self.rows * self.cell_m
         return (-y_max_m, -self.y_min_m), (self.x_min_m, x_max_m)
 

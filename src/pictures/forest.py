@@ -15,11 +15,11 @@ from src.pictures.learning_curves import quiet_axes
 
 ROW_PX = 26
 HEAD_PX = 34
-"""Of a group's title."""
+"""Height of a group's title."""
 TOP_PX = 84
-"""Title and keys."""
+"""Height of the picture's title and keys."""
 FOOT_PX = 60
-"""Ticks and what the axis shows."""
+"""Height of the ticks and of the axis label."""
 PLOT_PX = (680, 590)
 """Where the axis begins, and its width; labels stand before it, numbers after."""
 COLOURS = {"shows": "#0072B2", "does not show": "#D55E00", "undecided": "#6C757D", "not run": "#ADB5BD"}

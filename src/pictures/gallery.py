@@ -17,12 +17,12 @@ from src.pictures.legends import class_keys, radar_keys, reading_keys
 
 HEADER_PX = 84
 TITLE_PX = 46
-"""Above a cell: its title, and the names of its panels."""
+"""Height above a cell, for its title and the names of its panels."""
 FRAME_WINDOW: Window = ((-60.0, 60.0), (-30.0, 130.0))
 AROUND_M = 20.0
-"""To each side of a box that is looked at."""
+"""Ground shown to each side of a box that is looked at."""
 CROP_SIZES = 2.5
-"""Half of a crop of an image, in heights of the box."""
+"""Half the size of an image crop, in heights of the box."""
 MIN_CROP_PX = 24.0
 NAME_PX, ADVANCE = 13, 0.6
 """Height of a panel's name where it fits, and the mean width of a letter in heights."""
@@ -118,7 +118,7 @@ def _fitting(text: str, width: float) -> float:  # px
 
 
 def _cell_width(frames: Sequence[GalleryFrame]) -> float:
-    """One alone takes the whole sheet."""
+    """Width of a cell in pixels; a single one takes the whole sheet."""
     return HALF_PX if len(frames) > 1 else SHEET_PX - 2 * MARGIN_PX
 
 

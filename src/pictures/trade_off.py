@@ -31,7 +31,7 @@ class TradeOff:
 
 
 def efficient(points: Sequence[TradeOff]) -> list[TradeOff]:
-    """Those that no other one beats by a higher score at no higher cost, the cheapest first."""
+    """The Pareto front: points that no other beats by a higher score at no higher cost, the cheapest first."""
     kept: list[TradeOff] = []
     for point in sorted(points, key=lambda point: (point.cost, -point.score)):
         if not kept or point.score > kept[-1].score:

@@ -25,9 +25,9 @@ WINDOW: Window = ((-40.0, 40.0), (-40.0, 120.0))
 """(right, up) m that every panel from above shows: where a highway changes within three seconds."""
 HEADER_PX, CAPTION_PX = 44, 44
 PANEL_PX = (386, 772)
-"""Of a slice: four side by side."""
+"""Width and height of a slice; four stand side by side."""
 VIEW_PX = (300, 600)
-"""Of a forecast from above; the rest of its row is seen from the sensors."""
+"""Width and height of a forecast from above; the rest of its row is seen from the sensors."""
 BEARING_DEG, ELEVATION_DEG = 100.0, (-24.0, 12.0)
 """What the view from the sensors shows to each side, and below and above the horizon."""
 RANGES_M = (3.0, 200.0)

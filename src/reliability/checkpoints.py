@@ -217,7 +217,7 @@ def _refusal(target: Path, error: Exception) -> str:
 
 
 def open_checkpoint(path: Path) -> OpenCheckpoint:
-    """As `read_checkpoint`, with the path."""
+    """Read a checkpoint by `read_checkpoint`, which raises for a broken one, and keep its path beside it."""
     return OpenCheckpoint(path, read_checkpoint(path))
 
 

@@ -20,7 +20,7 @@ M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
 LARGEST = 2**31 - 1
 RESERVED_BYTES = 3 << 29
-"""Of address space, for huge pages; memory is taken as it is written."""
+"""Address space that is reserved for huge pages; memory is taken only as it is written."""
 MADV_HUGEPAGE = 14
 
 

@@ -87,7 +87,7 @@ class StepGuard:
             torch._foreach_copy_(now, before)
 
     def accept(self) -> None:
-        """The step's numbers are finite."""
+        """Note that the step's numbers are finite."""
         self.in_a_row = 0
 
     def refuse(self, module: GuardedModule, batch: FrameBatch, terms: dict[str, Tensor]) -> None:

@@ -13,7 +13,7 @@ import zipfile
 from typing import Any, BinaryIO
 
 MAX_LEVELS = 30
-"""Of a stored configuration, whose readers follow each level with a call of their own; a run's has six."""
+"""Deepest nesting of a stored configuration: readers follow each level with a call of their own. A run's has six."""
 ALLOWED = re.compile(
     r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|"
     r"torch ([A-Za-z0-9]+Storage|Size|(float|bfloat|u?int|bool|complex)[0-9a-z_]*)"

@@ -89,7 +89,7 @@ def main(overrides: list[str]) -> None:
 
 @contextmanager
 def noted_in(faults: list[str]) -> Iterator[None]:
-    """What is broken costs no other page."""
+    """Note a ConfigError or DataError raised within in `faults`, so that what is broken costs no other page."""
     try:
         yield
     except (ConfigError, DataError) as error:
@@ -115,7 +115,10 @@ def page_name(phase: str, task: str) -> str:
 
 
 def defaults_of(scale: str, phase: str, model: str) -> dict[str, Any]:
-    """Of a run without settings; where the default model lacks the phase, of `model`, whose name stays a setting."""
+    """Configuration of a run without settings: of the default model or, where that lacks the phase, of `model`.
+
+    The latter lacks the model's name, which thus counts as a setting.
+    """
     choices = [f"scale={scale}", f"phase={phase}"]
     try:
         return compose_config(choices, reads_data=False)[1]

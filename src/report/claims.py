@@ -43,7 +43,7 @@ class ComparisonConfig:
 
     @property
     def text(self) -> str:
-        """The two rows."""
+        """Both rows in words."""
         return f"{self.row} over {self.over}"
 
 
@@ -109,7 +109,7 @@ class Finding:
 
     @property
     def verdict(self) -> Verdict:
-        """Never from fewer pairs than the first look's."""
+        """What the runs decide; nothing with fewer pairs than at the first look, `NOT_RUN` without any."""
         if self.found is None:
             return Verdict.NOT_RUN
         if self.found.favours(self.measure.metric):
@@ -218,7 +218,7 @@ def judge(claim: Claim, records: Mapping[str, SweepRecord], results: Mapping[str
 
 
 def verdict_of(findings: list[Finding]) -> Verdict:
-    """Of a claim: it shows where all measures that decide show it, and does not where one does not."""
+    """Verdict on a claim: `NOT` if one measure that decides says so, else the one they agree on, else `UNDECIDED`."""
     verdicts = [finding.verdict for finding in findings if finding.measure.decides]
     if Verdict.NOT in verdicts:
         return Verdict.NOT

@@ -114,7 +114,7 @@ def _table(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
 
 
 def _of_claims(found: list[Finding]) -> list[Finding]:
-    """Those that are claimed or shown beside, without what asks why."""
+    """Findings on what is claimed or shown beside it, without those of comparisons that ask why."""
     return [one for one in found if one.measure.comparison.asks is None]
 
 

@@ -17,7 +17,7 @@ LATEX = str.maketrans(
 
 
 def escape_markdown(text: str) -> str:
-    """For a cell of a Markdown table or a paragraph."""
+    """Escape a text for a cell of a Markdown table or a paragraph."""
     return text.translate(MARKDOWN)
 
 
@@ -33,5 +33,5 @@ def markdown_table(head: Sequence[str], rows: Iterable[Iterable[str]], rule: str
 
 
 def escape_latex(text: str) -> str:
-    """For LaTeX's text mode."""
+    """Escape a text for LaTeX's text mode."""
     return text.translate(LATEX)

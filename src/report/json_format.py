@@ -17,16 +17,16 @@ Format = TypeVar("Format")
 Item = TypeVar("Item")
 
 MAX_BYTES = 16_000_000
-"""Of a file; the largest real ones have a tenth. Every wrong value in a dict costs a kilobyte while it is refused."""
+"""Largest file that is read; real ones have a tenth. A wrong value in a dict costs a kilobyte while it is refused."""
 MAX_FAULTS = 1000
 """More wrong values than these are only counted."""
 
 CLOSED = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 """Exactly these keys, of exactly these types: 1 and "1" are not the same, NaN is no number."""
 OPEN = ConfigDict(strict=True, allow_inf_nan=False)
-"""The same, but other keys are left out."""
+"""As CLOSED, but other keys are left out."""
 ANY_KEYS = OPEN | {"extra": "allow"}
-"""The same, but other keys are kept as they are."""
+"""As CLOSED, but other keys are kept as they are."""
 
 Many = Annotated[list[Item], Field(fail_fast=True)]
 """A list that is refused at its first wrong item, as it may hold millions of them."""

@@ -14,7 +14,7 @@ DETECTION = "detection"
 """The task (`phase.task`) whose numbers have names here."""
 RANGES = ("0-25", "25-50", "50-100", "100-150")
 LONG_RANGES = ("0-50", "50-150", "150-250")
-"""Of the second score of detections (`phase.long_range`)."""
+"""Distance ranges (m) of the second score of detections (`phase.long_range`)."""
 SPEEDS = ("0-0.5", "0.5-10", "10-25", "25+")
 PARTS = ("image_encoder", "radar_encoder", "kggi", "ocsf", "dptf", "detection_head", "total")
 """What a frame's latency is made of (Table 15)."""
@@ -167,7 +167,7 @@ def _forecast_metrics_by_time() -> Iterator[Metric]:
 
 METRICS = _named(_detection_metrics())
 FORECASTS = _named(_forecast_metrics())
-"""Of WORLD_TASKS, those of a world model."""
+"""Metrics of WORLD_TASKS, the tasks of a world model."""
 FORECASTS_BY_TIME = _named(_forecast_metrics_by_time())
 """Further numbers of forecasting, of one time each; pages leave them to its picture."""
 WORLD_TASKS = ("occupancy", "forecasting")

@@ -75,7 +75,7 @@ NAMES_OF_COMPARISON = {
         "model.dptf.gaussian_path.velocity_compensation=false",
     ): "phase 2, no velocity compensation",
 }
-"""By phase and sorted settings, in the order of the page."""
+"""Names of the experiments that a page compares, by phase and sorted settings, in the order of the page."""
 
 DROPOUT = "data.sensor_dropout="
 OF_THE_PHASE = ("model.dptf", "data.sensor_dropout")
@@ -119,7 +119,7 @@ def called_by_changes(results: Iterable[RunResult], defaults: dict[str, dict[str
 
 
 def runs_on_page(results: Iterable[RunResult], phase: str, in_sweeps: Collection[str]) -> list[RunResult]:
-    """Those of `results` that the page of `phase` shows; none when there is none of the phase itself.
+    """Runs of `results` that the page of `phase` shows; none when there is none of the phase itself.
 
     Phase 1, and phase 1 continued, stand on phase 2's page without their ablations. Runs of sweeps (their ids are
     `in_sweeps`) have tables of their own: an experiment of which all runs are such is shown only if it has a name here.
@@ -139,7 +139,7 @@ def runs_on_page(results: Iterable[RunResult], phase: str, in_sweeps: Collection
 
 
 def _as_by_phase(run: RunResult, runs: Mapping[str, RunResult], defaults: dict[str, dict[str, Any]]) -> RunResult:
-    """Started from the id of the very run that its phase starts from, without that setting.
+    """`run` without its `phase.init_from` where that names the very run which its phase starts from anyway.
 
     That run has the same settings, but for what only the phase itself has, as its memory.
     """

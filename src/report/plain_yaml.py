@@ -20,7 +20,7 @@ class _Level:
         self.is_mapping, self.nodes, self.keys = is_mapping, 0, set[str]()
 
     def is_repeated_key(self, node: yaml.NodeEvent) -> bool:
-        """Of its next node."""
+        """Count the next node of this level; True for a key that the mapping already has."""
         self.nodes += 1
         if not (self.is_mapping and self.nodes % 2 and isinstance(node, yaml.ScalarEvent)):
             return False

@@ -79,14 +79,14 @@ Bounds = Annotated[list[Score], Field(min_length=2, max_length=2)]
 
 @with_config(OPEN)
 class Intervals(TypedDict):
-    """How sure scores are, by their paths in metrics.json."""
+    """95 % intervals of scores over scenes, by the scores' paths in metrics.json."""
 
     scenes: Count
     bounds: dict[str, Bounds]
 
 
 class LongRangeScores(RangeScores):
-    """By the second protocol."""
+    """Scores by the second protocol, `phase.long_range`."""
 
     ranges: dict[str, RangeScores]
 

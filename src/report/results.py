@@ -26,9 +26,9 @@ from src.training.identity import OUTSIDE_IDENTITY, canonical, is_of, key_of, wi
 FORMAT = 1
 FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 MAX_POINTS = 200
-"""Of a learning curve."""
+"""Most points of a learning curve."""
 LARGEST_POINT = 1e15
-"""One beyond it is left out of a learning curve."""
+"""Points with a larger number are left out of a learning curve."""
 
 NOT_A_SETTING = ("seed", "scale", "phase")
 """Keys that do not make another experiment within a phase and a scale."""
@@ -36,7 +36,7 @@ LOCAL_PATH = re.compile(r"""["']*(/|~|\$|\.\./|file:|[A-Za-z]:[\\/])""")
 """How a value begins that is a path of one machine."""
 
 KEPT_OF_A_CLASS = ("AP", "AP_normalized", "AVE", "num_gt")
-"""Within a range or a speed class; the run's metrics.json has the rest."""
+"""What a result keeps of a class within a range or a speed class; the run's metrics.json has the rest."""
 
 Point = tuple[int, float]  # step, value
 
@@ -78,9 +78,9 @@ class RunResult(RunRecord):
     phase: str
     config: dict[str, Any]  # tree of config.yaml, without keys outside its identity
     metrics: dict[str, float | None]
-    """By the names of src/report/metric_names.py, as measured: fractions of 1, m/s, ms; None where there is no such
-    ground truth; a name is absent where the run was not scored by it. Also speeds.<class>.<boxes | car.boxes>, how
-    much ground truth there is. Of another task than detection: the numbers that its metrics.json has at the top."""
+    """Numbers by their names in src/report/metric_names.py, as measured: fractions of 1, m/s, ms; None where there is
+    no such ground truth; a name is absent where the run was not scored by it. Also speeds.<class>.<boxes | car.boxes>,
+    how much ground truth there is. Of another task than detection: the numbers that its metrics.json has at the top."""
     curves: dict[str, Many[Annotated[list[Measure], Field(min_length=2, max_length=2)]]]
     """[step, value] by column of metrics.csv: loss/*, val/*."""
     latency: Latency | None
@@ -90,7 +90,7 @@ class RunResult(RunRecord):
 
     @property
     def settings(self) -> tuple[str, ...]:
-        """As `settings_of` its overrides."""
+        """What makes the run another experiment within its phase, see `settings_of`."""
         return settings_of(self.overrides)
 
     @property
@@ -114,7 +114,7 @@ class ResultFile(RunResult):
 
 @dataclass(kw_only=True)
 class OtherResultFile(ResultFile):
-    """The same of another task than detection."""
+    """The result of another task than detection, as its file holds it."""
 
     metrics: OtherScores
 
@@ -203,7 +203,7 @@ def publish_latency(folder: Path, reports: Path, run_id: str) -> Path:
 
 
 def _write_result(path: Path, content: dict[str, Any]) -> Path:
-    """Unless it is there as it would be written."""
+    """Write a result, unless the file already holds just that; returns its path."""
     lines = (f"{json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
     text = "{\n" + ",\n".join(lines) + "\n}\n"  # a line per key: compact, and a change is seen where it is
     if not path.is_file() or path.read_bytes() != text.encode():
@@ -244,8 +244,8 @@ def read_results(reports: Path, scale: str | None = None) -> tuple[dict[str, Run
     return {result.run_id: result for result in results}, broken
 
 
-def sound_results(reports: Path, scale: str, wanted: Collection[str] | None = None) -> dict[str, RunResult]:
-    """As `read_results`; raises DataError naming what could not be read of the `wanted` runs, None: of all."""
+def read_results_or_raise(reports: Path, scale: str, wanted: Collection[str] | None = None) -> dict[str, RunResult]:
+    """Results as `read_results`; raises DataError naming those of `wanted` runs (None: all) that cannot be read."""
     results, broken = read_results(reports, scale)
     faults = [str(error) for path, error in broken.items() if wanted is None or path.stem in wanted]
     if faults:
@@ -254,14 +254,14 @@ def sound_results(reports: Path, scale: str, wanted: Collection[str] | None = No
 
 
 def _numbers(scores: OtherScores, headline: str, path: Path, remedy: str) -> dict[str, float | None]:
-    """What is not nested. Raises DataError for a missing headline number."""
+    """The numbers at the top of metrics.json, not nested ones. Raises DataError for a missing headline number."""
     if not isinstance(scores.get(headline), float):
         raise DataError(f"{path}: {headline}, the headline number of its task, is missing; {remedy}")
     return {name: value for name, value in scores.items() if not isinstance(value, dict)}
 
 
 def _flat_scores(scores: Scores) -> dict[str, float | None]:
-    """See RunResult.metrics."""
+    """Scores of detection, flattened to the names of `RunResult.metrics`."""
     groups = {"": scores, "measures.": scores.get("measures", {})}
     groups |= {f"classes.{name}.": part for name, part in scores["classes"].items()}
     groups |= {f"ranges.{name}.": part for name, part in scores["ranges"].items()}
@@ -288,7 +288,7 @@ def _flat_scores(scores: Scores) -> dict[str, float | None]:
 
 
 def _named(bounds: dict[str, Bounds]) -> dict[str, Bounds]:
-    """By the names of src/report/metric_names.py, those that have one."""
+    """Intervals by the names of src/report/metric_names.py; those without a name there are left out."""
     named = {
         path.replace(".classes.", ".") if path.startswith("speeds.") else path: values
         for path, values in bounds.items()
@@ -338,7 +338,7 @@ def _read_config(path: Path) -> dict[str, Any]:
 
 
 def curves_of(path: Path) -> dict[str, list[Point]]:
-    """As `read_curves`, of a run that has ended; none without the file. Raises DataError naming it."""
+    """Learning curves of a run that has ended (`read_curves`); none without the file. Raises DataError naming it."""
     try:
         return read_curves(path) if path.is_file() else {}
     except (OSError, ValueError, TypeError, csv.Error) as error:
@@ -370,7 +370,7 @@ def read_curves(path: Path, live: bool = False, over: str = "step") -> dict[str,
 
 
 def _thinned(points: list[Point]) -> list[Point]:
-    """At most MAX_POINTS of them, evenly; the first and the last stay."""
+    """At most MAX_POINTS of the points, spread evenly, the first and the last among them."""
     last = len(points) - 1
     if last < MAX_POINTS:
         return points

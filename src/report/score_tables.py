@@ -41,7 +41,7 @@ class Experiment:
         return (self.runs[0].phase, *self.runs[0].settings)
 
     def values(self, column: Metric) -> dict[int, float]:
-        """By seed, as the column states it; empty unless every run has it: means over other seeds do not compare."""
+        """The column's number by seed; empty unless every run has it: means over other seeds do not compare."""
         found = {run.seed: run.metrics.get(column.name) for run in self.runs}
         return {} if None in found.values() else {seed: column.scale * value for seed, value in found.items()}
 
@@ -89,7 +89,7 @@ class Estimate(NamedTuple):
 
 
 def estimate(runs: Sequence[RunResult], column: Metric) -> Estimate | None:
-    """Of the runs that have the number; None of none."""
+    """Mean of a metric over the runs that have it, with its interval over scenes; None if none has it."""
     having = [run for run in runs if run.metrics.get(column.name) is not None]
     if not having:
         return None

@@ -18,10 +18,10 @@ from src.report.metric_names import DETECTION, find_metric
 from src.training.identity import OF_A_CALL, is_of, key_of
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
-"""Of sweeps and tables: they are file names, parts of addresses and names of studies."""
+"""Names of sweeps and tables, which become file names, parts of addresses and names of studies."""
 
 MAX_COLUMNS = 8
-"""Of a table, its heads included."""
+"""Most columns of a table, that of its heads included."""
 
 NOT_OF_VALIDATION = ("cost.", "latency.")
 """How metrics begin that no search can have for an objective: metrics.json has none of them."""
@@ -140,7 +140,7 @@ class SweepConfig:
         self._check_search(where)
 
     def _check_names(self, where: str) -> None:
-        """Of the sweep, its tables and its rows."""
+        """Check the names of the sweep, its tables and its rows. Raises ConfigError."""
         tables = [table.name for table in self.tables]
         for name in (self.name, *tables):
             if not NAME.fullmatch(name):
@@ -174,7 +174,7 @@ class SweepConfig:
                 )
 
     def _check_references(self, where: str) -> None:
-        """Rows that are named as baseline or weights of others."""
+        """Check the rows that are named as baseline or weights of others. Raises ConfigError."""
         own = {row.label: row for row in self.rows}
         for baseline in (self.baseline, *(row.baseline for row in self.rows)):
             if baseline is not None and baseline not in own:
@@ -246,7 +246,7 @@ class SweepConfig:
         return next((row.baseline for row in self.rows if row.label == label and row.baseline), self.baseline)
 
     def at_scale(self, scale: str) -> SweepConfig:
-        """The same question with the overrides of one scale; a row not for it becomes one that only the paper has."""
+        """The sweep with the overrides of one scale; a row that is not for it becomes one that only the paper has."""
 
         def own(part: Any) -> dict[str, Any]:
             return {"overrides": [*part.overrides, *part.scale_overrides.get(scale, [])], "scale_overrides": {}}

@@ -41,7 +41,7 @@ class TableCell:
 
     @property
     def mean(self) -> float | None:
-        """Over seeds; None without any."""
+        """Mean over seeds; None without any."""
         return statistics.mean(self.values.values()) if self.values else None
 
     def compared_with(self, other: TableCell, metric: Metric) -> Comparison | None:
@@ -142,13 +142,13 @@ class SweepTable:
 
     @property
     def corner(self) -> str:
-        """Head of the heads."""
+        """Text of the upper left cell: what the lines are, and what a cell holds."""
         what = "trial" if self.is_search else "metric" if self.transposed else "row"
         return f"{what}: {PAPER}{BETWEEN}here" if any(map(self.has_paper, range(len(self.columns)))) else what
 
     @property
     def heads(self) -> list[Head]:
-        """Over the columns after the corner."""
+        """Heads of the columns after the corner."""
         if self.transposed:
             return [self._row_head(row) for row in self.rows]
         heads = []
@@ -249,7 +249,7 @@ class SweepTable:
 
 
 def rounded(value: float, metric: Metric) -> float:
-    """At the digits that are shown, and never -0.0."""
+    """The value rounded to the digits that are shown, never -0.0."""
     return round(value, metric.digits) + 0.0
 
 

@@ -75,7 +75,7 @@ def describe_starts(compared: Iterable[Iterable[RunResult]]) -> str:
 
 
 def _started_apart(runs: Iterable[RunResult]) -> list[str]:
-    """Those that began from another training of a run than most of these that begin from its weights."""
+    """Ids of runs that began from another training of their source run than most that begin from its weights."""
     runs = {run.run_id: run for run in runs}
     begun: dict[str, dict[str | None, list[str]]] = {}  # runs by the run and the weights that they began from
     for run in runs.values():
@@ -139,20 +139,22 @@ def describe_orderings(
     frame = _frame(result, any(cell.paper is not None for row in rows for cell in row.cells))
     main = [place for place, column in enumerate(columns) if column.name in MAIN]
     groups = [(columns[place].title, [place]) for place in main] or [("Over all metrics", list(range(len(columns))))]
-    judged = {where: _judge(columns, rows, places) for where, places in groups}
-    parts = [_found(where, found) for where, found in judged.items() if found]
+    orderings = {where: _compare_rows(columns, rows, places) for where, places in groups}
+    parts = [_found(where, found) for where, found in orderings.items() if found]
     if not parts:
         alone = "One row is trained here, so there is nothing to compare it with."
         return [frame, "No two of the rows can be compared yet." if len(rows) > 1 else alone]
     text = f"{'' if complete else 'So far: '}{'; '.join(parts)}"
     text += (
-        ": one seed never decides" if all(one.found.low is None for found in judged.values() for one in found) else ""
+        ": one seed never decides"
+        if all(one.found.low is None for found in orderings.values() for one in found)
+        else ""
     )
     return [frame, f"{text}."]
 
 
-class Judged(NamedTuple):
-    """Two rows beside one another."""
+class Ordering(NamedTuple):
+    """Two rows in the order that the paper states, or a row and its baseline, and how they compare here."""
 
     metric: str  # with a colon where there are several, else nothing
     first: str  # label
@@ -163,13 +165,13 @@ class Judged(NamedTuple):
 
     @property
     def words(self) -> str:
-        """The paper's order."""
+        """The order in words, with its metric."""
         return f"{self.metric}{self.first} before {self.second}"
 
 
-def _judge(columns: list[Metric], rows: list[SweepRow], places: list[int]) -> list[Judged]:
-    """Every two rows that the paper tells apart, its better one first; without numbers of it, rows and baselines."""
-    judged = []
+def _compare_rows(columns: list[Metric], rows: list[SweepRow], places: list[int]) -> list[Ordering]:
+    """Compare rows that the paper tells apart, its better one first; without its numbers, rows with their baselines."""
+    orderings = []
     by_label = {row.label: row for row in rows}
     for place in places:
         column = columns[place]
@@ -188,24 +190,26 @@ def _judge(columns: list[Metric], rows: list[SweepRow], places: list[int]) -> li
             found = first.cells[place].compared_with(second.cells[place], column)
             if found is not None:
                 better = found.favours(column) if found.decided else None
-                judged.append(Judged(prefix, first.label, second.label, better, found, bool(stated)))
-    return judged
+                orderings.append(Ordering(prefix, first.label, second.label, better, found, bool(stated)))
+    return orderings
 
 
-def _found(where: str, judged: list[Judged]) -> str:
+def _found(where: str, orderings: list[Ordering]) -> str:
     """How many of the paper's orderings hold, are the other way round, undecided or equal; or which rows are better."""
-    equal = sum(one.found.equal for one in judged)
-    left = sum(one.better is None for one in judged) - equal
-    of_paper = all(one.stated for one in judged)
+    equal = sum(one.found.equal for one in orderings)
+    left = sum(one.better is None for one in orderings) - equal
+    of_paper = all(one.stated for one in orderings)
     one, many = ("ordering of two rows", "orderings of two rows") if of_paper else ("comparison", "comparisons")
-    if equal == len(judged):
+    if equal == len(orderings):
         return f"{where}: {f'the one {one}' if equal == 1 else f'all {equal} {many}'} equal"
-    if left == len(judged):
+    if left == len(orderings):
         return f"{where}: {f'the one {one}' if left == 1 else f'all {left} {many}'} undecided"
-    held = [pair for pair in judged if pair.better]
-    turned = [pair for pair in judged if pair.better is False]
+    held = [pair for pair in orderings if pair.better]
+    turned = [pair for pair in orderings if pair.better is False]
     if of_paper:
-        parts = [f"{len(held)} of {len(judged)} {one if len(judged) == 1 else many} hold{'s' * (len(held) == 1)} here"]
+        parts = [
+            f"{len(held)} of {len(orderings)} {one if len(orderings) == 1 else many} hold{'s' * (len(held) == 1)} here"
+        ]
         parts[0] += f" ({_listed([pair.words for pair in held])})" if 0 < len(held) <= NAMED else ""
         parts += [f"{len(turned)} the other way round ({_listed([pair.words for pair in turned])})"] if turned else []
     else:
@@ -215,7 +219,7 @@ def _found(where: str, judged: list[Judged]) -> str:
                 alike.setdefault((pair.metric, f"{word} than {pair.second}"), []).append(pair.first)
         parts = [f"{metric}{' and '.join(rows)} {words}" for (metric, words), rows in alike.items()]
     parts += [f"{count} {word}" for word, count in {UNDECIDED: left, EQUAL: equal}.items() if count]
-    return f"{where}: {('; ' if any(pair.metric for pair in judged) else ', ').join(parts)}"
+    return f"{where}: {('; ' if any(pair.metric for pair in orderings) else ', ').join(parts)}"
 
 
 def describe_search(

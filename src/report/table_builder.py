@@ -23,7 +23,7 @@ from src.report.sweep_text import (
 from src.training.identity import RUN_ID, key_of, without_keys, without_legacy_defaults
 
 EARLIER = "; the number is of an earlier training"
-"""Of a run that has a result, though it is to be trained, trains, or failed."""
+"""Added to the note on a run that has a result, though it is to be trained, trains, or failed."""
 
 
 def sweep_tables(record: SweepRecord, results: dict[str, RunResult]) -> list[SweepTable]:
@@ -152,7 +152,7 @@ def _table(record: SweepRecord, results: dict[str, RunResult], config: TableConf
 def _rows(
     record: SweepRecord, results: dict[str, RunResult], config: TableConfig, columns: list[Metric]
 ) -> list[SweepRow]:
-    """In the order of the table's file, the paper's own last."""
+    """Rows in the order of the sweep's file, the paper's own last; or those that the table names, in its order."""
     sweep = record.sweep
     rows: dict[str, SweepRow] = {}
     for row in sweep.rows:

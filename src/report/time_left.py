@@ -29,7 +29,7 @@ def progress_line(name: str, runs: Collection[RunState], workers: int, now: floa
 
 
 def seconds_left(runs: Collection[RunState], workers: int, now: float, unchosen: int = 0) -> float | None:
-    """Mean duration of each phase's finished runs, over the runs that are not; None when none has finished yet."""
+    """Seconds until all runs end, at the mean duration of their phase's finished ones; None before any has finished."""
     of_phase: dict[str, list[float]] = defaultdict(list)
     for run in runs:
         if run.state == "done" and run.started is not None and run.ended is not None:

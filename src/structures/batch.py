@@ -115,7 +115,7 @@ class FrameBatch(TensorFields):
         return len(self.tokens)
 
     def to(self, device: torch.device | str, non_blocking: bool = False) -> FrameBatch:
-        """The same on another device, but for the annotations: targets begin on the host, which waits for no sizes."""
+        """The batch on another device, but for the annotations: targets begin on the host, which waits for no sizes."""
         past = tuple(frame.to(device, non_blocking) for frame in self.past)
         moved = super(FrameBatch, replace(self, boxes=None, past=())).to(device, non_blocking)
         return replace(moved, boxes=self.boxes, past=past)

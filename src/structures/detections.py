@@ -9,7 +9,7 @@ import numpy as np
 Array = np.ndarray
 
 WIDTHS = {"centers": 3, "sizes": 3, "rotations": 4, "velocities": 2}
-"""Of the columns that are matrices."""
+"""Widths of the columns that are matrices."""
 INTEGER_COLUMNS = ("samples", "labels", "attributes", "num_points")
 
 

@@ -41,7 +41,7 @@ class HeadCells:
 
 @dataclass
 class Evidence:
-    """Of a batch, the warped memory of its first sample; None for what a model does not have."""
+    """What a model shows of a batch beside boxes, of its memory the first sample's; None for what a model lacks."""
 
     gaussians: GaussianSet | None = None  # refined, history among them
     cells: SplattedCells | None = None

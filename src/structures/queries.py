@@ -31,12 +31,12 @@ class Queries(TensorFields):
 
     @classmethod
     def unknown(cls, features: Tensor, centers: Tensor, valid: Tensor) -> Queries:  # [B, Q, C], [B, Q, 3], [B, Q]
-        """Of no known class, standing."""
+        """Queries of no known class that stand still."""
         logits = centers.new_full((*valid.shape, len(CLASSES)), UNKNOWN_LOGIT)
         return cls(features, centers, torch.zeros_like(centers[..., :2]), logits, valid)
 
     def beside(self, others: Queries) -> Queries:
-        """These, all of group 0, and after them others that have groups."""
+        """These queries, all in group 0, followed by others that have groups."""
         own = replace(self, groups=torch.zeros_like(self.valid, dtype=torch.int64))
         return Queries.concatenate([own, others], dim=1)
 

@@ -34,7 +34,7 @@ class SkippedFiles:
         self.files.clear()
 
     def state(self) -> dict[str, dict[str, int]]:
-        """As plain values."""
+        """The counts as plain values, for a checkpoint."""
         return {"channels": dict(self.channels), "files": dict(self.files)}
 
     def restore(self, states: Iterable[dict[str, Any]]) -> None:

@@ -16,14 +16,14 @@ from src.reliability.command import run_command
 from src.reliability.passwords import hide_in_process_list
 from src.report.claims import Claim, Finding, judge, load_claims, verdict_of
 from src.report.comparisons import LOOKS
-from src.report.results import RunResult, sound_results
+from src.report.results import RunResult, read_results_or_raise
 from src.report.sweep_record import RunState, SweepRecord, read_record, record_path
 from src.report.table_builder import check_results
 from src.report.time_left import progress_line
 from src.sweep.compose import SweepCommand, compose_sweep
 from src.sweep.plan import Plan, changes_of, make_plan, without_published
 from src.sweep.run_plan import SweepCall, resume_command, run_plan
-from src.sweep.run_status import is_scored
+from src.sweep.run_status import is_finished_with_score
 from src.sweep.sweep_files import load_sweep
 from src.training.identity import key_of
 
@@ -48,7 +48,7 @@ def main(overrides: list[str]) -> None:
     for look in LOOKS:
         plans = study.plans(look, study.results())
         for plan in plans:
-            if not study.options.workers and not study.has_look(plan, look):
+            if not study.options.workers and not study.worth_recording(plan, look):
                 continue
             logger.info("%s", study.progress(plans, look, study.results()))
             command = study.commands[plan.sweep.name]
@@ -74,15 +74,15 @@ class Study:
 
     @property
     def options(self) -> SweepCommand:
-        """The runner's; the same for every sweep."""
+        """Options of the runner, the same for every sweep."""
         return next(iter(self.commands.values()))
 
     def results(self) -> dict[str, RunResult]:
         """What has finished so far, by run id. Raises DataError naming what cannot be read."""
-        return sound_results(self.call.reports, self.scale)
+        return read_results_or_raise(self.call.reports, self.scale)
 
     def findings(self, results: dict[str, RunResult]) -> list[tuple[Claim, list[Finding]]]:
-        """What they say of each claim. Raises DataError for results that no table takes."""
+        """What these results say of each claim. Raises DataError for results that no table takes."""
         records: dict[str, SweepRecord] = {}
         for name, command in self.commands.items():
             changes = changes_of(command.sweep.at_scale(self.scale), self.call.common)
@@ -104,21 +104,27 @@ class Study:
                 continue
             seeds = {row.label: range(look if row.label in rows else first) for row in command.sweep.rows}
             plan = make_plan(command.sweep, self.call.common, seeds, self.call.identify)
-            plans.append(without_published(plan, results, command.workers > 0) if command.published else plan)
+            plans.append(without_published(plan, results, training=command.workers > 0) if command.published else plan)
         return plans
 
-    def has_look(self, plan: Plan, look: int) -> bool:
-        """Whether the runs there are, here or by their results, are worth recording: any at the first look; at a later
-        one, which is taken at all its pairs, all runs of the rows that it adds seeds to."""
+    def worth_recording(self, plan: Plan, look: int) -> bool:
+        """Whether to record a look without training: the first if any run is finished, a later one if all are.
+
+        A later look is taken at all its pairs; of it, runs of the rows that it adds seeds to count. Finished are runs
+        with a score here or with a published result.
+        """
         rows = (runs.values() for runs in plan.rows.values() if len(runs) == look)
-        finished = (run in plan.published or is_scored(self.call.outputs / run) for run in chain.from_iterable(rows))
+        finished = (
+            run in plan.published or is_finished_with_score(self.call.outputs / run)
+            for run in chain.from_iterable(rows)
+        )
         return any(finished) if look == min(LOOKS) else all(finished)
 
     def progress(self, plans: list[Plan], look: int, results: dict[str, RunResult]) -> str:
         """How far a look is, over all its sweeps, and the time left as far as runs finished here tell it."""
         runs = {}
         for spec in (spec for plan in plans for spec in plan.specs.values()):
-            done = is_scored(self.call.outputs / spec.run_id)
+            done = is_finished_with_score(self.call.outputs / spec.run_id)
             took = results[spec.run_id].training_s if done and spec.run_id in results else None
             counts = done or any(spec.run_id in plan.published for plan in plans)
             state = "done" if counts else "waiting"

@@ -8,12 +8,12 @@ from pathlib import Path
 from src.errors import ConfigError
 from src.reliability.command import run_command
 from src.reliability.passwords import hide_in_process_list
-from src.report.results import sound_results
+from src.report.results import read_results_or_raise
 from src.report.sweep_file import DimensionConfig
 from src.sweep.compose import compose_sweep
 from src.sweep.plan import Plan, make_plan, without_published
 from src.sweep.run_plan import SweepCall, resume_command, run_plan
-from src.sweep.run_status import is_scored
+from src.sweep.run_status import is_finished_with_score
 from src.training.identity import key_of
 
 
@@ -30,10 +30,12 @@ def main(overrides: list[str]) -> None:
     call = replace(call, common=[override for override in common if key_of(override) != "seed"])
     plan = make_plan(sweep, call.common, seeds, call.identify)
     if command.published:
-        plan = without_published(plan, sound_results(call.reports, plan.scale, plan.specs), command.workers > 0)
+        plan = without_published(
+            plan, read_results_or_raise(call.reports, plan.scale, plan.specs), training=command.workers > 0
+        )
     elif not command.workers and not sweep.is_search:  # what is finished here is published anew
-        results = sound_results(call.reports, plan.scale, plan.specs)
-        elsewhere = [run for run in results if not is_scored(call.outputs / run)]
+        results = read_results_or_raise(call.reports, plan.scale, plan.specs)
+        elsewhere = [run for run in results if not is_finished_with_score(call.outputs / run)]
         plan = without_published(plan, elsewhere, training=False)
     if command.dry_run:
         print(describe(plan, call.outputs))
@@ -49,7 +51,7 @@ def describe(plan: Plan, outputs: Path) -> str:
         return "\n".join(
             [*lines, f"# a search of {plan.sweep.trials} trials for the best {plan.sweep.objective}:", *space]
         )
-    finished = sum(run_id in plan.published or is_scored(outputs / run_id) for run_id in plan.specs)
+    finished = sum(run_id in plan.published or is_finished_with_score(outputs / run_id) for run_id in plan.specs)
     results = len(plan.rows) * len(plan.seeds)
     lines.append(
         f"# {len(plan.rows)} rows x {len(plan.seeds)} seeds = {results} results of {len(plan.specs)} runs, "
@@ -59,7 +61,7 @@ def describe(plan: Plan, outputs: Path) -> str:
         state = "to train"
         if spec.run_id in plan.published:
             state = "has its result"
-        elif is_scored(outputs / spec.run_id):
+        elif is_finished_with_score(outputs / spec.run_id):
             state = "finished"
         rows = plan.labels(spec.run_id) or [spec.label]
         same = f" ({len(rows)} rows that coincide share it)" if len(rows) > 1 else ""

@@ -128,7 +128,7 @@ def make_plan(
     rows = {row.label: row for row in sweep.rows}
 
     def specs_of(row: RowConfig, seed: int) -> list[RunSpec]:
-        """Its run, preceded by those whose weights it starts from."""
+        """The row's run with a seed, preceded by those whose weights it starts from."""
         overrides = join_overrides(sweep.overrides, row.overrides, common, [f"seed={seed}"])
         sources = specs_of(rows[row.weights], seed) if row.weights is not None else []
         if sources:
@@ -159,7 +159,7 @@ def make_plan(
     return plan
 
 
-def without_published(plan: Plan, results: Collection[str], training: bool = True) -> Plan:
+def without_published(plan: Plan, results: Collection[str], *, training: bool = True) -> Plan:
     """The plan without training what has a result, by its run id, nor weights that only such runs start from.
 
     A run with a result is trained all the same where one without begins from its weights; not where nothing is trained

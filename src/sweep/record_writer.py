@@ -12,7 +12,7 @@ from src.reliability.passwords import masked
 from src.report.results import result_path
 from src.report.sweep_record import RunState, SweepRecord, read_record, record_path, write_record
 from src.sweep.plan import Plan, RunSpec
-from src.sweep.run_status import is_scored
+from src.sweep.run_status import is_finished_with_score
 from src.sweep.sweep_study import SweepStudy, SweepTrial, trials_begun
 from src.training.identity import canonical, is_of
 
@@ -29,7 +29,7 @@ class RecordWriter:
 
     def is_done(self, run_id: str) -> bool:
         """Whether the run is finished and has a score, or counts by its result; a finished run is not checked again."""
-        if run_id not in self._done and is_scored(self.outputs / run_id):
+        if run_id not in self._done and is_finished_with_score(self.outputs / run_id):
             self._done.add(run_id)
         return run_id in self._done or run_id in self.plan.published
 

@@ -22,7 +22,7 @@ from src.config import PHASES, Config, compose_config
 from src.errors import ConfigError, HorizonError, InterruptedRunError
 from src.reliability.passwords import masked
 from src.reliability.processes import die_with_parent
-from src.report.results import publish_result, sound_results
+from src.report.results import publish_result, read_results_or_raise
 from src.report.sweep_file import SweepConfig
 from src.report.sweep_record import SweepRecord, read_records, suffix_of
 from src.report.table_builder import write_sweep_tables
@@ -32,7 +32,7 @@ from src.sweep.latency_runs import measure_latencies
 from src.sweep.launcher import Launcher
 from src.sweep.plan import Plan, RunIdentity, compose_file, join_overrides, split_machine
 from src.sweep.record_writer import RecordWriter
-from src.sweep.run_status import is_scored
+from src.sweep.run_status import is_finished_with_score
 from src.sweep.runner import Runner
 from src.sweep.search import Search
 from src.sweep.sweep_study import FORMAT, SweepStudy, default_storage
@@ -50,7 +50,7 @@ class Identifier:
         self._composed: dict[tuple[str, ...], tuple[Config, dict[str, Any]]] = {}
 
     def compose(self, overrides: list[str]) -> tuple[Config, dict[str, Any]]:
-        """As `compose_config`."""
+        """Compose as `compose_config`, once for command lines that differ in the seed alone."""
         plain = [override for override in overrides if not re.fullmatch(r"seed=\d+", override)]
         if tuple(plain) not in self._composed:
             self._composed[tuple(plain)] = compose_config(plain)
@@ -101,7 +101,7 @@ class SweepCall:
 
     @classmethod
     def of(cls, sweep: SweepConfig, common: list[str], again: str) -> tuple[Self, Config]:
-        """It, and the configuration that `sweep`, one of them, has in common for its rows.
+        """The call, and the configuration that all rows of `sweep`, one of its sweeps, have in common.
 
         Raises ConfigError naming the sweep's file for what it says wrongly.
         """
@@ -144,7 +144,7 @@ def run_plan(plan: Plan, command: SweepCommand, call: SweepCall) -> None:
     missed: list[str] = []
     if plan.sweep.latency and (command.workers or command.latency):
         missed = measure_latencies(record, outputs, reports, runner, command.latency)
-    problems = [*(missed if command.latency else []), *runner.publish_done(strictly=True)]
+    problems = [*(missed if command.latency else []), *runner.publish_and_list_faults(strictly=True)]
     write_and_show_tables(record, call, problems)
 
 
@@ -167,7 +167,7 @@ def check_data_of_finished(plan: Plan, identify: Identifier, outputs: Path) -> N
         for spec in plan.specs.values()
         if any(key_of(override) == "data.root" for override in spec.machine)
         and spec.run_id not in plan.published
-        and is_scored(outputs / spec.run_id)
+        and is_finished_with_score(outputs / spec.run_id)
     ]
     if not finished:
         return
@@ -196,7 +196,7 @@ def write_and_show_tables(record: SweepRecord, call: SweepCall, problems: list[s
             problems.append(f"  {run.label}, seed {run.seed} ({run.run_id}): {run.reason}; log: {log}")
         problems.append(f"the same command retries them:\n    {call.again}")
     try:
-        paths = write_sweep_tables(call.reports, record, sound_results(call.reports, record.scale, record.runs))
+        paths = write_sweep_tables(call.reports, record, read_results_or_raise(call.reports, record.scale, record.runs))
     except HorizonError as error:
         if not problems:
             raise

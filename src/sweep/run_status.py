@@ -11,11 +11,11 @@ from typing import Any
 from src.report.results import is_finished, read_curves
 
 LARGEST = 1e9
-"""Of a score: a number beyond it, or one that is not finite, is damage."""
+"""Largest size of a score: a number beyond it, or one that is not finite, is damage."""
 
 
-def is_scored(folder: Path) -> bool:
-    """Whether the run is finished and has a score."""
+def is_finished_with_score(folder: Path) -> bool:
+    """Whether the run is finished and its headline number can be read."""
     return is_finished(folder) and read_score(folder, read_headline(folder)) is not None
 
 

@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
 POLL_S = 1.0
-"""Of a worker that has nothing to do."""
+"""How long a worker without work waits before it looks again."""
 PROGRESS_EVERY_S = 60.0
 RECORD_EVERY_S = 20.0
 DATABASE_TIMEOUT_S = 900.0
@@ -68,7 +68,7 @@ class Runner:
             with self.study.lock():
                 self.study.release_dead()
                 self._first_own = len(self.study.trials())
-            self.publish_done()
+            self.publish_and_list_faults()
             self._show(self.writer.write())
             workers = [threading.Thread(target=self._work, args=(index,)) for index in range(self.launcher.workers)]
             for worker in workers:
@@ -88,10 +88,10 @@ class Runner:
                         self._show(record)
             if self._worker_errors:
                 raise self._worker_errors[0]
-            self._with_retries(self.publish_done)
+            self._with_retries(self.publish_and_list_faults)
             return self._with_retries(self.writer.write)
 
-    def publish_done(self, strictly: bool = False) -> list[str]:
+    def publish_and_list_faults(self, strictly: bool = False) -> list[str]:
         """Write the results of finished runs, whoever trained them, to where tables find them.
 
         Runs whose files are broken are logged and returned, in a line each; so is a disk that does not take a result,

@@ -14,7 +14,7 @@ from src.structures.ray_bundle import RayBundle
 from src.structures.tensor_fields import TensorFields
 
 BALANCE_M = (50.0, 150.0)
-"""Between the shares of `ray_balance`."""
+"""Ranges that bound the three shares of `ray_balance`."""
 
 
 class FreePlaces(Enum):

@@ -50,7 +50,7 @@ def upload_boxes(
 def box_samples(
     boxes: list[Boxes3D],
 ) -> Tensor:  # [K] int64, the sample of each box of all samples
-    """Whose the boxes of `join_boxes` are."""
+    """The sample of each box of `join_boxes`."""
     owners = [row for row, sample in enumerate(boxes) for _ in range(len(sample))]
     return on_device(owners, torch.int64, boxes[0].centers.device)
 

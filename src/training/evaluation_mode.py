@@ -10,7 +10,7 @@ from torch import nn
 
 @contextmanager
 def evaluation_mode(model: nn.Module) -> Iterator[None]:
-    """Afterwards every part is in the mode it was in: `train()` would also wake norms that are frozen."""
+    """Context in evaluation mode; afterwards each part has its old mode: `train()` would also wake frozen norms."""
     training = [part for part in model.modules() if part.training]
     model.eval()
     try:

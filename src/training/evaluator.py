@@ -98,7 +98,7 @@ class DetectionEvaluator(Evaluator):
 
     @classmethod
     def of(cls, datamodule: DetectionDataModule, long_range: Protocol | None = None) -> DetectionEvaluator:
-        """All annotations of the validation split."""
+        """The evaluator over all annotations of the validation split."""
         return cls(datamodule.evaluation_set(), long_range)
 
     def reset(self) -> None:
@@ -130,14 +130,14 @@ class DetectionEvaluator(Evaluator):
         return self.scores.overall.headline()
 
     def as_dict(self) -> dict[str, Any]:
-        """See `score_report`; asked once: a validation in the middle of a training does without."""
+        """See `score_report`; made when first asked for: a validation in the middle of a training does without."""
         if self.content is None:
             self.content = score_report(self.evaluation_set, self.detections, self.scores, self.long_range)
         return self.content
 
     @staticmethod
     def describe(metrics: Mapping[str, Any]) -> str:
-        """By distance, class and speed."""
+        """Scores by distance, class and speed, as text."""
         return format_scores(metrics)
 
     def draw(self, folder: Path, title: str) -> None:

@@ -40,13 +40,13 @@ class Bfloat16Products(PrecisionPlugin):
 
     @contextmanager
     def forward_context(self) -> Iterator[None]:
-        """Around forward and backward."""
+        """Context around forward and backward."""
         with bfloat16_products():
             yield
 
 
 def precision_plugins(precision: str) -> list[PrecisionPlugin]:
-    """For a precision that is none of Lightning's."""
+    """Lightning plugins for a precision that Lightning does not have; none for its own."""
     return [Bfloat16Products()] if precision == Precision.PRODUCTS else []
 
 
@@ -149,10 +149,10 @@ def fit(
 
 
 class MovingAverage(EMAWeightAveraging):
-    """Of the weights after every step that was taken: a skipped one leaves nothing behind."""
+    """Moving average of the weights over the steps that were taken; a skipped one leaves nothing behind."""
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: TrainingModule, *rest: Any) -> None:
-        """After a step."""
+        """Take the weights into the average, unless the step was skipped."""
         if not pl_module.guard.in_a_row:
             super().on_train_batch_end(trainer, pl_module, *rest)
 

@@ -16,12 +16,12 @@ from src.structures.ray_bundle import RayBundle
 Array = np.ndarray
 
 Window = tuple[tuple[float, float], tuple[float, float]]
-"""From and to along x and along y, m."""
+"""(low, high) along x and along y, m."""
 HEIGHT_M = 1.0
 SLACK_M = 0.5
-"""A ray tells of a place that it passes so far above or below."""
+"""A ray tells of places that it passes within this height above or below."""
 DEPTH_M = 1.0
-"""It tells of matter so far behind the face that it met."""
+"""A ray also tells of places up to this far behind its return."""
 
 
 @dataclass
@@ -58,18 +58,18 @@ class GroundSlice:
         return cls(found, in_global[inside], cell_m, sample, time_s)
 
     def queries(self, time_s: float, device: torch.device) -> tuple[Tensor, Tensor]:  # [n, 4], [n]
-        """As a world model is asked for them at a time after the sample's frame."""
+        """The places at a time after the sample's frame and their sample, as `WorldModel.look_up` takes them."""
         times = self.in_aug.new_full((len(self.in_aug), 1), time_s)
         owner = torch.full((len(self.in_aug),), self.sample, device=device)
         return torch.cat([self.in_aug, times], 1).to(device), owner
 
     def solid(self, truth: TrueGeometry, time_s: float) -> Array:  # [n] bool
-        """What is really there."""
+        """Which places are solid at a time after the sample's frame, by the true geometry."""
         times_us = np.full(len(self.in_global), round(1e6 * (self.timestamp_s + time_s)))
         return truth.solid(self.in_global, times_us)
 
     def reached(self, rays: RayBundle) -> Array:  # [n] bool
-        """Places that rays of the sample passed or met: of others nobody learns what is there."""
+        """Which places the sample's rays passed or met: of others nothing is known."""
         low = self.in_aug[:, :2].min(0).values - 0.5 * self.cell_m
         cells = ((self.in_aug[:, :2] - low) / self.cell_m).long()
         rows = torch.full((cells.max(0).values + 1).tolist(), -1)
@@ -89,6 +89,6 @@ class GroundSlice:
 
 
 def global_from_aug(batch: FrameBatch, sample: int) -> Array:  # [4, 4]
-    """Of one sample."""
+    """Transform from a sample's augmented ego frame to global coordinates, in float64."""
     matrix = batch.global_from_ego[sample] @ torch.linalg.inv(batch.aug_from_ego[sample].double())
     return matrix.cpu().numpy()

@@ -31,12 +31,12 @@ logger = logging.getLogger(__name__)
 OF_THIS_RUN = ("phase", "resume")
 """Overrides that never concern the run whose weights are taken."""
 OF_STREAMED_DATA = tuple(f"data.{key}" for key in TEMPORAL_DATA_KEYS)
-"""Nor do these and the model's `keys_of_temporal_phase`, where that run is of single frames."""
+"""Overrides that, like the model's `keys_of_temporal_phase`, do not concern that run where it is of single frames."""
 INPUT_SETTINGS = (
     *("data.num_sweeps", "data.num_lidar_sweeps", "data.deskew_lidar", "data.timeline.radial_speeds"),
     *("data.min_distance_m", "data.propagate_points", "data.test_resize_offset"),
 )
-"""What the weights have learnt to see of data."""
+"""Keys of `data` that decide what inputs the weights have learnt to read."""
 
 Compose = Callable[[list[str]], tuple[RunConfig, dict[str, Any]]]
 """Overrides to a run's configuration, as dataclasses and as plain values (`compose_config`)."""

@@ -31,7 +31,7 @@ They are left out of its identity, of its result, and of what a sweep records of
 
 
 TEMPORAL_DATA_KEYS = ("groups_per_scene", "stream_sets", "past_frames", "sensor_dropout")
-"""Of `data`: what changes nothing of a phase without memory."""
+"""Keys of `data` that change nothing in a phase without memory."""
 
 LEGACY_DEFAULTS = {
     "data.timeline": None,
@@ -55,7 +55,7 @@ At this value a key is no part of an identity, and a checkpoint without the key 
 
 
 _NUMBER = re.compile(r"(?<![\w.+-])[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?(?![\w.+-])")
-"""No part of a word, as of a run id."""
+"""A number that is not part of a word, such as a run id."""
 
 RUN_ID = re.compile(r"[a-z0-9_]+-[a-z0-9_]+-[a-z0-9_]+-[0-9a-f]{8}")
 """What `run_identity` returns."""

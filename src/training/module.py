@@ -64,7 +64,7 @@ class TrainingModule(L.LightningModule):
         self.own_statistics: dict[str, Tensor] = {}  # of this rank, from the checkpoint of an unfinished epoch
 
     def train(self, mode: bool = True) -> Self:
-        """As the base, but for the frozen norms."""
+        """Set the mode of all modules but the frozen norms, which stay in evaluation mode."""
         super().train(mode)
         for norm in self.frozen_norms:
             norm.eval()

@@ -53,7 +53,7 @@ def draw_frames(model: Detector, clips: Iterable[list[FrameBatch]], grid: BEVGri
 
 @torch.no_grad()
 def last_outputs(model: Detector, clips: Iterable[list[FrameBatch]]) -> Iterator[tuple[str, FrameBatch, Any]]:
-    """Of every clip the end of its pictures' names, its last frame on the model's device, and the model's output."""
+    """For each clip the end of its pictures' names, its last frame on the model's device, and the model's output."""
     device = next(model.parameters()).device
     with evaluation_mode(model):
         for number, clip in enumerate(clips):

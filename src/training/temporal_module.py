@@ -103,7 +103,7 @@ class TemporalModule(TrainingModule):
         self.memories = [entry for entry in self.memories if not _common(batch.streams, entry[0]).any()]
 
     def memories_before_step(self) -> list[dict[str, Any]]:
-        """As in `rank_state`, of the time before the running step."""
+        """The `memories` of `rank_state` as they were before the running step."""
         return _plain(self._before_step)
 
     def on_train_batch_start(self, batch: FrameBatch, batch_idx: int) -> None:

@@ -40,7 +40,7 @@ class TrueMotion:
         self.sample_at = {key: sample for sample, key in enumerate(keys)}
 
     def correct(self, memory: FrameMemory, batch: FrameBatch) -> FrameMemory:
-        """The memory as it should be for the batch's frames. Raises ConfigError for one that holds no velocities."""
+        """The memory with true velocities, for the batch's frames. Raises ConfigError for one that holds none."""
         now = [self.truth.index_of[token] for token in batch.tokens]
         return memory.mapped(lambda frame: frame.with_velocities(partial(self._velocities, frame, now)))
 
@@ -52,7 +52,7 @@ class TrueMotion:
         xy: Tensor,  # [n, 2] m, ego frame of its own time
         predicted: Tensor,  # [n, 2] m/s over ground, same axes
     ) -> Tensor:  # [n, 2]
-        """Of what one stream remembers of a frame; as predicted where the truth is not known."""
+        """True velocities of what one stream remembers of a frame; the predicted ones where the truth is not known."""
         key = int(self.truth.scenes[now[stream]]), float(frame.timestamps_s[stream])
         if key not in self.sample_at:  # padding of a stream that began later
             return predicted

@@ -18,11 +18,11 @@ from src.training.run_folder import RunFolder
 logger = logging.getLogger(__name__)
 
 INIT_LIMIT_S = 15.0
-"""For the service to take a new run; an unreachable one delays the start by up to about twice this."""
+"""How long the service may take to accept a run; an unreachable one delays the start by up to about twice this."""
 FINISH_LIMIT_S = 60.0
-"""For the last data to be sent; the rest stays in the run's folder."""
+"""How long the last data may take to be sent; the rest stays in the run's folder."""
 LONGEST_NAME = 128
-"""What the service takes for groups and job types."""
+"""Longest name of a group or job type that the service takes."""
 T = TypeVar("T")
 
 
@@ -190,7 +190,7 @@ def _table(name: str, rows: dict[str, dict[str, Any]]) -> tuple[list[str], list[
 
 
 def _picture_name(path: Path) -> str:
-    """Without the sample's token, so that runs are compared picture by picture."""
+    """Name of a picture without the sample's token, so that W&B compares runs picture by picture."""
     return "_".join(path.stem.split("_")[:2])
 
 

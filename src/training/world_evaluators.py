@@ -60,18 +60,18 @@ STATIC = "static_"
 
 @dataclass
 class WorldScores:
-    """Of one sample."""
+    """What the scores of one sample are made of."""
 
     sums: dict[str, Array] = field(default_factory=dict)  # [2] total and count by number
     speed_errors: dict[int, Array] = field(default_factory=dict)  # by step: [n] m/s, of rays that end on moving objects
     forecasts: dict[str, ForecastScores] = field(default_factory=dict)  # by the prefix of their numbers
 
     def add(self, name: str, values: Tensor | Array, among: Tensor | Array) -> None:
-        """The mean of `values` over those `among`."""
+        """Store total and count of `values` over those `among`, for their mean."""
         self.sums[name] = np.array([float(values[among].sum()), float(among.sum())])
 
     def add_iou(self, name: str, found: Tensor, truth: Tensor) -> None:
-        """Intersection over union."""
+        """Store intersection and union, for their ratio."""
         self.sums[name] = np.array([float((found & truth).sum()), float((found | truth).sum())])
 
 
@@ -94,13 +94,13 @@ class OccupancyEvaluator(Evaluator):
     def __init__(self, index: DatasetIndex, timeline: TimelineConfig) -> None:
         self.index, self.timeline = index, timeline
         self.rows = {token: row for row, token in enumerate(index.sample_tokens.tolist())}
-        self.found: dict[int, WorldScores] = {}  # by row of the sample
+        self.scores_by_sample: dict[int, WorldScores] = {}  # by the sample's row in the index
         self.content: dict[str, Any] | None = None
         self._truth: tuple[int, TrueGeometry | None] | None = None  # of the scene asked for last, by its row
 
     @classmethod
     def of(cls, datamodule: DetectionDataModule) -> Self:
-        """Of the validation split's frames that are read with rays. Raises ConfigError without a timeline."""
+        """The evaluator of the validation frames that are read with rays. Raises ConfigError without a timeline."""
         timeline = datamodule.config.timeline
         if timeline is None or not datamodule.config.num_future_frames:
             raise ConfigError(
@@ -110,7 +110,7 @@ class OccupancyEvaluator(Evaluator):
 
     def reset(self) -> None:
         """Forget what an earlier pass collected."""
-        self.found.clear()
+        self.scores_by_sample.clear()
 
     def update(self, model: WorldModel, output: Any, batch: FrameBatch) -> None:
         """Score every sample of a batch."""
@@ -125,7 +125,7 @@ class OccupancyEvaluator(Evaluator):
                 self._score_slice(model, output, batch, sample, rays, truth, own)
         self._score(model, output, replace(batch, rays=RayBundle.concatenate(parts, dim=0)), rows, scores)
         for row, own in zip(rows, scores, strict=True):
-            self.found.setdefault(row, own)
+            self.scores_by_sample.setdefault(row, own)
 
     def _score(
         self, model: WorldModel, output: Any, batch: FrameBatch, rows: list[int], scores: list[WorldScores]
@@ -196,9 +196,9 @@ class OccupancyEvaluator(Evaluator):
         return self._truth[1]
 
     def compute(self) -> dict[str, float]:
-        """The headline and some more."""
+        """The headline and the numbers of `logged`; `as_dict` then has all."""
         found: dict[int, WorldScores] = {}
-        for of_rank in gather_by_rank(self.found):
+        for of_rank in gather_by_rank(self.scores_by_sample):
             found = of_rank | found
         rows = sorted(found)
         names = sorted({name for row in rows for name in found[row].sums})
@@ -228,7 +228,7 @@ class OccupancyEvaluator(Evaluator):
         return ratios(sums, weights)
 
     def _intervals(self, sums: Mapping[str, Array], scenes: Array) -> dict[str, Any]:
-        """As those of a detection's metrics.json: scenes are drawn again with replacement."""
+        """95 % intervals of all ratios from drawing scenes anew with replacement, as for detections."""
         _, places = np.unique(scenes, return_inverse=True)
 
         def bounds(draws: Array) -> dict[str, list[float]]:
@@ -246,7 +246,7 @@ class OccupancyEvaluator(Evaluator):
         draw_horizons(folder / "horizons.png", self.content, title)
 
     def draw_frames(self, model: Detector, clips: list[list[FrameBatch]], grid: BEVGrid, folder: Path) -> None:
-        """As `draw_world`, beside the true geometry where it is known."""
+        """Draw what the model says (`draw_world`) beside the true geometry where it is known."""
         draw_world(model, clips, self._truth_by_token, self.timeline, folder)
 
     def _truth_by_token(self, token: str) -> TrueGeometry | None:
@@ -254,12 +254,12 @@ class OccupancyEvaluator(Evaluator):
 
     @staticmethod
     def describe(metrics: Mapping[str, Any]) -> str:
-        """By time."""
+        """Occupancy scores by time, as text."""
         return format_occupancy(metrics)
 
 
 class ForecastEvaluator(OccupancyEvaluator):
-    """The same, with forecast LiDAR and beside it, `static_`, that of a world that stands still.
+    """Also scores forecast LiDAR and, as `static_`, the forecast of a world that stands still.
 
     Names are those of `sums_by_sample` and `median_errors`; `moving` and `unseen` are rays that end on moving
     objects, and where the input had not seen. A `gain` is the share by which a Chamfer distance lies below the static
@@ -309,7 +309,7 @@ class ForecastEvaluator(OccupancyEvaluator):
 
     @staticmethod
     def describe(metrics: Mapping[str, Any]) -> str:
-        """Beside the static-world baseline."""
+        """Forecast scores beside the static-world baseline's, then occupancy scores, as text."""
         return f"{format_forecast(metrics)}\n\n{format_occupancy(metrics)}"
 
 

@@ -31,7 +31,7 @@ from src.training.snapshots import last_outputs
 SLICES_S = (0.0, 1.0, 2.0, 3.0)
 SLICE_CELL_M = 0.5
 SHOWN_RAYS = 2048
-"""Of a moment; a film has fewer, as it has many moments."""
+"""Most rays shown of a moment; a film has fewer, as it has many moments."""
 FILM_RAYS = 1024
 
 
@@ -89,7 +89,7 @@ def _slice(
 def _moments(
     model: WorldModel, output: Any, batch: FrameBatch, steps: Sequence[int], count: int, interval_s: float
 ) -> Iterator[ForecastMoment]:
-    """Of those steps that the scene has; `count` rays each, the same at every call."""
+    """Forecasts of those `steps` that have rays; at most `count` rays each, the same at every call."""
     for step in steps:
         generator = torch.Generator(batch.device).manual_seed(step)
         rays = draw_rays(batch.rays[batch.rays.steps == step], model.bounds, count, generator)

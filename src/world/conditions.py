@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 
 SAME_TAGS = ("structure.regular", "construction.roadworks")
-"""Of every scene of this world."""
+"""Tags that every scene of this world has."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ Array = np.ndarray
 SCAN_S = 0.1
 RANGE_NOISE_M = 0.02
 REFLECTIVITY = {"ground": 0.1, "slat": 0.2}
-"""Of an actor it follows from its colour."""
+"""Reflectivity of what is no actor; an actor's follows from its colour."""
 DETECTABLE = -np.log(0.1) / 0.1
 """Echo over reflectivity at the reach: a surface of 0.1 that faces the sensor is seen with a chance of 0.9."""
 NEWTON_STEPS, EXACT_M = 12, 1e-5
@@ -35,7 +35,7 @@ class Blocks:
     reflectivity: Array  # [N] 0..1
 
     def within(self, place: Array, reach_m: float) -> Blocks:
-        """Those of which a part lies nearer to a place [3] than that."""
+        """Blocks of which a part may lie nearer to `place` [3] than `reach_m` while the scan lasts."""
         distance = np.hypot(*(self.middles - place)[:, :2].T) - 0.5 * np.hypot(*self.sizes[:, :2].T)
         near = distance < reach_m + 0.5 * SCAN_S * np.linalg.norm(self.velocities, axis=1)
         return Blocks(**{name: column[near] for name, column in vars(self).items()})
@@ -103,7 +103,7 @@ class _Fan:
 
 
 def detection_chance(echoes: Array, ranges: Array, reach_m: float) -> Array:
-    """Of an echo, by its strength and distance; none beyond the reach, where a reflectivity of 0.1 has 0.9."""
+    """Chance that an echo is detected, by strength and distance: 0.9 of reflectivity 0.1 at the reach, 0 beyond."""
     return np.where(ranges < reach_m, 1.0 - np.exp(-DETECTABLE * echoes * (reach_m / ranges) ** 2), 0.0)
 
 

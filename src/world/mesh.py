@@ -41,7 +41,7 @@ class Mesh:
         return Mesh(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def moved(self, offset: Array, yaw: float) -> Mesh:
-        """Turned about z, then shifted."""
+        """The mesh turned about z, then shifted."""
         cos, sin = np.cos(yaw), np.sin(yaw)
         turn = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
         return replace(self, corners=self.corners @ turn + offset)
@@ -127,7 +127,7 @@ class MeshMaker:
             self.panel(x_back - 0.02, min(outer, inner), max(outer, inner), z, z + size, -1, (235, 20, 20), glow=True)
 
     def mesh(self) -> Mesh:
-        """What was collected."""
+        """The collected quads as one mesh."""
         corners, colours, glows, two_sided = zip(*self.quads, strict=True) if self.quads else ((),) * 4
         return Mesh(
             corners=np.array(corners).reshape(-1, 4, 3),

@@ -15,7 +15,7 @@ Array = np.ndarray
 LEAD_IN_S = 0.7
 """Simulated time before the first key frame, for the sweeps that precede it."""
 HALF_STEP_S = 0.002
-"""Of the central differences that give rates."""
+"""Half the step of the central differences that give rates."""
 
 
 @dataclass

@@ -28,7 +28,7 @@ class Actor:
 
     @property
     def kind(self) -> Kind:
-        """What it is one of."""
+        """The actor's kind of object."""
         return KINDS[self.name]
 
 

@@ -50,7 +50,7 @@ class FigureTable:
         return sorted(found, key=_first_number)
 
     def allowed_for(self, group: str) -> float | None:
-        """By how much the world may differ in this row."""
+        """By how much the world may differ from the real data in this row; None for no limit."""
         return self.allowed_heavy if group in HEAVY and self.allowed_heavy is not None else self.allowed
 
     def compared(self) -> int:
@@ -295,7 +295,7 @@ class _Tables:
         return rows
 
     def authors_frames(self, groups: list[str], columns: list[str]) -> Rows:
-        """Of the classes that those frames hold."""
+        """Distances, speeds and number of boxes, of the classes that the authors' frames hold."""
         of = np.isin(self.counts.classes, ("car", "truck", "trailer", "traffic_sign", "animal"))
         speed, distance = self.counts.speed_mps[of], self.counts.distance_m[of]
         cars = self.counts.speed_mps[self.counts.classes == "car"]

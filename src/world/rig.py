@@ -77,7 +77,7 @@ _PLACES: dict[str, tuple[tuple[float, float, float], tuple[float, float, float],
     "XSENSE_CABIN": ((4.4, 0.0, 1.9), (0.0, 0.0, 0.0), 0.0),
     "XSENSE_CHASSIS": ((0.2, 0.0, 0.9), (0.0, 0.0, 0.0), 0.0),
 }
-"""By channel the place (m), yaw, pitch and roll (degrees; a camera's of its optical axis) and the delay (s)."""
+"""Place (m), yaw, pitch and roll (degrees; a camera's of its optical axis) and delay (s) of each channel."""
 
 
 def sensor_rig(config: WorldConfig) -> dict[str, Mount]:

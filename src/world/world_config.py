@@ -13,7 +13,7 @@ GENERATOR = "highway-3"
 """Changes whenever the same config would give other bytes, so that old worlds are not mistaken for new ones."""
 
 LIDAR_GENERATOR = "lidar-3"
-"""The same of what is written only with `lidar`; worlds without stay what they are."""
+"""As GENERATOR, for what is written only with `lidar`; worlds without LiDAR keep their digest."""
 
 RADAR_RATE_HZ = 20
 CAMERA_RATE_HZ = 10

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Iterator
@@ -10,14 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import uvicorn
-import yaml
 from PIL import Image
 
 from src.dashboard.server import create_app
-from src.report.metric_names import RANGES, SPEEDS
 from src.report.results import publish_result
 from src.report.sweep_file import PlotConfig, RowConfig, SweepConfig, TableConfig
 from src.report.sweep_record import RunState, SweepRecord, record_path, write_record
+from tests import finished_runs
 
 EVIL = "<script>alert(1)</script> | 3.2 m"
 """The label of a row, as unkind as labels get."""
@@ -39,32 +37,17 @@ class World:
 
 def write_run(outputs: Path, run_id: str, seed: int, value: float, margin: float, pictures: bool = False) -> Path:
     """The folder of a finished run whose every score is `value`."""
-    folder, (_, phase, scale, _) = outputs / run_id, run_id.rsplit("-", 3)
-    folder.mkdir(parents=True)
+    _, phase, scale, _ = run_id.rsplit("-", 3)
     overrides = [f"phase={phase}", f"model.ocsf.margin_m={margin}", f"scale={scale}", f"seed={seed}"]
-    record = {
-        "run_id": run_id, "overrides": overrides, "scale": scale, "seed": seed, "commit": "0123456789abcdef",
-        "data": {"name": "synthetic highway", "version": "v1.2-trainval", "split": "val", "root": "world"},
-        "initialized_from": None, "epochs": 2, "steps": 10, "parameters": 2_500_000, "resumed": False,
-        "seconds": {"fit": 10.0, "all": 12.0}, "peak_memory_mib": {"process": 900, "largest_worker": 100},
-        "skipped_files": {}, "device": "cpu", "processes": 1, "threads": 1, "versions": {"torch": "2"},
-    }  # fmt: skip
-    classes = {name: {"AP": value, "AVE": 2 - value, "num_gt": 10} for name in ("car", "truck")}
-    part = {"mAP": value, "NDS": value, "mAP_present": value, "mAVE_present": 2 - value, "classes": classes}
-    metrics = {
-        "mAP": value, "NDS": value, "mAVE": 2 - value, "classes": classes,
-        "ranges": dict.fromkeys(RANGES, part), "speeds": dict.fromkeys(SPEEDS, part),
+    record = finished_runs.run_json(run_id, seed, overrides=overrides, scale=scale, epochs=2)
+    metrics = finished_runs.metrics_json(value) | {
         "measures": {"moving_AP": value, "moving_boxes": 7, "history_near": None},
         "intervals": {"scenes": 20, "bounds": {"mAP": [value - 0.02, value + 0.03]}},
     }  # fmt: skip
     config = {"model": {"name": "horizon3d", "ocsf": {"margin_m": margin}}, "phase": {"name": phase}, "seed": seed,
               "data": {"root": "/nowhere", "sensor_dropout": None}, "paths": {"outputs": str(outputs)}}  # fmt: skip
-    (folder / "run.json").write_text(json.dumps(record))
-    (folder / "metrics.json").write_text(json.dumps(metrics))
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
-    (folder / "metrics.csv").write_text(
-        "step,epoch,step/total,loss/total,val/mAP\n2,0,9.5,,\n4,0,,8.5,0.1\n9,1,,4.5,0.2\n"
-    )
+    curves = "step,epoch,step/total,loss/total,val/mAP\n2,0,9.5,,\n4,0,,8.5,0.1\n9,1,,4.5,0.2\n"
+    folder = finished_runs.write_run(outputs / run_id, record, metrics, config, curves)
     (folder / "log.txt").write_text(f"12:00 INFO run {run_id} in {folder}\nepoch 1\repoch 2\n12:01 INFO finished\n")
     if pictures:
         (folder / "pictures").mkdir()

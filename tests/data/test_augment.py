@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -50,6 +52,26 @@ def test_flips_come_before_the_rotation():
     assert 0 < abs(angle) <= 0.3
 
 
+def test_each_axis_may_have_a_probability_of_its_own():
+    """The same draws as with one for both."""
+    both, each, y_alone = (
+        np.array(
+            [
+                draw_bev_transform(replace(PAPER_BEV, flip_probability=chance), frame_generator(0, 0, str(frame)))
+                for frame in range(100)
+            ]
+        )
+        for chance in (0.5, [0.5, 0.5], [0.0, 0.5])
+    )
+    assert np.array_equal(both, each)
+    mirrored = y_alone[:, :3, :3] @ np.diag([1.0, -1.0, 1.0])
+    kept = np.linalg.det(y_alone[:, :3, :3]) > 0
+    unmirrored = np.where(kept[:, None, None], y_alone[:, :3, :3], mirrored)
+    assert 30 < kept.sum() < 70 and (unmirrored[:, 0, 0] > 0.8).all()  # x still points ahead
+    x_kept = both[:, 0, 0] > 0
+    assert np.array_equal(both[x_kept], y_alone[x_kept]) and 30 < x_kept.sum() < 70
+
+
 def test_generator_is_known_by_its_three_names():
     draws = {key: frame_generator(*key).integers(2**60) for key in ((0, 0, "a"), (0, 1, "a"), (1, 0, "a"), (0, 0, "b"))}
     assert len(set(draws.values())) == 4
@@ -67,6 +89,9 @@ def test_generator_is_known_by_its_three_names():
         lambda: BevAugmentationConfig(scale=[1.0, float("nan")], rotation_rad=0, flip_probability=0),
         lambda: BevAugmentationConfig(scale=[1.0, float("inf")], rotation_rad=0, flip_probability=0),
         lambda: ImageAugmentationConfig(resize=[0, 0], rotation_deg=float("inf"), flip_probability=0),
+        lambda: BevAugmentationConfig(scale=[1.0, 1.0], rotation_rad=0, flip_probability=[0.5]),
+        lambda: BevAugmentationConfig(scale=[1.0, 1.0], rotation_rad=0, flip_probability=[0.0, 1.5]),
+        lambda: BevAugmentationConfig(scale=[1.0, 1.0], rotation_rad=0, flip_probability="often"),
     ],
 )
 def test_impossible_ranges(make):

@@ -1,6 +1,4 @@
-"""For the fault tests of trainings: a process to fork them from, a tiny world, and runs that nothing happened to."""
-
-import os
+"""For the fault tests of trainings: a tiny world, and runs that nothing happened to."""
 
 import pytest
 
@@ -8,19 +6,7 @@ from tests.faults import killing
 
 
 @pytest.fixture(scope="session")
-def context():
-    """Where processes come from; they compute with one thread, which is what makes results the same to the bit."""
-    before = os.environ.get("OMP_NUM_THREADS")
-    os.environ["OMP_NUM_THREADS"] = "1"
-    yield killing.fork_server()
-    if before is None:
-        os.environ.pop("OMP_NUM_THREADS")
-    else:
-        os.environ["OMP_NUM_THREADS"] = before
-
-
-@pytest.fixture(scope="session")
-def tiny(context, tmp_path_factory):
+def tiny(tmp_path_factory):
     """(overrides of a run of a phase, the run that nothing happened to), each trained once."""
     base = tmp_path_factory.mktemp("undisturbed")
     known = {}
@@ -29,16 +15,16 @@ def tiny(context, tmp_path_factory):
         if phase not in known:
             source = ("phase.init_from=null",) if phase == "phase2" else ()
             overrides = [f"phase={phase}", *source, *killing.TINY, f"data.root={base / 'world'}"]
-            known[phase] = overrides, undisturbed(context, base / phase, overrides)
+            known[phase] = overrides, undisturbed(base / phase, overrides)
         return known[phase]
 
     return of_phase
 
 
-def undisturbed(context, outputs, overrides):
+def undisturbed(outputs, overrides):
     """The result of a run to its end, the size of its checkpoint, and the CPU seconds to its first step and its end."""
     log = outputs.with_name(f"{outputs.name}.log")
-    process = killing.start(context, [*overrides, f"paths.outputs={outputs}"], log)
+    process = killing.start([*overrides, f"paths.outputs={outputs}"], log)
     first = end = 0.0
     while (used := killing.cpu_seconds(process.pid)) is not None:
         end = used

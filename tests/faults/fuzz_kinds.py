@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from PIL import Image, ImageDraw
 from torch import nn
 
@@ -47,6 +46,7 @@ from src.sweep.sweep_files import load_sweep
 from src.training.run_folder import RunFolder
 from src.world.pcd_writer import LIDAR_TYPE, lidar_pcd
 from src.world.write import _read_stored
+from tests import finished_runs
 from tests.data.tiny_set import VERSION, lidar_bytes, pcd_bytes, reader_settings, write_data_set
 from tests.faults.fuzzing import Kind
 from tests.faults.mutations import archive, changed_csv, changed_json, changed_yaml, damaged, either
@@ -355,27 +355,16 @@ def read_submission(path: Path) -> None:
 
 
 def run_files() -> dict[str, bytes]:
-    scores = {"AP": 0.5, "AVE": 1.5, "num_gt": 10}
-    part = {"mAP": 0.5, "NDS": 0.4, "mAP_present": 0.5, "mAVE_present": 1.0, "classes": {"car": scores}}
-    record = {
-        "run_id": RUN, "overrides": ["scale=mini", "phase=phase1"], "scale": "mini", "seed": 0, "commit": "0123",
-        "data": {"name": "synthetic highway", "version": "v1", "train_split": "train", "split": "val", "root": "w"},
-        "initialized_from": None, "epochs": 6, "steps": 10, "parameters": 2_500_000, "resumed": False,
-        "seconds": {"fit": 10.0, "all": 12.0}, "peak_memory_mib": {"process": 900, "largest_worker": 100},
-        "skipped_files": {"RADAR_LEFT_FRONT": 3}, "skipped_names": {"samples/a.pcd": 3}, "device": "cpu",
-        "processes": 1, "threads": 1, "versions": {"torch": "2"},
-    }  # fmt: skip
-    metrics = {
-        "mAP": 0.5, "NDS": 0.5, "mAVE": 1.0, "classes": {"car": scores, "truck": scores}, "ranges": {"50-100": part},
-        "speeds": {"0-0.5": part}, "tags": {"weather.rain": {"mAP": 0.5}},
-    }  # fmt: skip
+    record = finished_runs.run_json(
+        RUN, 0, overrides=["scale=mini", "phase=phase1"], skipped_files={"RADAR_LEFT_FRONT": 3},
+        skipped_names={"samples/a.pcd": 3},
+    )  # fmt: skip
+    metrics = finished_runs.metrics_json(0.5, ranges=["50-100"], speeds=["0-0.5"])
     config = {"model": {"name": "horizon3d", "ocsf": {"margin_m": 4.8}}, "phase": {"name": "phase1"}, "seed": 0,
               "data": {"root": "/data", "version": "v1"}, "paths": {"outputs": "o"}, "out": None}  # fmt: skip
-    curves = "step,epoch,loss/total,val/mAP,lr\n4,0,5.5,,0.1\n4,0,,0.1,\n9,1,4.5,,0.1\n9,1,,0.2,\n"
     latency = {"ms": {"whole": 12.0}, "fps": 80.0, "memory_gb": 0.1, "spread_ms": {"whole": 0.1}, "load": 0.2}
-    files = {"run.json": record, "metrics.json": metrics, "latency.json": latency}
-    texts = {name: json.dumps(content).encode() for name, content in files.items()}
-    return texts | {"config.yaml": yaml.safe_dump(config, sort_keys=False).encode(), "metrics.csv": curves.encode()}
+    texts = finished_runs.run_files(record, metrics, config) | {"latency.json": json.dumps(latency)}
+    return {name: text.encode() for name, text in texts.items()}
 
 
 RUN_FILES = run_files()

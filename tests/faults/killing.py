@@ -6,7 +6,6 @@ import json
 import os
 import random
 import signal
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,13 +13,22 @@ from pathlib import Path
 import torch
 
 from src.errors import CheckpointError
-from src.reliability.checkpoints import LAST, PREVIOUS, read_checkpoint
-from tests.running import FORKS
+from src.reliability import checkpoints
+from src.reliability.checkpoints import LAST, PREVIOUS, AtomicCheckpointIO, read_checkpoint
+from src.reliability.processes import die_with_parent
+from tests.running import fork, run_module
 
-ROOT = Path(__file__).resolve().parents[2]
 GRACE_S = 60.0
 """What schedulers commonly give between SIGTERM and SIGKILL is 30 s and more; the machine of a test may be busy."""
-POINTS = ("bytes", "written", "synced", "proven", "linked", "kept", "replaced")
+HOOKS = {  # by point: a function, and whether the point lies before or after it
+    "written": (os, "fsync", "before"),
+    "synced": (os, "fsync", "after"),
+    "verified": (checkpoints, "_verify_written", "after"),
+    "linked": (os, "link", "after"),
+    "kept": (checkpoints, "keep_as", "after"),
+    "replaced": (checkpoints, "sync_folder", "before"),
+}
+POINTS = ("bytes", *HOOKS)
 """Inside one write of a checkpoint, in their order."""
 TINY = (
     "scale=debug", "phase.epochs=2", "data.world.num_train_scenes=2", "data.world.num_val_scenes=1",
@@ -38,64 +46,31 @@ class InWrite:
     after_bytes: int  # of the file, for the point `bytes`
 
 
-def fork_server():
-    """What starts processes that have imported the training already; set up before the first thread."""
-    return FORKS
+def start(overrides, log, fault=None, prepare=None):
+    """`python -m src.train` with these overrides in a process of its own; with one thread, so the same to the bit."""
+    return fork(run_armed, overrides, fault, prepare, out=log, err=log, env=os.environ | {"OMP_NUM_THREADS": "1"})
 
 
-def start(context, overrides, log, fault=None, prepare=None):
-    """`python -m src.train` with these overrides in a process of its own."""
-    process = context.Process(target=run_train, args=(list(overrides), str(log), fault, prepare))
-    process.start()
-    return process
-
-
-def run_train(overrides, log, fault, prepare):
-    """In the new process: its session, its output, its fault, then the command."""
-    from src.reliability.command import run_command
-    from src.reliability.processes import die_with_parent
-    from src.train import main
-
+def run_armed(overrides, fault, prepare):
+    """In the new process: its fault, then the command."""
     die_with_parent(signal.SIGKILL)
-    os.setsid()
-    os.chdir(ROOT)
-    out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-    os.dup2(out, 1)
-    os.dup2(out, 2)
-    sys.argv = ["src.train", *overrides]
     torch.set_num_threads(1)
     if fault is not None:
         arm(fault)
     if prepare is not None:
         prepare()
-    run_command(main)
+    run_module("train", *overrides)
 
 
 def arm(fault):
     """Let this process strike itself inside a write of a checkpoint."""
-    from src.reliability import checkpoints as module
-
+    whole, write_bytes = AtomicCheckpointIO._write, checkpoints._DigestedFile.write
     state = {"saves": 0, "inside": False, "bytes": 0}
 
-    def reached(point):
-        if state["inside"] and state["saves"] >= fault.save and point == fault.point:
+    def reached():
+        if state["inside"] and state["saves"] >= fault.save:
             state["saves"] = -(10**6)  # once
             os.kill(os.getpid(), fault.number)
-
-    def around(owner, name, before=None, after=None):
-        original = getattr(owner, name)
-
-        def replaced(*args, **kwargs):
-            if before is not None:
-                reached(before)
-            result = original(*args, **kwargs)
-            if after is not None:
-                reached(after(args) if callable(after) else after)
-            return result
-
-        setattr(owner, name, replaced)
-
-    whole, write_bytes = module.AtomicCheckpointIO._write, module._DigestedFile.write
 
     def save(self, checkpoint, target):
         state["saves"] += 1
@@ -110,27 +85,45 @@ def arm(fault):
         state["bytes"] += count
         if state["bytes"] >= fault.after_bytes:
             self.flush()
-            reached("bytes")
+            reached()
         return count
 
-    module.AtomicCheckpointIO._write, module._DigestedFile.write = save, write
-    around(os, "fsync", before="written", after="synced")
-    around(module, "_verify_written", after="verified")
-    around(os, "link", after="linked")
-    around(os, "replace", after=lambda args: "kept" if Path(args[1]).name == PREVIOUS else "replaced")
+    def around(owner, name, when):
+        original = getattr(owner, name)
+
+        def replaced(*args, **kwargs):
+            if when == "before":
+                reached()
+            result = original(*args, **kwargs)
+            if when == "after":
+                reached()
+            return result
+
+        setattr(owner, name, replaced)
+
+    AtomicCheckpointIO._write = save
+    if fault.point == "bytes":
+        checkpoints._DigestedFile.write = write
+    else:
+        around(*HOOKS[fault.point])
+
+
+def write_armed(fault, path):
+    """In a new process: two checkpoints, of which the second takes the place of the first, with a fault inside."""
+    arm(fault)
+    writer = AtomicCheckpointIO()
+    for step in (1, 2):
+        content = {"state_dict": {"weight": torch.zeros(100)}, "horizon3d": {"config": {}}, "global_step": step}
+        writer.save_checkpoint(content, path)
 
 
 def brisk():
     """In the new process: look often whether a disk is back."""
-    from src.reliability import checkpoints
-
     checkpoints.RETRY_EVERY_S = 0.1
 
 
 def short_wait():
     """In the new process: do not wait long for a disk."""
-    from src.reliability import checkpoints
-
     checkpoints.RETRY_EVERY_S, checkpoints.WAIT_S = 0.1, 1.0
 
 
@@ -258,8 +251,8 @@ def jump_clock(folder, rng):
 class Chain:
     """One run that is killed again and again, each time resumed by the same command."""
 
-    def __init__(self, context, folder, overrides, reference, seed):
-        self.context, self.outputs, self.overrides = context, folder, [*overrides, f"paths.outputs={folder}"]
+    def __init__(self, folder, overrides, reference, seed):
+        self.outputs, self.overrides = folder, [*overrides, f"paths.outputs={folder}"]
         self.reference, self.rng = reference, random.Random(seed)
         self.log = folder.with_name(f"{folder.name}.log")
         self.kills = []  # (kind, point or damage)
@@ -276,7 +269,7 @@ class Chain:
         else:
             first, end = self.reference["first step"], self.reference["end"]
             until = self.rng.uniform(first, first + (end - first) * self._left())
-        process = start(self.context, self.overrides, self.log, fault)
+        process = start(self.overrides, self.log, fault)
         if not inside:
             strike_at(process, until, number)
         code = wait(process, self.log, timeout=300 if inside else GRACE_S + 240)
@@ -301,8 +294,7 @@ class Chain:
         folders = list(self.outputs.glob("horizon3d-phase*"))
         if not folders:
             return
-        checkpoints = folders[0] / "checkpoints"
-        last, previous = checkpoints / LAST, checkpoints / PREVIOUS
+        last, previous = (folders[0] / "checkpoints" / name for name in (LAST, PREVIOUS))
         two = previous.is_file() and not previous.samefile(last)  # not two names of one file that was synced long ago
         if number == signal.SIGKILL and self.rng.random() < 0.2 and two:
             what = damage(last, self.rng)
@@ -314,6 +306,6 @@ class Chain:
         """Let it end, if it has not; what it ended with."""
         if list(self.outputs.glob("horizon3d-phase*/run.json")):
             return outcome(self.outputs)
-        process = start(self.context, self.overrides, self.log)
+        process = start(self.overrides, self.log)
         assert wait(process, self.log) == 0, self.log.read_text()[-3000:]
         return outcome(self.outputs)

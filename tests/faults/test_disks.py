@@ -15,17 +15,16 @@ OF_SIZE = 64 * 2**20
 
 
 @pytest.fixture
-def training(context, tiny, tmp_path):
+def training(tiny, tmp_path):
     """A training of phase 2 in a folder of its own."""
-    overrides, reference = tiny("phase2")
-    return Training(context, overrides, reference, tmp_path)
+    return Training(*tiny("phase2"), tmp_path)
 
 
 class Training:
     """Starts of one command, each with its own log."""
 
-    def __init__(self, context, overrides, reference, base):
-        self.context, self.reference, self.base = context, reference, base
+    def __init__(self, overrides, reference, base):
+        self.reference, self.base = reference, base
         self.outputs = base / "outputs"
         self.overrides = [*overrides, f"paths.outputs={self.outputs}"]
         self.log = base / "0.log"
@@ -33,7 +32,7 @@ class Training:
     def start(self, prepare=None):
         self.log = self.base / f"{len(list(self.base.glob('*.log')))}.log"
         self.log.touch()
-        return killing.start(self.context, self.overrides, self.log, prepare=prepare)
+        return killing.start(self.overrides, self.log, prepare=prepare)
 
     def wait_for(self, condition, process, timeout=300):
         deadline = time.monotonic() + timeout

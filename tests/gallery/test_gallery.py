@@ -68,7 +68,7 @@ def test_a_frame_that_lost_its_boxes_counts_returns_in_the_annotations():
     truth = to_global(box, np.eye(4), 1)
     frames = [
         SimpleNamespace(
-            tokens=[token], boxes=[], lidar_points=None, lidar_batch=None, radar_batch=torch.zeros(2, dtype=torch.int64),
+            tokens=[token], boxes=[], lidar_points=None, lidar_batch=None, radar_batch=torch.tensor([0, 0]),
             radar_points=torch.tensor([[10.0, 0.0, 1.0], [30.0, 0.0, 1.0]]),
         )
         for token in ("a", "b")

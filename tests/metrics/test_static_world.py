@@ -21,8 +21,8 @@ from tests.world.conftest import small_config
 BOUNDS = ((-100.0, 250.0), (-100.0, 100.0), (-12.0, 12.0))
 
 
-def wall(x, half_width=20.0, step=0.1):
-    y, z = np.meshgrid(np.arange(-half_width, half_width, step), np.arange(0, 4, step))
+def wall(x):
+    y, z = np.meshgrid(np.arange(-20.0, 20.0, 0.1), np.arange(0, 4, 0.1))
     return np.stack([np.full(y.size, x), y.ravel(), z.ravel()], 1)
 
 
@@ -55,7 +55,7 @@ def test_the_first_point_in_a_ray_of_growing_width_is_met_else_the_road():
     assert (level, up) == (300.0, 300.0)  # the road 2 km away, and none
 
 
-def frame(points, origins=None, at=0.0, **rest):
+def frame(points, at=0.0, **rest):
     """A truck at x = `at`, in whose frame the points lie."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[0, 3] = at
@@ -64,7 +64,7 @@ def frame(points, origins=None, at=0.0, **rest):
         tokens=[f"at {at}"], timestamps_s=torch.tensor([at], dtype=torch.float64), global_from_ego=pose[None],
         aug_from_ego=torch.eye(4)[None], lidar_points=torch.nn.functional.pad(points, (0, 2)),
         lidar_batch=torch.zeros(len(points), dtype=torch.int64),
-        lidar_origins=torch.zeros_like(points) if origins is None else origins, **rest,
+        lidar_origins=torch.zeros_like(points), **rest,
     )  # fmt: skip
 
 

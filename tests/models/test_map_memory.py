@@ -16,9 +16,9 @@ from tests.models.moving import bare_frame, bda
 WIDE = BEVGrid(cells=(96, 96), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.0, 5.0))
 
 
-def make_fusion(grid=WIDE, channels=2, **changes):
+def make_fusion(channels=2, **changes):
     torch.manual_seed(0)
-    return TemporalFusion(memory_config(**changes), channels, grid)
+    return TemporalFusion(memory_config(**changes), channels, WIDE)
 
 
 def remember(fusion, memory, batch, fused):

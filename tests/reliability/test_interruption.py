@@ -1,6 +1,5 @@
 """A run that was stopped or killed anywhere ends as if nothing had happened."""
 
-import hashlib
 import os
 import signal
 import subprocess
@@ -16,13 +15,13 @@ from src import train as train_command
 from src.errors import InterruptedRunError
 from src.reliability.checkpoints import AtomicCheckpointIO, read_checkpoint
 from src.reliability.interruption import Interruption
-from src.reliability.processes import is_main_process, process_group
+from src.reliability.processes import process_group
 from src.training.evaluator import DetectionEvaluator
-from src.training.fit import fit
-from src.training.run_folder import Resume, RunFolder
+from src.training.run_folder import RunFolder
 from src.training.temporal_module import TemporalModule
-from tests.training.toys import EPOCHS, STEPS, ToyData, toy_module, toy_trainer
-from tests.training.two_ranks import spawn_two
+from tests.faults.killing import digest, outcome
+from tests.training.toys import EPOCHS, STEPS, ToyData, toy_module, train_toy
+from tests.training.two_ranks import become, spawn_two
 
 
 class Faulty(TemporalModule):
@@ -46,32 +45,17 @@ class Faulty(TemporalModule):
         return super().validation_step(batch, batch_idx)
 
 
-def train(path, *, fault=None, at_step=None, at_validation=None, ema=None, validate_every=1, every_steps=None, ranks=1):
+def train(path, *, fault=None, at_step=None, at_validation=None, **options):
     """Train in a folder, from its newest checkpoint where there is one; what the run ended with, and its module."""
-    folder = RunFolder(path.parent, path.name)
-    if is_main_process():
-        folder.open(Resume.auto)
-    module, data = toy_module(Faulty), ToyData()
+    folder, module = RunFolder(path.parent, path.name), toy_module(Faulty)
     module.fault, module.at_step, module.at_validation, module.seen = fault, at_step, at_validation, []
-    resume_from = folder.newest_checkpoint()
-    trainer = toy_trainer(
-        folder, resume_from, validate_every=validate_every, ema=ema, every_steps=every_steps, ranks=ranks
-    )
-    try:
-        fit(trainer, module, data, resume_from)
-    finally:
-        if is_main_process():
-            folder.close()
+    train_toy(folder, module, ToyData(), **options)
     return result(folder, module), module
 
 
 @pytest.fixture
 def run(tmp_path):
     return lambda name, **options: train(tmp_path / name, **options)
-
-
-def digest(state):
-    return hashlib.sha256(b"".join(state[name].numpy().tobytes() for name in sorted(state))).hexdigest()
 
 
 def result(folder, module):
@@ -263,9 +247,7 @@ def test_ignored_signals_stay_ignored():
 
 def stopped_on_two(rank, port, folder):
     """As rank `rank`: a whole run, and one that signals to rank 1 alone stop again and again."""
-    torch.set_num_threads(1)
-    who = {"LOCAL_RANK": rank, "RANK": rank, "WORLD_SIZE": 2, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
-    os.environ.update({name: str(value) for name, value in who.items()})
+    become(rank, 2, port)
     with process_group("cpu", 2):
         expected, whole = train(folder / "whole", ranks=2)
         for fault in ({"at_step": 1}, {"at_step": 4}, {"at_validation": (2, 0)}):
@@ -322,13 +304,6 @@ def end_after(process, outputs, rows, end):
     end(process.pid)
     process.communicate(timeout=180)
     return process.returncode
-
-
-def outcome(outputs):
-    (folder,) = outputs.glob("horizon3d-*")
-    names = ("metrics.csv", "metrics.json", "submission.json")
-    weights = digest(read_checkpoint(folder / "checkpoints" / "last.ckpt")["state_dict"])
-    return {name: (folder / name).read_text() if (folder / name).exists() else None for name in names}, weights
 
 
 @pytest.mark.slow

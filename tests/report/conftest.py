@@ -8,14 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
-from src.report.metric_names import RANGES, SPEEDS
+from src.report.metric_names import SPEEDS
 from src.report.results import RunResult, publish_result, result_path
 from src.report.sweep_file import PaperRowConfig, RowConfig, SweepConfig, TableConfig
 from src.report.sweep_record import RunState, SweepRecord
-
-CLASSES = ("car", "truck")
+from tests import finished_runs
 
 
 @pytest.fixture
@@ -34,28 +32,12 @@ def write_run(tmp_path: Path) -> Callable[..., Path]:
         speeds: bool = False,
         source: str | None = None,  # id of the run that it was told to start from
     ) -> Path:
-        folder = tmp_path / f"horizon3d-{phase}-{scale}-{name}"
-        folder.mkdir(parents=True)
-        told = {"init_from": source} if source else {}
-        overrides = [*overrides, *(f"phase.{key}={value}" for key, value in told.items())]
-        record = {
-            "run_id": folder.name, "overrides": overrides, "scale": scale, "seed": seed, "commit": "0123456789abcdef",
-            "data": {"name": "synthetic highway", "version": "v1.2-trainval", "train_split": "train", "split": "val",
-                     "root": root},
-            "initialized_from": None, "epochs": epochs, "steps": 10, "parameters": 2_500_000, "resumed": False,
-            "seconds": {"fit": 10.0, "all": 12.0}, "peak_memory_mib": {"process": 900, "largest_worker": 100},
-            "skipped_files": {}, "device": "cpu", "processes": 1, "threads": 1, "versions": {"torch": "2"},
-        }  # fmt: skip
-        classes = {c: {"AP": value, "AVE": 2 - value, "num_gt": 10} for c in CLASSES}
-        metrics = {
-            "mAP": value, "NDS": value, "mAVE": 2 - value, "classes": classes,
-            "ranges": {r: {"mAP": value, "NDS": value, "classes": classes} for r in RANGES},
-            "tags": {"weather.rain": {"mAP": value}},
-        }  # fmt: skip
-        if speeds:
-            part = {"mAP_present": value, "mAVE_present": 2 - value, "classes": classes | {
-                "car": {"AP": value, "AVE": 2 - value, "num_gt": 3}}}  # fmt: skip
-            metrics["speeds"] = {s: part for s in SPEEDS}
+        run_id, told = f"horizon3d-{phase}-{scale}-{name}", {"init_from": source} if source else {}
+        record = finished_runs.run_json(
+            run_id, seed, root, scale=scale, epochs=epochs,
+            overrides=[*overrides, *(f"phase.{key}={value}" for key, value in told.items())],
+        )  # fmt: skip
+        metrics = finished_runs.metrics_json(value, speeds=SPEEDS if speeds else ())
         model = {
             "name": "horizon3d", "ocsf": {"margin_m": 4.8}, "doppler": {"in_losses": False, "along_heading": True}
         }  # fmt: skip
@@ -63,12 +45,7 @@ def write_run(tmp_path: Path) -> Callable[..., Path]:
                   "data": {"root": str(tmp_path), "version": "v1.2-trainval"},
                   "backbone": {"file": f"{tmp_path}/r50.pth"},
                   "paths": {"outputs": str(tmp_path)}, "out": None}  # fmt: skip
-        curves = "step,epoch,loss/total,val/mAP,lr\n4,0,5.5,,0.1\n4,0,,0.1,\n9,1,4.5,,0.1\n9,1,,0.2,\n"
-        (folder / "run.json").write_text(json.dumps(record))
-        (folder / "metrics.json").write_text(json.dumps(metrics))
-        (folder / "config.yaml").write_text(yaml.safe_dump(config))
-        (folder / "metrics.csv").write_text(curves)
-        return folder
+        return finished_runs.write_run(tmp_path / run_id, record, metrics, config)
 
     return write
 
@@ -88,18 +65,7 @@ def publish_all(tmp_path: Path) -> Callable[[], None]:
 def make_result() -> Callable[..., RunResult]:
     """One result with these metrics, as `src.report.results` reads it; `changes` are other fields."""
 
-    def make(run_id: str, metrics: dict[str, float | None], seed: int = 0, **changes: Any) -> RunResult:
-        fields: dict[str, Any] = {
-            "run_id": run_id, "model": "horizon3d", "phase": "phase1", "scale": "mini", "seed": seed, "overrides": [],
-            "data": {"name": "synthetic highway", "root": "world", "split": "val"}, "commit": "0123456789abcdef",
-            "versions": {}, "device": "cpu", "processes": 1, "threads": 2, "initialized_from": None, "epochs": 6,
-            "steps": 10, "parameters": 2_500_000, "resumed": False, "seconds": {"all": 12.0},
-            "peak_memory_mib": {"process": 900}, "skipped_files": {}, "config": {}, "metrics": metrics, "curves": {},
-            "latency": None,
-        }  # fmt: skip
-        return RunResult(**(fields | changes))
-
-    return make
+    return finished_runs.result
 
 
 @pytest.fixture

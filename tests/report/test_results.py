@@ -17,8 +17,8 @@ from src.report.results import (
     publish_result,
     read_result,
     read_results,
+    read_results_or_raise,
     result_path,
-    sound_results,
 )
 
 
@@ -73,12 +73,10 @@ def test_the_second_score_of_detections_is_read_by_name(write_run, reports):
     assert result.metrics[path] == 0.1 and result.intervals == {path: [0.0, 0.2]}
 
 
-def with_intervals(folder, bounds, scenes=20):
+def with_intervals(folder, bounds):
     path = folder / "metrics.json"
     metrics = json.loads(path.read_text()) | {"measures": {"moving_AP": 0.4, "moving_boxes": 9, "history_near": None}}
-    path.write_text(
-        json.dumps(metrics | {"intervals": {"scenes": scenes, "draws": 500, "level": 0.95, "bounds": bounds}})
-    )
+    path.write_text(json.dumps(metrics | {"intervals": {"scenes": 20, "draws": 500, "level": 0.95, "bounds": bounds}}))
     return folder
 
 
@@ -313,10 +311,10 @@ def test_truncated_and_foreign_files_are_named_and_the_rest_is_read(published, w
 def test_what_cannot_be_read_is_an_error_to_those_who_want_it(published, write_run, reports):
     other = publish_result(write_run("b", [], 0, 0.4), reports)
     published.write_text("{")
-    assert list(sound_results(reports, "mini", [other.stem])) == [other.stem]
+    assert list(read_results_or_raise(reports, "mini", [other.stem])) == [other.stem]
     for wanted in (None, [published.stem]):
         with pytest.raises(DataError, match=r"mini-a\.json: not readable.*restore it"):
-            sound_results(reports, "mini", wanted)
+            read_results_or_raise(reports, "mini", wanted)
 
 
 def test_an_older_run_that_was_resumed_says_nothing_of_its_time(published):

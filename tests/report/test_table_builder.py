@@ -46,11 +46,11 @@ def cells_of(markdown):
     return {cells[0]: cells[1:] for cells in found}
 
 
-def with_bounds(results, half=0.05, **metrics):
-    """The results with an interval of this half width around each score, over 20 scenes."""
+def with_bounds(results):
+    """The results with an interval of 0.05 to each side of each score, over 20 scenes."""
     for result in results.values():
         result.scenes = 20
-        result.intervals = {name: [value - half, value + half] for name, value in result.metrics.items()}
+        result.intervals = {name: [value - 0.05, value + 0.05] for name, value in result.metrics.items()}
     return results
 
 

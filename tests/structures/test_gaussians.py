@@ -53,13 +53,12 @@ def augmentation(flip_x, flip_y, angle, scale):
     return matrix
 
 
-def physical(count=7):
+def physical():
     """Random Gaussians whose attributes have a meaning: unit directions, positive scales."""
     torch.manual_seed(0)
-    drawn = gaussians(count)
-    return gaussians(
-        count, directions=torch.nn.functional.normalize(drawn.directions, dim=-1), scales=drawn.scales.abs() + 0.2
-    )
+    drawn = gaussians(7)
+    directions = torch.nn.functional.normalize(drawn.directions, dim=-1)
+    return gaussians(7, directions=directions, scales=drawn.scales.abs() + 0.2)
 
 
 def covariance(of):

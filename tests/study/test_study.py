@@ -6,13 +6,13 @@ import pytest
 
 from src.errors import ConfigError, DataError, HorizonError, InterruptedRunError
 from src.report.claims import load_claims
-from src.report.results import RunResult
 from src.report.sweep_record import read_record
 from src.study import __main__ as study
 from src.sweep import run_plan, sweep_files
 from src.sweep.record_writer import RecordWriter
 from src.sweep.run_plan import Identifier, definition
 from src.sweep.sweep_study import SweepStudy, default_storage
+from tests import finished_runs
 from tests.sweep.fake_train import identify
 
 SWEEPS = {
@@ -76,13 +76,9 @@ def trained(monkeypatch):
             folder.mkdir(parents=True)
             (folder / "run.json").write_text("{}")
             (folder / "metrics.json").write_text(json.dumps({"mAP": value}))
-            results[spec.run_id] = RunResult(
-                run_id=spec.run_id, model="m", phase="phase1", scale="debug", seed=spec.seed, overrides=[],
-                data={"name": "n", "root": "r"}, commit="c", versions={}, device="cpu", processes=1, threads=1,
-                initialized_from=None, epochs=1, steps=1, parameters=1, resumed=False, seconds={"all": 60.0},
-                peak_memory_mib={"process": 1}, skipped_files={}, config={}, metrics={"mAP": value}, curves={},
-                latency=None,
-            )  # fmt: skip
+            results[spec.run_id] = finished_runs.result(
+                spec.run_id, {"mAP": value}, spec.seed, scale="debug", seconds={"all": 60.0}
+            )
         shared = SweepStudy(call.outputs, plan.study, default_storage(call.outputs), definition(plan, call.common))
         RecordWriter(plan, shared, call.again, call.outputs, call.reports).write()
         calls.append((plan.sweep.name, new))

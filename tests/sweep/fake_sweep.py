@@ -28,13 +28,11 @@ def make_sweep(rows=None, space=None, **more):
     return SweepConfig(name="fake", title="t", question="q", rows=rows, space=space, **more)
 
 
-def make_runner(
-    folder, sweep, seeds=(0,), common=(), workers=1, definition=None, storage=None, publish=None, results=()
-):
+def make_runner(folder, sweep, seeds=(0,), common=(), workers=1, storage=None, publish=None, results=()):
     outputs, reports = Path(folder) / "outputs", Path(folder) / "reports"
     common = [*common, f"paths.outputs={outputs}"]
-    plan = without_published(make_plan(sweep, common, list(seeds), identify), results, workers > 0)
-    definition = definition or {"format": 1, "kind": "search" if sweep.is_search else "rows"}
+    plan = without_published(make_plan(sweep, common, list(seeds), identify), results, training=workers > 0)
+    definition = {"format": 1, "kind": "search" if sweep.is_search else "rows"}
     study = SweepStudy(outputs, plan.study, storage or default_storage(outputs), definition)
     writer = RecordWriter(plan, study, "the command", outputs, reports)
     prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else lambda *_: None

@@ -38,8 +38,8 @@ def start(folder, **what):
     )  # fmt: skip
 
 
-def finish(process, expect=0, timeout=90):
-    out, err = process.communicate(timeout=timeout)
+def finish(process, expect=0):
+    out, err = process.communicate(timeout=90)
     assert process.returncode == expect, out + err
     return err
 
@@ -341,7 +341,7 @@ def test_a_result_that_cannot_be_published_costs_no_other(tmp_path):
     runner = make_runner(tmp_path, make_sweep({"a": [], "b": ["model.x=2"]}), publish=full)
     assert runner.run().count("done") == 2
     with pytest.raises(OSError, match="No space"):
-        runner.publish_done(strictly=True)
+        runner.publish_and_list_faults(strictly=True)
 
 
 def test_a_run_whose_files_are_broken_is_named_and_costs_no_other(tmp_path):
@@ -353,7 +353,7 @@ def test_a_run_whose_files_are_broken_is_named_and_costs_no_other(tmp_path):
     published = []
     runner = make_runner(tmp_path, make_sweep({"a": [], "b": ["model.x=2"]}), publish=publish)
     assert runner.run().count("done") == 2 and published == [runner.specs()[1].run_id]
-    (fault,) = runner.publish_done(strictly=True)
+    (fault,) = runner.publish_and_list_faults(strictly=True)
     assert fault.startswith(f"the result of {runner.specs()[0].run_id}") and "run.json: not readable" in fault
 
 

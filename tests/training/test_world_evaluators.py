@@ -54,15 +54,15 @@ def rays(times_s, model, samples):
     return RayBundle.concatenate(parts, dim=0)
 
 
-def index_of(root, count=2, scenes=(0, 1)):
+def index_of(root):
     return SimpleNamespace(
-        sample_tokens=np.array([f"stream{n}" for n in range(count)]), sample_scenes=np.array(scenes), root=root,
+        sample_tokens=np.array(["stream0", "stream1"]), sample_scenes=np.array([0, 1]), root=root,
         scene_names=np.array(["a", "b"]),
     )  # fmt: skip
 
 
-def frames(model, poses=None, augs=None):
-    batch = bare_frame(START_US / 1e6, poses or [pose(), pose()], augs)
+def frames(model, augs=None):
+    batch = bare_frame(START_US / 1e6, [pose(), pose()], augs)
     bundle = rays([0, 5, 15], model, 2)
     now = bundle[bundle.steps == 0]
     return replace(
@@ -90,8 +90,8 @@ def write_truth(root):
         truth.write(root, name)
 
 
-def timeline(rays, stride=5):
-    return replace(FIVE_HERTZ, scored_rays=rays, score_stride=stride)
+def timeline(rays):
+    return replace(FIVE_HERTZ, scored_rays=rays, score_stride=5)
 
 
 def scores_of(kind, model, batch, root):
@@ -191,7 +191,7 @@ def test_a_sample_counts_once_and_rays_are_drawn_alike_in_any_batch(tmp_path):
     whole = evaluator.compute()
     evaluator.update(Wall(scale=0.8), None, batch)
     assert evaluator.compute() == whole and 0 < whole["iou"] < 1
-    first = {row: scores.sums for row, scores in evaluator.found.items()}
+    first = {row: scores.sums for row, scores in evaluator.scores_by_sample.items()}
     one = replace(
         bare_frame(100.0, [pose()]),
         tokens=["stream1"],
@@ -199,7 +199,7 @@ def test_a_sample_counts_once_and_rays_are_drawn_alike_in_any_batch(tmp_path):
     )
     evaluator.reset()
     evaluator.update(Wall(scale=0.8), None, one)
-    np.testing.assert_array_equal(evaluator.found[1].sums["iou"], first[1]["iou"])
+    np.testing.assert_array_equal(evaluator.scores_by_sample[1].sums["iou"], first[1]["iou"])
 
 
 def test_frames_without_rays_score_nothing(tmp_path):

@@ -13,9 +13,10 @@ from src.structures.batch import FrameBatch
 from src.structures.boxes import Boxes3D
 from src.structures.detections import DetectionTable
 from src.training.evaluator import DetectionEvaluator
-from src.training.fit import build_loggers, build_trainer
+from src.training.fit import build_loggers, build_trainer, fit
 from src.training.optim import OptimConfig
 from src.training.phases import PhaseConfig
+from src.training.run_folder import Resume
 from src.training.temporal_module import TemporalModule
 from src.training.trainer_config import Accelerator, OnNonfinite, TrainerConfig
 from tests.evaluation_sets import set_of
@@ -170,3 +171,15 @@ def toy_trainer(
     trainer = build_trainer(folder, config, phase, precision=precision, ema_decay=ema, loggers=loggers)
     trainer.progress_bar_callback.disable()
     return trainer
+
+
+def train_toy(folder, module, data, **options):
+    """Train in a run's folder, from its newest checkpoint where there is one; `options` are those of `toy_trainer`."""
+    if is_main_process():
+        folder.open(Resume.auto)
+    resume_from = folder.newest_checkpoint()
+    try:
+        fit(toy_trainer(folder, resume_from, **options), module, data, resume_from)
+    finally:
+        if is_main_process():
+            folder.close()

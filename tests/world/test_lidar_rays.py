@@ -24,8 +24,8 @@ def straight_road(slope):
     return Road(**line, lanes=2, side_road=0, apron=None, screen_m=0.0)
 
 
-def one_block(middle, size, yaw, velocity=(0.0, 0.0, 0.0), reflectivity=0.5):
-    rows = {"middles": middle, "velocities": velocity, "sizes": size, "yaws": yaw, "reflectivity": reflectivity}
+def one_block(middle, size, yaw, velocity=(0.0, 0.0, 0.0)):
+    rows = {"middles": middle, "velocities": velocity, "sizes": size, "yaws": yaw, "reflectivity": 0.5}
     return Blocks(**{name: np.array([value], float) for name, value in rows.items()})
 
 

@@ -13,13 +13,13 @@ def facing(x0, x1, y0, y1, z):
     return [[x0, y0, z], [x0, y1, z], [x1, y1, z], [x1, y0, z]]
 
 
-def draw(quads, two_sided=False, layer=1.0, groups=None):
+def draw(quads, two_sided=False, groups=None):
     n = len(quads)
     groups = np.arange(n) if groups is None else np.array(groups)
     return draw_quads(
         np.array(quads, dtype=float).reshape(n, 4, 3),
         np.full(n, two_sided),
-        np.full(n, layer),
+        np.ones(n),
         groups,
         max(int(groups.max(initial=-1)) + 1, 1),
         INTRINSIC,

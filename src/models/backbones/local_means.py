@@ -42,15 +42,16 @@ class LocalMeans(nn.Module):
         radar_points: Tensor,  # [P, 7] aug frame
         radar_batch: Tensor,  # [P] int64
     ) -> SparseBEV:
-        """The same sites; points whose cell is not one of them are left out."""
+        """Add what the points measure to the map's sites; points in other cells are left out."""
         means = self.measure(bev, radar_points, radar_batch)
         return bev.with_features(bev.features + self.embed(means))
 
     @torch.no_grad()
     def measure(self, bev: SparseBEV, radar_points: Tensor, radar_batch: Tensor) -> Tensor:  # [M, 10] float32
-        """Of the points in the window of each cell: the mean point, its position as cells from the cell's centre, the
-        rest in units of the scales; the mean velocity weighted by speed, which one moving point among standing ones
-        decides; log of 1 + the points' weight. All 0 where no point is near.
+        """What the points in the window of each cell measure. All 0 where no point is near.
+
+        The mean point, its position as cells from the cell's centre, the rest in units of the scales; the mean velocity
+        weighted by speed, which one moving point among standing ones decides; log of 1 + the points' weight.
         """
         points = radar_points.float()
         cells = self.grid.cell_of(points[:, :2])

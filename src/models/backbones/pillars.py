@@ -54,7 +54,7 @@ class PillarEncoder(nn.Module):
 
     @property
     def norm_pairs(self) -> list[tuple[str, str]]:
-        """Each layer has its norm."""
+        """Name of each layer with that of its norm, which inference folds into it."""
         return [(f"layers.{number}", f"norms.{number}") for number in range(len(self.layers))]
 
     def forward(

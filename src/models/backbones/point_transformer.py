@@ -60,7 +60,7 @@ class RadarPoints:
         return replace(self, bev=self.bev.with_features(features))
 
     def padded(self) -> PaddedPoints:
-        """Sample by sample. Synchronises with a GPU once."""
+        """The points of each sample in a row of their own. Synchronises with a GPU once."""
         sample, batch_size = self.bev.indices[:, 0], self.bev.batch_size
         longest = int(segment_count(sample, batch_size).max())
         rows = topk_per_sample(self.means.new_zeros(len(sample)), sample, batch_size, longest)  # in their order

@@ -117,7 +117,7 @@ class VoVNet99(nn.Module):
                     nn.init.zeros_(module.bias)
 
     def train(self, mode: bool = True) -> VoVNet99:
-        """As for any module, except that batch norm stays in evaluation mode."""
+        """Set the mode of all modules but batch norms, which stay in evaluation mode."""
         super().train(mode)
         for module in self.modules():
             if isinstance(module, MapBatchNorm):

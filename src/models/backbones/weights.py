@@ -17,7 +17,7 @@ WRAPPERS = ("state_dict", "model")
 PREFIXES = ("img_backbone.", "backbone.bottom_up.")  # FCOS3D, DD3D
 LISTED_KEYS = 5
 LARGEST = 1e9
-"""Of a weight or a variance in size; those of published files stay far below."""
+"""Largest size of a weight or a variance that is taken; those of published files stay far below."""
 
 
 class BackboneName(Enum):

@@ -58,7 +58,7 @@ class StackFrame(RememberedFrame):
     cells: StoredCellStack
 
     def with_velocities(self, velocities: Callable[[int, Tensor, Tensor], Tensor]) -> StackFrame:
-        """Of the cells, which carry the maps of every age."""
+        """The frame with other velocities of its cells, which carry the maps of every age."""
         told = self.cells.by_stream(velocities, len(self.present), self.cells.xy, self.cells.velocities)
         return replace(self, cells=replace(self.cells, velocities=told))
 

@@ -81,7 +81,7 @@ def _fold_norms(model: nn.Module) -> None:
 
 
 def _merge_relus(model: nn.Module) -> None:
-    """A linear layer of a sequence applies the ReLU behind it."""
+    """Let each linear layer of a sequence apply the ReLU behind it."""
     for module in model.modules():
         if isinstance(module, nn.Sequential):
             for number, (layer, behind) in enumerate(zip(module[:-1], module[1:], strict=True)):
@@ -90,7 +90,7 @@ def _merge_relus(model: nn.Module) -> None:
 
 
 def _round_weights(model: nn.Module) -> None:
-    """To bfloat16, except where the model computes in float32 whatever autocast says."""
+    """Round weights to bfloat16, except where the model computes in float32 whatever autocast says."""
     exact = {id(module) for part in declared_parts(model, "full_precision_parts") for module in part.modules()}
     for module in model.modules():
         if isinstance(module, Linear) and id(module) not in exact:
@@ -98,7 +98,7 @@ def _round_weights(model: nn.Module) -> None:
 
 
 def declared_parts(model: nn.Module, member: str) -> Iterator[nn.Module]:
-    """The submodules that the modules of a model name in such a member."""
+    """The submodules that the modules of a model list by name in `member`, a class attribute."""
     for module in model.modules():
         for name in getattr(module, member, ()):
             yield module.get_submodule(name)

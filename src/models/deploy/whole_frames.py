@@ -38,7 +38,7 @@ class WholeFrames:
 
     @property
     def memory(self) -> Any:
-        """As the detector's `forward` takes it. Waits for a GPU."""
+        """What is remembered, as the detector's `forward` takes it. Waits for a GPU."""
         return self.form.unpack_memory(self._memory)
 
     @memory.setter

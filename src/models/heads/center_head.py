@@ -293,7 +293,7 @@ def measured_codes(
     codes: Tensor,  # [n, CODE_SIZE (+ 11)]
     rows: Tensor,  # [n] int64, cells
 ) -> Tensor:  # [n, CODE_SIZE (+ 11)]
-    """With what the radar measures of the velocities, the last numbers of a box code."""
+    """Box codes whose velocities have the radial part that the radar measures, where it does (`Doppler.correct`)."""
     before, velocities, after = codes.split([CODE_SIZE - 2, 2, codes.shape[1] - CODE_SIZE], dim=1)
     return torch.cat([before, output.doppler.correct(velocities, output.bev.sites.linear()[rows]), after], dim=1)
 
@@ -303,7 +303,7 @@ def _on_motion(
     codes: Tensor,  # [n, CODE_SIZE (+ 11)]
     rows: Tensor,  # [n] int64, cells
 ) -> Tensor:  # [n, CODE_SIZE (+ 11)]
-    """With `HeadOutput.motion` added."""
+    """Box codes with `HeadOutput.motion`, if there is any, added to their velocities."""
     if output.motion is None:
         return codes
     return codes + F.pad(output.motion[rows], (CODE_SIZE - 2, codes.shape[1] - CODE_SIZE))

@@ -146,7 +146,7 @@ def top_candidates(
 def boxes_of_columns(
     columns: Tensor,  # [n, sum of WIDTHS]
 ) -> Boxes3D:
-    """What `decoded_boxes` gives."""
+    """Boxes from the columns that `decoded_boxes` gives."""
     centers, sizes, yaws, velocities, scores, labels, attributes, _ = columns.split(WIDTHS, dim=1)
     return Boxes3D(
         centers=centers,

@@ -58,7 +58,7 @@ class FixedDecode(nn.Module):
         self,
         features: Tensor,  # [groups, n, C]
     ) -> Tensor:  # [groups, n, CODE_SIZE (+ 11)]
-        """As `CenterHead.regress`, all groups in two products."""
+        """Box codes as `CenterHead.regress` gives them, of all groups in two products."""
         hidden = torch.baddbmm(self.first_bias, features.to(self.first_weight.dtype), self.first_weight).relu()
         with torch.autocast(features.device.type, enabled=False):
             return torch.baddbmm(self.second_bias, hidden.float(), self.second_weight)
@@ -67,7 +67,7 @@ class FixedDecode(nn.Module):
         self,
         candidates: Tensor,  # [groups, n, sum of WIDTHS] of `forward`, on the CPU
     ) -> Boxes3D:
-        """What is left of them, best first."""
+        """Boxes that suppression leaves of the candidates, best first."""
         counts = [[count] for count in (candidates[..., -1] > 0).sum(1).tolist()]
         found = candidates[candidates[..., -1] > 0]
         head, boxes = self.head, boxes_of_columns(found)

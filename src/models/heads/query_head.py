@@ -30,7 +30,7 @@ from src.targets.supervision import supervised_boxes, upload_boxes
 INITIAL_SIZE_M = (4.5, 2.0, 1.8)
 """Length, width and height before the head has learnt any."""
 CLASS_COST, BOX_COST = 2.0, 0.25
-"""Of the assignment, as in DETR3D and what came of it; velocities cost nothing there."""
+"""Weights of the assignment's costs, as in DETR3D and its successors; velocities cost nothing there."""
 
 
 @dataclass
@@ -42,7 +42,7 @@ class QueryPrediction:
     valid: Tensor  # [B, Q] bool
 
     def split(self, count: int) -> tuple[QueryPrediction, QueryPrediction]:
-        """Of the first so many queries, and of the others."""
+        """Predictions of the first `count` queries, and of the others."""
         values = (self.logits, self.codes, self.valid)
         first, others = ([value[:, part] for value in values] for part in (slice(count), slice(count, None)))
         return QueryPrediction(*first), QueryPrediction(*others)
@@ -167,7 +167,7 @@ class SetPredictionHead(nn.Module):
     def costs(
         self, prediction: QueryPrediction, labels: Tensor, wanted: Tensor, samples: Tensor
     ) -> Tensor:  # [K, Q] float32
-        """Of each object and each query of its sample: what focal loss and L1 would change by."""
+        """Cost of matching each object to each query of its sample: what focal loss and L1 would change by."""
         logits = prediction.logits.float()
         yes = torch.ones_like(logits, dtype=torch.bool)
         gain = (sigmoid_focal(logits, yes) - sigmoid_focal(logits, ~yes))[samples]  # [K, Q, 12]

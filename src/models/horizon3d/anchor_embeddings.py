@@ -25,7 +25,7 @@ class JoinedEmbeddings:
 
     @classmethod
     def of(cls, parts: Sequence[nn.Sequential]) -> JoinedEmbeddings:
-        """Of these networks, in the order of their inputs."""
+        """Join these networks, in the order of their inputs."""
 
         def stacked(number: int, name: str) -> Tensor:
             return torch.stack([getattr(part[number], name) for part in parts])

@@ -180,7 +180,7 @@ class BEVPath(nn.Module):
         return WarpedCells(*(value[kept] for value in values))
 
     def shape(self, batch_size: int) -> tuple[int, int, int, int]:
-        """Of the grid over time: (B, slots, rows, cols)."""
+        """Shape of the grid over time: (B, slots, rows, cols)."""
         return batch_size, self.num_slots, *self.grid.cells
 
     def aggregate(self, fused: SparseBEV, warped: WarpedCells | PaddedWarpedCells | None) -> SparseBEV:
@@ -218,7 +218,7 @@ class BEVPath(nn.Module):
         return SparseMap(sites, segment_mean(features, owners, len(sites)))
 
     def _over_time_padded(self, fused: SparseBEV, warped: PaddedWarpedCells) -> SparseMap:
-        """The same in fixed shapes."""
+        """As `_over_time`, in fixed shapes."""
         shape = self.shape(fused.batch_size)
         sample, slot, row, col = Sites(shape, warped.keys).strides
         now = fused.sites.positions((sample, row, col), self.config.num_frames * slot)

@@ -48,7 +48,7 @@ class DPTFFrame(RememberedFrame):
         return replace(frame, gaussians=replace(frame.gaussians, valid=frame.gaussians.valid & keep[:, None]))
 
     def with_velocities(self, velocities: Callable[[int, Tensor, Tensor], Tensor]) -> DPTFFrame:
-        """Of cells and of Gaussians."""
+        """The frame with other velocities of its cells and its Gaussians."""
         cells, gaussians = self.cells, self.gaussians
         if cells is not None:
             told = cells.by_stream(velocities, len(self.present), cells.xy, cells.velocities)

@@ -92,12 +92,12 @@ class FixedHorizon3D(nn.Module):
         return FixedMemory.of(found, self.model.dptf, self.model.config.channels, device).tensors
 
     def unpack_memory(self, memory: tuple[Tensor, ...]) -> DPTFMemory | None:
-        """And back, in float32; what is never read again is lost. Waits for a GPU."""
+        """The inverse of `pack_memory`, in float32; what is never read again is lost. Waits for a GPU."""
         return FixedMemory(*(tensor.clone() for tensor in memory)).to_memory() if memory else None
 
 
 def default_capacities(model: Horizon3D) -> Capacities:
-    """As many points as there may be voxels, twice as many sites, twice the cells that Gaussians may occupy."""
+    """Room for as many points as voxels are allowed, twice as many sites, twice the cells that Gaussians may occupy."""
     config, cells = model.config, model.grid.rows * model.grid.cols
     most = config.radar_encoder.max_voxels
     if config.ocsf is None:

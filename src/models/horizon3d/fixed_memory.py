@@ -25,10 +25,13 @@ from src.structures.sparse_bev import SparseBEV
 from src.structures.taxonomy import Source
 
 FRAME_WIDTH = 20
-"""Of a frame: time (s), pose [4, 4], and whether there is one, its cells and its Gaussians."""
+"""Numbers of a frame: time (s), pose [4, 4]; whether it, its cells and its Gaussians are there."""
 CELL_WIDTH, GAUSSIAN_WIDTH = 5, 10
-"""Beside the features, which come before the last: position 2, velocity 2, whether there is one; mean, scales,
-direction, velocity 2 each, opacity logit, whether there is one."""
+"""Numbers of a cell and of a Gaussian without its features, which stand before the last number.
+
+A cell: position 2, velocity 2, whether it is there. A Gaussian: mean, scales, direction, velocity 2 each, opacity
+logit, whether it is there.
+"""
 
 
 @dataclass(frozen=True)
@@ -41,12 +44,12 @@ class FixedMemory:
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        """All there is."""
+        """All tensors of the memory."""
         return self.frames, self.cells, self.gaussians
 
     @classmethod
     def empty(cls, dptf: DPTF, channels: int, device: torch.device) -> FixedMemory:
-        """Nothing is remembered."""
+        """A memory without frames, on the device."""
         cells = gaussians = (0, 0)
         if dptf.bev_path is not None:
             cells = (dptf.bev_path.config.num_frames, dptf.bev_path.config.max_cells_per_frame)
@@ -60,7 +63,7 @@ class FixedMemory:
 
     @classmethod
     def of(cls, memory: DPTFMemory, dptf: DPTF, channels: int, device: torch.device) -> FixedMemory:
-        """The same memory; it is of one stream."""
+        """`memory`, which is of one stream, in fixed shapes."""
         fixed = cls.empty(dptf, channels, device)
         for age, frame in enumerate(memory.to(device).frames):
             held = torch.tensor([frame.cells is not None, frame.gaussians is not None], device=device)
@@ -73,7 +76,7 @@ class FixedMemory:
         return fixed
 
     def to_memory(self) -> DPTFMemory:
-        """The same in tensors as large as what is remembered, in float32. Waits for a GPU."""
+        """The inverse of `of`: tensors as large as what is remembered, in float32. Waits for a GPU."""
         frames = []
         for age, row in enumerate(self.frames.unbind(0)):
             present, has_cells, has_gaussians = (row[-3:] > 0).tolist()
@@ -161,14 +164,14 @@ def _taken(
     old: Tensor,  # [T', n, width]
     order: Tensor,  # [T] int64, of the new frame and the old ones
 ) -> Tensor:  # [T', n, width]
-    """The first T'; of no meaning where there is no frame."""
+    """The first T' of both in this order; of no meaning where there is no frame."""
     return torch.cat([new, old]).index_select(0, order[: len(old)].clamp(max=len(old)))
 
 
 def _best_cells(
     path: BEVPath, fused: SparseBEV, cells: CellPrediction, count: int
 ) -> Tensor:  # [1, count, CELL_WIDTH + C]
-    """As `BEVPath.store`, of a frame that is not augmented."""
+    """Rows of the cells that `BEVPath.store` keeps of a frame that is not augmented, padded to `count`."""
     score = cells.occupancy_logits.sigmoid()
     chosen = (score > path.config.memory_threshold) & (fused.sites.keys < fused.sites.end)
     best = where_scalar(chosen, score, -1.0).argsort(descending=True, stable=True)[:count]
@@ -185,7 +188,7 @@ def _cell_rows(cells: StoredCells) -> Tensor:  # [n, CELL_WIDTH + C]
 def _chosen_gaussians(
     path: GaussianPath, gaussians: GaussianSet, active: Tensor, batch: FrameBatch
 ) -> Tensor:  # [1, n, GAUSSIAN_WIDTH + C]
-    """As `GaussianPath.store`, of a frame that is not augmented."""
+    """Rows of the Gaussians that `GaussianPath.store` keeps of a frame that is not augmented."""
     picks = path.sample(gaussians, active, batch)[0]
     stored = replace(gaussians, features=stored_features(gaussians.features))
     rows = _gaussian_rows(stored)[0].index_select(0, picks.clamp(min=0))

@@ -89,7 +89,7 @@ class AnchorEncoder(nn.Module):
         gaussians: GaussianSet,
         joined: JoinedEmbeddings | None = None,
     ) -> Tensor:  # [B, G, C]
-        """e of the layer's equations."""
+        """Embedding of each Gaussian's attributes, e of the layer's equations."""
         with torch.autocast(gaussians.means.device.type, enabled=False):
             inputs = {
                 "mean": (gaussians.means - self.centre_m) / self.half_extent_m,
@@ -123,7 +123,7 @@ class SelfEncoding(nn.Module):
         gaussians: GaussianSet,
         picks: Tensor | None = None,  # [V] int64, `valid_rows` of the Gaussians, where the caller has them
     ) -> Tensor:  # [B, G, C]; zero for padding
-        """No gradient reaches the means, which only choose cells."""
+        """Exchange the features among neighbours. No gradient reaches the means, which only choose cells."""
         b, g, c = features.shape
         if fixed_shapes() is not None:
             return self._of_all(features, gaussians)
@@ -136,7 +136,7 @@ class SelfEncoding(nn.Module):
         return x.new_zeros(b * g, c).index_copy(0, picks, x).unflatten(0, (b, g))
 
     def _of_all(self, features: Tensor, gaussians: GaussianSet) -> Tensor:
-        """In fixed shapes: padding as Gaussians of a sample that does not exist."""
+        """`forward` in fixed shapes: padding counts as Gaussians of a sample that does not exist."""
         valid, (b, g), grid = gaussians.valid, gaussians.valid.shape, self.grid
         lower, size, shape = (grid.x_min_m, grid.y_min_m), (grid.cell_m,) * 2, (b, *grid.cells)
         means, sample = gaussians.means.flatten(0, 1), arange(b, torch.int64, valid.device)
@@ -315,7 +315,7 @@ class GaussianEncoder(nn.Module):
 
 
 def _measured(gaussians: GaussianSet, doppler: Doppler | None) -> GaussianSet:
-    """With what the radar measures of their velocities."""
+    """The Gaussians with the radial velocity that the radar measures, where it does (`Doppler.correct`)."""
     if doppler is None:
         return gaussians
     velocities = doppler.correct(gaussians.velocities.flatten(0, 1), gaussians.means.detach())

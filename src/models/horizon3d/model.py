@@ -114,7 +114,7 @@ class Horizon3D(Detector):
         return self.head(bev if self.neck is None else self.neck(bev), doppler)
 
     def _measure_doppler(self, batch: FrameBatch) -> dict[str, Doppler | None]:
-        """For whom the configuration wants it."""
+        """Measured velocities for `gaussians`, `cells` and `boxes`; None for each that `model.doppler` leaves out."""
         config, measured = self.config.doppler, None
         wanted = {name: getattr(config, name) for name in ("gaussians", "cells", "boxes")}
         if any(wanted.values()):

@@ -20,7 +20,7 @@ from src.structures.taxonomy import CAMERAS
 from src.targets.depth import lid_index
 
 FFN_RATIO = 4
-"""Of the public FB-BEV."""
+"""Width of the MLP's hidden layer over the channels, as in the public FB-BEV."""
 FOREGROUND_STRIDE = 2
 """Cells of the map per place where foreground is predicted, along either axis; between these it is bilinear."""
 FOREGROUND_BIAS = -4.6

@@ -51,7 +51,7 @@ class Doppler:
         grid: BEVGrid,
         config: DopplerConfig,
     ) -> Self:
-        """Of all points inside the grid."""
+        """Average the velocities of the points inside the grid around each cell, by radial speed."""
         given, weighted = radial_votes(radar_points, radar_batch, grid)
         if (fixed := fixed_shapes()) is not None:
             keys, _, groups = fixed.grouped(given, NONE, len(given))

@@ -19,7 +19,7 @@ class FullPrecisionLinear(nn.Linear):
 
 
 class FullPrecisionConv2d(nn.Conv2d):
-    """As `FullPrecisionLinear`, for images."""
+    """A convolution in float32 whatever autocast says, see `FullPrecisionLinear`."""
 
     full_precision_parts = ("",)
 

@@ -86,7 +86,7 @@ class ImageCrossAttention(nn.Module):
     def _gather(
         self, features: Tensor, query: Tensor, points: Tensor, views: CameraViews, values: list[Tensor]
     ) -> Tensor:  # [B, G, C]
-        """The same without gradient, in few launches."""
+        """What `forward` gathers before its output layer; without gradient, in few launches."""
         heights, logits = self.height(features).float(), self.logits(query).float()
         matrix = views.pix_from_aug.float()
         places, visible = view_sampling_locations(

@@ -51,7 +51,7 @@ class PositionEmbedding(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(3 * config.num_depth_bins, hidden), nn.ReLU(), nn.Linear(hidden, channels))
 
     def forward(self, views: CameraViews) -> Tensor:  # [B, N, h, w, C] float32
-        """Of every pixel of the finest level; a missing camera's are finite and say nothing."""
+        """Embedding of every pixel of the finest level; a missing camera's are finite and say nothing."""
         return self.embed(self.places(views))
 
     def of_points(
@@ -59,7 +59,7 @@ class PositionEmbedding(nn.Module):
         points: Tensor,  # [B, Q, 3] aug metres
         views: CameraViews,
     ) -> Tensor:  # [B, Q, C] float32
-        """Of the pixel that each point is seen at, summed over the views that see it; zero where none does."""
+        """Embedding of the pixel that a point is seen at, summed over the views that see it; zero where none does."""
         pixels, visible = views.project(points[:, :, None])  # [B, Q, N, 1, 2], [B, Q, N, 1]
         seen = self.embed(self.on_rays(pixels.squeeze(3), views))  # [B, Q, N, C]
         return torch.where(visible, seen, 0.0).sum(2)
@@ -88,5 +88,5 @@ class PositionEmbedding(nn.Module):
         return self.between(near, far)
 
     def between(self, near: Tensor, far: Tensor) -> Tensor:  # [..., 3] at depths 0 and 1 m -> [..., D, 3]
-        """A ray is straight, so two of its places tell all."""
+        """The places at every depth on rays, which two places of each determine."""
         return near[..., None, :] + self.depths_m[:, None] * (far - near)[..., None, :]

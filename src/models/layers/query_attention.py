@@ -17,7 +17,7 @@ from src.structures.taxonomy import SPEED_UNIT_MPS
 
 OFFSET_UNIT_M = 4.0
 FREQUENCIES = 7
-"""Of the sine embedding: the shortest period is 1/64 of the range, 4.8 m of 307 m."""
+"""Frequencies of the sine embedding, in octaves: the shortest period is 1/64 of the range, 4.8 m of 307 m."""
 PENALTY_RANGE = (-2.0, 1.0)
 """Heads start with penalties of softplus(-2) = 0.13 to softplus(1) = 1.3 per metre."""
 
@@ -61,7 +61,7 @@ class QueryEmbedding(SinePositionEmbedding):
         super().__init__(channels, grid, extra=2)
 
     def forward(self, queries: Queries) -> Tensor:  # [B, Q, C]
-        """Of every query."""
+        """Embedding of every query."""
         return super().forward(queries.centers, queries.velocities.float() / SPEED_UNIT_MPS)
 
 

@@ -68,6 +68,11 @@ class Decoders(nn.Module):
             nn.init.zeros_(self.velocity.output.weight)  # untrained, everything rests or goes as measured
             nn.init.zeros_(self.velocity.output.bias)
 
+    @property
+    def at_rest(self) -> bool:
+        """Whether the velocity decoder adds 0 to what is measured: so it begins, and stays without known speeds."""
+        return not any(parameter.any() for parameter in self.velocity.output.parameters())
+
     def forward(self, volumes: Volumes, queries: Tensor, batch: Tensor) -> tuple[Tensor, Tensor | None]:  # [Q], [Q]
         """What both heads say, the second None where there is none, from one look into the volumes."""
         place, seen, measured = self.sampler(volumes, queries, batch)

@@ -167,7 +167,8 @@ class LRS4Fusion(Detector, WorldModel):
         if self.temporal is None:
             return None
         volume, velocities = volumes.scales[FUSED_SCALE], None
-        if self.config.temporal.velocity_compensation:
+        known = batch.lidar_speeds is not None
+        if self.config.temporal.velocity_compensation and (known or not self.decoders.at_rest):
             indices = volume.indices
             centres = self.temporal.grid.centre_of(indices[:, 1:])
             now = torch.cat([centres, torch.zeros_like(centres[:, :1])], dim=1)

@@ -46,7 +46,7 @@ class GraphConfig:
 
     @property
     def widths(self) -> tuple[int, int]:
-        """Of `PointGraph.nodes` and `PointGraph.edges`."""
+        """Numbers of a node and of an edge, in `PointGraph.nodes` and `PointGraph.edges`."""
         return (5, 5) if self.invariance is Invariance.rigid else (6, 2)
 
 

@@ -143,7 +143,7 @@ class PointHead(nn.Module):
         features: Tensor,  # [n, C]
         graph: PointGraph,
     ) -> PointPrediction:
-        """Of every point."""
+        """Class and box of every point."""
         shape, velocities = self.box(features).split([CODE_SIZE - 2, 2], dim=1)
         codes = torch.cat([shape, SPEED_UNIT_MPS * velocities], dim=1)
         return PointPrediction(graph, self.classes(features), codes)

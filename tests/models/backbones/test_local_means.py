@@ -16,9 +16,9 @@ SCALES = torch.tensor(POINT_SCALES)
 ROW, COL = 5, 7
 
 
-def layer(channels: int = 4) -> LocalMeans:
+def layer() -> LocalMeans:
     torch.manual_seed(0)
-    return LocalMeans(SCALES, GRID, channels)
+    return LocalMeans(SCALES, GRID, channels=4)
 
 
 def sites(cells: list[tuple[int, int, int]], samples: int = 1) -> SparseBEV:

@@ -51,9 +51,9 @@ def radar_points(count: int = 120, seed: int = 0) -> torch.Tensor:
     return lower + unit * (upper - lower)
 
 
-def encoder_of(config: RadarEncoderConfig, seed: int = 0, channels: int = 10) -> RadarEncoder:
-    torch.manual_seed(seed)
-    return RadarEncoder(config, GRID, channels)
+def encoder_of(config: RadarEncoderConfig) -> RadarEncoder:
+    torch.manual_seed(0)
+    return RadarEncoder(config, GRID, channels=10)
 
 
 def published_name(key: str) -> str:

@@ -14,9 +14,9 @@ from tests.models.frames import GRID, SIZE, make_batch
 C, IMAGE, POINTS, HEADS = 8, 5, 3, 4
 
 
-def make(num_layers=2):
+def make():
     torch.manual_seed(0)
-    config = PerspectiveDecoderConfig(num_layers=num_layers, num_heads=2, num_points=POINTS)
+    config = PerspectiveDecoderConfig(num_layers=2, num_heads=2, num_points=POINTS)
     decoder = PerspectiveDecoder(config, C, IMAGE, 4, 2, GRID)
     return decoder, SetPredictionHead(DecodeConfig(score_threshold=0.0, max_boxes=10), C, GRID, 1.0)
 

@@ -26,13 +26,13 @@ CONFIG = HeadConfig(
 )
 
 
-def make_bev(cells: int = 400, batch_size: int = 2, channels: int = 8, seed: int = 0) -> SparseBEV:
-    """A patch of active cells around the origin with random features."""
-    generator = torch.Generator().manual_seed(seed)
+def make_bev(cells: int = 400) -> SparseBEV:
+    """A patch of active cells around the origin of two samples with random features."""
+    generator = torch.Generator().manual_seed(0)
     indices = torch.randint(150, 234, (cells, 3), generator=generator)
-    indices[:, 0] %= max(batch_size, 1)
-    sites, _ = Sites.unique(indices, (batch_size, 384, 384))
-    return SparseBEV(sites, torch.randn(len(sites), channels, generator=generator))
+    indices[:, 0] %= 2
+    sites, _ = Sites.unique(indices, (2, 384, 384))
+    return SparseBEV(sites, torch.randn(len(sites), 8, generator=generator))
 
 
 def make_boxes(seed: int = 0, labels: tuple[int, ...] = tuple(range(12))) -> Boxes3D:

@@ -48,14 +48,14 @@ def world_to_aug(batch, points):
     return (flat @ (aug @ ego).T)[:, :2]
 
 
-def distinct_world_points(batch, grid, count=60, half_m=20.0):
+def distinct_world_points(batch, grid):
     """World points near the vehicle, in distinct cells of the batch's augmented frame; and those cells [n, 2]."""
     generator = torch.Generator().manual_seed(3)
-    around = (torch.rand(count, 2, generator=generator).double() * 2 - 1) * half_m
+    around = (torch.rand(60, 2, generator=generator).double() * 2 - 1) * 20.0
     points = around + batch.global_from_ego[0, :2, 3]
     cells = grid.cell_of(world_to_aug(batch, points))
     _, owners = torch.unique(cells, dim=0, return_inverse=True)
-    first = torch.zeros(int(owners.max()) + 1, dtype=torch.int64).scatter_(0, owners, torch.arange(count))
+    first = torch.zeros(int(owners.max()) + 1, dtype=torch.int64).scatter_(0, owners, torch.arange(len(points)))
     return points[first], cells[first]
 
 

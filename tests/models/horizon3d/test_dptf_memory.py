@@ -12,10 +12,10 @@ from tests.models.moving import UTM, bare_frame, bda, pose, tensors_of
 DIM = 3
 
 
-def gaussians_for(b, count=4, value=0.0):
+def gaussians_for(b, value=0.0):
     """A set whose means tell stream and value."""
-    means = torch.arange(b, dtype=torch.float32)[:, None, None] + torch.full((b, count, 2), value)
-    return gaussians_at(means, features=torch.zeros(b, count, DIM))
+    means = torch.arange(b, dtype=torch.float32)[:, None, None] + torch.full((b, 4, 2), value)
+    return gaussians_at(means, features=torch.zeros(b, 4, DIM))
 
 
 def cells_for(counts, value=0.0):

@@ -26,9 +26,9 @@ BOUNDS = GaussianBounds((0.2, 3.2), 4.0, 60.0, 1.0)
 C = 16
 
 
-def make_gaussians(means, valid=None, seed=0):
+def make_gaussians(means):
     """Gaussians with random attributes at given places [B, G, 2]."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     b, g, _ = means.shape
     angles = torch.rand(b, g, generator=generator) * 6.3
     return GaussianSet(
@@ -40,15 +40,15 @@ def make_gaussians(means, valid=None, seed=0):
         features=torch.randn(b, g, C, generator=generator),
         sources=torch.zeros(b, g, dtype=torch.int64),
         elapsed_s=torch.zeros(b, g),
-        valid=torch.ones(b, g, dtype=torch.bool) if valid is None else valid,
+        valid=torch.ones(b, g, dtype=torch.bool),
     )
 
 
-def make_radar(grid, count=300, b=1, seed=1):
-    generator = torch.Generator().manual_seed(seed)
-    linear = torch.randperm(b * grid.rows * grid.cols, generator=generator)[:count].sort().values
-    sites = Sites.from_linear(linear, (b, *grid.cells))
-    return SparseBEV(sites, torch.randn(count, C, generator=generator))
+def make_radar(grid):
+    generator = torch.Generator().manual_seed(1)
+    linear = torch.randperm(grid.rows * grid.cols, generator=generator)[:300].sort().values
+    sites = Sites.from_linear(linear, (1, *grid.cells))
+    return SparseBEV(sites, torch.randn(300, C, generator=generator))
 
 
 def make_encoder(grid, layers=2, chained=False, early=False, learnable=3, heads=None):
@@ -57,9 +57,9 @@ def make_encoder(grid, layers=2, chained=False, early=False, learnable=3, heads=
     return GaussianEncoder(C, 16, grid, BOUNDS, layers, layer).eval()
 
 
-def places(count, b=1, seed=5):
-    generator = torch.Generator().manual_seed(seed)
-    return torch.rand(b, count, 2, generator=generator) * torch.tensor([40.0, 30.0]) - torch.tensor([18.0, 16.0])
+def places(count):
+    generator = torch.Generator().manual_seed(5)
+    return torch.rand(1, count, 2, generator=generator) * torch.tensor([40.0, 30.0]) - torch.tensor([18.0, 16.0])
 
 
 def test_sampling_points_follow_scale_and_rotation(grid):

@@ -26,12 +26,12 @@ class FixedHead(torch.nn.Module):
         return self.maps
 
 
-def flat_maps(b=1, n=4, bins=16, channels=16):
+def flat_maps(b=1):
     """No keypoint anywhere, every depth alike."""
     return CameraMaps(
-        keypoint_logits=torch.full((b, n, ROWS, COLS), -12.0),
-        depth_logits=torch.zeros(b, n, bins, ROWS, COLS),
-        features=torch.randn(b, n, channels, ROWS, COLS),
+        keypoint_logits=torch.full((b, 4, ROWS, COLS), -12.0),
+        depth_logits=torch.zeros(b, 4, 16, ROWS, COLS),
+        features=torch.randn(b, 4, 16, ROWS, COLS),
     )
 
 

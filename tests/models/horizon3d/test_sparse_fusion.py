@@ -13,10 +13,10 @@ from tests.models.horizon3d.cells import rows_at
 SHAPE = (2, 20, 20)
 
 
-def make_map(cells, channels=8):
+def make_map(cells):
     indices = torch.tensor(cells, dtype=torch.int64).reshape(-1, 3)
     sites, _ = Sites.from_indices(indices, SHAPE)
-    return SparseBEV(sites, torch.randn(len(sites), channels))
+    return SparseBEV(sites, torch.randn(len(sites), 8))
 
 
 @pytest.mark.parametrize("skip_zeros", [False, True])

@@ -11,9 +11,9 @@ from src.structures.gaussians import GaussianSet
 CHANNELS, HEADS = 16, 4
 
 
-def make_set(b=2, g=9, history=4, seed=0, dtype=torch.float32):
+def make_set(b=2, g=9, history=4, dtype=torch.float32):
     """Random features and embeddings; the last `history` Gaussians are half a second and a second old."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
 
     def draw(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)

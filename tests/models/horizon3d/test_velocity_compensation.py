@@ -118,12 +118,12 @@ def stream(model, seed, streams, steps):
         yield batch, output
 
 
-def train(config, seed=0, steps=STEPS, streams=STREAMS):
-    torch.manual_seed(seed)
+def train(config):
+    torch.manual_seed(0)
     model = Horizon3D(config, GRID, None, BoxOptions(velocity_code_weight=0.2)).train()
     optimizer = torch.optim.AdamW(model.parameters(), lr=LEARNING_RATE)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps)
-    for batch, output in stream(model, seed, streams, steps):
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=STEPS)
+    for batch, output in stream(model, 0, STREAMS, STEPS):
         optimizer.zero_grad()
         model.loss(output, batch).terms["total"].backward()
         optimizer.step()
@@ -132,12 +132,12 @@ def train(config, seed=0, steps=STEPS, streams=STREAMS):
 
 
 @torch.no_grad()
-def shares_found(model, seed=10**6, streams=64):
+def shares_found(model):
     """Shares of the hidden vehicles, fast and parked, near one of the best boxes, of which as many count as there are.
 
     In clips that the training has not seen.
     """
-    batch, output = list(stream(model, seed, streams, 2))[-1]
+    batch, output = list(stream(model, seed=10**6, streams=64, steps=2))[-1]
     predicted, found = model.decode(output), []
     for row in (~batch.starts).nonzero().squeeze(1).tolist():
         truth, best = batch.boxes[row].centers[:, :2], predicted[row].centers[:, :2]

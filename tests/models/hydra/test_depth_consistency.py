@@ -14,20 +14,18 @@ LEVEL, BINS, RANGE_M = (4, 6), 16, (1.0, 40.0)
 EDGES = lid_edges(RANGE_M, BINS).tolist()
 
 
-def make_refinement(num_queries=30, num_points=3):
+def make_refinement():
     """With offsets, trust and weights that are no longer those of the start."""
     torch.manual_seed(0)
-    module = DepthConsistency(
-        DepthConsistencyConfig(num_queries=num_queries, num_points=num_points), 8, 5, RANGE_M, GRID
-    )
+    module = DepthConsistency(DepthConsistencyConfig(num_queries=30, num_points=3), 8, 5, RANGE_M, GRID)
     for layer in (module.offset, module.attention.logits, module.foreground[1]):
         torch.nn.init.normal_(layer.weight, std=0.3)
     return module.eval()
 
 
-def make_inputs(seed=1):
+def make_inputs():
     """Map, radar with pillars at every third cell, views with a missing camera, depth logits."""
-    torch.manual_seed(seed)
+    torch.manual_seed(1)
     fused, radar = torch.randn(2, 8, *GRID.cells), torch.rand(2, 4, *GRID.cells)
     radar[:, :, torch.arange(GRID.rows) % 3 != 0] = 0.0
     valid = torch.ones(2, 4, dtype=torch.bool)

@@ -18,8 +18,8 @@ def embedding(**options):
     return PositionEmbedding(config, 8, GRID, **options)
 
 
-def views_of(batch, stride=16):
-    level = torch.zeros(*batch.image_valid.shape, 1, SIZE[0] // stride, SIZE[1] // stride)
+def views_of(batch):
+    level = torch.zeros(*batch.image_valid.shape, 1, SIZE[0] // 16, SIZE[1] // 16)
     return CameraViews([level], batch.pix_from_aug, batch.image_valid, SIZE)
 
 

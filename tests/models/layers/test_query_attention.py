@@ -15,18 +15,18 @@ GRID = BEVGrid(cells=(384, 384), cell_m=0.8, centre_m=(0.0, 0.0), z_range_m=(-3.
 C = 8
 
 
-def scene(queries=5, keys=12, seed=0):
-    generator = torch.Generator().manual_seed(seed)
+def scene():
+    generator = torch.Generator().manual_seed(0)
     spread = torch.tensor([60.0, 60.0, 2.0])
-    places = [(torch.rand(2, n, 3, generator=generator, dtype=torch.float64) - 0.5) * spread for n in (queries, keys)]
-    features = [torch.randn(2, n, C, generator=generator, dtype=torch.float64) for n in (queries, keys)]
-    valid = torch.rand(2, keys, generator=generator) < 0.7
+    places = [(torch.rand(2, n, 3, generator=generator, dtype=torch.float64) - 0.5) * spread for n in (5, 12)]
+    features = [torch.randn(2, n, C, generator=generator, dtype=torch.float64) for n in (5, 12)]
+    valid = torch.rand(2, 12, generator=generator) < 0.7
     return features[0], places[0], features[1], places[1], valid
 
 
-def make_attention(count=4):
+def make_attention():
     torch.manual_seed(0)
-    attention = DistanceAttention(C, 2, count).double()
+    attention = DistanceAttention(C, 2, 4).double()
     torch.nn.init.normal_(attention.penalty.weight, std=0.3)
     return attention
 

@@ -20,8 +20,8 @@ CONV = {2: F.conv2d, 3: F.conv3d}
 SHAPES = {2: (2, 9, 7), 3: (2, 5, 6, 7)}
 
 
-def random_map(ndim: int, channels: int, count: int = 30, seed: int = 0) -> SparseMap:
-    generator = torch.Generator().manual_seed(seed)
+def random_map(ndim: int, channels: int, count: int = 30) -> SparseMap:
+    generator = torch.Generator().manual_seed(0)
     shape = SHAPES[ndim]
     linear = torch.randperm(torch.Size(shape).numel(), generator=generator)[:count].sort().values
     features = torch.randn(count, channels, generator=generator)

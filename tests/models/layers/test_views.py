@@ -7,10 +7,10 @@ import torch
 from src.models.layers.views import CameraViews
 
 
-def make_views(pix_from_aug, size=(64, 96), valid=None):
+def make_views(pix_from_aug, valid=None):
     b, n = pix_from_aug.shape[:2]
     valid = torch.ones(b, n, dtype=torch.bool) if valid is None else valid
-    return CameraViews([torch.zeros(b, n, 4, size[0] // 8, size[1] // 8)], pix_from_aug, valid, size)
+    return CameraViews([torch.zeros(b, n, 4, 8, 12)], pix_from_aug, valid, (64, 96))
 
 
 def augmented_camera():

@@ -32,9 +32,9 @@ def cloud(count, seed=0, spread_m=30.0):
     return points * torch.tensor([1.0, 1.0, 1.0, 50.0, 0.1])
 
 
-def lidar_frame(clouds, time_s=0.0, poses=None, augs=None, boxes=None):
+def lidar_frame(clouds, time_s=0.0, poses=None, boxes=None):
     """One key frame of each of len(clouds) streams, of points [P, 5] in the aug frame."""
-    frame = bare_frame(time_s, poses or [pose()] * len(clouds), augs)
+    frame = bare_frame(time_s, poses or [pose()] * len(clouds))
     counts = torch.tensor([len(points) for points in clouds])
     return replace(
         frame,

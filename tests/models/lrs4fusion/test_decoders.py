@@ -33,8 +33,8 @@ def volumes(counts=(2000, 600, 150, 30)):
     return Volumes(tuple(scales), (0, 0, 0, 0))
 
 
-def queries(count, seed=3):
-    generator = torch.Generator().manual_seed(seed)
+def queries(count):
+    generator = torch.Generator().manual_seed(3)
     unit = torch.rand(count, 4, generator=generator)
     return unit * torch.tensor([16.0, 16.0, 4.0, 3.0]) + torch.tensor([-4.0, -8.0, -2.0, 0.0]), torch.arange(count) % 2
 

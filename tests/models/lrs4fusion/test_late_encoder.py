@@ -24,9 +24,9 @@ def random_map(shape, count, channels):
     return SparseMap(sites, torch.randn(len(sites), channels, generator=torch.Generator().manual_seed(1)))
 
 
-def one_voxel(channels=2):
+def one_voxel():
     sites, _ = Sites.from_indices(torch.tensor([[0, 4, 4, 4]]), (1, 9, 9, 9))
-    return SparseMap(sites, torch.ones(1, channels))
+    return SparseMap(sites, torch.ones(1, 2))
 
 
 def test_completion_reaches_the_cells_of_its_kernels():

@@ -187,6 +187,28 @@ def test_measured_speeds_move_the_volume_and_what_is_remembered():
     assert ahead.sum() > 50 and float(radial.median()) == pytest.approx(5.0, abs=0.2)
 
 
+def test_without_speeds_a_decoder_that_has_learned_none_is_not_asked_what_moves(monkeypatch):
+    """The next frame is the same to the bit as if it had been; one that has learned some is asked."""
+    model, asked = lrs_model(OCCUPANCY).eval(), []
+    ask = model.decoders.velocities
+    monkeypatch.setattr(model.decoders, "velocities", lambda *query: asked.append(0) or ask(*query))
+
+    def later():
+        return model.encode(frame(time_s=0.5, seed=4), model(frame())[1]).scales
+
+    def same(a, b):
+        return all(torch.equal(one.features, other.features) for one, other in zip(a, b, strict=True))
+
+    assert model.decoders.at_rest
+    unasked, times = later(), len(asked)
+    with monkeypatch.context() as patch:
+        patch.setattr(type(model.decoders), "at_rest", False)
+        assert same(later(), unasked) and times == 0 < len(asked)
+    asked.clear()
+    torch.nn.init.ones_(model.decoders.velocity.output.bias)
+    assert not same(later(), unasked) and asked and not model.decoders.at_rest
+
+
 def test_returns_of_another_time_give_the_voxels_of_the_key_time():
     """All drive 20 m/s along the heading, which is nearly their ray from a sensor far behind."""
     model, points = lrs_model(OCCUPANCY, "model.measured_motion=true").eval(), cloud(400)

@@ -9,13 +9,13 @@ from src.models.radargnn.graph import GraphConfig, Invariance, build_graph, pair
 from src.targets.heatmap import CODE_SIZE
 
 
-def cloud(count=40, seed=0):
-    generator = torch.Generator().manual_seed(seed)
+def cloud(count=40):
+    generator = torch.Generator().manual_seed(0)
     return torch.randn(count, 7, generator=generator) * torch.tensor([20.0, 20.0, 1.0, 8.0, 6.0, 6.0, 0.1])
 
 
-def graph_of(points, sample=None, count=4, invariance=Invariance.rigid):
-    sample = torch.zeros(len(points), dtype=torch.int64) if sample is None else sample
+def graph_of(points, count=4, invariance=Invariance.rigid):
+    sample = torch.zeros(len(points), dtype=torch.int64)
     return build_graph(GraphConfig(num_neighbours=count, invariance=invariance), points, sample, 3)
 
 

@@ -17,9 +17,9 @@ def make(num_layers=1, grid=GRID, **changes):
     return RadarDensifier(DensifierConfig(**settings), 3, grid).eval()
 
 
-def one_pillar(row=1, col=12):
+def one_pillar():
     x = torch.zeros(2, 3, *GRID.cells)
-    x[0, :, row, col] = torch.tensor([1.0, -2.0, 3.0])
+    x[0, :, 1, 12] = torch.tensor([1.0, -2.0, 3.0])
     return x
 
 

@@ -17,26 +17,27 @@ from tests.models.surroundings import AXES, rigs
 STRIDES = (8, 16, 32)
 
 
-def make_fusion(stride=16, num_heights=4):
+def make_fusion(stride=16):
     torch.manual_seed(0)
-    config = FrustumFusionConfig(image_stride_px=stride, num_heights=num_heights)
+    config = FrustumFusionConfig(image_stride_px=stride, num_heights=4)
     fusion = SparseFrustumFusion(config, 6, 10, 8, STRIDES, GRID)
     torch.nn.init.normal_(fusion.place.weight)
     return fusion
 
 
-def make_views(seed=0):
-    generator = torch.Generator().manual_seed(seed)
+def make_views():
+    generator = torch.Generator().manual_seed(0)
     sizes = [(SIZE[0] // stride, SIZE[1] // stride) for stride in STRIDES]
     levels = [torch.randn(2, 4, 10, *size, generator=generator) for size in sizes]
     matrices = rigs(2, SIZE, AXES)
     return CameraViews(levels, matrices, torch.ones(2, 4, dtype=torch.bool), SIZE)
 
 
-def make_radar(places=((10.0, 2.0), (10.0, 2.4), (20.0, -3.0), (4.0, -9.0)), samples=(0, 0, 0, 1)):
+def make_radar():
     """One point a place, in cells of their own."""
+    places = ((10.0, 2.0), (10.0, 2.4), (20.0, -3.0), (4.0, -9.0))
     xyz = torch.tensor([[x, y, 0.5 + 0.1 * number] for number, (x, y) in enumerate(places)])
-    indices = torch.cat([torch.tensor(samples)[:, None], GRID.cell_of(xyz[:, :2])], dim=1)
+    indices = torch.cat([torch.tensor([0, 0, 0, 1])[:, None], GRID.cell_of(xyz[:, :2])], dim=1)
     sites, order = Sites.from_indices(indices, (2, *GRID.cells))
     generator = torch.Generator().manual_seed(1)
     means = torch.cat([xyz, torch.zeros(len(xyz), 4)], dim=1)[order]

@@ -9,9 +9,9 @@ GRID = BEVGrid(cells=(12, 16), cell_m=0.8, centre_m=(1.0, -2.0), z_range_m=(-3.0
 NUM_CELLS = 2 * 12 * 16
 
 
-def random_gaussians(count, seed=0):
+def random_gaussians(count):
     """Some at the edge, some beyond it, and two that are nowhere."""
-    draw = torch.Generator().manual_seed(seed)
+    draw = torch.Generator().manual_seed(0)
     means = (torch.rand(count, 2, generator=draw) - 0.5) * 20
     means[3:4], means[5:6, 1] = 1e6, torch.nan
     angle = 6 * torch.rand(count, generator=draw)
