@@ -36,9 +36,8 @@ def chamfer_distance(
 
 @dataclass(kw_only=True)
 class ForecastScores:
-    """Of F target frames, a sample at a time, and of their R rays."""
+    """Of F target frames and of their R rays."""
 
-    samples: Array  # [F] int64
     steps: Array  # [F] int64, intervals of the timeline after the sample's frame
     chamfer: dict[str, Array]  # [F] m^2 each, NaN where not defined: cd, nfcd, lfcd, and cd_<subset>
     errors: Array  # [R] float32 m, |found - true range|
@@ -47,14 +46,13 @@ class ForecastScores:
 
     @classmethod
     def join(cls, parts: list[ForecastScores]) -> ForecastScores:
-        """All frames of several batches, at least one; NaN for a subset that a batch does not know."""
-        counts = np.cumsum([0, *(len(part.samples) for part in parts[:-1])])
+        """All frames of several samples, at least one; NaN for a subset that a sample does not know."""
+        counts = np.cumsum([0, *(len(part.steps) for part in parts[:-1])])
         columns = {
-            name: np.concatenate([getattr(part, name) for part in parts])
-            for name in ("samples", "steps", "errors", "ranges")
+            name: np.concatenate([getattr(part, name) for part in parts]) for name in ("steps", "errors", "ranges")
         }
         frames = np.concatenate([part.frames + count for part, count in zip(parts, counts, strict=True)])
-        unknown = [np.full(len(part.samples), np.nan) for part in parts]
+        unknown = [np.full(len(part.steps), np.nan) for part in parts]
         chamfer = {
             name: np.concatenate([part.chamfer.get(name, none) for part, none in zip(parts, unknown, strict=True)])
             for name in dict.fromkeys(name for part in parts for name in part.chamfer)
@@ -63,9 +61,8 @@ class ForecastScores:
 
 
 def score_forecast(
-    rays: RayBundle,
+    rays: RayBundle,  # of one sample
     found: Tensor,  # [R] m, forecast ranges
-    samples: Array,  # [B] int64, number of each sample of the batch in the whole set
     bounds: Bounds,
     subsets: Mapping[str, Tensor] | None = None,  # [R] bool by name: rays that are also compared among themselves
 ) -> ForecastScores:
@@ -77,15 +74,14 @@ def score_forecast(
     truth = rays.points.double().cpu().numpy()
     forecast = (rays.origins + found.clamp(min=0)[:, None] * rays.directions).double().cpu().numpy()
     subsets = {f"cd_{name}": mask.cpu().numpy() for name, mask in (subsets or {}).items()}
-    owners = np.stack([rays.batch.cpu().numpy(), rays.steps.cpu().numpy()], 1)
-    frames, frame = np.unique(owners, axis=0, return_inverse=True)
+    steps, frame = np.unique(rays.steps.cpu().numpy(), return_inverse=True)
     names = ("cd", *FIELDS_M, *subsets)
-    chamfer = {name: np.full(len(frames), np.nan) for name in names}
+    chamfer = {name: np.full(len(steps), np.nan) for name in names}
     inside = {"found": _inside(forecast, bounds), "truth": _inside(truth, bounds)}
     away = {"found": np.linalg.norm(forecast, axis=1), "truth": np.linalg.norm(truth, axis=1)}
     clouds = {"found": forecast, "truth": truth}
-    for row in range(len(frames)):
-        own = frame.ravel() == row
+    for row in range(len(steps)):
+        own = frame == row
         for name in names:
             low, high = FIELDS_M.get(name, (0.0, np.inf))
             members = own & subsets[name] if name in subsets else own
@@ -96,12 +92,11 @@ def score_forecast(
             chamfer[name][row] = chamfer_distance(*pair)
     kept = inside["truth"]
     return ForecastScores(
-        samples=samples[frames[:, 0]],
-        steps=frames[:, 1],
+        steps=steps,
         chamfer=chamfer,
         errors=(found - rays.ranges).abs().float().cpu().numpy()[kept],
         ranges=rays.ranges.cpu().numpy()[kept],
-        frames=frame.ravel()[kept],
+        frames=frame[kept],
     )
 
 
@@ -117,8 +112,8 @@ def keep_common_frames(*forecasts: ForecastScores) -> None:
             own[lost] = np.nan
 
 
-def sums_by_sample(scores: ForecastScores, num_samples: int, interval_s: float) -> dict[str, Array]:  # [S, 2] each
-    """Total and count of every mean in each sample; a score is the ratio of their sums (`diagnostics.ratios`).
+def forecast_sums(scores: ForecastScores, interval_s: float) -> dict[str, Array]:  # [2] each
+    """Total and count of every mean; a score is their ratio over all samples (`diagnostics.ratios`).
 
     `<cd>_<H>s`: over the frames up to the horizon H (O27); `<cd>@<t>s`: of the frames at t alone; `l1_<H>s`, `l1@<t>s`:
     over rays, and `l1_<low>-<high>m_<H>s` over those of that range.
@@ -127,12 +122,12 @@ def sums_by_sample(scores: ForecastScores, num_samples: int, interval_s: float) 
     times = {f"@{step * interval_s:.1f}s": scores.steps == step for step in np.unique(scores.steps).tolist()}
     for suffix, among in (_horizons(scores, interval_s) | times).items():
         for name, values in scores.chamfer.items():
-            sums[f"{name}{suffix}"] = _sums(values, scores.samples, among & ~np.isnan(values), num_samples)
-        rays, owners = among[scores.frames], scores.samples[scores.frames]
-        sums[f"l1{suffix}"] = _sums(scores.errors, owners, rays, num_samples)
+            sums[f"{name}{suffix}"] = _total(values, among & ~np.isnan(values))
+        rays = among[scores.frames]
+        sums[f"l1{suffix}"] = _total(scores.errors, rays)
         if suffix not in times:
             for label, near in _bins(scores).items():
-                sums[f"l1{label}{suffix}"] = _sums(scores.errors, owners, rays & near, num_samples)
+                sums[f"l1{label}{suffix}"] = _total(scores.errors, rays & near)
     return sums
 
 
@@ -157,9 +152,8 @@ def _bins(scores: ForecastScores) -> dict[str, Array]:  # [R] bool by label
     return {f"_{low:g}-{high:g}m": (scores.ranges >= low) & (scores.ranges < high) for low, high in BINS_M}
 
 
-def _sums(values: Array, owners: Array, rows: Array, num_samples: int) -> Array:  # [S, 2]
-    totals = np.bincount(owners[rows], weights=values[rows], minlength=num_samples)
-    return np.stack([totals, np.bincount(owners[rows], minlength=num_samples)], 1)
+def _total(values: Array, among: Array) -> Array:  # [2]
+    return np.array([values[among].sum(dtype=np.float64), among.sum()])
 
 
 def _inside(points: Array, bounds: Bounds) -> Array:  # [R] bool

@@ -33,6 +33,8 @@ class ModelConfig:
     new_in_temporal_phase: ClassVar[str] = ""
     """Regular expression: names of the parameters that the temporal phase adds, and no checkpoint of the phase before
     holds. Empty for a model without."""
+    keys_of_later_phases: ClassVar[tuple[str, ...]] = ()
+    """Dotted keys of what the first of several temporal phases neither builds nor reads."""
 
     name: str
     channels: int  # C, width of the map that the head reads

@@ -90,8 +90,10 @@ def find_source(
     kept = [override for override in overrides if not is_of(override, OF_THIS_RUN)]
     wanted = [f"phase={name}", *kept]
     its_config, tree = compose(wanted)
+    others = config.model.keys_of_later_phases if its_config.phase.init_from is None else ()
     if not its_config.phase.temporal:
-        others = (*OF_STREAMED_DATA, *config.model.keys_of_temporal_phase)
+        others = (*others, *OF_STREAMED_DATA, *config.model.keys_of_temporal_phase)
+    if others:
         wanted = [override for override in wanted if not is_of(override, others)]
         its_config, tree = compose(wanted)
     its_source = find_source(its_config, wanted, compose, phases)  # what that run starts from is part of its identity
@@ -167,7 +169,8 @@ def hand_over(model: Detector, weights: OpenCheckpoint, tree: dict[str, Any]) ->
     parts = sorted({key.partition(".")[0] for key in new})
     logger.info("weights from %s; new: %d tensors in %s", weights.path, len(new), ", ".join(parts) or "nothing")
     stored = checkpoint["horizon3d"]["config"]
-    for key, (old, now) in differing_settings(stored, tree, model.config.keys_of_temporal_phase).items():
+    later = (*model.config.keys_of_temporal_phase, *model.config.keys_of_later_phases)
+    for key, (old, now) in differing_settings(stored, tree, later).items():
         logger.warning("%s was %s in the run these weights come from and is %s now", key, old, now)
 
 

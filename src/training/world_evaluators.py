@@ -28,10 +28,10 @@ from src.metrics.forecast_text import format_forecast, format_occupancy
 from src.metrics.forecasting import (
     HORIZONS_S,
     ForecastScores,
+    forecast_sums,
     keep_common_frames,
     median_errors,
     score_forecast,
-    sums_by_sample,
 )
 from src.metrics.static_world import static_world, unseen
 from src.models.detector import Detector
@@ -261,7 +261,7 @@ class OccupancyEvaluator(Evaluator):
 class ForecastEvaluator(OccupancyEvaluator):
     """Also scores forecast LiDAR and, as `static_`, the forecast of a world that stands still.
 
-    Names are those of `sums_by_sample` and `median_errors`; `moving` and `unseen` are rays that end on moving
+    Names are those of `forecast_sums` and `median_errors`; `moving` and `unseen` are rays that end on moving
     objects, and where the input had not seen. A `gain` is the share by which a Chamfer distance lies below the static
     world's; both are over the frames in which both have points.
     Rays are thinned to `data.timeline.scored_rays`, so distances are larger than between whole clouds.
@@ -287,15 +287,14 @@ class ForecastEvaluator(OccupancyEvaluator):
         for sample, own in enumerate(scores):
             among = rays.batch == sample
             masks = {name: mask[among.cpu()] for name, mask in subsets.items()}
-            zeros = np.zeros(len(batch), np.int64)
             own.forecasts = {
-                prefix: score_forecast(rays[among], ranges[among], zeros, model.bounds, masks)
+                prefix: score_forecast(rays[among], ranges[among], model.bounds, masks)
                 for prefix, ranges in found.items()
             }
             keep_common_frames(*own.forecasts.values())
             for prefix, forecast in own.forecasts.items():
-                sums = sums_by_sample(forecast, 1, self.timeline.interval_s)
-                own.sums |= {f"{prefix}{name}": values[0] for name, values in sums.items()}
+                sums = forecast_sums(forecast, self.timeline.interval_s)
+                own.sums |= {f"{prefix}{name}": values for name, values in sums.items()}
         return moving
 
     def _ratios(self, sums: Mapping[str, Array], weights: Array) -> dict[str, Array]:

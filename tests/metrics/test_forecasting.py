@@ -8,10 +8,10 @@ from src.metrics.diagnostics import ratios
 from src.metrics.forecasting import (
     ForecastScores,
     chamfer_distance,
+    forecast_sums,
     keep_common_frames,
     median_errors,
     score_forecast,
-    sums_by_sample,
 )
 from tests.ray_bundles import rays_to
 
@@ -39,8 +39,8 @@ def test_chamfer_distance_is_that_of_all_distances(spread):
 def test_near_and_long_field_are_those_of_each_clouds_own_points():
     rays = rays_to([[40.0, 0, 0], [60.0, 0.0, 0.0], [0.0, 80.0, 0.0]], steps=1)
     found = torch.tensor([44.0, 45.0, 83.0])  # the second comes into the near field
-    scores = score_forecast(rays, found, np.array([7]), BOUNDS)
-    assert scores.samples.tolist() == [7] and scores.steps.tolist() == [1]
+    scores = score_forecast(rays, found, BOUNDS)
+    assert scores.steps.tolist() == [1]
     near = 0.5 * ((16 + 25) / 2 + 16)
     far = 0.5 * (9 + ((60**2 + 83**2) + 9) / 2)
     assert scores.chamfer["nfcd"][0] == pytest.approx(near, rel=1e-5)
@@ -50,24 +50,29 @@ def test_near_and_long_field_are_those_of_each_clouds_own_points():
 
 def test_clouds_are_cut_to_the_bounds_each_by_its_own_points():
     rays = rays_to([[100.0, 0, 0], [240.0, 0, 0], [0.0, 150.0, 0]], steps=1)
-    scores = score_forecast(rays, torch.tensor([101.0, 260.0, 150.0]), np.array([0]), BOUNDS)
+    scores = score_forecast(rays, torch.tensor([101.0, 260.0, 150.0]), BOUNDS)
     assert scores.chamfer["cd"][0] == pytest.approx(0.5 * (1 + (1 + 139**2) / 2), rel=1e-5)
     np.testing.assert_allclose(scores.errors, [1, 20])  # the third return lies outside
-    nothing = score_forecast(rays[rays.ranges < 0], torch.zeros(0), np.array([0]), BOUNDS)
-    assert len(nothing.samples) == len(nothing.errors) == 0
+    nothing = score_forecast(rays[rays.ranges < 0], torch.zeros(0), BOUNDS)
+    assert len(nothing.steps) == len(nothing.errors) == 0
 
 
 def scored():
     """Two samples: the first at steps 0, 2, 5 and 15, one metre, 2 m, 3 m and 4 m wrong; the second at 5, 6 m wrong."""
-    rays = rays_to([[30.0, 0, 0], [0, 90.0, 0]] * 5, steps=[0, 0, 2, 2, 5, 5, 15, 15, 5, 5], batch=[0] * 8 + [1] * 2)
-    moving = torch.tensor([True, False] * 4 + [False] * 2)
-    off = torch.tensor([1.0, 1, 2, 2, 3, 3, 4, 4, 6, 6])
-    return score_forecast(rays, rays.ranges + off, np.array([4, 1]), BOUNDS, {"moving": moving})
+    found = []
+    for steps, off, moves in (((0, 2, 5, 15), (1.0, 2, 3, 4), True), ((5,), (6.0,), False)):
+        rays = rays_to([[30.0, 0, 0], [0, 90.0, 0]] * len(steps), steps=np.repeat(steps, 2).tolist())
+        moving = torch.tensor([moves, False] * len(steps))
+        ranges = rays.ranges + torch.tensor(off).repeat_interleave(2)
+        found.append(score_forecast(rays, ranges, BOUNDS, {"moving": moving}))
+    return found
 
 
 def test_means_over_the_horizon_frames_and_bins():
-    sums = sums_by_sample(scored(), 5, 0.2)
-    means = {name: float(value[0]) for name, value in ratios(sums, np.ones((1, 5))).items()}
+    by_sample = [forecast_sums(scores, 0.2) for scores in scored()]
+    names = dict.fromkeys(name for sums in by_sample for name in sums)
+    stacked = {name: np.stack([sums.get(name, np.zeros(2)) for sums in by_sample]) for name in names}
+    means = {name: float(value[0]) for name, value in ratios(stacked, np.ones((1, 2))).items()}
     assert means["cd_1s"] == pytest.approx((4 + 9 + 36 - 0) / 3, rel=1e-5)
     assert means["cd_3s"] == pytest.approx((4 + 9 + 16 + 36) / 4, rel=1e-5)
     assert means["cd@0.4s"] == pytest.approx(4, rel=1e-5) and means["cd@0.0s"] == pytest.approx(1, rel=1e-5)
@@ -75,23 +80,23 @@ def test_means_over_the_horizon_frames_and_bins():
     assert means["l1_3s"] == pytest.approx((2 + 3 + 4 + 6) / 4, rel=1e-5)
     assert means["l1_50-150m_1s"] == pytest.approx((2 + 3 + 6) / 3, rel=1e-5)
     assert np.isnan(means["l1_150-250m_1s"])
-    assert sums["cd_1s"].tolist()[1] == pytest.approx([36, 1], rel=1e-5) and sums["cd_1s"][4, 1] == 2
-    medians = median_errors(scored(), 0.2)
+    assert by_sample[1]["cd_1s"] == pytest.approx([36, 1], rel=1e-5) and by_sample[0]["cd_1s"][1] == 2
+    medians = median_errors(ForecastScores.join(scored()), 0.2)
     assert medians["l1_median_1s"] == pytest.approx(3) and medians["l1_median_0-50m_3s"] == pytest.approx(3.5)
     assert np.isnan(medians["l1_median_150-250m_3s"])
 
 
-def test_batches_join():
-    one = scored()
+def test_samples_join():
+    one = scored()[0]
     both = ForecastScores.join([one, one])
-    alone, twice = (sums_by_sample(scores, 5, 0.2) for scores in (one, both))
+    alone, twice = (forecast_sums(scores, 0.2) for scores in (one, both))
     assert alone.keys() == twice.keys() and all(np.array_equal(2 * alone[name], twice[name]) for name in alone)
 
 
-def test_batches_join_where_one_does_not_know_a_subset():
+def test_samples_join_where_one_does_not_know_a_subset():
     rays = rays_to([[3.0, 4, 0], [6.0, 8, 0]], steps=1)
-    known = score_forecast(rays, rays.ranges + 1, np.array([0]), BOUNDS, {"moving": torch.tensor([True, False])})
-    unknown = score_forecast(rays, rays.ranges, np.array([1]), BOUNDS)
+    known = score_forecast(rays, rays.ranges + 1, BOUNDS, {"moving": torch.tensor([True, False])})
+    unknown = score_forecast(rays, rays.ranges, BOUNDS)
     for parts, defined in (([known, unknown], [True, False]), ([unknown, known], [False, True])):
         joined = ForecastScores.join(parts)
         assert (~np.isnan(joined.chamfer["cd_moving"])).tolist() == defined
@@ -103,8 +108,7 @@ def test_forecasts_are_compared_on_the_frames_in_which_both_have_points():
     """One loses all points of the second frame, the other all of the third."""
     rays = rays_to([[50.0, 0, 0]] * 3, steps=[1, 2, 3])
     one, other = (
-        score_forecast(rays, torch.tensor(ranges), np.array([0]), BOUNDS)
-        for ranges in ([51.0, 9e3, 52.0], [51.0, 60.0, 9e3])
+        score_forecast(rays, torch.tensor(ranges), BOUNDS) for ranges in ([51.0, 9e3, 52.0], [51.0, 60.0, 9e3])
     )
     keep_common_frames(one, other)
     for scores in (one, other):
@@ -112,5 +116,5 @@ def test_forecasts_are_compared_on_the_frames_in_which_both_have_points():
 
 
 def test_a_negative_range_is_a_point_at_the_sensor():
-    scores = score_forecast(rays_to([[3.0, 4, 0]], steps=1), torch.tensor([-2.0]), np.array([0]), BOUNDS)
+    scores = score_forecast(rays_to([[3.0, 4, 0]], steps=1), torch.tensor([-2.0]), BOUNDS)
     assert scores.chamfer["cd"][0] == pytest.approx(25) and scores.errors[0] == pytest.approx(7)

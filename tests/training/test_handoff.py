@@ -60,6 +60,17 @@ def source_of(*overrides):
     return source, run_identity(tree, None if source is None else source.identity)
 
 
+def test_what_a_later_stage_alone_builds_asks_for_no_other_first_run():
+    """Of LRS4Fusion: the ray head, the neck and their losses; the U-Net is everyone's."""
+    own = ("model=lrs4fusion", "phase=lrs_forecast")
+    plain = source_of(*own)
+    later = source_of(*own, "model.ray_head.num_samples=255", "model.loss.rays_per_frame=16")
+    assert later[0].identity == plain[0].identity and later[1] != plain[1]
+    assert not any("ray" in override for override in later[0].overrides)
+    shared = source_of(*own, "model.unet.point_channels=16")
+    assert shared[0].identity != plain[0].identity
+
+
 def identity(*overrides):
     """Run id of a command that starts from fresh weights."""
     return run_identity(compose_config(["scale=debug", *overrides])[1])

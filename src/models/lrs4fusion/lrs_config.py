@@ -99,6 +99,12 @@ class LRS4FusionConfig(ModelConfig):
 
     temporal_part: ClassVar[str] = "temporal"
     new_in_temporal_phase: ClassVar[str] = r"(ray_head|neck|head)\."
+    keys_of_later_phases: ClassVar[tuple[str, ...]] = (
+        *("model.channels", "model.ray_head", "model.head"),
+        *("model.neck.stage_channels", "model.neck.stage_strides", "model.neck.layers_per_stage"),
+        *("model.neck.fpn_channels", "model.loss.heatmap_weight", "model.loss.box_weight"),
+        *("model.loss.range_weight", "model.loss.rays_per_frame", "model.loss.ray_range_power"),
+    )  # not model.neck.finest_scale: it stands in the command of a published run, whose source would be another
 
     sensors: list[str]  # which of SENSORS are read
     norm_momentum: float  # weight of a new batch in the running statistics; few steps need a large one
