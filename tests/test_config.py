@@ -435,10 +435,11 @@ def test_a_second_score_of_detections_composes_and_an_older_checkpoint_has_none(
 
 @pytest.mark.parametrize(("key", "before"), LEGACY_DEFAULTS.items())
 def test_what_was_made_before_there_was_a_key_is_what_it_was(key, before):
-    of_world_model = key in (
-        "model.loss.ray_range_power", "model.measured_motion", "model.neck.finest_scale"
-    )  # fmt: skip
-    own = ["model=lrs4fusion", "phase=lrs_forecast"] if of_world_model else ["phase=phase2"]
+    world_model = ["model=lrs4fusion", "phase=lrs_forecast"]
+    owners = dict.fromkeys(
+        ("model.loss.ray_range_power", "model.measured_motion", "model.neck.finest_scale"), world_model
+    )
+    own = (owners | {"model.decoder.num_radar_cells": ["model=rctrans"]}).get(key, ["phase=phase2"])
     config, tree = compose_config(["scale=debug", *own, f"{key}={json.dumps(before)}"])
     older = without_keys(tree, [key])
     assert older != tree and run_identity(older) == run_identity(tree)
