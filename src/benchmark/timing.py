@@ -18,6 +18,7 @@ from torch import nn
 
 from src.benchmark.parts import Paths, backward_from, wrapped_parts
 from src.ops.scratch import release_scratch
+from src.reliability.cpu import peak_resident_bytes
 
 PATIENCE = 4.0  # a first call that takes so many times what a candidate may take is its only one
 
@@ -117,7 +118,7 @@ def peak_bytes(device: torch.device) -> int:
     """The most that torch has held on a GPU, or that the process has held on a CPU."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated()
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return peak_resident_bytes(resource.RUSAGE_SELF)
 
 
 def added_mib(function: Callable[[], Any], device: torch.device) -> float | None:

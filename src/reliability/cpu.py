@@ -1,10 +1,11 @@
-"""Process-wide switches of the CPU: large freed blocks are kept for reuse, and denormal numbers are zero."""
+"""Process-wide switches of the CPU: large freed blocks are kept for reuse, denormal numbers are zero; peak memory."""
 
 from __future__ import annotations
 
 import ctypes
 import mmap
 import os
+import resource
 import sys
 from functools import cache
 
@@ -74,3 +75,9 @@ def _reserve_huge_pages() -> None:
         aligned = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE
         libc.madvise(aligned, RESERVED_BYTES - mmap.PAGESIZE, MADV_HUGEPAGE)
         libc.free(start)
+
+
+def peak_resident_bytes(who: int) -> int:
+    """Largest resident memory of `resource.RUSAGE_SELF`, or of the largest of RUSAGE_CHILDREN that have ended."""
+    unit = 1 if sys.platform == "darwin" else 1024  # macOS counts bytes, Linux KiB
+    return unit * resource.getrusage(who).ru_maxrss

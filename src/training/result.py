@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import platform
 import resource
-import sys
 from typing import Any
 
 import lightning as L
@@ -15,6 +14,7 @@ import torch
 from src.errors import DataError
 from src.ops.precision import Precision
 from src.ops.products import describe_products
+from src.reliability.cpu import peak_resident_bytes
 from src.structures.skipped import SHOWN_NAMES
 from src.training.module import TrainingModule
 from src.training.phases import EVALUATORS
@@ -59,9 +59,8 @@ def run_record(
 
 def peak_memory_mib() -> dict[str, int]:
     """Largest resident memory of this process and of its largest ended child (a loader worker)."""
-    unit = 1024 if sys.platform != "darwin" else 2**20  # Linux counts KiB, macOS bytes
     return {
-        name: resource.getrusage(who).ru_maxrss // unit
+        name: peak_resident_bytes(who) // 2**20
         for name, who in (("process", resource.RUSAGE_SELF), ("largest_worker", resource.RUSAGE_CHILDREN))
     }
 

@@ -1,10 +1,12 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from src.errors import ConfigError
+from src.reliability import cpu
 from src.reliability.cpu import tune_allocator
 
 
@@ -71,3 +73,10 @@ def test_denormal_numbers_are_zero_in_every_thread_forwards_and_backwards():
     """In a fresh process: 1e-40 is no longer a number."""
     found = subprocess.run([sys.executable, "-c", DENORMAL], capture_output=True, text=True, check=True)
     assert found.stdout.split() == ["0", "0"]
+
+
+@pytest.mark.parametrize(("platform", "unit"), [("linux", 1024), ("darwin", 1)])
+def test_peak_memory_is_in_bytes_on_every_system(monkeypatch, platform, unit):
+    monkeypatch.setattr(cpu.sys, "platform", platform)
+    monkeypatch.setattr(cpu.resource, "getrusage", lambda who: SimpleNamespace(ru_maxrss=7 * (who + 1)))
+    assert cpu.peak_resident_bytes(0) == 7 * unit and cpu.peak_resident_bytes(1) == 14 * unit
