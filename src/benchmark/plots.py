@@ -13,9 +13,8 @@ from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
 from src.pictures.canvas import SHEET_PX, Canvas
 from src.pictures.contents import AXIS_INK, INK
-from src.pictures.learning_curves import LINE_COLOURS, LINE_DASHES, style_axes
+from src.pictures.learning_curves import LINE_COLOURS, LINE_DASHES, LINE_MARKERS, style_axes
 
-MARKERS = "os^Dv<>Ph"
 COLUMNS, PANEL_PX, GAP_PX = 4, (300, 220), (92, 96)
 SOAK_PANEL_PX, SOAK_GAP_PX = (400, 170), (112, 96)
 LABEL_GAP_PT = 9.0
@@ -113,7 +112,7 @@ def _panel(
     for index, (label, line) in enumerate(lines.items()):
         if not line:
             continue
-        style = {"color": LINE_COLOURS[index % len(LINE_COLOURS)], "marker": MARKERS[index % len(MARKERS)]}
+        style = {"color": LINE_COLOURS[index % len(LINE_COLOURS)], "marker": LINE_MARKERS[index % len(LINE_MARKERS)]}
         style["linestyle"] = LINE_DASHES[index % len(LINE_DASHES)]
         axes.plot(*zip(*line, strict=True), label=label, linewidth=1.6, markersize=4, **style)
         last = line[-1][1]

@@ -190,6 +190,19 @@ class BoardReader:
         self, stamps: dict[Path, Stamp], names: list[str], unfinished: dict[str, float | None],
         folders: RunFolders, now: float,
     ) -> Board:  # fmt: skip
+        records, results, broken = self._read_files(stamps)
+        sweeps, not_shown = self._sweeps(records, results, folders, now)
+        runs = _runs_of(results, sweeps)
+        _add_folders(runs, names, unfinished, now)
+        return Board(
+            sweeps=sweeps, runs=runs, broken=broken | not_shown, folders=folders, has_reports=self.reports.is_dir(),
+            now=now,
+        )  # fmt: skip
+
+    def _read_files(
+        self, stamps: dict[Path, Stamp]
+    ) -> tuple[dict[Path, SweepRecord], dict[str, RunResult], dict[str, str]]:
+        """Records by file, results by run, and by file what is wrong with the others."""
         records, results, broken = {}, {}, {}
         for path, stamp in stamps.items():
             content = self._cached(path, stamp)
@@ -203,37 +216,23 @@ class BoardReader:
             else:
                 results[content.run_id] = content
         self._files = {path: content for path, content in self._files.items() if path in stamps}
-        sweeps = []
+        return records, results, broken
+
+    def _sweeps(
+        self, records: dict[Path, SweepRecord], results: dict[str, RunResult], folders: RunFolders, now: float
+    ) -> tuple[list[Sweep], dict[str, str]]:  # fmt: skip
+        """The sweeps, and by file why some cannot be shown."""
+        sweeps, not_shown = [], {}
         for path, record in records.items():
             try:
                 sweep = self._sweep(record, results, folders, now)
                 _ = sweep.state, sweep.left_s, [settings_of(run.overrides) for run in record.runs.values()]
             except Exception as error:  # one bad record must not hide the others
                 logger.exception("%s cannot be shown", path)
-                broken[str(path.relative_to(self.reports))] = f"{type(error).__name__}: {error}"
+                not_shown[str(path.relative_to(self.reports))] = f"{type(error).__name__}: {error}"
             else:
                 sweeps.append(sweep)
-        runs = {run_id: Run(run_id=run_id, state="done", result=result) for run_id, result in results.items()}
-        for sweep in sweeps:
-            for run_id, planned in sweep.record.runs.items():
-                killed = planned.state == "running" and sweep.state != "running"
-                state = "stopped" if killed else planned.state
-                run = runs.setdefault(run_id, Run(run_id=run_id, state=state))
-                run.planned = run.planned or planned
-                if run.result is None and STATES.index(state) < STATES.index(run.state):  # in another sweep
-                    run.state, run.planned = state, planned
-            for label, run_id in sweep.record.labelled:
-                runs[run_id].rows.append((sweep.key, label))
-        for name in names:
-            alive = now - (unfinished.get(name) or 0.0) < ALIVE_S
-            state = "running" if name in unfinished and alive else "stopped" if name in unfinished else "done"
-            run = runs.setdefault(name, Run(run_id=name, state=state))
-            run.has_folder = True
-            if run.state == "waiting" and name in unfinished:  # no runner has begun it, so somebody else has
-                run.state = state
-        return Board(
-            sweeps=sweeps, runs=runs, broken=broken, folders=folders, has_reports=self.reports.is_dir(), now=now
-        )  # fmt: skip
+        return sweeps, not_shown
 
     def _sweep(
         self, record: SweepRecord, results: dict[str, RunResult], folders: RunFolders, now: float
@@ -266,6 +265,33 @@ class BoardReader:
             content = DataError(f"{path}: not readable ({type(error).__name__}: {error}); delete it")
         self._files[path] = (stamp, content)
         return content
+
+
+def _runs_of(results: dict[str, RunResult], sweeps: list[Sweep]) -> dict[str, Run]:
+    """Runs that have a result or that a sweep plans."""
+    runs = {run_id: Run(run_id=run_id, state="done", result=result) for run_id, result in results.items()}
+    for sweep in sweeps:
+        for run_id, planned in sweep.record.runs.items():
+            killed = planned.state == "running" and sweep.state != "running"
+            state = "stopped" if killed else planned.state
+            run = runs.setdefault(run_id, Run(run_id=run_id, state=state))
+            run.planned = run.planned or planned
+            if run.result is None and STATES.index(state) < STATES.index(run.state):  # in another sweep
+                run.state, run.planned = state, planned
+        for label, run_id in sweep.record.labelled:
+            runs[run_id].rows.append((sweep.key, label))
+    return runs
+
+
+def _add_folders(runs: dict[str, Run], names: list[str], unfinished: dict[str, float | None], now: float) -> None:
+    """Note which runs have a folder, and add those that nothing else tells of."""
+    for name in names:
+        alive = now - (unfinished.get(name) or 0.0) < ALIVE_S
+        state = "running" if name in unfinished and alive else "stopped" if name in unfinished else "done"
+        run = runs.setdefault(name, Run(run_id=name, state=state))
+        run.has_folder = True
+        if run.state == "waiting" and name in unfinished:  # no runner has begun it, so somebody else has
+            run.state = state
 
 
 def _kind(run: Run) -> tuple[Any, ...]:

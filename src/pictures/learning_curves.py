@@ -14,7 +14,10 @@ from src.pictures.contents import AXIS_INK, FRAME_COLOUR, GRID_COLOUR, INK, MUTE
 
 Curves = Mapping[str, Sequence[tuple[int, float]]]  # name -> step, value
 
-LINE_COLOURS = ("#0072B2", "#D55E00", "#00846B", "#8C2D7E", "#E6A000", "#3DA5D9", "#6B3E1E", "#E7298A", "#4B3BB5")
+LINE_COLOURS = (
+    "#0072B2", "#D55E00", "#00846B", "#8C2D7E", "#E6A000", "#3DA5D9", "#6B3E1E", "#E7298A", "#4B3BB5", "#212529"
+)  # fmt: skip
+LINE_MARKERS = "os^Dv<>PhX"
 LINE_DASHES = ("-", (0, (5, 1.6)), (0, (1.4, 1.4)))
 HEIGHT_PX = 520
 

@@ -11,7 +11,7 @@ from matplotlib.transforms import Bbox
 
 from src.pictures.canvas import SHEET_PX, Canvas
 from src.pictures.contents import AXIS_INK, MUTED
-from src.pictures.learning_curves import LINE_COLOURS, quiet_axes
+from src.pictures.learning_curves import LINE_COLOURS, LINE_MARKERS, quiet_axes
 
 HEIGHT_PX = 560
 LABEL_PLACES = ((9, 5), (9, -14), (-9, 5), (-9, -14), (9, 20), (-9, 20), (9, -28), (-9, -28))
@@ -44,9 +44,9 @@ def paint_points(axes: Axes, points: Sequence[TradeOff]) -> None:
     best = efficient(points)
     axes.step([p.cost for p in best], [p.score for p in best], where="post", color="#ADB5BD", linewidth=1.2, zorder=1)
     for number, point in enumerate(points):
-        colour = LINE_COLOURS[number % len(LINE_COLOURS)]
+        colour, marker = LINE_COLOURS[number % len(LINE_COLOURS)], LINE_MARKERS[number % len(LINE_MARKERS)]
         axes.vlines(point.cost, point.low, point.high, color=colour, linewidth=1.6, alpha=0.6)
-        axes.plot(point.cost, point.score, "o", color=colour, markersize=8)
+        axes.plot(point.cost, point.score, marker, color=colour, markersize=8, clip_on=False)
         place = {"xytext": (9, 5), "textcoords": "offset points"}
         axes.annotate(point.label, (point.cost, point.score), **place, fontsize=10, color=colour, parse_math=False)
 

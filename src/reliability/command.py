@@ -11,7 +11,8 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
@@ -27,6 +28,25 @@ INTERRUPT_GRACE_S = 2.0
 def signal_name(number: int) -> str:
     """`SIGKILL` and so on, for a message; `signal N` where the system has no name for it."""
     return signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
+
+
+@contextmanager
+def handling_signals(
+    handler: Callable[[int, FrameType | None], None], *numbers: signal.Signals
+) -> Iterator[list[signal.Signals]]:
+    """Give those signals to `handler` that are not ignored, and yield them; the earlier handlers come back afterwards.
+
+    A shell's background jobs and the processes of one launcher ignore Ctrl-C, and that is theirs to decide.
+    """
+    outer = {number: signal.getsignal(number) for number in numbers}
+    taken = [number for number, earlier in outer.items() if earlier is not signal.SIG_IGN]
+    for number in taken:
+        signal.signal(number, handler)
+    try:
+        yield taken
+    finally:
+        for number, earlier in outer.items():
+            signal.signal(number, earlier)
 
 
 def run_command(main: Callable[[list[str]], None]) -> None:

@@ -14,7 +14,7 @@ import lightning as L
 from lightning.pytorch.trainer.states import TrainerFn
 
 from src.errors import InterruptedRunError
-from src.reliability.command import INTERRUPT_GRACE_S
+from src.reliability.command import INTERRUPT_GRACE_S, handling_signals
 from src.reliability.metrics_csv import MetricsCSV
 
 
@@ -32,7 +32,7 @@ class Interruption(L.Callback):
         self.last, self.every_steps = last, every_steps
         self.requested = False
         self.began = False  # whether there were steps left to train
-        self._signals: tuple[signal.Signals, ...] = ()
+        self._signals: list[signal.Signals] = []
         self._first_signal_s = 0.0
         self._saving = False
         self._saved_step = -1
@@ -40,16 +40,9 @@ class Interruption(L.Callback):
     @contextmanager
     def listening(self) -> Iterator[None]:
         """Take SIGTERM and SIGINT as requests to stop; the earlier handlers come back afterwards."""
-        outer = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-        # A shell's background jobs and the processes of one launcher ignore Ctrl-C, and that is theirs to decide.
-        self._signals = tuple(number for number, handler in outer.items() if handler is not signal.SIG_IGN)
         self.requested = self.began = False
-        self._listen()
-        try:
+        with handling_signals(self._request, signal.SIGINT, signal.SIGTERM) as self._signals:
             yield
-        finally:
-            for number, handler in outer.items():
-                signal.signal(number, handler)
 
     def _listen(self) -> None:
         # Lightning puts a handler of its own before ours at the start of each fit and validate; on several ranks it

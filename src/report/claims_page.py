@@ -110,7 +110,7 @@ def _table(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
                     as_code([command]) if first else "",
                 ]
             )
-    return markdown_table(HEADS, lines, rule=" --- ")
+    return markdown_table(HEADS, lines)
 
 
 def _of_claims(found: list[Finding]) -> list[Finding]:
@@ -130,7 +130,7 @@ def _reasons(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
                 lines.append(
                     [str(number), escape_markdown(comparison.asks), escape_markdown(comparison.text), told, command]
                 )
-    return markdown_table(REASON_HEADS, lines, rule=" --- ") if lines else ""
+    return markdown_table(REASON_HEADS, lines) if lines else ""
 
 
 def _answer(finding: Finding) -> str:

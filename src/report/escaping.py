@@ -26,10 +26,10 @@ def as_code(words: Iterable[str]) -> str:
     return f"`{' '.join(words).replace('`', chr(39)).replace('|', chr(92) + '|')}`"
 
 
-def markdown_table(head: Sequence[str], rows: Iterable[Iterable[str]], rule: str = "---") -> str:
-    """A table of cells that are Markdown already; `rule` stands below each cell of the head."""
+def markdown_table(head: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table of cells that are Markdown already."""
     first, *others = (f"| {' | '.join(cells)} |" for cells in (head, *rows))
-    return "\n".join([first, f"|{rule}" * len(head) + "|", *others])
+    return "\n".join([first, "|---" * len(head) + "|", *others])
 
 
 def escape_latex(text: str) -> str:

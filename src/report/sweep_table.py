@@ -201,7 +201,7 @@ class SweepTable:
             [escape_markdown(_headed(head)), *(cell.text(escape_markdown, "**{}**".format) for cell in cells)]
             for head, cells in self.lines
         ]
-        parts = [f"# {escape_markdown(self.title)}", markdown_table(heads, lines, rule=" --- ")]
+        parts = [f"# {escape_markdown(self.title)}", markdown_table(heads, lines)]
         parts += map(escape_markdown, [self.caption, *self.text])
         return "\n\n".join(part for part in parts if part) + "\n"
 

@@ -97,10 +97,10 @@ class SweepCall:
     identify: Identifier
     outputs: Path
     reports: Path
-    again: str  # the command that resumes it
+    resume_command: str
 
     @classmethod
-    def of(cls, sweep: SweepConfig, common: list[str], again: str) -> tuple[Self, Config]:
+    def of(cls, sweep: SweepConfig, common: list[str], resume_command: str) -> tuple[Self, Config]:
         """The call, and the configuration that all rows of `sweep`, one of its sweeps, have in common.
 
         Raises ConfigError naming the sweep's file for what it says wrongly.
@@ -108,7 +108,8 @@ class SweepCall:
         identify = Identifier()
         compose_file(sweep, common, identify)
         config, _ = identify.compose(join_overrides(sweep.overrides, common))
-        return cls(common, identify, Path(config.paths.outputs), Path(config.paths.reports), again), config
+        outputs, reports = Path(config.paths.outputs), Path(config.paths.reports)
+        return cls(common, identify, outputs, reports, resume_command), config
 
 
 def run_plan(plan: Plan, command: SweepCommand, call: SweepCall) -> None:
@@ -132,7 +133,8 @@ def run_plan(plan: Plan, command: SweepCommand, call: SweepCall) -> None:
         in_child=partial(die_with_parent, signal.SIGTERM),  # a killed runner leaves checkpoints, no orphans
         group=plan.study,
     )
-    writer, publish = RecordWriter(plan, study, call.again, outputs, reports), partial(publish_result, reports=reports)
+    writer = RecordWriter(plan, study, call.resume_command, outputs, reports)
+    publish = partial(publish_result, reports=reports)
     if plan.sweep.is_search:
         runner = Search(plan, study, writer, launcher, publish, call.common, call.identify)
     else:
@@ -140,7 +142,9 @@ def run_plan(plan: Plan, command: SweepCommand, call: SweepCall) -> None:
     record = runner.run()
     if runner.stop.requested:
         print(progress_of(record, command.workers, time.time()))
-        raise InterruptedRunError(f"the sweep was stopped; nothing finished is lost, resume it with\n    {call.again}")
+        raise InterruptedRunError(
+            f"the sweep was stopped; nothing finished is lost, resume it with\n    {call.resume_command}"
+        )
     missed: list[str] = []
     if plan.sweep.latency and (command.workers or command.latency):
         missed = measure_latencies(record, outputs, reports, runner, command.latency)
@@ -194,7 +198,7 @@ def write_and_show_tables(record: SweepRecord, call: SweepCall, problems: list[s
         for run in failed:
             log = str(call.outputs / run.log) if run.log is not None else "none"
             problems.append(f"  {run.label}, seed {run.seed} ({run.run_id}): {run.reason}; log: {log}")
-        problems.append(f"the same command retries them:\n    {call.again}")
+        problems.append(f"the same command retries them:\n    {call.resume_command}")
     try:
         paths = write_sweep_tables(call.reports, record, read_results_or_raise(call.reports, record.scale, record.runs))
     except HorizonError as error:

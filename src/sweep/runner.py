@@ -18,7 +18,7 @@ from typing import TextIO, TypeVar
 from optuna.trial import Trial
 
 from src.errors import HorizonError
-from src.reliability.command import INTERRUPT_GRACE_S
+from src.reliability.command import INTERRUPT_GRACE_S, handling_signals
 from src.report.metric_names import metric_of
 from src.report.results import is_finished
 from src.report.sweep_record import SweepRecord
@@ -279,16 +279,11 @@ class Runner:
             logger.warning("the database of the sweep did not take a heartbeat (%s)", args.exc_type.__name__)
 
         hook, threading.excepthook = threading.excepthook, log_missed
-        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-        for number, handler in before.items():
-            if handler is not signal.SIG_IGN:  # a shell's background job ignores Ctrl-C
-                signal.signal(number, request)
         try:
-            yield
+            with handling_signals(request, signal.SIGINT, signal.SIGTERM):
+                yield
         finally:
             threading.excepthook = hook
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
 
 def title_of(spec: RunSpec) -> str:

@@ -125,6 +125,9 @@ def fit(
                 warnings.filterwarnings("ignore", message=expected)
             trainer.strategy.checkpoint_io.opened = resume
             ckpt_path = None if resume is None else resume.path
+            if resume is not None:  # Lightning would forget the best score where the folder has been moved
+                for state in resume.content.get("callbacks", {}).values():
+                    state.pop("dirpath", None)
             trainer.fit(module, datamodule=datamodule, ckpt_path=ckpt_path, weights_only=True)
             counted = None
             if not interruption.began:  # only the results were missing

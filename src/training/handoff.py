@@ -21,6 +21,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from src.errors import CheckpointError, ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
 from src.models.detector import Detector
 from src.reliability.checkpoints import LAST, OpenCheckpoint, load_model_weights, open_checkpoint
+from src.reliability.command import handling_signals
 from src.reliability.processes import die_with_parent
 from src.training.identity import RUN_ID, TEMPORAL_DATA_KEYS, is_of, leaves, run_identity, train_command
 from src.training.run_config import RunConfig
@@ -217,10 +218,8 @@ def _run_command(command: list[str]) -> int:
     def forward(number: int, frame: FrameType | None) -> None:
         child.send_signal(number)
 
-    before = signal.signal(signal.SIGTERM, forward)
-    try:
-        return child.wait()
-    except KeyboardInterrupt:  # the terminal gave it to the child as well, which ends after a checkpoint
-        return child.wait()
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    with handling_signals(forward, signal.SIGTERM):
+        try:
+            return child.wait()
+        except KeyboardInterrupt:  # the terminal gave it to the child as well, which ends after a checkpoint
+            return child.wait()

@@ -42,6 +42,13 @@ def test_every_point_is_drawn_with_its_interval_and_name() -> None:
     assert [text.get_text() for text in axes.texts] == [p.label for p in POINTS]
 
 
+def test_ten_points_differ_in_colour_and_in_shape() -> None:
+    axes = Canvas(400, 300).axes(30, 30, 340, 240)
+    paint_points(axes, [point(str(number), number, number) for number in range(10)])
+    _, *marks = axes.lines
+    assert len({mark.get_color() for mark in marks}) == len({mark.get_marker() for mark in marks}) == 10
+
+
 def test_labels_of_close_points_stand_apart() -> None:
     axes = Canvas(800, 300).axes(30, 30, 740, 240)
     paint_points(axes, [point("Horizon3D", 283.0, 29.9), point("BEVFusion", 287.0, 31.4), point("far", 100.0, 5.0)])

@@ -162,6 +162,19 @@ def test_the_validation_after_the_last_epoch_may_be_the_best(run, monkeypatch, t
 
 
 @STOPPED_OFTEN
+def test_the_best_score_is_known_after_the_outputs_were_moved(run, monkeypatch, tmp_path):
+    compute, left = DetectionEvaluator.compute, [0.9, 0.5, 0.1]
+    monkeypatch.setattr(DetectionEvaluator, "compute", lambda self: compute(self) | {"mAP": left.pop(0)})
+    with pytest.raises(InterruptedRunError):
+        run("outputs/run", fault=terminate, at_step=STEPS)
+    (tmp_path / "outputs").rename(tmp_path / "moved")
+    run("moved/run")
+    checkpoints = tmp_path / "moved" / "run" / "checkpoints"
+    steps = {path.name: read_checkpoint(path)["global_step"] for path in checkpoints.glob("*.ckpt")}
+    assert (steps["best.ckpt"], steps["last.ckpt"]) == (STEPS, EPOCHS * STEPS) and not left
+
+
+@STOPPED_OFTEN
 def test_the_checkpoint_is_read_once(run, monkeypatch):
     with pytest.raises(InterruptedRunError):
         run("stopped", fault=terminate, at_step=4, ema=0.9)

@@ -133,7 +133,7 @@ def test_a_table_may_show_some_of_the_rows(make_record, results_of):
     record.sweep.tables[0].rows = ["other", "c", "best"]
     (table,) = sweep_tables(record, results_of({"a0": 0.1, "b0": 0.2, "c0": 0.4}))
     text = cells_of(table.to_markdown())
-    assert list(text) == ["row: paper | here", "---", "other", "c", "best"]
+    assert list(text) == ["row: paper | here", "other", "c", "best"]
     assert text["c"] == ["– | 40.0", "– | +20.0 undecided"]  # to the baseline that is not shown
     assert text["other"] == ["4.0 | –", "+1.0 | –"]
     assert text["best"][0] == "**8.0** | –"

@@ -80,7 +80,7 @@ def trained(monkeypatch):
                 spec.run_id, {"mAP": value}, spec.seed, scale="debug", seconds={"all": 60.0}
             )
         shared = SweepStudy(call.outputs, plan.study, default_storage(call.outputs), definition(plan, call.common))
-        RecordWriter(plan, shared, call.again, call.outputs, call.reports).write()
+        RecordWriter(plan, shared, call.resume_command, call.outputs, call.reports).write()
         calls.append((plan.sweep.name, new))
 
     monkeypatch.setattr(study, "run_plan", finish_all)

@@ -26,23 +26,21 @@ from src.reliability.processes import (
     SharedStatistics,
     build_strategy,
     gather_by_rank,
-    is_main_process,
     process_group,
     running_statistics,
 )
 from src.structures.detections import DetectionTable, EvaluationSet
 from src.training.evaluator import DetectionEvaluator
-from src.training.fit import fit
 from src.training.module import TrainingModule
 from src.training.optim import OptimConfig
-from src.training.run_folder import Resume, RunFolder
+from src.training.run_folder import RunFolder
 from src.training.temporal_module import TemporalModule
 from tests.evaluation_sets import set_of
 from tests.models.frames import make_batch
 from tests.models.horizon3d.small_model import dptf_config, make_model
 from tests.models.surroundings import DIAGONALS
 from tests.training.toys import STEPS as TOY_STEPS
-from tests.training.toys import Positions, toy_batch, toy_module, toy_trainer
+from tests.training.toys import Positions, toy_batch, toy_module, train_toy
 from tests.training.two_ranks import become, spawn_two
 
 STREAMS, STEPS = 4, 3
@@ -321,21 +319,13 @@ class SharedData(L.LightningDataModule):
 
 def train_single(path, world_size, stop_at=None):
     """Train three epochs in a folder, from its newest checkpoint where there is one."""
-    folder = RunFolder(path.parent, path.name)
-    if is_main_process():
-        folder.open(Resume.auto)
-    resume_from = folder.newest_checkpoint()
     module = toy_module(Single)
     module.model.dropout.p = 0.0  # its draws are a rank's own
     module.evaluator, module.stop_at = DetectionEvaluator(random_problem(*PROBLEM)[0]), stop_at
-    trainer = toy_trainer(folder, resume_from, ranks=world_size)
     try:
-        fit(trainer, module, SharedData(), resume_from)
+        train_toy(RunFolder(path.parent, path.name), module, SharedData(), ranks=world_size)
     except InterruptedRunError:
-        assert stop_at is not None and trainer.global_step == stop_at + 1
-    finally:
-        if is_main_process():
-            folder.close()
+        assert stop_at is not None and module.trainer.global_step == stop_at + 1
     return module.evaluator.scores and module.evaluator.as_dict()
 
 
