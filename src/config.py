@@ -6,6 +6,7 @@ import it: everything below receives plain values or its own small dataclass.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
@@ -172,6 +173,16 @@ class Config:
     def image_size_px(self) -> tuple[int, int] | None:
         """(height, width) of the images that the model uses, None for a model without."""
         return tuple(self.backbone.image_size_px) if "camera" in self.model.sensors else None
+
+    @property
+    def draw_seed(self) -> int:
+        """What order, augmentation and dropout of the training are drawn from.
+
+        `seed`, but for a phase that goes on from another: with the same it would see that one's epochs once more.
+        """
+        if self.phase.init_from is None:
+            return self.seed
+        return int.from_bytes(hashlib.sha256(f"{self.seed}/{self.phase.name}".encode()).digest()[:4], "little")
 
 
 def _register() -> None:

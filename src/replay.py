@@ -33,6 +33,7 @@ from src.reliability.command import run_command
 from src.reliability.cpu import tune_cpu
 from src.reliability.nonfinite import describe_gradients, gradient_norm, read_dump
 from src.structures.batch import LIDAR_POINT_FIELDS, RADAR_POINT_FIELDS, FrameBatch
+from src.training.handoff import norms_handed_over
 from src.training.module import TrainingModule
 from src.training.phases import MODULES
 
@@ -81,7 +82,8 @@ class Step:
         config, step = self.config, self.content["horizon3d"]["step"]
         model = restored_model(config, self.content, self.path)
         kind = MODULES[config.phase.module]
-        module = kind(model, config.optim, config.backbone.lr_multiplier, None, config.seed, {})
+        norms = norms_handed_over(model) if config.phase.frozen_statistics else ()
+        module = kind(model, config.optim, config.backbone.lr_multiplier, None, config.draw_seed, {}, frozen_norms=norms)
         module.restore_rank({"means": {}, "memories": step["memories"]})
         module.to(self.device)
         module.on_fit_start()

@@ -1,9 +1,11 @@
 """What the entry points share: where data come from, and what a machine can do."""
 
+from operator import attrgetter
+
 import pytest
 
 from src import assembly
-from src.assembly import build_datamodule, build_model, data_root, save_submission
+from src.assembly import build_datamodule, build_model, build_module, data_root, save_submission
 from src.config import compose_config
 from src.errors import ConfigError, DataError
 from src.reliability.processes import check_devices
@@ -28,6 +30,23 @@ def test_too_many_workers_are_refused(tmp_path):
     config, _ = compose_config(["scale=debug", "data.num_workers=100000"])
     with pytest.raises(ConfigError, match="data.num_workers=100000"):
         build_datamodule(config, tmp_path)
+
+
+def test_a_later_phase_draws_anew_and_the_same_each_time(tmp_path):
+    """Phase 1 continued would else see the order and the augmentation of phase 1's first epochs once more."""
+    shared = ["scale=debug", "data.world.key_frames_per_scene=8", f"paths.outputs={tmp_path}"]
+    seen = []
+    for choice in (["phase=phase1"], ["phase=phase1", "seed=1"], *2 * [["phase=phase1_further"]]):
+        config, tree = compose_config([*shared, *choice])
+        data = build_datamodule(config, data_root(config))
+        data.setup("fit")
+        loader = data.train_dataloader()
+        keys = [key for batch in loader.batch_sampler for key in batch]
+        drawn = loader.dataset[min(keys, key=attrgetter("sample"))].aug_from_ego.tolist()
+        seen.append(([key.sample for key in keys], drawn, build_module(config, tree, data).seed))
+    assert seen[2] == seen[3]
+    for first, other in [(0, 1), (0, 2), (1, 2)]:
+        assert all(a != b for a, b in zip(seen[first], seen[other], strict=True))
 
 
 def test_devices_that_are_not_there_are_named(monkeypatch):
