@@ -83,7 +83,9 @@ class Step:
         model = restored_model(config, self.content, self.path)
         kind = MODULES[config.phase.module]
         norms = norms_handed_over(model) if config.phase.frozen_statistics else ()
-        module = kind(model, config.optim, config.backbone.lr_multiplier, None, config.draw_seed, {}, frozen_norms=norms)
+        module = kind(
+            model, config.optim, config.backbone.lr_multiplier, None, config.draw_seed, {}, frozen_norms=norms
+        )
         module.restore_rank({"means": {}, "memories": step["memories"]})
         module.to(self.device)
         module.on_fit_start()

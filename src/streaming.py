@@ -197,9 +197,7 @@ class StreamingDetector:
     def _check(self, frame: FrameBatch) -> None:
         if len(frame) != 1:
             raise ValueError(f"one frame at a time: the batch must hold 1 frame, but got {len(frame)}")
-        known = torch.isfinite(frame.timestamps_s).all() and torch.isfinite(frame.global_from_ego).all()
-        if not known:
-            raise ValueError(f"frame {frame.tokens[0]}: timestamps_s and global_from_ego must be finite")
+        self._check_numbers(frame)
         if not torch.equal(frame.aug_from_ego[0].cpu(), torch.eye(4)):
             raise ValueError(
                 f"frame {frame.tokens[0]}: aug_from_ego must be the identity, augmentation is for training"
@@ -218,3 +216,14 @@ class StreamingDetector:
                 f"frame {frame.tokens[0]}: images must be {wanted}, but got {found}; a missing camera is a black image "
                 "with image_valid False"
             )
+
+    def _check_numbers(self, frame: FrameBatch) -> None:
+        """Sensors' values already on a GPU are not looked at, which would have to be waited for."""
+        values = {name: getattr(frame, name) for name in ("timestamps_s", "global_from_ego")}
+        if frame.device.type == "cpu":
+            values |= {name: getattr(frame, name) for name in ("radar_points", "lidar_points")}
+            if frame.image_valid is not None:
+                values["pix_from_aug"] = frame.pix_from_aug[frame.image_valid]
+        for name, value in values.items():
+            if value is not None and not torch.isfinite(value).all():
+                raise ValueError(f"frame {frame.tokens[0]}: {name} must be finite")

@@ -268,6 +268,10 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["--help"], "key=value"),
         (["model.kggi=null"], "model.kggi.*model.ocsf|model.ocsf.*model.kggi"),
         (["data.on_bad_file=ignore"], "on_bad_file"),
+        (
+            ["model=centerpoint", "model.loss.heatmap_weight=null", "model.loss.box_weight=null"],
+            "heatmap_weight, box_weight are all null.*give one",
+        ),
         (["data.world.num_train_scenes=-1"], "num_train_scenes"),
         (["scale=paper"], "data.root has no value"),
         (["phase.epochs=0"], "phase.epochs"),

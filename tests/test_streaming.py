@@ -207,7 +207,10 @@ def test_what_is_not_one_plain_frame_is_refused_and_costs_no_memory(phase2):
             good, images=good.images[:, :3], image_valid=good.image_valid[:, :3], pix_from_aug=good.pix_from_aug[:, :3]
         ),
         "images must be .*but got None": replace(good, images=None, image_valid=None, pix_from_aug=None),
-        "must be finite": replace(good, timestamps_s=good.timestamps_s * float("nan")),
+        **{
+            f"{name} must be finite": replace(good, **{name: getattr(good, name) * float("nan")})
+            for name in ("timestamps_s", "radar_points", "pix_from_aug")
+        },
         "aug_from_ego must be the identity": replace(good, aug_from_ego=2 * good.aug_from_ego),
     }
     phase2.step(good)

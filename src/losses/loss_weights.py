@@ -9,10 +9,13 @@ from src.errors import ConfigError
 
 @dataclass(kw_only=True)
 class LossWeights:
-    """Weights by term, fields `*_weight`; null switches a term off. Raises ConfigError for a negative one."""
+    """Weights by term, fields `*_weight`; null switches a term off. Raises ConfigError for a negative one or none."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name.endswith("_weight") and value is not None and value < 0:
-                raise ConfigError(f"model.loss.{field.name}={value}: must not be negative; null switches a term off")
+        names = [field.name for field in fields(self) if field.name.endswith("_weight")]
+        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        if not given:
+            raise ConfigError(f"model.loss: {', '.join(names)} are all null, so nothing would be learnt; give one")
+        for name, value in given.items():
+            if value < 0:
+                raise ConfigError(f"model.loss.{name}={value}: must not be negative; null switches a term off")

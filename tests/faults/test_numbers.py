@@ -24,7 +24,7 @@ from src.models.horizon3d.model import Horizon3D
 from src.ops import products
 from src.ops.precision import computing
 from src.reliability.checkpoints import read_checkpoint
-from src.reliability.nonfinite import step_seed, write_dump
+from src.reliability.nonfinite import read_dump, step_seed, write_dump
 from src.training.module import TrainingModule
 from src.training.trainer_config import OnNonfinite
 from tests.running import command
@@ -199,6 +199,15 @@ def test_a_replay_says_where_the_numbers_are_finite(dump, capsys):
     torch.save(content, path)
     replay.main([f"checkpoint={path}", "trainer.accelerator=cpu"])
     assert capsys.readouterr().out != first
+
+
+@pytest.mark.slow
+def test_a_replay_keeps_the_statistics_that_its_training_keeps(dump):
+    path = dump(lambda batch: None, "phase.frozen_statistics=true")
+    content, batch = read_dump(path)
+    config = restore_config(content["horizon3d"]["config"], [])
+    module = replay.Step(path, config, content, batch, torch.device("cpu")).build()
+    assert module.frozen_norms and not any(norm.training for norm in module.frozen_norms)
 
 
 def test_a_replay_needs_a_dump(tmp_path):
