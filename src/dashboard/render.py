@@ -24,6 +24,7 @@ from src.dashboard.figures import headline, run_figures, sweep_figures
 from src.dashboard.folders import Picture
 from src.report.metric_names import METRICS, Metric
 from src.report.score_tables import metrics_of
+from src.report.sweep_table import format_score
 from src.report.time_left import duration
 from src.training.identity import leaves, train_command
 
@@ -277,7 +278,7 @@ def metric_rows(run: Run, other: Run | None) -> dict[str, list[MetricRow]]:
 
 def number(value: float | None, metric: Metric) -> str:
     """A metric's value in the table's unit; empty for None."""
-    return "" if value is None else f"{value * metric.scale:.{metric.digits}f}"
+    return "" if value is None else format_score(value * metric.scale, None, metric)
 
 
 def signed(value: float, digits: int) -> str:

@@ -6,6 +6,7 @@ dashboard.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -37,7 +38,8 @@ from src.report.results import RunResult, finished_runs, publish_result, read_re
 from src.report.score_tables import BY_RANGE, BY_SPEED, ERROR_BY_SPEED, Experiment, estimate
 from src.report.sweep_record import SweepRecord, read_records
 from src.report.sweep_table import MISSING
-from src.report.table_builder import write_sweep_tables
+from src.report.sweep_text import counted, place_of
+from src.report.table_builder import is_current, write_sweep_tables
 from src.sweep.sweep_files import load_sweep
 from src.training.run_folder import make_writable
 
@@ -182,21 +184,30 @@ def draw_claims(path: Path, findings: list[tuple[Claim, list[Finding]]], scale: 
 
 
 def write_trade_off(reports: Path, record: SweepRecord, results: dict[str, RunResult]) -> list[Path]:
-    """mAP over the milliseconds of a frame, where at least two rows of a sweep that times them were timed."""
+    """mAP over the milliseconds of a frame, where at least two rows of a sweep that times them were timed.
+
+    Latencies are of the machine that timed most: others do not compare. Results of earlier trainings do not count.
+    """
     if not record.sweep.latency:
         return []
     score, cost = (find_metric(name, record.name) for name in ("mAP", "latency.total"))
-    points = []
-    for label, runs in record.rows.items():
-        found = [results[run_id] for run_id in runs.values() if run_id in results]
-        accuracy, time = estimate(found, score), estimate(found, cost)
+    rows = {
+        label: [results[run_id] for run_id in runs.values() if is_current(record, run_id, results)]
+        for label, runs in record.rows.items()
+    }
+    places = Counter(place_of(run.latency) for found in rows.values() for run in found if run.latency is not None)
+    points, place = [], max(places, key=places.get, default="")
+    for label, found in rows.items():
+        timed = [run for run in found if run.latency is not None and place_of(run.latency) == place]
+        accuracy, time = estimate(found, score), estimate(timed, cost)
         if accuracy is not None and time is not None:
-            points.append(TradeOff(label, time.mean, *accuracy))
+            seeds = "" if len(found) == max(map(len, rows.values())) else f", {counted(len(found), 'seed')}"
+            points.append(TradeOff(f"{label}{seeds}", time.mean, *accuracy))
     if len(points) < 2:
         return []
     path = reports / "pictures" / f"{record.name}_latency_{record.scale}{record.suffix}.png"
     title = f"{record.sweep.title}, scale {record.scale}"
-    draw_trade_off(path, points, title, "milliseconds from frame to boxes", score.heading)
+    draw_trade_off(path, points, title, f"milliseconds from frame to boxes, {place}", score.heading)
     return [path]
 
 

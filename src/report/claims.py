@@ -84,6 +84,7 @@ class ClaimMeasure:
     """One number by which two rows are compared."""
 
     comparison: ComparisonConfig
+    sweep: SweepConfig  # as its file says it
     metric: Metric
     half_width: float  # in the metric's unit; 0 of what asks: no interval is precise enough for a question
     paper: float | None  # difference of the paper's numbers; None where it has none
@@ -104,7 +105,7 @@ class Finding:
 
     measure: ClaimMeasure
     found: Comparison | None  # at the look it stands at
-    pairs: int  # seeds that both rows have
+    common_seeds: int  # that both rows have; those of `found` are the pairs that count
     runs: list[tuple[RunResult, RunResult]]  # behind it, of the first row and of the second, by seed
 
     @property
@@ -121,7 +122,7 @@ class Finding:
         """Whether further seeds may decide it."""
         return (
             self.measure.decides
-            and self.pairs < max(LOOKS)
+            and self.common_seeds < max(LOOKS)
             and not (self.found is not None and self.found.settled(self.measure.half_width))
         )
 
@@ -192,7 +193,7 @@ def _measures(comparison: ComparisonConfig, sweep: SweepConfig, half_width: floa
                 "rows"
             )
         decides = not asks and name in comparison.metrics
-        measures.append(ClaimMeasure(comparison, metric, 0.0 if asks else width, paper, decides))
+        measures.append(ClaimMeasure(comparison, sweep, metric, 0.0 if asks else width, paper, decides))
     return measures
 
 
@@ -200,8 +201,8 @@ def judge(claim: Claim, records: Mapping[str, SweepRecord], results: Mapping[str
     """What the finished runs of the sweeps' records (by the sweep's name) say of a claim, measure by measure."""
     findings = []
     for measure in claim.measures:
-        record = records.get(measure.comparison.sweep)
-        first, second = (_runs(record, label, results) for label in (measure.comparison.row, measure.comparison.over))
+        labels, record = (measure.comparison.row, measure.comparison.over), records.get(measure.comparison.sweep)
+        first, second = (_runs(record, measure.sweep, label, results) for label in labels)
         values = [
             {
                 seed: measure.metric.scale * run.metrics[measure.metric.name]
@@ -227,13 +228,19 @@ def verdict_of(findings: list[Finding]) -> Verdict:
     return Verdict.UNDECIDED
 
 
-def _runs(record: SweepRecord | None, label: str, results: Mapping[str, RunResult]) -> dict[int, RunResult]:
-    """Finished runs of a row, by seed. Warns of a record that lacks the row: of another version of its sweep."""
-    if record is not None and label not in record.rows:
+def _runs(
+    record: SweepRecord | None, sweep: SweepConfig, label: str, results: Mapping[str, RunResult]
+) -> dict[int, RunResult]:
+    """Finished runs of a row, by seed. Warns of a record of another version of its sweep, whose row is none or another:
+    it has no run of this one."""
+    if record is None:
+        return {}
+    if record.sweep.definition_of(label) != sweep.at_scale(record.scale).definition_of(label):
         logger.warning(
-            "the record of sweep %s, scale %s, has no row %r, which claims.yaml names; its runs count once `python -m "
-            "src.study scale=%s workers=0 published=true` has recorded it again",
+            "the record of sweep %s, scale %s, has no row %r as sweeps/ defines it, which claims.yaml names; its runs "
+            "count once `python -m src.study scale=%s workers=0 published=true` has recorded it again",
             *(record.name, record.scale, label, record.scale),
         )
-    runs = {} if record is None else record.rows.get(label, {})
+        return {}
+    runs = record.rows.get(label, {})
     return {seed: results[run_id] for seed, run_id in runs.items() if is_current(record, run_id, results)}

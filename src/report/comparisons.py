@@ -37,11 +37,15 @@ class Comparison:
     high: float | None
     pairs: int
     digits: int  # that are shown
+    exact: bool = False  # of a look: what is shown decides nothing
 
     @property
     def decided(self) -> bool:
-        """Whether the interval as it is shown leaves out zero."""
-        return self.low is not None and (round(self.low, self.digits) > 0 or round(self.high, self.digits) < 0)
+        """Whether the interval leaves out zero, as it is shown or `exact`."""
+        if self.low is None:
+            return False
+        low, high = (end if self.exact else round(end, self.digits) for end in (self.low, self.high))
+        return low > 0 or high < 0
 
     @property
     def equal(self) -> bool:
@@ -99,7 +103,7 @@ def compare_at_looks(
     for pairs, quantile in LOOKS.items():
         if pairs > len(gains):
             break
-        found = _with_interval(gains[:pairs], quantile, digits)
+        found = _with_interval(gains[:pairs], quantile, digits, exact=True)
         if found.settled(half_width):
             break
     return found
@@ -109,12 +113,12 @@ def _gains(first: Mapping[int, float], second: Mapping[int, float]) -> list[floa
     return [first[seed] - second[seed] for seed in sorted(first) if seed in second]
 
 
-def _with_interval(gains: list[float], quantile: float | None, digits: int) -> Comparison:
+def _with_interval(gains: list[float], quantile: float | None, digits: int, exact: bool = False) -> Comparison:
     mean = statistics.mean(gains)
     if quantile is None:
         return Comparison(mean, None, None, len(gains), digits)
     half = quantile * statistics.stdev(gains) / math.sqrt(len(gains))
-    return Comparison(mean, mean - half, mean + half, len(gains), digits)
+    return Comparison(mean, mean - half, mean + half, len(gains), digits, exact)
 
 
 def t_quantile(freedom: int) -> float:

@@ -167,6 +167,9 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
     if not FOLDER_NAME.fullmatch(record.run_id):
         name = f"{run_folder / 'run.json'}: run_id"
         raise DataError(f"{name} must be the name of a folder, but is {record.run_id!r:.80}; {remedy}")
+    if record.run_id != run_folder.name:
+        what = f"{run_folder / 'run.json'}: run_id must be {run_folder.name}, the folder's name, but is {record.run_id}"
+        raise DataError(f"{what}; move a copy elsewhere, or call the folder as its run")
     overrides = [_without_local_path(o) for o in record.overrides if not is_of(o, OUTSIDE_IDENTITY)]
     content = {
         "format": FORMAT,

@@ -15,7 +15,7 @@ from pydantic import with_config
 from src.errors import ConfigError
 from src.report.json_format import CLOSED, Count, Many
 from src.report.metric_names import DETECTION, find_metric
-from src.training.identity import OF_A_CALL, is_of, key_of
+from src.training.identity import OF_A_CALL, canonical, is_of, key_of
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 """Names of sweeps and tables, which become file names, parts of addresses and names of studies."""
@@ -244,6 +244,14 @@ class SweepConfig:
     def baseline_of(self, label: str) -> str | None:
         """Label of the row that this one's differences are taken to."""
         return next((row.baseline for row in self.rows if row.label == label and row.baseline), self.baseline)
+
+    def definition_of(self, label: str) -> tuple[object, ...] | None:
+        """What a row's runs override, in one spelling, and that of the row whose weights they are; None for no row."""
+        row = next((row for row in self.rows if row.label == label), None)
+        if row is None:
+            return None
+        settings = {key_of(override): canonical(override) for override in [*self.overrides, *row.overrides]}
+        return settings, row.weights and self.definition_of(row.weights)
 
     def at_scale(self, scale: str) -> SweepConfig:
         """The sweep with the overrides of one scale; a row that is not for it becomes one that only the paper has."""

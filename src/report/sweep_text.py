@@ -23,8 +23,11 @@ NAMED = 3
 
 
 def describe_table(table: SweepTable, record: SweepRecord, results: dict[str, RunResult], complete: bool) -> str:
-    """Data, scale, epochs, seeds, commits and devices of a table, and what its differences are taken to."""
-    seeds = sorted({seed for runs in record.rows.values() for seed in runs} or {r.seed for r in record.runs.values()})
+    """Data, scale, epochs, seeds, commits and devices of a table, and what its differences are taken to.
+
+    `results` are those of the rows that it shows.
+    """
+    seeds = sorted({seed for row in table.rows for seed in row.runs} or {run.seed for run in record.runs.values()})
     data = "Data: no run has finished yet"
     if results:
         any_result = next(iter(results.values()))
@@ -60,35 +63,32 @@ def describe_epochs(results: Iterable[RunResult]) -> list[str]:
     ]
 
 
-def describe_starts(compared: Iterable[Iterable[RunResult]]) -> str:
-    """Which runs began from another training of one run than those they are compared with; empty where none did.
+def describe_starts(pairs: Iterable[tuple[RunResult, RunResult]]) -> str:
+    """Which runs began from another training of one run than the one they are compared with; empty where none did.
 
-    Their pairs share less than their seed says. Results without digests are of one training.
+    Such pairs share less than their seed says. Of results without digests nothing is known.
     """
-    apart = list(dict.fromkeys(run_id for runs in compared for run_id in _started_apart(runs)))
+    apart = list(dict.fromkeys(run.run_id for pair in pairs if (run := _started_apart(*pair)) is not None))
     if not apart:
         return ""
     return (
-        "Of runs that begin from one run's weights, these began from another training of it than most that they are "
-        f"compared with, whose noise is in those differences and intervals: {', '.join(apart)}."
+        "Of runs that begin from one run's weights, these began from another training of it than the one that they "
+        f"are compared with, whose noise is in those differences and intervals: {', '.join(apart)}."
     )
 
 
-def _started_apart(runs: Iterable[RunResult]) -> list[str]:
-    """Ids of runs that began from another training of their source run than most that begin from its weights."""
-    runs = {run.run_id: run for run in runs}
-    begun: dict[str, dict[str | None, list[str]]] = {}  # runs by the run and the weights that they began from
-    for run in runs.values():
-        if run.initialized_from is not None:
-            begun.setdefault(run.initialized_from, {}).setdefault(run.initial_weights, []).append(run.run_id)
-    for source, groups in begun.items():
-        if source in runs:
-            groups.setdefault(runs[source].weights, []).append(source)
-    apart = []
-    for groups in begun.values():
-        most = max(groups.values(), key=len)
-        apart += [run_id for group in groups.values() if group is not most for run_id in group]
-    return apart
+def _started_apart(first: RunResult, second: RunResult) -> RunResult | None:
+    """The one of two runs that began from another training of the other, or of the run that both begin from."""
+    for run, other in ((first, second), (second, first)):
+        if run.initialized_from == other.run_id:
+            weights = other.weights
+        elif run.initialized_from is not None and run.initialized_from == other.initialized_from:
+            weights = other.initial_weights
+        else:
+            continue
+        if None not in (run.initial_weights, weights) and run.initial_weights != weights:
+            return run
+    return None
 
 
 def describe_machines(results: Iterable[RunResult]) -> list[str]:
@@ -96,7 +96,7 @@ def describe_machines(results: Iterable[RunResult]) -> list[str]:
     code, devices = set(), set()
     for result in results:
         code.add(result.commit[:10] + ("+" if result.commit.endswith("+") else ""))
-        threads = f"{_counted(result.processes, 'process')} of {_counted(result.threads, 'thread')}"
+        threads = f"{counted(result.processes, 'process')} of {counted(result.threads, 'thread')}"
         devices.add(f"{result.device}, {threads}")
     return [words + _listed(sorted(found)) for words, found in (("code ", code), ("", devices)) if found]
 
@@ -127,7 +127,7 @@ def _latency(table: SweepTable, timed: list[Latency]) -> str:
 def place_of(latency: Latency) -> str:
     """Processor and threads of a measurement."""
     name = latency.get("processor") or latency.get("device") or "an unnamed device"
-    return f"{name}, {_counted(latency.get('threads', 1), 'thread')}"
+    return f"{name}, {counted(latency.get('threads', 1), 'thread')}"
 
 
 def describe_orderings(
@@ -227,7 +227,7 @@ def describe_search(
 ) -> list[str]:
     """What became of a search's trials, and the best one: its label, what the search chose for it, its objective."""
     counts = ", ".join(f"{states.count(state)} {state}" for state in ("pruned", "failed"))
-    text = f"{states.count('done')} of {_counted(trials, 'trial')} finished, {counts}."
+    text = f"{states.count('done')} of {counted(trials, 'trial')} finished, {counts}."
     if best is None:
         return [text]
     label, chosen, value = best
@@ -254,5 +254,6 @@ def _listed(items: list[object]) -> str:
     return ", ".join(str(item) for item in items)
 
 
-def _counted(number: int, noun: str) -> str:
+def counted(number: int, noun: str) -> str:
+    """`1 seed`, `2 seeds`."""
     return f"{number} {noun}{'' if number == 1 else 'es' if noun.endswith('s') else 's'}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from src.errors import DataError
@@ -137,16 +137,29 @@ def _table(record: SweepRecord, results: dict[str, RunResult], config: TableConf
     table = SweepTable(config.name, record.scale, config.title, "", columns, rows, is_search)
     trained = [row for row in rows if row.state != PAPER]
     complete = is_search or all(row.state == "done" for row in trained)
-    table.caption = describe_table(table, record, results, complete)
+    shown = {run_id: results[run_id] for row in rows for run_id in row.runs.values() if run_id in results}
+    table.caption = describe_table(table, record, shown, complete)
     if is_search:
         table.text = describe_search([row.state for row in rows], sweep.trials, objective, best)
     else:
-        table.text = describe_orderings(columns, trained, next(iter(results.values()), None), complete)
+        table.text = describe_orderings(columns, trained, next(iter(shown.values()), None), complete)
     if sweep.note is not None:
         table.text = [sweep.note, *table.text]
-    if starts := describe_starts([results.values()]):
+    if starts := describe_starts(_compared(record, table, results)):
         table.text.append(starts)
     return table
+
+
+def _compared(
+    record: SweepRecord, table: SweepTable, results: dict[str, RunResult]
+) -> Iterator[tuple[RunResult, RunResult]]:
+    """Runs of one seed that a table compares: of a row and its baseline; without any baseline, of each two rows."""
+    for place, row in enumerate(table.rows):
+        others = [] if table.baselines else [other.runs for other in table.rows[place + 1 :]]
+        for other in [record.rows[row.baseline]] if row.baseline in record.rows else others:
+            for seed, run_id in row.runs.items():
+                if run_id in results and other.get(seed) in results:
+                    yield results[run_id], results[other[seed]]
 
 
 def _rows(

@@ -1,7 +1,8 @@
 """`python -m src.study`: the sweeps that the paper's claims name, each comparison with as many seeds as it needs.
 
 At the first of `LOOKS` every row of every sweep is trained, sweep by sweep in the order of the claims; at each later
-one the rows of the comparisons that are still open. How they are decided: docs/scores.md.
+one the rows of the comparisons that are still open, unless pairs of the look before are missing. How they are decided:
+docs/scores.md.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, pairwise
 
 from src.errors import ConfigError, DataError, HorizonError, InterruptedRunError
 from src.reliability.command import run_command
@@ -21,8 +22,8 @@ from src.report.sweep_record import RunState, SweepRecord, read_record, record_p
 from src.report.table_builder import check_results
 from src.report.time_left import progress_line
 from src.sweep.compose import SweepCommand, compose_sweep
-from src.sweep.plan import Plan, changes_of, make_plan, without_published
-from src.sweep.run_plan import SweepCall, resume_command, run_plan
+from src.sweep.plan import Plan, changes_of, make_plan
+from src.sweep.run_plan import SweepCall, resume_command, run_plan, without_results
 from src.sweep.run_status import is_finished_with_score
 from src.sweep.sweep_files import load_sweep
 from src.training.identity import key_of
@@ -45,8 +46,8 @@ def main(overrides: list[str]) -> None:
         print(study.describe())
         return
     problems = []
-    for look in LOOKS:
-        plans = study.plans(look, study.results())
+    for before, look in pairwise((0, *LOOKS)):
+        plans = study.plans(look, study.results(), before)
         for plan in plans:
             if not study.options.workers and not study.worth_recording(plan, look):
                 continue
@@ -94,9 +95,13 @@ class Study:
             check_results(records[name], results)
         return [(claim, judge(claim, records, results)) for claim in self.claims]
 
-    def plans(self, look: int, results: dict[str, RunResult]) -> list[Plan]:
-        """What each sweep trains for a look, without those of which nothing is open any more."""
-        still = [one.measure.comparison for _, found in self.findings(results) for one in found if one.is_open]
+    def plans(self, look: int, results: dict[str, RunResult], before: int = 0) -> list[Plan]:
+        """What each sweep trains for a look, without those of which nothing is open any more.
+
+        A comparison of fewer than `before` pairs waits for them: partners of runs that are missing tell nothing.
+        """
+        findings = [one for _, found in self.findings(results) for one in found]
+        still = [one.measure.comparison for one in findings if one.is_open and one.common_seeds >= before]
         first, plans = min(LOOKS), []
         for name, command in self.commands.items():
             rows = {row for one in still if one.sweep == name for row in (one.row, one.over)}
@@ -104,7 +109,7 @@ class Study:
                 continue
             seeds = {row.label: range(look if row.label in rows else first) for row in command.sweep.rows}
             plan = make_plan(command.sweep, self.call.common, seeds, self.call.identify)
-            plans.append(without_published(plan, results, training=command.workers > 0) if command.published else plan)
+            plans.append(without_results(plan, command, self.call.outputs, lambda: results))
         return plans
 
     def worth_recording(self, plan: Plan, look: int) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from src.errors import ConfigError
@@ -11,8 +12,8 @@ from src.reliability.passwords import hide_in_process_list
 from src.report.results import read_results_or_raise
 from src.report.sweep_file import DimensionConfig
 from src.sweep.compose import compose_sweep
-from src.sweep.plan import Plan, make_plan, without_published
-from src.sweep.run_plan import SweepCall, resume_command, run_plan
+from src.sweep.plan import Plan, make_plan
+from src.sweep.run_plan import SweepCall, resume_command, run_plan, without_results
 from src.sweep.run_status import is_finished_with_score
 from src.training.identity import key_of
 
@@ -29,14 +30,8 @@ def main(overrides: list[str]) -> None:
     seeds = list(range(config.seed, config.seed + command.seeds))
     call = replace(call, common=[override for override in common if key_of(override) != "seed"])
     plan = make_plan(sweep, call.common, seeds, call.identify)
-    if command.published:
-        plan = without_published(
-            plan, read_results_or_raise(call.reports, plan.scale, plan.specs), training=command.workers > 0
-        )
-    elif not command.workers and not sweep.is_search:  # what is finished here is published anew
-        results = read_results_or_raise(call.reports, plan.scale, plan.specs)
-        elsewhere = [run for run in results if not is_finished_with_score(call.outputs / run)]
-        plan = without_published(plan, elsewhere, training=False)
+    results = partial(read_results_or_raise, call.reports, plan.scale, plan.specs)
+    plan = without_results(plan, command, call.outputs, results)
     if command.dry_run:
         print(describe(plan, call.outputs))
         return

@@ -11,7 +11,7 @@ from src.errors import DataError
 from src.reliability.passwords import masked
 from src.report.results import result_path
 from src.report.sweep_record import RunState, SweepRecord, read_record, record_path, write_record
-from src.sweep.plan import Plan, RunSpec
+from src.sweep.plan import Plan, RunSpec, without_published
 from src.sweep.run_status import is_finished_with_score
 from src.sweep.sweep_study import SweepStudy, SweepTrial, trials_begun
 from src.training.identity import canonical, is_of
@@ -22,8 +22,10 @@ logger = logging.getLogger(__name__)
 class RecordWriter:
     """Writes `reports/sweeps/<stem>.json` of a plan; several runners may write the same one."""
 
-    def __init__(self, plan: Plan, study: SweepStudy, command: str, outputs: Path, reports: Path) -> None:
-        self.plan, self.study, self.command, self.outputs = plan, study, command, outputs
+    def __init__(
+        self, plan: Plan, study: SweepStudy, command: str, outputs: Path, reports: Path, published: bool = False
+    ) -> None:
+        self.plan, self.study, self.command, self.outputs, self.published = plan, study, command, outputs, published
         self.reports, self.path = reports, record_path(reports, plan.sweep.name, plan.scale, plan.changes)
         self._done: set[str] = set()
 
@@ -46,6 +48,10 @@ class RecordWriter:
     def _build(self, trials: list[SweepTrial]) -> SweepRecord:
         latest = {trial.run_id: trial for trial in trials if trial.run_id is not None}
         runs = {spec.run_id: self._state(spec, latest.get(spec.run_id)) for spec in self.plan.specs.values()}
+        if self.published:  # results may have come since the plan was made
+            there = [run_id for run_id in runs if result_path(self.reports, run_id).is_file()]
+            for run_id in without_published(self.plan, there).published:
+                runs[run_id].state = "done" if runs[run_id].state == "waiting" else runs[run_id].state
         if self.plan.sweep.is_search:
             for trial in trials:
                 for spec in (RunSpec(**content) for content in trial.attrs.get("run_specs", [])):

@@ -11,6 +11,7 @@ import shlex
 import signal
 import sys
 import time
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,7 +31,7 @@ from src.report.time_left import progress_of
 from src.sweep.compose import SweepCommand
 from src.sweep.latency_runs import measure_latencies
 from src.sweep.launcher import Launcher
-from src.sweep.plan import Plan, RunIdentity, compose_file, join_overrides, split_machine
+from src.sweep.plan import Plan, RunIdentity, compose_file, join_overrides, split_machine, without_published
 from src.sweep.record_writer import RecordWriter
 from src.sweep.run_status import is_finished_with_score
 from src.sweep.runner import Runner
@@ -112,6 +113,19 @@ class SweepCall:
         return cls(common, identify, outputs, reports, resume_command), config
 
 
+def without_results(plan: Plan, command: SweepCommand, outputs: Path, results: Callable[[], Collection[str]]) -> Plan:
+    """The plan without training what counts by its result; `results` reads those there are, by run id, where any may.
+
+    With `published` they all do. Without workers those of runs that are not finished here: these are published anew.
+    """
+    if command.published:
+        return without_published(plan, results(), training=command.workers > 0)
+    if command.workers or plan.sweep.is_search:
+        return plan
+    elsewhere = [run for run in results() if not is_finished_with_score(outputs / run)]
+    return without_published(plan, elsewhere, training=False)
+
+
 def run_plan(plan: Plan, command: SweepCommand, call: SweepCall) -> None:
     """Train what is missing, measure latencies, write and show the tables.
 
@@ -133,7 +147,7 @@ def run_plan(plan: Plan, command: SweepCommand, call: SweepCall) -> None:
         in_child=partial(die_with_parent, signal.SIGTERM),  # a killed runner leaves checkpoints, no orphans
         group=plan.study,
     )
-    writer = RecordWriter(plan, study, call.resume_command, outputs, reports)
+    writer = RecordWriter(plan, study, call.resume_command, outputs, reports, command.published)
     publish = partial(publish_result, reports=reports)
     if plan.sweep.is_search:
         runner = Search(plan, study, writer, launcher, publish, call.common, call.identify)

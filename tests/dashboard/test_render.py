@@ -12,9 +12,11 @@ from src.dashboard.render import (
     config_difference,
     flat_config,
     metric_rows,
+    number,
     signed,
 )
 from src.report.escaping import escape_markdown
+from src.report.metric_names import METRICS
 from tests.dashboard.experiments import EVIL
 
 
@@ -99,6 +101,11 @@ def test_a_run_without_numbers_does_not_show_those_of_its_baseline(board, render
     against = board.runs[shared_world.run_id(2, 1)]
     held = renderer.run(board, run, against).content
     assert "seed 1 (phase1 00000021)</text>" in held  # the legend says whose they are
+
+
+def test_a_number_that_rounds_to_zero_has_no_sign():
+    metric = METRICS["mAVE"]
+    assert [number(value, metric) for value in (-0.0002, 0.5, None)] == ["0.00", "0.50", ""]
 
 
 def test_every_id_stands_once(board, renderer):

@@ -19,7 +19,7 @@ PAPER = {"large": {"mAP": 20.3, "mAVE": 0.5}, "small": {"mAP": 18.6, "mAVE": 0.7
 def sweep_of(name, scales=None):
     if name != "margin":
         raise ConfigError(f"there is no sweeps/{name}.yaml")
-    rows = [RowConfig(label=label, paper=paper) for label, paper in PAPER.items()]
+    rows = [RowConfig(label=label, overrides=[f"x={label}"], paper=paper) for label, paper in PAPER.items()]
     return SweepConfig(
         title="t", question="q", name=name, rows=[*rows, RowConfig(label="huge", scales=["paper"])], baseline="small"
     )
@@ -49,7 +49,7 @@ def test_the_ten_claims_and_the_effects_that_the_paper_gives_them():
     assert deciding["cameras"] == [7.5] and deciding["keypoints"] == [1.5, 2.6]  # 20.3 - 12.8; 19.2, 20.3 - 17.7
     assert deciding["enlargement"] == [3.1, 1.7, 0.7] and deciding["layers"] == [1.1]
     assert deciding["paths"] == [None, None, 1.1, 2.3] and deciding["memory"] == [None] * 4
-    assert deciding["lead"] == [7.7, 6.5, 5.3, 1.5, None, None]
+    assert deciding["lead"] == [7.7, 6.5, 5.3, 1.5, None, 1.0]
     beside = {m.metric.name: m.paper for m in claims[6].measures if m.comparison.row == "BEV path, compensated"}
     assert beside["mAP"] == 1.4 and beside["measures.moving_AP"] is None
 
@@ -102,9 +102,10 @@ def test_a_file_that_is_none_is_named(claims_of, tmp_path):
 def judged(claims_of, make_record, make_result):
     """The findings of a claim on runs with these values by row; a seed whose value is None has no result."""
 
-    def judge_runs(values, *changes, states=None):
+    def judge_runs(values, *changes, states=None, overrides=()):
         (claim,) = claims_of(*(changes or [{}]))
         record = make_record(dict.fromkeys(values, {}), seeds=max(map(len, values.values())), states=states)
+        record.sweep.overrides = list(overrides)
         results = {}
         for label, numbers in values.items():
             for seed, value in enumerate(numbers):
@@ -125,6 +126,7 @@ def test_verdicts(judged):
     assert verdict([12.0, 12.1, 11.9], zero) == (Verdict.SHOWS, False)
     assert verdict([8.0, 8.1, 7.9], zero) == (Verdict.NOT, False)  # the other way round
     assert verdict([10.0, 10.1, 9.9], zero) == (Verdict.NOT, False)  # 0.44 to each side of zero: precise
+    assert verdict([10.41, 10.5, 10.62], zero) == (Verdict.SHOWS, False)  # precise as well, but from 0.045 to 0.975
     assert verdict([10.0, 10.1, 9.9], zero, {"half_width": 0.4}) == (Verdict.UNDECIDED, True)
     assert verdict([15.0, 10.0, 20.0], zero) == (Verdict.UNDECIDED, True)
     assert verdict([15.0, 5.0] * 6, zero) == (Verdict.UNDECIDED, False)  # twelve are the most
@@ -173,13 +175,14 @@ def test_what_asks_why_decides_nothing(judged, claims_of):
 def test_pairs_are_of_finished_runs_of_one_seed(judged):
     values = {"large": [12.0, 12.1, 11.9, 12.0], "small": [10.0, None, 10.0, 10.0]}
     (finding,) = judged(values)
-    assert finding.pairs == finding.found.pairs == 3 and [(one.seed, other.seed) for one, other in finding.runs] == [
+    assert finding.common_seeds == finding.found.pairs == 3
+    assert [(one.seed, other.seed) for one, other in finding.runs] == [
         (0, 0),
         (2, 2),
         (3, 3),
     ]
     (finding,) = judged(values, states={"a3": {"state": "running"}})  # its result is of an earlier training
-    assert finding.pairs == 2 and finding.verdict is Verdict.UNDECIDED
+    assert finding.common_seeds == 2 and finding.verdict is Verdict.UNDECIDED
 
 
 def test_a_record_that_does_not_know_a_claims_row_is_named(judged, caplog):
@@ -188,6 +191,15 @@ def test_a_record_that_does_not_know_a_claims_row_is_named(judged, caplog):
         (found,) = judged({"large": [30.0, 31.0, 32.0], "huge": [1.0, 2.0, 3.0]})
     assert found.verdict is Verdict.NOT_RUN and "of sweep epsilon, scale mini, has no row 'small'" in caplog.text
     assert "`python -m src.study scale=mini workers=0 published=true`" in caplog.text
+
+
+@pytest.mark.parametrize(("override", "same"), [("y=1", False), ("x=huge", True)])
+def test_runs_of_a_row_as_its_file_said_it_before_do_not_count(judged, caplog, override, same):
+    """The rows' own x comes later than the file's."""
+    values = {"large": [12.0, 12.1, 11.9], "small": [10.0] * 3}
+    (found,) = judged(values, overrides=[override])
+    assert found.verdict is (Verdict.SHOWS if same else Verdict.NOT_RUN)
+    assert ("has no row 'large' as sweeps/ defines it" in caplog.text) != same
 
 
 def test_committed_records_know_every_row_that_the_claims_name(caplog):

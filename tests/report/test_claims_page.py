@@ -1,15 +1,17 @@
 """The page of the claims and its picture, through the command's own entry."""
 
 import json
+from dataclasses import replace
 
 import pytest
 from PIL import Image
 
 from src.dashboard import single_file as export
 from src.errors import DataError
-from src.report.__main__ import main
+from src.report import __main__ as page
 from src.report.sweep_record import record_path, write_record
 from src.report.sweep_text import describe_starts
+from src.sweep.sweep_files import load_sweep
 
 
 @pytest.fixture
@@ -18,20 +20,30 @@ def report(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(export, "export_dashboard", lambda *arguments: None)
 
     def run(scale="mini"):
-        main(["phase=phase1", f"scale={scale}", f"paths.outputs={tmp_path}", f"paths.reports={tmp_path / 'reports'}"])
-        return tmp_path / "reports", capsys.readouterr().out
+        reports = tmp_path / "reports"
+        page.main(["phase=phase1", f"scale={scale}", f"paths.outputs={tmp_path}", f"paths.reports={reports}"])
+        return reports, capsys.readouterr().out
 
     return run
 
 
 @pytest.fixture
-def write_sweep(write_run, make_record, tmp_path):
-    """Writes the record of a sweep and a run for each row and seed; every score is the row's value for that seed."""
+def write_sweep(write_run, make_record, tmp_path, monkeypatch):
+    """Writes the record of a sweep and a run for each row and seed; every score is the row's value for that seed.
 
-    def write(name, rows, changes=(), scale="mini", overrides=(), latency=False):
-        record = make_record(dict.fromkeys(rows, {}), seeds=max(map(len, rows.values())), name=name, scale=scale)
+    The sweep's file defines its rows as the record does.
+    """
+    filed = {}
+    monkeypatch.setattr(page, "load_sweep", lambda name: filed.get(name) or load_sweep(name))
+
+    def write(name, rows, changes=(), scale="mini", overrides=(), latency=False, states=None):
+        record = make_record(
+            dict.fromkeys(rows, {}), seeds=max(map(len, rows.values())), name=name, scale=scale, states=states
+        )
         record.changes, record.sweep.overrides = list(changes), list(overrides)
         record.sweep.latency = latency
+        own = [replace(row, overrides=[f"x={row.label}"], scale_overrides={}) for row in load_sweep(name).rows]
+        filed[name] = replace(load_sweep(name), overrides=list(overrides), scale_overrides={}, rows=own)
         for label, values in rows.items():
             for seed, value in enumerate(values):
                 end = record.rows[label][seed].rpartition("-")[2]
@@ -59,15 +71,15 @@ def test_claims_with_results_stand_beside_those_that_are_not_run(report, write_s
 
 
 def test_runs_are_named_that_began_from_other_weights_than_those_they_are_compared_with(make_result):
-    """Two pairs of one source, each of one training of it, and a third whose second began from another."""
+    """Two pairs of one source, each of one training of it, and a third of two."""
 
     def run(name, weights):
         return make_result(name, {}, initialized_from="phase1", initial_weights=weights)
 
     pairs = [(run("a", "x"), run("b", "x")), (run("c", "y"), run("d", "y"))]
     assert describe_starts(pairs) == ""
-    assert describe_starts([*pairs, (run("e", "x"), run("f", "y"))]).endswith("differences and intervals: f.")
-    assert describe_starts([[one for pair in pairs for one in pair]]).endswith(": c, d.")  # all compared with all
+    assert describe_starts([*pairs, (run("e", "x"), run("f", "y"))]).endswith("differences and intervals: e.")
+    assert describe_starts([(run("e", "x"), run("f", None))]) == "", "nothing is known of it"
 
 
 def test_what_tells_why_stands_behind_the_claims_as_far_as_it_has_run(report, write_sweep):
@@ -91,6 +103,15 @@ def test_the_page_says_which_sweeps_have_settings_of_their_own(report, write_swe
     assert not settings or "\n- `layers`: `optim.rise_fraction=0.4 model.kggi.num_radar_keypoints=256`\n" in text
 
 
+def test_a_row_that_its_file_defines_otherwise_by_now_has_not_run(report, write_sweep):
+    write_sweep("paths", {"phase 1 continued": [0.1] * 3, "BEV path": [0.2] * 3, "Gaussian path": [0.2] * 3})
+    (row,) = (row for row in page.load_sweep("paths").rows if row.label == "BEV path")
+    row.overrides = ["x=another"]
+    text = (report()[0] / "README.md").read_text()
+    assert "| BEV path over phase 1 continued | mAP, % | – | – | – | not run |" in text
+    assert "| Gaussian path over phase 1 continued | mAP, % | – | +10.0 [+10.0, +10.0] | 3 | shows |" in text
+
+
 def test_the_command_trains_all_seeds_that_the_page_reads(report, write_sweep):
     write_sweep("layers", {"1 layer": [0.10] * 7, "2 layers": [0.10, 0.12, 0.14, 0.10, 0.12, 0.14, 0.9]})
     text = (report()[0] / "README.md").read_text()
@@ -107,8 +128,8 @@ def test_without_a_result_of_any_claim_there_is_no_page(report, write_sweep):
 
 def test_a_damaged_result_leaves_the_page_as_it_was(report, write_sweep, tmp_path):
     write_sweep("layers", {"1 layer": [0.10] * 3, "2 layers": [0.20, 0.21, 0.19]})
-    page = report()[0] / "README.md"
-    before = page.read_text()
+    path = report()[0] / "README.md"
+    before = path.read_text()
     first, *_ = sorted((tmp_path / "reports" / "results").iterdir())
     first.write_text("{")
     (tmp_path / first.stem / "run.json").unlink()  # or it would be written anew
@@ -116,7 +137,7 @@ def test_a_damaged_result_leaves_the_page_as_it_was(report, write_sweep, tmp_pat
         DataError, match=rf"all else is written, but\n.*{first.name}.*\n.*page of the claims is as it was"
     ):
         report()
-    assert page.read_text() == before and "2 layers over 1 layer" in before
+    assert path.read_text() == before and "2 layers over 1 layer" in before
 
 
 def test_another_scale_has_a_page_of_its_own(report, write_sweep):
@@ -141,3 +162,20 @@ def test_rows_of_a_sweep_that_times_them_become_a_picture(report, write_sweep, t
         _, said = report()
         assert picture.is_file() == (f"written: {picture}" in said) == (enough and latency)
     assert not latency or Image.open(picture).width == 1600
+
+
+def test_the_picture_shows_what_a_table_compares(report, write_sweep, tmp_path, monkeypatch):
+    """Rows that the same machine timed, by results of their last training; fewer seeds are named."""
+    rows = {"one": [0.10, 0.11], "few": [0.20, 0.21], "again": [0.30, 0.31], "elsewhere": [0.40, 0.41]}
+    states = {"b1": {"state": "running"}, "c0": {"state": "waiting"}, "c1": {"state": "waiting"}}
+    write_sweep("layers", rows, latency=True, states=states)
+    for end in "abcd":
+        timed = {"ms": {"total": 250.0}, "spread_ms": {"total": 20.0}, "fps": 4.0, "memory_gb": 1.0,
+                 "processor": "another CPU" if end == "d" else "CPU"}  # fmt: skip
+        (tmp_path / f"horizon3d-phase1-mini-{end}0" / "latency.json").write_text(json.dumps(timed))
+    drawn = []
+    monkeypatch.setattr(page, "draw_trade_off", lambda path, points, title, cost, score: drawn.append((points, cost)))
+    report()
+    ((points, cost),) = drawn
+    assert [(point.label, point.score) for point in points] == [("one", pytest.approx(10.5)), ("few, 1 seed", 20.0)]
+    assert cost == "milliseconds from frame to boxes, CPU, 1 thread"

@@ -76,6 +76,13 @@ def test_the_first_look_that_decides_or_is_precise_stays():
     assert compare_at_looks(by_seed(0.1, 0.2, 0.0, 5.0, 5.0, 5.0), ZERO, 0.4, 1).pairs == 6
 
 
+def test_a_look_is_decided_by_its_bounds_and_not_as_they_are_shown():
+    found = compare_at_looks(by_seed(0.41, 0.50, 0.62), ZERO, 0.5, 1)  # [0.045, 0.975]
+    assert found.decided and found.favours(MAP) and found.text == "+0.5 [+0.0, +1.0]"
+    found = compare_at_looks(by_seed(0.39, 0.50, 0.64), ZERO, 0.56, 1)  # [-0.04, 1.06]
+    assert not found.decided and found.settled(0.56) and found.text == "+0.5 [+0.0, +1.1] undecided"
+
+
 def test_fewer_pairs_than_a_look_have_no_interval():
     found = compare_at_looks({0: 90.0, 3: 91.0, 7: 9.0}, {0: 1.0, 3: 1.0}, 0.5, 1)
     assert found == Comparison(89.5, None, None, 2, 1) and not found.settled(1e9) and found.numbers == "+89.5"

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -401,6 +402,16 @@ def test_a_run_without_its_configuration_is_named(write_run, reports):
         (folder / "config.yaml").write_text(content)
         with pytest.raises(DataError, match=r"a/config\.yaml: not a run's configuration"):
             publish_result(folder, reports)
+
+
+def test_a_copy_of_a_folder_replaces_no_result(write_run, reports):
+    folder = write_run("a", [], 0, 0.3)
+    before = publish_result(folder, reports).read_bytes()
+    copy = shutil.copytree(folder, folder.with_name(f"{folder.name}.copy"))
+    damage(copy / "metrics.json", lambda m: m.update(mAP=0.9))
+    with pytest.raises(DataError, match=rf"run_id must be {copy.name}, the folder's name, but is {folder.name}; move"):
+        publish_result(copy, reports)
+    assert [path.read_bytes() for path in (reports / "results").iterdir()] == [before]
 
 
 def test_a_curve_that_is_no_number_is_named(write_run, reports):

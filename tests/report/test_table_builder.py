@@ -131,7 +131,10 @@ def test_a_table_may_show_some_of_the_rows(make_record, results_of):
     record = make_record({"a": {"mAP": 9.0}, "b": {"mAP": 3.0}, "c": {}}, seeds=1, columns=("mAP",), baseline="b",
                          paper_rows={"other": {"mAP": 4.0}, "best": {"mAP": 8.0}})  # fmt: skip
     record.sweep.tables[0].rows = ["other", "c", "best"]
-    (table,) = sweep_tables(record, results_of({"a0": 0.1, "b0": 0.2, "c0": 0.4}))
+    results = results_of({"a0": 0.1, "b0": 0.2})
+    results |= results_of({"c0": 0.4}, phase="phase2", epochs=1, commit="fedcba9876543210")
+    (table,) = sweep_tables(record, results)
+    assert "phase2: 1 epoch; seed 0; code fedcba9876; cpu" in table.caption and "phase1" not in table.caption
     text = cells_of(table.to_markdown())
     assert list(text) == ["row: paper | here", "other", "c", "best"]
     assert text["c"] == ["– | 40.0", "– | +20.0 undecided"]  # to the baseline that is not shown
@@ -344,17 +347,29 @@ def test_different_data_or_scales_are_refused_by_name(make_record, results_of, c
     assert sweep_tables(record, results | {"of-no-row": other})
 
 
-def test_a_table_says_which_runs_begin_from_another_training_of_their_source(make_record, results_of):
-    record, begun = make_record({"a": {}, "b": {}, "c": {}}, seeds=1), {"initialized_from": "horizon3d-phase1-mini-0"}
-
-    def text(before, after):
-        results = results_of({"a0": 0.1}, **begun, initial_weights=before)
-        (table,) = sweep_tables(record, results | results_of({"b0": 0.2, "c0": 0.3}, **begun, initial_weights=after))
-        return table.to_markdown()
-
-    for before in ("1" * 16, None):
-        assert f"whose noise is in those differences and intervals: {PREFIX}a0." in text(before, "2" * 16)
-        assert "another training" not in text(before, before)
+@pytest.mark.parametrize(
+    ("baselines", "digests", "apart"),
+    [
+        ((None, None, None), "122", "a0"),  # each two rows are compared
+        (("b", "b", "b"), "122", "a0"),
+        (("b", "b", None), "112", ""),  # c is compared with none
+        (("b", "b", "b"), "121", "a0, c0"),
+        (("b", "b", "b"), "111", ""),
+        (("b", "b", "b"), "0x1", ""),  # what is not recorded may be the same
+    ],
+)
+def test_a_table_says_which_runs_begin_from_another_training_than_what_they_are_compared_with(
+    make_record, results_of, baselines, digests, apart
+):
+    record, results = make_record({"a": {}, "b": {}, "c": {}}, seeds=1), {}
+    for row, baseline, digest in zip(record.sweep.rows, baselines, digests, strict=True):
+        row.baseline = baseline
+        start = {"initialized_from": f"{PREFIX}0", "initial_weights": None if digest == "x" else digest * 16}
+        results |= results_of({f"{row.label}0": 0.1}, **start)
+    text = sweep_tables(record, results)[0].to_markdown()
+    assert ("another training" in text) == bool(apart)
+    named = ", ".join(f"{PREFIX}{end}" for end in apart.split(", "))
+    assert not apart or f"whose noise is in those differences and intervals: {named}." in text
 
 
 def test_weights_scored_once_more_are_those_of_their_row(make_record, results_of):

@@ -113,6 +113,20 @@ def test_rows_outside_the_open_comparisons_stay_at_the_first_look(places, traine
     ]
 
 
+def test_a_row_that_never_finishes_gets_no_partners_beyond_the_first_look(places, trained, monkeypatch):
+    calls, results = trained
+    run_plan = study.run_plan
+
+    def failing(plan, *rest):
+        run_plan(plan, *rest)
+        for run_id in plan.rows.get("large", {}).values():
+            results.pop(run_id, None)
+
+    monkeypatch.setattr(study, "run_plan", failing)
+    study.main(places)
+    assert [name for name, _ in calls] == ["margin", "layers", "layers"]
+
+
 def test_a_plan_is_printed_with_the_time_that_it_takes(places, trained, capsys, tmp_path):
     calls, _ = trained
     study.main([*places, "dry_run=true"])
@@ -204,6 +218,17 @@ def test_without_workers_no_look_follows_an_incomplete_one(places, trained, tmp_
     calls.clear()
     study.main(of_results)
     assert calls == [("margin", {})] and "margin: undecided" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("override", ["published=true", "published=false"])
+def test_without_workers_results_count_beside_what_is_finished_here(places, trained, tmp_path, override):
+    study.main(places)
+    first, *others = record_of(tmp_path, "margin").runs
+    elsewhere = tmp_path / "another"
+    elsewhere.mkdir()
+    (tmp_path / "outputs" / first).rename(elsewhere / first)
+    study.main([*places, "workers=0", override, f"paths.outputs={elsewhere}"])
+    assert others and record_of(tmp_path, "margin").count("done") == 1 + len(others)
 
 
 def test_another_experiment_has_records_of_its_own(places, trained, tmp_path):

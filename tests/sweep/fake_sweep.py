@@ -28,13 +28,15 @@ def make_sweep(rows=None, space=None, **more):
     return SweepConfig(name="fake", title="t", question="q", rows=rows, space=space, **more)
 
 
-def make_runner(folder, sweep, seeds=(0,), common=(), workers=1, storage=None, publish=None, results=()):
+def make_runner(
+    folder, sweep, seeds=(0,), common=(), workers=1, storage=None, publish=None, results=(), published=False
+):
     outputs, reports = Path(folder) / "outputs", Path(folder) / "reports"
     common = [*common, f"paths.outputs={outputs}"]
     plan = without_published(make_plan(sweep, common, list(seeds), identify), results, training=workers > 0)
     definition = {"format": 1, "kind": "search" if sweep.is_search else "rows"}
     study = SweepStudy(outputs, plan.study, storage or default_storage(outputs), definition)
-    writer = RecordWriter(plan, study, "the command", outputs, reports)
+    writer = RecordWriter(plan, study, "the command", outputs, reports, published)
     prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else lambda *_: None
     command = [sys.executable, "-m", "tests.sweep.fake_train"]
     launcher = Launcher(command, study.folder, workers, [], in_child=lambda: prctl(1, signal.SIGTERM))

@@ -103,6 +103,19 @@ def test_without_workers_what_there_is_is_recorded(tmp_path):
     assert not trained(tmp_path) and record == record_of(tmp_path)
 
 
+@pytest.mark.parametrize("published", [True, False])
+def test_what_is_published_after_the_plan_was_made_is_no_longer_waiting(tmp_path, published):
+    """But for a run that is to be trained all the same, as another begins from its weights."""
+    rows = {"one": ["phase=phase1"], "two": ["phase=phase2"], "other": ["phase=phase1", "optim.lr=1"]}
+    runner = make_runner(tmp_path, make_sweep(rows), published=published, workers=0)
+    for label in ("one", "other"):
+        path = result_path(tmp_path / "reports", runner.plan.rows[label][0])
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("{}")
+    states = [run.state for run in runner.run().runs.values()]
+    assert states == ["waiting", "waiting", "done" if published else "waiting"]
+
+
 def test_a_failed_row_is_reported_and_retried_by_the_next_call(tmp_path):
     rows = {"good": ["model.x=1"], "bad": ["model.x=2"], "killed": ["model.x=3"]}
     bad = fault(tmp_path, ["model.x=2", "seed=0"], "5", "3")
