@@ -52,7 +52,10 @@ def paint_points(axes: Axes, points: Sequence[TradeOff]) -> None:
 
 
 def spread_labels(axes: Axes) -> None:
-    """Put every label at the first of its places where it covers no point and no label before it, else at the first."""
+    """Put every label at the first of its places above the axis where it covers no point and no label before it.
+
+    Where there is none it stands at the first of all.
+    """
     renderer = axes.figure.canvas.get_renderer()
     centres = [axes.transData.transform(label.xy) for label in axes.texts]
     taken = [Bbox.from_extents(x - MARKER_PX, y - MARKER_PX, x + MARKER_PX, y + MARKER_PX) for x, y in centres]
@@ -61,7 +64,7 @@ def spread_labels(axes: Axes) -> None:
             label.xyann = place
             label.set_horizontalalignment("left" if place[0] > 0 else "right")
             box = label.get_window_extent(renderer)
-            if not any(box.overlaps(other) for other in taken):
+            if box.y0 >= axes.bbox.y0 and not any(box.overlaps(other) for other in taken):
                 break
         taken.append(box)
 

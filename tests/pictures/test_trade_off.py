@@ -49,6 +49,14 @@ def test_ten_points_differ_in_colour_and_in_shape() -> None:
     assert len({mark.get_color() for mark in marks}) == len({mark.get_marker() for mark in marks}) == 10
 
 
+def test_no_label_stands_below_the_axis() -> None:
+    axes = Canvas(800, 300).axes(30, 30, 740, 240)
+    paint_points(axes, [point("PETR", 60.0, 0.0), point("Far3D", 66.0, 0.2), point("SpaRC", 150.0, 17.0)])
+    axes.set(xlim=(0, 200), ylim=(0, 20))
+    spread_labels(axes)
+    assert all(text.get_window_extent().y0 >= axes.bbox.y0 for text in axes.texts)
+
+
 def test_labels_of_close_points_stand_apart() -> None:
     axes = Canvas(800, 300).axes(30, 30, 740, 240)
     paint_points(axes, [point("Horizon3D", 283.0, 29.9), point("BEVFusion", 287.0, 31.4), point("far", 100.0, 5.0)])
