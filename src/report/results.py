@@ -150,6 +150,11 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
     """
     remedy = "delete run.json and metrics.json there and give the run's command again"
     record = read_as(RunRecord, run_folder / "run.json", remedy)
+    found, name = f"{run_folder / 'run.json'}: run_id", record.run_id
+    if not FOLDER_NAME.fullmatch(name):
+        raise DataError(f"{found} must be the name of a folder, but is {name!r:.80}; {remedy}")
+    if name != (own := run_folder.name):
+        raise DataError(f"{found} must be {own}, the folder's name, but is {name}; move a copy elsewhere")
     is_detection = record.task == DETECTION
     metrics_path = run_folder / "metrics.json"
     scores = read_as(Scores if is_detection else OtherScores, metrics_path, remedy)
@@ -164,12 +169,6 @@ def publish_result(run_folder: Path, reports: Path) -> Path:
         latency = read_as(Latency, latency_path, "delete it and measure again")
     else:
         latency = _of_fresh_weights(result_path(reports, record.run_id))
-    if not FOLDER_NAME.fullmatch(record.run_id):
-        name = f"{run_folder / 'run.json'}: run_id"
-        raise DataError(f"{name} must be the name of a folder, but is {record.run_id!r:.80}; {remedy}")
-    if record.run_id != run_folder.name:
-        what = f"{run_folder / 'run.json'}: run_id must be {run_folder.name}, the folder's name, but is {record.run_id}"
-        raise DataError(f"{what}; move a copy elsewhere, or call the folder as its run")
     overrides = [_without_local_path(o) for o in record.overrides if not is_of(o, OUTSIDE_IDENTITY)]
     content = {
         "format": FORMAT,
