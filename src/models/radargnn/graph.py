@@ -26,9 +26,9 @@ MIN_DISTANCE_M = 1e-3
 class Invariance(Enum):
     """Under what motions of the whole scene the features stay and boxes move along.
 
-    `translation`: edges carry relative positions, nodes velocities. `rigid`: also rotations about the vertical: both, and
-    boxes, are along axes whose x points to the nearest neighbour, and edges carry point-pair features as well. These
-    alone would be the same in a scene and its mirror image, where headings and velocities differ.
+    `translation`: edges carry relative positions, nodes velocities. `rigid`: also rotations about the vertical: both,
+    and boxes, are along axes whose x points to the nearest neighbour, and edges carry point-pair features as well.
+    These alone would be the same in a scene and its mirror image, where headings and velocities differ.
     """
 
     translation = "translation"

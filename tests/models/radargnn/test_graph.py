@@ -53,7 +53,7 @@ def test_nodes_and_edges_by_hand():
     assert graph.neighbours.flatten().tolist() == [1, 0, 1]
     assert graph.axes.tolist() == [[1.0, 0.0], [-1.0, 0.0], [-1.0, 0.0]]
     torch.testing.assert_close(graph.nodes[0], torch.tensor([0.5, 0.5, 0.6, 0.8, 0.5, 1.0]))
-    torch.testing.assert_close(graph.nodes[1, 2:4], torch.tensor([0.0, -0.3]))  # what is left there, is right of its axis
+    torch.testing.assert_close(graph.nodes[1, 2:4], torch.tensor([0.0, -0.3]))  # leftwards, so to its axis' right
     assert graph.nodes[:, 5].tolist() == [1.0, 2.0, 0.0]  # how many hear it
     ahead, distance, apart = 0.2, 0.2, math.hypot(0.6, 0.5)
     torch.testing.assert_close(graph.edges[1, 0], torch.tensor([ahead, 0.0, distance, 0.8, 0.0, -0.6, apart]))
