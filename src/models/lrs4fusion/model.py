@@ -57,7 +57,7 @@ class LRS4Fusion(Detector, WorldModel):
     It answers queries (x, y, z, t) by occupancy and radial velocity, and gives the ranges of future rays, and boxes.
     Parts that the phase's stage does not train are frozen; those that it does not use are absent.
     Region and voxels are the model's own (`model.roi`); it has no use for the `grid` that others share.
-    Raises ConfigError when parts and region do not fit.
+    Raises ConfigError when parts and region do not fit, or when the stage would learn nothing.
     """
 
     phase_options = LRSOptions
@@ -93,6 +93,11 @@ class LRS4Fusion(Detector, WorldModel):
             self.requires_grad_(False)
             self.ray_head = RayHead(config.ray_head, farthest_m(self.bounds))
         if self.stage is LRSStage.detection:
+            if (config.loss.heatmap_weight, config.loss.box_weight) == (None, None):
+                raise ConfigError(
+                    "model.loss.heatmap_weight and box_weight are both null, so the stage detection would learn "
+                    "nothing; give one"
+                )
             self.decoders.requires_grad_(False)  # they still say how fast what is remembered moves
             self.neck = BEVNeck(config.neck, late.scale_channels).to(memory_format=torch.channels_last)
             self.head = CenterHead(

@@ -81,6 +81,8 @@ def test_sensors_and_stages_that_there_are():
         lrs_config("phase.options.stage=dreams")
     with pytest.raises(ConfigError, match="velocity_compensation=true needs model.decoders.velocity=true"):
         lrs_config("model.decoders.velocity=false")
+    with pytest.raises(ConfigError, match="heatmap_weight and box_weight are both null.*stage detection"):
+        lrs_model("phase.options.stage=detection", "model.loss.heatmap_weight=null", "model.loss.box_weight=null")
     with pytest.raises(ConfigError, match="reads LiDAR, which this world lacks"):
         lrs_config("data.world.lidar=false")
     with pytest.raises(ValueError, match="FrameBatch.lidar_points is None, but this model uses LiDAR"):
