@@ -17,7 +17,7 @@ from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.views import CameraViews
 from src.ops.nms import maxpool_peaks
 from src.ops.segment_reduce import topk_per_sample
-from src.structures.queries import Queries
+from src.structures.queries import UNKNOWN_LOGIT, Queries
 from src.structures.taxonomy import CLASSES
 from src.targets.depth import DepthBinsConfig, lid_centres
 
@@ -85,9 +85,11 @@ class QueryProposals(nn.Module):
         return Proposals(Queries.concatenate(parts, dim=1), logits, camera)
 
     def _radar(self, logits: Tensor, radar: RadarPoints) -> Queries:
-        """The peaks of the heat map of any class; they bring their class, their place and their radial velocity."""
-        bev = radar.bev
-        scores = (logits.sigmoid() * maxpool_peaks(logits.sigmoid(), bev.sites)).amax(1)
+        """The peaks of the heat map of any class; they bring their place, their radial velocity, and the scores of the
+        classes of which they are peaks: of the others a neighbour brings a better one."""
+        bev, peaks = radar.bev, maxpool_peaks(logits.sigmoid(), radar.bev.sites)
+        scores = (logits.sigmoid() * peaks).amax(1)
+        logits = torch.where(peaks, logits, logits.clamp(max=UNKNOWN_LOGIT))
         rows = topk_per_sample(scores, bev.indices[:, 0], bev.batch_size, self.config.num_radar)
         picks = torch.where(rows >= 0, rows, len(bev))  # one more row, which padding reads
         features, means, known = (F.pad(table, (0, 0, 0, 1)) for table in (bev.features, radar.means, logits))

@@ -53,7 +53,9 @@ def test_radar_queries_stand_at_the_peaks_and_know_what_is_measured():
     rows = [2, 0, 1]  # best first
     assert torch.equal(queries.centers[0, :3], radar.means[rows, :3])
     assert torch.equal(queries.velocities[0, :3], radar.means[rows, 4:6])
-    assert torch.equal(queries.logits[0, :3], logits[rows]) and not queries.logits.requires_grad
+    known = logits.detach().clone()
+    known[0, 4] = known[1, 2] = UNKNOWN_LOGIT  # where the other is the better one
+    assert torch.equal(queries.logits[0, :3], known[rows]) and not queries.logits.requires_grad
     torch.testing.assert_close(queries.features[0, :3], proposals.from_radar(radar.bev.features[rows]))
     assert torch.equal(queries.centers[1, 0], radar.means[3, :3])
 
