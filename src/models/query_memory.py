@@ -19,7 +19,7 @@ from src.ops.frame_motion import zero_slow_velocities
 from src.ops.take_rows import take_rows
 from src.structures.batch import FrameBatch
 from src.structures.evidence import Evidence, WarpedPoints
-from src.structures.queries import UNKNOWN_LOGIT, Queries
+from src.structures.queries import Queries
 from src.structures.taxonomy import CLASSES, SPEED_UNIT_MPS
 
 MOTION_NUMBERS = 7
@@ -47,6 +47,7 @@ class QueryFrame(RememberedFrame):
     centers: Tensor  # [B, K, 3] m, of their boxes
     velocities: Tensor  # [B, K, 2] m/s over ground
     features: Tensor  # [B, K, C]
+    logits: Tensor  # [B, K, 12] of their classes
     valid: Tensor  # [B, K] bool
 
     def with_velocities(self, velocities: Callable[[int, Tensor, Tensor], Tensor]) -> QueryFrame:
@@ -136,9 +137,9 @@ class QueryPropagation(nn.Module):
         past = memory.before(batch).frames[: self.config.num_frames] if memory is not None else ()
         frames = [*past, *[self._nothing(batch)] * (self.config.num_frames - len(past))]
         motion = motions(frames, batch, self.config.max_age_s)  # [T, B]
-        centers, velocities, features, valid = (
+        centers, velocities, features, logits, valid = (
             torch.stack([getattr(frame, name) for frame in frames])
-            for name in ("centers", "velocities", "features", "valid")
+            for name in ("centers", "velocities", "features", "logits", "valid")
         )  # [T, B, K, ...]
         with torch.autocast(batch.device.type, enabled=False):
             elapsed = motion.elapsed_s[..., None].expand_as(valid)
@@ -151,7 +152,6 @@ class QueryPropagation(nn.Module):
             driven = driven.expand(*valid.shape, 4, 4)
             told = [elapsed[..., None], velocities / SPEED_UNIT_MPS, driven[..., :2, 3] / EGO_UNIT_M]
             features = self.norm(features, torch.cat([*told, driven[..., :2, 0]], dim=-1))
-        logits = features.new_full((*valid.shape, len(CLASSES)), UNKNOWN_LOGIT)
         queries = Queries(features, centers, velocities, logits, valid).map(_by_sample)
         return RecalledQueries(past, queries, _by_sample(elapsed), motion.usable.t(), self.config.queries_per_frame)
 
@@ -177,6 +177,7 @@ class QueryPropagation(nn.Module):
             centers=_padded(transform_points(ego_from_aug, centers), wanted),
             velocities=_padded(transform_vectors_xy(ego_from_aug, velocities), wanted),
             features=_padded(take_rows(features.float(), picks), wanted),
+            logits=_padded(take_rows(prediction.logits.float(), picks), wanted),
             valid=_padded(best.isfinite()[..., None], wanted).squeeze(-1),
         )
         return QueryMemory((frame, *past)[: self.config.num_frames])
@@ -184,7 +185,7 @@ class QueryPropagation(nn.Module):
     def _nothing(self, batch: FrameBatch) -> QueryFrame:
         """A frame in which no stream remembers anything."""
         shape, device = (len(batch), self.config.queries_per_frame), batch.device
-        sizes = {"centers": 3, "velocities": 2, "features": self.channels}
+        sizes = {"centers": 3, "velocities": 2, "features": self.channels, "logits": len(CLASSES)}
         return QueryFrame(
             batch.timestamps_s,
             batch.global_from_ego,
