@@ -19,7 +19,7 @@ from src.ops.frame_motion import zero_slow_velocities
 from src.ops.take_rows import take_rows
 from src.structures.batch import FrameBatch
 from src.structures.evidence import Evidence, WarpedPoints
-from src.structures.queries import Queries
+from src.structures.queries import UNKNOWN_LOGIT, Queries
 from src.structures.taxonomy import CLASSES, SPEED_UNIT_MPS
 
 MOTION_NUMBERS = 7
@@ -152,6 +152,7 @@ class QueryPropagation(nn.Module):
             driven = driven.expand(*valid.shape, 4, 4)
             told = [elapsed[..., None], velocities / SPEED_UNIT_MPS, driven[..., :2, 3] / EGO_UNIT_M]
             features = self.norm(features, torch.cat([*told, driven[..., :2, 0]], dim=-1))
+        logits = logits.clamp(UNKNOWN_LOGIT, 0.0)  # what a frame adds to them must not add up over many
         queries = Queries(features, centers, velocities, logits, valid).map(_by_sample)
         return RecalledQueries(past, queries, _by_sample(elapsed), motion.usable.t(), self.config.queries_per_frame)
 

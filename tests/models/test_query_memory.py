@@ -57,6 +57,8 @@ def test_the_best_queries_move_by_their_velocity():
     assert recalled.elapsed_s[0].tolist() == [0.5, 0.5, 0, 0, 0, 0]
     assert recalled.usable.tolist() == [[True, False, False]]
     assert len(recalled.newest) == 2 and len(recalled.older) == 4
+    assert recalled.queries.logits[0, 0].tolist() == pytest.approx([*[-4.6] * 2, 0.0, *[-4.6] * 9])  # 3.0 at most as 0
+    assert recalled.queries.logits[0, 1, 0] == 0.0
     assert not memory.frames[0].features.requires_grad
     slow = make_propagation(min_speed_mps=1.0)
     assert seen(slow.recall(memory, bare_frame(0.5, [pose()])))[0] == (9, 9, 0, 0.5)
