@@ -26,9 +26,8 @@ MIN_DISTANCE_M = 1e-3
 class Invariance(Enum):
     """Under what motions of the whole scene the features stay and boxes move along.
 
-    `translation`: edges carry relative positions, nodes velocities. `rigid`: also rotations about the vertical: both,
-    and boxes, are along axes whose x points to the nearest neighbour, and edges carry point-pair features as well.
-    These alone would be the same in a scene and its mirror image, where headings and velocities differ.
+    `translation`: edges carry relative positions, nodes velocity vectors. `rigid`: also rotations about the vertical:
+    edges carry point-pair features, nodes speeds, and boxes are relative to the direction of the nearest neighbour.
     """
 
     translation = "translation"
@@ -48,7 +47,7 @@ class GraphConfig:
     @property
     def widths(self) -> tuple[int, int]:
         """Numbers of a node and of an edge, in `PointGraph.nodes` and `PointGraph.edges`."""
-        return (6, 7) if self.invariance is Invariance.rigid else (6, 2)
+        return (5, 5) if self.invariance is Invariance.rigid else (6, 2)
 
 
 @dataclass
@@ -60,7 +59,7 @@ class PointGraph:
     batch_size: int
     neighbours: Tensor  # [n, k] int64 row of each, nearest first; the point's own where it has fewer
     present: Tensor  # [n, k] bool
-    axes: Tensor  # [n, 2] unit vector in the aug frame: the x axis of what is relative to the point
+    axes: Tensor  # [n, 2] unit vector in the aug frame: the x axis that boxes of the point are relative to
     nodes: Tensor  # [n, node features]
     edges: Tensor  # [n, k, edge features], zero where not present
 
@@ -104,19 +103,17 @@ def build_graph(
         neighbours, present = nearest_neighbours(points[:, :2], sample, batch_size, config.num_neighbours)
         near = F.embedding(neighbours, points)  # [n, k, 7]
         offsets = (near - points[:, None])[..., :2]
+        rigid = config.invariance is Invariance.rigid
+        edges = pair_features(points[:, None, 4:6], near[..., 4:6], offsets) if rigid else offsets / EDGE_UNIT_M
+        ahead = constant((1.0, 0.0), points.dtype, points.device).expand(len(points), 2)
         distance = offsets.norm(dim=2)
         distance, first = distance.masked_fill(~present | (distance < MIN_DISTANCE_M), torch.inf).min(dim=1)
         chosen = offsets.gather(1, first[:, None, None].expand(-1, 1, 2)).squeeze(1)
-        rigid = config.invariance is Invariance.rigid
         known = distance.isfinite()[:, None] & rigid
-        ahead = constant((1.0, 0.0), points.dtype, points.device).expand(len(points), 2)
         axes = torch.where(known, unit_vectors(chosen, MIN_DISTANCE_M), ahead)
-        cosine, sine = axes.unbind(1)
-        edges = torch.stack(rotate_back(cosine[:, None], sine[:, None], *offsets.unbind(2)), dim=2) / EDGE_UNIT_M
-        if rigid:
-            edges = torch.cat([edges, pair_features(points[:, None, 4:6], near[..., 4:6], offsets)], dim=2)
         scales = constant(POINT_SCALES, points.dtype, points.device)
-        motion = torch.stack(rotate_back(cosine, sine, *(points / scales)[:, 4:6].unbind(1)), dim=1)
+        motion = points[:, 4:6] / scales[4:6]
+        motion = motion.norm(dim=1, keepdim=True) if rigid else motion
         heard = torch.zeros_like(sample).index_add(0, neighbours.flatten(), present.flatten().long())
         z, rcs, dt = ((points / scales)[:, column, None] for column in (2, 3, 6))
         nodes = torch.cat([z, rcs, motion, dt, heard[:, None] / config.num_neighbours], dim=1)
