@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Generic, Self, TypeVar, get_args, get_type_hin
 import torch
 from torch import Tensor
 
-from src.errors import ConfigError, require_least
+from src.errors import CheckpointError, ConfigError, require_least
 from src.ops.frame_motion import relative_motion, relative_pose
 from src.structures.batch import MAX_EGO_SPEED_MPS, FrameBatch
 from src.structures.tensor_fields import TensorFields
@@ -201,7 +201,7 @@ class FrameMemory(TensorFields, Generic[Frame]):
 
     @classmethod
     def from_state(cls, state: list[dict[str, Any]]) -> Self:
-        """The memory that `state` described."""
+        """The memory that `state` described. Raises CheckpointError for one of other fields, as other code writes."""
         return cls(tuple(_restored(cls.frame_type, entry) for entry in state))
 
     @classmethod
@@ -223,6 +223,12 @@ def _plain(value: Any) -> Any:
 def _restored(kind: type, entry: dict[str, Any]) -> Any:
     """An instance of the dataclass `kind` from its `_plain` form; fields may be other `TensorFields`, or None."""
     hints = get_type_hints(kind)
+    if entry.keys() != (names := {field.name for field in fields(kind)}):
+        odd = ", ".join(sorted(entry.keys() ^ names))
+        raise CheckpointError(
+            f"what the checkpoint remembers ({kind.__name__}) differs from this code's in {odd}: it was written by "
+            "other code; go on with that, or begin anew with resume=restart"
+        )
     values = dict(entry)
     for name, value in entry.items():
         parts = [part for part in (hints[name], *get_args(hints[name])) if isinstance(part, type)]

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from src.errors import ConfigError
+from src.errors import CheckpointError, ConfigError
 from src.geometry.bev_grid import BEVGrid
 from src.models.heads.query_head import QueryPrediction
 from src.models.query_memory import MotionNorm, QueryMemory, QueryMemoryConfig, QueryPropagation
@@ -126,6 +126,14 @@ def test_streams_come_and_go_a_checkpoint_keeps_them_and_an_oracle_tells_velocit
     told = memory.mapped(lambda frame: frame.with_velocities(lambda row, xy, v: v * 0 + row + xy.sum(1, keepdim=True)))
     recalled = propagation.recall(told, bare_frame(0.5, [pose(), pose(3.0)]))
     assert seen(recalled, 0) == [(10, 10, 10, 10)] and seen(recalled, 1) == [(10.5, 10.5, 11, 11)]
+
+
+def test_a_memory_that_other_code_has_written_is_refused_by_name():
+    propagation = make_propagation()
+    state = remember(propagation, None, bare_frame(0.0, [pose()]), (5, 5, 8, 0, 0.0)).state()
+    del state[0]["logits"]
+    with pytest.raises(CheckpointError, match=r"remembers \(QueryFrame\) differs from this code's in logits.*restart"):
+        QueryMemory.from_state(state)
 
 
 def test_untrained_motion_is_a_plain_norm_and_trained_it_tells_ages_apart():
