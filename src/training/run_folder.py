@@ -121,7 +121,7 @@ class RunFolder:
         return next(free for free in names if not free.exists())
 
     def _tidy(self) -> None:
-        for folder in (self.path, self.checkpoints):
+        for folder in (self.path, self.checkpoints, self.pictures):
             for pattern in ("*.tmp", ".probe-*"):
                 for left_over in folder.glob(pattern):
                     left_over.unlink(missing_ok=True)

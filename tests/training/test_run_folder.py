@@ -108,6 +108,7 @@ def test_a_damaged_last_checkpoint_gives_way_to_the_one_before(tmp_path, caplog)
 def test_what_a_killed_process_was_writing_goes_and_so_does_what_only_resuming_needs(tmp_path):
     folder = RunFolder(tmp_path, "run")
     folder.open(Resume.auto)
+    folder.pictures.mkdir()
     for name in ("last.ckpt", "previous.ckpt", "best.ckpt"):
         write_checkpoint(folder, name)
     for name in (
@@ -116,13 +117,15 @@ def test_what_a_killed_process_was_writing_goes_and_so_does_what_only_resuming_n
         ".probe-77",
         "../.submission.json.77.tmp",
         "../metrics.csv.tmp",
+        "../pictures/.curves.png.77.tmp",
     ):
         (folder.checkpoints / name).write_bytes(b"half")
     folder.close()
     again = RunFolder(tmp_path, "run")
     again.open(Resume.auto)
     assert {path.name for path in folder.checkpoints.iterdir()} == {"last.ckpt", "previous.ckpt", "best.ckpt"}
-    assert {path.name for path in folder.path.iterdir()} == {"checkpoints", ".lock"}
+    assert {path.name for path in folder.path.iterdir()} == {"checkpoints", "pictures", ".lock"}
+    assert not list(folder.pictures.iterdir())
     write_json(again.metrics_json, {"mAP": 0.5})
     again.finish({"commit": "abc"})
     assert again.finished and {path.name for path in folder.checkpoints.iterdir()} == {"last.ckpt", "best.ckpt"}
