@@ -29,7 +29,7 @@ from src.reliability.processes import (
     launch,
     process_group,
 )
-from src.report.results import curves_of
+from src.report.run_curves import curves_of
 from src.structures.skipped import SkippedFiles
 from src.training.fit import build_loggers, build_trainer, fit
 from src.training.handoff import WeightSource, find_source, hand_over, open_source, train_source

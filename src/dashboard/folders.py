@@ -17,7 +17,8 @@ import yaml
 from PIL import Image
 
 from src.report.plain_yaml import load_plain_yaml
-from src.report.results import Point, is_finished, read_curves, without_local_paths
+from src.report.results import is_finished, without_local_paths
+from src.report.run_curves import Point, read_curves
 
 TAIL_BYTES = 24_000
 CONFIG_BYTES = 1_000_000

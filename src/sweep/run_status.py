@@ -8,7 +8,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from src.report.results import is_finished, read_curves
+from src.report.results import is_finished
+from src.report.run_curves import read_curves
 
 LARGEST = 1e9
 """Largest size of a score: a number beyond it, or one that is not finite, is damage."""

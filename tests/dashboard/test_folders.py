@@ -5,7 +5,7 @@ import os
 import pytest
 
 from src.dashboard.folders import RunFolders
-from src.report.results import read_curves
+from src.report.run_curves import read_curves
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ import pytest
 from src.errors import DataError
 from src.report import json_format
 from src.report.results import (
-    MAX_POINTS,
     finished_runs,
     publish_latency,
     publish_result,
@@ -21,6 +20,7 @@ from src.report.results import (
     read_results_or_raise,
     result_path,
 )
+from src.report.run_curves import MAX_POINTS
 
 
 def damage(path, change):
