@@ -186,14 +186,16 @@ def draw_claims(path: Path, findings: list[tuple[Claim, list[Finding]]], scale: 
 def write_trade_off(reports: Path, record: SweepRecord, results: dict[str, RunResult]) -> list[Path]:
     """mAP over the milliseconds of a frame, where at least two rows of a sweep that times them were timed.
 
-    Latencies are of the machine that timed most: others do not compare. Results of earlier trainings do not count.
+    Latencies are of the machine that timed most: others do not compare. Neither results of earlier trainings count nor
+    rows that score the weights of another one.
     """
     if not record.sweep.latency:
         return []
     score, cost = (find_metric(name, record.name) for name in ("mAP", "latency.total"))
     rows = {
-        label: [results[run_id] for run_id in runs.values() if is_current(record, run_id, results)]
-        for label, runs in record.rows.items()
+        row.label: [results[key] for key in record.rows[row.label].values() if is_current(record, key, results)]
+        for row in record.sweep.rows
+        if row.weights is None and row.label in record.rows
     }
     places = Counter(place_of(run.latency) for found in rows.values() for run in found if run.latency is not None)
     points, place = [], max(places, key=places.get, default="")

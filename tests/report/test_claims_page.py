@@ -36,12 +36,14 @@ def write_sweep(write_run, make_record, tmp_path, monkeypatch):
     filed = {}
     monkeypatch.setattr(page, "load_sweep", lambda name: filed.get(name) or load_sweep(name))
 
-    def write(name, rows, changes=(), scale="mini", overrides=(), latency=False, states=None):
+    def write(name, rows, changes=(), scale="mini", overrides=(), latency=False, states=None, weights=None):
         record = make_record(
             dict.fromkeys(rows, {}), seeds=max(map(len, rows.values())), name=name, scale=scale, states=states
         )
         record.changes, record.sweep.overrides = list(changes), list(overrides)
         record.sweep.latency = latency
+        for row in record.sweep.rows:
+            row.weights = (weights or {}).get(row.label)
         own = [replace(row, overrides=[f"x={row.label}"], scale_overrides={}) for row in load_sweep(name).rows]
         filed[name] = replace(load_sweep(name), overrides=list(overrides), scale_overrides={}, rows=own)
         for label, values in rows.items():
@@ -165,11 +167,15 @@ def test_rows_of_a_sweep_that_times_them_become_a_picture(report, write_sweep, t
 
 
 def test_the_picture_shows_what_a_table_compares(report, write_sweep, tmp_path, monkeypatch):
-    """Rows that the same machine timed, by results of their last training; fewer seeds are named."""
+    """Rows that the same machine timed, by results of their last training; fewer seeds are named.
+
+    Weights that two rows score are one method.
+    """
     rows = {"one": [0.10, 0.11], "few": [0.20, 0.21], "again": [0.30, 0.31], "elsewhere": [0.40, 0.41]}
+    rows["other rule"] = [0.50, 0.51]
     states = {"b1": {"state": "running"}, "c0": {"state": "waiting"}, "c1": {"state": "waiting"}}
-    write_sweep("layers", rows, latency=True, states=states)
-    for end in "abcd":
+    write_sweep("layers", rows, latency=True, states=states, weights={"other rule": "one"})
+    for end in "abcde":
         timed = {"ms": {"total": 250.0}, "spread_ms": {"total": 20.0}, "fps": 4.0, "memory_gb": 1.0,
                  "processor": "another CPU" if end == "d" else "CPU"}  # fmt: skip
         (tmp_path / f"horizon3d-phase1-mini-{end}0" / "latency.json").write_text(json.dumps(timed))
