@@ -20,7 +20,7 @@ from src.pictures.forest import ForestGroup, ForestRow, draw_forest
 from src.pictures.trade_off import TradeOff, draw_trade_off
 from src.reliability.command import run_command
 from src.report.claims import Claim, Finding, judge, load_claims, verdict_of
-from src.report.claims_page import claims_page
+from src.report.claims_page import claims_page, why_page
 from src.report.metric_names import DETECTION, RANGES, SPEEDS, find_metric
 from src.report.pages import (
     FURTHER,
@@ -145,9 +145,9 @@ def write_page(reports: Path, name: str, scale: str, runs: list[RunResult]) -> P
 
 
 def write_claims(reports: Path, scale: str, records: list[SweepRecord], results: dict[str, RunResult]) -> list[Path]:
-    """The page of the claims and its picture, once any has a result; sweeps that a command line changed are others.
+    """The pages of the claims and their picture, once any has a result; sweeps that a command line changed are others.
 
-    `README.md` at the default scale, `claims_<scale>.md` at another.
+    `README.md` at the default scale, `claims_<scale>.md` at another; `claims_why_<scale>.md` for what lies behind them.
     Raises ConfigError for a file of claims that is wrong.
     """
     by_sweep = {record.name: record for record in records if not record.changes}
@@ -158,7 +158,11 @@ def write_claims(reports: Path, scale: str, records: list[SweepRecord], results:
     path = reports / ("README.md" if is_default else f"claims_{scale}.md")
     picture = f"pictures/claims_{scale}.png"
     draw_claims(reports / picture, findings, scale)
-    write_whole(path, claims_page(findings, by_sweep, scale, picture))
+    why = path.with_name(f"claims_why_{scale}.md")
+    write_whole(path, claims_page(findings, by_sweep, scale, picture, why.name))
+    if text := why_page(findings, scale, path.name):
+        write_whole(why, text)
+        return [path, why]
     return [path]
 
 

@@ -1,4 +1,4 @@
-"""The page of the claims: what was run, and which hold here, each with the command that says so."""
+"""The pages of the claims: what was run, which hold here and why, each with the command that says so."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ RULE = f"""Rows are compared by runs of the same seed: the mean difference, test
 pairs and no other number, each time with an interval of 1 - 0.05/{len(LOOKS)}, so that stopping at the first
 look that decides keeps the error at 5 %. *Shows*: the interval is beyond zero on the claimed side; *does not show*: it
 is beyond zero on the other side, or contains zero and is as narrow as [claims.yaml](../src/report/claims.yaml) asks;
-else *undecided*. A claim shows where all its measures do. What is in italics decides nothing.
-More of it: [docs/scores.md](../docs/scores.md#when-a-claim-holds)."""
+else *undecided*: with fewer than {_MOST} pairs more of them may decide it. A claim shows where all its measures do.
+What is in italics decides nothing. More of it: [docs/scores.md](../docs/scores.md#when-a-claim-holds)."""
 
 
-WHY = f"""Further measures of these rows, and further rows, that tell what lies behind a claim; its number stands
-before each. They were chosen after results were seen and decide nothing: each interval is of 1 - 0.05/{len(LOOKS)}
-by itself."""
+WHY = f"""Further measures of the rows that the claims compare, and further rows, that tell what lies behind a claim;
+its number stands before each. They were chosen after results were seen and decide nothing: each interval is of
+1 - 0.05/{len(LOOKS)} by itself."""
 
 
 def claims_page(
-    findings: list[tuple[Claim, list[Finding]]], records: Mapping[str, SweepRecord], scale: str, picture: str
+    findings: list[tuple[Claim, list[Finding]]], records: Mapping[str, SweepRecord], scale: str, picture: str, why: str
 ) -> str:
-    """The page; `records` are of the claims' sweeps by name, `picture` is the address of the figure, seen from it."""
+    """The page; `records` are of the claims' sweeps by name, `picture` and `why` are addresses seen from it."""
     verdicts = [verdict_of(found) for _, found in findings]
     counts = ", ".join(f"{v} {verdicts.count(v)}" for v in Verdict if v in verdicts)
     parts = [
@@ -43,9 +43,22 @@ def claims_page(
         f"## What was run\n\n{_what_was_run(findings, records, scale)}",
         f"## The claims\n\n{RULE}\n\n{_table(findings, scale)}",
     ]
-    reasons = _reasons(findings, scale)
-    parts += [f"## Why\n\n{WHY}\n\n{reasons}"] if reasons else []
+    told = [
+        f"* **{number}** {escape_markdown(claim.config.because)}"
+        for number, (claim, found) in enumerate(findings, start=1)
+        if claim.config.because and any(one.found and one.measure.comparison.asks for one in found)
+    ]
+    parts += ["\n".join([f"## Why\n\nIn words; [the numbers]({why}).\n", *told])] if told else []
     return "\n\n".join(parts) + "\n"
+
+
+def why_page(findings: list[tuple[Claim, list[Finding]]], scale: str, claims: str) -> str:
+    """What lies behind the claims, whose page is at `claims`; empty where nothing of it has been run."""
+    reasons = _reasons(findings, scale)
+    if not reasons:
+        return ""
+    title = f"# Behind the paper's claims, scale {scale}"
+    return f"{title}\n\n[The claims]({claims}). {WHY}\n\n{reasons}\n"
 
 
 def command_of(sweep: str, findings: Iterable[Finding], scale: str) -> str:

@@ -1,6 +1,7 @@
 """The page of the claims and its picture, through the command's own entry."""
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -87,14 +88,18 @@ def test_runs_are_named_that_began_from_other_weights_than_those_they_are_compar
 def test_what_tells_why_stands_behind_the_claims_as_far_as_it_has_run(report, write_sweep):
     values = [0.12, 0.121, 0.119]
     write_sweep("comparison", {"Horizon3D, neck (ours)": values, "BEVFusion": [0.10] * 3})
-    text = (report()[0] / "README.md").read_text()
+    reports, said = report()
+    text = (reports / "README.md").read_text()
     found = "%: +2.0 [+1.6, +2.4], 3 seeds"
     answer = f"mAP, {found}; mAP 0-25 m, {found}; mAP 50-100 m, {found}"
-    claims, why = text.split("## Why")
+    why = (reports / "claims_why_mini.md").read_text()
+    claims, words = text.split("## Why")
     command = "`python -m src.sweep +sweep=comparison scale=mini seeds=3`"
     row = "| 10 | Is it ahead with a head that sees more than 3 x 3 cells? | Horizon3D, neck (ours) over BEVFusion"
     assert f"{row} | {answer} | {command} |" in why and "neck" not in claims
     assert "Of 10 claims: not run 10." in text and len(why.split("| 10 |")) == 2
+    assert f"written: {reports / 'claims_why_mini.md'}" in said and "](claims_why_mini.md)" in words
+    assert re.findall(r"^\* \*\*(\d+)\*\* BEVFusion", words, re.M) == ["10"] and words.count("* **") == 1
 
 
 @pytest.mark.parametrize("settings", [[], ["optim.rise_fraction=0.4", "model.kggi.num_radar_keypoints=256"]])
