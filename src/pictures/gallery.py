@@ -7,17 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.lines import Line2D
 
 from src.pictures.bev import BevScene, frame_ground, paint_detections, paint_ego, upright
-from src.pictures.cameras import PictureViews, paint_camera, paint_wireframes
+from src.pictures.cameras import PictureViews, clip_edges, paint_camera, paint_wireframes
 from src.pictures.canvas import GAP_PX, HALF_PX, MARGIN_PX, SHEET_PX, Canvas
-from src.pictures.contents import INK, MUTED, PictureBoxes, Window, match_boxes
+from src.pictures.contents import BOX_EDGES, INK, MUTED, PictureBoxes, Window, match_boxes
 from src.pictures.legends import class_keys, radar_keys, reading_keys
 
 HEADER_PX = 84
-TITLE_PX = 46
-"""Height above a cell, for its title and the names of its panels."""
+TITLE_PX = 26
+"""Height above a cell, for its title."""
 FRAME_WINDOW: Window = ((-60.0, 60.0), (-30.0, 130.0))
 AROUND_M = 20.0
 """Ground shown to each side of a box that is looked at."""
@@ -27,6 +30,8 @@ MIN_CROP_PX = 24.0
 NAME_PX, ADVANCE = 13, 0.6
 """Height of a panel's name where it fits, and the mean width of a letter in heights."""
 LINE_PX = 18
+MARK_COLOUR = "#FFD60A"
+"""Of the box that is looked at, below all others."""
 
 
 @dataclass
@@ -68,7 +73,7 @@ def draw_whole_frames(
                 at = left + place * (wide + GAP_PX), top + cameras_px + 4 + line * LINE_PX
                 canvas.text(*at, text, _fitting(text, wide), colour=MUTED if line else INK)
 
-    _draw_cells(path, title, frames, names_px + high, score, paint)
+    _draw_cells(path, title, frames, names_px + high, score, right - left, paint)
 
 
 def draw_boxes(path: Path, title: str, frames: Sequence[GalleryFrame], names: Sequence[str], score: float) -> None:
@@ -76,15 +81,21 @@ def draw_boxes(path: Path, title: str, frames: Sequence[GalleryFrame], names: Se
     side = (_cell_width(frames) - GAP_PX * len(names)) / (len(names) + 1)
 
     def paint(canvas: Canvas, frame: GalleryFrame, left: float, top: float) -> None:
+        top += LINE_PX
         _paint_crop(canvas.axes(left, top, side, side), frame)
         right, up = upright(frame.box.centers[0, :2])
         window = (right - AROUND_M, right + AROUND_M), (up - AROUND_M, up + AROUND_M)
         for place, scene in enumerate(frame.scenes, start=1):
             at = left + place * (side + GAP_PX)
-            paint_detections(_panel(canvas, at, top, side, side, window), scene)
+            axes = _panel(canvas, at, top, side, side, window)
+            footprint = upright(frame.box.corners()[:, :4, :2])
+            mark = PolyCollection(footprint, facecolors="none", edgecolors=MARK_COLOUR, linewidths=8, zorder=3.5)
+            axes.add_collection(mark, autolim=False)
+            paint_detections(axes, scene)
             canvas.text(at, top - 19, names[place - 1], _fitting(names[place - 1], side))
 
-    _draw_cells(path, title, frames, side, score, paint)
+    mark = Line2D([], [], color=MARK_COLOUR, linewidth=6, label="looked at")
+    _draw_cells(path, title, frames, LINE_PX + side, score, 2 * AROUND_M, paint, mark)
 
 
 def _draw_cells(
@@ -93,7 +104,9 @@ def _draw_cells(
     frames: Sequence[GalleryFrame],
     height: float,  # of a cell without its title, px
     score: float,
+    wide_m: float,  # ground that a panel shows from left to right
     paint: Callable[[Canvas, GalleryFrame, float, float], None],
+    *keys: Artist,
 ) -> None:
     """Cells two to a row, below a header with the legends."""
     step = TITLE_PX + height + GAP_PX
@@ -101,9 +114,10 @@ def _draw_cells(
     canvas.text(MARGIN_PX, 8, title, 20, bold=True)
     shown = [frame.scenes[-1] for frame in frames]
     labels = {label for scene in shown for label in (*scene.predictions.labels, *scene.ground_truth.labels)}
-    canvas.legend(MARGIN_PX, 36, [*reading_keys(missed=True, truth_alone=False), *radar_keys()], size_px=12)
+    canvas.legend(MARGIN_PX, 36, [*keys, *reading_keys(missed=True, truth_alone=False), *radar_keys()], size_px=12)
     canvas.legend(MARGIN_PX, 59, class_keys(labels), size_px=12)
-    canvas.text(SHEET_PX - MARGIN_PX, 12, f"score ≥ {score:.2f}; forward is up", 12, colour=MUTED, align="right")
+    note = f"score ≥ {score:.2f}; forward is up; from above {wide_m:g} m wide"
+    canvas.text(SHEET_PX - MARGIN_PX, 12, note, 12, colour=MUTED, align="right")
     for place, frame in enumerate(frames):
         row, column = divmod(place, 2)
         left, top = MARGIN_PX + column * (HALF_PX + GAP_PX), HEADER_PX + row * step
@@ -151,6 +165,9 @@ def _paint_crop(axes: Axes, frame: GalleryFrame) -> None:
     image, matrix, scene = frame.views.images[index], frame.views.pix_from_ego[index], frame.scenes[-1]
     size, half = (image.shape[1], image.shape[0]), max(CROP_SIZES * height, MIN_CROP_PX)
     axes.imshow(image, extent=(0, size[0], size[1], 0), aspect="auto", interpolation="nearest")
+    corners = frame.box.corners() @ matrix[:3, :3].T + matrix[:3, 3]
+    edges, _ = clip_edges(corners[:, BOX_EDGES, :].reshape(-1, 2, 3), *size)
+    axes.add_collection(LineCollection(edges, colors=MARK_COLOUR, linewidths=6, alpha=0.8), autolim=False)
     paint_wireframes(axes, scene.predictions, matrix, size, predicted=True)
     paint_wireframes(axes, scene.ground_truth, matrix, size, predicted=False)
     for text in axes.texts:

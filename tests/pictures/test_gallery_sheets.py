@@ -93,3 +93,20 @@ def test_what_no_camera_shows_says_so(tmp_path: Path) -> None:
         with Image.open(tmp_path / "a.png") as picture:
             corner = np.asarray(picture.convert("RGB"))[gallery.HEADER_PX + gallery.TITLE_PX + 60, 30]
         assert tuple(corner) == pytest.approx((228, 231, 234), abs=4)
+
+
+def test_the_box_that_is_looked_at_is_marked_in_the_image_and_on_the_ground_of_each_run(tmp_path: Path) -> None:
+    """Of two boxes the one at 30 m ahead, in the middle of its panels; the other, 10 m to its left, is not."""
+    box, other = one_box((30, 0, 0), (4, 2, 2)), one_box((30, 10, 0), (4, 2, 2))
+    shown = GalleryFrame("A frame", [BevScene(GRID, PictureBoxes.empty(), other)] * 2, views(50), box)
+    draw_boxes(tmp_path / "a.png", "", [shown], ["one", "two"], 0.25)
+    with Image.open(tmp_path / "a.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    marked = (np.abs(pixels - 255 * np.array(to_rgb(gallery.MARK_COLOUR))) < 40).all(axis=2)
+    marked[: gallery.HEADER_PX] = False
+    side = (SHEET_PX - 20 - 24) / 3  # image and two panels of one wide cell, 12 px apart
+    for place in range(3):
+        left = 10 + place * (side + 12)
+        columns = np.flatnonzero(marked[:, round(left) : round(left + side)].any(axis=0))
+        assert len(columns) and abs(columns.mean() - side / 2) < 6, place
+        assert np.ptp(columns) < side / 2
