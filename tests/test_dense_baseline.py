@@ -12,6 +12,7 @@ from src.streaming import StreamingDetector
 from tests.running import call
 
 pytestmark = pytest.mark.slow
+FEW = "model.head.score_threshold=0.005"  # one step leaves every score near where it began
 
 
 @pytest.fixture(scope="module", params=["dense_bev", "crt_fusion", "hydra", "sparc", "petr", "far3d", "rctrans"])
@@ -27,8 +28,7 @@ def outputs(tmp_path_factory, family):
 @pytest.fixture(scope="module")
 def trained(outputs, family):
     """A run of phase 2, which trains its phase 1 first."""
-    few = "model.head.score_threshold=0.005"  # one step leaves every score near where it began
-    call("train", "phase=phase2", f"model={family}", "scale=debug", few, f"paths.outputs={outputs}")
+    call("train", "phase=phase2", f"model={family}", "scale=debug", FEW, f"paths.outputs={outputs}")
     (folder,) = outputs.glob(f"{family}-phase2-debug-*")
     return folder
 
@@ -77,3 +77,30 @@ def test_frames_are_streamed_as_the_validation_does(trained, outputs):
     assert seen == [0.0, 1.0, 2.0]  # the debug memory holds two frames
     detector.reset()
     assert detector.memory is None
+
+
+def test_radargnn_which_has_no_memory_by_the_same_commands(tmp_path):
+    outputs, scores = tmp_path / "outputs", tmp_path / "scores"
+    call(
+        "train",
+        "phase=phase1",
+        "model=radargnn",
+        "scale=debug",
+        "model.head.score_threshold=0.005",
+        f"paths.outputs={outputs}",
+    )
+    (folder,) = outputs.glob("radargnn-phase1-debug-*")
+    path = folder / "checkpoints" / "last.ckpt"
+    call("evaluate", f"checkpoint={path}", f"out={scores}", f"paths.outputs={outputs}")
+    assert (scores / "metrics.json").read_text() == (folder / "metrics.json").read_text()
+    meta = json.loads((folder / "submission.json").read_text())["meta"]
+    assert meta["use_radar"] and not meta["use_camera"]
+    detector = StreamingDetector.load(path)
+    (world,) = (outputs / "worlds").iterdir()
+    frames = build_datamodule(restore_config(read_checkpoint(path)["horizon3d"]["config"], []), world).stream()
+    for _, frame in zip(range(2), frames, strict=False):
+        boxes = detector.step(frame)
+        with torch.inference_mode():
+            output, _ = detector.model(frame)
+            (wanted,) = detector.model.decode(output)
+        assert len(boxes) == len(wanted) and torch.allclose(boxes.centers, wanted.centers, atol=1e-4)
