@@ -132,17 +132,19 @@ def _of_claims(found: list[Finding]) -> list[Finding]:
 
 
 def _reasons(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
-    """The comparisons that ask why, with what has been found; empty where nothing has."""
+    """The comparisons that ask why, of claims for which one has been answered; empty where none is."""
     lines = []
     for number, (claim, found) in enumerate(findings, start=1):
+        asking = [one for one in found if one.measure.comparison.asks is not None]
+        if not any(one.found for one in asking):
+            continue
         for comparison in (one for one in claim.config.comparisons if one.asks is not None):
-            answers = [one for one in found if one.measure.comparison is comparison and one.found is not None]
-            if answers:
-                command = as_code([command_of(comparison.sweep, answers, scale)])
-                told = "; ".join(map(_answer, answers))
-                lines.append(
-                    [str(number), escape_markdown(comparison.asks), escape_markdown(comparison.text), told, command]
-                )
+            answers = [one for one in asking if one.measure.comparison is comparison and one.found is not None]
+            told = "; ".join(map(_answer, answers)) or str(Verdict.NOT_RUN)
+            command = as_code([command_of(comparison.sweep, answers, scale)])
+            lines.append(
+                [str(number), escape_markdown(comparison.asks), escape_markdown(comparison.text), told, command]
+            )
     return markdown_table(REASON_HEADS, lines) if lines else ""
 
 
