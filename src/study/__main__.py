@@ -1,8 +1,8 @@
 """`python -m src.study`: the sweeps that the paper's claims name, each comparison with as many seeds as it needs.
 
-At the first of `LOOKS` every row of every sweep is trained, sweep by sweep in the order of the claims; at each later
-one the rows of the comparisons that are still open, unless pairs of the look before are missing. How they are decided:
-docs/scores.md.
+At the first of `LOOKS` every row of every sweep is trained, sweep by sweep in the order of the claims, those that no
+claim names last; at each later one the rows of the comparisons that are still open, unless pairs of the look before are
+missing. How they are decided: docs/scores.md.
 """
 
 from __future__ import annotations
@@ -31,6 +31,18 @@ from src.training.identity import key_of
 logger = logging.getLogger(__name__)
 
 SET_BY_THE_RULE = ("sweep", "seed", "seeds", "trials", "latency")
+BESIDE = (
+    "standing",
+    "single_frame",
+    "query_models",
+    "camera_keypoints",
+    "radar_velocity",
+    "frame_factors",
+    "memory_factors",
+    "sparser",
+    "scaling",
+)
+"""Sweeps of detectors' accuracy that no claim names. `learning_rates` and `tune` choose what the others run with."""
 
 
 def main(overrides: list[str]) -> None:
@@ -161,7 +173,7 @@ class Study:
 def read_study(overrides: list[str]) -> Study:
     """The study of a command line. Raises ConfigError for claims, sweeps and options that are wrong."""
     claims = load_claims(load_sweep)
-    names = dict.fromkeys(measure.comparison.sweep for claim in claims for measure in claim.measures)
+    names = dict.fromkeys([*(measure.comparison.sweep for claim in claims for measure in claim.measures), *BESIDE])
     composed = {name: compose_sweep([f"+sweep={name}", *overrides]) for name in names}
     commands = {name: command for name, (command, _) in composed.items()}
     command, common = next(iter(composed.values()))

@@ -97,7 +97,9 @@ def test_what_tells_why_stands_behind_the_claims_as_far_as_it_has_run(report, wr
     command = "`python -m src.sweep +sweep=comparison scale=mini seeds=3`"
     row = "| 10 | Is it ahead with a head that sees more than 3 x 3 cells? | Horizon3D, neck (ours) over BEVFusion"
     assert f"{row} | {answer} | {command} |" in why and "neck" not in claims
-    assert "Of 10 claims: not run 10." in text and "| 10 | On which classes? | Horizon3D over BEVFusion | not run |" in why
+    assert (
+        "Of 10 claims: not run 10." in text and "| 10 | On which classes? | Horizon3D over BEVFusion | not run |" in why
+    )
     assert why.count("\n| 10 |") == 2 and why.count("\n| ") == 3
     assert f"written: {reports / 'claims_why_mini.md'}" in said and "](claims_why_mini.md)" in words
     assert re.findall(r"^\* \*\*(\d+)\*\* BEVFusion", words, re.M) == ["10"] and words.count("* **") == 1

@@ -56,6 +56,7 @@ def places(tmp_path, monkeypatch):
     (tmp_path / "claims.yaml").write_text(json.dumps(CLAIMS))
     monkeypatch.setattr(sweep_files, "SWEEPS", folder)
     monkeypatch.setattr(study, "load_claims", lambda load: load_claims(load, tmp_path / "claims.yaml"))
+    monkeypatch.setattr(study, "BESIDE", ())
     monkeypatch.setattr(run_plan, "Identifier", FakeIdentifier)
     return ["scale=debug", f"paths.outputs={tmp_path / 'outputs'}", f"paths.reports={tmp_path / 'reports'}"]
 
@@ -101,6 +102,23 @@ def test_seeds_are_added_to_what_is_open_and_to_nothing_else(places, trained, ca
     calls.clear()
     study.main(places)  # nothing is open: the first look is shown again
     assert calls == [("margin", {}), ("layers", {})]
+
+
+def test_sweeps_that_no_claim_names_stand_last_and_at_the_first_look(places, trained, monkeypatch, tmp_path):
+    calls, _ = trained
+    rows = [{"label": label, "overrides": [f"model.width={label}"]} for label in ("narrow", "wide")]
+    (tmp_path / "sweeps" / "width.yaml").write_text(json.dumps({"title": "t", "question": "q?", "rows": rows}))
+    monkeypatch.setattr(study, "BESIDE", ("width",))
+    study.main(places)
+    assert [name for name, _ in calls] == ["margin", "layers", "width", "layers"]
+    assert calls[2][1] == {"narrow": [0, 1, 2], "wide": [0, 1, 2]}
+
+
+def test_every_sweep_of_accuracy_is_of_a_claim_or_beside_them():
+    named = {measure.comparison.sweep for claim in load_claims(sweep_files.load_sweep) for measure in claim.measures}
+    files = {path.stem for path in sweep_files.SWEEPS.glob("*.yaml") if not path.stem.startswith("lrs_")}
+    assert not named & set(study.BESIDE)
+    assert files - named - set(study.BESIDE) == {"learning_rates", "tune"}
 
 
 def test_rows_outside_the_open_comparisons_stay_at_the_first_look(places, trained, monkeypatch):
