@@ -37,7 +37,7 @@ class ForestRow:
     low: float | None = None
     high: float | None = None
     expected: float | None = None
-    decides: bool = True  # else it is drawn fainter
+    decides: bool = True  # else it is drawn hollow and grey
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def reach(groups: Sequence[ForestGroup]) -> tuple[float, float]:
 
 def paint_row(axes: Axes, place: float, row: ForestRow) -> None:
     """Mean, interval (an arrow where it leaves the axis) and the expected effect at a height."""
-    colour, faint = COLOURS[row.verdict], 1.0 if row.decides else 0.55
+    colour, faint = (COLOURS[row.verdict], 1.0) if row.decides else (MUTED, 0.7)
     left, right = axes.get_xlim()
     if row.low is not None:
         axes.hlines(place, max(row.low, left), min(row.high, right), color=colour, linewidth=2.2, alpha=faint)
