@@ -1,6 +1,7 @@
 """Other detectors without LiDAR by the commands people type, at debug scale: phases, evaluation, streaming."""
 
 import json
+from itertools import islice
 
 import pytest
 import torch
@@ -86,7 +87,7 @@ def test_radargnn_which_has_no_memory_by_the_same_commands(tmp_path):
         "phase=phase1",
         "model=radargnn",
         "scale=debug",
-        "model.head.score_threshold=0.005",
+        FEW,
         f"paths.outputs={outputs}",
     )
     (folder,) = outputs.glob("radargnn-phase1-debug-*")
@@ -98,7 +99,9 @@ def test_radargnn_which_has_no_memory_by_the_same_commands(tmp_path):
     detector = StreamingDetector.load(path)
     (world,) = (outputs / "worlds").iterdir()
     frames = build_datamodule(restore_config(read_checkpoint(path)["horizon3d"]["config"], []), world).stream()
-    for _, frame in zip(range(2), frames, strict=False):
+    first = list(islice(frames, 2))
+    assert len(first) == 2
+    for frame in first:
         boxes = detector.step(frame)
         with torch.inference_mode():
             output, _ = detector.model(frame)

@@ -159,11 +159,14 @@ def write_claims(reports: Path, scale: str, records: list[SweepRecord], results:
     picture = f"pictures/claims_{scale}.png"
     draw_claims(reports / picture, findings, scale)
     why = path.with_name(f"claims_why_{scale}.md")
-    write_whole(path, claims_page(findings, by_sweep, scale, picture, why.name))
-    if text := why_page(findings, scale, path.name):
-        write_whole(why, text)
-        return [path, why]
-    return [path]
+    reasons = why_page(findings, scale, path.name)
+    if reasons:
+        write_whole(why, reasons)
+    else:
+        why.unlink(missing_ok=True)
+    address = why.name if reasons else None
+    write_whole(path, claims_page(findings, by_sweep, scale, picture, address, in_words=is_default))
+    return [path, why] if reasons else [path]
 
 
 def draw_claims(path: Path, findings: list[tuple[Claim, list[Finding]]], scale: str) -> None:
@@ -191,13 +194,13 @@ def write_trade_off(reports: Path, record: SweepRecord, results: dict[str, RunRe
     """mAP over the milliseconds of a frame, where at least two rows of a sweep that times them were timed.
 
     Latencies are of the machine that timed most: others do not compare. Neither results of earlier trainings count nor
-    rows that score the weights of another one.
+    rows that score the weights of another row.
     """
     if not record.sweep.latency:
         return []
     score, cost = (find_metric(name, record.name) for name in ("mAP", "latency.total"))
     rows = {
-        row.label: [results[key] for key in record.rows[row.label].values() if is_current(record, key, results)]
+        row.label: [results[run] for run in record.rows[row.label].values() if is_current(record, run, results)]
         for row in record.sweep.rows
         if row.weights is None and row.label in record.rows
     }

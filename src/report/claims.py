@@ -55,7 +55,7 @@ class ClaimConfig:
     name: str
     sentence: str
     source: str  # of the paper
-    because: str = ""  # what its questions have answered so far, in words
+    because: str = ""  # what its questions have answered at the default scale, in words
     comparisons: Many[ComparisonConfig]
 
 

@@ -30,9 +30,18 @@ its number stands before each. They were chosen after results were seen and deci
 
 
 def claims_page(
-    findings: list[tuple[Claim, list[Finding]]], records: Mapping[str, SweepRecord], scale: str, picture: str, why: str
+    findings: list[tuple[Claim, list[Finding]]],
+    records: Mapping[str, SweepRecord],
+    scale: str,
+    picture: str,
+    why: str | None,
+    in_words: bool,
 ) -> str:
-    """The page; `records` are of the claims' sweeps by name, `picture` and `why` are addresses seen from it."""
+    """The page; `records` are of the claims' sweeps by name.
+
+    `picture` and `why`, the page of what lies behind the claims if there is one, are addresses seen from it; `in_words`
+    where the file of claims says what has been found at this scale.
+    """
     verdicts = [verdict_of(found) for _, found in findings]
     counts = ", ".join(f"{v} {verdicts.count(v)}" for v in Verdict if v in verdicts)
     parts = [
@@ -43,13 +52,20 @@ def claims_page(
         f"## What was run\n\n{_what_was_run(findings, records, scale)}",
         f"## The claims\n\n{RULE}\n\n{_table(findings, scale)}",
     ]
-    told = [
+    words = [
         f"* **{number}** {escape_markdown(claim.config.because)}"
         for number, (claim, found) in enumerate(findings, start=1)
-        if claim.config.because and any(one.found and one.measure.comparison.asks for one in found)
+        if in_words and claim.config.because and is_answered(found)
     ]
-    parts += ["\n".join([f"## Why\n\nIn words; [the numbers]({why}).\n", *told])] if told else []
+    if why is not None:
+        parts += [f"## Why\n\nWhat lies behind the claims: [the numbers]({why})."]
+        parts += ["\n".join(words)] if words else []
     return "\n\n".join(parts) + "\n"
+
+
+def is_answered(found: Iterable[Finding]) -> bool:
+    """Whether anything is known of what asks why a claim holds or does not."""
+    return any(one.measure.comparison.asks is not None and one.found is not None for one in found)
 
 
 def why_page(findings: list[tuple[Claim, list[Finding]]], scale: str, claims: str) -> str:
@@ -135,11 +151,10 @@ def _reasons(findings: list[tuple[Claim, list[Finding]]], scale: str) -> str:
     """The comparisons that ask why, of claims for which one has been answered; empty where none is."""
     lines = []
     for number, (claim, found) in enumerate(findings, start=1):
-        asking = [one for one in found if one.measure.comparison.asks is not None]
-        if not any(one.found for one in asking):
+        if not is_answered(found):
             continue
         for comparison in (one for one in claim.config.comparisons if one.asks is not None):
-            answers = [one for one in asking if one.measure.comparison is comparison and one.found is not None]
+            answers = [one for one in found if one.measure.comparison is comparison and one.found is not None]
             told = "; ".join(map(_answer, answers)) or str(Verdict.NOT_RUN)
             command = as_code([command_of(comparison.sweep, answers, scale)])
             lines.append(

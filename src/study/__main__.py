@@ -1,4 +1,4 @@
-"""`python -m src.study`: the sweeps that the paper's claims name, each comparison with as many seeds as it needs.
+"""`python -m src.study`: the sweeps of the paper's claims, each comparison with as many seeds as it needs, and others.
 
 At the first of `LOOKS` every row of every sweep is trained, sweep by sweep in the order of the claims, those that no
 claim names last; at each later one the rows of the comparisons that are still open, unless pairs of the look before are
@@ -78,10 +78,10 @@ def main(overrides: list[str]) -> None:
 
 @dataclass
 class Study:
-    """The claims, and the sweeps that they name as the command line makes them."""
+    """The claims, and the sweeps that they name and those beside them as the command line makes them."""
 
     claims: list[Claim]
-    commands: dict[str, SweepCommand]  # by the sweep's name, in the order of the claims
+    commands: dict[str, SweepCommand]  # by the sweep's name, in the order of the claims, then `BESIDE`
     call: SweepCall
     scale: str
 

@@ -102,7 +102,7 @@ def test_what_tells_why_stands_behind_the_claims_as_far_as_it_has_run(report, wr
     )
     assert why.count("\n| 10 |") == 2 and why.count("\n| ") == 3
     assert f"written: {reports / 'claims_why_mini.md'}" in said and "](claims_why_mini.md)" in words
-    assert re.findall(r"^\* \*\*(\d+)\*\* BEVFusion", words, re.M) == ["10"] and words.count("* **") == 1
+    assert re.findall(r"^\* \*\*(\d+)\*\* Ours is ahead", words, re.M) == ["10"] and words.count("* **") == 1
 
 
 @pytest.mark.parametrize("settings", [[], ["optim.rise_fraction=0.4", "model.kggi.num_radar_keypoints=256"]])
@@ -157,7 +157,9 @@ def test_another_scale_has_a_page_of_its_own(report, write_sweep):
     default = (report()[0] / "README.md").read_text()
     reports, _ = report("debug")
     assert (reports / "README.md").read_text() == default
-    assert "# The paper's claims, scale debug" in (reports / "claims_debug.md").read_text()
+    debug = (reports / "claims_debug.md").read_text()
+    assert "# The paper's claims, scale debug" in debug and "](claims_why_debug.md)" in debug
+    assert "\n* **4** " in default and "\n* **4** " not in debug, "the words are of the default scale"
 
 
 @pytest.mark.parametrize("latency", [True, False])
