@@ -98,6 +98,11 @@ def clip_polygon(
     return polygon[:, :2] / polygon[:, 2:]
 
 
+def project_corners(boxes: PictureBoxes, pix_from_ego: Array) -> Array:  # [K, 8, 3]
+    """Corners of K boxes as homogeneous pixels (u*d, v*d, d); `pix_from_ego` [4, 4]."""
+    return boxes.corners() @ pix_from_ego[:3, :3].T + pix_from_ego[:3, 3]
+
+
 def paint_wireframes(
     axes: Axes,
     boxes: PictureBoxes,
@@ -106,7 +111,7 @@ def paint_wireframes(
     predicted: bool,
 ) -> None:
     """Add the visible edges: predictions solid in class colours with a tinted front face, truth dashed on a halo."""
-    corners = boxes.corners() @ pix_from_ego[:3, :3].T + pix_from_ego[:3, 3]  # [K, 8, 3] (u*d, v*d, d)
+    corners = project_corners(boxes, pix_from_ego)
     edges = corners[:, BOX_EDGES, :]  # [K, 12, 2, 3]
     pieces, rows = clip_edges(edges.reshape(-1, 2, 3), *size)
     depth = np.maximum(corners[:, :, 2].mean(axis=1), NEAR_M)

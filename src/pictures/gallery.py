@@ -13,7 +13,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.lines import Line2D
 
 from src.pictures.bev import BevScene, frame_ground, paint_detections, paint_ego, upright
-from src.pictures.cameras import PictureViews, clip_edges, paint_camera, paint_wireframes
+from src.pictures.cameras import PictureViews, clip_edges, paint_camera, paint_wireframes, project_corners
 from src.pictures.canvas import GAP_PX, HALF_PX, MARGIN_PX, SHEET_PX, Canvas
 from src.pictures.contents import BOX_EDGES, INK, MUTED, PictureBoxes, Window, match_boxes
 from src.pictures.legends import class_keys, radar_keys, reading_keys
@@ -116,7 +116,7 @@ def _draw_cells(
     labels = {label for scene in shown for label in (*scene.predictions.labels, *scene.ground_truth.labels)}
     canvas.legend(MARGIN_PX, 36, [*keys, *reading_keys(missed=True, truth_alone=False), *radar_keys()], size_px=12)
     canvas.legend(MARGIN_PX, 59, class_keys(labels), size_px=12)
-    note = f"score ≥ {score:.2f}; forward is up; from above {wide_m:g} m wide"
+    note = f"score ≥ {score:.2f}; forward is up; BEV {wide_m:g} m wide"
     canvas.text(SHEET_PX - MARGIN_PX, 12, note, 12, colour=MUTED, align="right")
     for place, frame in enumerate(frames):
         row, column = divmod(place, 2)
@@ -151,7 +151,7 @@ def _paint_crop(axes: Axes, frame: GalleryFrame) -> None:
     best = (0.0, 0.0, 0.0, -1)  # height, u, v (px), camera
     for index, image in enumerate(frame.views.images if frame.views is not None else ()):
         matrix = frame.views.pix_from_ego[index]
-        corners = frame.box.corners()[0] @ matrix[:3, :3].T + matrix[:3, 3]
+        (corners,) = project_corners(frame.box, matrix)
         if image is None or (corners[:, 2] <= 0).any():
             continue
         pixels = corners[:, :2] / corners[:, 2:]
@@ -165,8 +165,7 @@ def _paint_crop(axes: Axes, frame: GalleryFrame) -> None:
     image, matrix, scene = frame.views.images[index], frame.views.pix_from_ego[index], frame.scenes[-1]
     size, half = (image.shape[1], image.shape[0]), max(CROP_SIZES * height, MIN_CROP_PX)
     axes.imshow(image, extent=(0, size[0], size[1], 0), aspect="auto", interpolation="nearest")
-    corners = frame.box.corners() @ matrix[:3, :3].T + matrix[:3, 3]
-    edges, _ = clip_edges(corners[:, BOX_EDGES, :].reshape(-1, 2, 3), *size)
+    edges, _ = clip_edges(project_corners(frame.box, matrix)[:, BOX_EDGES, :].reshape(-1, 2, 3), *size)
     axes.add_collection(LineCollection(edges, colors=MARK_COLOUR, linewidths=6, alpha=0.8), autolim=False)
     paint_wireframes(axes, scene.predictions, matrix, size, predicted=True)
     paint_wireframes(axes, scene.ground_truth, matrix, size, predicted=False)
