@@ -80,7 +80,8 @@ def main(overrides: list[str]) -> None:
     config, _ = compose_config([override for override in overrides if key_of(override) != "runs"])
     refuse_options_of_others(config, "gallery")
     reports = Path(config.paths.reports)
-    folders = [finished_run(Path(config.paths.outputs), run) for run in runs]  # before a world is written for them
+    outputs = Path(config.paths.outputs)
+    folders = [finished_run(outputs, run, config.scale) for run in runs]  # before a world is written for them
     make_writable(reports, "paths.reports")
     datamodule = build_datamodule(config, data_root(config, write=False))
     gallery = Gallery(config, datamodule, {folder.run_id: read_boxes(folder, datamodule) for folder in folders})
@@ -88,8 +89,8 @@ def main(overrides: list[str]) -> None:
     print(f"written: {gallery.write(reports, shlex.join(['python', '-m', 'src.gallery', *said]))}")
 
 
-def finished_run(outputs: Path, run_id: str) -> RunFolder:
-    """The folder of a run with boxes. Raises ConfigError when there is none."""
+def finished_run(outputs: Path, run_id: str, scale: str) -> RunFolder:
+    """The folder of a run with boxes. Raises ConfigError when there is none, or it is of another scale."""
     folder = RunFolder(outputs, run_id)
     if not folder.finished:
         raise ConfigError(f"runs={run_id}: {folder.path} holds no finished run; train it first")
@@ -98,6 +99,9 @@ def finished_run(outputs: Path, run_id: str) -> RunFolder:
             f"runs={run_id}: {folder.path} has no submission.json: the run learns no boxes, or none reached the score "
             "threshold; leave it out"
         )
+    its_scale = folder.read_result()[0].get("scale")
+    if its_scale != scale:
+        raise ConfigError(f"runs={run_id}: it is of scale={its_scale}, this command of scale={scale}; give its scale")
     return folder
 
 
@@ -140,6 +144,7 @@ class Gallery:
         truth, predictions = self.evaluation_set.ground_truth, parts.ranking.predictions
         returns = self._count_returns()
         misses, false = worst_misses(parts, returns, COUNT), worst_false_positives(parts, COUNT)
+        false = false[predictions.scores[false] >= SHOWN_SCORE]  # the others are not drawn
         film = self._scene(next(iter(frames)))
         wanted = {*frames, *film, *truth.samples[misses].tolist(), *predictions.samples[false].tolist()}
         batches = self._read(wanted)

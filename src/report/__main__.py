@@ -74,7 +74,10 @@ def main(overrides: list[str]) -> None:
         with noted_in(faults):
             claims += write_claims(reports, config.scale, records, results)
     if not pages and not records:
-        what = f"{outputs}: no finished run of {config.phase.name} at scale={config.scale}"
+        what = (
+            f"{outputs}: no finished run of {config.phase.name} at scale={config.scale}, nor a result of that scale in "
+            f"{reports}; give the scale and the phase of what was trained, or train it with python -m src.train"
+        )
         raise DataError("\n".join([what, *faults]))
     from src.dashboard.single_file import export_dashboard  # its templates are not needed before
 

@@ -147,9 +147,13 @@ def open_source(source: WeightSource) -> OpenCheckpoint:
     try:
         return open_checkpoint(source.checkpoint)
     except CheckpointError as error:
-        if source.overrides is None:
+        if source.folder is None:
             raise
-        raise CheckpointError(f"{error}; or make it anew with\n    {source.command} resume=restart") from error
+        overrides = source.overrides
+        if overrides is None:  # a run given by its id says what made it
+            overrides = source.folder.read_result()[0]["overrides"]
+        remedy = f"{train_command(overrides)} resume=restart"
+        raise CheckpointError(f"{error}; or make it anew with\n    {remedy}") from error
 
 
 def hand_over(model: Detector, weights: OpenCheckpoint, tree: dict[str, Any]) -> None:

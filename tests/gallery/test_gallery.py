@@ -92,6 +92,9 @@ def test_what_it_refuses(trained, tmp_path):
     record = json.loads((other / "run.json").read_text())
     (other / "run.json").write_text(json.dumps(record | {"data": record["data"] | {"root": "0123"}}))
     assert "runs=other: it was scored on" in refused(outputs, "runs=other", expect=4)
+    (other / "run.json").write_text(json.dumps(record | {"scale": "mini"}))
+    said = refused(outputs, "runs=other", expect=3)
+    assert "runs=other: it is of scale=mini, this command of scale=debug" in said
     (other / "run.json").write_text(json.dumps(record))
     (other / "submission.json").unlink()  # as a run without any box leaves none
     said = refused(outputs, "runs=other", f"paths.reports={tmp_path}", expect=3)

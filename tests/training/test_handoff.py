@@ -289,11 +289,17 @@ def test_several_processes_train_it_only_where_the_run_begins(tmp_path):
     assert not train.begins(folder, Resume.auto) and train.begins(folder, Resume.restart)
 
 
-def test_a_damaged_source_is_found_before_the_own_run_is_touched(tmp_path):
+@pytest.mark.parametrize("by_id", [False, True])
+def test_a_damaged_source_is_found_before_the_own_run_is_touched(tmp_path, by_id):
     overrides = ["phase=phase2", "scale=debug", f"paths.outputs={tmp_path}", "resume=restart"]
     config, tree = compose_config(overrides)
     source = find_source(config, overrides, compose_config, PHASES)
     finished(source)
+    if by_id:  # as a sweep's rows with the weights of another
+        source.folder.record.write_text(json.dumps({"overrides": source.overrides}))
+        overrides += [f"phase.init_from={source.identity}"]
+        config, tree = compose_config(overrides)
+        source = find_source(config, overrides, compose_config, PHASES)
     folder = RunFolder(tmp_path, run_identity(tree, source.identity))
     folder.path.mkdir()
     with pytest.raises(CheckpointError, match="(?s)last.ckpt is truncated.*make it anew.*phase=phase1.*resume=restart"):
