@@ -133,18 +133,27 @@ def hidden(
     evaluation_set: EvaluationSet,
 ) -> Array:  # [k] bool
     """Objects with fewer than SEEN_POINTS returns now, but as many or more at an earlier key frame within SEEN_S."""
-    samples = evaluation_set.ground_truth.samples
-    times_s = evaluation_set.times_s[samples]
-    order = np.lexsort((times_s, evaluation_set.instances))
+    times_s = evaluation_set.times_s[evaluation_set.ground_truth.samples]
+    seen = seen_before(points >= SEEN_POINTS, evaluation_set.instances, times_s)
+    return seen & (points < SEEN_POINTS) & (points != UNKNOWN_POINTS)
+
+
+def seen_before(
+    hit: Array,  # [k] bool
+    instances: Array,  # [k] int64
+    times_s: Array,  # [k]
+) -> Array:  # [k] bool
+    """Which rows come within SEEN_S after another of the same instance that is hit; rows in any order."""
+    order = np.lexsort((times_s, instances))
     rank = np.arange(len(order))
-    starts = np.diff(evaluation_set.instances[order], prepend=-1) != 0
+    starts = np.diff(instances[order], prepend=-1) != 0
     first = np.maximum.accumulate(np.where(starts, rank, 0))  # of the same object
-    last_seen = np.maximum.accumulate(np.where(points[order] >= SEEN_POINTS, rank, -1))
-    before = np.concatenate([[-1], last_seen[:-1]]) if len(order) else last_seen
+    last_hit = np.maximum.accumulate(np.where(hit[order], rank, -1))
+    before = np.concatenate([[-1], last_hit[:-1]]) if len(order) else last_hit
     known = before >= first
     recent = times_s[order] - times_s[order][np.where(known, before, 0)] <= SEEN_S
     result = np.zeros(len(order), bool)
-    result[order] = known & recent & (points[order] < SEEN_POINTS) & (points[order] != UNKNOWN_POINTS)
+    result[order] = known & recent
     return result
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from src.assembly import data_root
 from src.config import Config, compose_config, refuse_options_of_others
 from src.data.cache import load_index
@@ -66,6 +68,7 @@ def draw_previews(config: Config, root: Path, folder: Path) -> None:
     reader = FrameReader(index, replace(settings, num_sweeps=PREVIEW_SWEEPS, test_resize_offset=0.0))
     for number, (name, tags) in enumerate(zip(index.scene_names, index.scene_descriptions, strict=True)):
         samples = index.samples_of({name})
+        samples = samples[np.argsort(index.frame_times_us[samples])]
         frame = reader.read(int(samples[round(0.5 * (len(samples) - 1))]), None)
         title = f"{name[:14]}…  " + "  ".join(tag.split(".")[1] for tag in tags.split(";"))
         path = folder / f"scene_{number:03d}.png"

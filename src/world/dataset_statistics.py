@@ -24,7 +24,7 @@ GROWTH_M = 0.5
 
 @dataclass(kw_only=True)
 class DatasetCounts:
-    """One row per labelled box (B), per key frame (F), per ego pose of a key frame and per point (P) of key sweeps."""
+    """One row per labelled box (B), per key frame (F) in the order of scenes and time, and per point (P) of key sweeps."""
 
     classes: Array  # [B] name of the detection class, "" for ignored categories
     frames: Array  # [B] row of the key frame
@@ -39,7 +39,7 @@ class DatasetCounts:
     lidar: Array  # [B] as stored
     scenes: Array  # [F]
     descriptions: Array  # [F] scene tags
-    times_s: Array  # [F]
+    times_s: Array  # [F] since the first key frame of the scene
     points: Array  # [F] radar points of the key sweeps
     ego_speed_mps: Array  # [F] from one key frame to the next, NaN at a scene's end
     ego_yaw_rad: Array  # [F]
@@ -52,15 +52,19 @@ class DatasetCounts:
 
 def count_dataset(index: DatasetIndex, num_sweeps: int) -> DatasetCounts:
     """Measure every key frame of a release. Raises DataError for tables or radar files that cannot be read."""
+    chronological = np.lexsort((index.frame_times_us, index.sample_scenes))  # tables may be in any order
+    scenes, times_us = index.sample_scenes[chronological], index.frame_times_us[chronological]
     boxes = _box_columns(index)
+    boxes["frames"] = np.argsort(chronological)[boxes["frames"]]
     frames: dict[str, list[Array]] = {"radar": [], "radar_grown": [], "accumulated": [], "order": []}
     points: list[Array] = []
-    origins = index.pose_translations[index.frame_poses]
-    yaws = yaw_of(quaternion_to_matrix(index.pose_rotations[index.frame_poses]))
+    poses = index.frame_poses[chronological]
+    origins = index.pose_translations[poses]
+    yaws = yaw_of(quaternion_to_matrix(index.pose_rotations[poses]))
     by_frame = np.argsort(boxes["frames"], kind="stable")
     starts = np.searchsorted(boxes["frames"][by_frame], np.arange(len(index) + 1))
-    for frame in range(len(index)):
-        rows = by_frame[starts[frame] : starts[frame + 1]]
+    for place, frame in enumerate(chronological):
+        rows = by_frame[starts[place] : starts[place + 1]]
         here = {name: column[rows] for name, column in boxes.items()}
         counts, seen = _count_frame(index, frame, here, num_sweeps)
         points.append(seen)
@@ -70,9 +74,9 @@ def count_dataset(index: DatasetIndex, num_sweeps: int) -> DatasetCounts:
     order = np.argsort(np.concatenate(frames.pop("order")))
     counted = {name: np.concatenate(columns)[order] for name, columns in frames.items()}
     offset = boxes["centres"][:, :2] - origins[boxes["frames"], :2]
-    times = 1e-6 * (index.frame_times_us - index.frame_times_us[0])
+    times = 1e-6 * (times_us - times_us[np.searchsorted(scenes, scenes)])
     step = np.linalg.norm(np.diff(origins, axis=0)[:, :2], axis=1) / np.maximum(np.diff(times), 1e-3)
-    speed = np.append(np.where(np.diff(index.sample_scenes) == 0, step, np.nan), np.nan)
+    speed = np.append(np.where(np.diff(scenes) == 0, step, np.nan), np.nan)
     heading = yaws[boxes["frames"]]
     every = np.concatenate(points)
     return DatasetCounts(
@@ -80,8 +84,8 @@ def count_dataset(index: DatasetIndex, num_sweeps: int) -> DatasetCounts:
         **counted,
         distance_m=np.hypot(*offset.T),
         ahead=np.cos(heading) * offset[:, 0] + np.sin(heading) * offset[:, 1] > 0,
-        scenes=index.sample_scenes,
-        descriptions=index.scene_descriptions[index.sample_scenes],
+        scenes=scenes,
+        descriptions=index.scene_descriptions[scenes],
         times_s=times,
         points=np.array([len(seen) for seen in points]),
         ego_speed_mps=speed,

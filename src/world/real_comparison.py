@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from src.metrics.diagnostics import SEEN_POINTS, SEEN_S, seen_before
 from src.structures.taxonomy import CLASS_RANGE_M, RADARS
 from src.world.dataset_statistics import DatasetCounts
 
@@ -21,9 +22,6 @@ FEWEST_BOXES = 50
 """A real figure that rests on fewer boxes says little."""
 HEAVY = ("truck", "bus", "trailer")
 FAST_MPS = 10.0
-SEEN_POINTS = 3
-SEEN_S = 4.0
-"""How long the paper's memory reaches back."""
 
 
 @dataclass(kw_only=True)
@@ -280,8 +278,8 @@ class _Tables:
 
     def ego(self, groups: list[str], columns: list[str]) -> Rows:
         speed = 3.6 * self.counts.ego_speed_mps[np.isfinite(self.counts.ego_speed_mps)]
-        steps = np.searchsorted(self.counts.times_s, self.counts.times_s + 2.99)
-        steps = np.minimum(steps, len(self.counts.times_s) - 1)
+        clock = self.counts.times_s + 1e6 * self.counts.scenes  # scenes one after the other
+        steps = np.minimum(np.searchsorted(clock, clock + 2.99), len(clock) - 1)
         within = (self.counts.scenes[steps] == self.counts.scenes) & (
             np.abs(self.counts.times_s[steps] - self.counts.times_s - 3.0) < 0.1
         )
@@ -315,10 +313,10 @@ class _Tables:
         rows: Rows = {}
         for least in (SEEN_POINTS, 1):
             few = points < least
-            seen = self._seen_before(points >= least)
+            seen = seen_before(points >= least, self.counts.instances, self.counts.times_s[self.counts.frames])
             rows[f"fewer than {least} points"] = {
                 "now %": _share(few[movers]),
-                f"seen with {least} in the last {SEEN_S:g} s %": _share((few & seen)[movers]),
+                f"seen with {least} in the last {SEEN_S:.0f} s %": _share((few & seen)[movers]),
             }
         return FigureTable(
             name="remembered",
@@ -329,19 +327,6 @@ class _Tables:
             world=rows,
             real={},
         )
-
-    def _seen_before(self, hit: Array) -> Array:
-        """Whether the same object was hit at an earlier key frame of the last SEEN_S."""
-        order = np.lexsort((self.counts.frames, self.counts.instances))
-        owner, hit = self.counts.instances[order], hit[order]
-        when = self.counts.times_s[self.counts.frames[order]]
-        seen = np.zeros(len(order), dtype=bool)
-        for back in range(1, round(2 * SEEN_S) + 1):
-            same = (owner[back:] == owner[:-back]) & (when[back:] - when[:-back] < SEEN_S + 0.1)
-            seen[back:] |= same & hit[:-back]
-        result = np.empty_like(seen)
-        result[order] = seen
-        return result
 
 
 def _between(values: Array, band: str) -> Array:

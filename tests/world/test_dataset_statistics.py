@@ -1,5 +1,8 @@
 """Counts of a data set: by hand, and against what the tables store."""
 
+import json
+import shutil
+
 import numpy as np
 import pytest
 
@@ -36,6 +39,20 @@ def test_counts_are_those_that_the_tables_store(world, counts):
     files = [row for row in world["sample_data"] if row["is_key_frame"] and world.channel(row) in RADARS]
     assert counts.points.sum() == len(counts.range_m) == sum(row["width"] for row in files)
     assert counts.range_m.max() <= 190 and np.abs(counts.planar_m - counts.range_m).max() < 15
+
+
+def test_the_order_of_the_tables_does_not_matter(world, counts, tmp_path):
+    for path in world.root.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    (tmp_path / VERSION).unlink()
+    shutil.copytree(world.root / VERSION, tmp_path / VERSION)
+    rows = [world["sample"][row] for row in np.random.default_rng(0).permutation(len(world["sample"]))]
+    assert rows != world["sample"]
+    (tmp_path / VERSION / "sample.json").write_text(json.dumps(rows))
+    others = count_dataset(load_index(tmp_path, VERSION, None), SWEEPS)
+    for name, column in vars(counts).items():
+        np.testing.assert_array_equal(getattr(others, name), column, err_msg=name)
+    assert (np.diff(counts.times_s)[np.diff(counts.scenes) == 0] > 0).all() and np.isfinite(counts.ego_speed_mps).any()
 
 
 def test_accumulated_points_lie_in_the_box_where_it_was_at_the_time_of_their_sweep(world, counts):
