@@ -192,17 +192,22 @@ def report(step: Step, watch: Watch) -> bool:
 
 
 def describe_inputs(batch: FrameBatch) -> Iterator[str]:
-    """A line for each kind of input that is not finite; unknown velocities of annotations are NaN by design."""
+    """A line for each kind of input that is not finite, of past frames too; unknown velocities and speeds are NaN."""
+    for past in batch.past:
+        yield from describe_inputs(past)
     for sensor, names in (("radar", RADAR_POINT_FIELDS), ("lidar", LIDAR_POINT_FIELDS)):
         points, owners = getattr(batch, f"{sensor}_points"), getattr(batch, f"{sensor}_batch")
         rows = [] if points is None else (~torch.isfinite(points).all(dim=1)).nonzero().flatten()[:MAX_SHOWN].tolist()
         for row in rows:
             point = ", ".join(f"{n} {v:.4g}" for n, v in zip(names, points[row], strict=True))
             yield f"input: {sensor} point {row} of {batch.tokens[int(owners[row])]} is not finite: {point}"
-    for name in ("timestamps_s", "global_from_ego", "aug_from_ego", "pix_from_aug"):
+    for name in ("timestamps_s", "global_from_ego", "aug_from_ego", "pix_from_aug", "lidar_origins"):
         value = getattr(batch, name)
         if value is not None and not torch.isfinite(value).all():
-            yield f"input: {name} is not finite"
+            yield f"input: {name} of {', '.join(batch.tokens)} is not finite"
+    for name in ("origins", "directions", "ranges", "times_s") if batch.rays is not None else ():
+        if not torch.isfinite(getattr(batch.rays, name)).all():
+            yield f"input: {name} of the rays of {', '.join(batch.tokens)} are not finite"
     for token, boxes in zip(batch.tokens, batch.boxes or [], strict=False):
         for name in ("centers", "sizes", "yaws"):
             if not torch.isfinite(getattr(boxes, name)).all():

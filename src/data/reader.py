@@ -203,7 +203,7 @@ class FrameReader:
         """The LiDAR frame at a moment, in the ego frame of its LIDAR_LEFT sweep or else of the first there is."""
         files = sweeps_before(self.index, self.timeline.sweeps(sample, step), self.settings.num_lidar_sweeps)
         rows, clouds = self._files.lidar_clouds(sample, files, skipped)
-        frame, aug_from_global = self._key_frame(sample, aug_from_ego), np.eye(4)
+        frame, aug_from_global, time_us = self._key_frame(sample, aug_from_ego), np.eye(4), 0
         if len(rows):
             own = rows[np.argmax(self.index.data_channels[rows] == CHANNELS.index(REFERENCE_CHANNEL))]
             global_from_ego = ego_poses(self.index, self.index.data_poses[own])
@@ -214,7 +214,6 @@ class FrameReader:
                 "timestamps_s": torch.tensor([1e-6 * time_us], dtype=torch.float64),
                 "global_from_ego": torch.from_numpy(global_from_ego[None]),
             }
-        time_us = time_us if len(rows) else 0
         return FrameBatch(**frame, **self._input(sample, rows, clouds, aug_from_global, time_us, skipped))
 
     def _rays(self, sample: int, steps: Sequence[int], aug_from_global: Array, skipped: Skipped) -> RayBundle:

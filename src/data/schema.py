@@ -191,9 +191,9 @@ def _calibration_columns(folder: Path, parts: dict[str, Array]) -> tuple[Table, 
     sensor_rows = table.links("sensor_token", sensors)
     channel_of = np.array([CHANNELS.index(c) if c in CHANNELS else -1 for c in sensors.values("channel")], np.int8)
     channels = channel_of[sensor_rows]
-    parts["ego_from_sensor"] = pose_matrix(table.quaternions("rotation"), table.vectors("translation", 3))
+    parts["ego_from_sensor"] = pose_matrix(table.rotations(), table.vectors("translation", 3))
     is_camera = (channels >= 0) & (channels < len(CAMERAS))
-    parts["intrinsics"] = table.intrinsics("camera_intrinsic", is_camera)
+    parts["intrinsics"] = table.intrinsics(is_camera)
     return table, channels
 
 
@@ -208,7 +208,7 @@ def _data_columns(
     order = np.argsort(times, kind="stable")
     parts["pose_times_us"] = times[order]
     parts["pose_translations"] = poses.vectors("translation", 3)[order]
-    parts["pose_rotations"] = poses.quaternions("rotation")[order]
+    parts["pose_rotations"] = poses.rotations()[order]
     sorted_row = np.empty(len(order), np.int32)
     sorted_row[order] = np.arange(len(order))
 
@@ -296,7 +296,7 @@ def _box_columns(folder: Path, samples: Table, table: Table, instances: Table, p
     attribute_ids = _box_attributes(table, attributes, labels >= 0)
     points = _box_points(table)
     velocities = _box_velocities(table, instance_rows, 1e-6 * parts["sample_times_us"][sample_rows], centers)
-    rotations = table.quaternions("rotation")
+    rotations = table.rotations()
 
     sound = _is_place(centers) & ((sizes > 0) & (sizes <= MAX_BOX_SIZE_M)).all(axis=1)
     if not sound.all():

@@ -71,7 +71,7 @@ class SensorFiles:
         """Rows of the key frame's files and the sweeps before it of each channel, fewer at a scene's start."""
         rows = self.index.key_data[sample, [CHANNELS.index(channel) for channel in channels]]
         for channel, row in zip(channels, rows, strict=True):
-            if row < 0 and count:
+            if row < 0:
                 skipped.channels[f"{channel} (not recorded)"] += 1
         return sweeps_before(self.index, rows, count)
 

@@ -101,15 +101,16 @@ class Table:
         """A list of `width` numbers per record; unless `finite` is False none is NaN or beyond LARGEST in size."""
         return self._numbers(self.values(field, list), field, (width,), finite=finite)
 
-    def quaternions(self, field: str) -> Array:  # [n, 4] float64 (w, x, y, z), unit length
-        """Rotations; a length more than 1e-3 away from 1 is refused, smaller rounding is taken out."""
-        raw = self.vectors(field, 4)
-        length = np.linalg.norm(raw, axis=1, keepdims=True)
-        self.check(np.abs(length[:, 0] - 1) < 1e-3, field, raw, "a quaternion (w, x, y, z) of length 1")
+    def rotations(self) -> Array:  # [n, 4] float64 (w, x, y, z)
+        """The field `rotation`; a length more than 1e-3 away from 1 is refused, smaller rounding stays."""
+        raw = self.vectors("rotation", 4)
+        length = np.linalg.norm(raw, axis=1)
+        self.check(np.abs(length - 1) < 1e-3, "rotation", raw, "a quaternion (w, x, y, z) of length 1")
         return raw
 
-    def intrinsics(self, field: str, needed: Array) -> Array:  # [n, 3, 3] float64, NaN where not needed
-        """Camera matrices of the records marked in `needed` [n]."""
+    def intrinsics(self, needed: Array) -> Array:  # [n, 3, 3] float64, NaN where not needed
+        """Camera matrices (`camera_intrinsic`) of the records marked in `needed` [n]."""
+        field = "camera_intrinsic"
         column = self.values(field, list)
         result = np.full((len(column), 3, 3), np.nan)
         for row in np.flatnonzero(needed):

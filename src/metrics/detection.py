@@ -122,8 +122,8 @@ def match_parts(
     evaluation_set: EvaluationSet,
     predictions: DetectionTable,
     diagnoses: Mapping[int, FrameDiagnosis],  # by sample
-    by_range: bool = True,
-    by_speed: bool = True,
+    by_range: bool,
+    by_speed: bool,
     protocol: Protocol = OFFICIAL,
 ) -> MatchedParts:
     """Rank and match, and say which boxes are scored together. Raises as `score_detections`."""

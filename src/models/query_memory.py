@@ -96,7 +96,7 @@ class RecalledQueries:
         known = self.queries.valid[0]
         queries = self.queries.map(lambda value: value[0][known])
         return Evidence(
-            warped_cells=WarpedPoints(queries.centers[:, :2], queries.velocities, self.elapsed_s[0][known], True)
+            warped_queries=WarpedPoints(queries.centers[:, :2], queries.velocities, self.elapsed_s[0][known], True)
         )
 
 

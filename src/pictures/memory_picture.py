@@ -51,15 +51,16 @@ class MemoryScene:
     ground_truth: PictureBoxes = field(default_factory=PictureBoxes.empty)
     gaussians: PictureMemory | None = None
     cells: PictureMemory | None = None
+    queries: PictureMemory | None = None
 
     def drawable(self) -> MemoryScene:
         """The scene with what can be drawn, in the order of drawing."""
-        gaussians, cells = (None if part is None else part.drawable() for part in (self.gaussians, self.cells))
-        return MemoryScene(self.grid, self.ground_truth.drawable(), gaussians, cells)
+        parts = (None if part is None else part.drawable() for part in (self.gaussians, self.cells, self.queries))
+        return MemoryScene(self.grid, self.ground_truth.drawable(), *parts)
 
     def paths(self) -> list[tuple[str, PictureMemory]]:
         """The memories there are, with their names."""
-        named = (("History Gaussians", self.gaussians), ("BEV cells", self.cells))
+        named = (("History Gaussians", self.gaussians), ("BEV cells", self.cells), ("Queries", self.queries))
         return [(name, memory) for name, memory in named if memory is not None]
 
     def moving(self) -> PictureBoxes:
@@ -166,7 +167,7 @@ def paint_memory(
     cell_m: float,
     close: bool,
 ) -> None:
-    """Gaussians as one-sigma ellipses, cells as squares, in the colour of their age; close up also with velocities."""
+    """Gaussians as one-sigma ellipses, others as squares, in the colour of their age; close up also with velocities."""
     xy = memory.moved if moved else memory.stayed
     (left, right), (down, up) = axes.get_xlim(), axes.get_ylim()
     plot, reach = upright(xy), 10.0  # m beyond the border that may still touch the window
@@ -251,11 +252,7 @@ def caption(memory: PictureMemory, moved: bool) -> str:
     return f"{how} (used by the model)" if memory.compensated == moved else how
 
 
-def draw_memory(
-    path: Path | str,
-    scene: MemoryScene,
-    title: str = "",
-) -> None:
+def draw_memory(path: Path | str, scene: MemoryScene, title: str) -> None:
     """Write one PNG, SHEET_PX wide: close-ups of each path's memory without and with velocity, and the whole range.
 
     Without velocity, what is remembered stays where it was seen and only the ego has moved on; with it, it has also

@@ -181,7 +181,7 @@ def _wait_for_all(ranks: list[subprocess.Popen], stops: list[float]) -> int:
         failed, code = next((rank, code) for rank, process in enumerate(ranks) if (code := process.poll()))
         if code != interrupted and not stops:
             logger.warning("process %d of %d %s; ending the others", failed, len(ranks), _how_it_ended(code))
-        _end_within(TERMINATION_GRACE_S, ranks)
+        _end_all(ranks)
     codes = [process.returncode for process in ranks]
     specific = [code for code in codes if code in (ConfigError.exit_code, DataError.exit_code, DivergedError.exit_code)]
     if not any(codes) or specific:
@@ -196,14 +196,14 @@ def _how_it_ended(code: int) -> str:
     return f"was killed by {signal_name(-code)}{why}"
 
 
-def _end_within(seconds: float, ranks: list[subprocess.Popen]) -> None:
-    """Wait for the processes that are left, and kill those that have not ended by then."""
-    deadline = time.monotonic() + seconds
+def _end_all(ranks: list[subprocess.Popen]) -> None:
+    """Wait for the processes that are left, and kill those that have not ended after TERMINATION_GRACE_S."""
+    deadline = time.monotonic() + TERMINATION_GRACE_S
     while None in [process.poll() for process in ranks] and time.monotonic() < deadline:
         time.sleep(0.1)
     left = [rank for rank, process in enumerate(ranks) if process.poll() is None]
     for rank in left:
-        logger.warning("process %d of %d did not end within %.0f s; killing it", rank, len(ranks), seconds)
+        logger.warning("process %d of %d did not end within %.0f s; killing it", rank, len(ranks), TERMINATION_GRACE_S)
         ranks[rank].kill()
     for rank in left:
         ranks[rank].wait()

@@ -127,7 +127,7 @@ def _score_lines(experiments: list[Experiment], columns: list[Metric]) -> list[l
         values = [experiment.values(column) for experiment in experiments]
         for line, experiment, own in zip(lines, experiments, values, strict=True):
             if not own:
-                line.append("-")
+                line.append(MISSING)
                 continue
             text = format_score(statistics.mean(own.values()), mean_bounds(experiment.runs, column), column)
             others = [compare(own, other, column.digits) for other in values if other and other is not own]
@@ -168,6 +168,6 @@ def gain_table(subject: Experiment, others: list[Experiment], columns: list[Metr
     for other in others:
         found = [compare(subject.values(column), other.values(column), column.digits) for column in known]
         pairs = sum(run.seed in seeds for run in other.runs)
-        lines.append([other.label, str(pairs), *("-" if gain is None else gain.text for gain in found)])
+        lines.append([other.label, str(pairs), *(MISSING if gain is None else gain.text for gain in found)])
     titles = [f"{subject.label} over", "seeds", *(column.heading for column in known)]
     return markdown_table(titles, lines) if known else ""

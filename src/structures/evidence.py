@@ -48,3 +48,4 @@ class Evidence:
     head_cells: HeadCells | None = None
     warped_gaussians: WarpedPoints | None = None  # empty where nothing is remembered yet
     warped_cells: WarpedPoints | None = None  # empty where nothing is remembered yet
+    warped_queries: WarpedPoints | None = None  # empty where nothing is remembered yet

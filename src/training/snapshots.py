@@ -96,17 +96,15 @@ def memory_of(
     scene: BevScene,  # of the same frame
 ) -> MemoryScene | None:
     """What the memory picture shows; None for a model without memory, empty memories where it remembers nothing yet."""
-    if evidence.warped_gaussians is None and evidence.warped_cells is None:
+    warped = (evidence.warped_gaussians, evidence.warped_cells, evidence.warped_queries)
+    if warped == (None, None, None):
         return None
-    remembered = MemoryScene(scene.grid, scene.ground_truth)
-    if evidence.warped_gaussians is not None:
-        remembered.gaussians = _memory(evidence.warped_gaussians)
-    if evidence.warped_cells is not None:
-        remembered.cells = _memory(evidence.warped_cells)
-    return remembered
+    return MemoryScene(scene.grid, scene.ground_truth, *map(_memory, warped))
 
 
-def _memory(points: WarpedPoints) -> PictureMemory:
+def _memory(points: WarpedPoints | None) -> PictureMemory | None:
+    if points is None:
+        return None
     gaussians = None if points.gaussians is None else _gaussians(points.gaussians)
     return PictureMemory(
         _numpy(points.xy), _numpy(points.velocities), _numpy(points.elapsed_s), gaussians, points.compensated

@@ -24,7 +24,7 @@ GROWTH_M = 0.5
 
 @dataclass(kw_only=True)
 class DatasetCounts:
-    """One row per labelled box (B), per key frame (F) in the order of scenes and time, and per point (P) of key sweeps."""
+    """One row per labelled box (B), per key frame (F), by scene and time, and per point (P) of key sweeps."""
 
     classes: Array  # [B] name of the detection class, "" for ignored categories
     frames: Array  # [B] row of the key frame
@@ -115,7 +115,7 @@ def _box_columns(index: DatasetIndex) -> dict[str, Array]:
         "frames": frames,
         "centres": centres,
         "half": 0.5 * table.vectors("size", 3)[:, [1, 0, 2]],
-        "yaws": yaw_of(quaternion_to_matrix(table.quaternions("rotation"))),
+        "yaws": yaw_of(quaternion_to_matrix(table.rotations())),
         "velocity": velocity,
         "speed_mps": np.hypot(velocity[:, 0], velocity[:, 1]),
         "levels": levels[table.links("visibility_token", Table(folder / "visibility.json"), optional=True)],

@@ -241,8 +241,8 @@ class Radars:
         bent = rng.normal(0, 0.05, len(picked))
         copy = found.point[picked] * longer
         copy = np.stack([copy[:, 0] - bent * copy[:, 1], copy[:, 1] + bent * copy[:, 0], copy[:, 2]], 1)
-        alarms = rng.poisson(self.config.false_alarms_per_sweep, 6)
-        which = np.repeat(np.arange(6), alarms)
+        alarms = rng.poisson(self.config.false_alarms_per_sweep, len(self.places))
+        which = np.repeat(np.arange(len(alarms)), alarms)
         n = len(which)
         angle, span = rng.uniform(-np.pi, np.pi, n), rng.uniform(8, 170, n)
         nowhere = np.stack([span * np.cos(angle), span * np.sin(angle), rng.normal(1, 2, n)], 1)

@@ -31,7 +31,7 @@ from src.world.scenery import make_scenery
 from src.world.sensor_faults import SensorFaults
 from src.world.simulate import Scene, make_scene, scene_rng
 from src.world.solid import true_geometry
-from src.world.table_rows import Row, Tables, link_by, link_chain, rounded, token
+from src.world.table_rows import Row, Tables, link_chain, link_sensors, rounded, token
 from src.world.world_config import (
     CAMERA_RATE_HZ,
     KEY_FRAME_RATE_HZ,
@@ -263,7 +263,7 @@ class SceneWriter:
         ]
         link_chain(samples)
         data = [row for *_, row in sorted(self.data, key=itemgetter(0, 1))]
-        link_by(data, "calibrated_sensor_token")
+        link_sensors(data)
         times = sorted({time for time, *_ in self.data} | set(self._ego_times()))
         rotations, translations = scene.ego.poses(np.array(times))
         poses = [

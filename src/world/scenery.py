@@ -10,7 +10,7 @@ import numpy as np
 from src.world.catalogue import GREENS
 from src.world.mesh import Colour, Mesh, MeshMaker
 from src.world.placement import Actor
-from src.world.road import LANE_M, MEDIAN_HALF_M, SHOULDER_M, SIDE_ROAD_HALF_M, SLAT_M, SLAT_STEP_M, Road
+from src.world.road import LANE_M, MEDIAN_HALF_M, SHOULDER_M, SIDE_ROAD_HALF_M, SLAT_M, SLAT_STEP_M, START_M, Road
 from src.world.world_config import WorldConfig
 
 Array = np.ndarray
@@ -124,7 +124,7 @@ def _along(road: Road, points: Array) -> Array:
     """Rough s of local points, good to tens of metres: that of the nearest centre-line sample of every 20th metre."""
     coarse = road.xy[::20]
     nearest = np.argmin(((points[:, None, :2] - coarse[None]) ** 2).sum(-1), 1)
-    return nearest * 20.0 - 800.0
+    return nearest * 20.0 + START_M
 
 
 def _boards(road: Road, s: Array, d: float, half_width: float, height: float) -> Array:

@@ -71,10 +71,10 @@ def link_chain(rows: list[Row]) -> None:
         row["next"] = rows[i + 1]["token"] if i + 1 < len(rows) else ""
 
 
-def link_by(rows: list[Row], key: str) -> None:
-    """Link each group of rows that agree in `key`, in their order."""
+def link_sensors(rows: list[Row]) -> None:
+    """Link the rows of each calibrated sensor, in their order."""
     groups: dict[object, list[Row]] = defaultdict(list)
     for row in rows:
-        groups[row[key]].append(row)
+        groups[row["calibrated_sensor_token"]].append(row)
     for group in groups.values():
         link_chain(group)

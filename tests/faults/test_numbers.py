@@ -25,6 +25,8 @@ from src.ops import products
 from src.ops.precision import computing
 from src.reliability.checkpoints import read_checkpoint
 from src.reliability.nonfinite import read_dump, step_seed, write_dump
+from src.structures.batch import FrameBatch
+from src.structures.ray_bundle import RayBundle
 from src.training.module import TrainingModule
 from src.training.trainer_config import OnNonfinite
 from tests.running import command
@@ -160,6 +162,18 @@ def replayed(path, capsys, *overrides):
     with pytest.raises(DivergedError) as caught:
         replay.main([f"checkpoint={path}", "trainer.accelerator=cpu", *overrides])
     return capsys.readouterr().out, str(caught.value)
+
+
+def test_broken_inputs_of_past_frames_and_rays_are_named():
+    eye, one = torch.eye(4)[None], torch.tensor([[1.0, 0.0, 0.0]])
+    numbers = torch.ones(1)
+    rays = RayBundle(one, one, numbers * torch.nan, numbers, numbers * torch.nan, *torch.zeros(2, 1, dtype=torch.int64))
+    past = FrameBatch(["before"], torch.zeros(1).double(), eye.double() * torch.nan, eye)
+    batch = FrameBatch(["now"], torch.zeros(1).double(), eye.double(), eye, rays=rays, past=(past,))
+    assert list(replay.describe_inputs(batch)) == [
+        "input: global_from_ego of before is not finite",
+        "input: ranges of the rays of now are not finite",  # speeds may be unknown
+    ]
 
 
 @pytest.mark.slow

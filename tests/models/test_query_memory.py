@@ -190,5 +190,5 @@ def test_what_is_recalled_can_be_shown(pair):
     model = pair[1].eval()
     with torch.no_grad():
         output, _ = model(drive(3), fill(model, 3))
-    shown = model.evidence(output).warped_cells
+    shown = model.evidence(output).warped_queries
     assert len(shown.xy) == output.recalled.queries.valid[0].sum() > 0 and shown.compensated

@@ -22,6 +22,15 @@ def test_agrees_with_the_convolution_of_the_concatenation(present, bias):
     torch.testing.assert_close(*results)
 
 
+def test_maps_of_unequal_width():
+    torch.manual_seed(0)
+    maps = [torch.randn(1, width, 3, 4, dtype=torch.float64) for width in (5, 1, 3)]
+    weight = torch.randn(2, 9, 1, 1, dtype=torch.float64)
+    torch.testing.assert_close(concat_conv2d(maps, weight, None), F.conv2d(torch.cat(maps, dim=1), weight))
+    with pytest.raises(ValueError, match="at most 9 channels, but got 12"):
+        concat_conv2d([*maps, maps[-1]], weight, None)
+
+
 def test_nothing_to_convolve():
     with pytest.raises(ValueError, match="at least one"):
         concat_conv2d([], torch.ones(1, 1, 1, 1), None)

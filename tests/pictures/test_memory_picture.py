@@ -155,6 +155,12 @@ def render(path: Path, scene: MemoryScene) -> np.ndarray:
 
 
 @pytest.mark.slow
+def test_each_memory_is_called_by_what_it_holds() -> None:
+    one = cells([(1, 1)], (0.0, 0.0), 1.0)
+    scene = MemoryScene(GRID, boxes([]), cells=one, queries=cells([(1, 1), (2, 2)], (0.0, 0.0), 1.0)).drawable()
+    assert [(name, len(memory)) for name, memory in scene.paths()] == [("BEV cells", 1), ("Queries", 2)]
+
+
 def test_cells_lie_behind_the_box_without_velocity_and_on_it_with(tmp_path: Path) -> None:
     truth = PictureBoxes([(0, 60, 0)], [(8, 6, 2)], [0.0], [(20, 0)], [0])
     patch = [(x, y) for x in np.arange(-2, 2.5, 0.8) for y in np.arange(58, 62.5, 0.8)]

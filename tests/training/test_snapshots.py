@@ -157,7 +157,10 @@ def test_both_places_whichever_the_model_used(compensated: bool) -> None:
         assert len(memory) == 1  # padding is not shown
         assert np.allclose(memory.stayed, [[-4, 5]]) and np.allclose(memory.moved, [[5, 2]])
         assert memory.compensated == compensated
-    assert shown.gaussians.gaussians is not None and shown.cells.gaussians is None
+    assert shown.gaussians.gaussians is not None and shown.cells.gaussians is None and shown.queries is None
+    evidence = Evidence(warped_queries=evidence.warped_cells)
+    shown = memory_of(evidence, scene_of(frame(0), Boxes3D.empty(), evidence, GRID))
+    assert shown.gaussians is None and shown.cells is None and len(shown.queries) == 1
 
 
 def test_paths_that_are_off_or_have_nothing_yet() -> None:

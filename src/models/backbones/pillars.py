@@ -13,7 +13,7 @@ from src.geometry.bev_grid import BEVGrid
 from src.models.backbones.sparse_voxel import POINT_SCALES
 from src.models.layers.dense import map_of_rows
 from src.models.layers.sparse import RowBatchNorm
-from src.ops.segment_reduce import segment_max, segment_mean
+from src.ops.segment_reduce import segment_count, segment_max, segment_mean
 
 EXTRA_FEATURES = 6
 """From the cell's centre (x, y), from the mean of the pillar's points (x, y, z), log of their number."""
@@ -99,6 +99,6 @@ class PillarEncoder(nn.Module):
         means = segment_mean(points, rows, len(cells))
         units = points.new_tensor([self.grid.cell_m, self.grid.cell_m, POINT_SCALES[2]])
         from_mean = (points[:, :3] - F.embedding(rows, means[:, :3])) / units
-        count = torch.bincount(rows, minlength=len(cells)).to(points.dtype).log()[rows]
+        count = segment_count(rows, len(cells)).to(points.dtype).log()[rows]
         features = torch.cat([points / self.point_scales, from_centre, from_mean, count[:, None]], dim=1)
         return features, cells, rows, means

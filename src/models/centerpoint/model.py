@@ -82,8 +82,7 @@ class CenterPoint(Detector):
         """Detect in B frames. Raises ValueError for a batch without LiDAR."""
         if batch.lidar_points is None or batch.lidar_batch is None:
             raise ValueError("FrameBatch.lidar_points is None, but this model uses LiDAR; read it with the frames")
-        points = batch.lidar_points[:, : len(POINT_SCALES)]
-        bev = self.lidar_encoder(points, batch.lidar_batch, len(batch))
+        bev = self.lidar_encoder(batch.lidar_points, batch.lidar_batch, len(batch))
         return CenterPointOutput(bev, self.head(bev)), None
 
     def loss_terms(self, output: CenterPointOutput, batch: FrameBatch) -> Objective:

@@ -7,11 +7,12 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from src.errors import ConfigError, require_least
+from src.errors import require_least
 from src.models.detector import Objective
 from src.models.far3d.adaptive_queries import AdaptiveQueries, AdaptiveQueryConfig
 from src.models.far3d.perspective_decoder import PerspectiveDecoder, PerspectiveDecoderConfig
 from src.models.heads.keypoint_head import CameraMaps
+from src.models.layers.feed_forward import check_image_heads
 from src.models.layers.views import CameraViews
 from src.models.query_detector import CameraQueryLossConfig, QueryDetector, QueryDetectorConfig, QueryOutput
 from src.models.query_memory import QueryMemory
@@ -32,9 +33,8 @@ class Far3DConfig(QueryDetectorConfig):
     loss: CameraQueryLossConfig
 
     def __post_init__(self) -> None:
-        require_least(self, "model", {"channels": 4, "num_queries": 1})
-        if self.channels % 4:
-            raise ConfigError(f"model.channels={self.channels}: must be a multiple of 4, the heads of image attention")
+        require_least(self, "model", {"num_queries": 1})
+        check_image_heads(self.channels)
 
 
 @dataclass

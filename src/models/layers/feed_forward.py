@@ -5,7 +5,15 @@ from __future__ import annotations
 import torch
 from torch import nn
 
+from src.errors import ConfigError
+
 NUM_HEADS = 4
+
+
+def check_image_heads(channels: int) -> None:
+    """Raises ConfigError for channels (`model.channels`) that the heads of image attention do not divide."""
+    if channels < 1 or channels % NUM_HEADS:
+        raise ConfigError(f"model.channels={channels}: must be a multiple of {NUM_HEADS}, the heads of image attention")
 
 
 def linear_relu_norm(in_channels: int, channels: int) -> nn.Sequential:

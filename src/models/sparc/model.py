@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from src.errors import ConfigError, require_least
 from src.losses.classification import penalty_reduced_focal
 from src.losses.normalizers import mean_over_ranks
 from src.models.backbones.point_transformer import PointTransformer, PointTransformerConfig, RadarPoints
 from src.models.detector import Objective
 from src.models.heads.query_proposals import ProposalConfig, Proposals, QueryProposals
+from src.models.layers.feed_forward import check_image_heads
 from src.models.layers.views import CameraViews
 from src.models.query_detector import CameraQueryLossConfig, QueryDetector, QueryDetectorConfig, QueryOutput
 from src.models.query_memory import QueryMemory
@@ -40,9 +40,7 @@ class SpaRCConfig(QueryDetectorConfig):
     loss: SpaRCLossConfig
 
     def __post_init__(self) -> None:
-        require_least(self, "model", {"channels": 4})
-        if self.channels % 4:
-            raise ConfigError(f"model.channels={self.channels}: must be a multiple of 4, the heads of image attention")
+        check_image_heads(self.channels)
 
 
 @dataclass
