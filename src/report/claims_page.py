@@ -47,7 +47,7 @@ def claims_page(
     parts = [
         f"# The paper's claims, scale {scale}",
         f"Of {len(findings)} claims: {counts}. Written by `python -m src.report scale={scale}` from the results of the "
-        f"sweeps; `python -m src.study scale={scale}` trains what is missing.",
+        f"sweeps; `python -m src.study scale={scale} published=true` trains what is missing.",
         f"![Each claim's effect with its interval, and the paper's effect]({picture})",
         f"## What was run\n\n{_what_was_run(findings, records, scale)}",
         f"## The claims\n\n{RULE}\n\n{_table(findings, scale)}",

@@ -64,30 +64,34 @@ def describe_epochs(results: Iterable[RunResult]) -> list[str]:
 
 
 def describe_starts(pairs: Iterable[tuple[RunResult, RunResult]]) -> str:
-    """Which runs began from another training of one run than the one they are compared with; empty where none did.
+    """Which runs began from another training of one run than the one they are compared with, and of how many pairs it
+    is not recorded; empty where none did.
 
-    Such pairs share less than their seed says. Of results without digests nothing is known.
+    Such pairs share less than their seed says.
     """
-    apart = list(dict.fromkeys(run.run_id for pair in pairs if (run := _started_apart(*pair)) is not None))
-    if not apart:
-        return ""
-    return (
-        "Of runs that begin from one run's weights, these began from another training of it than the one that they "
-        f"are compared with, whose noise is in those differences and intervals: {', '.join(apart)}."
-    )
+    pairs = {tuple(run.run_id for run in pair): pair for pair in pairs}
+    starts = [found for pair in pairs.values() if (found := _starts(*pair)) is not None]
+    apart = list(dict.fromkeys(run.run_id for run, *weights in starts if None not in weights and len({*weights}) > 1))
+    unknown = sum(None in weights for _, *weights in starts)
+    parts = []
+    if apart:
+        parts.append(
+            "Of runs that begin from one run's weights, these began from another training of it than the one that they "
+            f"are compared with, whose noise is in those differences and intervals: {', '.join(apart)}."
+        )
+    if unknown:
+        parts.append(f"Of {counted(unknown, 'such pair')} it is not recorded whether both began from one training.")
+    return " ".join(parts)
 
 
-def _started_apart(first: RunResult, second: RunResult) -> RunResult | None:
-    """The one of two runs that began from another training of the other, or of the run that both begin from."""
+def _starts(first: RunResult, second: RunResult) -> tuple[RunResult, str | None, str | None] | None:
+    """Of two runs the one that began from the other, or from the run that both begin from, with the digests of the
+    weights that it began from and of those that the other has or began from."""
     for run, other in ((first, second), (second, first)):
         if run.initialized_from == other.run_id:
-            weights = other.weights
-        elif run.initialized_from is not None and run.initialized_from == other.initialized_from:
-            weights = other.initial_weights
-        else:
-            continue
-        if None not in (run.initial_weights, weights) and run.initial_weights != weights:
-            return run
+            return run, run.initial_weights, other.weights
+        if run.initialized_from is not None and run.initialized_from == other.initialized_from:
+            return run, run.initial_weights, other.initial_weights
     return None
 
 

@@ -15,7 +15,7 @@ from itertools import chain, pairwise
 from src.errors import ConfigError, DataError, HorizonError, InterruptedRunError
 from src.reliability.command import run_command
 from src.reliability.passwords import hide_in_process_list
-from src.report.claims import Claim, Finding, judge, load_claims, verdict_of
+from src.report.claims import Claim, Finding, Verdict, judge, load_claims, verdict_of
 from src.report.comparisons import LOOKS
 from src.report.results import RunResult, read_results_or_raise
 from src.report.sweep_record import RunState, SweepRecord, read_record, record_path
@@ -30,6 +30,7 @@ from src.training.identity import key_of
 
 logger = logging.getLogger(__name__)
 
+ALL_OPEN = ", if all stays open, with the seeds of the looks before"
 SET_BY_THE_RULE = ("sweep", "seed", "seeds", "trials", "latency")
 BESIDE = (
     "standing",
@@ -110,10 +111,15 @@ class Study:
     def plans(self, look: int, results: dict[str, RunResult], before: int = 0) -> list[Plan]:
         """What each sweep trains for a look, without those of which nothing is open any more.
 
-        A comparison of fewer than `before` pairs waits for them: partners of runs that are missing tell nothing.
+        A comparison of fewer than `before` pairs waits for them: partners of runs that are missing tell nothing. Of a
+        claim that one of its measures does not show nothing is open.
         """
-        findings = [one for _, found in self.findings(results) for one in found]
-        still = [one.measure.comparison for one in findings if one.is_open and one.common_seeds >= before]
+        undecided = [found for _, found in self.findings(results) if verdict_of(found) is not Verdict.NOT]
+        still = [
+            one.measure.comparison
+            for one in chain.from_iterable(undecided)
+            if one.is_open and one.common_seeds >= before
+        ]
         first, plans = min(LOOKS), []
         for name, command in self.commands.items():
             rows = {row for one in still if one.sweep == name for row in (one.row, one.over)}
@@ -125,17 +131,22 @@ class Study:
         return plans
 
     def worth_recording(self, plan: Plan, look: int) -> bool:
-        """Whether to record a look without training: the first if any run is finished, a later one if all are.
+        """Whether to record a look without training: the first if any run is finished, a later one if all pairs of a
+        comparison are.
 
-        A later look is taken at all its pairs; of it, runs of the rows that it adds seeds to count. Finished are runs
-        with a score here or with a published result.
+        Finished are runs with a score here or with a published result.
         """
-        rows = (runs.values() for runs in plan.rows.values() if len(runs) == look)
-        finished = (
-            run in plan.published or is_finished_with_score(self.call.outputs / run)
-            for run in chain.from_iterable(rows)
-        )
-        return any(finished) if look == min(LOOKS) else all(finished)
+        finished = {
+            label: [run in plan.published or is_finished_with_score(self.call.outputs / run) for run in runs.values()]
+            for label, runs in plan.rows.items()
+            if len(runs) == look
+        }
+        if look == min(LOOKS):
+            return any(chain.from_iterable(finished.values()))
+        measures = chain.from_iterable(claim.measures for claim in self.claims)
+        compared = [one.comparison for one in measures if one.decides and one.comparison.sweep == plan.sweep.name]
+        complete = {label for label, runs in finished.items() if all(runs)}
+        return any({one.row, one.over} <= complete for one in compared)
 
     def progress(self, plans: list[Plan], look: int, results: dict[str, RunResult]) -> str:
         """How far a look is, over all its sweeps, and the time left as far as runs finished here tell it."""
@@ -156,7 +167,7 @@ class Study:
             plans = self.plans(look, results)
             if not plans:
                 continue
-            lines.append(f"# {self.progress(plans, look, results)}{', if all stays open' if look > min(LOOKS) else ''}")
+            lines.append(f"# {self.progress(plans, look, results)}{ALL_OPEN if look > min(LOOKS) else ''}")
             for plan in plans:
                 rows = [label for label, runs in plan.rows.items() if len(runs) == look]
                 lines.append(f"#   {plan.sweep.name}: {'; '.join(rows)}")

@@ -82,7 +82,10 @@ def test_runs_are_named_that_began_from_other_weights_than_those_they_are_compar
     pairs = [(run("a", "x"), run("b", "x")), (run("c", "y"), run("d", "y"))]
     assert describe_starts(pairs) == ""
     assert describe_starts([*pairs, (run("e", "x"), run("f", "y"))]).endswith("differences and intervals: e.")
-    assert describe_starts([(run("e", "x"), run("f", None))]) == "", "nothing is known of it"
+    unknown = [(run("e", "x"), run("f", None)), (run("g", None), run("h", None))]
+    told = "Of 2 such pairs it is not recorded whether both began from one training."
+    assert describe_starts([*unknown, unknown[0]]) == told, "a pair that several measures compare is one"
+    assert describe_starts([(make_result("i", {}), make_result("j", {}))]) == "", "both began from fresh weights"
 
 
 def test_what_tells_why_stands_behind_the_claims_as_far_as_it_has_run(report, write_sweep):

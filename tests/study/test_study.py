@@ -131,6 +131,34 @@ def test_rows_outside_the_open_comparisons_stay_at_the_first_look(places, traine
     ]
 
 
+@pytest.fixture
+def claim_of_two(tmp_path, places):
+    """The first claim also wants the largest to be better than none."""
+    both = [{"sweep": "margin", "row": "large", "over": row, "metrics": ["mAP"]} for row in ("small", "none")]
+    claims = [CLAIMS["claims"][0] | {"comparisons": both}, CLAIMS["claims"][1]]
+    (tmp_path / "claims.yaml").write_text(json.dumps(CLAIMS | {"claims": claims}))
+    return places
+
+
+def test_a_claim_that_one_measure_does_not_show_is_not_open(claim_of_two, trained, monkeypatch, capsys):
+    calls, _ = trained
+    monkeypatch.setitem(GAIN, "small", [4.0] * 12)
+    monkeypatch.setitem(GAIN, "none", [9.0, -9.0] * 6)
+    study.main(claim_of_two)
+    assert [name for name, _ in calls] == ["margin", "layers", "layers"]
+    assert "margin: does not show" in capsys.readouterr().out
+
+
+def test_without_workers_a_complete_comparison_does_not_wait_for_another(claim_of_two, trained, monkeypatch, tmp_path):
+    calls, results = trained
+    monkeypatch.setitem(GAIN, "large", [2.0, 1.0, 0.9, 1.0, 1.2, 1.1, *[1.0] * 6])
+    study.main(claim_of_two)
+    del results[record_of(tmp_path, "margin").rows["none"][5]]
+    calls.clear()
+    study.main([*claim_of_two, "published=true", "workers=0", f"paths.outputs={tmp_path / 'another'}"])
+    assert [name for name, _ in calls] == ["margin", "layers", "margin", "layers"]
+
+
 def test_a_row_that_never_finishes_gets_no_partners_beyond_the_first_look(places, trained, monkeypatch):
     calls, results = trained
     run_plan = study.run_plan
@@ -154,10 +182,10 @@ def test_a_plan_is_printed_with_the_time_that_it_takes(places, trained, capsys, 
         "# study at scale debug, 3 seeds: 0 of 15 done, 0 running, 15 left, time left unknown yet",
         "#   margin: none; small; large",
         "#   layers: one; two",
-        "# study at scale debug, 6 seeds: 0 of 27 done, 0 running, 27 left, time left unknown yet, if all stays open",
+        "# study at scale debug, 6 seeds: 0 of 27 done, 0 running, 27 left, time left unknown yet" + study.ALL_OPEN,
         "#   margin: small; large",
         "#   layers: one; two",
-        "# study at scale debug, 12 seeds: 0 of 51 done, 0 running, 51 left, time left unknown yet, if all stays open",
+        "# study at scale debug, 12 seeds: 0 of 51 done, 0 running, 51 left, time left unknown yet" + study.ALL_OPEN,
         "#   margin: small; large",
         "#   layers: one; two",
         "margin: not run (Larger is better)",
