@@ -138,7 +138,7 @@ def save_submission(config: Config, path: Path, tokens: list[str], table: Detect
 def build_module(
     config: Config,
     tree: dict[str, Any],
-    datamodule: DetectionDataModule,
+    datamodule: DetectionDataModule | None,  # of the evaluation; None for a module that does not evaluate
     model: Detector | None = None,  # None: as `build_model`
 ) -> TrainingModule:
     """The LightningModule of a run; `tree` is the configuration as plain values."""
@@ -147,7 +147,7 @@ def build_module(
         model,
         optim=config.optim,
         backbone_lr_multiplier=config.backbone.lr_multiplier,
-        evaluator=config.phase.evaluator(datamodule),
+        evaluator=config.phase.evaluator(datamodule) if datamodule is not None else None,
         seed=config.draw_seed,
         config=tree,
         skip_nonfinite=config.trainer.on_nonfinite is OnNonfinite.skip,

@@ -25,7 +25,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from src.assembly import restored_model
+from src.assembly import build_module, restored_model
 from src.config import Config, compose_config, refuse_options_of_others, restore_config
 from src.errors import ConfigError, DivergedError
 from src.ops.precision import computing
@@ -33,9 +33,7 @@ from src.reliability.command import run_command
 from src.reliability.cpu import tune_cpu
 from src.reliability.nonfinite import describe_gradients, gradient_norm, read_dump
 from src.structures.batch import LIDAR_POINT_FIELDS, RADAR_POINT_FIELDS, FrameBatch
-from src.training.handoff import norms_handed_over
 from src.training.module import TrainingModule
-from src.training.phases import MODULES
 
 MAX_SHOWN = 8
 
@@ -80,12 +78,7 @@ class Step:
     def build(self) -> TrainingModule:
         """The module as it was when the step began. Raises CheckpointError when the weights do not fit."""
         config, step = self.config, self.content["horizon3d"]["step"]
-        model = restored_model(config, self.content, self.path)
-        kind = MODULES[config.phase.module]
-        norms = norms_handed_over(model) if config.phase.frozen_statistics else ()
-        module = kind(
-            model, config.optim, config.backbone.lr_multiplier, None, config.draw_seed, {}, frozen_norms=norms
-        )
+        module = build_module(config, {}, None, restored_model(config, self.content, self.path))
         module.restore_rank({"means": {}, "memories": step["memories"]})
         module.to(self.device)
         module.on_fit_start()
