@@ -99,13 +99,13 @@ class Sites:
             sites.keys = _counted_anew(linear, _row_major(sites.shape), sites.shape[1:], sites.strides)
         return sites
 
-    def on_grid(self, shape: tuple[int, ...], axes: tuple[int, ...]) -> Sites:
-        """The same cells on a grid of another size with these axes of theirs, the batch's among them.
+    def on_grid(self, shape: tuple[int, ...], axes: tuple[int, ...] | None) -> Sites:
+        """The same cells on a grid of another size, with some of the axes (all of `shape` and the batch's) if given.
 
         Trusts that they lie in it and are as many; they keep their order.
         """
         sites, steps = Sites(tuple(shape), self.keys), [0] * len(self.shape)
-        for axis, step in zip(axes, sites.strides, strict=True):
+        for axis, step in zip(axes or range(len(shape)), sites.strides, strict=True):
             steps[axis] = step
         sites.keys = self.positions(tuple(steps))
         return sites

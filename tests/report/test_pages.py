@@ -64,7 +64,7 @@ def test_phase_2_is_held_against_phase_1(both_phases, report, tmp_path):
         "phase 1", "phase 1 continued, no memory", "phase 2", "phase 2, no velocity compensation"
     ]  # fmt: skip
     assert summary["phase 2"].startswith("| phase 2 | **43.0** | **43.0** | **1.57** |")
-    assert rows(text, "| experiment | mAP 0-0.5 m/s, % |")["phase 1"] == "| phase 1 |" + " - |" * 4
+    assert rows(text, "| experiment | mAP 0-0.5 m/s, % |")["phase 1"] == "| phase 1 |" + " – |" * 4
     assert "0-0.5 m/s 13 (cars 3), 0.5-10 m/s 13 (cars 3)" in text
     gain = rows(text, "| phase 2 over | seeds | mAP, % |")
     assert "| 2 | +8.0 [+8.0, +8.0] |" in gain["phase 1"]

@@ -70,7 +70,7 @@ def test_what_a_run_was_not_scored_by_is_a_dash(read, write_run):
     experiments = group_runs(read(), unnamed)
     rows = {line.split(" | ")[0]: line for line in score_table(experiments, BY_SPEED + ERROR_BY_SPEED).splitlines()}
     # Eight columns and the labels are cut in two.
-    assert rows["| `x=1`"] == "| `x=1` |" + " - |" * 4 and rows["| `y=1`"] == "| `y=1` |" + " - |" * 4
+    assert rows["| `x=1`"] == "| `x=1` |" + " – |" * 4 and rows["| `y=1`"] == "| `y=1` |" + " – |" * 4
     assert rows["| `defaults`"] == "| `defaults` |" + " 1.80 |" * 4
     assert score_table(experiments[:1], BY_SPEED) == "", "what no run has is left out"
 
@@ -96,8 +96,8 @@ def test_gains_are_paired_by_seed(read, write_run):
     better, plain, lone = group_runs(read(), unnamed)
     lines = gain_table(better, [plain, lone], [METRICS["mAP"], BY_SPEED[0], METRICS["measures.moving_AP"]]).splitlines()
     assert lines[0] == "| `x=1` over | seeds | mAP, % | mAP 0-0.5 m/s, % |"
-    assert lines[2] == "| `defaults` | 3 | +5.3 [+1.5, +9.1] | - |"  # 5, 7, 4: far less than the spread over seeds
-    assert lines[3] == "| `y=1` | 0 | - | - |"
+    assert lines[2] == "| `defaults` | 3 | +5.3 [+1.5, +9.1] | – |"  # 5, 7, 4: far less than the spread over seeds
+    assert lines[3] == "| `y=1` | 0 | – | – |"
     assert "| 3 | -5.3 [-9.1, -1.5] |" in gain_table(plain, [better], [METRICS["mAP"]])
     assert gain_table(plain, [better], BY_SPEED) == ""
 
