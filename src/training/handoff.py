@@ -147,11 +147,11 @@ def open_source(source: WeightSource) -> OpenCheckpoint:
     try:
         return open_checkpoint(source.checkpoint)
     except CheckpointError as error:
-        if source.folder is None:
-            raise
         overrides = source.overrides
-        if overrides is None:  # a run given by its id says what made it
-            overrides = source.folder.read_result()[0]["overrides"]
+        if overrides is None and source.folder is not None:  # a run given by its id says what made it
+            overrides = source.folder.read_result()[0].get("overrides")
+        if overrides is None:
+            raise
         remedy = f"{train_command(overrides)} resume=restart"
         raise CheckpointError(f"{error}; or make it anew with\n    {remedy}") from error
 

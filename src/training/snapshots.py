@@ -97,7 +97,7 @@ def memory_of(
 ) -> MemoryScene | None:
     """What the memory picture shows; None for a model without memory, empty memories where it remembers nothing yet."""
     warped = (evidence.warped_gaussians, evidence.warped_cells, evidence.warped_queries)
-    if warped == (None, None, None):
+    if all(points is None for points in warped):
         return None
     return MemoryScene(scene.grid, scene.ground_truth, *map(_memory, warped))
 
