@@ -33,6 +33,9 @@ class ModelConfig:
     new_in_temporal_phase: ClassVar[str] = ""
     """Regular expression: names of the parameters that the temporal phase adds, and no checkpoint of the phase before
     holds. Empty for a model without."""
+    may_be_passed_over: ClassVar[str] = ""
+    """Regular expression: names of the parameters of stacked layers that weights scored as they are have and the model
+    may do without."""
     keys_of_later_phases: ClassVar[tuple[str, ...]] = ()
     """Dotted keys of what the first of several temporal phases neither builds nor reads."""
 

@@ -159,14 +159,17 @@ def open_source(source: WeightSource) -> OpenCheckpoint:
 def hand_over(model: Detector, weights: OpenCheckpoint, tree: dict[str, Any]) -> None:
     """Take the earlier phase's `weights` into `model`; what the new phase adds keeps its own.
 
-    Weights that are scored as they are, in a temporal phase, may hold parts of it that this run switches off. These and
-    settings that differ are logged. Raises CheckpointError naming every key that does not fit.
+    Weights that are scored as they are may hold stacked layers that this run passes over and, in a temporal phase,
+    parts of it that are switched off. These and settings that differ are logged. Raises CheckpointError naming every
+    key that does not fit.
     """
     checkpoint = weights.take()
     added = re.compile(model.config.new_in_temporal_phase) if model.config.new_in_temporal_phase else None
-    if added and tree["phase"]["temporal"] and tree["phase"]["epochs"] == 0:
+    if tree["phase"]["epochs"] == 0:
+        parts = (model.config.may_be_passed_over, model.config.new_in_temporal_phase * tree["phase"]["temporal"])
+        may_be_off = re.compile("|".join(filter(None, parts)) or "$")
         state, wanted = checkpoint["state_dict"], {f"model.{key}" for key in model.state_dict()}
-        off = [key for key in state if key not in wanted and added.match(key.removeprefix("model."))]
+        off = [key for key in state if key not in wanted and may_be_off.match(key.removeprefix("model."))]
         checkpoint["state_dict"] = {key: value for key, value in state.items() if key not in off}
         if off:
             logger.info("switched off: %d tensors of %s", len(off), weights.path)

@@ -417,6 +417,29 @@ def test_trained_weights_are_scored_with_a_part_of_the_memory_switched_off(tmp_p
         give(path, "phase=phase2", *part)  # to train on, it is another model
 
 
+def test_trained_weights_are_scored_with_their_first_layers_alone(tmp_path, caplog):
+    path = write_checkpoint(tmp_path / "three.ckpt", "phase=phase1", "model.ocsf.num_layers=3")
+    given = torch.load(path, weights_only=True)["state_dict"]
+    fewer = ("phase=phase1", "model.ocsf.num_layers=1", f"phase.init_from={path}")
+    with caplog.at_level(logging.INFO):
+        _, _, after = give(path, *fewer, "phase.epochs=0")
+    assert all(torch.equal(value, given[f"model.{key}"]) for key, value in after.items())
+    left = {key.removeprefix("model.") for key in given} - set(after)
+    assert {key.split("layers.")[1][0] for key in left} == {"1", "2"}
+    assert f"of {path}" in caplog.text
+    with pytest.raises(CheckpointError, match="unexpected"):
+        give(path, *fewer)  # to train on, it is another model
+    with pytest.raises(CheckpointError, match=r"missing ocsf\.encoder\.layers\.3\."):
+        give(path, "phase=phase1", "model.ocsf.num_layers=4", f"phase.init_from={path}", "phase.epochs=0")
+
+
+@pytest.mark.parametrize("wanted", ["phase=phase1", "phase=phase1 model.ocsf.num_layers=1"])
+def test_layers_passed_over_hide_no_other_phase(tmp_path, wanted):
+    path = write_checkpoint(tmp_path / "two.ckpt", "phase=phase2", "model.dptf.bev_path=null")
+    with pytest.raises(CheckpointError, match=r"unexpected ocsf\.encoder\.layers\.0\.temporal_attention"):
+        give(path, *wanted.split(), f"phase.init_from={path}", "phase.epochs=0")
+
+
 def test_a_checkpoint_of_phase_2_into_phase_1_names_the_memory(tmp_path):
     path = write_checkpoint(tmp_path / "two.ckpt", "phase=phase2", "model.dptf.gaussian_path.self_attention=null")
     with pytest.raises(CheckpointError, match=r"unexpected dptf\.bev_path.*more"):
