@@ -33,9 +33,8 @@ class ModelConfig:
     new_in_temporal_phase: ClassVar[str] = ""
     """Regular expression: names of the parameters that the temporal phase adds, and no checkpoint of the phase before
     holds. Empty for a model without."""
-    may_be_passed_over: ClassVar[str] = ""
-    """Regular expression: names of the parameters of stacked layers that weights scored as they are have and the model
-    may do without."""
+    layer_stack: ClassVar[str] = ""
+    """Name of a list of alike layers, each of which refines what the one before it made. Empty for a model without."""
     keys_of_later_phases: ClassVar[tuple[str, ...]] = ()
     """Dotted keys of what the first of several temporal phases neither builds nor reads."""
 

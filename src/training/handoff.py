@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from src.errors import CheckpointError, ConfigError, DataError, DivergedError, HorizonError, InterruptedRunError
@@ -159,20 +159,20 @@ def open_source(source: WeightSource) -> OpenCheckpoint:
 def hand_over(model: Detector, weights: OpenCheckpoint, tree: dict[str, Any]) -> None:
     """Take the earlier phase's `weights` into `model`; what the new phase adds keeps its own.
 
-    Weights that are scored as they are may hold stacked layers that this run passes over and, in a temporal phase,
-    parts of it that are switched off. These and settings that differ are logged. Raises CheckpointError naming every
-    key that does not fit.
+    Weights that are scored as they are may hold more layers of a stack, of which the last ones are taken, and in a
+    temporal phase parts of it that this run switches off. These and settings that differ are logged. Raises
+    CheckpointError naming every key that does not fit.
     """
     checkpoint = weights.take()
     added = re.compile(model.config.new_in_temporal_phase) if model.config.new_in_temporal_phase else None
     if tree["phase"]["epochs"] == 0:
-        parts = (model.config.may_be_passed_over, model.config.new_in_temporal_phase * tree["phase"]["temporal"])
-        may_be_off = re.compile("|".join(filter(None, parts)) or "$")
         state, wanted = checkpoint["state_dict"], {f"model.{key}" for key in model.state_dict()}
-        off = [key for key in state if key not in wanted and may_be_off.match(key.removeprefix("model."))]
-        checkpoint["state_dict"] = {key: value for key, value in state.items() if key not in off}
-        if off:
+        state = _last_layers(state, wanted, model.config.layer_stack, weights.path)
+        off = [key for key in state if key not in wanted and added and added.match(key.removeprefix("model."))]
+        if off and tree["phase"]["temporal"]:
+            state = {key: value for key, value in state.items() if key not in off}
             logger.info("switched off: %d tensors of %s", len(off), weights.path)
+        checkpoint["state_dict"] = state
     new = load_model_weights(model, checkpoint, weights.path, added)
     parts = sorted({key.partition(".")[0] for key in new})
     logger.info("weights from %s; new: %d tensors in %s", weights.path, len(new), ", ".join(parts) or "nothing")
@@ -180,6 +180,27 @@ def hand_over(model: Detector, weights: OpenCheckpoint, tree: dict[str, Any]) ->
     later = (*model.config.keys_of_temporal_phase, *model.config.keys_of_later_phases)
     for key, (old, now) in differing_settings(stored, tree, later).items():
         logger.warning("%s was %s in the run these weights come from and is %s now", key, old, now)
+
+
+def _last_layers(state: dict[str, Tensor], wanted: set[str], stack: str, path: Path) -> dict[str, Tensor]:
+    """The weights with no more layers of `stack` than are wanted, the last ones.
+
+    Losses see what the last layer makes; what earlier ones make alone, the rest of the model has not learnt to read.
+    """
+    layer = re.compile(rf"(model\.{re.escape(stack)})\.(\d+)\.(.*)")
+    stored, kept = (len({found[2] for key in keys if (found := layer.match(key))}) for keys in (state, wanted))
+    over = stored - kept
+    if over <= 0:
+        return state
+    logger.info("passed over: the first %d of %d layers of %s", over, stored, path)
+    last = {}
+    for key, value in state.items():
+        found = layer.match(key)
+        if found is None:
+            last[key] = value
+        elif int(found[2]) >= over:
+            last[f"{found[1]}.{int(found[2]) - over}.{found[3]}"] = value
+    return last
 
 
 def norms_handed_over(model: Detector) -> list[nn.Module]:

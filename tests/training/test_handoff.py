@@ -417,20 +417,26 @@ def test_trained_weights_are_scored_with_a_part_of_the_memory_switched_off(tmp_p
         give(path, "phase=phase2", *part)  # to train on, it is another model
 
 
-def test_trained_weights_are_scored_with_their_first_layers_alone(tmp_path, caplog):
+@pytest.mark.parametrize("fewer", [1, 2])
+def test_trained_weights_are_scored_with_their_last_layers_alone(tmp_path, fewer, caplog):
     path = write_checkpoint(tmp_path / "three.ckpt", "phase=phase1", "model.ocsf.num_layers=3")
     given = torch.load(path, weights_only=True)["state_dict"]
-    fewer = ("phase=phase1", "model.ocsf.num_layers=1", f"phase.init_from={path}")
+    command = ("phase=phase1", f"model.ocsf.num_layers={fewer}", f"phase.init_from={path}")
     with caplog.at_level(logging.INFO):
-        _, _, after = give(path, *fewer, "phase.epochs=0")
-    assert all(torch.equal(value, given[f"model.{key}"]) for key, value in after.items())
-    left = {key.removeprefix("model.") for key in given} - set(after)
-    assert {key.split("layers.")[1][0] for key in left} == {"1", "2"}
-    assert f"of {path}" in caplog.text
-    with pytest.raises(CheckpointError, match="unexpected"):
-        give(path, *fewer)  # to train on, it is another model
-    with pytest.raises(CheckpointError, match=r"missing ocsf\.encoder\.layers\.3\."):
-        give(path, "phase=phase1", "model.ocsf.num_layers=4", f"phase.init_from={path}", "phase.epochs=0")
+        _, _, after = give(path, *command, "phase.epochs=0")
+    for key, value in after.items():
+        stack, layers, rest = f"model.{key}".partition("encoder.layers.")
+        number = f"{int(rest[0]) + 3 - fewer}{rest[1:]}" if layers else ""
+        assert torch.equal(value, given[f"{stack}{layers}{number}"])
+    assert f"passed over: the first {3 - fewer} of 3 layers of {path}" in caplog.text
+    with pytest.raises(CheckpointError, match=r"unexpected ocsf\.encoder\.layers\.[12]\."):
+        give(path, *command)  # to train on, it is another model
+
+
+def test_weights_are_not_scored_with_more_layers_than_they_have(tmp_path):
+    path = write_checkpoint(tmp_path / "one.ckpt", "phase=phase1", "model.ocsf.num_layers=1")
+    with pytest.raises(CheckpointError, match=r"missing ocsf\.encoder\.layers\.1\."):
+        give(path, "phase=phase1", "model.ocsf.num_layers=2", f"phase.init_from={path}", "phase.epochs=0")
 
 
 @pytest.mark.parametrize("wanted", ["phase=phase1", "phase=phase1 model.ocsf.num_layers=1"])

@@ -28,7 +28,7 @@ class Horizon3DConfig(ModelConfig):
     temporal_part: ClassVar[str] = "dptf"
     temporal_switches: ClassVar[tuple[str, ...]] = ("doppler.cells",)
     new_in_temporal_phase: ClassVar[str] = r"dptf\.|ocsf\.encoder\.layers\.\d+\.temporal_attention\."
-    may_be_passed_over: ClassVar[str] = r"ocsf\.encoder\.layers\.[1-9]\d*\."
+    layer_stack: ClassVar[str] = "ocsf.encoder.layers"
 
     radar_encoder: RadarEncoderConfig
     kggi: KGGIConfig | None  # null together with ocsf: radar only
