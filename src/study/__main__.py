@@ -42,6 +42,7 @@ BESIDE = (
     "memory_factors",
     "sparser",
     "scaling",
+    "training_scenes",
 )
 """Sweeps of detectors' accuracy that no claim names. `learning_rates` and `tune` choose what the others run with."""
 
