@@ -235,7 +235,7 @@ def test_a_place_on_the_axis_is_the_value_trained(name):
     sweep = load_sweep(name)
     for row in sweep.rows:
         if row.x is not None:
-            override, *_ = row.overrides  # others keep the number of steps
+            (override,) = row.overrides
             assert float(override.split("=")[1]) == row.x
             assert row.x == 0 or f"{row.x:g} " in row.label.replace("on, ", "")
 
