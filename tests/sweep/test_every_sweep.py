@@ -21,7 +21,7 @@ OF_SOME_ROWS = (
 )
 ON_MOVERS = ("measures.camera_velocity_error", "measures.history_velocity_error")
 SELDOM = ("speeds.", "classes.", "lfcd", "cd_unseen", *ON_MOVERS)
-"""The debug world lacks most of them: it is small, and so is what a forecast may miss or a few Gaussians may meet there."""
+"""The debug world lacks most of them: it is small, and so is what a forecast may miss or a few Gaussians meet there."""
 CAMERA_ONLY, OF_RADAR = ("PETR", "Far3D"), ("measures.hidden_recall",)
 """What hides from the radar is nothing to a model that reads none."""
 pytestmark = [pytest.mark.slow, pytest.mark.exhaustive]  # test_sweep.py trains one with every other suite
