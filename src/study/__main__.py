@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, pairwise
 
@@ -96,24 +97,29 @@ class Study:
         """What has finished so far, by run id. Raises DataError naming what cannot be read."""
         return read_results_or_raise(self.call.reports, self.scale)
 
-    def findings(self, results: dict[str, RunResult]) -> list[tuple[Claim, list[Finding]]]:
-        """What these results say of each claim. Raises DataError for results that no table takes."""
+    def records(self) -> dict[str, SweepRecord]:
+        """The records there are, by the sweep's name."""
         records: dict[str, SweepRecord] = {}
         for name, command in self.commands.items():
             changes = changes_of(command.sweep.at_scale(self.scale), self.call.common)
             path = record_path(self.call.reports, name, self.scale, changes)
-            try:
+            with suppress(DataError):  # none yet, or one that the runner will replace
                 records[name] = read_record(path)
-            except DataError:  # none yet, or one that the runner will replace
-                continue
-            check_results(records[name], results)
+        return records
+
+    def findings(self, results: dict[str, RunResult]) -> list[tuple[Claim, list[Finding]]]:
+        """What these results say of each claim. Raises DataError for results that no table takes."""
+        records = self.records()
+        for record in records.values():
+            check_results(record, results)
         return [(claim, judge(claim, records, results)) for claim in self.claims]
 
     def plans(self, look: int, results: dict[str, RunResult], before: int = 0) -> list[Plan]:
         """What each sweep trains for a look, without those of which nothing is open any more.
 
         A comparison of fewer than `before` pairs waits for them: partners of runs that are missing tell nothing. Of a
-        claim that one of its measures does not show nothing is open.
+        claim that one of its measures does not show nothing is open. Of a row that decides no claim any seeds will do
+        for the first look, so those of its record that have results stay if they are enough.
         """
         undecided = [found for _, found in self.findings(results) if verdict_of(found) is not Verdict.NOT]
         still = [
@@ -121,12 +127,28 @@ class Study:
             for one in chain.from_iterable(undecided)
             if one.is_open and one.common_seeds >= before
         ]
+        measures = chain.from_iterable(claim.measures for claim in self.claims)
+        deciding = {
+            (one.comparison.sweep, label)
+            for one in measures
+            if one.decides
+            for label in (one.comparison.row, one.comparison.over)
+        }
+        recorded = {
+            (name, label): [seed for seed, run in runs.items() if run in results]
+            for name, record in self.records().items()
+            for label, runs in record.rows.items()
+        }
         first, plans = min(LOOKS), []
         for name, command in self.commands.items():
             rows = {row for one in still if one.sweep == name for row in (one.row, one.over)}
             if look > first and not rows:
                 continue
             seeds = {row.label: range(look if row.label in rows else first) for row in command.sweep.rows}
+            for label in seeds.keys() - rows:
+                there = recorded.get((name, label), [])
+                if (name, label) not in deciding and len(there) >= first:
+                    seeds[label] = there
             plan = make_plan(command.sweep, self.call.common, seeds, self.call.identify)
             plans.append(without_results(plan, command, self.call.outputs, lambda: results))
         return plans

@@ -246,6 +246,26 @@ def test_what_has_a_result_elsewhere_is_not_trained(places, trained, tmp_path):
     assert [new for _, new in calls if new] == [{"none": [1]}]
 
 
+def test_a_row_that_decides_nothing_keeps_the_seeds_that_its_record_has(places, trained, monkeypatch, tmp_path):
+    calls, results = trained
+    monkeypatch.setitem(GAIN, "none", [9.0, -9.0] * 6)
+    asked = json.loads(json.dumps(CLAIMS))
+    asked["claims"][0]["comparisons"][0] |= {"row": "small", "over": "none"}
+    (tmp_path / "claims.yaml").write_text(json.dumps(asked))
+    study.main(places)  # twelve seeds of both
+    (tmp_path / "claims.yaml").write_text(json.dumps(CLAIMS))
+    runs = record_of(tmp_path, "margin").rows["none"]
+    for seed in range(9):
+        del results[runs[seed]]
+    calls.clear()
+    published = [*places, "published=true", f"paths.outputs={tmp_path / 'another'}"]
+    study.main(published)
+    assert not any(new for _, new in calls) and list(record_of(tmp_path, "margin").rows["none"]) == [9, 10, 11]
+    del results[runs[9]]  # two are too few
+    study.main(published)
+    assert ("margin", {"none": [0, 1, 2]}) in calls
+
+
 def test_without_workers_no_look_follows_an_incomplete_one(places, trained, tmp_path, capsys):
     calls, results = trained
     study.main(places)
