@@ -18,6 +18,7 @@ from src.report.sweep_record import RunState, SweepRecord, read_record
 from src.report.sweep_table import SweepTable
 from src.report.table_builder import sweep_tables
 from src.report.time_left import seconds_left
+from src.training.identity import RUN_ID
 
 logger = logging.getLogger(__name__)
 STALLED_S = 120.0
@@ -83,8 +84,9 @@ class Run:
 
     @property
     def parts(self) -> list[str]:
-        """Model, phase, scale and digest, from its name."""
-        return self.run_id.rsplit("-", 3) if self.run_id.count("-") >= 3 else [self.run_id, "", "", ""]
+        """Model, phase, scale and digest, from its name; of a folder named otherwise its name and nothing."""
+        named = RUN_ID.fullmatch(self.run_id)
+        return list(named.groups()) if named else [self.run_id, "", "", ""]
 
     @property
     def phase(self) -> str:

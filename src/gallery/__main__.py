@@ -118,7 +118,8 @@ def read_boxes(folder: RunFolder, datamodule: DetectionDataModule) -> DetectionT
 
 def short_names(runs: list[str]) -> list[str]:
     """Model and phase of each run id, or the whole name where several have the same."""
-    short = [" ".join(run.split("-")[:2]) if RUN_ID.fullmatch(run) else run for run in runs]
+    named = [RUN_ID.fullmatch(run) for run in runs]
+    short = [f"{name['model']} {name['phase']}" if name else run for name, run in zip(named, runs, strict=True)]
     return [name if short.count(name) == 1 else run for name, run in zip(short, runs, strict=True)]
 
 

@@ -107,7 +107,8 @@ def check_rows(record: SweepRecord, results: dict[str, RunResult]) -> None:
 def _experiment(result: RunResult) -> tuple[object, ...]:
     """What the runs of a row have in common; the run whose weights each begins with is of its seed, named or not."""
     source = result.config.get("phase", {}).get("init_from")
-    phase = source.split("-")[1] if RUN_ID.fullmatch(str(source)) else source
+    named = RUN_ID.fullmatch(str(source))
+    phase = named["phase"] if named else source
     config = without_keys(without_legacy_defaults(result.config), ["seed", "phase.init_from"])
     return result.model, result.phase, phase, config or result.settings
 

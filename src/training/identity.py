@@ -57,7 +57,7 @@ At this value a key is no part of an identity, and a checkpoint without the key 
 _NUMBER = re.compile(r"(?<![\w.+-])[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?(?![\w.+-])")
 """A number that is not part of a word, such as a run id."""
 
-RUN_ID = re.compile(r"[a-z0-9_]+-[a-z0-9_]+-[a-z0-9_]+-[0-9a-f]{8}")
+RUN_ID = re.compile(r"(?P<model>[a-z0-9_]+)-(?P<phase>[a-z0-9_]+)-(?P<scale>[a-z0-9_]+)-(?P<digest>[0-9a-f]{8})")
 """What `run_identity` returns."""
 
 
