@@ -5,6 +5,7 @@ import logging
 import os
 import signal
 import sys
+import time
 import types
 from functools import partial
 from pathlib import Path
@@ -224,10 +225,19 @@ def start_real(tmp_path, environment=(), *, offline=True, earlier=(), steps=(), 
 
 
 def history_of(path):
-    """Rows of a .wandb file as W&B would send them: {step: values}. Blocks of 32 KiB with records in fragments."""
+    """Rows of the .wandb file of an ended run as W&B would send them: {step: values}. Blocks of 32 KiB with records in
+    fragments. W&B's own process writes them, and may end a moment after ours.
+    """
+    until = time.monotonic() + 30.0
+    while not (rows := rows_of(path.read_bytes())) and time.monotonic() < until:
+        time.sleep(0.1)
+    return rows
+
+
+def rows_of(content):
     from wandb.proto import wandb_internal_pb2
 
-    content, at, record, rows = path.read_bytes(), 7, b"", {}
+    at, record, rows = 7, b"", {}
     while at + 7 <= len(content):
         if 2**15 - at % 2**15 < 7:  # no room for a header: the block's end is padding
             at += 2**15 - at % 2**15
