@@ -54,7 +54,7 @@ train: $(STAMP) ## train PHASE=1|1_further|2 [MODEL=lrs4fusion: all its phases] 
 sweep: $(STAMP) ## train every row of SWEEP=epsilon and write its tables [ARGS="seeds=3 workers=2 dry_run=true"]
 	$(PYTHON) -m src.sweep +sweep=$(SWEEP) $(SCALE_ARG) $(ARGS)
 
-study: $(STAMP) ## train the sweeps of the paper's claims, with as many seeds as each needs, and the others with three [ARGS="workers=2 dry_run=true"]
+study: $(STAMP) ## train the sweeps of the paper's claims and the others with three seeds, then more for claims that are open [ARGS="workers=2 dry_run=true"]
 	$(PYTHON) -m src.study $(SCALE_ARG) $(ARGS)
 
 report: $(STAMP) ## everything finished into reports/: results, tables, pages, dashboard.html; shows the page of PHASE

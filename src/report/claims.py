@@ -56,6 +56,7 @@ class ClaimConfig:
     sentence: str
     source: str  # of the paper
     because: str = ""  # what its questions have answered at the default scale, in words
+    verdict: Verdict | None = None  # that these words are about
     comparisons: Many[ComparisonConfig]
 
 
@@ -108,6 +109,7 @@ class Finding:
     found: Comparison | None  # at the look it stands at
     common_seeds: int  # that both rows have; those of `found` are the pairs that count
     runs: list[tuple[RunResult, RunResult]]  # behind it, of the first row and of the second, by seed
+    lacking: list[str] = field(default_factory=list)  # finished runs, by id, whose results have no such number
 
     @property
     def verdict(self) -> Verdict:
@@ -157,6 +159,8 @@ def load_claims(load_sweep: Callable[[str], SweepConfig], path: Path = CLAIMS) -
             except ConfigError as error:
                 raise ConfigError(f"{here}: {error}") from error
             claims[-1].measures.extend(_measures(comparison, sweep, file.half_width, here))
+        if bool(config.because) != (config.verdict is not None):
+            raise ConfigError(f"{where}, claim {config.name}: because and the verdict that it is of go together")
         if not any(measure.decides for measure in claims[-1].measures):
             raise ConfigError(f"{where}, claim {config.name}: all of comparisons ask why; name one that decides")
     return claims
@@ -201,9 +205,11 @@ def _measures(comparison: ComparisonConfig, sweep: SweepConfig, half_width: floa
 def judge(claim: Claim, records: Mapping[str, SweepRecord], results: Mapping[str, RunResult]) -> list[Finding]:
     """What the finished runs of the sweeps' records (by the sweep's name) say of a claim, measure by measure."""
     findings = []
+    runs_of = functools.cache(lambda name, label: _runs(records.get(name), sweeps[name], label, results))
+    sweeps = {measure.comparison.sweep: measure.sweep for measure in claim.measures}
     for measure in claim.measures:
-        labels, record = (measure.comparison.row, measure.comparison.over), records.get(measure.comparison.sweep)
-        first, second = (_runs(record, measure.sweep, label, results) for label in labels)
+        compared = measure.comparison
+        first, second = (runs_of(compared.sweep, label) for label in (compared.row, compared.over))
         values = [
             {
                 seed: measure.metric.scale * run.metrics[measure.metric.name]
@@ -215,7 +221,13 @@ def judge(claim: Claim, records: Mapping[str, SweepRecord], results: Mapping[str
         found = compare_at_looks(*values, measure.half_width, measure.metric.digits)
         common = sorted(values[0].keys() & values[1].keys())
         used = [(first[seed], second[seed]) for seed in common[: found.pairs if found else 0]]
-        findings.append(Finding(measure, found, len(common), used))
+        lacking = [
+            runs[seed].run_id
+            for runs, known in zip((first, second), values, strict=True)
+            for seed in runs
+            if seed not in known
+        ]
+        findings.append(Finding(measure, found, len(common), used, lacking))
     return findings
 
 

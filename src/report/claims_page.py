@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 
 from src.report.claims import Claim, Finding, Verdict, verdict_of
@@ -11,6 +12,8 @@ from src.report.results import RunResult
 from src.report.sweep_record import SweepRecord
 from src.report.sweep_table import MISSING, format_paper
 from src.report.sweep_text import SYNTHETIC, describe_epochs, describe_machines, describe_starts, sweep_settings
+
+logger = logging.getLogger(__name__)
 
 HEADS = ("claim", "measure", "paper", "here", "seeds", "verdict", "command")
 REASON_HEADS = ("claim", "question", "rows", "here", "command")
@@ -52,11 +55,18 @@ def claims_page(
         f"## What was run\n\n{_what_was_run(findings, records, scale)}",
         f"## The claims\n\n{RULE}\n\n{_table(findings, scale)}",
     ]
-    words = [
-        f"* **{number}** {escape_markdown(claim.config.because)}"
-        for number, (claim, found) in enumerate(findings, start=1)
-        if in_words and claim.config.because and is_answered(found)
-    ]
+    words = []
+    for number, (claim, found) in enumerate(findings, start=1):
+        if not in_words or not claim.config.because or not is_answered(found):
+            continue
+        if claim.config.verdict is verdict_of(found):
+            words.append(f"* **{number}** {escape_markdown(claim.config.because)}")
+        else:
+            logger.warning(
+                "claims.yaml, claim %s: because speaks of the verdict %r, but the results say %r; it is left out until "
+                "both are written anew",
+                *(claim.config.name, str(claim.config.verdict), str(verdict_of(found))),
+            )
     if why is not None:
         parts += [f"## Why\n\nWhat lies behind the claims: [the numbers]({why})."]
         parts += ["\n".join(words)] if words else []

@@ -159,7 +159,7 @@ def _compared(
         others = [] if table.baselines else [other.runs for other in table.rows[place + 1 :]]
         for other in [record.rows[row.baseline]] if row.baseline in record.rows else others:
             for seed, run_id in row.runs.items():
-                if run_id in results and other.get(seed) in results:
+                if run_id != other.get(seed) and {run_id, other.get(seed)} <= results.keys():
                     yield results[run_id], results[other[seed]]
 
 

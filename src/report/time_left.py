@@ -6,6 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection
 
 from src.report.sweep_record import RunState, SweepRecord
+from src.training.identity import key_of
 
 
 def progress_of(record: SweepRecord, workers: int, now: float) -> str:
@@ -29,8 +30,9 @@ def progress_line(name: str, runs: Collection[RunState], workers: int, now: floa
 
 
 def seconds_left(runs: Collection[RunState], workers: int, now: float, unchosen: int = 0) -> float | None:
-    """Seconds until all runs end, at the mean duration of their phase's finished ones; None before any has finished."""
-    of_phase: dict[str, list[float]] = defaultdict(list)
+    """Seconds until all runs end, at the mean duration of the finished ones of as many epochs of their phase; None
+    before any has finished."""
+    of_phase: dict[tuple[str, ...], list[float]] = defaultdict(list)
     for run in runs:
         if run.state == "done" and run.started is not None and run.ended is not None:
             of_phase[_phase(run)].append(max(0.0, run.ended - run.started))
@@ -59,5 +61,6 @@ def duration(seconds: float) -> str:
     return f"{minutes // 1440} d {minutes % 1440 // 60} h"
 
 
-def _phase(run: RunState) -> str:
-    return run.run_id.rpartition("-")[0]  # <model>-<phase>-<scale>
+def _phase(run: RunState) -> tuple[str, ...]:
+    """Model, phase and scale, and the epochs if they are not those of the phase: 0 of what is only scored."""
+    return run.run_id.rpartition("-")[0], *(one for one in run.overrides if key_of(one) == "phase.epochs")

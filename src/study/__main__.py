@@ -2,13 +2,14 @@
 
 At the first of `LOOKS` every row of every sweep is trained, sweep by sweep in the order of the claims, those that no
 claim names last; at each later one the rows of the comparisons that are still open, unless pairs of the look before are
-missing. How they are decided: docs/scores.md.
+missing. What fails costs nothing else and is not tried again in the same call. How claims are decided: docs/scores.md.
 """
 
 from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, pairwise
@@ -16,11 +17,11 @@ from itertools import chain, pairwise
 from src.errors import ConfigError, DataError, HorizonError, InterruptedRunError
 from src.reliability.command import run_command
 from src.reliability.passwords import hide_in_process_list
-from src.report.claims import Claim, Finding, Verdict, judge, load_claims, verdict_of
+from src.report.claims import Claim, ComparisonConfig, Finding, Verdict, judge, load_claims, verdict_of
 from src.report.comparisons import LOOKS
 from src.report.results import RunResult, read_results_or_raise
 from src.report.sweep_record import RunState, SweepRecord, read_record, record_path
-from src.report.table_builder import check_results
+from src.report.table_builder import check_results, is_current
 from src.report.time_left import progress_line
 from src.sweep.compose import SweepCommand, compose_sweep
 from src.sweep.plan import Plan, changes_of, make_plan
@@ -60,23 +61,33 @@ def main(overrides: list[str]) -> None:
     if study.options.dry_run:
         print(study.describe())
         return
-    problems = []
+    problems: dict[str, str] = {}  # by sweep, as it stands after its last look
     for before, look in pairwise((0, *LOOKS)):
-        plans = study.plans(look, study.results(), before)
-        for plan in plans:
-            if not study.options.workers and not study.worth_recording(plan, look):
+        steps = study.steps(look, study.results(), before)
+        for step in steps:
+            if not study.options.workers and not study.worth_recording(step, look):
                 continue
-            logger.info("%s", study.progress(plans, look, study.results()))
-            command = study.commands[plan.sweep.name]
+            logger.info("%s", study.progress(steps, look, study.results()))
+            name = step.plan.study
+            problems.pop(name, None)
             try:
-                run_plan(plan, command, study.call)
+                run_plan(step.plan, study.commands[step.plan.sweep.name], study.call)
             except InterruptedRunError:
                 raise
             except HorizonError as error:  # costs no other sweep
-                problems.append(f"{plan.study}: {error}")
+                problems[name] = f"{name}: {error}"
+                logger.error("%s", problems[name])  # at once: whatever else may end this call, it has been said
     print(study.verdicts())
     if problems:
-        raise HorizonError("\n".join(problems))
+        raise HorizonError("\n".join(problems.values()))
+
+
+@dataclass(frozen=True)
+class SweepAtLook:
+    """A sweep at one look."""
+
+    plan: Plan
+    rows: list[str]  # those that the look is for: at the first all, later those of open comparisons
 
 
 @dataclass
@@ -114,12 +125,12 @@ class Study:
             check_results(record, results)
         return [(claim, judge(claim, records, results)) for claim in self.claims]
 
-    def plans(self, look: int, results: dict[str, RunResult], before: int = 0) -> list[Plan]:
+    def steps(self, look: int, results: dict[str, RunResult], before: int = 0) -> list[SweepAtLook]:
         """What each sweep trains for a look, without those of which nothing is open any more.
 
         A comparison of fewer than `before` pairs waits for them: partners of runs that are missing tell nothing. Of a
-        claim that one of its measures does not show nothing is open. Of a row that decides no claim any seeds will do
-        for the first look, so those of its record that have results stay if they are enough.
+        claim that one of its measures does not show nothing is open. Raises ConfigError where the command line makes
+        one run of both rows of a comparison.
         """
         undecided = [found for _, found in self.findings(results) if verdict_of(found) is not Verdict.NOT]
         still = [
@@ -127,57 +138,81 @@ class Study:
             for one in chain.from_iterable(undecided)
             if one.is_open and one.common_seeds >= before
         ]
-        measures = chain.from_iterable(claim.measures for claim in self.claims)
-        deciding = {
-            (one.comparison.sweep, label)
-            for one in measures
-            if one.decides
-            for label in (one.comparison.row, one.comparison.over)
-        }
-        recorded = {
-            (name, label): [seed for seed, run in runs.items() if run in results]
-            for name, record in self.records().items()
-            for label, runs in record.rows.items()
-        }
-        first, plans = min(LOOKS), []
+        first, steps = min(LOOKS), []
         for name, command in self.commands.items():
-            rows = {row for one in still if one.sweep == name for row in (one.row, one.over)}
+            labels = [row.label for row in command.sweep.rows]
+            rows = {label for one in still if one.sweep == name for label in (one.row, one.over)}
             if look > first and not rows:
                 continue
-            seeds = {row.label: range(look if row.label in rows else first) for row in command.sweep.rows}
-            for label in seeds.keys() - rows:
-                there = recorded.get((name, label), [])
-                if (name, label) not in deciding and len(there) >= first:
-                    seeds[label] = there
+            seeds: dict[str, Sequence[int]] = {label: range(look if label in rows else first) for label in labels}
+            seeds |= self.recorded_seeds(name, results)
             plan = make_plan(command.sweep, self.call.common, seeds, self.call.identify)
-            plans.append(without_results(plan, command, self.call.outputs, lambda: results))
-        return plans
+            for one in self.deciding(name):
+                for _, run_id in plan.rows[one.row].items() & plan.rows[one.over].items():
+                    raise ConfigError(
+                        f"the command line makes one run, {run_id}, of {one.row!r} and {one.over!r} of "
+                        f"sweeps/{name}.yaml, which a claim compares; leave out what these rows set themselves"
+                    )
+            plan = without_results(plan, command, self.call.outputs, lambda: results)
+            steps.append(SweepAtLook(plan, [label for label in labels if look == first or label in rows]))
+        return steps
 
-    def worth_recording(self, plan: Plan, look: int) -> bool:
+    def deciding(self, sweep: str) -> list[ComparisonConfig]:
+        """The comparisons of a sweep that decide claims, each once for every measure of it that does."""
+        measures = chain.from_iterable(claim.measures for claim in self.claims)
+        return [one.comparison for one in measures if one.decides and one.comparison.sweep == sweep]
+
+    def recorded_seeds(self, sweep: str, results: dict[str, RunResult]) -> dict[str, Sequence[int]]:
+        """Seeds of rows that decide no claim, for which any will do: those of the record, where they are enough.
+
+        Counted are runs that would not be trained, and that are what the row still says.
+        """
+        record, command = self.records().get(sweep), self.commands[sweep]
+        if record is None:
+            return {}
+        deciding = {label for one in self.deciding(sweep) for label in (one.row, one.over)}
+        if command.workers and not command.published:
+            results = {run: one for run, one in results.items() if is_finished_with_score(self.call.outputs / run)}
+        there: dict[str, Sequence[int]] = {
+            row.label: [
+                seed for seed, run in record.rows.get(row.label, {}).items() if is_current(record, run, results)
+            ]
+            for row in command.sweep.rows
+        }
+        planned = make_plan(command.sweep, self.call.common, there, self.call.identify).rows
+        kept = {
+            label: [seed for seed, run in runs.items() if run == record.rows[label][seed]]
+            for label, runs in planned.items()
+            if label not in deciding
+        }
+        return {label: seeds for label, seeds in kept.items() if len(seeds) >= min(LOOKS)}
+
+    def worth_recording(self, step: SweepAtLook, look: int) -> bool:
         """Whether to record a look without training: the first if any run is finished, a later one if all pairs of a
         comparison are.
 
         Finished are runs with a score here or with a published result.
         """
+        plan = step.plan
         finished = {
-            label: [run in plan.published or is_finished_with_score(self.call.outputs / run) for run in runs.values()]
-            for label, runs in plan.rows.items()
-            if len(runs) == look
+            label: [
+                run in plan.published or is_finished_with_score(self.call.outputs / run)
+                for run in plan.rows[label].values()
+            ]
+            for label in step.rows
         }
         if look == min(LOOKS):
             return any(chain.from_iterable(finished.values()))
-        measures = chain.from_iterable(claim.measures for claim in self.claims)
-        compared = [one.comparison for one in measures if one.decides and one.comparison.sweep == plan.sweep.name]
         complete = {label for label, runs in finished.items() if all(runs)}
-        return any({one.row, one.over} <= complete for one in compared)
+        return any({one.row, one.over} <= complete for one in self.deciding(plan.sweep.name))
 
-    def progress(self, plans: list[Plan], look: int, results: dict[str, RunResult]) -> str:
+    def progress(self, steps: list[SweepAtLook], look: int, results: dict[str, RunResult]) -> str:
         """How far a look is, over all its sweeps, and the time left as far as runs finished here tell it."""
         runs = {}
-        for spec in (spec for plan in plans for spec in plan.specs.values()):
+        for spec in (spec for step in steps for spec in step.plan.specs.values()):
             done = is_finished_with_score(self.call.outputs / spec.run_id)
             took = results[spec.run_id].training_s if done and spec.run_id in results else None
-            counts = done or any(spec.run_id in plan.published for plan in plans)
+            counts = done or any(spec.run_id in step.plan.published for step in steps)
             state = "done" if counts else "waiting"
             runs[spec.run_id] = RunState(**spec.stored, state=state, started=None if took is None else 0.0, ended=took)
         name = f"study at scale {self.scale}, {look} seeds"
@@ -187,21 +222,25 @@ class Study:
         """The plan as text: what each look trains, later ones if what is open now stays so; then the verdicts."""
         results, lines = self.results(), []
         for look in LOOKS:
-            plans = self.plans(look, results)
-            if not plans:
+            steps = self.steps(look, results)
+            if not steps:
                 continue
-            lines.append(f"# {self.progress(plans, look, results)}{ALL_OPEN if look > min(LOOKS) else ''}")
-            for plan in plans:
-                rows = [label for label, runs in plan.rows.items() if len(runs) == look]
-                lines.append(f"#   {plan.sweep.name}: {'; '.join(rows)}")
+            lines.append(f"# {self.progress(steps, look, results)}{ALL_OPEN if look > min(LOOKS) else ''}")
+            lines += [f"#   {step.plan.sweep.name}: {'; '.join(step.rows)}" for step in steps]
         return "\n".join([*lines, self.verdicts()])
 
     def verdicts(self) -> str:
-        """A line per claim."""
-        return "\n".join(
-            f"{claim.config.name}: {verdict_of(found)} ({claim.config.sentence})"
-            for claim, found in self.findings(self.results())
-        )
+        """A line per claim, followed by one for each of its measures that finished runs lack."""
+        lines = []
+        for claim, found in self.findings(self.results()):
+            lines.append(f"{claim.config.name}: {verdict_of(found)} ({claim.config.sentence})")
+            lines += [
+                f"  {one.measure.comparison.text}: no {one.measure.metric.name} in the results of "
+                f"{', '.join(one.lacking)}, whose pairs do not count"
+                for one in found
+                if one.measure.decides and one.lacking
+            ]
+        return "\n".join(lines)
 
 
 def read_study(overrides: list[str]) -> Study:

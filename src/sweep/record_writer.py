@@ -110,7 +110,7 @@ class RecordWriter:
                 if seed in by_seed or _settings(known) not in settings:
                     continue
                 state = self._current_state(known, latest)
-                if state.state != "waiting":
+                if state.state not in ("waiting", "failed"):  # this command trains neither
                     by_seed[seed] = run_id
                     record.runs.setdefault(run_id, state)
                     if known.needs in earlier.runs:

@@ -12,7 +12,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -99,6 +99,7 @@ class SweepCall:
     outputs: Path
     reports: Path
     resume_command: str
+    failed: dict[str, str] = field(default_factory=dict)  # reasons by run id; a later sweep does not train them again
 
     @classmethod
     def of(cls, sweep: SweepConfig, common: list[str], resume_command: str) -> tuple[Self, Config]:
@@ -152,7 +153,7 @@ def run_plan(plan: Plan, command: SweepCommand, call: SweepCall) -> None:
     if plan.sweep.is_search:
         runner = Search(plan, study, writer, launcher, publish, call.common, call.identify)
     else:
-        runner = Runner(plan, study, writer, launcher, publish)
+        runner = Runner(plan, study, writer, launcher, publish, failed=call.failed)
     record = runner.run()
     if runner.stop.requested:
         print(progress_of(record, command.workers, time.time()))

@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -53,6 +53,7 @@ class Runner:
     writer: RecordWriter
     launcher: Launcher
     publish: Callable[[Path], object]  # a finished run's folder
+    failed: dict[str, str] = field(default_factory=dict, kw_only=True)  # reasons by run id; not trained again
 
     def __post_init__(self) -> None:
         self.outputs = self.writer.outputs
@@ -165,22 +166,25 @@ class Runner:
     def _next(self, trials: list[SweepTrial]) -> tuple[RunSpec | None, bool]:
         """(the next run to train, whether all are done or have failed); the lock is held."""
         latest = {trial.run_id: trial for trial in trials if trial.run_id is not None}
-        failed: dict[str, str] = {}
         settled = True
         for spec in self.plan.specs.values():  # in training order: a source comes before the runs that start from it
             trial = latest.get(spec.run_id)
             if self.writer.is_done(spec.run_id):
+                self.failed.pop(spec.run_id, None)
                 continue
             if trial is not None and trial.state == "failed" and trial.number >= self._first_own:
-                failed[spec.run_id] = trial.reason or ""
+                self.failed[spec.run_id] = trial.reason or ""
                 continue
             if trial is not None and trial.state == "running":
+                self.failed.pop(spec.run_id, None)
                 settled = False
                 continue
-            if spec.needs in failed:
-                reason = f"{spec.needs}, which it starts from, failed: {failed[spec.needs]}"
+            reason = self.failed.get(spec.run_id)
+            if reason is None and spec.needs in self.failed:
+                reason = f"{spec.needs}, which it starts from, failed: {self.failed[spec.needs]}"
+            if reason is not None:
                 self.study.add_failed(spec.stored, reason)
-                failed[spec.run_id] = reason
+                self.failed[spec.run_id] = reason
                 continue
             settled = False
             if spec.needs is None or self.writer.is_done(spec.needs):

@@ -86,9 +86,12 @@ def test_a_file_without_claims_is_refused(tmp_path):
 
 
 def test_a_file_that_is_none_is_named(claims_of, tmp_path):
+    words = {"name": "a", "sentence": "s", "source": "t", "comparisons": [COMPARISON]}
     for file, message in (
         ({"half_widht": 1.0}, "half_widht is not a known key; did you mean half_width"),
         ({"half_width": "wide"}, "half_width must be a valid number"),
+        ({"claims": [words | {"because": "So it is."}]}, "claim a: because and the verdict that it is of go together"),
+        ({"claims": [words | {"verdict": "shown", "because": "So."}]}, "verdict"),
         ({"claims": [{"name": "a", "sentence": "s", "source": "t", "comparisons": []}]}, "claim a: comparisons is em"),
         ({"claims": [{"name": "a", "sentence": "s", "source": "t", "comparisons": []}] * 2}, "claim a stands more"),
     ):
@@ -200,6 +203,13 @@ def test_runs_of_a_row_as_its_file_said_it_before_do_not_count(judged, caplog, o
     (found,) = judged(values, overrides=[override])
     assert found.verdict is (Verdict.SHOWS if same else Verdict.NOT_RUN)
     assert ("has no row 'large' as sweeps/ defines it" in caplog.text) != same
+
+
+def test_finished_runs_without_the_number_are_named(judged):
+    (finding,) = judged({"large": [12.0, 12.1, 11.9], "small": [10.0] * 3}, {"metrics": ["measures.moving_AP"]})
+    assert finding.verdict is Verdict.NOT_RUN and len(finding.lacking) == 6
+    (finding,) = judged({"large": [12.0, 12.1, 11.9], "small": [10.0, None, 10.0]})
+    assert finding.lacking == []  # what has not run lacks nothing
 
 
 def test_committed_records_know_every_row_that_the_claims_name(caplog):

@@ -34,6 +34,15 @@ def test_each_phase_takes_what_its_finished_runs_took():
     assert seconds_left(runs, 1, NOW) == pytest.approx(80.0 + 100.0)  # of any phase
 
 
+def test_what_is_only_scored_says_nothing_of_what_is_trained():
+    runs = record_of(took=(100.0, 200.0, 600.0), **STATES).runs
+    runs["m-phase1-mini-0"].overrides = ["phase.epochs=0"]
+    runs["m-phase1-mini-2"].state = "waiting"
+    assert seconds_left(runs.values(), 1, NOW) == pytest.approx(200.0 + 600.0)
+    runs["m-phase1-mini-2"].overrides = ["phase.epochs=0"]
+    assert seconds_left(runs.values(), 1, NOW) == pytest.approx(100.0 + 600.0)
+
+
 def test_progress_is_told_in_a_line():
     line = progress_of(record_of(**STATES, phase1_3="failed"), 1, NOW)
     assert line == "a: 3 of 6 done, 1 running, 1 left, 1 failed, time left unknown yet"

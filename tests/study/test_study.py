@@ -197,11 +197,11 @@ def test_time_left_is_that_of_runs_finished_here(places, trained):
     _, results = trained
     study.main(places)
     here = study.read_study([*places, "workers=2"])
-    plans = here.plans(12, {})  # as if no claim had a result: all is open
-    assert here.progress(plans, 12, results) == (
+    steps = here.steps(12, {})  # as if no claim had a result: all is open
+    assert here.progress(steps, 12, results) == (
         "study at scale debug, 12 seeds: 21 of 51 done, 0 running, 30 left, about 15 min left"
     )
-    assert here.progress(plans, 12, {}).endswith("30 left, time left unknown yet")
+    assert here.progress(steps, 12, {}).endswith("30 left, time left unknown yet")
 
 
 def test_results_that_no_table_takes_are_refused(places, trained):
@@ -236,6 +236,51 @@ def test_a_sweep_that_fails_costs_no_other(places, trained, monkeypatch, capsys)
         study.main(places)
 
 
+def test_a_sweep_that_is_whole_at_its_next_look_has_not_failed(places, trained, monkeypatch, capsys):
+    run_plan, failed = study.run_plan, []
+
+    def failing(plan, *rest):
+        run_plan(plan, *rest)
+        if plan.sweep.name == "layers" and not failed:
+            failed.append(plan)
+            raise HorizonError("the table could not be written")
+
+    monkeypatch.setattr(study, "run_plan", failing)
+    study.main(places)
+    assert failed and "layers: shows" in capsys.readouterr().out
+
+
+def test_a_failure_is_told_whatever_ends_the_study(places, trained, monkeypatch, caplog):
+    def failing(plan, *_):
+        raise HorizonError("1 of 9 runs failed") if plan.sweep.name == "margin" else InterruptedRunError("stopped")
+
+    monkeypatch.setattr(study, "run_plan", failing)
+    with pytest.raises(InterruptedRunError):
+        study.main(places)
+    assert "margin-debug: 1 of 9 runs failed" in caplog.text
+
+
+def test_finished_runs_that_lack_what_decides_are_named(places, trained, capsys, tmp_path):
+    _, results = trained
+    study.main(places)
+    lacking = record_of(tmp_path, "layers").rows["one"][1]
+    results[lacking].metrics["mAP"] = None
+    capsys.readouterr()
+    study.main([*places, "workers=0"])
+    said = capsys.readouterr().out
+    assert f"\n  two over one: no mAP in the results of {lacking}, whose pairs do not count" in said
+
+
+def test_rows_that_the_command_line_makes_one_run_are_refused(places, trained, tmp_path):
+    calls, _ = trained
+    path = tmp_path / "sweeps" / "layers.yaml"
+    path.write_text(path.read_text().replace("model.layers", "model.ocsf.num_layers"))
+    message = "makes one run, .*, of 'two' and 'one' of sweeps/layers.yaml, which a claim compares; leave out"
+    with pytest.raises(ConfigError, match=message):
+        study.main([*places, "model.ocsf.num_layers=2"])
+    assert not calls
+
+
 def test_what_has_a_result_elsewhere_is_not_trained(places, trained, tmp_path):
     calls, results = trained
     study.main(places)
@@ -261,6 +306,16 @@ def test_a_row_that_decides_nothing_keeps_the_seeds_that_its_record_has(places, 
     published = [*places, "published=true", f"paths.outputs={tmp_path / 'another'}"]
     study.main(published)
     assert not any(new for _, new in calls) and list(record_of(tmp_path, "margin").rows["none"]) == [9, 10, 11]
+
+    def planned(*overrides):
+        return list(study.read_study([*published, *overrides]).steps(3, results)[0].plan.rows["none"])
+
+    assert planned() == [9, 10, 11] and planned("published=false") == [0, 1, 2]  # it would train all of them
+    path = tmp_path / "sweeps" / "margin.yaml"
+    said = path.read_text()
+    path.write_text(said.replace("model.margin=none", "model.margin=nothing"))
+    assert planned() == [0, 1, 2]
+    path.write_text(said)
     del results[runs[9]]  # two are too few
     study.main(published)
     assert ("margin", {"none": [0, 1, 2]}) in calls

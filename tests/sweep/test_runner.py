@@ -204,6 +204,29 @@ def test_earlier_seeds_of_a_row_that_scores_weights_stay(tmp_path):
     assert sorted(record.rows["scored"]) == [0, 1] and record.count("done") == 4
 
 
+def test_a_failed_seed_of_an_earlier_command_is_no_failure_of_one_without_it(tmp_path):
+    sweep = make_sweep({"a": ["model.x=1"]})
+    bad = fault(tmp_path, ["model.x=1", "seed=1"], "5")
+    assert make_runner(tmp_path, sweep, seeds=(0, 1)).run().runs[bad].state == "failed"
+    assert list(make_runner(tmp_path, sweep, seeds=(0,)).run().rows["a"]) == [0]
+    assert make_runner(tmp_path, sweep, seeds=(0, 1)).run().count("done") == 2
+
+
+def test_what_failed_in_a_sweep_of_the_same_call_is_not_trained_again(tmp_path):
+    rows = {"bad": ["model.x=1"], "two": ["model.x=1", "phase=phase2"], "good": ["model.x=2"]}
+    first = make_runner(tmp_path, make_sweep({"bad": ["model.x=1"]}))
+    bad = fault(tmp_path, ["model.x=1", "seed=0"], "5")
+    first.run()
+    again = make_runner(tmp_path, make_sweep(rows), common=["optim.lr=0.01"])
+    assert first.failed.keys() == {bad} and not again.failed
+    second = make_runner(tmp_path, make_sweep(rows))
+    second.failed = first.failed
+    record = second.run()
+    assert record.runs[bad].reason == first.failed[bad] and trained(tmp_path, "begin")[bad] == 1
+    assert record.count("done") >= 1 and trained(tmp_path)[record.rows["good"][0]] == 1
+    assert make_runner(tmp_path, make_sweep(rows)).run().count("failed") == 0  # the next call does
+
+
 def test_another_command_line_is_another_sweep_beside_the_first(tmp_path):
     sweep = make_sweep({"a": ["model.x=1"]})
     plain = make_runner(tmp_path, sweep).run()
