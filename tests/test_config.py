@@ -15,6 +15,11 @@ from src.training.identity import LEGACY_DEFAULTS, run_identity, without_keys
 from src.training.optim import cycle_value
 from tests.running import command
 
+TERMS = [
+    "heatmap", "box", "keypoint", "depth", "radar_objectness", "occupancy_focal", "occupancy_dice", "cell_focal",
+    "cell_dice", "cell_lovasz", "cell_velocity", "gaussian_velocity",
+]  # fmt: skip
+"""Of Horizon3D's loss."""
 SCALES = sorted(p.stem for p in (CONF / "scale").glob("*.yaml"))
 
 
@@ -271,6 +276,10 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (
             ["model=centerpoint", "model.loss.heatmap_weight=null", "model.loss.box_weight=null"],
             "heatmap_weight, box_weight are all null.*give one",
+        ),
+        (
+            [f"model.loss.{name}_weight=null" for name in TERMS],
+            "heatmap_weight, .*gaussian_velocity_weight are all null.*give one",
         ),
         (["data.world.num_train_scenes=-1"], "num_train_scenes"),
         (["scale=paper"], "data.root has no value"),

@@ -43,7 +43,7 @@ def sigmoid_focal(
     return _Focal.apply(logits, torch.rsub(positive, 1, alpha=2), scale, None)
 
 
-def occupancy_focal(
+def balanced_focal(
     logits: Tensor,  # [M]
     occupied: Tensor,  # [K] int64, rows that are, each once
 ) -> Tensor:  # []

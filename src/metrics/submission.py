@@ -268,14 +268,14 @@ def to_ego(
     table: DetectionTable,
     global_from_ego: Array,  # [4, 4] float64 rotation and translation
 ) -> Boxes3D:
-    """Rows of a table, of one sample, in its ego frame: what `to_global` undoes."""
+    """Rows of a table, of one sample, in its ego frame: what `to_global` undoes, velocities along the ego's ground."""
     ego_from_global = invert_rigid(global_from_ego)
     rotation = ego_from_global[:3, :3]
     floats = {
         "centers": table.centers @ rotation.T + ego_from_global[:3, 3],
         "sizes": table.sizes[:, [1, 0, 2]],
         "yaws": yaw_of(rotation @ quaternion_to_matrix(table.rotations)),
-        "velocities": table.velocities @ rotation[:2, :2].T,
+        "velocities": table.velocities @ np.linalg.inv(global_from_ego[:2, :2]).T,
         "scores": table.scores,
     }
     integers = {"labels": table.labels, "attributes": table.attributes, "num_points": table.num_points}

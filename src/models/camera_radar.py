@@ -58,7 +58,7 @@ class CameraRadarConfig(ModelConfig):
 class CameraRadarOutput:
     """One frame through the model."""
 
-    views: LiftedViews
+    lifted: LiftedViews
     radar_bev: Tensor  # [B, C_radar, rows, cols]
     fused_bev: Tensor  # [B, C_fused, rows, cols]
     head: HeadOutput
@@ -120,7 +120,7 @@ class CameraRadarDetector(Detector):
         terms, counts = self.head.loss(output.head, batch.boxes, weights.heatmap_weight, weights.box_weight)
         if weights.depth_weight is not None:
             target = self.view_transform.depth_target(batch, self.image_encoder.image_size_px)
-            total = depth_cross_entropy(output.views.depth_logits.flatten(0, 1), target)
+            total = depth_cross_entropy(output.lifted.depth_logits.flatten(0, 1), target)
             terms["depth"] = weights.depth_weight * total / mean_over_ranks((target >= 0).sum())
         return Objective(terms, counts)
 
@@ -129,6 +129,6 @@ class CameraRadarDetector(Detector):
         frames = len(output.radar_bev)
         return {
             "pillars": output.radar_bev.any(dim=1).sum() / frames,
-            "lifted_pairs": output.views.num_lifted / frames,
-            "depth_confidence": output.views.depth_logits.float().softmax(2).amax(2).mean(),
+            "lifted_pairs": output.lifted.num_lifted / frames,
+            "depth_confidence": output.lifted.depth_logits.float().softmax(2).amax(2).mean(),
         }

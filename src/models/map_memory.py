@@ -42,7 +42,7 @@ class MapMemory(FrameMemory[MapFrame]):
 
 
 @dataclass
-class WarpedMaps:
+class RecalledMaps:
     """Past maps and their motion to the current augmented frame, newest first; `TemporalFusion.maps` resamples them."""
 
     frames: tuple[MapFrame, ...]  # of the batch's past (`FrameMemory.before`), at most as many as configured
@@ -73,24 +73,24 @@ class TemporalFusion(nn.Module):
         memory: MapMemory | None,
         batch: FrameBatch,
         fused: Tensor,  # [B, C, rows, cols]
-    ) -> tuple[Tensor, WarpedMaps, MapMemory]:
+    ) -> tuple[Tensor, RecalledMaps, MapMemory]:
         """The current map changed by the past, what of the past is in use, and the memory with the current map."""
-        warped_maps = self.recall(memory, batch)
-        return self.aggregate(fused, warped_maps), warped_maps, self.remember(warped_maps.frames, batch, fused)
+        recalled = self.recall(memory, batch)
+        return self.aggregate(fused, recalled), recalled, self.remember(recalled.frames, batch, fused)
 
     @torch.no_grad()
-    def recall(self, memory: MapMemory | None, batch: FrameBatch) -> WarpedMaps:
+    def recall(self, memory: MapMemory | None, batch: FrameBatch) -> RecalledMaps:
         """The remembered maps with their motion to the batch's time and augmented frame."""
         frames = memory.before(batch).frames[: self.config.num_frames] if memory is not None else ()
         motions = [frame.motion(batch, self.config.max_age_s) for frame in frames]
         usable = torch.zeros(self.config.num_frames, len(batch), dtype=torch.bool, device=batch.device)
         for age, motion in enumerate(motions):
             usable[age] = motion.usable
-        return WarpedMaps(frames, motions, usable)
+        return RecalledMaps(frames, motions, usable)
 
-    def maps(self, warped_maps: WarpedMaps) -> Iterator[Tensor]:  # of [B, C, rows, cols] float32
+    def maps(self, recalled: RecalledMaps) -> Iterator[Tensor]:  # of [B, C, rows, cols] float32
         """Past maps resampled into the current augmented frame, newest first; zero where nothing is known."""
-        for frame, motion in zip(warped_maps.frames, warped_maps.motions, strict=True):
+        for frame, motion in zip(recalled.frames, recalled.motions, strict=True):
             yield self.align(frame, motion.aug_from_past, motion.usable)
 
     @torch.no_grad()
@@ -114,17 +114,17 @@ class TemporalFusion(nn.Module):
     def aggregate(
         self,
         fused: Tensor,  # [B, C, rows, cols]
-        warped_maps: WarpedMaps,
+        recalled: RecalledMaps,
     ) -> Tensor:  # [B, C, rows, cols]
         """F + norm(refine(reduce([F, M_1, ..., M_T]))): the current map F, changed by the warped past maps M."""
-        maps = itertools.chain([fused], self.maps(warped_maps))  # younger clips remember fewer, the others are zero
+        maps = itertools.chain([fused], self.maps(recalled))  # younger clips remember fewer, the others are zero
         x = concat_conv2d(maps, self.reduce.conv.weight, self.reduce.conv.bias)  # of torch.cat(maps, dim=1)
         return fused + self.norm(self.refine(F.relu(self.reduce.norm(x))))
 
     @torch.no_grad()
     def remember(
         self,
-        past: tuple[MapFrame, ...],  # of `WarpedMaps`
+        past: tuple[MapFrame, ...],  # of `RecalledMaps`
         batch: FrameBatch,
         fused: Tensor,  # [B, C, rows, cols]
     ) -> MapMemory:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from src.errors import CheckpointError, ConfigError, require_least
 from src.ops.frame_motion import relative_motion, relative_pose
+from src.ops.segment_reduce import topk_per_sample
 from src.structures.batch import MAX_EGO_SPEED_MPS, FrameBatch
 from src.structures.tensor_fields import TensorFields
 
@@ -100,6 +101,19 @@ class RememberedFrame(TensorFields):
         Raises ConfigError for one that does not.
         """
         raise ConfigError(f"{type(self).__name__} holds no velocities that an oracle could replace; leave oracle= out")
+
+
+def rows_to_remember(
+    scores: Tensor,  # [n]
+    streams: Tensor,  # [n] int64, of each row, ascending
+    threshold: float,
+    batch_size: int,
+    limit: int,  # rows of a stream
+) -> Tensor:  # [m] int64, their streams ascend
+    """The best rows of each stream among those above the threshold."""
+    kept = (scores > threshold).nonzero().squeeze(1)
+    best = topk_per_sample(scores[kept], streams[kept], batch_size, limit).flatten()
+    return kept[best[best >= 0]]
 
 
 class StoredRows(TensorFields):

@@ -270,8 +270,7 @@ def test_no_boxes_reach_the_global_frame():
 
 
 def test_boxes_come_back_to_the_ego_frame():
-    tilt, place = np.array([0.98, 0.02, -0.03, 0.2]), np.array([7.0e5, 5.3e6, 0.25])
-    level = np.array([0.9, 0, 0, -0.4])
+    pose = pose_matrix(np.array([0.98, 0.02, -0.03, 0.2]), np.array([7.0e5, 5.3e6, 0.25]))  # tilted
     rng = np.random.default_rng(1)
     boxes = Boxes3D(
         centers=torch.from_numpy(rng.uniform(-150, 150, (5, 3)).astype(np.float32)),
@@ -283,9 +282,7 @@ def test_boxes_come_back_to_the_ego_frame():
         scores=torch.linspace(0, 1, 5),
         num_points=torch.arange(5),
     )
-    for rotation, names in ((tilt, ("centers", "sizes", "yaws")), (level, ("velocities",))):
-        pose = pose_matrix(rotation, place)
-        back = to_ego(to_global(boxes, pose, 0), pose)
-        for name in (*names, "labels", "attributes", "scores", "num_points"):
-            torch.testing.assert_close(getattr(back, name), getattr(boxes, name), rtol=0, atol=1e-5)
+    back = to_ego(to_global(boxes, pose, 0), pose)
+    for name in ("centers", "sizes", "yaws", "velocities", "labels", "attributes", "scores", "num_points"):
+        torch.testing.assert_close(getattr(back, name), getattr(boxes, name), rtol=0, atol=1e-5)
     assert len(to_ego(DetectionTable.empty(), np.eye(4))) == 0

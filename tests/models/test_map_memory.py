@@ -112,12 +112,12 @@ def test_aggregation_is_the_convolution_of_all_maps_side_by_side():
     for step in range(2):  # of three that there is room for
         frame = bare_frame(0.5 * step, [pose(4.0 * step), pose(step, 1.0)])
         memory = remember(fusion, memory, frame, torch.randn(2, 2, 96, 96))
-    warped_maps = fusion.recall(memory, bare_frame(1.0, [pose(8.0), pose(2.0, 1.0)]))
+    recalled = fusion.recall(memory, bare_frame(1.0, [pose(8.0), pose(2.0, 1.0)]))
     fused = torch.randn(2, 2, 96, 96)
-    past = list(fusion.maps(warped_maps))
+    past = list(fusion.maps(recalled))
     stack = torch.cat([fused, *past, torch.zeros_like(fused)], dim=1)
     wanted = fused + fusion.norm(fusion.refine(fusion.reduce(stack)))
-    torch.testing.assert_close(fusion.aggregate(fused, warped_maps), wanted, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(fusion.aggregate(fused, recalled), wanted, rtol=1e-5, atol=1e-5)
     assert len(past) == 2 and (wanted - fused).abs().max() > 0.5
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from src.losses.classification import occupancy_focal, sigmoid_focal
+from src.losses.classification import balanced_focal, sigmoid_focal
 from src.losses.normalizers import mean_over_ranks
 from src.models.camera_radar import CameraRadarConfig, CameraRadarDetector, CameraRadarLossConfig, CameraRadarOutput
 from src.models.crt_fusion.motion_estimator import CellMotion, MotionEstimator, velocity_loss
@@ -91,16 +91,16 @@ class CRTFusion(CameraRadarDetector):
 
         Raises ValueError when images are absent or of another number, or when the memory is of other streams.
         """
-        images, radar_bev = self.encode(batch, memory)
-        views = self.view_transform(images, radar_bev)
-        current = fused = self.fuser(views.bev, radar_bev)
+        views, radar_bev = self.encode(batch, memory)
+        lifted = self.view_transform(views, radar_bev)
+        current = fused = self.fuser(lifted.bev, radar_bev)
         motion, moved, memory_now = self.estimator(fused), None, None
         if self.temporal is not None:
             moved = self.temporal.recall(memory, batch)
             current = self.temporal.aggregate(fused, moved)
             memory_now = self.temporal.remember(batch, fused, motion, moved)
         head = self.head(self.decoder(current))
-        return CRTFusionOutput(views, radar_bev, fused, head, motion, moved), memory_now
+        return CRTFusionOutput(lifted, radar_bev, fused, head, motion, moved), memory_now
 
     def loss_terms(self, output: CRTFusionOutput, batch: FrameBatch) -> Objective:
         """Weighted terms `heatmap`, `box`, `depth`, `foreground`, `occupancy` and `velocity`."""
@@ -108,11 +108,11 @@ class CRTFusion(CameraRadarDetector):
         if weights.foreground_weight is not None:
             target = self.view_transform.depth_target(batch, self.image_encoder.image_size_px) >= 0  # [B*N, h, w]
             present = batch.image_valid.flatten()[:, None, None].expand_as(target)
-            total = (sigmoid_focal(output.views.foreground_logits, target) * present).sum()
+            total = (sigmoid_focal(output.lifted.foreground_logits, target) * present).sum()
             terms["foreground"] = weights.foreground_weight * total / mean_over_ranks(present.sum())
         raster = BoxRaster(batch.boxes, self.grid, margin_m=0.0, device=batch.device)
         if weights.occupancy_weight is not None:
-            terms["occupancy"] = weights.occupancy_weight * occupancy_focal(output.motion.occupancy_logits, raster.keys)
+            terms["occupancy"] = weights.occupancy_weight * balanced_focal(output.motion.occupancy_logits, raster.keys)
         if weights.velocity_weight is not None:
             terms["velocity"] = weights.velocity_weight * velocity_loss(output.motion, raster)
         return Objective(terms, counts)

@@ -15,11 +15,10 @@ from src.geometry.tensor_transforms import transform_points_xy, transform_vector
 from src.models.crt_fusion.motion_estimator import CellMotion
 from src.models.layers.dense import DenseConvNormReLU, MapConv2d, map_of_rows, rows_of_map
 from src.models.layers.norm import MapBatchNorm
-from src.models.memory import FrameMemory, RememberedFrame, StoredRows, TemporalConfig
+from src.models.memory import FrameMemory, RememberedFrame, StoredRows, TemporalConfig, rows_to_remember
 from src.ops.bilinear_scatter import bilinear_scatter
 from src.ops.concat_conv import concat_conv2d
 from src.ops.frame_motion import zero_slow_velocities
-from src.ops.segment_reduce import topk_per_sample
 from src.structures.batch import FrameBatch
 
 
@@ -139,12 +138,10 @@ class MotionGuidedFusion(nn.Module):
     @torch.no_grad()
     def remember(self, batch: FrameBatch, fused: Tensor, motion: CellMotion, moved: MovedMaps) -> StackMemory:
         """The occupied cells of the current map and of those before it, with their velocities, detached."""
-        score = motion.occupancy_logits.sigmoid()
-        kept = (score > self.config.occupancy_threshold).nonzero().squeeze(1)
-        rows = torch.div(kept, self.grid.rows * self.grid.cols, rounding_mode="floor")
-        best = topk_per_sample(score[kept], rows, len(batch), self.config.max_cells).flatten()
-        best = best[best >= 0]  # sample by sample, so their rows ascend
-        kept, rows = kept[best], rows[best]
+        scores = motion.occupancy_logits.sigmoid()
+        streams = torch.arange(len(batch), device=batch.device).repeat_interleave(self.grid.rows * self.grid.cols)
+        kept = rows_to_remember(scores, streams, self.config.occupancy_threshold, len(batch), self.config.max_cells)
+        rows = streams[kept]
         row = torch.div(kept, self.grid.cols, rounding_mode="floor") % self.grid.rows
         ego_from_aug = batch.ego_from_aug[rows]
         older = rows_of_map(moved.maps)[kept, : -self.channels]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
-from src.models.layers.azimuth_attention import AzimuthAttention
+from src.models.crt_fusion.azimuth_attention import AzimuthAttention
 from src.models.layers.full_precision import FullPrecisionConv2d
 from src.models.layers.lift_splat import LiftedViews, LiftSplat, LiftSplatConfig
 from src.models.layers.views import CameraViews

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from src.models.camera_radar import CameraRadarConfig, CameraRadarDetector, CameraRadarOutput
 from src.models.layers.dense import DenseConvNormReLU
 from src.models.layers.lift_splat import LiftSplat
-from src.models.map_memory import MapMemory, TemporalFusion, WarpedMaps
+from src.models.map_memory import MapMemory, RecalledMaps, TemporalFusion
 from src.structures.batch import FrameBatch
 
 
@@ -23,7 +23,7 @@ class DenseBEVConfig(CameraRadarConfig):
 class DenseBEVOutput(CameraRadarOutput):
     """One frame through the model."""
 
-    warped_maps: WarpedMaps | None  # None in phase 1
+    recalled: RecalledMaps | None  # None in phase 1
 
 
 class ConvFuser(nn.Module):
@@ -64,17 +64,17 @@ class DenseBEV(CameraRadarDetector):
 
         Raises ValueError when images are absent or of another number, or when the memory is of other streams.
         """
-        images, radar_bev = self.encode(batch, memory)
-        views = self.view_transform(images)
-        fused = self.fuser(views.bev, radar_bev)
-        current, warped_maps, memory_now = fused, None, None
+        views, radar_bev = self.encode(batch, memory)
+        lifted = self.view_transform(views)
+        fused = self.fuser(lifted.bev, radar_bev)
+        current, recalled, memory_now = fused, None, None
         if self.temporal is not None:
-            current, warped_maps, memory_now = self.temporal(memory, batch, fused)
-        return DenseBEVOutput(views, radar_bev, fused, self.head(self.decoder(current)), warped_maps), memory_now
+            current, recalled, memory_now = self.temporal(memory, batch, fused)
+        return DenseBEVOutput(lifted, radar_bev, fused, self.head(self.decoder(current)), recalled), memory_now
 
     def diagnostics(self, output: DenseBEVOutput) -> dict[str, Tensor | float]:
         """Also past maps in use."""
         values = super().diagnostics(output)
-        if output.warped_maps is not None:
-            values["remembered_frames"] = output.warped_maps.usable.sum() / len(output.radar_bev)
+        if output.recalled is not None:
+            values["remembered_frames"] = output.recalled.usable.sum() / len(output.radar_bev)
         return values

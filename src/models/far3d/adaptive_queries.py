@@ -10,8 +10,7 @@ from torch import nn
 
 from src.errors import ConfigError
 from src.geometry.bev_grid import BEVGrid
-from src.models.heads.keypoint_head import CameraKeypointHead, CameraMaps, best_pixels
-from src.models.heads.query_proposals import KeypointQueryConfig
+from src.models.heads.keypoint_head import CameraKeypointHead, CameraMaps, KeypointQueryConfig, best_pixels
 from src.models.layers.views import CameraViews
 from src.ops.score_and_lift_pixels import most_likely_depth, peak_scores
 from src.ops.take_rows import take_rows

@@ -19,6 +19,7 @@ from src.models.detector import Objective
 from src.models.heads.branches import Branches, MergedBranches, checkpointed_branches
 from src.models.heads.decode import (
     ATTRIBUTE_RULES,
+    GROUP_COLUMNS,
     AttributeSource,
     DecodeConfig,
     Suppression,
@@ -93,7 +94,9 @@ class HeadOutput:
     logits: Tensor  # [M, 12] float32, columns as taxonomy.CLASSES
     codes: Tensor | None  # [M, 7, CODE_SIZE (+ 11 attributes)] in training with `all`, else evaluated where needed
     doppler: Doppler | None = None  # velocities take their radial part from it
-    motion: Tensor | None = None  # [M, 2] m/s over ground, augmented axes: what the velocities of codes are added to
+    base_velocities: Tensor | None = (
+        None  # [M, 2] m/s over ground, augmented axes: what the velocities of codes are added to
+    )
 
 
 class CenterHead(nn.Module):
@@ -127,9 +130,8 @@ class CenterHead(nn.Module):
             nn.init.constant_(branches.outputs[0].bias, DENSE_HEATMAP_BIAS if dense else HEATMAP_BIAS)
         widths = (*CODE_WIDTHS, len(ATTRIBUTES)) if self.learned else CODE_WIDTHS
         self.regressions = nn.ModuleList(Branches(channels, widths) for _ in HEAD_GROUPS)
-        in_group_order = [CLASSES.index(name) for group in HEAD_GROUPS for name in group]
         self.merged = False  # for inference
-        self.class_columns = tuple(in_group_order.index(label) for label in range(len(CLASSES)))
+        self.class_columns = tuple(GROUP_COLUMNS.index(label) for label in range(len(CLASSES)))
 
     def merge_for_inference(self) -> None:
         """Heat maps of all groups are asked for in every cell, codes of one group where it has candidates."""
@@ -141,7 +143,7 @@ class CenterHead(nn.Module):
         self,
         bev: SparseBEV | Tensor,  # a tensor [B, C, rows, cols] where the head is dense
         doppler: Doppler | None = None,
-        motion: Tensor | None = None,  # [B, 2, rows, cols] of a dense head, as `HeadOutput.motion`
+        base_velocities: Tensor | None = None,  # [B, 2, rows, cols] of a dense head, as `HeadOutput.base_velocities`
     ) -> HeadOutput:
         """Heat maps of all cells; box codes only where training needs them everywhere."""
         bev = self.shared(bev)
@@ -157,7 +159,9 @@ class CenterHead(nn.Module):
             calls = [[part] for part in parts] if bev.features.device.type == "cpu" else [parts]
             codes = torch.cat([checkpointed_branches(call, bev.features) for call in calls], dim=1)
             codes = codes.unflatten(1, (len(parts), -1))
-        return HeadOutput(bev, logits, codes, doppler, None if motion is None else rows_of_map(motion))
+        return HeadOutput(
+            bev, logits, codes, doppler, None if base_velocities is None else rows_of_map(base_velocities)
+        )
 
     def regress(
         self,
@@ -235,7 +239,7 @@ class CenterHead(nn.Module):
             terms["heatmap"] = heatmap_weight * (zeros.index_add(0, group_of_class, focal) / normalizer).sum()
         if box_weight is None and not self.learned:
             return Objective(terms, diagnostics)
-        predicted = _on_motion(output, self.regress(output, targets.rows, targets.groups), targets.rows)
+        predicted = _on_base(output, self.regress(output, targets.rows, targets.groups), targets.rows)
         if output.doppler is not None and output.doppler.config.in_losses:
             predicted = measured_codes(output, predicted, targets.rows)
         if box_weight is not None:
@@ -281,7 +285,7 @@ class CenterHead(nn.Module):
         radar = None if doppler is None else (doppler.keys, doppler.velocities)
         turned = doppler is not None and doppler.config.along_heading
         cells = (rows, output.bev.indices, labels, scores)
-        moving = _on_motion(output, codes, rows)
+        moving = _on_base(output, codes, rows)
         found = decoded_boxes(moving, *cells, threshold, self.grid, ATTRIBUTE_RULES, radar, turned)
         if self.learned:
             found[:, ATTRIBUTE] = learned_attributes(codes[:, CODE_SIZE:], labels).to(found.dtype)
@@ -298,15 +302,15 @@ def measured_codes(
     return torch.cat([before, output.doppler.correct(velocities, output.bev.sites.linear()[rows]), after], dim=1)
 
 
-def _on_motion(
+def _on_base(
     output: HeadOutput,
     codes: Tensor,  # [n, CODE_SIZE (+ 11)]
     rows: Tensor,  # [n] int64, cells
 ) -> Tensor:  # [n, CODE_SIZE (+ 11)]
-    """Box codes with `HeadOutput.motion`, if there is any, added to their velocities."""
-    if output.motion is None:
+    """Box codes with `HeadOutput.base_velocities`, if there is any, added to their velocities."""
+    if output.base_velocities is None:
         return codes
-    return codes + F.pad(output.motion[rows], (CODE_SIZE - 2, codes.shape[1] - CODE_SIZE))
+    return codes + F.pad(output.base_velocities[rows], (CODE_SIZE - 2, codes.shape[1] - CODE_SIZE))
 
 
 def _attribute_loss(logits: Tensor, targets: HeadTargets) -> Tensor:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
 from src.losses.classification import depth_cross_entropy, penalty_reduced_focal
 from src.losses.normalizers import mean_over_ranks
@@ -17,13 +18,28 @@ from src.models.layers.merging import with_relu
 from src.models.layers.views import CameraViews
 from src.ops.score_and_lift_pixels import score_and_lift_pixels
 from src.ops.take_rows import take_rows
-from src.targets.depth import paint_depth
+from src.targets.depth import DepthBinsConfig, paint_depth
 from src.targets.keypoints import keypoint_heatmap
 from src.targets.projection import BoxViews
 
 # Probability 0.1 for every pixel at the start, so that the focal loss is not drowned by background.
 KEYPOINT_BIAS = -2.19
 CHANNELS_PER_NORM_GROUP = 4
+
+
+@dataclass(kw_only=True)
+class KeypointQueryConfig(DepthBinsConfig):
+    """How queries start at objects found in the images (`model.queries`). Raises ConfigError for values that cannot
+    work; every other integer of a model's own must be at least 1."""
+
+    keypoint_nms_cells: int  # odd window of local maxima in the keypoint map
+
+    def __post_init__(self) -> None:
+        counts = [field.name for field in fields(self) if isinstance(getattr(self, field.name), int)]
+        require_least(self, "model.queries", dict.fromkeys(counts, 1))
+        self.check_depth_bins("model.queries")
+        if self.keypoint_nms_cells % 2 == 0:
+            raise ConfigError(f"model.queries.keypoint_nms_cells={self.keypoint_nms_cells}: must be odd")
 
 
 @dataclass

@@ -18,10 +18,10 @@ from src.models.layers.doppler import Doppler
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.merging import block_diagonal, joined_convs
 from src.models.layers.sparse import ConvNormReLU, RowBatchNorm, SubmanifoldConv, TemporalConv
-from src.models.memory import motions
+from src.models.memory import motions, rows_to_remember
 from src.ops.fixed_shapes import fixed_shapes
 from src.ops.frame_motion import zero_slow_velocities
-from src.ops.segment_reduce import gather_rows, segment_mean, topk_per_sample
+from src.ops.segment_reduce import gather_rows, segment_mean
 from src.ops.sites import Sites, places_among
 from src.structures.batch import FrameBatch
 from src.structures.sparse_bev import SparseBEV, SparseMap
@@ -134,12 +134,9 @@ class BEVPath(nn.Module):
     @torch.no_grad()
     def store(self, fused: SparseBEV, cells: CellPrediction, batch: FrameBatch) -> StoredCells:
         """Cells above the memory threshold, detached, in the unaugmented ego frame."""
-        score = cells.occupancy_logits.sigmoid()
-        kept = (score > self.config.memory_threshold).nonzero().squeeze(1)
+        scores, limit = cells.occupancy_logits.sigmoid(), self.config.max_cells_per_frame
+        kept = rows_to_remember(scores, fused.indices[:, 0], self.config.memory_threshold, len(batch), limit)
         indices = fused.indices[kept]
-        best = topk_per_sample(score[kept], indices[:, 0], len(batch), self.config.max_cells_per_frame).flatten()
-        best = best[best >= 0]  # sample by sample, so their rows ascend
-        kept, indices = kept[best], indices[best]
         ego_from_aug = batch.ego_from_aug[indices[:, 0]]  # [n, 4, 4]
         return StoredCells(
             xy=transform_points_xy(ego_from_aug, self.grid.centre_of(indices[:, 1:])),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -40,6 +41,8 @@ class VelocityGroups(Enum):
 @dataclass(kw_only=True)
 class Horizon3DLossConfig(LossWeights):
     """Weights of the terms (`model.loss`); an inner weight of null switches its term off, uncomputed."""
+
+    factors: ClassVar[tuple[str, ...]] = ("kggi_weight", "ocsf_weight", "dptf_weight")
 
     kggi_weight: float  # lambda_kggi, on keypoint, depth and radar objectness
     ocsf_weight: float  # lambda_ocsf, on the two occupancy terms

@@ -18,8 +18,8 @@ from src.models.horizon3d.loss import cell_losses, gaussian_velocity_loss, kggi_
 from src.models.horizon3d.model_config import Horizon3DConfig
 from src.models.horizon3d.ocsf import OCSF
 from src.models.horizon3d.output import Horizon3DOutput
+from src.models.horizon3d.sparse_neck import SparseNeck
 from src.models.layers.doppler import Doppler
-from src.models.layers.sparse_neck import SparseNeck
 from src.models.layers.views import CameraViews
 from src.ops.fixed_shapes import Capacities
 from src.ops.side_stream import on_side_stream

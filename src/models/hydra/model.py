@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from src.errors import ConfigError
-from src.losses.classification import occupancy_focal
-from src.models.backbones.bev_decoder import SqueezeFuser
+from src.losses.classification import balanced_focal
 from src.models.camera_radar import CameraRadarConfig, CameraRadarDetector, CameraRadarLossConfig, CameraRadarOutput
 from src.models.detector import Objective
 from src.models.hydra.depth_consistency import DepthConsistency, DepthConsistencyConfig
 from src.models.hydra.height_association import HeightLift, HeightLiftConfig
+from src.models.hydra.squeeze_fuser import SqueezeFuser
 from src.models.layers.feed_forward import NUM_HEADS
-from src.models.map_memory import MapMemory, TemporalFusion, WarpedMaps
+from src.models.map_memory import MapMemory, RecalledMaps, TemporalFusion
 from src.structures.batch import FrameBatch
 from src.targets.box_raster import BoxRaster
 
@@ -45,7 +45,7 @@ class HyDRaOutput(CameraRadarOutput):
     """One frame through the model."""
 
     foreground_logits: Tensor  # [B, rows, cols] float32
-    warped_maps: WarpedMaps | None  # None in phase 1
+    recalled: RecalledMaps | None  # None in phase 1
 
 
 class HyDRa(CameraRadarDetector):
@@ -70,23 +70,23 @@ class HyDRa(CameraRadarDetector):
 
         Raises ValueError when images are absent or of another number, or when the memory is of other streams.
         """
-        images, radar_bev = self.encode(batch, memory)
-        views = self.view_transform(images, radar_bev)
-        fused = self.fuser(views.bev, radar_bev)
-        context = replace(images, levels=[views.context])
-        fused, foreground = self.refinement(fused, radar_bev, context, views.depth_logits)
-        current, warped_maps, memory_now = fused, None, None
+        views, radar_bev = self.encode(batch, memory)
+        lifted = self.view_transform(views, radar_bev)
+        fused = self.fuser(lifted.bev, radar_bev)
+        context = replace(views, levels=[lifted.context])
+        fused, foreground = self.refinement(fused, radar_bev, context, lifted.depth_logits)
+        current, recalled, memory_now = fused, None, None
         if self.temporal is not None:
-            current, warped_maps, memory_now = self.temporal(memory, batch, fused)
+            current, recalled, memory_now = self.temporal(memory, batch, fused)
         head = self.head(self.decoder(current))
-        return HyDRaOutput(views, radar_bev, fused, head, foreground, warped_maps), memory_now
+        return HyDRaOutput(lifted, radar_bev, fused, head, foreground, recalled), memory_now
 
     def loss_terms(self, output: HyDRaOutput, batch: FrameBatch) -> Objective:
         """Also `foreground`: which cells lie in boxes."""
         terms, counts = super().loss_terms(output, batch)
         if self.config.loss.foreground_weight is not None:
             raster = BoxRaster(batch.boxes, self.grid, margin_m=0.0, device=batch.device)
-            focal = occupancy_focal(output.foreground_logits.flatten(), raster.keys)
+            focal = balanced_focal(output.foreground_logits.flatten(), raster.keys)
             terms["foreground"] = self.config.loss.foreground_weight * focal
         return Objective(terms, counts)
 
@@ -94,6 +94,6 @@ class HyDRa(CameraRadarDetector):
         """Also cells called foreground and past maps in use."""
         frames = len(output.radar_bev)
         values = super().diagnostics(output) | {"foreground_cells": (output.foreground_logits > 0).sum() / frames}
-        if output.warped_maps is not None:
-            values["remembered_frames"] = output.warped_maps.usable.sum() / frames
+        if output.recalled is not None:
+            values["remembered_frames"] = output.recalled.usable.sum() / frames
         return values

@@ -124,12 +124,12 @@ class QuerySampler(nn.Module):
         with torch.autocast(queries.device.type, enabled=False):
             points, times = full_precision(queries).split([3, 1], dim=1)
             place = torch.cat([self.grid.normalised(points), times / HORIZON_S], dim=1)
-            if volumes.motion is None:
+            if volumes.measured is None:
                 here, start = self._seen(volumes, FUSED_SCALE, points, batch), points
                 measured = torch.zeros_like(points[:, 0])
             else:
                 near = self.neighbours[FUSED_SCALE]
-                here, start, measured = volumes.motion.seen_at(points, times.squeeze(1), batch, near)
+                here, start, measured = volumes.measured.seen_at(points, times.squeeze(1), batch, near)
             a = self.place(place) + self.context(here)
             for layer in self.hidden:
                 a = F.relu(layer(a))

@@ -99,7 +99,7 @@ class Volumes:
 
     scales: tuple[SparseMap, ...]  # V1 .. V4
     dropped: tuple[int, ...]  # sites that the guard of each scale has left out, over all samples
-    motion: MeasuredMotion | None = None  # of FUSED_SCALE; None: all rests
+    measured: MeasuredMotion | None = None  # of FUSED_SCALE; None: all rests
 
 
 class LateEncoder(nn.Module):

@@ -151,7 +151,7 @@ class LRS4Fusion(Detector, WorldModel):
         if measured is None:
             return volumes
         volume, grid = volumes.scales[FUSED_SCALE], self.voxels.at(FUSED_SCALE)
-        return replace(volumes, motion=MeasuredMotion.of(volume, grid, batch, measured, ego_mps))
+        return replace(volumes, measured=MeasuredMotion.of(volume, grid, batch, measured, ego_mps))
 
     def _head_output(self, volumes: Volumes) -> HeadOutput:
         """Where motion is measured the head sees it, and what it says of velocities is added to it."""
@@ -159,10 +159,10 @@ class LRS4Fusion(Detector, WorldModel):
         if not self.config.measured_motion:
             return self.head(x)
         motion = x.new_zeros(len(x), 2, *x.shape[2:], dtype=torch.float32)
-        if volumes.motion is not None:
-            motion = volumes.motion.on_ground(self.head.grid)
+        if volumes.measured is not None:
+            motion = volumes.measured.on_ground(self.head.grid)
         seen = (motion / self.config.decoders.velocity_unit_mps).to(x.dtype, memory_format=torch.channels_last)
-        return self.head(torch.cat([x, seen], dim=1), motion=motion)
+        return self.head(torch.cat([x, seen], dim=1), base_velocities=motion)
 
     def remember(self, volumes: Volumes, batch: FrameBatch) -> VolumeMemory | None:
         """What the next frame needs of this one, None without temporal part.
@@ -178,12 +178,12 @@ class LRS4Fusion(Detector, WorldModel):
             centres = self.temporal.grid.centre_of(indices[:, 1:])
             now = torch.cat([centres, torch.zeros_like(centres[:, :1])], dim=1)
             speeds = torch.cat(_in_parts(partial(self.decoders.velocities, volumes), now, indices[:, 0]))
-            if volumes.motion is None:
+            if volumes.measured is None:
                 velocities = speeds[:, None] * directions(centres, None)
             else:
-                rays = centres - volumes.motion.origins[indices[:, 0]]
+                rays = centres - volumes.measured.origins[indices[:, 0]]
                 velocities = speeds[:, None] * directions(rays, ego_heading(batch)[indices[:, 0]])
-                velocities = velocities.index_copy(0, volumes.motion.rows, volumes.motion.velocities)
+                velocities = velocities.index_copy(0, volumes.measured.rows, volumes.measured.velocities)
         return self.temporal.remember(volume, velocities, batch)
 
     def transition(self, batch: FrameBatch, memory: VolumeMemory | None) -> VolumeMemory | None:

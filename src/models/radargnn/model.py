@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
+from src.geometry.box_distance import footprint_distances
 from src.geometry.constants import constant
-from src.geometry.tensor_transforms import rotate_back
 from src.losses.classification import sigmoid_focal
 from src.losses.loss_weights import LossWeights
 from src.losses.normalizers import mean_over_ranks
@@ -189,9 +189,7 @@ class PointHead(nn.Module):
         if len(objects) == 0:
             return torch.full_like(graph.sample, -1), torch.zeros_like(objects.labels, dtype=torch.bool)
         offset = graph.points[:, None, :2] - objects.centers[:, :2]  # [n, K, 2]
-        along, across = rotate_back(objects.yaws.cos(), objects.yaws.sin(), *offset.unbind(2))
-        half = 0.5 * objects.sizes[:, :2]
-        inside = (along.abs() <= half[:, 0]) & (across.abs() <= half[:, 1]) & (graph.sample[:, None] == samples)
+        inside = (footprint_distances(graph.points[:, :2], objects.bev()) == 0) & (graph.sample[:, None] == samples)
         distance, nearest = offset.square().sum(2).masked_fill(~inside, torch.inf).min(dim=1)
         return torch.where(distance.isfinite(), nearest, -1), inside.any(0)
 

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
-from src.models.backbones.point_transformer import RadarPoints
 from src.models.layers.views import CameraViews
+from src.models.sparc.point_transformer import RadarPoints
 from src.ops.segment_reduce import segment_softmax, weighted_segment_sum
 
 

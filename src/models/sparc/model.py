@@ -8,14 +8,14 @@ from torch import Tensor
 
 from src.losses.classification import penalty_reduced_focal
 from src.losses.normalizers import mean_over_ranks
-from src.models.backbones.point_transformer import PointTransformer, PointTransformerConfig, RadarPoints
 from src.models.detector import Objective
-from src.models.heads.query_proposals import ProposalConfig, Proposals, QueryProposals
 from src.models.layers.feed_forward import check_image_heads
 from src.models.layers.views import CameraViews
 from src.models.query_detector import CameraQueryLossConfig, QueryDetector, QueryDetectorConfig, QueryOutput
 from src.models.query_memory import QueryMemory
 from src.models.sparc.frustum_fusion import FrustumFusionConfig, SparseFrustumFusion
+from src.models.sparc.point_transformer import PointTransformer, PointTransformerConfig, RadarPoints
+from src.models.sparc.query_proposals import ProposalConfig, Proposals, QueryProposals
 from src.models.sparc.sparc_decoder import SpaRCDecoder, SpaRCDecoderConfig
 from src.structures.batch import FrameBatch
 from src.structures.taxonomy import CAMERAS

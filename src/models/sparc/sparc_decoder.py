@@ -9,13 +9,13 @@ from torch import Tensor, nn
 
 from src.errors import require_least
 from src.geometry.bev_grid import BEVGrid
-from src.models.backbones.point_transformer import PaddedPoints
 from src.models.heads.query_head import QueryPrediction, SetPredictionHead
 from src.models.layers.dense import Conv2d
 from src.models.layers.feed_forward import feed_forward
 from src.models.layers.image_attention import ImageCrossAttention, PointOffsets
 from src.models.layers.query_attention import DistanceAttention, QueryEmbedding, check_decoder_heads
 from src.models.layers.views import CameraViews
+from src.models.sparc.point_transformer import PaddedPoints
 from src.structures.queries import Queries
 
 FFN_RATIO = 4

@@ -18,10 +18,10 @@ def test_named_terms_and_one_entry_per_sample():
     output, terms = train_step(model, batch)
     assert set(terms) == TERMS and gradients_are_finite(model)
     torch.testing.assert_close(terms["total"], sum(v for k, v in terms.items() if k != "total"))
-    assert output.fused_bev.shape == (2, 16, *GRID.cells) and output.views.foreground_logits.shape == (8, 4, 6)
+    assert output.fused_bev.shape == (2, 16, *GRID.cells) and output.lifted.foreground_logits.shape == (8, 4, 6)
     assert len(model.eval().decode(model(batch)[0])) == 2
     found = model.diagnostics(output)
-    assert found["lifted_pairs"] == output.views.num_lifted / 2 and found["occupied_cells"] == 0.0
+    assert found["lifted_pairs"] == output.lifted.num_lifted / 2 and found["occupied_cells"] == 0.0
 
 
 @pytest.mark.parametrize("missing", [EVERY[1:2], EVERY])
@@ -29,13 +29,13 @@ def test_missing_cameras(missing):
     model, batch = crt_model(), make_batch()
     output, terms = missing_cameras_do_not_matter(model, batch, missing)
     if missing == EVERY:
-        assert output.views.num_lifted == terms["depth"] == terms["foreground"] == 0
+        assert output.lifted.num_lifted == terms["depth"] == terms["foreground"] == 0
 
 
 def test_autocast_keeps_positions_and_losses_in_float32():
     model, batch = crt_model(), make_batch()
     output = autocast_step(model, batch)
-    assert output.views.bev.dtype == output.motion.velocities.dtype == output.head.logits.dtype == torch.float32
+    assert output.lifted.bev.dtype == output.motion.velocities.dtype == output.head.logits.dtype == torch.float32
 
 
 @pytest.mark.parametrize(

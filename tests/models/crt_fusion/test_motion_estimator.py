@@ -2,7 +2,7 @@
 
 import torch
 
-from src.losses.classification import occupancy_focal, sigmoid_focal
+from src.losses.classification import balanced_focal, sigmoid_focal
 from src.models.crt_fusion.motion_estimator import CellMotion, MotionEstimator, velocity_loss
 from src.structures.boxes import Boxes3D
 from src.targets.box_raster import BoxRaster
@@ -38,12 +38,12 @@ def test_targets_are_the_cells_of_boxes_and_the_faster_box_wins():
     target = torch.cat([moving | unknown, torch.zeros(cells, dtype=torch.bool)])
     assert torch.equal(target.nonzero().squeeze(1), raster.keys) and len(raster.keys) > 15
     focal = sigmoid_focal(motion.occupancy_logits, target)
-    found = occupancy_focal(motion.occupancy_logits, raster.keys)
+    found = balanced_focal(motion.occupancy_logits, raster.keys)
     torch.testing.assert_close(found, focal[target].mean() + focal[~target].mean())
     errors = (motion.velocities[:cells][moving] - torch.tensor([20.0, 1.0])).abs()
     torch.testing.assert_close(velocity_loss(motion, raster), errors.mean())
     nothing = BoxRaster([boxes(), boxes()], GRID, margin_m=0.0)
-    assert velocity_loss(motion, nothing) == 0.0 and occupancy_focal(motion.occupancy_logits, nothing.keys).isfinite()
+    assert velocity_loss(motion, nothing) == 0.0 and balanced_focal(motion.occupancy_logits, nothing.keys).isfinite()
 
 
 def test_it_predicts_metres_per_second_and_an_empty_map_at_first():

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from src.models.layers.azimuth_attention import AzimuthAttention
+from src.models.crt_fusion.azimuth_attention import AzimuthAttention
 from src.models.layers.views import CameraViews
 from tests.models.camera_radar_frames import crt_model, radar_map
 from tests.models.frames import GRID, SIZE, make_batch

@@ -38,10 +38,10 @@ def test_shapes_named_terms_and_one_entry_per_sample():
     output, terms = train_step(model, batch)
     assert set(terms) == TERMS and gradients_are_finite(model)
     torch.testing.assert_close(terms["total"], sum(v for k, v in terms.items() if k != "total"))
-    assert output.views.bev.shape == (2, 12, 48, 64) and output.views.depth_logits.shape == (2, 4, 16, 4, 6)
+    assert output.lifted.bev.shape == (2, 12, 48, 64) and output.lifted.depth_logits.shape == (2, 4, 16, 4, 6)
     assert output.radar_bev.shape == (2, 8, 48, 64) and output.fused_bev.shape == (2, 16, 48, 64)
     assert output.head.logits.shape == (2 * 48 * 64, 12) and len(output.head.bev) == 2 * 48 * 64
-    for value in (output.views.bev, output.radar_bev, output.fused_bev):
+    for value in (output.lifted.bev, output.radar_bev, output.fused_bev):
         assert value.is_contiguous(memory_format=torch.channels_last)
     assert output.head.bev.features.is_contiguous()  # cells are rows without a copy
     boxes = model.eval().decode(model(batch)[0])
@@ -80,7 +80,7 @@ def test_missing_cameras(missing):
         batch.images[sample, camera] = 0
     output, terms = train_step(model, batch)
     assert all(value.isfinite() for value in terms.values()) and gradients_are_finite(model)
-    assert len(missing) == 1 or (output.views.num_lifted == 0 and float(terms["depth"].detach()) == 0.0)
+    assert len(missing) == 1 or (output.lifted.num_lifted == 0 and float(terms["depth"].detach()) == 0.0)
 
 
 def test_what_a_missing_camera_shows_does_not_matter():
@@ -106,7 +106,7 @@ def test_weights_multiply_and_null_switches_a_term_off(name):
 def test_autocast_keeps_positions_and_losses_in_float32(temporal):
     model, batch = dense_model(temporal=temporal), make_batch()
     output = autocast_step(model, batch)
-    assert output.views.bev.dtype == output.radar_bev.dtype == output.head.logits.dtype == torch.float32
+    assert output.lifted.bev.dtype == output.radar_bev.dtype == output.head.logits.dtype == torch.float32
     assert output.fused_bev.dtype == torch.bfloat16
 
 
@@ -123,7 +123,7 @@ def test_diagnostics_count_pillars_pairs_frames_and_objects():
     output, _ = model(batch)
     found = {name: float(value) for name, value in model.diagnostics(output).items()}
     assert 0 < found["pillars"] <= 75 and found["remembered_frames"] == 0.0
-    assert found["lifted_pairs"] == output.views.num_lifted / 2 and 1 / 16 <= found["depth_confidence"] <= 1
+    assert found["lifted_pairs"] == output.lifted.num_lifted / 2 and 1 / 16 <= found["depth_confidence"] <= 1
     assert "objects" not in found
     assert model.loss(output, batch).diagnostics["objects"] == 5.0
     memory = model(batch)[1]

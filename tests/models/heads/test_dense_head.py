@@ -91,10 +91,10 @@ def test_velocities_are_regressed_on_top_of_known_motion(train_regression):
     lower = GRID.to_cells(boxes[0].centers[:, :2]).round().flip(1)  # of the nearest corner
     rest = [replace(boxes[0], velocities=boxes[0].velocities - lower), boxes[1]]
     torch.testing.assert_close(
-        head.loss(head(x, motion=motion), boxes, 1.0, 0.25).terms, head.loss(head(x), rest, 1.0, 0.25).terms
+        head.loss(head(x, base_velocities=motion), boxes, 1.0, 0.25).terms, head.loss(head(x), rest, 1.0, 0.25).terms
     )
     head.eval()
-    moved, still = head.decode(head(x, motion=motion)), head.decode(head(x))
+    moved, still = head.decode(head(x, base_velocities=motion)), head.decode(head(x))
     assert torch.equal(moved[1].velocities, still[1].velocities) and torch.equal(moved[0].centers, still[0].centers)
     known = moved[0].velocities - still[0].velocities
     torch.testing.assert_close(known, known.round(), atol=1e-4, rtol=0)

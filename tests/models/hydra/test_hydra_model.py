@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from src.errors import ConfigError
-from src.models.backbones.bev_decoder import SqueezeFuser
+from src.models.hydra.squeeze_fuser import SqueezeFuser
 from tests.models.camera_radar_frames import hydra_model
 from tests.models.frames import GRID, drive, make_batch
 from tests.models.learning import autocast_step, gradients_are_finite, missing_cameras_do_not_matter, train_step
@@ -21,7 +21,7 @@ def test_named_terms_and_one_entry_per_sample():
     assert output.fused_bev.shape == (2, 16, *GRID.cells) and output.foreground_logits.shape == (2, *GRID.cells)
     assert len(model.eval().decode(model(batch)[0])) == 2
     found = model.diagnostics(output)
-    assert found["lifted_pairs"] == output.views.num_lifted / 2 and found["foreground_cells"] == 0.0
+    assert found["lifted_pairs"] == output.lifted.num_lifted / 2 and found["foreground_cells"] == 0.0
 
 
 @pytest.mark.parametrize("missing", [EVERY[1:2], EVERY])
@@ -29,13 +29,13 @@ def test_missing_cameras(missing):
     model, batch = hydra_model(), make_batch()
     output, terms = missing_cameras_do_not_matter(model, batch, missing)
     if missing == EVERY:
-        assert output.views.num_lifted == terms["depth"] == 0
+        assert output.lifted.num_lifted == terms["depth"] == 0
 
 
 def test_autocast_keeps_positions_and_losses_in_float32():
     model, batch = hydra_model(), make_batch()
     output = autocast_step(model, batch)
-    kept = (output.views.bev, output.foreground_logits, output.head.logits)
+    kept = (output.lifted.bev, output.foreground_logits, output.head.logits)
     assert all(value.dtype == torch.float32 for value in kept)
 
 

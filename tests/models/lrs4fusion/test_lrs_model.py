@@ -175,10 +175,10 @@ def test_measured_speeds_move_the_volume_and_what_is_remembered():
         return replace(own, aug_from_ego=augment[None])
 
     output, memory = model(seen(0.0))
-    assert len(output.volumes.motion.xyz) > 100 and not output.volumes.motion.ego_mps.any()
+    assert len(output.volumes.measured.xyz) > 100 and not output.volumes.measured.ego_mps.any()
     later = model.encode(seen(0.5), memory)
-    torch.testing.assert_close(later.motion.ego_mps, (augment[:3, :3] @ torch.tensor([20.0, 0, 0]))[None])
-    assert model.encode(seen(0.5, measured=False), memory).motion is None
+    torch.testing.assert_close(later.measured.ego_mps, (augment[:3, :3] @ torch.tensor([20.0, 0, 0]))[None])
+    assert model.encode(seen(0.5, measured=False), memory).measured is None
     voxels = memory.frames[0].voxels  # in the ego frame, where the heading is x
     in_ego = SENSOR @ augment[:3, :3].inverse().T
     cosine = F.normalize(voxels.xyz - in_ego, dim=1)[:, 0]
@@ -234,8 +234,8 @@ def test_boxes_begin_with_measured_motion():
     model = lrs_model("model.measured_motion=true").eval()
     batch = replace(frame(), lidar_origins=torch.zeros(700, 3), lidar_speeds=torch.full((700,), 20.0))
     output, unknown = model(batch)[0], model(replace(batch, lidar_speeds=None))[0]
-    known = output.head.motion.norm(dim=1) > 15
-    assert known.sum() > 20 and not unknown.head.motion.any()
+    known = output.head.base_velocities.norm(dim=1) > 15
+    assert known.sum() > 20 and not unknown.head.base_velocities.any()
     assert (output.head.bev.features - unknown.head.bev.features).abs().amax(1)[known].min() > 0
     model.head.loss(output.head, batch.boxes, 1.0, 0.25).terms["box"].backward()
     assert model.head.shared[0].conv.weight.grad[:, -2:].any()

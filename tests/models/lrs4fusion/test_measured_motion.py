@@ -228,7 +228,7 @@ def test_decoders_begin_with_the_measured_speed_of_what_will_be_there():
         velocity_unit_mps=10.0,
     )
     model, volumes = Decoders(config, (3, 3, 3, 3), FINEST), Volumes(tuple(scales), (0,) * 4)
-    volumes.motion = motion(scales[FUSED_SCALE])
+    volumes.measured = motion(scales[FUSED_SCALE])
     queries = torch.tensor([[*CAR, 0.0], [30.5, 0.5, 0.5, 1.0], [*CAR, 2.0], [*WALL, 0.0]])
     occupancy, speeds = model(volumes, queries, torch.zeros(4).long())
     torch.testing.assert_close(speeds, torch.tensor([10.0, 10.0, 0.0, 0.0]), atol=0.01, rtol=0)

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from src.errors import ConfigError
-from src.models.backbones.point_transformer import RadarPoints
 from src.models.layers.views import CameraViews
 from src.models.sparc.frustum_fusion import FrustumFusionConfig, SparseFrustumFusion
+from src.models.sparc.point_transformer import RadarPoints
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV
 from tests.models.frames import GRID, SIZE

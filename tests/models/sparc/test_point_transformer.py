@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from src.errors import ConfigError
-from src.models.backbones.point_transformer import (
+from src.models.sparc.point_transformer import (
     PointTransformer,
     PointTransformerConfig,
     SerialisedBlock,

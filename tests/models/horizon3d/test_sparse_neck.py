@@ -2,7 +2,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from src.models.layers.sparse_neck import SparseNeck
+from src.models.horizon3d.sparse_neck import SparseNeck
 from src.ops.sites import Sites
 from src.structures.sparse_bev import SparseBEV
 from tests.ops.maps import random_sites

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from src.models.backbones.point_transformer import RadarPoints
-from src.models.heads.query_proposals import ProposalConfig, QueryProposals
 from src.models.layers.views import CameraViews
+from src.models.sparc.point_transformer import RadarPoints
+from src.models.sparc.query_proposals import ProposalConfig, QueryProposals
 from src.ops.sites import Sites
 from src.structures.queries import UNKNOWN_LOGIT
 from src.structures.sparse_bev import SparseBEV

@@ -2,39 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from src.errors import ConfigError, require_least
 from src.geometry.bev_grid import BEVGrid
-from src.models.backbones.point_transformer import RadarPoints
 from src.models.heads.center_head import HEATMAP_BIAS
-from src.models.heads.keypoint_head import CameraKeypointHead, CameraMaps, lift_keypoints
+from src.models.heads.keypoint_head import CameraKeypointHead, CameraMaps, KeypointQueryConfig, lift_keypoints
 from src.models.layers.full_precision import FullPrecisionLinear
 from src.models.layers.views import CameraViews
+from src.models.sparc.point_transformer import RadarPoints
 from src.ops.nms import maxpool_peaks
 from src.ops.segment_reduce import topk_per_sample
 from src.structures.queries import UNKNOWN_LOGIT, Queries
 from src.structures.taxonomy import CLASSES
-from src.targets.depth import DepthBinsConfig, lid_centres
-
-
-@dataclass(kw_only=True)
-class KeypointQueryConfig(DepthBinsConfig):
-    """How queries start at objects found in the images (`model.queries`). Raises ConfigError for values that cannot
-    work; every other integer of a model's own must be at least 1."""
-
-    keypoint_nms_cells: int  # odd window of local maxima in the keypoint map
-
-    def __post_init__(self) -> None:
-        counts = [field.name for field in fields(self) if isinstance(getattr(self, field.name), int)]
-        require_least(self, "model.queries", dict.fromkeys(counts, 1))
-        self.check_depth_bins("model.queries")
-        if self.keypoint_nms_cells % 2 == 0:
-            raise ConfigError(f"model.queries.keypoint_nms_cells={self.keypoint_nms_cells}: must be odd")
+from src.targets.depth import lid_centres
 
 
 @dataclass(kw_only=True)
