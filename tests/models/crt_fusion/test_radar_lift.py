@@ -87,14 +87,14 @@ def test_only_foreground_pixels_and_likely_depths_are_lifted():
     model, batch = crt_model().eval(), make_batch()
     lift = model.view_transform
     with torch.no_grad():
-        whole = model(batch)[0].views
+        whole = model(batch)[0].lifted
         likely = (whole.depth_logits.softmax(2) >= 1 / 16).sum()
         assert 0 < whole.num_lifted <= likely < whole.depth_logits.numel()
         lift.foreground.bias.fill_(-20.0)
-        nothing = model(batch)[0].views
+        nothing = model(batch)[0].lifted
         assert nothing.num_lifted == 0 and not nothing.bev.any()
         lift.foreground.bias.fill_(20.0)
         lift.depth.weight.zero_(), lift.depth.bias.zero_()
         lift.depth.bias[3] = 5.0
-        sure = model(batch)[0].views  # one bin of every pixel
+        sure = model(batch)[0].lifted  # one bin of every pixel
         assert 0 < sure.num_lifted <= whole.depth_logits[:, :, 0].numel()

@@ -123,8 +123,8 @@ def test_a_return_changes_the_columns_that_look_at_it_and_no_other():
 def test_depth_knows_the_radar_before_anything_is_lifted():
     model, batch = hydra_model().eval(), make_batch()
     with torch.no_grad():
-        with_radar = model(batch)[0].views
+        with_radar = model(batch)[0].lifted
         batch.radar_points[:, 0] += 4.0
-        elsewhere = model(batch)[0].views
+        elsewhere = model(batch)[0].lifted
     assert not torch.allclose(with_radar.depth_logits, elsewhere.depth_logits)
     assert not torch.allclose(with_radar.context, elsewhere.context)
