@@ -266,6 +266,7 @@ def test_full_size_values_are_those_of_the_specification(phase):
         (["phase.monitor=val/xyz"], "phase.monitor=val/xyz: must be one of val/mAP, val/NDS"),
         (["phase.monitor="], "phase.monitor=: must be one of"),
         (["optim.betas=[]"], "optim.betas"),
+        (["optim.betas=[0.9,0.99]"], r"optim.betas=\[0.9, 0.99\] begins with another beta1.*cycled_beta1=null"),
         (["trainer.devices=0"], "trainer.devices"),
         (["trainer.devices=3"], "data.batch_size=2.*trainer.devices=3"),
         (["precision=16"], "precision"),

@@ -39,6 +39,11 @@ class OptimConfig:
             value = getattr(self, name)
             if value is not None and (len(value) != 2 or not all(0 <= beta < 1 for beta in value)):
                 raise ConfigError(f"optim.{name} must be two numbers in [0, 1), but got {value}")
+        if self.cycled_beta1 is not None and self.betas[0] != self.cycled_beta1[0]:
+            raise ConfigError(
+                f"optim.betas={self.betas} begins with another beta1 than optim.cycled_beta1={self.cycled_beta1}, "
+                "which sets it at every step; give both the same, or cycled_beta1=null for a constant one"
+            )
         if self.ema_decay is not None and not 0 < self.ema_decay < 1:
             raise ConfigError(f"optim.ema_decay must be null or lie in (0, 1), but got {self.ema_decay}")
 

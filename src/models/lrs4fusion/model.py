@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, Self
 
 import torch
@@ -41,6 +42,8 @@ from src.structures.ray_bundle import RayBundle
 NORM_EPS = 1e-3  # PartA2's
 QUERIES_AT_ONCE = 1 << 16
 """Of samples along rays: their features are 544 numbers each."""
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -137,7 +140,9 @@ class LRS4Fusion(Detector, WorldModel):
         if batch.lidar_points is None or batch.lidar_batch is None:
             raise ValueError("FrameBatch.lidar_points is None, but this model uses LiDAR; read it with the frames")
         measured = None
-        if self.config.measured_motion and batch.lidar_speeds is not None:
+        if self.config.measured_motion and batch.lidar_speeds is None:
+            warn_without_speeds()
+        elif self.config.measured_motion:
             measured = return_velocities(batch)
             batch = replace(batch, lidar_points=at_key_time(batch.lidar_points, measured))
         voxels = self.pointnet(batch.lidar_points, batch.lidar_batch, len(batch), batch.lidar_speeds)
@@ -252,6 +257,15 @@ class LRS4Fusion(Detector, WorldModel):
             values[f"sites_{scale + 1}"] = len(volume) / frames
             values[f"dropped_sites_{scale + 1}"] = dropped / frames
         return values
+
+
+@cache
+def warn_without_speeds() -> None:
+    """Once a process: what `measured_motion` asks for cannot be had."""
+    logger.warning(
+        "model.measured_motion=true, but no return has a measured speed (data.timeline.radial_speeds=none), so nothing "
+        "is moved by it"
+    )
 
 
 @torch.no_grad()

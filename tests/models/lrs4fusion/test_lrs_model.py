@@ -11,6 +11,7 @@ from src.benchmark.scenes import ROADS
 from src.benchmark.scenes import lidar_frame as made_frame
 from src.errors import ConfigError
 from src.models.deploy.inference import prepare_for_inference
+from src.models.lrs4fusion.model import warn_without_speeds
 from src.structures.boxes import Boxes3D
 from src.structures.taxonomy import CLASSES
 from src.targets.occupancy_rays import sample_queries
@@ -164,7 +165,7 @@ def test_the_memory_changes_features_and_no_site():
     assert torch.equal(model(now, restored)[0].volumes.scales[3].features, remembering.scales[3].features)
 
 
-def test_measured_speeds_move_the_volume_and_what_is_remembered():
+def test_measured_speeds_move_the_volume_and_what_is_remembered(caplog):
     """All returns go 5 m/s along their rays from a mast, the ego 20 m/s along x, in a turned and larger aug frame."""
     augment = bda(0.4, scale=1.05)
     model = lrs_model(OCCUPANCY, "model.measured_motion=true").eval()
@@ -178,7 +179,9 @@ def test_measured_speeds_move_the_volume_and_what_is_remembered():
     assert len(output.volumes.measured.xyz) > 100 and not output.volumes.measured.ego_mps.any()
     later = model.encode(seen(0.5), memory)
     torch.testing.assert_close(later.measured.ego_mps, (augment[:3, :3] @ torch.tensor([20.0, 0, 0]))[None])
-    assert model.encode(seen(0.5, measured=False), memory).measured is None
+    warn_without_speeds.cache_clear()
+    assert not caplog.text and model.encode(seen(0.5, measured=False), memory).measured is None
+    assert "model.measured_motion=true, but no return has a measured speed" in caplog.text
     voxels = memory.frames[0].voxels  # in the ego frame, where the heading is x
     in_ego = SENSOR @ augment[:3, :3].inverse().T
     cosine = F.normalize(voxels.xyz - in_ego, dim=1)[:, 0]
