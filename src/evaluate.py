@@ -24,7 +24,7 @@ from src.reliability.cpu import tune_cpu
 from src.training.fit import build_evaluation_trainer
 from src.training.identity import digest_of_changes
 from src.training.module import TrainingModule
-from src.training.run_folder import check_no_run, make_writable, name_of_checkpoint, write_json
+from src.training.run_folder import check_no_run, make_writable, name_of_checkpoint, name_of_predictions, write_json
 from src.training.temporal_module import TemporalModule
 from src.training.true_motion import Oracle, TrueMotion
 
@@ -40,7 +40,8 @@ def main(overrides: list[str]) -> None:
     source = Path(config.checkpoint or config.predictions)
     if config.predictions and not source.is_file():  # before a world is written for it
         raise DataError(f"predictions={source}: there is no such file")
-    name = f"{name_of_checkpoint(source)}{digest_of_changes(overrides)}"
+    name = name_of_checkpoint(source) if config.checkpoint else name_of_predictions(source)
+    name += digest_of_changes(overrides)
     out = Path(config.out) if config.out else Path(config.paths.outputs) / "evaluations" / name
     check_no_run(out)
     make_writable(out, "out")
@@ -59,11 +60,10 @@ def main(overrides: list[str]) -> None:
         scores = score_detections(truth, boxes)
         metrics = score_report(truth, boxes, scores, config.phase.long_range)
         text = format_scores(metrics)
-    print(text)
-    write_json(out / "metrics.json", metrics)
+    write_json(out / "metrics.json", metrics)  # before anything is printed, which a closed pipe ends
     if write_more is not None:
         written += write_more(out)
-    print(f"\nwritten into {out}: {', '.join(written)}")
+    print(f"{text}\n\nwritten into {out}: {', '.join(written)}")
 
 
 def score_checkpoint(path: Path, overrides: list[str]) -> tuple[TrainingModule, Callable[[Path], list[str]]]:
@@ -82,6 +82,11 @@ def score_checkpoint(path: Path, overrides: list[str]) -> tuple[TrainingModule, 
     if config.oracle is not Oracle.none:
         if not isinstance(module, TemporalModule):
             raise ConfigError(f"oracle={config.oracle.value}: this checkpoint is of single frames and has no memory")
+        if not config.model.moves_memory:
+            raise ConfigError(
+                f"oracle={config.oracle.value}: this checkpoint moves nothing of its memory by velocities, so "
+                "true ones would move nothing either; give one with velocity_compensation=true"
+            )
         if datamodule.brings_past:
             raise ConfigError(
                 f"oracle={config.oracle.value}: moves the memory of streams, but with data.past_frames="

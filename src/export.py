@@ -17,6 +17,7 @@ from src.models.deploy.inference import prepare_for_inference
 from src.reliability.checkpoints import read_checkpoint
 from src.reliability.command import run_command
 from src.structures.taxonomy import CAMERAS
+from src.training.identity import digest_of_changes
 from src.training.run_folder import make_writable, name_of_checkpoint
 
 EXAMPLE_FRAMES = 2
@@ -28,19 +29,20 @@ DESCRIPTION = "description.json"
 def main(overrides: list[str]) -> None:
     """Write the image encoder of a checkpoint, batch norms folded, in float32, into `out`.
 
-    Without `out` the file is named by the checkpoint and its run and lies in `paths.outputs`/exports.
+    The command line may change its configuration, the size of the images for instance. Without `out` the file is named
+    by the checkpoint, its run and what is changed, and lies in `paths.outputs`/exports.
     """
     command, _ = compose_config(overrides)
     refuse_options_of_others(command, "export")
     if command.checkpoint is None:
         raise ConfigError("give checkpoint=PATH of the trained model whose image encoder is to be exported")
     path = Path(command.checkpoint)
-    exports = Path(command.paths.outputs) / "exports"
-    out = Path(command.out) if command.out else exports / f"{name_of_checkpoint(path)}.pt2"
+    name = f"{name_of_checkpoint(path)}{digest_of_changes(overrides)}.pt2"
+    out = Path(command.out) if command.out else Path(command.paths.outputs) / "exports" / name
     if out.suffix != ".pt2" or out.is_dir():
         raise ConfigError(f"out={out}: must be a file that ends in .pt2")
     checkpoint = read_checkpoint(path)
-    config = restore_config(checkpoint["horizon3d"]["config"], [])
+    config = restore_config(checkpoint["horizon3d"]["config"], overrides)
     if config.image_size_px is None:
         raise ConfigError(f"checkpoint={path}: {config.model.name} with this configuration uses no images")
     if config.backbone.trim_padding:

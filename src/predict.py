@@ -59,13 +59,13 @@ def main(overrides: list[str]) -> None:
     film = Film()
     bar = tqdm(frames, total=len(tokens), desc="predicting", unit="frame")
     found, skipped = predict(detector, bar, film if command.trainer.num_pictures else None)
-    for name in ("strip.png", "scene.gif"):  # of an earlier command, whose boxes these are not
-        (out / name).unlink(missing_ok=True)
-    if film:
-        film.write_strip(out / "strip.png", command.trainer.num_pictures)
-        film.write_animation(out / "scene.gif")
     table = DetectionTable.concatenate([to_global(*found[token], row) for row, token in enumerate(tokens)])
     written = save_submission(config, out / "submission.json", tokens, table)
+    for name in ("strip.png", "scene.gif"):  # of an earlier command, whose boxes these are not
+        (out / name).unlink(missing_ok=True)
+    if film:  # after the boxes, which are worth more
+        film.write_strip(out / "strip.png", command.trainer.num_pictures)
+        film.write_animation(out / "scene.gif")
     print(f"{len(tokens)} frames, {sum(len(boxes) for boxes, _ in found.values())} boxes, written into {out}: ", end="")
     print(", ".join(["submission.json"] * written + ["scene.gif", "strip.png"] * bool(film)))
     if skipped:

@@ -64,6 +64,10 @@ def test_evaluate_agrees_with_training_from_checkpoint_and_from_file(trained, ou
         "evaluate", f"predictions={tmp_path / 'a' / 'submission.json'}", f"data.root={world}",
         f"out={tmp_path / 'b'}", f"paths.outputs={outputs}",
     )  # fmt: skip
+    submission = tmp_path / "a" / "submission.json"
+    call("evaluate", f"predictions={submission}", f"data.root={world}", f"paths.outputs={outputs}")
+    (own,) = (outputs / "evaluations").glob("a-submission-*/metrics.json")  # files of one name in others of that name
+    assert own.read_text() == (tmp_path / "b" / "metrics.json").read_text()
     from_file = json.loads((tmp_path / "b" / "metrics.json").read_text())
     measures = from_file.pop("measures")  # a file of boxes does not tell what they were made of
     assert {name.partition("_")[0] for name in measures} == {"moving"}
@@ -83,8 +87,11 @@ def test_an_oracle_tells_a_memory_how_things_move(trained, outputs, tmp_path):
         call("evaluate", f"checkpoint={checkpoint}", *data, f"out={tmp_path / oracle}", f"oracle={oracle}")
         found.add((tmp_path / oracle / "submission.json").read_text())
     assert len(found) == 3, "what is remembered lies elsewhere each time"
+    still = [f"model.dptf.{path}_path.velocity_compensation=false" for path in ("bev", "gaussian")]
+    unmoved = write_checkpoint(tmp_path / "unmoved.ckpt", "phase=phase2", *still)
     single, boxes = folder / "checkpoints" / "last.ckpt", tmp_path / "none" / "submission.json"
     told = ("oracle=velocity", *data, f"out={tmp_path / 'no'}")
+    assert "moves nothing of its memory" in call("evaluate", f"checkpoint={unmoved}", *told, expect=3).stderr
     assert "of single frames" in call("evaluate", f"checkpoint={single}", *told, expect=3).stderr
     assert "no memory" in call("evaluate", f"predictions={boxes}", *told, expect=3).stderr
     assert "option of python -m src.evaluate" in call("train", *told[:1], "scale=debug", expect=3).stderr
@@ -132,6 +139,8 @@ def test_world_preview_and_comparison(outputs, tmp_path):
     assert "Boxes with at least one radar point: " in result.stdout
     page = (tmp_path / "statistics.md").read_text()
     assert "2 scenes of 3 key frames" in page and "compare=true" in page and str(outputs) not in page
+    recorded = ("data=truckscenes", f"data.root={tmp_path}", "preview=true", "compare=true")
+    assert "no world to write or to preview" in call("world.__main__", *recorded, *paths, expect=3).stderr
 
 
 def test_make_names_its_targets_and_a_wrong_phase():

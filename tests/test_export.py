@@ -37,9 +37,19 @@ def test_without_a_name_it_is_named_by_the_checkpoint(tmp_path, monkeypatch):
     folder = tmp_path / "outputs" / "some-run" / "checkpoints"
     folder.mkdir(parents=True)
     path = write_checkpoint(folder / "last.ckpt", "phase=phase1")
-    monkeypatch.setattr(torch.export, "save", lambda program, out, extra_files: out.write(b"program"))
+    described = []
+
+    def save(program, out, extra_files):
+        described.append(extra_files)
+        out.write(b"program")
+
+    monkeypatch.setattr(torch.export, "save", save)
     export.main([f"checkpoint={path}", f"paths.outputs={tmp_path / 'outputs'}"])
-    assert (tmp_path / "outputs" / "exports" / "some-run-last.pt2").is_file()
+    exports = tmp_path / "outputs" / "exports"
+    assert (exports / "some-run-last.pt2").is_file()
+    export.main([f"checkpoint={path}", f"paths.outputs={tmp_path / 'outputs'}", "backbone.image_size_px=[64,128]"])
+    assert len(list(exports.glob("some-run-last-*.pt2"))) == 1
+    assert json.loads(described[-1][export.DESCRIPTION])["input"] == "[B, 4, 3, 64, 128] uint8 RGB"
 
 
 @pytest.mark.slow

@@ -53,10 +53,11 @@ def main(overrides: list[str]) -> None:
         print(warning)
     suite = importlib.import_module(f"src.benchmark.suite_{config.suite.value}")
     page = page_of(config.suite.value, overrides, machine, suite.measure(config, tree))
-    print(markdown(page))
-    if config.out:
+    if config.out:  # first: what took long is safe
         name = page_name(config)
         write_page(Path(config.out), name, page)
+    print(markdown(page))
+    if config.out:
         print(f"written: {Path(config.out) / name}.md and .json")
     if page["result"].get("agrees") is False:
         raise DataError("our metric and the official evaluator disagree on this problem; see the numbers above")

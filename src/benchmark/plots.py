@@ -37,9 +37,8 @@ def held_mib(point: dict[str, Any]) -> float:
     return (point["added MiB"] or 0.0) + point["remembered MiB"]
 
 
-def draw_scaling(path: Path, measured: dict[str, Rows], title: str) -> None:
-    """Time over every sweep, memory over the two ranges, and time by part over the fixed scene, of all models."""
-    fixed = "range, fixed scene"
+def draw_scaling(path: Path, measured: dict[str, Rows], title: str, fixed: str) -> None:
+    """Time over every sweep, memory over the two ranges, and time by part over the sweep `fixed`, of all models."""
     models = list(dict.fromkeys(point["model"] for point in measured[fixed]))
 
     def lines_of(name: str, value_of: Callable[[dict[str, Any]], float]) -> dict[str, Line]:

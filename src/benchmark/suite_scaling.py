@@ -92,7 +92,10 @@ def measure(config: Config, tree: dict[str, Any]) -> dict[str, Any]:
     if config.out:
         name = f"{page_name(config)}.png"
         draw_scaling(
-            Path(config.out) / name, measured, f"Cost of a frame without its image encoder, scale {config.scale}"
+            Path(config.out) / name,
+            measured,
+            f"Cost of a frame without its image encoder, scale {config.scale}",
+            FIXED_SCENE,
         )
         result["picture"] = name
     return result | measured

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,7 +16,7 @@ def replacing(path: Path, mode: str = "w", sync: bool = False, newline: str | No
 
     Raises OSError with the file's name for any failure to write, such as a full disk; an older file then stays.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")  # process ids of two machines may be one
     try:
         with open(temporary, mode, encoding=None if "b" in mode else "utf-8", newline=newline) as file:
             yield file

@@ -57,6 +57,11 @@ class ModelConfig:
         return None if self._temporal is None else self._temporal.max_age_s
 
     @property
+    def moves_memory(self) -> bool:
+        """Whether what is remembered moves by velocities of its own, if it has any, which an oracle can replace."""
+        return self._temporal is not None
+
+    @property
     def _temporal(self) -> Any:
         return getattr(self, self.temporal_part) if self.temporal_part else None
 

@@ -65,7 +65,9 @@ def run_command(main: Callable[[list[str]], None]) -> None:
     except HorizonError as error:
         print(f"\n{type(error).__name__}: {error}", file=sys.stderr)  # a progress bar may stand on the line
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit) as error:
+        if isinstance(error, SystemExit) and not isinstance(error.__context__, KeyboardInterrupt):
+            raise  # Lightning makes an exit of a KeyboardInterrupt; others mean their exit
         print("\nInterrupted; the same command resumes from its last checkpoint, if it writes any.", file=sys.stderr)
         sys.exit(InterruptedRunError.exit_code)
     except Exception as error:

@@ -213,8 +213,9 @@ def write_dump(
     }
     try:
         AtomicCheckpointIO(fail_fast=lambda: True).save_checkpoint(content, path)  # the other ranks wait
-        of_rank = [old for old in folder.iterdir() if re.fullmatch(rf"nonfinite-step\d+-rank{rank}\.pt", old.name)]
-        for old in sorted(of_rank, key=lambda old: old.stat().st_mtime)[:-MAX_DUMPS]:
+        named = re.compile(rf"nonfinite-step\d+-rank{rank}\.pt")
+        others = [old for old in folder.iterdir() if named.fullmatch(old.name) and old != path]  # clocks may be wrong
+        for old in sorted(others, key=lambda old: old.stat().st_mtime)[: 1 - MAX_DUMPS]:
             old.unlink()
     except (CheckpointError, OSError) as error:
         logger.warning("the step could not be kept for a replay: %s", error)

@@ -20,6 +20,7 @@ import yaml
 from src.errors import BusyError, CheckpointError, ConfigError, DataError
 from src.files.atomic_write import replacing, write_whole
 from src.reliability.checkpoints import BEST, LAST, PREVIOUS, OpenCheckpoint, open_checkpoint, sync_folder
+from src.training.identity import digest_of
 
 logger = logging.getLogger(__name__)
 
@@ -181,6 +182,12 @@ def name_of_checkpoint(source: Path) -> str:
     folder = source.resolve().parent
     run = folder.parent.name if folder.name == "checkpoints" else folder.name
     return f"{run}-{source.stem}"
+
+
+def name_of_predictions(source: Path) -> str:
+    """The names of file and folder, and 8 hex digits of where they are: all of `src.predict` have the same names."""
+    source = source.resolve()
+    return f"{source.parent.name}-{source.stem}-{digest_of([str(source)])}"
 
 
 def check_no_run(folder: Path) -> None:

@@ -74,7 +74,7 @@ def scene_of(
     truth = batch.boxes[0] if batch.boxes is not None else Boxes3D.empty()
     if len(truth):
         limits = torch.tensor([CLASS_RANGE_M[name] for name in CLASSES], device=truth.labels.device)[truth.labels]
-        counted = (truth.centers[:, :2].norm(dim=1) < limits) & (truth.num_points > 0)
+        counted = (truth.centers[:, :2].norm(dim=1) < limits) & (truth.num_points != 0)
         truth = truth[counted]
     scene = BevScene(
         grid=PictureGrid(grid.x_min_m, grid.y_min_m, grid.cell_m, grid.rows, grid.cols),

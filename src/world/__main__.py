@@ -34,8 +34,10 @@ def main(overrides: list[str]) -> None:
     """
     config, _ = compose_config(overrides)
     refuse_options_of_others(config, "world")
-    if config.data.world is None and not config.compare:
-        raise ConfigError("data.world is null: this configuration reads recorded data, there is no world to write")
+    if config.data.world is None and (config.preview or not config.compare):
+        raise ConfigError(
+            "data.world is null: this configuration reads recorded data, there is no world to write or to preview"
+        )
     root = data_root(config)
     print(f"world: {root}")
     if config.compare:

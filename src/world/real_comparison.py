@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from src.metrics.diagnostics import SEEN_POINTS, SEEN_S, seen_before
+from src.metrics.diagnostics import FAST_MPS, SEEN_POINTS, SEEN_S, seen_before
 from src.structures.taxonomy import CLASS_RANGE_M, RADARS
 from src.world.dataset_statistics import DatasetCounts
 
@@ -21,7 +21,6 @@ REAL_STATISTICS = Path(__file__).with_name("real_statistics.yaml")
 FEWEST_BOXES = 50
 """A real figure that rests on fewer boxes says little."""
 HEAVY = ("truck", "bus", "trailer")
-FAST_MPS = 10.0
 
 
 @dataclass(kw_only=True)

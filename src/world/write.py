@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import logging
 import multiprocessing
 import os
 import shutil
@@ -24,27 +26,37 @@ from src.world.scene_writer import write_scene
 from src.world.table_rows import Tables, shared_tables
 from src.world.world_config import WorldConfig, stored_config
 
+logger = logging.getLogger(__name__)
+
 VERSION = "v1.2-trainval"
 CONFIG_FILE = "world.json"
 SPLITS_FILE = "splits.json"
+PARTIAL, LOCK_FILE = "partial", ".lock"
+"""Of the name of a folder that is being filled, and the file in it that its writer has locked."""
 
 
 def ensure_world(config: WorldConfig, root: Path, progress: bool = True) -> Path:
     """The world of this config at `root`, written now unless it is there already.
 
     Everything goes into a hidden folder beside `root` that is renamed at the end, so an interrupted run leaves no
-    `root`. The bytes depend on the config alone, not on `num_workers`. Raises ConfigError if the world at `root` has
-    another config, DataError if `root` holds something else or half of a world, or cannot be written.
+    `root`; while another process writes it, it is waited for. The bytes depend on the config alone, not on
+    `num_workers`. Raises ConfigError if the world at `root` has another config, DataError if `root` holds something
+    else or half of a world, or cannot be written.
     """
     root = Path(root)
-    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+    if not _is_there(root):
+        _wait_for_others(root)
+    if _is_there(root):
         _check_stored(config, root)
         return root
-    partial_root = root.parent / f".{root.name}.partial-{uuid.uuid4().hex[:8]}"
+    partial_root = root.parent / f".{root.name}.{PARTIAL}-{uuid.uuid4().hex[:8]}"
     try:
         try:
-            root.parent.mkdir(parents=True, exist_ok=True)
-            _fill(config, partial_root, progress)
+            partial_root.mkdir(parents=True)
+            with open(partial_root / LOCK_FILE, "w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                _fill(config, partial_root, progress)
+                (partial_root / LOCK_FILE).unlink()
         except OSError as error:
             raise DataError(
                 f"{root}: the world could not be written ({error.strerror or error}); make room, or choose another "
@@ -60,6 +72,27 @@ def ensure_world(config: WorldConfig, root: Path, progress: bool = True) -> Path
     finally:
         shutil.rmtree(partial_root, ignore_errors=True)
     return root
+
+
+def _is_there(root: Path) -> bool:
+    """Whether anything is; an empty folder is nothing."""
+    return root.exists() and (not root.is_dir() or any(root.iterdir()))
+
+
+def _wait_for_others(root: Path) -> None:
+    """Wait while other processes write this world; what killed ones have left of it is removed."""
+    for other in root.parent.glob(f".{root.name}.{PARTIAL}-*"):
+        try:
+            lock = open(other / LOCK_FILE)
+        except OSError:  # it is not locked yet, or has been moved away by now
+            continue
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                logger.info("another process is writing the world %s; waiting for it", root)
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            shutil.rmtree(other, ignore_errors=True)  # of whoever ended without moving it away
 
 
 def _check_stored(config: WorldConfig, root: Path) -> None:

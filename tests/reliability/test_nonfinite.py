@@ -4,7 +4,9 @@ import copy
 import csv
 import logging
 import math
+import os
 import re
+import time
 from dataclasses import replace
 from itertools import pairwise
 
@@ -227,6 +229,17 @@ def test_the_newest_dumps_of_a_rank_are_kept(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
         f"nonfinite-step{step}-rank{rank}.pt" for step in steps for rank in (0, 1)
     )
+
+
+def test_a_dump_is_kept_whatever_the_clock_said_before(tmp_path):
+    module, batch = toy_module(), toy_batch([0, 1], [True] * 2)
+    named = {"rank": 0, "epoch": 0, "world_size": 1, "seed": 1, "memories": [], "found": ""}
+    ahead = time.time() + 3600
+    for step in (1, 2, 3):
+        path = write_dump(tmp_path, module.model, {}, batch, global_step=step, **named)
+        os.utime(path, (ahead + step, ahead + step))
+    newest = write_dump(tmp_path, module.model, {}, batch, global_step=4, **named)
+    assert {path.name[14:20] for path in tmp_path.iterdir()} == {"000002", "000003", "000004"} and newest.is_file()
 
 
 def test_a_disk_that_refuses_the_dump_does_not_hide_the_fault(tmp_path, monkeypatch, caplog):

@@ -256,6 +256,23 @@ def test_a_killed_write_leaves_nothing_that_looks_complete(tmp_path, make_config
     assert not root.exists()
     assert not list(tmp_path.rglob("world.json"))
     assert ensure_world(make_config(**TINY), root, progress=False) == root
+    assert list(tmp_path.iterdir()) == [root] and not (root / ".lock").exists(), "what was left is gone"
+
+
+@pytest.mark.slow
+def test_two_processes_write_a_world_once(tmp_path, make_config, caplog):
+    root, config = tmp_path / "w", make_config(key_frames_per_scene=20)
+    child = multiprocessing.get_context("spawn").Process(target=ensure_world, args=(config, root, False))
+    child.start()
+    end = time.monotonic() + 60
+    while not list(tmp_path.rglob("*.jpg")) and time.monotonic() < end:
+        time.sleep(0.02)
+    (writing,) = tmp_path.iterdir()
+    with caplog.at_level("INFO"):
+        ensure_world(config, root, progress=False)
+    child.join()
+    assert child.exitcode == 0 and not writing.exists() and list(tmp_path.iterdir()) == [root]
+    assert f"another process is writing the world {root}; waiting for it" in caplog.text
 
 
 @pytest.mark.slow

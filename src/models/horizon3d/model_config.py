@@ -70,6 +70,12 @@ class Horizon3DConfig(ModelConfig):
         return ("radar",) if self.ocsf is None else ("camera", "radar")
 
     @property
+    def moves_memory(self) -> bool:
+        """Whether any path compensates for velocities."""
+        paths = [self.dptf.bev_path, self.dptf.gaussian_path] if self.dptf is not None else []
+        return any(path is not None and path.velocity_compensation for path in paths)
+
+    @property
     def keys_of_temporal_phase(self) -> tuple[str, ...]:
         """All of DPTF with its loss terms; velocities of Gaussians unless they are supervised before."""
         terms = [f"cell_{term}_weight" for term in ("focal", "dice", "lovasz", "velocity")]
