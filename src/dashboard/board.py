@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import operator
 import threading
 import time
 from collections.abc import Iterable
@@ -169,6 +170,7 @@ class BoardReader:
         self.reports = reports
         self.outputs = outputs
         self._files: dict[Path, tuple[Stamp, object]] = {}
+        self._tables: dict[Path, tuple[list[object], list[SweepTable], str | None]] = {}
         self._lock = threading.Lock()
         self._board: Board | None = None
         self._mark: object = None
@@ -225,9 +227,10 @@ class BoardReader:
     ) -> tuple[list[Sweep], dict[str, str]]:  # fmt: skip
         """The sweeps, and by file why some cannot be shown."""
         sweeps, not_shown = [], {}
+        self._tables = {path: known for path, known in self._tables.items() if path in records}
         for path, record in records.items():
             try:
-                sweep = self._sweep(record, results, folders, now)
+                sweep = self._sweep(path, record, results, folders, now)
                 _ = sweep.state, sweep.left_s, [settings_of(run.overrides) for run in record.runs.values()]
             except Exception as error:  # one bad record must not hide the others
                 logger.exception("%s cannot be shown", path)
@@ -237,16 +240,28 @@ class BoardReader:
         return sweeps, not_shown
 
     def _sweep(
-        self, record: SweepRecord, results: dict[str, RunResult], folders: RunFolders, now: float
+        self, path: Path, record: SweepRecord, results: dict[str, RunResult], folders: RunFolders, now: float
     ) -> Sweep:  # fmt: skip
         running = [run for run in record.runs.values() if run.state == "running"]
         signs = [folders.written(run.run_id, run.log) for run in running]
         written = max([record.updated, *(sign for sign in signs if sign is not None)])
-        try:
-            tables, problem = sweep_tables(record, results), None
-        except (ValueError, DataError) as error:
-            tables, problem = [], str(error)
+        tables, problem = self._tables_of(path, record, results)
         return Sweep(record=record, tables=tables, problem=problem, written=written, now=now)
+
+    def _tables_of(
+        self, path: Path, record: SweepRecord, results: dict[str, RunResult]
+    ) -> tuple[list[SweepTable], str | None]:
+        """Tables, or what is wrong with them; made anew where the record or a result of it has been read anew."""
+        shown = {*record.runs, *(run for runs in record.rows.values() for run in runs.values())}
+        sources = [record, *(results.get(run) for run in sorted(shown))]
+        known = self._tables.get(path)
+        if known is None or len(known[0]) != len(sources) or any(map(operator.is_not, known[0], sources)):
+            try:
+                known = (sources, sweep_tables(record, results), None)
+            except (ValueError, DataError) as error:
+                known = (sources, [], str(error))
+            self._tables[path] = known
+        return known[1], known[2]
 
     def _cached(self, path: Path, stamp: Stamp) -> RunResult | SweepRecord | DataError:
         known = self._files.get(path)

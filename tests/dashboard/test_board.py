@@ -190,17 +190,23 @@ def test_only_what_changed_is_read_again(world, monkeypatch):
     reads = []
     original = board_module.read_result
     monkeypatch.setattr(board_module, "read_result", lambda path: reads.append(path.name) or original(path))
+    tables, build = [], board_module.sweep_tables
+    monkeypatch.setattr(board_module, "sweep_tables", lambda *sources: tables.append(sources) or build(*sources))
     reader = BoardReader(world.reports, world.outputs)
     board, mark = reader.read()
-    assert len(reads) == 7
+    assert len(reads) == 7 and len(tables) == len(board.sweeps)
     assert reader.read() == (board, mark) and len(reads) == 7
+    training = write_run(world.outputs, "horizon3d-phase2-mini-0000001a", 0, 0.3, 1.0)
+    (training / "metrics.json").unlink()  # it still trains, and makes no table anew
+    assert reader.read()[1] != mark and len(tables) == len(board.sweeps)
+    before = len(tables)
     path = world.reports / "results" / f"{World.run_id(0, 0)}.json"
     path.write_text(path.read_text().replace('"seed": 0', '"seed": 7'))
     changed, new_mark = reader.read()
     assert reads[7:] == [path.name] and new_mark != mark
-    assert changed.runs[World.run_id(0, 0)].seed == 7
+    assert changed.runs[World.run_id(0, 0)].seed == 7 and len(tables) == before + 1
     path.unlink()
-    assert reader.read()[0].runs[World.run_id(0, 0)].result is None
+    assert reader.read()[0].runs[World.run_id(0, 0)].result is None and len(tables) == before + 2
 
 
 def test_nothing_at_all(tmp_path):
