@@ -51,27 +51,31 @@ def ensure_world(config: WorldConfig, root: Path, progress: bool = True) -> Path
         return root
     partial_root = root.parent / f".{root.name}.{PARTIAL}-{uuid.uuid4().hex[:8]}"
     try:
-        try:
-            partial_root.mkdir(parents=True)
-            with open(partial_root / LOCK_FILE, "w") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-                _fill(config, partial_root, progress)
-                (partial_root / LOCK_FILE).unlink()
-        except OSError as error:
-            raise DataError(
-                f"{root}: the world could not be written ({error.strerror or error}); make room, or choose another "
-                "data.root or paths.outputs"
-            ) from error
-        try:
-            os.replace(partial_root, root)
-        except OSError as error:
-            # Another process may have finished the same world in the meantime.
-            if not root.exists():
-                raise DataError(f"{root}: the finished world could not be moved here: {error}") from error
-            _check_stored(config, root)
+        partial_root.mkdir(parents=True)
+        with open(partial_root / LOCK_FILE, "w") as lock:  # until it is moved: who gets the lock removes what lies here
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            _fill(config, partial_root, progress)
+            _move(config, partial_root, root)
+    except OSError as error:
+        raise DataError(
+            f"{root}: the world could not be written ({error.strerror or error}); make room, or choose another "
+            "data.root or paths.outputs"
+        ) from error
     finally:
         shutil.rmtree(partial_root, ignore_errors=True)
     return root
+
+
+def _move(config: WorldConfig, partial_root: Path, root: Path) -> None:
+    """Give the finished world its name, unless another process has finished the same one."""
+    try:
+        os.replace(partial_root, root)
+    except OSError as error:
+        if not root.exists():
+            raise DataError(f"{root}: the finished world could not be moved here: {error}") from error
+        _check_stored(config, root)
+    else:
+        (root / LOCK_FILE).unlink(missing_ok=True)
 
 
 def _is_there(root: Path) -> bool:
