@@ -120,8 +120,12 @@ def save_submission(config: Config, path: Path, tokens: list[str], table: Detect
         path.unlink(missing_ok=True)  # of an earlier command, whose boxes these are not
         logger.warning("no box reached the score threshold, so there is no valid submission to write")
         return False
-    max_age_s = config.model.memory_max_age_s  # the benchmark's rules are about how far back a detector looks
-    memory = "no memory" if max_age_s is None else f"memory of up to {max_age_s:g} s"
+    max_age_s, window_s = config.model.memory_max_age_s, config.data.past_window_s
+    memory = "no memory"  # the benchmark's rules are about how far back a detector looks
+    if max_age_s is not None and window_s is None:
+        memory = f"streamed, memory of frames of up to {max_age_s:g} s, each with what it remembered itself"
+    elif max_age_s is not None:
+        memory = f"memory of inputs of up to {window_s:g} s"
     meta: dict[str, bool | str] = {f"use_{sensor}": sensor in config.model.sensors for sensor in SENSORS}
     timeline = config.data.timeline
     if timeline is not None and timeline.radial_speeds is RadialSpeeds.radar:

@@ -89,8 +89,9 @@ def score_checkpoint(path: Path, overrides: list[str]) -> tuple[TrainingModule, 
             )
         if datamodule.brings_past:
             raise ConfigError(
-                f"oracle={config.oracle.value}: moves the memory of streams, but with data.past_frames="
-                f"{config.data.past_frames} each frame brings a past of data.timeline along; give data.past_frames=0"
+                f"oracle={config.oracle.value}: moves the memory of streams, but with data.past_window_s="
+                f"{config.data.past_window_s}, data.past_frames={config.data.past_frames} each frame brings its past "
+                "along; give data.past_window_s=null data.past_frames=0"
             )
         module.oracle = TrueMotion(datamodule.evaluation_set(), config.oracle)
     build_evaluation_trainer(config.precision, config.trainer.accelerator.value).validate(

@@ -39,6 +39,7 @@ class StreamingDetector:
     - Frames that are not in the past of the present one are forgotten. So a frame given again replaces itself, less
       what lay at the far end of a full memory, and a clock that jumps back continues from there; call `reset` when
       another recording begins.
+    - A frame that brings its past along (`FrameBatch.past`) is detected with that alone, and is not remembered.
     - Frames from which the vehicle could not have come at 100 m/s are not used: the localisation has jumped.
 
     Any number of frames may be given; only the last few are kept. The memory lives here, as `memory`, never in the
@@ -172,7 +173,7 @@ class StreamingDetector:
 
         Raises ValueError for a batch that is not one frame, is augmented, or lacks what the model reads.
         """
-        if self.whole_frames is not None:
+        if self.whole_frames is not None and not frame.past:
             self._begin(frame)
             with torch.inference_mode(), computing(self.precision, self.device):
                 boxes = self.whole_frames.step(frame)
@@ -185,7 +186,11 @@ class StreamingDetector:
         """Boxes of the next frame and the model's own output, both on the device; never in fixed shapes. See `step`."""
         self._begin(frame)
         with computing(self.precision, self.device):
-            output, self.memory = self.model(frame.to(self.device), self.memory)
+            frame = frame.to(self.device)
+            if frame.past:
+                output = self.model.output_alone(frame, self.model.memory_of(frame.past))
+            else:
+                output, self.memory = self.model(frame, self.memory)
             (boxes,) = self.model.decode(output)
         return boxes, output
 

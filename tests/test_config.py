@@ -202,8 +202,9 @@ FULL_SIZE = {
     "data": {
         "train_split": "train", "train_scenes": None, "split": "val", "batch_size": 8, "num_sweeps": 10,
         "min_distance_m": 1.0, "propagate_points": False, "on_bad_file": "error", "test_resize_offset": 0.0,
-        "groups_per_scene": 2, "stream_sets": 1, "past_frames": 0, "sensor_dropout": 0.0, "num_lidar_sweeps": 5,
-        "lidar_origins": False, "deskew_lidar": True, "timeline": None, "num_future_frames": 0,
+        "groups_per_scene": 2, "stream_sets": 1, "past_frames": 0, "past_window_s": None,
+        "sensor_dropout": 0.0, "num_lidar_sweeps": 5, "lidar_origins": False, "deskew_lidar": True,
+        "timeline": None, "num_future_frames": 0,
     },
     "data.augmentation.image": {"resize": [-0.06, 0.11], "rotation_deg": 5.4, "flip_probability": 0.5},
     "data.augmentation.bev": {"scale": [0.95, 1.05], "rotation_rad": 0.3925, "flip_probability": 0.5},

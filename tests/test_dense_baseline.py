@@ -49,7 +49,7 @@ def test_both_phases_leave_what_is_promised(trained, outputs, family):
     assert "weights from" in log and "in temporal" in log
     meta = json.loads((trained / "submission.json").read_text())["meta"]
     assert meta["use_camera"] and meta["use_radar"] == (family not in ("petr", "far3d"))
-    assert "memory of up to 6 s" in meta["description"]
+    assert "memory of frames of up to 6 s" in meta["description"]
     weights = [read_checkpoint(folder / "checkpoints" / "last.ckpt")["state_dict"] for folder in (first, trained)]
     assert {key for key in weights[1] if key not in weights[0]} == {key for key in weights[1] if ".temporal." in key}
 

@@ -108,8 +108,25 @@ def test_memory_shows_in_the_boxes_and_its_age_can_be_set(checkpoints, outputs, 
     forgetful, everything = results(tmp_path), results(whole)
     changed = [forgetful[token] != boxes for token, boxes in everything.items()]
     assert sum(changed) == 2 * (FRAMES - 1)  # all but the first frame of each scene
-    for folder, words in ((tmp_path, "memory of up to 0.3 s"), (whole, "memory of up to 6 s")):
+    for folder, words in ((tmp_path, "memory of frames of up to 0.3 s"), (whole, "memory of frames of up to 6 s")):
         assert words in json.loads((folder / "submission.json").read_text())["meta"]["description"]
+
+
+@pytest.mark.slow
+def test_a_window_lets_nothing_older_through_what_is_remembered(checkpoints, outputs, whole, tmp_path):
+    """0.8 s hold the frame before with its quarter second of sweeps; a stream's memory of it knows older frames too."""
+    run(checkpoints["phase2"], f"paths.outputs={outputs}", f"out={tmp_path}", "data.past_window_s=0.8")
+    windowed, everything = results(tmp_path), results(whole)
+    same = [windowed[token] == boxes for token, boxes in everything.items()]
+    assert same == 2 * ([True, True] + [False] * (FRAMES - 2))
+    description = json.loads((tmp_path / "submission.json").read_text())["meta"]["description"]
+    assert "memory of inputs of up to 0.8 s" in description
+    scored, where = tmp_path / "scored", (f"checkpoint={checkpoints['phase2']}", f"paths.outputs={outputs}")
+    evaluate.main([*where, f"out={scored}", "data.past_window_s=0.8"])
+    counts = [{token: len(boxes) for token, boxes in results(folder).items()} for folder in (scored, tmp_path)]
+    assert counts[0] == counts[1]
+    with pytest.raises(ConfigError, match="each frame brings its past along"):
+        evaluate.main([*where, "data.past_window_s=0.8", "oracle=velocity"])
 
 
 @pytest.mark.slow

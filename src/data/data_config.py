@@ -24,6 +24,7 @@ class DataConfig(ReaderOptions):
     groups_per_scene: int  # sequences a scene is cut into when clips are streamed for training; method 6.4
     stream_sets: int  # at most so many sets of streams take turns when clips are streamed; 1: all streams at every step
     past_frames: int  # 0: clips are streamed; else frames are shuffled, each with so many before it (of the timeline)
+    past_window_s: float | None  # frames of an evaluation are in no stream and see nothing older; null: streams
     sensor_dropout: float  # share of frames with a past that come without any sensor data
     num_workers: int  # loader processes per device
     augmentation: AugmentationConfig | None
@@ -45,6 +46,13 @@ class DataConfig(ReaderOptions):
             raise ConfigError(f"data.train_scenes={self.train_scenes}: must be at least 1, or null for all")
         if not 0 <= self.sensor_dropout < 1:
             raise ConfigError(f"data.sensor_dropout={self.sensor_dropout}: must be at least 0 and below 1")
+        if self.past_window_s is not None and not (self.past_window_s > 0 and self.timeline is None):
+            raise ConfigError(
+                f"data.past_window_s={self.past_window_s}: must be above 0, or null for streams"
+                if self.timeline is None
+                else f"data.past_window_s={self.past_window_s}: is of key frames, but data.timeline says what past its "
+                "frames have; leave one of them null"
+            )
         if self.num_future_frames and self.timeline is None:
             raise ConfigError(
                 f"data.num_future_frames={self.num_future_frames}: the future is that of data.timeline, which is null"

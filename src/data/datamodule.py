@@ -54,11 +54,12 @@ class FrameDataset(Dataset[FrameBatch]):
         augmentation: AugmentationConfig | None,
         seed: int,
         sensor_dropout: float = 0.0,
-        past_frames: int = 0,  # of a frame that is in no stream
+        past_frames: int = 0,  # that each frame brings along
+        past_window_s: float | None = None,  # age of the oldest point of frames that do, at the time of the frame
         training: bool = False,  # times whose rays supervise are drawn
     ) -> None:
         self.reader, self.augmentation, self.seed, self.sensor_dropout = reader, augmentation, seed, sensor_dropout
-        self.past_frames, self.training = past_frames, training
+        self.past_frames, self.past_window_s, self.training = past_frames, past_window_s, training
 
     def __getitem__(self, key: FrameKey) -> FrameBatch | HorizonError:
         clip = None if key.clip is None else str(self.reader.index.sample_tokens[key.clip])
@@ -94,6 +95,10 @@ class FrameDataset(Dataset[FrameBatch]):
             else nothing
             for row in self.reader.before(key.sample, self.past_frames)
         ]
+        if self.past_window_s is not None:
+            now_s = float(frame.timestamps_s)
+            past = [one if now_s - float(one.timestamps_s) <= self.past_window_s else nothing for one in past]
+            frame, *past = (without_older_points(one, now_s - self.past_window_s) for one in (frame, *past))
         return replace(frame, past=tuple(past))
 
 
@@ -108,6 +113,19 @@ def drop_sensors(frame: FrameBatch, share: float, draw: tuple[int, ...]) -> Fram
     if first or np.random.default_rng(draw).random() >= share:
         return frame
     return without_sensors(frame)
+
+
+def without_older_points(frame: FrameBatch, oldest_s: float) -> FrameBatch:
+    """One frame without the points that were measured before a time."""
+    changes = {}
+    for sensor in ("radar", "lidar"):
+        points = getattr(frame, f"{sensor}_points")
+        if points is not None:
+            keep = float(frame.timestamps_s) - points[:, -1].double() >= oldest_s  # `dt` is the last of both
+            names = (f"{sensor}_{name}" for name in ("points", "batch", "origins", "speeds"))
+            values = {name: getattr(frame, name, None) for name in names}
+            changes |= {name: value[keep] for name, value in values.items() if value is not None}
+    return replace(frame, **changes)
 
 
 def without_sensors(frame: FrameBatch) -> FrameBatch:
@@ -216,7 +234,7 @@ class DetectionDataModule(L.LightningDataModule):
 
         Raises ConfigError for a scene that the split does not have, and where frames bring their past along.
         """
-        if self.brings_past:
+        if self.brings_past and self.config.timeline is not None:
             raise ConfigError(
                 f"data.past_frames={self.config.past_frames}: must be 0 to follow scenes frame by frame, found frames "
                 "that each bring a past of data.timeline along; give data.past_frames=0 for streams of key frames, or "
@@ -245,7 +263,7 @@ class DetectionDataModule(L.LightningDataModule):
         """One clip in stream 0, without augmentation."""
         frames = self._frames(None)
         for sample in samples:
-            order = () if self.brings_past else (0, int(samples[0]))
+            order = () if self.brings_past and self.config.timeline is not None else (0, int(samples[0]))
             frame = frames[FrameKey(0, int(sample), *order)]
             if isinstance(frame, HorizonError):
                 raise frame
@@ -306,8 +324,25 @@ class DetectionDataModule(L.LightningDataModule):
 
     @property
     def brings_past(self) -> bool:
-        """Whether frames that are looked at in order have their past with them, of the timeline, not in a stream."""
-        return self.temporal and self.config.timeline is not None and self.config.past_frames > 0
+        """Whether frames that are looked at in order have their past with them, not in a stream."""
+        of_timeline = self.config.timeline is not None and self.config.past_frames > 0
+        return self.temporal and (of_timeline or self.config.past_window_s is not None)
+
+    def _window_depth(self) -> int:
+        """How many key frames before a frame of the validation split `data.past_window_s` holds at most.
+
+        Raises ConfigError for none.
+        """
+        depth, window_s = 0, self.config.past_window_s
+        for scene in self._scenes_of(split_samples(self.index, self.config.split)):
+            times_s = 1e-6 * self.index.frame_times_us[scene]
+            depth = max(depth, *np.arange(len(scene)) - np.searchsorted(times_s, times_s - window_s))
+        if not depth:
+            raise ConfigError(
+                f"data.past_window_s={window_s}: no frame of the split {self.config.split!r} has another one that "
+                "shortly before it, so nothing would be remembered; raise it, or give a checkpoint of single frames"
+            )
+        return int(depth)
 
     def _rank(self) -> tuple[int, int]:
         """This process's rank and the number of processes, which must divide the batch."""
@@ -326,10 +361,17 @@ class DetectionDataModule(L.LightningDataModule):
         return divmod(self.trainer.global_step, min(steps, self.trainer.num_training_batches))
 
     def _frames(self, augmentation: AugmentationConfig | None, training: bool = False) -> FrameDataset:
-        """Frames by key. Those of the timeline's past always come along, the key frames before it in training."""
-        config = self.config
-        past = config.past_frames if self.temporal and (training or config.timeline is not None) else 0
-        return FrameDataset(self.reader, augmentation, self.seed, config.sensor_dropout, past, training)
+        """Frames by key. Those of the timeline's past always come along, the key frames before it in training.
+
+        With `data.past_window_s` key frames do in validation too.
+        """
+        config, past = self.config, 0
+        if self.temporal and (training or config.timeline is not None):
+            past = config.past_frames
+        elif self.brings_past:
+            past = self._window_depth()
+        window_s = config.past_window_s
+        return FrameDataset(self.reader, augmentation, self.seed, config.sensor_dropout, past, window_s, training)
 
     def _loader(
         self, sampler: ScheduleSampler, augmentation: AugmentationConfig | None, training: bool = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
@@ -156,6 +156,13 @@ class Detector(nn.Module, ABC):
     def transition(self, batch: FrameBatch, memory: Any) -> Any:
         """The memory of `forward` where the frame is only remembered; not detached with `trains_last_transition`."""
         return self(batch, memory)[1]
+
+    def memory_of(self, frames: Iterable[FrameBatch]) -> Any:
+        """The memory of consecutive frames, the oldest first, of which the first has none; None for no frame."""
+        memory = None
+        for frame in frames:
+            memory = self.transition(frame, memory)
+        return memory
 
     def restore_memory(self, state: list[dict[str, Any]]) -> Any:
         """The memory that `FrameMemory.state` described. Raises NotImplementedError for single-frame detectors."""

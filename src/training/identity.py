@@ -30,12 +30,13 @@ They are left out of its identity, of its result, and of what a sweep records of
 """
 
 
-TEMPORAL_DATA_KEYS = ("groups_per_scene", "stream_sets", "past_frames", "sensor_dropout")
+TEMPORAL_DATA_KEYS = ("groups_per_scene", "stream_sets", "past_frames", "past_window_s", "sensor_dropout")
 """Keys of `data` that change nothing in a phase without memory."""
 
 LEGACY_DEFAULTS = {
     "data.timeline": None,
     "data.train_scenes": None,
+    "data.past_window_s": None,
     "phase.long_range": None,
     "model.radar_encoder.pruning_ratio": 0.0,
     "model.kggi.num_radar_peaks": 0,
@@ -152,7 +153,7 @@ def run_identity(tree: dict[str, Any], source: str | None = None) -> str:
         tree["phase"]["init_from"] = source
     if not tree["phase"]["temporal"]:
         for key in TEMPORAL_DATA_KEYS:
-            tree["data"].pop(key)
+            tree["data"].pop(key, None)
     tree = without_legacy_defaults(tree)
     digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:8]
     return f"{tree['model']['name']}-{tree['phase']['name']}-{tree['scale']}-{digest}"

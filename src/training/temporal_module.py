@@ -60,10 +60,9 @@ class TemporalModule(TrainingModule):
 
         In training a model may learn through the last of them (`Detector.trains_last_transition`).
         """
-        learns, memory = self.model.training and self.model.trains_last_transition, None
+        learns = self.model.training and self.model.trains_last_transition
         with evaluation_mode(self.model), torch.no_grad():
-            for frame in frames[: len(frames) - learns]:
-                memory = self.model.transition(frame, memory)
+            memory = self.model.memory_of(frames[: len(frames) - learns])
         return self.model.transition(frames[-1], memory) if learns else memory
 
     def select_memory(self, batch: FrameBatch) -> FrameMemory | None:

@@ -29,8 +29,8 @@ BEV = BevAugmentationConfig(scale=[0.95, 1.05], rotation_rad=0.4, flip_probabili
 def config(**changes):
     values = dict(
         root=None, version=VERSION, train_split="train", train_scenes=None, split="val", batch_size=2,
-        groups_per_scene=2, stream_sets=1, past_frames=0, sensor_dropout=0.0, num_workers=0, num_sweeps=2,
-        min_distance_m=1.0, propagate_points=False, on_bad_file=OnBadFile.error, test_resize_offset=0.0,
+        groups_per_scene=2, stream_sets=1, past_frames=0, past_window_s=None, sensor_dropout=0.0, num_workers=0,
+        num_sweeps=2, min_distance_m=1.0, propagate_points=False, on_bad_file=OnBadFile.error, test_resize_offset=0.0,
         num_lidar_sweeps=1, lidar_origins=False,
         deskew_lidar=True, timeline=None, num_future_frames=0,
         augmentation=AugmentationConfig(image=None, bev=BEV),
@@ -368,6 +368,49 @@ def test_the_past_of_a_first_frame_sees_nothing(data_set):
         assert torch.equal(frame.timestamps_s, first.timestamps_s)
     others = [batch for batch in data.train_dataloader() if batch.past[1].tokens != batch.tokens]
     assert others and all(len(batch.radar_points) == 0 and len(batch.past[1].radar_points) for batch in others)
+
+
+def test_a_window_gives_every_frame_what_it_holds_and_no_stream(drives):
+    """Scenes of 4, 1 and 3 frames, half a second apart."""
+    order = module(drives, ("radar",)).evaluation_set().tokens
+    first = [0, 0, 0, 0, 4, 5, 5, 5]
+    for window_s, depth in ((0.55, 1), (1.05, 2), (9.0, 3)):
+        data = module(drives, ("radar",), temporal=True, past_window_s=window_s)
+        expected = [
+            [order[at - k] if at - k >= first[at] else order[at] for k in range(depth, 0, -1)] for at in range(8)
+        ]
+        batches = list(data.val_dataloader())
+        assert all(batch.streams is None for batch in batches)
+        rows = [(batch, row) for batch in batches for row in range(len(batch))]
+        assert [[past.tokens[row] for past in batch.past] for batch, row in rows] == expected
+        frames = list(data.stream())
+        assert [[past.tokens[0] for past in frame.past] for frame in frames] == expected
+        assert [bool(frame.starts) for frame in frames] == [1, 0, 0, 0, 1, 1, 0, 0]
+        assert all(batch.streams is not None and not batch.past for batch in data.train_dataloader())
+    with pytest.raises(ConfigError, match=r"past_window_s=0.3: no frame of the split 'val' has another"):
+        module(drives, ("radar",), temporal=True, past_window_s=0.3).val_dataloader()
+    alone = module(drives, ("radar",), past_window_s=0.3)  # single frames remember nothing anyway
+    assert not any(batch.past for batch in alone.val_dataloader())
+    for changes, words in (({"past_window_s": 0.0}, "above 0"), ({"timeline": FIVE_HERTZ}, "data.timeline says")):
+        with pytest.raises(ConfigError, match=words):
+            config(**({"past_window_s": 0.55} | changes))
+
+
+def test_no_point_is_older_than_the_window(data_set):
+    """Of a past frame the newest sweeps are left, whose age counts from the frame that they are for."""
+    whole = module(data_set, temporal=True, past_frames=1, batch_size=1)
+    whole = {batch.tokens[0]: batch for batch in whole.train_dataloader()}
+    window_s = 0.52
+    data = module(data_set, temporal=True, past_frames=1, past_window_s=window_s, batch_size=1)
+    lost = 0
+    for batch in data.train_dataloader():
+        there = whole[batch.tokens[0]]
+        for one, all_of_it in zip((batch, *batch.past), (there, *there.past), strict=True):
+            age_s = float(batch.timestamps_s - one.timestamps_s) + all_of_it.radar_points[:, -1].double()
+            assert torch.equal(one.radar_points, all_of_it.radar_points[age_s <= window_s])
+            assert len(one.radar_batch) == len(one.radar_points) and one.image_valid.equal(all_of_it.image_valid)
+            lost += int((age_s > window_s).sum())
+    assert lost
 
 
 def test_stream_of_scenes(drives):

@@ -40,6 +40,7 @@ def test_run_identity_of_phase_2():
         "data.groups_per_scene=1",
         "data.sensor_dropout=0.5",
         "data.past_frames=2",
+        "data.past_window_s=0.55",
         "phase.epochs=2",
     ):
         assert identity(override) != base, override
