@@ -80,7 +80,9 @@ class FrameReader:
 
         `clip` is the token of the first frame of the clip that this frame is part of: A_t is then that frame's, so
         that it stays the same throughout the clip (method 6.4). `history` and `targets` are steps of the timeline: its
-        LiDAR frames at the first are `past`, those at the second `rays`.
+        LiDAR frames at the first are `past`, those at the second `rays`. A moment of the past without a sweep becomes a
+        frame with the token, time and pose of the key frame and no points; such frames come first, because at one a
+        memory forgets those before it.
         Raises DataError for an unreadable file (unless skipped) and for poses that jump.
         """
         index = self.index
@@ -100,7 +102,8 @@ class FrameReader:
         if self.settings.image_size_px is not None:
             batch |= self._images(sample, global_from_ego, aug_from_ego, augmentation, rng, skipped)
         if history:
-            batch["past"] = tuple(self._past_frame(sample, step, aug_from_ego, skipped) for step in history)
+            past = [self._past_frame(sample, step, aug_from_ego, skipped) for step in history]
+            batch["past"] = tuple(sorted(past, key=lambda frame: frame.tokens != batch["tokens"]))
         if targets:
             batch["rays"] = self._rays(sample, targets, aug_from_ego @ invert_rigid(global_from_ego), skipped)
         if index.annotated:

@@ -51,6 +51,19 @@ def test_where_a_scene_had_not_begun_a_past_frame_sees_nothing(lidar_set):
     assert len(late.lidar_points) == 2 * len(STATIC) and late.tokens != frame.tokens
 
 
+def test_past_frames_that_see_nothing_come_before_those_that_see(broken_lidar):
+    """A memory would forget at one of the key frame's own time what it has taken in before."""
+    reader = broken_lidar.reader(**ONLY_LIDAR, on_bad_file=OnBadFile.skip)
+    for row in reader.timeline.sweeps(1, -2):
+        if row >= 0:
+            (broken_lidar.root / reader.index.filename(int(row))).unlink()
+    frame = reader.read(1, None, history=[-3, -2, -1])
+    nothing, *seen = frame.past
+    assert nothing.tokens == frame.tokens and len(nothing.lidar_points) == 0
+    assert [KEY_S - float(past.timestamps_s) for past in seen] == pytest.approx([0.6, 0.2], abs=1e-6)
+    assert all(len(past.lidar_points) == 2 * len(STATIC) for past in seen)
+
+
 @pytest.mark.parametrize("augmentation", [None, TURNED])
 def test_rays_end_at_what_stands_there_and_begin_where_the_sensor_was(lidar_set, augmentation):
     steps = [-2, 0, 1, 2]
