@@ -8,6 +8,7 @@ import torch
 from src.data.pcd import LidarCloud
 from src.geometry.neighbours import neighbours_within
 from src.structures.ray_bundle import RayBundle
+from src.structures.taxonomy import EGO_BODY_M
 
 Array = np.ndarray
 
@@ -19,9 +20,6 @@ RADAR_LEAST_HEIGHT_M = 0.3
 car would drive along, a third of all that seems to move [ours]."""
 MAX_RADIAL_MPS = 60.0
 """Faster returns are ambiguous Doppler (lrs 2.5)."""
-EGO_BODY_M = np.array([[-12.0, -1.5, 0.3], [6.0, 1.5, 4.3]])
-"""Lowest and highest corner of the truck with its trailer, ego frame; they drive along and supervise nothing (lrs 2.3)
-[ours]."""
 TRUE_MARGIN_M = 0.15
 """Returns scatter about the faces of boxes by the sensor's noise."""
 
@@ -30,7 +28,7 @@ def without_ego_body(
     cloud: LidarCloud,
     ego_from_sensor: Array,  # [4, 4]
 ) -> LidarCloud:
-    """The returns that are not of the truck itself."""
+    """The returns that are not of the truck itself, which drives along and supervises nothing (lrs 2.3)."""
     in_ego = cloud.points[:, :3] @ ego_from_sensor[:3, :3].T + ego_from_sensor[:3, 3]
     others = ((in_ego < EGO_BODY_M[0]) | (in_ego > EGO_BODY_M[1])).any(1)
     return LidarCloud(cloud.points[others], cloud.times_us[others])

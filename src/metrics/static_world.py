@@ -7,9 +7,11 @@ import torch
 from torch import Tensor
 
 from src.geometry.bounds import Bounds
+from src.geometry.constants import constant
 from src.geometry.neighbours import neighbours_within
 from src.geometry.tensor_transforms import invert_rigid, transform_points
 from src.structures.batch import FrameBatch
+from src.structures.taxonomy import EGO_BODY_M
 
 Array = np.ndarray
 
@@ -47,13 +49,23 @@ def static_world(
 def aggregated_scan(
     batch: FrameBatch,
 ) -> tuple[Tensor, Tensor]:  # [L, 3] m in the batch's (augmented) ego frames, [L] int64 sample
-    """The points of the frame's own sweeps and of the frames before it."""
-    clouds, owners = [batch.lidar_points[:, :3]], [batch.lidar_batch]
-    for frame in batch.past:
-        aug_from_past = aug_from_frame(batch, frame)[frame.lidar_batch]
-        clouds.append(_moved(aug_from_past, frame.lidar_points[:, :3]))
-        owners.append(frame.lidar_batch)
+    """The points of the frame's own sweeps and of the frames before it, but for those of the truck, which drives on."""
+    clouds, owners = [], []
+    for frame in (batch, *batch.past):
+        points, own = _without_ego_body(frame)
+        clouds.append(points if frame is batch else _moved(aug_from_frame(batch, frame)[own], points))
+        owners.append(own)
     return torch.cat(clouds), torch.cat(owners)
+
+
+def _without_ego_body(
+    frame: FrameBatch,
+) -> tuple[Tensor, Tensor]:  # [L, 3] m in its own (augmented) ego frames, [L] int64 sample
+    points, owners = frame.lidar_points[:, :3], frame.lidar_batch
+    in_ego = _moved(frame.ego_from_aug[owners], points)
+    low, high = constant(EGO_BODY_M, points.dtype, points.device)
+    others = ((in_ego < low) | (in_ego > high)).any(1)
+    return points[others], owners[others]
 
 
 def aug_from_frame(batch: FrameBatch, other: FrameBatch) -> Tensor:  # [B, 4, 4] float32

@@ -42,6 +42,9 @@ LIDARS: tuple[str, ...] = tuple(_TAXONOMY["lidars"])
 REFERENCE_CHANNEL = "LIDAR_LEFT"
 """Its key frame defines ego(t): the frame of all network geometry and of evaluation ranges."""
 
+EGO_BODY_M = ((-12.0, -1.5, 0.3), (6.0, 1.5, 4.3))
+"""Lowest and highest corner of the truck with its trailer, ego frame [ours]."""
+
 MOVING_MPS = 1.0
 """What is faster over ground moves: in losses, scores and pictures."""
 

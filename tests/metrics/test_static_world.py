@@ -81,6 +81,27 @@ def test_past_scans_are_moved_by_the_ego():
     assert static_world(replace(frame(np.zeros((0, 3))), rays=batch.rays), 300.0).tolist() == [300.0, 300.0]
 
 
+def test_the_truck_itself_does_not_stand_where_it_was():
+    """Its own returns are known in the ego frame of their time, whatever the augmentation."""
+    own, others = [[-9.0, 0.0, 2.0], [5.0, 1.0, 1.0]], [[-9.0, 2.0, 2.0], [-9, 0, 0.1], [-13, 0, 2], [7, 0, 1]]
+    past = frame(own + others, at=10.0)
+    batch = frame(own + others, at=20.0, past=(past,))
+    kept = torch.tensor(others)
+    expected = torch.cat([kept, kept - torch.tensor([10.0, 0, 0])])
+    torch.testing.assert_close(aggregated_scan(batch)[0], expected)
+    assert aggregated_scan(batch)[1].tolist() == [0] * 8
+    trailer = frame([], at=20.0, past=(frame(own, at=10.0),), rays=rays_to([[-38.0, 0, 4]]))  # through (-19, 0, 2)
+    assert static_world(trailer, 300.0) == 300
+
+    turned = torch.tensor([[0.0, -1.05, 0, 0], [1.05, 0, 0, 0], [0, 0, 1.05, 0], [0, 0, 0, 1]])
+    block = torch.block_diag(turned[:3, :3].T, torch.eye(2))
+    past, batch = (
+        replace(one, aug_from_ego=turned[None], lidar_points=one.lidar_points @ block) for one in (past, batch)
+    )
+    found, _ = aggregated_scan(replace(batch, past=(past,)))
+    torch.testing.assert_close(found, expected @ turned[:3, :3].T)
+
+
 def test_autocast_rounds_no_scan():
     past = frame([[187.3, -57.77, 1.03]], at=10.0)
     batch = frame([[50.3, 0.0, 0.0]], at=12.0, past=(past,))
