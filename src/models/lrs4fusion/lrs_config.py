@@ -140,6 +140,11 @@ class LRS4FusionConfig(ModelConfig):
         return replace(self, roi=roi)
 
     @property
+    def moves_memory(self) -> bool:
+        """Whether the memory compensates for velocities."""
+        return self.temporal is not None and self.temporal.velocity_compensation
+
+    @property
     def keys_of_temporal_phase(self) -> tuple[str, ...]:
         """None: the phase before remembers as well."""
         return ()

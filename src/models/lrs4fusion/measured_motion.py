@@ -42,7 +42,7 @@ class MeasuredMotion:
     features: Tensor  # [m, C]
     batch: Tensor  # [m] int64
     origins: Tensor  # [B, 3] m, `sensor_origins`
-    ego_mps: Tensor  # [B, 3] the ego's velocity, 0 where nothing is remembered
+    ego_mps: Tensor  # [B, 3] the ego's velocity, NaN where unknown
 
     @classmethod
     def of(
@@ -51,7 +51,7 @@ class MeasuredMotion:
         grid: VoxelGrid,  # of the volume
         batch: FrameBatch,  # with LiDAR and its origins
         velocities: Tensor,  # [L, 3] `return_velocities`
-        ego_mps: Tensor,  # [B, 3] m/s, aug frame
+        ego_mps: Tensor,  # [B, 3] m/s, aug frame, NaN where unknown
     ) -> MeasuredMotion:
         """A voxel moves where half of its measured returns do, or, where it has none, of the `ball_query` around it."""
         indices = volume.indices
@@ -74,8 +74,8 @@ class MeasuredMotion:
     ) -> tuple[Tensor, Tensor, Tensor]:  # [Q, C], [Q, 3] m, [Q] m/s
         """If all that moves keeps its velocity: features at every place and time, where those are now, their speed.
 
-        The speed is along the ray from where the sensors are by then, if it drives on as well; 0 where nothing moves.
-        Differentiable in the features.
+        The speed is along the ray from where the sensors are by then, if the ego drives on as well, or along the
+        present ray where its velocity is unknown; 0 where nothing moves. Differentiable in the features.
         """
         steps = (times_s / TIME_STEP_S).round().long()
         span = 1 + 2 * int(steps.abs().max()) if len(steps) else 1
@@ -94,7 +94,8 @@ class MeasuredMotion:
         here = ball_query(self.rest.features, self.rest.sites, self.grid, points, batch, neighbours)
         velocities = velocities.detach()
         source = points - velocities * times_s[:, None]
-        rays = F.normalize(points - self.origins[batch] - self.ego_mps[batch] * times_s[:, None], dim=1)
+        driven = torch.where(self.ego_mps[batch].isnan(), velocities, self.ego_mps[batch])
+        rays = F.normalize(points - self.origins[batch] - driven * times_s[:, None], dim=1)
         return torch.where(met > 0, features, here), source, (velocities * rays).sum(1)
 
     def on_ground(

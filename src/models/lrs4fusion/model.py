@@ -42,6 +42,8 @@ from src.structures.ray_bundle import RayBundle
 NORM_EPS = 1e-3  # PartA2's
 QUERIES_AT_ONCE = 1 << 16
 """Of samples along rays: their features are 544 numbers each."""
+RAYS_AT_ONCE = 1 << 12
+"""Forecast without gradient: each has 2,000 samples, and a validation asks for a quarter of a million rays."""
 
 logger = logging.getLogger(__name__)
 
@@ -148,7 +150,7 @@ class LRS4Fusion(Detector, WorldModel):
         voxels = self.pointnet(batch.lidar_points, batch.lidar_batch, len(batch), batch.lidar_speeds)
         x = self.stem(self.unet(voxels))
         if self.temporal is None:
-            volumes, ego_mps = self.late_encoder(x), torch.zeros_like(batch.aug_from_ego[:, :3, 3])
+            volumes, ego_mps = self.late_encoder(x), torch.full_like(batch.aug_from_ego[:, :3, 3], torch.nan)
         else:
             warped = self.temporal.recall(memory, batch)
             volumes = self.late_encoder(x, lambda current: self.temporal(current, warped))
@@ -193,7 +195,7 @@ class LRS4Fusion(Detector, WorldModel):
 
     def transition(self, batch: FrameBatch, memory: VolumeMemory | None) -> VolumeMemory | None:
         """As in `Detector`."""
-        return self.remember(self.encode(batch, memory), batch)
+        return None if self.temporal is None else self.remember(self.encode(batch, memory), batch)
 
     @torch.no_grad()
     def ray_occupancy(self, volumes: Volumes, rays: RayBundle) -> Tensor:  # [R, N]
@@ -224,7 +226,9 @@ class LRS4Fusion(Detector, WorldModel):
         """As in `WorldModel`; gradients go to the ray head alone."""
         if self.ray_head is None:
             raise ConfigError(f"phase.options.stage={self.stage}: ranges of rays need the stage {LRSStage.forecast}")
-        return self.ray_head(self.ray_occupancy(output.volumes, rays))
+        at_once = max(1, len(rays)) if torch.is_grad_enabled() else RAYS_AT_ONCE
+        pieces = torch.arange(len(rays), device=rays.ranges.device).split(at_once)
+        return torch.cat([self.ray_head(self.ray_occupancy(output.volumes, rays[piece])) for piece in pieces])
 
     def loss_terms(self, output: LRSOutput, batch: FrameBatch) -> Objective:
         """Weighted terms of the stage: `heatmap` and `box`; `occupancy` and `velocity`; or `range`.

@@ -55,7 +55,7 @@ class WarpedVolume:
 
     volume: SparseMap  # [n, C] on (B, z, y, x) of the second scale
     elapsed_s: Tensor  # [B], 0 where nothing is remembered
-    ego_mps: Tensor  # [B, 3] the ego's mean velocity since, aug frame; 0 where nothing is remembered
+    ego_mps: Tensor  # [B, 3] the ego's mean velocity since, aug frame; NaN where nothing is remembered
 
 
 class WindowedFusion(nn.Module):
@@ -116,8 +116,8 @@ class WindowedFusion(nn.Module):
         if not frames:
             keys = torch.zeros(0, dtype=torch.int64, device=batch.device)
             empty = batch.aug_from_ego.new_zeros(0, self.memory_channels)
-            nothing = batch.aug_from_ego.new_zeros(len(batch), 4)
-            return WarpedVolume(SparseMap(Sites(shape, keys), empty), nothing[:, 0], nothing[:, 1:])
+            nothing = torch.zeros_like(batch.aug_from_ego[:, :3, 3])
+            return WarpedVolume(SparseMap(Sites(shape, keys), empty), nothing[:, 0], nothing + torch.nan)
         voxels, motion = frames[0].voxels, frames[0].motion(batch, self.config.max_age_s)
         xyz = voxels.xyz
         if self.config.velocity_compensation:
@@ -128,7 +128,7 @@ class WindowedFusion(nn.Module):
         sites, owners = Sites.unique(indices, shape)
         features = segment_mean(full_precision(voxels.features)[kept], owners, len(sites))
         driven = -motion.aug_from_past[:, :3, 3] / motion.elapsed_s.clamp(min=torch.finfo(torch.float32).eps)[:, None]
-        ego_mps = torch.where(motion.usable[:, None], driven, 0.0)
+        ego_mps = torch.where(motion.usable[:, None], driven, torch.nan)
         return WarpedVolume(SparseMap(sites, features), motion.elapsed_s, ego_mps)
 
     def _check(self, frame: VolumeFrame) -> None:

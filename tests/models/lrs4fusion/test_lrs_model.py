@@ -76,6 +76,8 @@ def test_frames_without_points_inside_teach_finite_steps_and_are_remembered_as_n
 
 def test_sensors_and_stages_that_there_are():
     assert lrs_config().model.sensors == ["lidar"] and lrs_config().model.memory_frames == 1
+    still = ("model.temporal.velocity_compensation=false", "model.temporal=null")  # nothing for an oracle to replace
+    assert lrs_config().model.moves_memory and not any(lrs_config(one).model.moves_memory for one in still)
     with pytest.raises(ConfigError, match=r"model.sensors=\['lidar', 'camera'\]: must be \['lidar'\]"):
         lrs_config("model.sensors=[lidar,camera]")
     with pytest.raises(ConfigError, match="stage=dreams: must be one of occupancy, forecast, detection"):
@@ -149,6 +151,21 @@ def test_forecasts_train_the_ray_head_alone(monkeypatch):
     assert model.forecast(output, rays[:0]).shape == (0,)
 
 
+def test_without_gradients_a_few_rays_at_a_time_are_forecast(monkeypatch):
+    """The same ranges as at once, which is how it learns; the second piece holds rays of both samples."""
+    model, rays, pieces = lrs_model(FORECAST, "model.measured_motion=true").eval(), some_rays(), []
+    speeds = torch.full((700,), 20.0)
+    output = model(replace(frame(), lidar_origins=torch.zeros(700, 3), lidar_speeds=speeds))[0]
+    model.ray_head.register_forward_pre_hook(lambda _, inputs: pieces.append(len(inputs[0])))
+    whole = model.forecast(output, rays)
+    monkeypatch.setattr("src.models.lrs4fusion.model.RAYS_AT_ONCE", 2)
+    with torch.no_grad():
+        torch.testing.assert_close(model.forecast(output, rays), whole)
+        assert model.forecast(output, rays[:0]).shape == (0,)
+    model.forecast(output, rays).sum().backward()
+    assert pieces == [6, 2, 2, 2, 0, 6] and whole.std() > 0
+
+
 def test_the_memory_changes_features_and_no_site():
     model = lrs_model(OCCUPANCY).eval()
     _, memory = model(frame())
@@ -176,9 +193,11 @@ def test_measured_speeds_move_the_volume_and_what_is_remembered(caplog):
         return replace(own, aug_from_ego=augment[None])
 
     output, memory = model(seen(0.0))
-    assert len(output.volumes.measured.xyz) > 100 and not output.volumes.measured.ego_mps.any()
+    assert len(output.volumes.measured.xyz) > 100 and output.volumes.measured.ego_mps.isnan().all()
     later = model.encode(seen(0.5), memory)
     torch.testing.assert_close(later.measured.ego_mps, (augment[:3, :3] @ torch.tensor([20.0, 0, 0]))[None])
+    single = lrs_model(OCCUPANCY, "model.measured_motion=true", "model.temporal=null").eval()
+    assert single.encode(seen(0.5)).measured.ego_mps.isnan().all()
     warn_without_speeds.cache_clear()
     assert not caplog.text and model.encode(seen(0.5, measured=False), memory).measured is None
     assert "model.measured_motion=true, but no return has a measured speed" in caplog.text
@@ -257,6 +276,12 @@ def test_single_frames_have_no_memory():
     model = lrs_model("model.temporal=null").eval()
     output, memory = model(frame())
     assert memory is None and model.temporal is None and len(model.decode(output)) == 2
+
+
+def test_single_frames_are_not_encoded_to_remember_nothing(monkeypatch):
+    model = lrs_model("model.temporal=null")
+    monkeypatch.setattr(model, "encode", lambda *_: pytest.fail("encoded"))
+    assert model.transition(frame(), None) is None
 
 
 def test_points_outside_the_region_and_other_samples_change_nothing():

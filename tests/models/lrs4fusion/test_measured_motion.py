@@ -109,6 +109,17 @@ def test_a_speed_is_along_the_ray_from_where_the_sensors_will_be():
     torch.testing.assert_close(speeds, expected)
 
 
+def test_where_the_egos_speed_is_unknown_a_speed_is_along_the_present_ray():
+    """A car 20 m behind at 25 m/s: 2 s later it is still behind an ego as fast, ahead of one known to stand."""
+    behind = [-19.5, 0.5, 0.5]
+    moving = motion(volume(behind, behind, samples=[0, 1]), (-25.0, -25.0), (behind, behind), (0, 1), torch.nan,
+                    sensors=(0.5, 0.5, 0.5))  # fmt: skip
+    moving.ego_mps[1] = 0
+    ahead = [30.5, 0.5, 0.5, 2.0]
+    speeds = seen(moving, [*behind, 0.0], ahead, [*behind, 0.0], ahead, batch=[0, 0, 1, 1])[2]
+    assert speeds.tolist() == [-25.0, -25.0, -25.0, 25.0]
+
+
 def test_the_place_that_it_leaves_is_empty_and_what_rests_stays():
     moving = motion(volume(CAR, WALL))
     features, source, speeds = seen(moving, [*CAR, 1.0], [*WALL, 2.0], [*WALL, 0.0])

@@ -59,7 +59,9 @@ def test_a_static_world_coincides_with_the_present():
     assert torch.equal(warped.volume.sites.keys, seen_now.sites.keys) and warped.elapsed_s.tolist() == [0.5]
     torch.testing.assert_close(warped.volume.features, seen_now.features)
     torch.testing.assert_close(warped.ego_mps, torch.tensor([[6.0, 3.0, 0.0]]))
-    assert not part.recall(memory, before).ego_mps.any()  # a memory that is not in the past
+    assert part.recall(memory, before).ego_mps.isnan().all()  # a memory that is not in the past
+    late = bare_frame(2.0, [pose(3.0, 1.5, origin=UTM)])
+    assert part.recall(memory, late).ego_mps.isnan().all() and part.recall(None, after).ego_mps.isnan().all()
 
 
 def test_a_turn_keeps_matter_within_half_a_voxel():
