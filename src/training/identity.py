@@ -41,6 +41,7 @@ LEGACY_DEFAULTS = {
     "model.radar_encoder.pruning_ratio": 0.0,
     "model.kggi.num_radar_peaks": 0,
     "model.neck_channels": [],
+    "model.doppler.withheld": 0.0,  # has gone since
     "model.doppler.in_losses": True,
     "model.doppler.along_heading": False,
     "model.dptf.gaussian_path.forget_refuted": False,

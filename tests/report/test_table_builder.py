@@ -228,10 +228,14 @@ def test_a_setting_that_was_typed_though_it_is_the_default_is_the_same(make_reco
     assert sweep_tables(make_record({"a": {}}, seeds=2), results)[0].rows[0].done == 2
 
 
-def test_a_key_that_an_older_run_lacks_is_the_same_at_its_value_of_before(make_record, results_of):
-    older = results_of({"a0": 0.1}, config={"seed": 0, "data": {}})
-    for value, same in ((None, True), (4, False)):
-        results = older | results_of({"a1": 0.2}, config={"seed": 1, "data": {"train_scenes": value}})
+@pytest.mark.parametrize(
+    ("part", "key", "before", "other"), [("data", "train_scenes", None, 4), ("model", "doppler", {"withheld": 0.0}, {})]
+)
+def test_a_key_that_one_run_lacks_is_the_same_at_its_value_of_before(make_record, results_of, part, key, before, other):
+    """The newer run has a younger key, the older one a key that has gone."""
+    lacking = results_of({"a0": 0.1}, config={"seed": 0, part: {key: {}} if isinstance(before, dict) else {}})
+    for value, same in ((before, True), (other or {"withheld": 0.5}, False)):
+        results = lacking | results_of({"a1": 0.2}, config={"seed": 1, part: {key: value}})
         if same:
             assert sweep_tables(make_record({"a": {}}, seeds=2), results)[0].rows[0].done == 2
         else:
