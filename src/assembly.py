@@ -123,7 +123,7 @@ def save_submission(config: Config, path: Path, tokens: list[str], table: Detect
     max_age_s, window_s = config.model.memory_max_age_s, config.data.past_window_s
     memory = "no memory"  # the benchmark's rules are about how far back a detector looks
     if max_age_s is not None and window_s is None:
-        memory = f"streamed, memory of frames of up to {max_age_s:g} s, each with what it remembered itself"
+        memory = f"memory of frames of up to {max_age_s:g} s, in which older inputs may live on"
     elif max_age_s is not None:
         memory = f"memory of inputs of up to {window_s:g} s"
     meta: dict[str, bool | str] = {f"use_{sensor}": sensor in config.model.sensors for sensor in SENSORS}
