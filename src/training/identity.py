@@ -41,7 +41,6 @@ LEGACY_DEFAULTS = {
     "model.radar_encoder.pruning_ratio": 0.0,
     "model.kggi.num_radar_peaks": 0,
     "model.neck_channels": [],
-    "model.doppler.withheld": 0.0,  # has gone since
     "model.doppler.in_losses": True,
     "model.doppler.along_heading": False,
     "model.dptf.gaussian_path.forget_refuted": False,
@@ -54,6 +53,9 @@ LEGACY_DEFAULTS = {
 
 At this value a key is no part of an identity, and a checkpoint without the key has it.
 """
+
+GONE_DEFAULTS = {"model.doppler.withheld": 0.0}
+"""Keys that older runs have and today's do not, with the value that does what is done now: no part of an identity."""
 
 
 _NUMBER = re.compile(r"(?<![\w.+-])[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?(?![\w.+-])")
@@ -130,8 +132,9 @@ def _value_at(tree: dict[str, Any], key: str) -> Any:
 
 
 def without_legacy_defaults(tree: dict[str, Any]) -> dict[str, Any]:
-    """A copy of a configuration without the younger keys that have their value of before."""
-    return without_keys(tree, [key for key, before in LEGACY_DEFAULTS.items() if _value_at(tree, key) == before])
+    """A copy of a configuration without the keys, younger or gone, whose value changes nothing."""
+    neutral = LEGACY_DEFAULTS | GONE_DEFAULTS
+    return without_keys(tree, [key for key, value in neutral.items() if _value_at(tree, key) == value])
 
 
 def digest_of_changes(overrides: list[str]) -> str:
