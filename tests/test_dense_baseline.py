@@ -16,7 +16,11 @@ pytestmark = pytest.mark.slow
 FEW = "model.head.score_threshold=0.005"  # one step leaves every score near where it began
 
 
-@pytest.fixture(scope="module", params=["dense_bev", "crt_fusion", "hydra", "sparc", "petr", "far3d", "rctrans"])
+ALIKE = [pytest.param(name, marks=pytest.mark.exhaustive) for name in ("hydra", "far3d", "rctrans")]
+"""Detectors whose memory and head one of the others has as well."""
+
+
+@pytest.fixture(scope="module", params=["dense_bev", "crt_fusion", "sparc", "petr", *ALIKE])
 def family(request):
     return request.param
 

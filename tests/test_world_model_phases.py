@@ -66,6 +66,7 @@ def test_the_first_phase_writes_its_world_and_scores_occupancy(occupancy, world)
     assert not (occupancy / "submission.json").exists()
 
 
+@pytest.mark.exhaustive
 def test_without_labels_a_forecast_learns_the_ray_head_alone(unlabelled, tmp_path):
     places = ("trainer.num_pictures=1", "data.world=null", f"data.root={unlabelled}", f"paths.outputs={tmp_path}")
     said = call("train", *MODEL, "phase=lrs_forecast", *places)  # the first phase before it

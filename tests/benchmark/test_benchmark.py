@@ -196,6 +196,7 @@ def test_ops(outputs, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_scaling(outputs, tmp_path, monkeypatch):
     monkeypatch.setattr(scaling, "ROADS", {"debug": Highway(100, 10, 5, 150.0)})
     monkeypatch.setattr(scaling, "RANGES_M", {"debug": (37.5, 75.0, 150.0)})

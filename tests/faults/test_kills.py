@@ -60,7 +60,7 @@ def test_a_kill_at_each_point_of_a_write_leaves_a_whole_checkpoint(tmp_path, poi
     assert read_checkpoint(tmp_path / LAST)["global_step"] == (2 if point == "replaced" else 1)
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_kill_inside_a_write_and_a_torn_file_cost_nothing(tiny, tmp_path):
     """With the full model on clips: the newest file half written, then torn after its write, then a SIGTERM."""
     overrides, reference = tiny("phase2")

@@ -80,6 +80,7 @@ def test_sizes_stand_beside_horizon3ds(family, scale, low, high):
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_frames_are_overfitted(model):
     """Over 0.9 AP at one cell, averaged over the classes present."""
     assert overfitted_precision(model, make_batch(boxes=(5, 4)), 140, 4e-3, 100) > 0.9

@@ -142,6 +142,7 @@ def test_sizes_stand_beside_horizon3ds(family, scale):
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_two_frames_are_overfitted(family):
     """Over 0.9 AP at one cell, averaged over the classes present."""
     model, batch = small_model(family), make_batch(boxes=(5, 4))

@@ -171,6 +171,7 @@ def test_latency_is_measured_once_per_row_and_a_failure_is_told(tmp_path, monkey
 
 
 @pytest.mark.slow
+@pytest.mark.exhaustive
 def test_results_of_other_machines_are_given_a_latency_of_fresh_weights(sweeps, places, tmp_path, capsys, monkeypatch):
     """Their weights are not here; the table says so."""
     words = ["+sweep=timed", "scale=debug", "phase.epochs=1", "trainer.num_pictures=0", "trainer=cpu", *places]
