@@ -92,10 +92,12 @@ def draw_forest(path: Path | str, groups: Sequence[ForestGroup], title: str, axi
     axes = canvas.axes(left, TOP_PX, width, height)
     axes.set(xlim=reach(groups), ylim=(height, 0), yticks=[])
     quiet_axes(axes, grid="x")
-    axes.axvline(0, color="#868E96", linewidth=1.2)
+    axes.axvline(0, color="#868E96", linewidth=1.2, zorder=1)
     axes.set_xlabel(axis, color=AXIS_INK, fontsize=10, parse_math=False)
     top = TOP_PX
     for group in groups:
+        below = top - TOP_PX  # no line of the plot crosses a long title
+        axes.axhspan(below, below + HEAD_PX, color="white", linewidth=0, zorder=1.5)
         canvas.text(16, top + 11, group.title, 15, bold=True)
         canvas.text(SHEET_PX - 16, top + 11, group.verdict, 15, bold=True, colour=COLOURS[group.verdict], align="right")
         top += HEAD_PX
