@@ -15,14 +15,17 @@ from src.sweep.sweep_files import sweep_files
 ROOT = Path(__file__).resolve().parents[2]
 PARTS_OF_SOME = ("image_encoder", "kggi", "ocsf", "gaussian_encoder", "dptf", "view_transform", "temporal_fusion")
 """Of Table 15: not every model has each of them."""
-SELDOM = ("speeds.", "classes.", "lfcd", "cd_unseen")
+SELDOM = ("speeds.", "classes.", "lfcd", "static_lfcd", "cd_unseen")
 """The debug world lacks most of them: it is small, and so is what a forecast may miss there."""
 FROM_FEW = ("measures.camera_velocity_error", "measures.history_velocity_error")
 """Of Gaussians within fast objects, and the debug world has few of both: there exactly where a run has met one."""
-CAMERA_ONLY, OF_RADAR = ("PETR", "Far3D"), ("measures.hidden_recall",)
+CAMERA_ONLY, OF_RADAR = ("PETR", "Far3D"), ("measures.hidden_recall", "latency.radar_encoder")
 """What hides from the radar is nothing to a model that reads none."""
-OF_HISTORY = ("measures.remembered_share", "measures.history_near", "measures.history_faint")
-"""There exactly where Gaussians are remembered."""
+OF_SOURCE = {
+    "measures.remembered_share": "history", "measures.history_near": "history", "measures.history_faint": "history",
+    "measures.random_near": "random", "measures.random_faint": "random",
+}  # fmt: skip
+"""There exactly where a model has Gaussians of that source."""
 pytestmark = [pytest.mark.slow, pytest.mark.exhaustive]  # test_sweep.py trains one with every other suite
 
 
@@ -58,13 +61,13 @@ def test_a_sweep_ends_with_complete_tables(name, folder):
         assert trained
         for place, column in enumerate(table.columns):
             asked = [row for row in trained if column.name not in OF_RADAR or row.label not in CAMERA_ONLY]
-            if column.name in OF_HISTORY + FROM_FEW:
+            if column.name in (*OF_SOURCE, *FROM_FEW):
                 asked, others = [], asked
                 for row in others:
                     (run_id,) = record.rows[row.label].values()
                     measures = json.loads((folder / "outputs" / run_id / "metrics.json").read_text())["measures"]
-                    if column.name in OF_HISTORY:
-                        is_there = bool(measures.get("history_gaussians"))
+                    if column.name in OF_SOURCE:
+                        is_there = bool(measures.get(f"{OF_SOURCE[column.name]}_gaussians"))
                     else:  # a model with Gaussians has the measure, be it of none of them
                         assert "camera_gaussians" not in measures or column.name.removeprefix("measures.") in measures
                         is_there = measures.get(column.name.removeprefix("measures.")) is not None
