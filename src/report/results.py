@@ -52,6 +52,7 @@ class RunRecord:
     device: str
     processes: Count
     threads: Count
+    cpu_products: dict[str, str] | None = None  # what a CPU multiplies by and in; older results do not have it
     initialized_from: str | None  # run id, or digest of a checkpoint
     epochs: Count  # of this phase
     steps: Count

@@ -101,8 +101,15 @@ def describe_machines(results: Iterable[RunResult]) -> list[str]:
     for result in results:
         code.add(result.commit[:10] + ("+" if result.commit.endswith("+") else ""))
         threads = f"{counted(result.processes, 'process')} of {counted(result.threads, 'thread')}"
-        devices.add(f"{result.device}, {threads}")
+        devices.add(f"{result.device}, {threads}{_products(result)}")
     return [words + _listed(sorted(found)) for words, found in (("code ", code), ("", devices)) if found]
+
+
+def _products(result: RunResult) -> str:
+    """In what a run multiplied that asks for bfloat16 where the processor has it; empty for one that did not say."""
+    if result.config.get("precision") != "bf16-products" or not result.cpu_products:
+        return ""
+    return " (products in float32)" if result.cpu_products["bfloat16"] == "never" else " (large products in bfloat16)"
 
 
 def _scene_intervals(results: dict[str, RunResult]) -> str:

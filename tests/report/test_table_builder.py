@@ -158,6 +158,19 @@ def test_the_caption_names_what_was_run(make_record, results_of):
     assert table.caption.endswith("every other row. Latency on Fast CPU, 1 thread.")
 
 
+def test_the_caption_says_in_what_processors_multiplied_that_need_not_have_bfloat16(make_record, results_of):
+    results = results_of(THREE)
+    precisions = {"a": "bf16-products", "b": "32-true"}
+    for run_id, result in results.items():
+        result.config = {"precision": precisions[run_id.removeprefix(PREFIX)[0]]}
+        result.cpu_products = {"float32": "torch", "bfloat16": "never"}
+    results[f"{PREFIX}a1"].cpu_products = {"float32": "torch", "bfloat16": "from 256 rows"}
+    results[f"{PREFIX}a2"].cpu_products = None
+    (table,) = sweep_tables(make_record({"a": {}, "b": {}}), results)
+    where = "cpu, 1 process of 2 threads"
+    assert f"; {where}, {where} (large products in bfloat16), {where} (products in float32). Bold" in table.caption
+
+
 def test_a_note_stands_under_every_table_whatever_has_run(make_record, results_of):
     record = make_record({"a": {}, "b": {}})
     record.sweep.note = "Half of the *rate* for a"
