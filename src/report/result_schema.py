@@ -145,6 +145,13 @@ class Seconds(TypedDict, extra_items=Measure):
     earlier: NotRequired[Measure]  # of the others, before the run was resumed; older files count the last session alone
 
 
+class CpuProducts(TypedDict):
+    """What a CPU multiplies matrices by and in."""
+
+    float32: str
+    bfloat16: str  # "never", or from which size on
+
+
 class PeakMemory(TypedDict, extra_items=Count):
     """MiB: also largest_worker."""
 

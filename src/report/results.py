@@ -19,7 +19,16 @@ from src.files.atomic_write import write_whole
 from src.report.json_format import OPEN, Count, Many, Measure, read_all, read_as, read_json
 from src.report.metric_names import DETECTION, METRICS
 from src.report.plain_yaml import load_plain_yaml
-from src.report.result_schema import Bounds, DataNames, Latency, OtherScores, PeakMemory, Scores, Seconds
+from src.report.result_schema import (
+    Bounds,
+    CpuProducts,
+    DataNames,
+    Latency,
+    OtherScores,
+    PeakMemory,
+    Scores,
+    Seconds,
+)
 from src.report.run_curves import curves_of
 from src.training.identity import OUTSIDE_IDENTITY, canonical, is_of, key_of, without_keys
 
@@ -52,7 +61,7 @@ class RunRecord:
     device: str
     processes: Count
     threads: Count
-    cpu_products: dict[str, str] | None = None  # what a CPU multiplies by and in; older results do not have it
+    cpu_products: CpuProducts | None = None  # what a CPU multiplies by and in; older results do not have it
     initialized_from: str | None  # run id, or digest of a checkpoint
     epochs: Count  # of this phase
     steps: Count

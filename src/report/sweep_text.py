@@ -109,7 +109,8 @@ def _products(result: RunResult) -> str:
     """In what a run multiplied that asks for bfloat16 where the processor has it; empty for one that did not say."""
     if result.config.get("precision") != "bf16-products" or not result.cpu_products:
         return ""
-    return " (products in float32)" if result.cpu_products["bfloat16"] == "never" else " (large products in bfloat16)"
+    dtype = "float32" if result.cpu_products["bfloat16"] == "never" else "bfloat16"
+    return f" (matrix products in {dtype})"
 
 
 def _scene_intervals(results: dict[str, RunResult]) -> str:
