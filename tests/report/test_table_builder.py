@@ -168,7 +168,8 @@ def test_the_caption_says_in_what_processors_multiplied_that_need_not_have_bfloa
     results[f"{PREFIX}a2"].cpu_products = None
     (table,) = sweep_tables(make_record({"a": {}, "b": {}}), results)
     where = "cpu, 1 process of 2 threads"
-    assert f"; {where}, {where} (matrix products in bfloat16), {where} (matrix products in float32). Bold" in table.caption
+    products = f"{where} (matrix products in bfloat16), {where} (matrix products in float32)"
+    assert f"; {where}, {products}. Bold" in table.caption
 
 
 def test_a_note_stands_under_every_table_whatever_has_run(make_record, results_of):
